@@ -1,0 +1,1 @@
+"""Blocks of N by sequence number: mean, covariance, present, lost."""

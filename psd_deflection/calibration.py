@@ -1,0 +1,1 @@
+"""Counts to volts to metres; the sensor types."""

@@ -1,0 +1,1 @@
+"""The command line: ``psd-deflection COMMAND``; one file a command."""

@@ -1,0 +1,26 @@
+"""List every parameter with unit, bounds, default and what it is for.
+
+With --params-file the values of that file are shown and checked.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from psd_deflection.config import PARAMETERS, load_rig
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('--params-file', metavar='RIG.yaml', help='a ROS 2 parameter file')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the table."""
+    rig = load_rig(args.params_file)
+    for p in PARAMETERS:
+        bounds = p.bound_text() or (', '.join(p.choices) if p.choices else '')
+        unit = f' {p.unit}' if p.unit else ''
+        print(f'{p.name} = {rig.values[p.name]}{unit}')
+        print(f'    {p.description}' + (f' ({bounds})' if bounds else ''))
+    return 0

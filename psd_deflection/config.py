@@ -1,0 +1,538 @@
+"""Parameters: declared once here, checked here, read by every command and by the ROS node.
+
+``PARAMETERS`` is the only list of what can be set, with type, default, unit, bounds and a sentence
+for the reader. :func:`load_rig` reads a ROS 2 parameter file (``/**: ros__parameters:``) without
+ROS; :func:`rig_from_values` makes the frozen :class:`Rig` from flat values (``link.length``) and
+is what the node calls with the values that rclpy gives it. Every refusal names the source, the
+key, the value and the bound.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+
+from psd_deflection.errors import ConfigError
+from psd_deflection.records import FloatArray
+
+Kind = Literal['double', 'integer', 'bool', 'string', 'double_array', 'string_array']
+Value = float | int | bool | str | list[float] | list[str]
+
+MAX_FILE_BYTES = 1_000_000
+MAX_KEYS = 10_000
+
+SENSOR_TYPES = ('duolateral', 'tetralateral', 'pincushion', 'quadrant')
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One thing that can be set. ``minimum``/``maximum`` hold for each element of an array.
+
+    ``above``: an exclusive lower bound. ``live``: may change while the node runs.
+    """
+
+    name: str
+    kind: Kind
+    default: Any
+    unit: str
+    description: str
+    minimum: float | None = None
+    maximum: float | None = None
+    above: float | None = None
+    length: int | None = None
+    choices: tuple[str, ...] | None = None
+    live: bool = False
+
+    def bound_text(self) -> str:
+        """The bounds in words, for an error message or ``--help``."""
+        parts = []
+        if self.above is not None:
+            parts.append(f'above {self.above:g}')
+        if self.minimum is not None:
+            parts.append(f'at least {self.minimum:g}')
+        if self.maximum is not None:
+            parts.append(f'at most {self.maximum:g}')
+        return ' and '.join(parts)
+
+
+def _psd(number: int, center: list[float]) -> list[Parameter]:
+    p = f'psd_{number}.'
+    return [
+        Parameter(p + 'type', 'string', 'duolateral', '', 'sensor type', choices=SENSOR_TYPES),
+        Parameter(
+            p + 'center',
+            'double_array',
+            center,
+            'm',
+            'centre of the PSD in link_tip (x, y)',
+            minimum=-10.0,
+            maximum=10.0,
+            length=2,
+        ),
+        Parameter(
+            p + 'height',
+            'double',
+            0.0,
+            'm',
+            'sensitive surface above the tip section, along +Z',
+            minimum=-10.0,
+            maximum=10.0,
+        ),
+        Parameter(
+            p + 'active_area',
+            'double_array',
+            [0.010, 0.010],
+            'm',
+            'active area (width, height)',
+            above=0.0,
+            maximum=1.0,
+            length=2,
+        ),
+        Parameter(
+            p + 'zero',
+            'double_array',
+            [0.0, 0.0],
+            'm',
+            'dot on the unloaded link (x, y); ~/zero sets it',
+            minimum=-0.5,
+            maximum=0.5,
+            length=2,
+        ),
+    ]
+
+
+PARAMETERS: tuple[Parameter, ...] = (
+    # The link.
+    Parameter('link.length', 'double', 0.585, 'm', 'length L of the link', above=0.0, maximum=1000.0),
+    Parameter('link.outer_radius', 'double', 0.0159, 'm', 'outer radius of the tube', above=0.0, maximum=10.0),
+    Parameter('link.inner_radius', 'double', 0.0138, 'm', 'inner radius of the tube', minimum=0.0, maximum=10.0),
+    Parameter('link.youngs_modulus', 'double', 69e9, 'Pa', "Young's modulus E", above=0.0, maximum=1e13),
+    Parameter('link.shear_modulus', 'double', 24e9, 'Pa', 'shear modulus G', above=0.0, maximum=1e13),
+    Parameter(
+        'link.slope_ratio',
+        'double',
+        1.5,
+        '',
+        'k of the tip slope, phi = -k dY/L: 3/2 for a tip force, 2 for a tip moment',
+        minimum=0.0,
+        maximum=10.0,
+    ),
+    # The two detectors.
+    *_psd(1, [0.0, 0.070]),
+    *_psd(2, [-0.100, 0.0]),
+    # Amplifier and converter.
+    Parameter(
+        'amplifier.sensitivity', 'double', 0.5e-3, 'm/V', 'dot travel per volt on x and y', above=0.0, maximum=1.0
+    ),
+    Parameter('amplifier.sum_nominal', 'double', 5.0, 'V', 'sum signal with the laser on', above=0.0, maximum=100.0),
+    Parameter('amplifier.noise', 'double', 2e-3, 'V', 'noise, rms per sample and channel', above=0.0, maximum=10.0),
+    Parameter('converter.bits', 'integer', 16, '', 'bits of the converter', minimum=8, maximum=16),
+    Parameter('converter.full_scale', 'double', 10.0, 'V', 'range is +- this', above=0.0, maximum=1000.0),
+    Parameter('converter.sample_rate_hz', 'double', 1000.0, 'Hz', 'samples per second', minimum=1.0, maximum=10_000.0),
+    # The link's modes (used by the simulation).
+    Parameter('dynamics.bending_frequency', 'double', 14.0, 'Hz', 'first bending mode', above=0.0, maximum=1e4),
+    Parameter('dynamics.bending_damping_ratio', 'double', 0.02, '', 'its damping ratio', minimum=0.0, maximum=0.99),
+    Parameter('dynamics.torsion_frequency', 'double', 21.0, 'Hz', 'first torsion mode', above=0.0, maximum=1e4),
+    Parameter('dynamics.torsion_damping_ratio', 'double', 0.02, '', 'its damping ratio', minimum=0.0, maximum=0.99),
+    # From samples to estimates.
+    Parameter('block_size', 'integer', 20, 'samples', 'samples averaged for one estimate', minimum=1, maximum=1000),
+    Parameter(
+        'min_samples', 'integer', 10, 'samples', 'a block with fewer present has no estimate', minimum=1, maximum=1000
+    ),
+    Parameter(
+        'sum_min',
+        'double',
+        2.5,
+        'V',
+        'a sum signal below this means that the laser is lost',
+        minimum=0.0,
+        maximum=100.0,
+        live=True,
+    ),
+    Parameter('solver', 'string', 'exact', '', 'the solver whose answer is /link_tip/deflection'),
+    Parameter(
+        'solvers',
+        'string_array',
+        ['exact', 'wls', 'iterative'],
+        '',
+        'solvers that run; each has a topic /link_tip/SOLVER/deflection',
+    ),
+    Parameter(
+        'wls.weights',
+        'string',
+        'inverse_variance',
+        '',
+        'weights of wls: from the noise, or the row scaling of the thesis',
+        choices=('inverse_variance', 'thesis'),
+    ),
+    Parameter(
+        'wls.row_scaling',
+        'double_array',
+        [0.03, 0.5, 10.0, 0.1],
+        '',
+        "the thesis's row scaling of x1, y1, x2, y2 (weights are its squares), used when wls.weights is thesis",
+        above=0.0,
+        maximum=1e6,
+        length=4,
+    ),
+    # Acquisition.
+    Parameter('source', 'string', 'serial', '', 'where samples come from', choices=('serial',)),
+    Parameter('port', 'string', '', '', 'serial port; empty starts the simulated rig'),
+    Parameter(
+        'baud', 'integer', 921_600, 'baud', 'line speed (USB-CDC devices ignore it)', minimum=1200, maximum=12_000_000
+    ),
+    Parameter(
+        'latency_offset',
+        'double',
+        0.0,
+        's',
+        'constant delay of the link to take off every stamp',
+        minimum=-1.0,
+        maximum=1.0,
+    ),
+    Parameter(
+        'queue_blocks', 'integer', 250, 'blocks', 'blocks that may wait for a slow consumer', minimum=2, maximum=100_000
+    ),
+    # Recording.
+    Parameter('record', 'bool', False, '', 'record from the start'),
+    Parameter('bag_dir', 'string', 'recordings', '', 'folder in which recordings are made'),
+)
+
+BY_NAME: Mapping[str, Parameter] = MappingProxyType({p.name: p for p in PARAMETERS})
+
+EFFECTS_PREFIX = 'effects.'
+"""Keys below it describe simulated effects; ``psd_deflection.simulation`` checks them."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkConfig:
+    """The link: m, Pa."""
+
+    length: float
+    outer_radius: float
+    inner_radius: float
+    youngs_modulus: float
+    shear_modulus: float
+    slope_ratio: float
+
+    @property
+    def second_moment(self) -> float:
+        """I = pi/4 (Ro^4 - Ri^4), m^4."""
+        return math.pi / 4.0 * (self.outer_radius**4 - self.inner_radius**4)
+
+    @property
+    def bending_stiffness(self) -> float:
+        """EI, N m^2."""
+        return self.youngs_modulus * self.second_moment
+
+    @property
+    def torsional_stiffness(self) -> float:
+        """GJ, N m^2, with J = 2 I for a circular tube."""
+        return self.shear_modulus * 2.0 * self.second_moment
+
+
+@dataclass(frozen=True, slots=True)
+class PsdConfig:
+    """One detector: places in m."""
+
+    type: str
+    center: tuple[float, float]
+    height: float
+    active_area: tuple[float, float]
+    zero: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class AmplifierConfig:
+    """``sensitivity`` m/V; ``sum_nominal`` V; ``noise`` V rms per sample and channel."""
+
+    sensitivity: float
+    sum_nominal: float
+    noise: float
+
+
+@dataclass(frozen=True, slots=True)
+class ConverterConfig:
+    """``full_scale`` V (range +-); ``sample_rate_hz`` Hz."""
+
+    bits: int
+    full_scale: float
+    sample_rate_hz: float
+
+    @property
+    def volts_per_count(self) -> float:
+        """One step, V."""
+        return self.full_scale / float(2 ** (self.bits - 1))
+
+
+@dataclass(frozen=True, slots=True)
+class DynamicsConfig:
+    """First bending (X and Y alike) and torsion mode: Hz and damping ratios."""
+
+    bending_frequency: float
+    bending_damping_ratio: float
+    torsion_frequency: float
+    torsion_damping_ratio: float
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorConfig:
+    """How samples become estimates."""
+
+    block_size: int
+    min_samples: int
+    sum_min: float
+    solver: str
+    solvers: tuple[str, ...]
+    wls_weights: str
+    wls_row_scaling: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class AcquisitionConfig:
+    """Where samples come from and where they are kept."""
+
+    source: str
+    port: str
+    baud: int
+    latency_offset: float
+    queue_blocks: int
+    record: bool
+    bag_dir: str
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """The whole parameter set. ``values`` is what it was made of, flat, defaults included."""
+
+    link: LinkConfig
+    psd_1: PsdConfig
+    psd_2: PsdConfig
+    amplifier: AmplifierConfig
+    converter: ConverterConfig
+    dynamics: DynamicsConfig
+    estimator: EstimatorConfig
+    acquisition: AcquisitionConfig
+    values: Mapping[str, Value] = field(repr=False)
+    effects: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def psds(self) -> tuple[PsdConfig, PsdConfig]:
+        """Both detectors, in order."""
+        return (self.psd_1, self.psd_2)
+
+    @property
+    def centers(self) -> FloatArray:
+        """c_i, (2, 2), m."""
+        return np.array([p.center for p in self.psds], dtype=np.float64)
+
+    @property
+    def zeros(self) -> FloatArray:
+        """m_i0, (2, 2), m."""
+        return np.array([p.zero for p in self.psds], dtype=np.float64)
+
+    @property
+    def heights(self) -> FloatArray:
+        """h_i, (2,), m."""
+        return np.array([p.height for p in self.psds], dtype=np.float64)
+
+
+def check_value(parameter: Parameter, value: object, source: str) -> Value:
+    """Return ``value`` as the parameter's type, or refuse it.
+
+    Raises ConfigError naming ``source``, key, value and bound.
+    """
+
+    def refuse(why: str) -> ConfigError:
+        unit = f' {parameter.unit}' if parameter.unit else ''
+        return ConfigError(f'{source}: {parameter.name} = {value!r}{unit}: {why}')
+
+    def number(v: object) -> float:
+        if isinstance(v, str):
+            # YAML 1.1 reads 69e9 as a string; ROS reads it as a number, and so do we.
+            try:
+                v = float(v)
+            except ValueError:
+                raise refuse('must be a number') from None
+        if isinstance(v, bool) or not isinstance(v, (int, float)):
+            raise refuse('must be a number')
+        out = float(v)
+        if not math.isfinite(out):
+            raise refuse('must be finite')
+        bounds = parameter.bound_text()
+        if parameter.above is not None and out <= parameter.above:
+            raise refuse(f'must be {bounds}')
+        if parameter.minimum is not None and out < parameter.minimum:
+            raise refuse(f'must be {bounds}')
+        if parameter.maximum is not None and out > parameter.maximum:
+            raise refuse(f'must be {bounds}')
+        return out
+
+    kind = parameter.kind
+    if kind == 'double':
+        return number(value)
+    if kind == 'integer':
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise refuse('must be a whole number')
+        return int(number(value))
+    if kind == 'bool':
+        if not isinstance(value, bool):
+            raise refuse('must be true or false')
+        return value
+    if kind == 'string':
+        if not isinstance(value, str):
+            raise refuse('must be text')
+        if parameter.choices is not None and value not in parameter.choices:
+            raise refuse(f'must be one of {", ".join(parameter.choices)}')
+        return value
+    if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray):
+        raise refuse('must be a list')
+    items = list(value)
+    if parameter.length is not None and len(items) != parameter.length:
+        raise refuse(f'must have {parameter.length} elements, has {len(items)}')
+    if kind == 'double_array':
+        return [number(v) for v in items]
+    if not items or not all(isinstance(v, str) for v in items):
+        raise refuse('must be a list of names')
+    return [str(v) for v in items]
+
+
+def rig_from_values(values: Mapping[str, object], source: str = 'parameters') -> Rig:
+    """Make a :class:`Rig` from flat values; what is missing takes its default.
+
+    Raises ConfigError for an unknown key (with the nearest known one), a wrong type, a value out
+    of bounds, or values that contradict each other.
+    """
+    effects: dict[str, Any] = {}
+    got: dict[str, Value] = {p.name: p.default for p in PARAMETERS}
+    for key, value in values.items():
+        if key.startswith(EFFECTS_PREFIX):
+            effects[key[len(EFFECTS_PREFIX) :]] = value
+            continue
+        parameter = BY_NAME.get(key)
+        if parameter is None:
+            near = difflib.get_close_matches(key, BY_NAME, n=1)
+            hint = f'; did you mean {near[0]}?' if near else ''
+            raise ConfigError(f'{source}: {key} = {value!r}: no parameter of that name{hint}')
+        got[key] = check_value(parameter, value, source)
+    v: dict[str, Any] = dict(got)
+    if v['link.inner_radius'] >= v['link.outer_radius']:
+        raise ConfigError(
+            f'{source}: link.inner_radius = {v["link.inner_radius"]} m: must be less than '
+            f'link.outer_radius = {v["link.outer_radius"]} m'
+        )
+    if v['min_samples'] > v['block_size']:
+        raise ConfigError(f'{source}: min_samples = {v["min_samples"]}: must be at most block_size = {v["block_size"]}')
+    if v['solver'] not in v['solvers']:
+        v['solvers'] = [v['solver'], *v['solvers']]
+        got['solvers'] = v['solvers']
+    if len(set(v['solvers'])) != len(v['solvers']):
+        raise ConfigError(f'{source}: solvers = {v["solvers"]!r}: a name is there twice')
+
+    def section(prefix: str) -> dict[str, Any]:
+        out = {}
+        for p in PARAMETERS:
+            if p.name.startswith(prefix + '.'):
+                item = v[p.name]
+                out[p.name[len(prefix) + 1 :]] = tuple(item) if isinstance(item, list) else item
+        return out
+
+    return Rig(
+        link=LinkConfig(**section('link')),
+        psd_1=PsdConfig(**section('psd_1')),
+        psd_2=PsdConfig(**section('psd_2')),
+        amplifier=AmplifierConfig(**section('amplifier')),
+        converter=ConverterConfig(**section('converter')),
+        dynamics=DynamicsConfig(**section('dynamics')),
+        estimator=EstimatorConfig(
+            block_size=v['block_size'],
+            min_samples=v['min_samples'],
+            sum_min=v['sum_min'],
+            solver=v['solver'],
+            solvers=tuple(v['solvers']),
+            wls_weights=v['wls.weights'],
+            wls_row_scaling=tuple(v['wls.row_scaling']),
+        ),
+        acquisition=AcquisitionConfig(
+            source=v['source'],
+            port=v['port'],
+            baud=v['baud'],
+            latency_offset=v['latency_offset'],
+            queue_blocks=v['queue_blocks'],
+            record=v['record'],
+            bag_dir=v['bag_dir'],
+        ),
+        values=MappingProxyType(got),
+        effects=MappingProxyType(effects),
+    )
+
+
+def replace_values(rig: Rig, changes: Mapping[str, object], source: str = 'override') -> Rig:
+    """The same rig with some values changed, checked like any others."""
+    effects = {EFFECTS_PREFIX + k: e for k, e in rig.effects.items()}
+    return rig_from_values({**rig.values, **effects, **changes}, source)
+
+
+def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[str, object]:
+    """Flat values of a ROS 2 parameter file: those for ``/**`` and for ``node_name``.
+
+    Lists stay lists; maps become dotted keys. Raises ConfigError naming the file when it is
+    missing, too large, not YAML, or not a parameter file.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        if size > MAX_FILE_BYTES:
+            raise ConfigError(f'{path}: {size} bytes: a parameter file has at most {MAX_FILE_BYTES}')
+        text = path.read_text(encoding='utf-8')
+    except FileNotFoundError:
+        raise ConfigError(f'{path}: no such parameter file') from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f'{path}: cannot be read as a parameter file ({error})') from None
+    try:
+        tree = yaml.safe_load(text)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        mark = getattr(error, 'problem_mark', None)
+        where = f':{mark.line + 1}:{mark.column + 1}' if mark is not None else ''
+        problem = getattr(error, 'problem', None) or 'not YAML'
+        raise ConfigError(f'{path}{where}: malformed YAML: {problem}') from None
+    if not isinstance(tree, dict):
+        raise ConfigError(f'{path}: not a ROS 2 parameter file: expected "/**:" then "ros__parameters:"')
+    flat: dict[str, object] = {}
+    wanted = ('/**', node_name, '/' + node_name, '/**/' + node_name)
+    for name, body in tree.items():
+        if not isinstance(body, dict) or not isinstance(body.get('ros__parameters'), dict):
+            raise ConfigError(f'{path}: {name}: not a ROS 2 parameter file: "ros__parameters:" is missing below it')
+        if name in wanted:
+            _flatten(body['ros__parameters'], '', flat, path, 0)
+    if not any(name in wanted for name in tree):
+        raise ConfigError(f'{path}: has no parameters for /** or {node_name} (found: {", ".join(map(str, tree))})')
+    return flat
+
+
+def _flatten(tree: Mapping[Any, Any], prefix: str, out: dict[str, object], path: Path, depth: int) -> None:
+    if depth > 8:
+        raise ConfigError(f'{path}: {prefix} is nested too deep')
+    for key, value in tree.items():
+        name = f'{prefix}{key}'
+        if isinstance(value, dict):
+            _flatten(value, name + '.', out, path, depth + 1)
+        else:
+            out[name] = value
+        if len(out) > MAX_KEYS:
+            raise ConfigError(f'{path}: more than {MAX_KEYS} parameters')
+
+
+def load_rig(path: str | Path | None = None, overrides: Mapping[str, object] | None = None) -> Rig:
+    """The rig of a parameter file (default: the thesis rig's values), with overrides on top."""
+    values = read_parameter_file(path) if path is not None else {}
+    rig = rig_from_values(values, str(path) if path is not None else 'defaults')
+    return replace_values(rig, overrides) if overrides else rig

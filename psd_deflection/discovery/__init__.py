@@ -1,0 +1,1 @@
+"""What the simulation is missing: compare, localise, screen, fit, select, report."""

@@ -1,0 +1,61 @@
+"""The errors a user can meet, each with the exit status that the command line gives it.
+
+Every message is one line that names what was wrong, where, and the way out. Anything else that
+is raised is a defect of ours and ends with a traceback.
+
+========  =======================================================================
+status    meaning
+========  =======================================================================
+0         done (``replay --compare``: no bit differs)
+1         done, and the answer is "differs" (``replay --compare``)
+2         the command line was not understood (argparse)
+3         ``ConfigError``: parameter file or parameter value
+4         ``RecordingError``: a recording cannot be read or written
+5         ``DeviceError``: port missing, in use, silent, or of another protocol
+6         ``SolverError``: the geometry cannot be solved
+========  =======================================================================
+"""
+
+from __future__ import annotations
+
+
+class PsdDeflectionError(Exception):
+    """Base of every error that is the outside world's, not ours."""
+
+    exit_status = 70
+
+
+class ConfigError(PsdDeflectionError):
+    """A parameter is unknown, of the wrong type or out of bounds; a parameter file is malformed.
+
+    Example: ``rig.yaml: amplifier.noise = -1.0 V: must be at least 0.0``.
+    """
+
+    exit_status = 3
+
+
+class RecordingError(PsdDeflectionError):
+    """A recording is missing, empty, truncated, of another kind, or cannot be written.
+
+    Example: ``run.csv:17: column y2 holds 'abc', which is not a number``.
+    """
+
+    exit_status = 4
+
+
+class DeviceError(PsdDeflectionError):
+    """The port is missing or in use, no frame came in time, or the device speaks another version.
+
+    Example: ``/dev/ttyACM0: no frame in 2 s; is the device powered and --baud right?``
+    """
+
+    exit_status = 5
+
+
+class SolverError(PsdDeflectionError):
+    """The rig's geometry cannot be solved; the message names the degeneracy.
+
+    Example: ``psd_1.center and psd_2.center coincide: the twist cannot be seen``.
+    """
+
+    exit_status = 6

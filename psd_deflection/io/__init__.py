@@ -1,0 +1,1 @@
+"""Where bytes meet the world: serial ports, recordings, CSV."""

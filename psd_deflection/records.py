@@ -1,0 +1,158 @@
+"""What flows through the house: frozen records with shapes and units.
+
+One sample's way: counts in a :class:`RawChunk`, cut by sequence number into a
+:class:`SampleBlock`, averaged to :class:`SpotMeans`, solved to a :class:`DeflectionEstimate` for
+each solver and a :class:`TipLoad`. Times are integer nanoseconds of ROS time; everything else SI.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+CHANNELS = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
+"""The order of the six channels everywhere: on the wire, in recordings, in arrays."""
+
+FLAG_OVER_RANGE = 1
+"""SAMPLE flags, bit 0: the device saw a channel over range."""
+
+FLAG_DEVICE_DROPPED = 2
+"""SAMPLE flags, bit 1: the device dropped samples before this one."""
+
+
+class BlockStatus(IntEnum):
+    """Why a block has, or has not, an estimate."""
+
+    OK = 0
+    TOO_FEW_SAMPLES = 1
+    LASER_LOST = 2
+    SATURATED = 3
+    OUTSIDE_ACTIVE_AREA = 4
+    NOT_SOLVED = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawChunk:
+    """Samples as they came, in order, with no claim to be a whole block.
+
+    ``seq`` int64 (n,): the sample number, extended past the 32 bits of the wire.
+    ``t_ns`` int64 (n,): when each was taken, ROS time, ns.
+    ``readings`` (n, 6): int16 converter counts, or float32 volts, in the order of ``CHANNELS``.
+    ``flags`` uint8 (n,): as on the wire.
+    ``volts_per_count``: V a count; None says that ``readings`` are volts already.
+    """
+
+    seq: IntArray
+    t_ns: IntArray
+    readings: npt.NDArray[np.int16] | npt.NDArray[np.float32]
+    flags: npt.NDArray[np.uint8]
+    volts_per_count: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SampleBlock:
+    """The samples that are present of one block; a lost one is absent, never invented.
+
+    ``index``: seq // block_size. ``seq`` int64 (n,), ``t_ns`` int64 (n,) ROS time in ns,
+    ``volts`` float32 (n, 6), ``flags`` uint8 (n,), n >= 1.
+    """
+
+    index: int
+    seq: IntArray
+    t_ns: IntArray
+    volts: npt.NDArray[np.float32]
+    flags: npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SpotMeans:
+    """The two dots averaged over one block.
+
+    ``t_ns``: middle of the block. ``dots``: (x1, y1, x2, y2), m, from each PSD's centre.
+    ``sums``: (sum1, sum2), V. ``covariance`` (4, 4): sample covariance of the dots, m^2 (zeros
+    where fewer than two samples are present). ``present`` + ``lost`` = block size. ``reason`` is
+    empty when ``status`` is OK.
+    """
+
+    t_ns: int
+    index: int
+    dots: tuple[float, float, float, float]
+    sums: tuple[float, float]
+    covariance: FloatArray
+    present: int
+    lost: int
+    status: BlockStatus
+    reason: str
+
+
+class DeflectionEstimate(NamedTuple):
+    """One solver's answer for one block (a NamedTuple: it is made 50 to 150 times a second).
+
+    ``dx``, ``dy`` m; ``theta``, ``phi``, ``omega`` rad, right-hand positive about Z, X, Y.
+    ``covariance``: 3 x 3 of (dx, dy, theta), row by row, m^2, m rad, rad^2.
+    ``residual_rms``: rms of the four dot residuals, m. ``primary``: the one that is published as
+    ``/link_tip/deflection``.
+    """
+
+    t_ns: int
+    block: int
+    solver: str
+    dx: float
+    dy: float
+    theta: float
+    phi: float
+    omega: float
+    covariance: tuple[float, ...]
+    residual_rms: float
+    primary: bool
+
+
+class TipLoad(NamedTuple):
+    """A load at the tip centroid in ``link_tip_rest``: N, N, N m."""
+
+    t_ns: int
+    fx: float
+    fy: float
+    tz: float
+
+
+class ReferencePose(NamedTuple):
+    """An independent measurement of the tip: m, m, rad."""
+
+    t_ns: int
+    dx: float
+    dy: float
+    theta: float
+
+
+class TemperatureReading(NamedTuple):
+    """Ambient temperature, degrees Celsius (as sensor_msgs/Temperature has it)."""
+
+    t_ns: int
+    celsius: float
+
+
+class DiagnosticEntry(NamedTuple):
+    """One line of health: ``level`` 0 OK, 1 WARN, 2 ERROR, 3 STALE, as diagnostic_msgs has them."""
+
+    name: str
+    level: int
+    message: str
+    values: tuple[tuple[str, str], ...]
+
+
+class DiagnosticReport(NamedTuple):
+    """What is published on ``/diagnostics``, once a second."""
+
+    t_ns: int
+    entries: tuple[DiagnosticEntry, ...]
+
+
+Record = SampleBlock | SpotMeans | DeflectionEstimate | TipLoad | ReferencePose | TemperatureReading | DiagnosticReport

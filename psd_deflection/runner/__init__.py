@@ -1,0 +1,1 @@
+"""Threads, bounded queues, shutdown: the only room that starts a thread."""

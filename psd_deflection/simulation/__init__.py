@@ -1,0 +1,1 @@
+"""The rig in numbers: load history to link, optics, detectors and electronics."""

@@ -1,0 +1,1 @@
+"""From dots to the pose of the tip: one algorithm a file, one interface (``_interface``)."""

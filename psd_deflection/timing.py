@@ -1,0 +1,1 @@
+"""Device clock to host time, by regression on counters; never arrival time."""
