@@ -32,7 +32,7 @@ types: $(VENV)/.installed
 	$(BIN)/mypy
 
 contracts: $(VENV)/.installed
-	$(BIN)/lint-imports
+	$(BIN)/lint-imports --no-cache
 
 unit: $(VENV)/.installed
 	$(BIN)/python -m pytest
