@@ -139,6 +139,14 @@ class TemperatureReading(NamedTuple):
     celsius: float
 
 
+class ZeroChange(NamedTuple):
+    """The unloaded dots were taken anew: (x1, y1, x2, y2) m, used from block ``block`` on."""
+
+    t_ns: int
+    block: int
+    dots: tuple[float, float, float, float]
+
+
 class DiagnosticEntry(NamedTuple):
     """One line of health: ``level`` 0 OK, 1 WARN, 2 ERROR, 3 STALE, as diagnostic_msgs has them."""
 
@@ -155,4 +163,4 @@ class DiagnosticReport(NamedTuple):
     entries: tuple[DiagnosticEntry, ...]
 
 
-Record = SampleBlock | SpotMeans | DeflectionEstimate | TipLoad | ReferencePose | TemperatureReading | DiagnosticReport
+Record = SampleBlock | SpotMeans | DeflectionEstimate | TipLoad | ReferencePose | TemperatureReading | DiagnosticReport | ZeroChange
