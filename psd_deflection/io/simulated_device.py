@@ -33,7 +33,7 @@ from psd_deflection.protocol.frames import (
     encode,
 )
 from psd_deflection.records import CHANNELS, FLAG_DEVICE_DROPPED, FLAG_OVER_RANGE, FloatArray
-from psd_deflection.simulation.rig_simulator import RigSimulator
+from psd_deflection.simulation.simulator import RigSimulator
 
 SECOND_NS = 1_000_000_000
 BATCH = 50
