@@ -67,9 +67,7 @@ class Pipeline:
         self._rail = np.float32((2 ** (rig.converter.bits - 1) - 1) * rig.converter.volts_per_count)
         self._half = tuple(half / 2.0 for psd in rig.psds for half in psd.active_area)
         variances = dot_noise_variances(rig)
-        self._variances = [
-            tuple(float(v) / n for v in variances) for n in range(1, config.block_size + 1)
-        ]
+        self._variances = [tuple(float(v) / n for v in variances) for n in range(1, config.block_size + 1)]
         self._build(rig)
 
     def _build(self, rig: Rig) -> None:

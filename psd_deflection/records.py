@@ -115,7 +115,16 @@ class DeflectionEstimate(NamedTuple):
 
 
 class TipLoad(NamedTuple):
-    """A load at the tip centroid in ``link_tip_rest``: N, N, N m."""
+    """The load at the tip that the link model needs for an estimate, in ``link_tip_rest``: N, N, N m."""
+
+    t_ns: int
+    fx: float
+    fy: float
+    tz: float
+
+
+class AppliedLoad(NamedTuple):
+    """A known load at the tip centroid in ``link_tip_rest``, held until the next one: N, N, N m."""
 
     t_ns: int
     fx: float
@@ -163,4 +172,14 @@ class DiagnosticReport(NamedTuple):
     entries: tuple[DiagnosticEntry, ...]
 
 
-Record = SampleBlock | SpotMeans | DeflectionEstimate | TipLoad | ReferencePose | TemperatureReading | DiagnosticReport | ZeroChange
+Record = (
+    SampleBlock
+    | SpotMeans
+    | DeflectionEstimate
+    | TipLoad
+    | AppliedLoad
+    | ReferencePose
+    | TemperatureReading
+    | DiagnosticReport
+    | ZeroChange
+)

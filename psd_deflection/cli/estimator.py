@@ -165,4 +165,3 @@ def _run_without_ros(overrides: dict[str, object], display: Display, watch: Call
     if session.failed is not None:
         raise session.failed
     return 0
-

@@ -6,6 +6,7 @@ quarter of a core at 1 kHz (field notes), so the bytes are read from the descrip
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import select
@@ -38,11 +39,9 @@ class SerialPort:
             raise DeviceError(f'{name}: cannot be opened at {baud} baud ({error})') from None
         self._fd = self._serial.fileno()
         if hasattr(self._serial, 'set_low_latency_mode'):
-            try:
+            # Only some drivers have a latency timer to shorten.
+            with contextlib.suppress(OSError, ValueError, NotImplementedError):
                 self._serial.set_low_latency_mode(True)
-            except (OSError, ValueError, NotImplementedError):
-                # Only some drivers have a latency timer to shorten.
-                pass
         self._serial.reset_input_buffer()
 
     def read(self, timeout: float) -> bytes:
@@ -69,11 +68,9 @@ class SerialPort:
 
     def close(self) -> None:
         """Give the port back."""
-        try:
+        # A port that was pulled out has nothing left to close.
+        with contextlib.suppress(OSError):
             self._serial.close()
-        except OSError:
-            # A port that was pulled out has nothing left to close.
-            pass
 
 
 def _why(error: serial.SerialException, name: str) -> str:

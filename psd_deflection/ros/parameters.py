@@ -39,9 +39,7 @@ def rig_of_node(node: Node, extra: Mapping[str, object]) -> Rig:
     for parameter in PARAMETERS:
         if node.has_parameter(parameter.name):
             node.undeclare_parameter(parameter.name)
-        node.declare_parameter(
-            parameter.name, rig.values[parameter.name], _descriptor(parameter), ignore_override=True
-        )
+        node.declare_parameter(parameter.name, rig.values[parameter.name], _descriptor(parameter), ignore_override=True)
     return rig
 
 

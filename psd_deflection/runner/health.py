@@ -37,16 +37,21 @@ class HealthReporter:
         before = self._seen
         self._seen = now
         seconds = (now.t_ns - before.t_ns) / 1e9 if before is not None else 0.0
-        new = (
-            _Seen(0, *(b - a for a, b in zip(before[1:], now[1:], strict=True))) if before is not None else now
-        )
+        new = _Seen(0, *(b - a for a, b in zip(before[1:], now[1:], strict=True))) if before is not None else now
 
         def rate(count: int) -> str:
             return f'{count / seconds:.2f}' if seconds > 0 else 'unknown'
 
         return DiagnosticReport(
-            t_ns, (self._acquisition(new, rate(new.samples)), self._clock(), self._estimates(new, rate(new.estimates)),
-                   self._laser(1), self._laser(2), self._recording())
+            t_ns,
+            (
+                self._acquisition(new, rate(new.samples)),
+                self._clock(),
+                self._estimates(new, rate(new.estimates)),
+                self._laser(1),
+                self._laser(2),
+                self._recording(),
+            ),
         )
 
     def _acquisition(self, new: _Seen, rate: str) -> DiagnosticEntry:
@@ -112,7 +117,9 @@ class HealthReporter:
         total = spots.sums[psd - 1]
         x, y = spots.dots[2 * psd - 2], spots.dots[2 * psd - 1]
         lost = total < self._session.rig.estimator.sum_min
-        mine = lost or (spots.status in (BlockStatus.SATURATED, BlockStatus.OUTSIDE_ACTIVE_AREA) and f'{psd} ' in spots.reason)
+        mine = lost or (
+            spots.status in (BlockStatus.SATURATED, BlockStatus.OUTSIDE_ACTIVE_AREA) and f'{psd} ' in spots.reason
+        )
         values = (
             ('sum (V)', f'{total:.4f}'),
             ('x (mm)', f'{x * 1e3:.4f}'),
@@ -120,12 +127,21 @@ class HealthReporter:
             ('x, std in the block (um)', f'{spots.covariance[2 * psd - 2, 2 * psd - 2] ** 0.5 * 1e6:.2f}'),
             ('y, std in the block (um)', f'{spots.covariance[2 * psd - 1, 2 * psd - 1] ** 0.5 * 1e6:.2f}'),
         )
-        return DiagnosticEntry(name, ERROR if mine else OK, (spots.reason or 'laser lost') if mine else 'dot seen', values)
+        return DiagnosticEntry(
+            name, ERROR if mine else OK, (spots.reason or 'laser lost') if mine else 'dot seen', values
+        )
 
     def _recording(self) -> DiagnosticEntry:
         recorder = self._session.recorder
         folder = recorder.folder
-        values = (('folder', str(folder or '')), ('messages', str(recorder.written)), ('dropped', str(recorder.dropped)))
+        values = (
+            ('folder', str(folder or '')),
+            ('messages', str(recorder.written)),
+            ('dropped', str(recorder.dropped)),
+        )
         return DiagnosticEntry(
-            'psd_deflection: recording', WARN if recorder.dropped else OK, 'recording' if folder else 'not recording', values
+            'psd_deflection: recording',
+            WARN if recorder.dropped else OK,
+            'recording' if folder else 'not recording',
+            values,
         )

@@ -12,9 +12,8 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
-from psd_deflection.io.sinks import RecordSink
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import Record
 from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Restarted
@@ -22,6 +21,13 @@ from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Restart
 T = TypeVar('T')
 
 REQUEST_TIMEOUT_S = 1.0
+
+
+class RecordSink(Protocol):
+    """Takes records."""
+
+    def put(self, record: Record) -> None:
+        """One record, in order."""
 
 
 @dataclass(slots=True)
