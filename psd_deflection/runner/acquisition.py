@@ -180,6 +180,9 @@ class Acquisition:
 
     def start(self) -> None:
         """Start the reader thread; :meth:`open` came before."""
+        if self._port is not None:
+            # What came while the device was heard out is older than it would look.
+            self._port.discard_input()
         self._thread.start()
 
     def stop(self) -> None:
@@ -195,8 +198,6 @@ class Acquisition:
         return self._clock.state()
 
     def _run(self) -> None:
-        if self._port is not None:
-            self._port.discard_input()
         silent_since = time.monotonic()
         try:
             while not self._stop.is_set():
