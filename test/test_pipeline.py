@@ -179,7 +179,7 @@ def test_zero_takes_the_present_dots_and_applies_from_the_next_block_on(rig: Rig
     # The same change in another pipeline gives the same bits.
     other = Pipeline(rig)
     other.process(chunk_of(still(pose, 20 * 30, 5)))
-    other.apply_zero(change)
+    other.apply(change)
     again = other.process(chunk_of(still(pose, 20 * 30, 6), 600))
     assert (estimates(again, 'exact') == estimates(after, 'exact')).all()
 
