@@ -148,6 +148,18 @@ class TemperatureReading(NamedTuple):
     celsius: float
 
 
+class ParameterChange(NamedTuple):
+    """Parameters that changed while the run went on (``~/zero``, a live parameter).
+
+    ``values``: name and value, checked already; they hold from block ``block`` on. It is recorded,
+    and replay applies it at the same block.
+    """
+
+    t_ns: int
+    block: int
+    values: tuple[tuple[str, float | tuple[float, ...]], ...]
+
+
 class DiagnosticEntry(NamedTuple):
     """One line of health: ``level`` 0 OK, 1 WARN, 2 ERROR, 3 STALE, as diagnostic_msgs has them."""
 
@@ -173,4 +185,5 @@ Record = (
     | ReferencePose
     | TemperatureReading
     | DiagnosticReport
+    | ParameterChange
 )

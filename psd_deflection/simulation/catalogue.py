@@ -1,0 +1,192 @@
+"""What an effect is, which there are, and how a rig file says that one is on.
+
+An effect is one file in ``effects/`` with one :class:`Effect` called ``EFFECT``: adding a file adds
+an effect. In a rig file the effects stand below ``effects:``, one map each, under any key::
+
+    effects:
+      sensor_rotation_2: {name: sensor_rotation, psd: 2, angle: 0.01}
+
+so that the file remains a ROS 2 parameter file.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import importlib
+import math
+import pkgutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from psd_deflection.config import Rig
+from psd_deflection.errors import ConfigError
+from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.physics import Physics
+
+Stage = Literal['link', 'load', 'optics', 'psd', 'electronics']
+Point = Literal['configure', 'load', 'static', 'pose', 'beam', 'dots', 'volts', 'output']
+State = dict[str, Any]
+Values = Mapping[str, float]
+
+STAGES: tuple[Stage, ...] = ('load', 'link', 'optics', 'psd', 'electronics')
+
+
+@dataclass(frozen=True, slots=True)
+class EffectParameter:
+    """One parameter. ``nominal`` is the value at which the effect is off (or what a shape
+    parameter takes when it is not given); ``scale`` is the size that is worth a probe, about the
+    prior's standard deviation. ``choices``: a discrete parameter, its values searched apart.
+    ``kind`` ``shape``: means nothing while the others are nominal; ``grid`` has where to look.
+    """
+
+    name: str
+    unit: str
+    minimum: float
+    maximum: float
+    scale: float
+    description: str
+    nominal: float = 0.0
+    kind: Literal['amplitude', 'shape', 'choice'] = 'amplitude'
+    choices: tuple[int, ...] = ()
+    grid: tuple[float, ...] = ()
+    required: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """One physical effect: what it is, where it acts, and how.
+
+    ``equation`` and ``source`` are for the reader. ``needs``: the excitation that shows it.
+    ``configure`` changes the constants before a run; ``apply`` changes a chunk at ``point``.
+    ``finite``: its signature vanishes or is not defined at the nominal value, so that it is probed
+    at ``probes`` (values of the first amplitude parameter) instead of by a derivative.
+    """
+
+    name: str
+    stage: Stage
+    summary: str
+    equation: str
+    source: str
+    needs: str
+    parameters: tuple[EffectParameter, ...]
+    point: Point
+    configure: Callable[[Physics, Values], None] | None = None
+    apply: Callable[[Chunk, Values, State], None] | None = None
+    finite: bool = False
+    probes: tuple[float, ...] = ()
+    order: int = 0
+
+    def parameter(self, name: str) -> EffectParameter:
+        """The declared parameter of that name (KeyError if there is none)."""
+        for p in self.parameters:
+            if p.name == name:
+                return p
+        raise KeyError(name)
+
+
+@dataclass(frozen=True, slots=True)
+class ActiveEffect:
+    """An effect that is on, with a value for every parameter."""
+
+    effect: Effect
+    values: Values
+
+    @property
+    def label(self) -> str:
+        """Name and discrete choices, for people: ``sensor_rotation (psd 2)``."""
+        choice = [f'{p.name} {self.values[p.name]:g}' for p in self.effect.parameters if p.kind == 'choice']
+        return self.effect.name + (f' ({", ".join(choice)})' if choice else '')
+
+
+@functools.cache
+def catalogue() -> Mapping[str, Effect]:
+    """Every effect by name, in the order in which they act."""
+    package = importlib.import_module('psd_deflection.simulation.effects')
+    found: list[Effect] = []
+    for module in pkgutil.iter_modules(package.__path__):
+        found.append(importlib.import_module(f'{package.__name__}.{module.name}').EFFECT)
+    found.sort(key=lambda e: (STAGES.index(e.stage), e.order, e.name))
+    return {e.name: e for e in found}
+
+
+def make_active(name: str, values: Mapping[str, object], source: str) -> ActiveEffect:
+    """Check one effect's parameters; raises ConfigError naming source, key, value, bound."""
+    effect = catalogue().get(name)
+    if effect is None:
+        near = difflib.get_close_matches(name, catalogue(), n=1)
+        hint = f'; did you mean {near[0]}?' if near else f'; there are: {", ".join(catalogue())}'
+        raise ConfigError(f'{source}: name = {name!r}: no effect of that name{hint}')
+    known = [p.name for p in effect.parameters]
+    for key in values:
+        if key not in known:
+            raise ConfigError(f'{source}: {key} = {values[key]!r}: {name} has the parameters {", ".join(known)}')
+    out: dict[str, float] = {}
+    for p in effect.parameters:
+        if p.name not in values:
+            if p.required:
+                raise ConfigError(f'{source}: {p.name} is missing: {name} needs it ({p.description}, {p.unit or "1"})')
+            out[p.name] = p.nominal
+            continue
+        raw = values[p.name]
+        try:
+            value = float(raw)  # type: ignore[arg-type]
+        except (TypeError, ValueError):
+            raise ConfigError(f'{source}: {p.name} = {raw!r}: must be a number') from None
+        if isinstance(raw, bool) or not math.isfinite(value):
+            raise ConfigError(f'{source}: {p.name} = {raw!r}: must be a finite number')
+        if p.choices and value not in p.choices:
+            raise ConfigError(f'{source}: {p.name} = {raw!r}: must be one of {", ".join(map(str, p.choices))}')
+        if not p.minimum <= value <= p.maximum:
+            unit = f' {p.unit}' if p.unit else ''
+            raise ConfigError(
+                f'{source}: {p.name} = {raw!r}{unit}: must be at least {p.minimum:g} and at most {p.maximum:g}'
+            )
+        out[p.name] = value
+    return ActiveEffect(effect, out)
+
+
+def effects_from_values(flat: Mapping[str, object], source: str = 'effects') -> list[ActiveEffect]:
+    """Effects of flat keys ``KEY.name``, ``KEY.angle`` ...; raises ConfigError."""
+    groups: dict[str, dict[str, object]] = {}
+    for key, value in flat.items():
+        group, dot, name = key.partition('.')
+        if not dot:
+            raise ConfigError(f'{source}.{key} = {value!r}: must be a map like {{name: sensor_gain, psd: 1, x: 0.001}}')
+        groups.setdefault(group, {})[name] = value
+    found = []
+    for group, body in groups.items():
+        name = str(body.pop('name', group))
+        found.append(make_active(name, body, f'{source}.{group}'))
+    return sort_effects(found)
+
+
+def effects_of_rig(rig: Rig) -> list[ActiveEffect]:
+    """The effects that a rig file has on; raises ConfigError."""
+    return effects_from_values(rig.effects)
+
+
+def sort_effects(effects: Sequence[ActiveEffect]) -> list[ActiveEffect]:
+    """In the order in which they act."""
+    order = {name: i for i, name in enumerate(catalogue())}
+    return sorted(effects, key=lambda a: order[a.effect.name])
+
+
+def effects_to_values(effects: Sequence[ActiveEffect]) -> dict[str, dict[str, object]]:
+    """The map that goes below ``effects:`` in a rig file."""
+    out: dict[str, dict[str, object]] = {}
+    for active in effects:
+        key = active.effect.name
+        for p in active.effect.parameters:
+            if p.kind == 'choice':
+                key += f'_{active.values[p.name]:g}'
+        base, n = key, 2
+        while key in out:
+            key, n = f'{base}_{n}', n + 1
+        body: dict[str, object] = {'name': active.effect.name}
+        for p in active.effect.parameters:
+            value = float(active.values[p.name])
+            body[p.name] = int(value) if p.kind == 'choice' else value
+        out[key] = body
+    return out

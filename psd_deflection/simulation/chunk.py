@@ -1,0 +1,38 @@
+"""Consecutive samples on their way through the stages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.physics import Physics
+
+
+def _none() -> FloatArray:
+    return np.empty((0, 0))
+
+
+@dataclass(slots=True, eq=False)
+class Chunk:
+    """n samples, one row a quantity, filled stage by stage; effects change rows in place.
+
+    ``t`` (n,): s since the first sample. ``warmer`` (n,): K above the first temperature.
+    ``loads`` (3, n): Fx, Fy N, Tz N m. ``static`` (3, n): the pose these loads would settle at,
+    without ``physics.static_offset``. ``pose`` (3, n): dX, dY m, theta rad. ``beams`` (4, n): l_1,
+    l_2, m. ``true_dots`` (4, n): on the plate from the PSD centres. ``dots`` (4, n): as the PSDs
+    report them. ``sums`` (2, n), ``volts`` (6, n): V.
+    """
+
+    t: FloatArray
+    warmer: FloatArray
+    loads: FloatArray
+    physics: Physics
+    static: FloatArray = field(default_factory=_none)
+    pose: FloatArray = field(default_factory=_none)
+    beams: FloatArray = field(default_factory=_none)
+    true_dots: FloatArray = field(default_factory=_none)
+    dots: FloatArray = field(default_factory=_none)
+    sums: FloatArray = field(default_factory=_none)
+    volts: FloatArray = field(default_factory=_none)

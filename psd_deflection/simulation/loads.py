@@ -1,0 +1,178 @@
+"""Load histories: what is known to pull at the tip, sample by sample.
+
+The thesis hangs 10, 30 and 50 N on a sidebar, 0.585 m from the link on its +X side, and on the
+link itself (thesis chapter 5). A weight pulls along -Y; on the sidebar it also turns the tip by
+Tz = -F * 0.585 m (a weight at +X turns clockwise in (x, y), so theta is negative).
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from psd_deflection.errors import RecordingError
+from psd_deflection.records import FloatArray
+
+SIDEBAR_ARM = 0.585
+"""Where the weight hangs on the sidebar, m from the link, toward +X."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadHistory:
+    """``loads`` (n, 3): Fx N, Fy N, Tz N m at the tip centroid, held from each sample to the next."""
+
+    loads: FloatArray
+    sample_rate_hz: float
+
+    def __len__(self) -> int:
+        return len(self.loads)
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return len(self.loads) / self.sample_rate_hz
+
+    def then(self, *others: LoadHistory) -> LoadHistory:
+        """This one, then the others (all at this one's rate)."""
+        return LoadHistory(np.concatenate([self.loads, *(o.loads for o in others)]), self.sample_rate_hz)
+
+    def plus(self, other: LoadHistory) -> LoadHistory:
+        """Both at once, as long as the shorter."""
+        n = min(len(self), len(other))
+        return LoadHistory(self.loads[:n] + other.loads[:n], self.sample_rate_hz)
+
+
+def sidebar(force: float) -> tuple[float, float, float]:
+    """The load of a weight of ``force`` N on the sidebar."""
+    return (0.0, -force, -force * SIDEBAR_ARM)
+
+
+def direct(force: float) -> tuple[float, float, float]:
+    """The load of a weight of ``force`` N on the link itself."""
+    return (0.0, -force, 0.0)
+
+
+def _count(duration: float, rate: float) -> int:
+    return max(0, round(duration * rate))
+
+
+def constant(load: tuple[float, float, float], duration: float, rate: float = 1000.0) -> LoadHistory:
+    """One load for ``duration`` s."""
+    return LoadHistory(np.tile(np.asarray(load, dtype=np.float64), (_count(duration, rate), 1)), rate)
+
+
+def steps(levels: list[tuple[float, float, float]], dwell: float, rate: float = 1000.0) -> LoadHistory:
+    """Each of ``levels`` for ``dwell`` s."""
+    parts = [constant(level, dwell, rate).loads for level in levels]
+    return LoadHistory(np.concatenate(parts) if parts else np.empty((0, 3)), rate)
+
+
+def ramp(
+    start: tuple[float, float, float], end: tuple[float, float, float], duration: float, rate: float = 1000.0
+) -> LoadHistory:
+    """Straight from ``start`` to ``end``."""
+    s = np.linspace(0.0, 1.0, _count(duration, rate))[:, None]
+    return LoadHistory((1.0 - s) * np.asarray(start) + s * np.asarray(end), rate)
+
+
+def chirp(
+    amplitude: tuple[float, float, float],
+    f0: float,
+    f1: float,
+    duration: float,
+    rate: float = 1000.0,
+) -> LoadHistory:
+    """A sine whose frequency rises steadily from ``f0`` to ``f1`` Hz."""
+    t = np.arange(_count(duration, rate)) / rate
+    phase = 2.0 * np.pi * (f0 * t + 0.5 * (f1 - f0) * t * t / max(duration, 1e-9))
+    return LoadHistory(np.sin(phase)[:, None] * np.asarray(amplitude, dtype=np.float64), rate)
+
+
+def thesis_load_cases(dwell: float = 4.0, rate: float = 1000.0) -> LoadHistory:
+    """0, 10, 30, 50 N on the sidebar, back to 0, the same on the link itself, back to 0."""
+    levels = [(0.0, 0.0, 0.0), *(sidebar(f) for f in (10.0, 30.0, 50.0))]
+    levels += [(0.0, 0.0, 0.0), *(direct(f) for f in (10.0, 30.0, 50.0)), (0.0, 0.0, 0.0)]
+    return steps(levels, dwell, rate)
+
+
+def identification(rate: float = 1000.0) -> LoadHistory:
+    """24 s in which every effect of the catalogue that one recording can show is excited.
+
+    Steps of weight on the sidebar and on the link, pulls along X, torque both ways, back through
+    the same levels (hysteresis), and a chirp through both modes.
+    """
+    levels = [
+        (0.0, 0.0, 0.0),
+        sidebar(30.0),
+        sidebar(50.0),
+        sidebar(10.0),
+        (0.0, 0.0, 0.0),
+        direct(50.0),
+        (30.0, 0.0, 0.0),
+        (-20.0, -20.0, 15.0),
+        (0.0, 20.0, 25.0),
+        (0.0, 0.0, 0.0),
+    ]
+    swept = chirp((4.0, 4.0, 3.0), 2.0, 30.0, 4.0, rate)
+    return steps(levels, 2.0, rate).then(swept)
+
+
+def from_csv(path: str | Path, rate: float = 1000.0) -> LoadHistory:
+    """``t,load_fx,load_fy,load_tz`` of a CSV file, held between rows and cut to ``rate``.
+
+    Raises RecordingError naming file, line and column.
+    """
+    path = Path(path)
+    times: list[float] = []
+    rows: list[list[float]] = []
+    names = ('t', 'load_fx', 'load_fy', 'load_tz')
+    try:
+        with path.open(newline='', encoding='utf-8') as stream:
+            reader = csv.DictReader(stream)
+            missing = [n for n in names if n not in (reader.fieldnames or ())]
+            if missing:
+                raise RecordingError(f'{path}:1: no column {missing[0]}; a load history has {", ".join(names)}')
+            for row in reader:
+                numbers = []
+                for name in names:
+                    try:
+                        numbers.append(float(row[name]))
+                    except (TypeError, ValueError):
+                        raise RecordingError(
+                            f'{path}:{reader.line_num}: column {name} holds {row[name]!r}, which is not a number'
+                        ) from None
+                if not np.all(np.isfinite(numbers)):
+                    raise RecordingError(f'{path}:{reader.line_num}: holds a number that is not finite')
+                if times and numbers[0] <= times[-1]:
+                    raise RecordingError(f'{path}:{reader.line_num}: column t does not rise')
+                times.append(numbers[0])
+                rows.append(numbers[1:])
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordingError(f'{path}: cannot be read as a load history ({error})') from None
+    if not rows:
+        raise RecordingError(f'{path}: no rows below the header')
+    t = np.asarray(times) - times[0]
+    step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
+    wanted = np.arange(_count(float(t[-1]) + step, rate)) / rate
+    # Half a nanosecond of grace, so that a row written at a sample's own time holds from it.
+    index = np.clip(np.searchsorted(t, wanted + 0.5e-9, side='right') - 1, 0, len(t) - 1)
+    return LoadHistory(np.asarray(rows)[index], rate)
+
+
+class CyclicLoads:
+    """A history over and over, for a device that never ends."""
+
+    def __init__(self, history: LoadHistory) -> None:
+        if len(history) == 0:
+            raise ValueError('a cyclic history needs at least one sample')
+        self._loads = history.loads
+        self._next = 0
+
+    def take(self, n: int) -> FloatArray:
+        """The next n samples, (n, 3)."""
+        index = (self._next + np.arange(n)) % len(self._loads)
+        self._next = (self._next + n) % len(self._loads)
+        return self._loads[index]

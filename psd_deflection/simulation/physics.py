@@ -1,0 +1,80 @@
+"""The constants one simulation runs on: those of the rig file, which effects may change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from psd_deflection.config import Rig
+from psd_deflection.records import FloatArray
+
+
+@dataclass(slots=True)
+class Physics:
+    """SI throughout; arrays are (2,) per axis or (2, 2) per PSD and axis.
+
+    ``bending_stiffness`` EI, ``torsional_stiffness`` GJ, N m^2. ``clamp_bending`` and
+    ``clamp_torsion``: clamp rotation per moment, rad/(N m). ``static_offset``: (dX, dY) of the
+    link without load, m. ``slope_ratio``: k of phi = -k dY/L; 0 is the nominal, parallel planes.
+    ``beams``: l_i. ``half_area``: half width and height of the active areas.
+    """
+
+    period: float
+    length: float
+    bending_stiffness: float
+    torsional_stiffness: float
+    clamp_bending: float
+    clamp_torsion: float
+    static_offset: FloatArray
+    bending_frequency: float
+    bending_damping_ratio: float
+    torsion_frequency: float
+    torsion_damping_ratio: float
+    slope_ratio: float
+    centers: FloatArray
+    beams: FloatArray
+    heights: FloatArray
+    half_area: FloatArray
+    sensitivity: float
+    sum_nominal: float
+    noise: float
+    volts_per_count: float
+    full_scale: float
+
+    @classmethod
+    def of(cls, rig: Rig) -> Physics:
+        """The nominal constants of a rig file (contract section 2): no effect is in them."""
+        return cls(
+            period=1.0 / rig.converter.sample_rate_hz,
+            length=rig.link.length,
+            bending_stiffness=rig.link.bending_stiffness,
+            torsional_stiffness=rig.link.torsional_stiffness,
+            clamp_bending=0.0,
+            clamp_torsion=0.0,
+            static_offset=np.zeros(2),
+            bending_frequency=rig.dynamics.bending_frequency,
+            bending_damping_ratio=rig.dynamics.bending_damping_ratio,
+            torsion_frequency=rig.dynamics.torsion_frequency,
+            torsion_damping_ratio=rig.dynamics.torsion_damping_ratio,
+            slope_ratio=0.0,
+            centers=rig.centers,
+            beams=rig.centers + rig.zeros,
+            heights=rig.heights,
+            half_area=0.5 * np.array([p.active_area for p in rig.psds], dtype=np.float64),
+            sensitivity=rig.amplifier.sensitivity,
+            sum_nominal=rig.amplifier.sum_nominal,
+            noise=rig.amplifier.noise,
+            volts_per_count=rig.converter.volts_per_count,
+            full_scale=rig.converter.full_scale,
+        )
+
+    @property
+    def force_compliance(self) -> float:
+        """Tip deflection per force at the tip, m/N: L^3/3EI, and the clamp's turn by F L times L."""
+        return self.length**3 / (3.0 * self.bending_stiffness) + self.clamp_bending * self.length**2
+
+    @property
+    def torque_compliance(self) -> float:
+        """Twist per torque, rad/(N m): L/GJ and the clamp's own."""
+        return self.length / self.torsional_stiffness + self.clamp_torsion

@@ -1,0 +1,141 @@
+"""The forward model: loads in, converter counts out, as a whole or in steps of any size.
+
+Theory of operation. A :class:`Chunk` holds consecutive samples, one row a quantity, and passes the
+stages in order. What must be remembered between chunks (modes, hysteresis, delays) lives in the
+simulator, so that a history cut anywhere gives the same samples bit for bit; for this everything
+is elementwise or a recursive filter, and the noise is drawn sample by sample. Effects hook in at
+named points (:data:`POINTS`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from psd_deflection.config import Rig
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.catalogue import ActiveEffect, State, effects_of_rig
+from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.modes import Filter, mode_coefficients
+from psd_deflection.simulation.optics import dots_on_plate
+from psd_deflection.simulation.physics import Physics
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedChunk:
+    """What :meth:`RigSimulator.step` gives for n samples.
+
+    ``counts`` int16 (n, 6): converter counts in the order of ``CHANNELS``. ``pose`` (n, 3): true
+    dX m, dY m, theta rad. ``dots`` (n, 4): true x1 y1 x2 y2 on the plate, m.
+    """
+
+    counts: npt.NDArray[np.int16]
+    pose: FloatArray
+    dots: FloatArray
+
+
+class ForwardModel:
+    """The stages without noise and converter; keeps its state between calls.
+
+    ``effects``: what is on; by default those of the rig file.
+    """
+
+    def __init__(self, rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> None:
+        self.effects = tuple(effects_of_rig(rig) if effects is None else effects)
+        self.physics = Physics.of(rig)
+        for active in self.effects:
+            if active.effect.configure is not None:
+                active.effect.configure(self.physics, active.values)
+        p = self.physics
+        bending = mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period)
+        torsion = mode_coefficients(p.torsion_frequency, p.torsion_damping_ratio, p.period)
+        self._modes = (
+            Filter(bending, float(p.static_offset[0])),
+            Filter(bending, float(p.static_offset[1])),
+            Filter(torsion),
+        )
+        self._states: list[State] = [{} for _ in self.effects]
+        self._count = 0
+        self._first_temperature: float | None = None
+
+    def run(self, loads: FloatArray, temperature: FloatArray | None = None) -> Chunk:
+        """The next n samples, up to the amplifier's volts: ``loads`` (n, 3) N, N, N m.
+
+        ``temperature`` (n,), degrees Celsius; None is a steady one.
+        """
+        n = len(loads)
+        p = self.physics
+        warmer = np.zeros(n)
+        if temperature is not None and n:
+            if self._first_temperature is None:
+                self._first_temperature = float(temperature[0])
+            warmer = temperature - self._first_temperature
+        t = np.arange(self._count, self._count + n, dtype=np.float64) * p.period
+        self._count += n
+        chunk = Chunk(t, warmer, np.array(np.asarray(loads, dtype=np.float64).T, order='C'), p)
+        self._at('load', chunk)
+        chunk.static = np.empty((3, n))
+        chunk.static[0] = chunk.loads[0] * p.force_compliance
+        chunk.static[1] = chunk.loads[1] * p.force_compliance
+        chunk.static[2] = chunk.loads[2] * p.torque_compliance
+        self._at('static', chunk)
+        chunk.pose = np.empty((3, n))
+        for axis, mode in enumerate(self._modes):
+            held = chunk.static[axis] + p.static_offset[axis] if axis < 2 else chunk.static[axis]
+            chunk.pose[axis] = mode(held)
+        self._at('pose', chunk)
+        chunk.beams = np.repeat(p.beams.reshape(4, 1), n, axis=1)
+        self._at('beam', chunk)
+        chunk.true_dots = dots_on_plate(chunk.pose, chunk.beams, p)
+        chunk.dots = chunk.true_dots.copy()
+        chunk.sums = np.full((2, n), p.sum_nominal)
+        self._at('dots', chunk)
+        chunk.volts = np.empty((6, n))
+        for psd in range(2):
+            chunk.volts[3 * psd : 3 * psd + 2] = chunk.dots[2 * psd : 2 * psd + 2] / p.sensitivity
+            chunk.volts[3 * psd + 2] = chunk.sums[psd]
+        self._at('volts', chunk)
+        return chunk
+
+    def finish(self, chunk: Chunk) -> None:
+        """What acts on the signal with its noise on it: clipping and coarse steps."""
+        self._at('output', chunk)
+
+    def _at(self, point: str, chunk: Chunk) -> None:
+        for active, state in zip(self.effects, self._states, strict=True):
+            if active.effect.point == point and active.effect.apply is not None:
+                active.effect.apply(chunk, active.values, state)
+
+
+class RigSimulator:
+    """The rig with its noise and converter, sample after sample.
+
+    The same ``rig`` and ``seed`` give the same samples however the loads are cut into steps.
+    """
+
+    def __init__(self, rig: Rig, seed: int = 0) -> None:
+        self._model = ForwardModel(rig)
+        self._noise = np.random.default_rng(seed)
+
+    @property
+    def physics(self) -> Physics:
+        """The constants in use, effects included."""
+        return self._model.physics
+
+    def step(self, loads: FloatArray, temperature: FloatArray | None = None) -> SimulatedChunk:
+        """The next n samples: ``loads`` (n, 3) Fx N, Fy N, Tz N m at the tip centroid.
+
+        ``temperature`` (n,), degrees Celsius, or None.
+        """
+        chunk = self._model.run(loads, temperature)
+        p = self._model.physics
+        chunk.volts += (p.noise * self._noise.standard_normal((len(loads), 6))).T
+        self._model.finish(chunk)
+        limit = round(p.full_scale / p.volts_per_count)
+        counts = np.clip(np.rint(chunk.volts / p.volts_per_count), -limit, limit - 1).astype(np.int16)
+        return SimulatedChunk(
+            np.ascontiguousarray(counts.T), np.ascontiguousarray(chunk.pose.T), np.ascontiguousarray(chunk.true_dots.T)
+        )

@@ -1,0 +1,162 @@
+"""``wls``: weighted least squares on the linearised plate, with the design matrix put right.
+
+The thesis's section 4.3 with the corrected rows of ``_linear`` and the pre-load readings
+subtracted. The weights are the inverse variances. The thesis's own choice, rows scaled by
+Po = [0.03, 0.5, 10, 0.1], makes W = Po^2 (its 4.25 and its code differ on that); it is kept under
+the name ``thesis``. It is no statement about noise: it takes dX from x2 and dY from y1 alone and
+ignores x1, which is what hides the wrong sign in the source's matrix.
+
+With the inverse variances each axis has its own weighted mean, and what is left is one equation for
+theta; no matrix is inverted. Linear still means that d comes out unturned; ``wls_exact`` undoes that.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from psd_deflection.errors import ConfigError, SolverError
+from psd_deflection.records import FloatArray
+from psd_deflection.solvers._geometry import check_twist
+from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers._linear import FixedGain, design_matrix, status_of
+from psd_deflection.solvers._plane import interleave, split, weighted_covariance
+
+THESIS_ROW_SCALING = (0.03, 0.5, 10.0, 0.1)
+"""Po of x1, y1, x2, y2 for the thesis's loads on the sidebar (section 5.5, Figs 5.12-5.20)."""
+
+Weights = Literal['inverse_variance', 'thesis']
+
+
+class WlsSolver(Solver):
+    """Weighted linear least squares, P >= 2 PSDs.
+
+    With the weights ``thesis`` the covariance is G V G^T for the gain G that those weights make:
+    they are not the noise's, so (A^T W A)^-1 would not be the estimate's covariance.
+    """
+
+    name: ClassVar[str] = 'wls'
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        weights: Weights = 'inverse_variance',
+        row_scaling: tuple[float, ...] = THESIS_ROW_SCALING,
+    ) -> None:
+        """Bind to ``geometry``.
+
+        ``weights``: from the variances that ``solve`` is given, or ``thesis``: the squares of
+        ``row_scaling`` (2P,), each above 0. Raises SolverError where the beams coincide and
+        ConfigError for a row scaling of another length.
+        """
+        self._count = check_twist(geometry)
+        self._beams = np.asarray(geometry.beams, dtype=np.float64)
+        self._zeros = np.asarray(geometry.zeros, dtype=np.float64)
+        self._rows = tuple(
+            (lx, ly, x0, y0) for (lx, ly), (x0, y0) in zip(self._beams.tolist(), self._zeros.tolist(), strict=True)
+        )
+        self._fixed = fixed_weights(geometry, weights, row_scaling)
+
+    def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
+        """One block, pure floats. See :class:`Solver`."""
+        if self._fixed is not None:
+            return self._fixed.solve(dots, variances)
+        sum_x = sum_y = mean_x = mean_y = shift_x = shift_y = 0.0
+        terms = []
+        try:
+            for i, (lx, ly, x0, y0) in enumerate(self._rows):
+                wx = 1.0 / variances[2 * i]
+                wy = 1.0 / variances[2 * i + 1]
+                bx = dots[2 * i] - x0
+                by = dots[2 * i + 1] - y0
+                sum_x += wx
+                sum_y += wy
+                mean_y += wx * ly
+                mean_x += wy * lx
+                shift_x += wx * bx
+                shift_y += wy * by
+                terms.append((wx, wy, bx, by, lx, ly))
+        except ZeroDivisionError:
+            raise SolverError('solve: variances must be above 0 m^2') from None
+        mean_y /= sum_x
+        mean_x /= sum_y
+        shift_x /= sum_x
+        shift_y /= sum_y
+        moment = information = 0.0
+        for wx, wy, bx, by, lx, ly in terms:
+            ty = ly - mean_y
+            tx = lx - mean_x
+            moment += wx * ty * bx - wy * tx * by
+            information += wx * ty * ty + wy * tx * tx
+        vtt = 1.0 / information
+        theta = moment * vtt
+        dx = mean_y * theta - shift_x
+        dy = -mean_x * theta - shift_y
+        vxt = mean_y * vtt
+        vyt = -mean_x * vtt
+        vxy = mean_y * vyt
+        residual: list[float] = []
+        for _, _, bx, by, lx, ly in terms:
+            residual.append(bx + dx - ly * theta)
+            residual.append(by + dy + lx * theta)
+        return Solution(
+            dx,
+            dy,
+            theta,
+            0.0,
+            0.0,
+            (1.0 / sum_x + mean_y * vxt, vxy, vxt, vxy, 1.0 / sum_y - mean_x * vyt, vyt, vxt, vyt, vtt),
+            tuple(residual),
+            SolverStatus.OK if theta - theta == 0.0 else SolverStatus.NOT_CONVERGED,
+            0,
+        )
+
+    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
+        """N blocks. See :class:`Solver`."""
+        if self._fixed is not None:
+            return self._fixed.solve_many(dots, variances)
+        x, y, vx, vy = split(dots, variances)
+        n = x.shape[0]
+        bx = x - self._zeros[:, 0]
+        by = y - self._zeros[:, 1]
+        lx = self._beams[:, 0]
+        ly = self._beams[:, 1]
+        wx = 1.0 / vx
+        wy = 1.0 / vy
+        sum_x = wx.sum(axis=1)
+        sum_y = wy.sum(axis=1)
+        mean_y = (wx * ly).sum(axis=1) / sum_x
+        mean_x = (wy * lx).sum(axis=1) / sum_y
+        tx = lx - mean_x[:, None]
+        ty = ly - mean_y[:, None]
+        information = (wx * ty * ty + wy * tx * tx).sum(axis=1)
+        theta = (wx * ty * bx - wy * tx * by).sum(axis=1) / information
+        shift_x = (wx * bx).sum(axis=1) / sum_x
+        shift_y = (wy * by).sum(axis=1) / sum_y
+        pose = np.column_stack((mean_y * theta - shift_x, -mean_x * theta - shift_y, theta))
+        shape = wx.shape
+        covariance = weighted_covariance(
+            np.broadcast_to(lx, shape), np.broadcast_to(ly, shape), wx, wy, np.ones(len(wx)), np.zeros(len(wx))
+        )
+        residual = interleave(bx + pose[:, :1] - ly * pose[:, 2:], by + pose[:, 1:2] + lx * pose[:, 2:])
+        covariance = np.broadcast_to(covariance, (n, 3, 3)).copy()
+        return Solutions(pose, np.zeros((n, 2)), covariance, residual, status_of(pose))
+
+
+def fixed_weights(geometry: Geometry, weights: Weights, row_scaling: tuple[float, ...]) -> FixedGain | None:
+    """The gain of the ``thesis`` weights; None where the weights follow the noise.
+
+    Raises ConfigError for other weights and for a row scaling of another length or not above 0.
+    """
+    if weights == 'inverse_variance':
+        return None
+    if weights != 'thesis':
+        raise ConfigError(f'wls.weights = {weights!r}: must be one of inverse_variance, thesis')
+    count = 2 * len(geometry.centers)
+    if len(row_scaling) != count or not all(0.0 < s < float('inf') for s in row_scaling):
+        raise ConfigError(
+            f'wls.row_scaling = {list(row_scaling)}: must have {count} elements above 0, '
+            'one for x and one for y of each PSD'
+        )
+    return FixedGain(design_matrix(geometry), np.asarray(geometry.zeros), np.array(row_scaling, dtype=np.float64))

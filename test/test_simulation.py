@@ -1,0 +1,117 @@
+"""The forward model against closed forms, an independent integrator, and itself in pieces."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from psd_deflection.config import load_rig
+from psd_deflection.errors import RecordingError
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation import loads
+from psd_deflection.simulation.modes import Filter, mode_coefficients
+from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
+
+
+def test_any_splitting_gives_the_same_samples_bit_for_bit() -> None:
+    history = loads.identification().loads[1500:4200]
+    whole = RigSimulator(load_rig(), seed=3).step(history)
+    for sizes in ([1] * 50, [7, 13, 1, 64, 3], [20] * 9):
+        pieces = RigSimulator(load_rig(), seed=3)
+        got = []
+        start = 0
+        for size in sizes:
+            got.append(pieces.step(history[start : start + size]))
+            start += size
+        got.append(pieces.step(history[start:]))
+        assert np.array_equal(np.concatenate([g.counts for g in got]), whole.counts)
+        assert np.array_equal(np.concatenate([g.pose for g in got]), whole.pose)
+        assert np.array_equal(np.concatenate([g.dots for g in got]), whole.dots)
+
+
+def test_mode_is_exact_against_an_independent_integrator() -> None:
+    w, zeta = 2 * np.pi * 14.0, 0.02
+    held = np.repeat([1.0, -0.5, 2.0], 40)
+    got = Filter(mode_coefficients(14.0, zeta, 1e-3))(held)
+    state, want = np.zeros(2), []
+
+    def slope(_: float, y: FloatArray, u: float) -> list[float]:
+        return [y[1], w * w * (u - y[0]) - 2 * zeta * w * y[1]]
+
+    for u in held:
+        want.append(state[0])
+        state = solve_ivp(slope, (0, 1e-3), state, args=(u,), rtol=1e-11, atol=1e-14).y[:, -1]
+    np.testing.assert_allclose(got, want, atol=1e-9)
+
+
+def test_settled_pose_is_the_beam_formula() -> None:
+    rig = load_rig()
+    step = RigSimulator(rig).step(loads.constant(loads.sidebar(50.0), 12.0).loads)
+    assert np.array_equal(step.pose[0], np.zeros(3))
+    # 50 N: errata G-10.
+    np.testing.assert_allclose(
+        step.pose[-1], [0.0, -2.2271675e-3, -50 * 0.585**2 / rig.link.torsional_stiffness], atol=2e-9
+    )
+    assert step.pose[-1, 2] == pytest.approx(-0.016418222, abs=2e-8)
+
+
+def test_dots_obey_the_contract_equation() -> None:
+    rig = load_rig()
+    chunk = ForwardModel(rig).run(loads.identification().loads)
+    for i, (c, m) in enumerate(((rig.psd_1.center, chunk.dots[:2]), (rig.psd_2.center, chunk.dots[2:]))):
+        turn = np.array(
+            [[np.cos(chunk.pose[2]), -np.sin(chunk.pose[2])], [np.sin(chunk.pose[2]), np.cos(chunk.pose[2])]]
+        )
+        back = np.einsum('ijn,jn->in', turn, np.asarray(c)[:, None] + m) + chunk.pose[:2]
+        np.testing.assert_allclose(back, np.tile(np.asarray(c)[:, None], back.shape[1]), atol=1e-15, err_msg=str(i))
+
+
+def test_converter_rounds_and_clips() -> None:
+    far = loads.constant((4000.0, -4000.0, 0.0), 1.0)
+    counts = RigSimulator(load_rig()).step(far.loads).counts
+    assert counts.dtype == np.int16
+    assert counts.min() == -32768
+    assert counts.max() == 32767
+
+
+def test_noise_has_the_declared_size_on_all_six_channels() -> None:
+    counts = RigSimulator(load_rig(), seed=1).step(np.zeros((20_000, 3))).counts
+    volts = counts * load_rig().converter.volts_per_count
+    np.testing.assert_allclose(volts.std(axis=0), 2e-3, rtol=0.03)
+    np.testing.assert_allclose(volts.mean(axis=0), [0, 0, 5, 0, 0, 5], atol=1e-4)
+
+
+def test_cyclic_loads_go_round() -> None:
+    history = loads.ramp((0, 0, 0), (1, 2, 3), 0.007)
+    cycle = loads.CyclicLoads(history)
+    got = np.concatenate([cycle.take(5), cycle.take(4), cycle.take(12)])
+    np.testing.assert_array_equal(got, np.concatenate([history.loads] * 3))
+
+
+def test_load_file_is_held_between_rows(tmp_path: Path) -> None:
+    path = tmp_path / 'loads.csv'
+    path.write_text('t,load_fx,load_fy,load_tz\n0,0,0,0\n0.003,0,-10,0\n0.006,1,0,2\n')
+    np.testing.assert_array_equal(loads.from_csv(path).loads, [[0, 0, 0]] * 3 + [[0, -10, 0]] * 3 + [[1, 0, 2]] * 3)
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('', 'no column t'),
+        ('t,load_fx,load_fy\n0,1,2\n', 'no column load_tz'),
+        ('t,load_fx,load_fy,load_tz\n', 'no rows'),
+        ('t,load_fx,load_fy,load_tz\n0,1,2,abc\n', ':2: column load_tz'),
+        ('t,load_fx,load_fy,load_tz\n0,1,2,nan\n', ':2: '),
+        ('t,load_fx,load_fy,load_tz\n0,1,2,3\n0,1,2,3\n', ':3: column t does not rise'),
+    ],
+)
+def test_bad_load_file_is_refused_by_line(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / 'loads.csv'
+    path.write_text(text)
+    with pytest.raises(RecordingError) as error:
+        loads.from_csv(path)
+    assert 'loads.csv' in str(error.value)
+    assert said in str(error.value)
