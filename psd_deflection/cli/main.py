@@ -18,4 +18,84 @@ COMMANDS: dict[str, str] = {
     'estimator': 'acquire, estimate, publish on ROS 2 and record (the daemon)',
     'replay': 'run a recording through the same pipeline',
     'simulate': 'simulate the rig: as a recording, or as a device on a pseudo-terminal',
+    'info': 'say what is in a recording',
+    'convert': 'write the samples of a recording as a CSV, an .mcap or a bag',
     'design': 'size the link and place the sensors (appendix B, condition numbers)',
+    'params': 'list every parameter with unit, bounds and default',
+}
+"""Command name to one-line summary; the module is ``psd_deflection.cli.NAME`` (``-`` as ``_``)."""
+
+EPILOG = """\
+A first look, without hardware:   psd-deflection estimator
+What it measured, once more:      psd-deflection replay RECORDING --compare
+Each command explains itself:     psd-deflection COMMAND --help
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status (``psd_deflection.errors`` lists them)."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    parser = argparse.ArgumentParser(
+        prog='psd-deflection',
+        description='Tip deflection and twist of a flexible link from two position sensing detectors.',
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument('--version', action='version', version=f'psd-deflection {__version__}')
+    commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
+    chosen = next((a for a in argv if not a.startswith('-')), None)
+    for name, summary in COMMANDS.items():
+        sub = commands.add_parser(
+            name, help=summary, description=summary, formatter_class=argparse.RawDescriptionHelpFormatter
+        )
+        if name == chosen:
+            module = importlib.import_module('psd_deflection.cli.' + name.replace('-', '_'))
+            sub.description = module.__doc__
+            module.add_arguments(sub)
+            sub.set_defaults(run=module.run)
+    # `ros2 run` and `ros2 launch` add arguments of their own: they are for rclpy, not for argparse.
+    own, ros_arguments = _split_ros_arguments(argv)
+    args = parser.parse_args(own)
+    args.ros_arguments = ros_arguments
+    try:
+        return int(args.run(args))
+    except PsdDeflectionError as error:
+        print(f'psd-deflection {args.command}: {error}', file=sys.stderr)
+        return error.exit_status
+    except BrokenPipeError:
+        # `psd-deflection ... | head` is not an error; keep the interpreter's own flush quiet too.
+        sys.stderr.close()
+        return 0
+
+
+def _split_ros_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    own: list[str] = []
+    for_ros: list[str] = []
+    inside = False
+    for argument in argv:
+        if argument == '--ros-args':
+            inside = True
+        (for_ros if inside else own).append(argument)
+        if argument == '--':
+            inside = False
+    return own, for_ros
+
+
+def estimator() -> int:
+    """Console script of ``ros2 run psd_deflection estimator`` (colcon)."""
+    return main(['estimator', *sys.argv[1:]])
+
+
+def replay() -> int:
+    """Console script of ``ros2 run psd_deflection replay`` (colcon)."""
+    return main(['replay', *sys.argv[1:]])
+
+
+def simulate() -> int:
+    """Console script of ``ros2 run psd_deflection simulate`` (colcon)."""
+    return main(['simulate', *sys.argv[1:]])
+
+
+def discover() -> int:
+    """Console script of ``ros2 run psd_deflection discover`` (colcon)."""
+    return main(['discover', *sys.argv[1:]])
