@@ -22,16 +22,15 @@ from psd_deflection.errors import RecordingError
 from psd_deflection.io import cdr
 from psd_deflection.io.bag_metadata import DEFAULT_QOS, Qos, TopicCount, bag_information, qos_text, to_yaml
 from psd_deflection.io.ros2msg import TYPE_HASHES, definition
-from psd_deflection.records import ParameterChange, Record, SampleBlock
+from psd_deflection.records import ParameterChange, Record
 
 NS_PER_S = 1_000_000_000
 
 META_SOFTWARE = 'psd_deflection'
 META_PARAMETERS = 'psd_deflection.parameters'
 META_HELLO = 'psd_deflection.device_hello'
-META_SEQUENCE = 'psd_deflection.sequence'
 META_CHANGE = 'psd_deflection.change.'
-"""Names of the MCAP metadata records; every value in the last four is JSON."""
+"""Names of the MCAP metadata records; every value in the last three is JSON."""
 
 
 def _json_values(values: Mapping[str, object]) -> dict[str, str]:
@@ -70,7 +69,6 @@ class McapFile:
         self._channels: dict[str, int] = {}
         self._chunk_first: int | None = None
         self._chunk_last = 0
-        self._sequence_noted = False
         self._changes = 0
         self._stream: BinaryIO | None = None
         parameters = _json_values(rig_values)
@@ -128,17 +126,8 @@ class McapFile:
                     f'{META_CHANGE}{self._changes:06d}', {**head, 'values': json.dumps(dict(record.values))}
                 )
             return
-        if isinstance(record, SampleBlock) and not self._sequence_noted:
-            self._note_sequence(int(record.seq[0]))
         for message in to_messages(record):
             self.write_encoded(message.topic, message.type, cdr.encode(message.type, message.fields), message.t_ns)
-
-    def _note_sequence(self, first: int) -> None:
-        # The topic holds seq modulo 2^32; blocks are cut by the whole number.
-        self._sequence_noted = True
-        if first >> 32:
-            with self._guard():
-                self._writer.add_metadata(META_SEQUENCE, {'first': str(first)})
 
     def write_encoded(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
         """Write one message that is CDR already, at log time ``t_ns``.

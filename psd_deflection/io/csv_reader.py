@@ -7,7 +7,7 @@ have no nanoseconds left in one. The file is read in passes and never held whole
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +16,7 @@ import numpy as np
 
 from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
 from psd_deflection.errors import RecordingError
+from psd_deflection.io.mcap_source import RawMessage
 from psd_deflection.io.recording import EstimateSeries, Recording
 from psd_deflection.records import CHANNELS, AppliedLoad, ReferencePose, SampleBlock, TemperatureReading
 
@@ -220,6 +221,10 @@ class CsvRecording(Recording):
             if found:
                 counts[topic] = len(found)
         return counts
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """None: a CSV has rows."""
+        return iter(())
 
     def _optional(self, names: Sequence[str]) -> Iterator[tuple[int, tuple[float, ...]]]:
         """(t_ns, values) of each row whose cells of these columns are filled in."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +24,14 @@ from psd_deflection.config import load_rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.io import cdr
 from psd_deflection.io.bag_reader import BagRecording
-from psd_deflection.io.bag_writer import BagWriter, McapFile
+from psd_deflection.io.bag_writer import META_CHANGE, BagWriter, McapFile
 from psd_deflection.io.recordings import open_recording
 from psd_deflection.io.ros2msg import definition
 from psd_deflection.records import (
     CHANNELS,
     AppliedLoad,
     DeflectionEstimate,
+    ParameterChange,
     Record,
     ReferencePose,
     SampleBlock,
@@ -40,6 +41,7 @@ from psd_deflection.records import (
 from .making import STEP, T0, block, run
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
+CLOUD = 'sensor_msgs/msg/PointCloud2'
 HELLO = {'serial': 'A1', 'sample_rate_hz': 1000}
 
 
@@ -148,10 +150,23 @@ def test_several_files_are_read_in_their_order(tmp_path: Path) -> None:
 # --- sample numbers -----------------------------------------------------------------------------
 
 
-def test_numbers_are_extended_past_32_bits_within_a_file(tmp_path: Path) -> None:
+def modulo(path: Path, records: Sequence[SampleBlock]) -> Path:
+    """A recording of someone who knows eight fields only."""
+    names, formats = ['seq', 'dt', *CHANNELS], {'seq': 'u4', 'dt': 'u4'}
+    with McapFile(path, rig_values={}) as out:
+        for b in records:
+            fields = cloud(b, names, formats, 36)
+            out.write_encoded(SAMPLES, CLOUD, cdr.encode(CLOUD, fields), int(b.t_ns[0]))
+    return path
+
+
+@pytest.mark.parametrize('write', [write_mcap, modulo])
+def test_numbers_go_on_past_32_bits_within_a_file(
+    tmp_path: Path, write: Callable[[Path, Sequence[SampleBlock]], Path]
+) -> None:
     start = 2**32 // 20 - 3
     records = [block(start + i, first_index=start, lost=(5,) if i == 2 else ()) for i in range(70)]
-    assert_same(list(open_recording(write_mcap(tmp_path / 'a.mcap', records)).blocks()), records)
+    assert_same(list(open_recording(write(tmp_path / 'a.mcap', records)).blocks()), records)
 
 
 @pytest.mark.parametrize('epoch', [1, 2, 7])
@@ -161,10 +176,51 @@ def test_blocks_of_a_run_past_its_wrap_are_cut_as_they_were(tmp_path: Path, epoc
     assert_same(list(open_recording(write_mcap(tmp_path / 'a.mcap', records)).blocks()), records)
 
 
-def test_a_long_gap_with_a_wrap_in_it_is_a_gap(tmp_path: Path) -> None:
+@pytest.mark.parametrize('write', [write_mcap, modulo])
+def test_a_long_gap_with_a_wrap_in_it_is_a_gap(
+    tmp_path: Path, write: Callable[[Path, Sequence[SampleBlock]], Path]
+) -> None:
     start, gap = 2**32 // 20 - 100_000, 300_000
     records = [block(start, first_index=start), block(start + gap, first_index=start)]
-    assert_same(list(open_recording(write_mcap(tmp_path / 'a.mcap', records)).blocks()), records)
+    assert_same(list(open_recording(write(tmp_path / 'a.mcap', records)).blocks()), records)
+
+
+def test_a_jump_of_the_whole_number_needs_no_guess(tmp_path: Path) -> None:
+    records = [block(5), block(3 * 2**32, first_index=3 * 2**32 - 10)]
+    recording = open_recording(write_mcap(tmp_path / 'a.mcap', records))
+    assert_same(list(recording.blocks()), records)
+    assert not recording.warnings
+
+
+def test_changes_of_parameters_come_back(tmp_path: Path) -> None:
+    changes = [
+        ParameterChange(T0, 3, (('psd_1.zero', (1e-3, -2e-3)), ('psd_2.zero', (0.1, 1 / 3)))),
+        ParameterChange(T0 + 5, 12, (('sum_min', 2.25),)),
+    ]
+    path = write_mcap(tmp_path / 'a.mcap', [block(0), *changes, block(1)])
+    assert open_recording(path).changes == changes
+    assert open_recording(path).topics() == {SAMPLES: 2}
+
+
+@pytest.mark.parametrize(
+    'entry',
+    [
+        {},
+        {'t_ns': 'x', 'block': '1', 'values': '{}'},
+        {'t_ns': '1', 'block': '1', 'values': '[1]'},
+        {'t_ns': '1', 'block': '1', 'values': '{"a": {}}'},
+        {'t_ns': '1', 'block': '1', 'values': '[' * 100_000},
+    ],
+)
+def test_a_change_that_is_not_readable_is_left_out(tmp_path: Path, entry: dict[str, str]) -> None:
+    with (tmp_path / 'a.mcap').open('wb') as stream:
+        writer = Writer(stream)
+        writer.start('ros2')
+        writer.add_metadata(META_CHANGE + '000001', entry)
+        writer.finish()
+    recording = open_recording(tmp_path / 'a.mcap')
+    assert list(recording.changes) == []
+    assert 'is left out' in recording.warnings[0]
 
 
 def test_a_device_that_starts_anew_does_not_mix_blocks(tmp_path: Path) -> None:
@@ -254,12 +310,10 @@ def test_other_layouts_compressions_and_no_chunks(
     with (tmp_path / 'a.mcap').open('wb') as stream:
         writer = Writer(stream, compression=compression, use_chunking=chunked, index_types=IndexType.NONE)
         writer.start('ros2')
-        schema = writer.register_schema(
-            'sensor_msgs/PointCloud2', 'ros2msg', definition('sensor_msgs/msg/PointCloud2').encode()
-        )
+        schema = writer.register_schema('sensor_msgs/PointCloud2', 'ros2msg', definition(CLOUD).encode())
         channel = writer.register_channel(SAMPLES, 'cdr', schema)
         for b in expected:
-            message = cdr.encode('sensor_msgs/msg/PointCloud2', cloud(b, names, formats, 64, big))
+            message = cdr.encode(CLOUD, cloud(b, names, formats, 64, big))
             writer.add_message(channel, int(b.t_ns[0]), message, int(b.t_ns[0]))
         writer.finish()
     recording = open_recording(tmp_path / 'a.mcap')
