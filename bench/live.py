@@ -31,6 +31,18 @@ def percentiles(values: list[float]) -> tuple[float, float]:
     return float(np.median(values)), float(np.percentile(values, 99))
 
 
+def until_stdin_closes() -> threading.Event:
+    """An event that is set when the parent closes our standard input."""
+    stop = threading.Event()
+
+    def wait() -> None:
+        sys.stdin.read()
+        stop.set()
+
+    threading.Thread(target=wait, daemon=True).start()
+    return stop
+
+
 def subscriber() -> None:
     """Child process: prints, for each message, topic, stamp and the monotonic time of its callback."""
     import rclpy
@@ -50,8 +62,7 @@ def subscriber() -> None:
     listen('/link_tip/deflection')
     listen('/bare')
     print('ready', flush=True)
-    stop = threading.Event()
-    threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
+    stop = until_stdin_closes()
     while not stop.is_set():
         rclpy.spin_once(node, timeout_sec=0.1)
     json.dump(rows, sys.stdout)
@@ -67,8 +78,7 @@ def bare_publisher() -> None:
     publisher = node.create_publisher(PoseStamped, '/bare', 10)
     message = PoseStamped()
     message.header.frame_id = 'link_tip_rest'
-    stop = threading.Event()
-    threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
+    stop = until_stdin_closes()
     rows: list[tuple[int, int]] = []
     count = 0
     while not stop.wait(0.02):
@@ -100,11 +110,11 @@ class Device:
             before = self.device.taken
             stream = self.device.take(time.monotonic_ns() - start)
             try:
-                os.read(self.port.master, 4096)
+                asked = os.read(self.port.master, 4096)
             except OSError:
-                pass
+                asked = b''
             try:
-                os.write(self.port.master, stream + self.device.receive(b'', 0))
+                os.write(self.port.master, self.device.receive(asked, 0) + stream)
             except OSError:
                 continue
             if before // 20 != self.device.taken // 20:

@@ -23,7 +23,6 @@ import numpy as np
 from tqdm import tqdm
 
 from psd_deflection.config import Rig, load_rig, rig_from_values
-from psd_deflection.errors import RecordingError
 from psd_deflection.io.comparison import Comparison
 from psd_deflection.io.recording import Recording
 from psd_deflection.io.recordings import open_recording
@@ -165,11 +164,10 @@ def _print_summary(args: argparse.Namespace, rig: Rig, pipeline: Pipeline, total
         print(f'  no estimate: {count} blocks, {cause.replace("_", " ")}')
     if len(poses):
         low, high = poses.min(axis=0), poses.max(axis=0)
-        print(f'  ΔX {low[0] * 1e6:+.2f} … {high[0] * 1e6:+.2f} µm, ΔY {low[1] * 1e6:+.2f} … {high[1] * 1e6:+.2f} µm, '
-              f'θ {np.rad2deg(low[2]) * 1e3:+.2f} … {np.rad2deg(high[2]) * 1e3:+.2f} mdeg')
+        print(
+            f'  ΔX {low[0] * 1e6:+.2f} … {high[0] * 1e6:+.2f} µm, ΔY {low[1] * 1e6:+.2f} … {high[1] * 1e6:+.2f} µm, '
+            f'θ {np.rad2deg(low[2]) * 1e3:+.2f} … {np.rad2deg(high[2]) * 1e3:+.2f} mdeg'
+        )
     print(f'  {recorded_seconds:.1f} s of data in {seconds:.2f} s')
     if args.out is not None:
         print(f'  written to {Path(args.out)}')
-
-
-__all__ = ['RecordingError', 'add_arguments', 'run']

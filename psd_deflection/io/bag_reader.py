@@ -313,9 +313,15 @@ def _joined(a: SampleBlock, b: SampleBlock) -> SampleBlock:
 
 
 def _to_change(entry: Mapping[str, str]) -> ParameterChange:
+    def number(value: object) -> float:
+        # As they are: a whole number must come back as one.
+        if isinstance(value, int | float):
+            return value
+        raise TypeError
+
     values: list[tuple[str, float | tuple[float, ...]]] = []
     for key, value in json.loads(entry['values']).items():
-        values.append((key, tuple(map(float, value)) if isinstance(value, list) else float(value)))
+        values.append((key, tuple(map(number, value)) if isinstance(value, list) else number(value)))
     return ParameterChange(int(entry['t_ns']), int(entry['block']), tuple(values))
 
 

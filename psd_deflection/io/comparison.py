@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Iterator
 
 from msg_adapters import DIAGNOSTICS, INPUTS, SAMPLES, to_messages
+from msg_adapters.orientation import angles
 from psd_deflection.errors import RecordingError
 from psd_deflection.io import cdr
 from psd_deflection.io.message_decode import header_and_doubles
@@ -35,7 +36,8 @@ class Comparison:
         self.different = 0
         self.only_recorded = 0
         self.only_replayed = 0
-        self._path = recording.path
+        self._recording = recording
+        self._complete = True
         self._recorded: dict[str, deque[tuple[int, bytes]]] = {t: deque() for t in topics}
         self._replayed: dict[str, deque[tuple[int, bytes]]] = {t: deque() for t in topics}
         self._worst: dict[str, float] = {}
@@ -44,6 +46,7 @@ class Comparison:
             (m.channel.topic, m.log_time, m.cdr) for m in recording.messages(topics)
         )
         self._ended = False
+        self._newest = 0
 
     @property
     def same(self) -> bool:
@@ -64,15 +67,20 @@ class Comparison:
                     self._count_only_replayed(topic, t_ns)
                 newest = max(newest, t_ns)
         if newest:
+            self._newest = newest
             self._read_until(newest + _LAG_NS)
             self._match()
 
     def finish(self) -> None:
         """What is left on either side has no counterpart."""
         self._read_until(None)
+        self._complete = self._recording.complete
         self._match()
         for topic in self._recorded:
             for t_ns, _ in self._recorded[topic]:
+                if t_ns > self._newest and not self._complete:
+                    # The cut took the samples and left what was made of them.
+                    continue
                 self.only_recorded += 1
                 self._note(f'{topic} at {t_ns} ns is recorded, the replay has none')
             for t_ns, _ in self._replayed[topic]:
@@ -133,14 +141,22 @@ class Comparison:
     def _differ(self, topic: str, t_ns: int, a: bytes, b: bytes) -> None:
         self.different += 1
         self._note(f'{topic} at {t_ns} ns')
-        count = (min(len(a), len(b)) - 4) // 8 - 3
+        if not topic.endswith('/deflection'):
+            return
         try:
-            _, old = header_and_doubles(a, count)
-            _, new = header_and_doubles(b, count)
+            old, new = (header_and_doubles(side, 7)[1] for side in (a, b))
         except ValueError:
             return
-        worst = max((abs(x - y) for x, y in zip(old, new, strict=True)), default=0.0)
-        self._worst[topic] = max(self._worst.get(topic, 0.0), worst)
+        for axis, name in enumerate(('ΔX', 'ΔY')):
+            self._worsen(f'{topic} {name} (m)', abs(old[axis] - new[axis]))
+        self._worsen(f'{topic} θ (rad)', abs(_theta(old) - _theta(new)))
+
+    def _worsen(self, name: str, difference: float) -> None:
+        self._worst[name] = max(self._worst.get(name, 0.0), difference)
+
+
+def _theta(doubles: tuple[float, ...]) -> float:
+    return angles(dict(zip('xyzw', doubles[3:], strict=True)))[0]
 
 
 def _stamp(encoded: bytes, log_time: int) -> int:
