@@ -7,13 +7,13 @@ metres -> health -> solvers -> estimates and the load that the link model needs 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.averaging import BlockCutter, block_middle_ns, mean_and_covariance
+from psd_deflection.averaging import BlockCutter, block_middle_ns, covariance
 from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_variances
 from psd_deflection.config import Rig, replace_values
 from psd_deflection.mechanics import LinkStatics
@@ -83,25 +83,25 @@ class Pipeline:
         """Samples passed over because their number did not rise."""
         return self._cutter.repeated
 
-    def process(self, chunk: RawChunk) -> list[Record]:
-        """The records of every block that ``chunk`` completes."""
+    def process(self, chunk: RawChunk) -> Iterator[Record]:
+        """The records of every block that ``chunk`` completes, each as soon as it is known.
+
+        A block's primary estimate comes first, before the other solvers run: who publishes it as it
+        comes publishes it soonest. Take them all: the next chunk must not come before.
+        """
         readings = chunk.readings
         volts: npt.NDArray[np.float32]
         if chunk.volts_per_count is not None:
             volts = counts_to_volts(readings.astype(np.int16, copy=False), chunk.volts_per_count)
         else:
             volts = readings.astype(np.float32, copy=False)
-        records: list[Record] = []
         for block in self._cutter.add(chunk, volts):
-            self._block(block, records)
-        return records
+            yield from self._block(block)
 
-    def flush(self) -> list[Record]:
+    def flush(self) -> Iterator[Record]:
         """The records of the unfinished block: the stream has ended, or starts anew."""
-        records: list[Record] = []
         for block in self._cutter.flush():
-            self._block(block, records)
-        return records
+            yield from self._block(block)
 
     def zero(self) -> ParameterChange | None:
         """Take the mean of the last blocks' dots as the unloaded ones, from the next block on.
@@ -130,52 +130,61 @@ class Pipeline:
         values = {name: list(v) if isinstance(v, tuple) else v for name, v in change.values}
         self._build(replace_values(self.rig, values, 'change'))
 
-    def _block(self, block: SampleBlock, records: list[Record]) -> None:
+    def _block(self, block: SampleBlock) -> Iterator[Record]:
         size = self._cutter.block_size
         present = len(block.seq)
         self.counters.samples += present
         self.counters.blocks += 1
         volts = block.volts
-        mean, covariance = mean_and_covariance(self._calibration.dots(volts))
+        samples = self._calibration.dots(volts)
+        x1, y1, x2, y2 = (samples.sum(axis=0) / present).tolist()
+        dots: Dots = (x1, y1, x2, y2)
         sums = volts[:, 2::3].astype(np.float64)
-        dots: Dots = (float(mean[0]), float(mean[1]), float(mean[2]), float(mean[3]))
         status, reason = self._health(block, dots, sums)
         t_ns = block_middle_ns(block, size, self._period_ns)
-        sum1, sum2 = (sums.sum(axis=0) / present).tolist()
-        estimates: list[DeflectionEstimate] = []
+        variances = self._variances[present - 1]
+        best: DeflectionEstimate | None = None
         if status is BlockStatus.OK:
-            variances = self._variances[present - 1]
-            for name, solver, primary in self._solvers:
-                s = solver.solve(dots, variances)
-                if s.status is SolverStatus.OK:
-                    rms = (sum(r * r for r in s.residual) / len(s.residual)) ** 0.5
-                    estimates.append(
-                        DeflectionEstimate(
-                            t_ns, block.index, name, s.dx, s.dy, s.theta, s.phi, s.omega, s.covariance, rms, primary
-                        )
-                    )
-                elif primary:
-                    status = BlockStatus.NOT_SOLVED
-                    reason = f'{name}: {s.status.name.lower().replace("_", " ")}'
-        spots = SpotMeans(t_ns, block.index, dots, (sum1, sum2), covariance, present, size - present, status, reason)
-        self.last_spots = spots
-        if status is BlockStatus.OK:
-            best = estimates[0]
-            self.last_estimate = best
+            best, failure = self._solve(0, t_ns, block.index, dots, variances)
+            if best is None:
+                status, reason = BlockStatus.NOT_SOLVED, failure
+        self.last_estimate = best
+        if best is not None:
             self.counters.estimates += 1
-            self._recent = [*self._recent[1 - ZERO_BLOCKS :], dots]
-            records.append(best)
+            yield best
             fx, fy, tz = self._statics.tip_load(best.dx, best.dy, best.theta)
-            records.append(TipLoad(t_ns, fx, fy, tz))
-            records.extend(estimates[1:])
+            yield TipLoad(t_ns, fx, fy, tz)
+            self._recent = [*self._recent[1 - ZERO_BLOCKS :], dots]
+            for number in range(1, len(self._solvers)):
+                other, _ = self._solve(number, t_ns, block.index, dots, variances)
+                if other is not None:
+                    yield other
         else:
-            self.last_estimate = None
             # A mean taken across an outage must not become a zero.
             self._recent = []
             name = status.name.lower()
             self.counters.refused[name] = self.counters.refused.get(name, 0) + 1
-        records.append(spots)
-        records.append(block)
+        sum1, sum2 = (sums.sum(axis=0) / present).tolist()
+        spots = SpotMeans(
+            t_ns, block.index, dots, (sum1, sum2), covariance(samples), present, size - present, status, reason
+        )
+        self.last_spots = spots
+        yield spots
+        yield block
+
+    def _solve(
+        self, number: int, t_ns: int, block: int, dots: Dots, variances: tuple[float, ...]
+    ) -> tuple[DeflectionEstimate | None, str]:
+        """The answer of solver ``number``, or None and why there is none."""
+        name, solver, primary = self._solvers[number]
+        s = solver.solve(dots, variances)
+        if s.status is not SolverStatus.OK:
+            return None, f'{name}: {s.status.name.lower().replace("_", " ")}'
+        rms = (sum(r * r for r in s.residual) / len(s.residual)) ** 0.5
+        return (
+            DeflectionEstimate(t_ns, block, name, s.dx, s.dy, s.theta, s.phi, s.omega, s.covariance, rms, primary),
+            '',
+        )
 
     def _health(self, block: SampleBlock, dots: Dots, sums: npt.NDArray[np.float64]) -> tuple[BlockStatus, str]:
         """Why this block can have no estimate, the cause before its consequences."""

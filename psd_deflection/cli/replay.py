@@ -79,12 +79,12 @@ def replayed(recording: Recording, pipeline: Pipeline, blocks: Iterable[SampleBl
     for block in blocks:
         while changes and changes[0].block <= block.index:
             # What is unfinished belongs to the time before the change.
-            yield pipeline.flush()
+            yield list(pipeline.flush())
             change = changes.pop(0)
             pipeline.apply(change)
             yield [change]
-        yield pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags))
-    yield pipeline.flush()
+        yield list(pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags)))
+    yield list(pipeline.flush())
 
 
 def rig_of(recording: Recording, params_file: str | None) -> Rig:

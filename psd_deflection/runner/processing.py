@@ -10,7 +10,7 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -32,7 +32,7 @@ class RecordSink(Protocol):
 
 @dataclass(slots=True)
 class Latency:
-    """Last byte read -> records given to the first sink, over the last second, s."""
+    """Last byte read -> the block's records given to all sinks, over the last second, s."""
 
     median: float
     worst: float
@@ -100,11 +100,14 @@ class Processing:
             raise error
         return value  # type: ignore[return-value]
 
-    def give(self, records: list[Record]) -> None:
-        """Hand records to every sink, in order."""
-        for sink in self.sinks:
-            for record in records:
+    def give(self, records: Iterable[Record]) -> int:
+        """Hand each record to every sink as it comes; how many there were."""
+        count = 0
+        for record in records:
+            count += 1
+            for sink in self.sinks:
                 sink.put(record)
+        return count
 
     def _run(self) -> None:
         try:
@@ -115,9 +118,7 @@ class Processing:
                     self._carry_out()
                     continue
                 if isinstance(item, Chunk):
-                    records = self.pipeline.process(item.raw)
-                    if records:
-                        self.give(records)
+                    if self.give(self.pipeline.process(item.raw)):
                         self._latencies.append((time.monotonic_ns() - item.read_ns) / 1e9)
                         self._tell_refusals()
                 elif isinstance(item, Restarted):
