@@ -365,6 +365,14 @@ def test_samples_that_are_no_numbers_count_as_lost(tmp_path: Path) -> None:
     assert 'NaN' in recording.warnings[0]
 
 
+def test_a_load_without_a_stamp_counts_from_when_it_came(tmp_path: Path) -> None:
+    with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
+        for t_ns in (0, T0 + 7):
+            (m,) = to_messages(AppliedLoad(t_ns, 1.0, 2.0, 3.0))
+            out.write_encoded(m.topic, m.type, cdr.encode(m.type, m.fields), T0 + 99)
+    assert [r.t_ns for r in open_recording(tmp_path / 'a.mcap').loads()] == [T0 + 99, T0 + 7]
+
+
 # --- what cannot be read ------------------------------------------------------------------------
 
 
