@@ -29,7 +29,7 @@ SECONDS = 4
 
 RECORDINGS: dict[str, dict[str, object]] = {
     'clean': {},
-    'lost_samples': {'lose': frozenset({45, 46, 200, *range(1010, 1025), *range(2000, 2145), 3999})},
+    'lost_samples': {'lose': frozenset({45, 46, 200, *range(1003, 1030), *range(2000, 2145), 3999})},
     'laser_off': {'dark': ((2, 1507, 2523),)},
 }
 
