@@ -29,6 +29,7 @@ from msg_adapters import (
     temperature,
     wrench_stamped,
 )
+from msg_adapters.header import header, stamp_ns
 from msg_adapters.orientation import angles
 from psd_deflection.errors import RecordingError
 from psd_deflection.io import cdr
@@ -201,11 +202,15 @@ class BagRecording(Recording):
             raise RecordingError(f'{self.path}: {topic} is {found!r} in {encoding!r}, not {wanted} in cdr')
 
     def _decoded(self, topic: str, convert: Callable[[dict[str, Any]], T]) -> list[T]:
+        """Every message of ``topic``; one without a stamp (0) has the time at which it came."""
         out = []
         for channel, log_time, message in self.messages([topic]):
             self._check_type(channel.type, channel.encoding, topic)
             try:
-                out.append(convert(cdr.decode(channel.type, message)))
+                fields = cdr.decode(channel.type, message)
+                if stamp_ns(fields) == 0:
+                    fields['header'] = header(log_time, fields['header']['frame_id'])
+                out.append(convert(fields))
             except ValueError as error:
                 raise RecordingError(f'{self.path}: {topic} at log time {log_time}: {error}') from None
         return out
@@ -313,9 +318,15 @@ def _joined(a: SampleBlock, b: SampleBlock) -> SampleBlock:
 
 
 def _to_change(entry: Mapping[str, str]) -> ParameterChange:
+    def number(value: object) -> float:
+        # As they are: a whole number must come back as one.
+        if isinstance(value, int | float):
+            return value
+        raise TypeError
+
     values: list[tuple[str, float | tuple[float, ...]]] = []
     for key, value in json.loads(entry['values']).items():
-        values.append((key, tuple(map(float, value)) if isinstance(value, list) else float(value)))
+        values.append((key, tuple(map(number, value)) if isinstance(value, list) else number(value)))
     return ParameterChange(int(entry['t_ns']), int(entry['block']), tuple(values))
 
 

@@ -54,7 +54,7 @@ class CsvRecording(Recording):
         self._warnings: list[str] = []
         self._header, self._columns = self._read_header()
         self._step_ns = 1e9 / sample_rate_hz if sample_rate_hz else self._find_step()
-        self.__dict__['sample_rate_hz'] = 1e9 / self._step_ns
+        self.sample_rate_hz = 1e9 / self._step_ns
 
     @property
     def complete(self) -> bool:

@@ -202,7 +202,7 @@ def test_a_dot_that_was_not_seen_is_not_published(status: BlockStatus) -> None:
 def test_only_the_primary_estimate_is_the_deflection() -> None:
     assert [m.topic for m in to_messages(estimate(1, 'wls', primary=False))] == ['/link_tip/wls/deflection']
     primary = to_messages(estimate(1))
-    assert [m.topic for m in primary] == ['/link_tip/exact/deflection', DEFLECTION, DEFLECTION_WITH_COVARIANCE]
+    assert [m.topic for m in primary] == [DEFLECTION, '/link_tip/exact/deflection', DEFLECTION_WITH_COVARIANCE]
     assert all(m.fields['header']['frame_id'] == 'link_tip_rest' for m in primary)
 
 

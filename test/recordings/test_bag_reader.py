@@ -195,10 +195,10 @@ def test_a_jump_of_the_whole_number_needs_no_guess(tmp_path: Path) -> None:
 def test_changes_of_parameters_come_back(tmp_path: Path) -> None:
     changes = [
         ParameterChange(T0, 3, (('psd_1.zero', (1e-3, -2e-3)), ('psd_2.zero', (0.1, 1 / 3)))),
-        ParameterChange(T0 + 5, 12, (('sum_min', 2.25),)),
+        ParameterChange(T0 + 5, 12, (('sum_min', 2.25), ('min_samples', 7))),
     ]
     path = write_mcap(tmp_path / 'a.mcap', [block(0), *changes, block(1)])
-    assert open_recording(path).changes == changes
+    assert repr(open_recording(path).changes) == repr(changes)
     assert open_recording(path).topics() == {SAMPLES: 2}
 
 
@@ -363,6 +363,14 @@ def test_samples_that_are_no_numbers_count_as_lost(tmp_path: Path) -> None:
     assert first.seq.tolist() == [0, 1, 2, *range(4, 20)]
     assert len(second.seq) == 20
     assert 'NaN' in recording.warnings[0]
+
+
+def test_a_load_without_a_stamp_counts_from_when_it_came(tmp_path: Path) -> None:
+    with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
+        for t_ns in (0, T0 + 7):
+            (m,) = to_messages(AppliedLoad(t_ns, 1.0, 2.0, 3.0))
+            out.write_encoded(m.topic, m.type, cdr.encode(m.type, m.fields), T0 + 99)
+    assert [r.t_ns for r in open_recording(tmp_path / 'a.mcap').loads()] == [T0 + 99, T0 + 7]
 
 
 # --- what cannot be read ------------------------------------------------------------------------
