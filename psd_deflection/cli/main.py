@@ -18,6 +18,7 @@ COMMANDS: dict[str, str] = {
     'estimator': 'acquire, estimate, publish on ROS 2 and record (the daemon)',
     'replay': 'run a recording through the same pipeline',
     'simulate': 'simulate the rig: as a recording, or as a device on a pseudo-terminal',
+    'budget': 'error budget: what each cause does to dX, dY and theta (chapter 3)',
     'design': 'size the link and place the sensors (appendix B, condition numbers)',
     'params': 'list every parameter with unit, bounds and default',
 }
