@@ -20,6 +20,7 @@ COMMANDS: dict[str, str] = {
     'simulate': 'simulate the rig: as a recording, or as a device on a pseudo-terminal',
     'info': 'say what is in a recording',
     'convert': 'write the samples of a recording as a CSV, an .mcap or a bag',
+    'budget': 'error budget: what each cause does to dX, dY and theta (chapter 3)',
     'design': 'size the link and place the sensors (appendix B, condition numbers)',
     'params': 'list every parameter with unit, bounds and default',
 }
