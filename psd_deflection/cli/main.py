@@ -18,6 +18,7 @@ COMMANDS: dict[str, str] = {
     'estimator': 'acquire, estimate, publish on ROS 2 and record (the daemon)',
     'replay': 'run a recording through the same pipeline',
     'simulate': 'simulate the rig: as a recording, or as a device on a pseudo-terminal',
+    'compare-methods': 'how far each method is off, and where the figures of Table 5.1 come from',
     'params': 'list every parameter with unit, bounds and default',
 }
 """Command name to one-line summary; the module is ``psd_deflection.cli.NAME`` (``-`` as ``_``)."""
