@@ -97,6 +97,15 @@ def _psd(number: int, center: list[float]) -> list[Parameter]:
             length=2,
         ),
         Parameter(
+            p + 'spot_radius',
+            'double',
+            0.5e-3,
+            'm',
+            'radius of the laser spot on it, to 1/e^2 of the peak',
+            above=0.0,
+            maximum=0.1,
+        ),
+        Parameter(
             p + 'zero',
             'double_array',
             [0.0, 0.0],
@@ -247,6 +256,7 @@ class PsdConfig:
     center: tuple[float, float]
     height: float
     active_area: tuple[float, float]
+    spot_radius: float
     zero: tuple[float, float]
 
 

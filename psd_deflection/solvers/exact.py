@@ -221,7 +221,7 @@ def _newton_many(
         turned = c * c - s * s
         slope = difference * s * c + mixed * turned + along * s - across * c
         curvature = difference * turned - 4.0 * mixed * s * c + along * c + across * s
-        step = slope / np.abs(curvature)
+        step = np.where(converged, 0.0, slope / np.abs(curvature))
         theta = theta - step
         converged = np.abs(step) < _LAST_STEP
         if converged.all():
