@@ -98,9 +98,7 @@ def run(args: argparse.Namespace) -> int:
     """Replay."""
     recording = open_recording(args.recording)
     rig = rig_of(recording, args.params_file)
-    recording = open_recording(
-        args.recording, block_size=rig.estimator.block_size, sample_rate_hz=rig.converter.sample_rate_hz
-    )
+    recording = open_recording(args.recording, block_size=rig.estimator.block_size)
     pipeline = Pipeline(rig)
     comparison = Comparison(recording) if args.compare else None
     sink: Sink | None = None
@@ -127,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
         if sink is not None:
             sink.close()
     seconds = time.perf_counter() - began
-    for warning in recording.warnings:
+    for warning in [*recording.warnings, *_rate_warning(recording, rig)]:
         print(f'warning: {warning}', file=sys.stderr)
     _print_summary(args, rig, pipeline, totals, seconds)
     if comparison is None:
@@ -135,6 +133,16 @@ def run(args: argparse.Namespace) -> int:
     comparison.finish()
     print(comparison.summary(), file=sys.stderr if args.json else sys.stdout)
     return 0 if comparison.same else DIFFERS
+
+
+def _rate_warning(recording: Recording, rig: Rig) -> list[str]:
+    found, stated = recording.sample_rate_hz, rig.converter.sample_rate_hz
+    if not found or abs(found - stated) < 0.01 * stated:
+        return []
+    return [
+        f'{recording.path}: has {found:.4g} samples a second, the rig says {stated:g} '
+        '(converter.sample_rate_hz): the stamps of shortened blocks are off'
+    ]
 
 
 def _print_summary(args: argparse.Namespace, rig: Rig, pipeline: Pipeline, totals: Totals, seconds: float) -> None:
