@@ -56,6 +56,8 @@ def test_everything_is_explained(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['budget', '--explain', '--set', 'pointing_drift=2e-6']) == 0
     out = capsys.readouterr().out
     assert 'pointing_drift = 2e-06 rad' in out
+    assert 'spot on the sensor (3.1): 1.1110 mm' in out
+    assert 'stop window of thesis_iteration: 57.30 mdeg' in out
     for cause in CAUSES:
         assert cause.formula in out
     for entry in INPUTS:
