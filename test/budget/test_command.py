@@ -80,6 +80,7 @@ def test_the_method_follows_the_rigs_solver(tmp_path: Path, capsys: pytest.Captu
         (['--monte-carlo', '1000', '--seed', '-1'], '--seed'),
         (['--load', 'nan', '0', '0'], 'must be finite'),
         (['--load', '0', '-500', '0'], 'take a smaller load'),
+        (['--load', '1e300', '0', '0'], 'than the link is long'),
         (['--out', 'budget.txt'], '.png, .svg or .pdf'),
         (['--inputs', 'absent.yaml'], 'absent.yaml'),
         (['--params-file', 'absent.yaml'], 'absent.yaml'),
