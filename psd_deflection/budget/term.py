@@ -61,6 +61,11 @@ class Situation:
     def at_load(cls, rig: Rig, inputs: Mapping[str, float], load: tuple[float, float, float], method: str) -> Situation:
         """At the pose of a tip load (Fx N, Fy N, Tz N m). Raises ConfigError where a dot leaves its sensor."""
         pose = np.array(LinkStatics.from_rig(rig).deflection(*load))
+        if not np.all(np.abs(pose) <= [rig.link.length, rig.link.length, math.pi]):
+            raise ConfigError(
+                f'--load {load[0]:g} {load[1]:g} {load[2]:g}: the tip would move by more than the link is long '
+                'or turn by more than half a turn: take a smaller load'
+            )
         chain = Chain.of(rig)
         estimator = estimator_of(rig, method)
         places, _ = measure(chain, pose)

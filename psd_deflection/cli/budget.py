@@ -22,12 +22,15 @@ from typing import Any
 
 import numpy as np
 
+from psd_deflection.budget import optics
+from psd_deflection.budget.computation import stop_window
+from psd_deflection.budget.environment import averaging_gain
 from psd_deflection.budget.estimate import METHOD_OF_SOLVER, METHODS
 from psd_deflection.budget.evaluate import CAUSES, Budget, evaluate, monte_carlo
 from psd_deflection.budget.inputs import INPUTS, read_inputs
 from psd_deflection.budget.term import Contribution, Kind, Situation
 from psd_deflection.cli._report import columns, save_figure
-from psd_deflection.config import load_rig
+from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import ConfigError
 
 MICRO_MILLIDEGREE = np.array([1e6, 1e6, math.degrees(1e3)])
@@ -68,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     rig = load_rig(args.params_file)
     inputs = read_inputs(args.inputs, _settings(args.set))
     if args.explain:
-        print(explain(inputs))
+        print(explain(rig, inputs))
         return 0
     draws = args.monte_carlo
     if draws is not None and not 100 <= draws <= MAX_DRAWS:
@@ -106,8 +109,8 @@ def _settings(pairs: list[str]) -> dict[str, object]:
     return out
 
 
-def explain(inputs: dict[str, float]) -> str:
-    """Every term with its formula, every input with value, unit, bounds and source."""
+def explain(rig: Rig, inputs: dict[str, float]) -> str:
+    """Every term with its formula, every input with value, unit, bounds and source, and what follows from them."""
     lines = [
         'Terms: name (row of Table 3.1), kind: deviation of each error parameter, before it goes through the model'
     ]
@@ -119,7 +122,32 @@ def explain(inputs: dict[str, float]) -> str:
         p = entry.parameter
         unit = f' {p.unit}' if p.unit else ''
         lines.append(f'  {p.name} = {inputs[p.name]:g}{unit}: {p.description} ({p.bound_text()}); {entry.source}')
-    return '\n'.join(lines)
+    return '\n'.join([*lines, '', 'From these:', *_derived(rig, inputs)])
+
+
+def _derived(rig: Rig, inputs: dict[str, float]) -> list[str]:
+    """Intermediate results of chapter 3 at these inputs."""
+    length, temperature, wavelength = rig.link.length, inputs['temperature'], inputs['laser_wavelength']
+    spot = optics.beam_diameter(inputs['laser_diameter'], wavelength, length)
+    index = optics.air_index(optics.STANDARD_PRESSURE, temperature, wavelength=wavelength)
+    per_kelvin = optics.index_per_kelvin(temperature, wavelength)
+    per_gradient = optics.gradient_shift(abs(per_kelvin), length)
+    warm = optics.air_index(optics.STANDARD_PRESSURE, temperature + inputs['air_step'], wavelength=wavelength)
+    step = optics.boundary_shift(inputs['air_step_angle'], index, warm, length)
+    rate, block = rig.converter.sample_rate_hz, rig.estimator.block_size
+    hum = averaging_gain(block, inputs['interference_frequency'], rate)
+    window = stop_window(rig.centers + rig.zeros, inputs['iteration_tolerance'])
+    return [
+        f'  spot on the sensor (3.1): {spot * 1e3:.4f} mm',
+        f'  index of air (3.3) at 50 % humidity: {index:.9f}, dn/dT {per_kelvin:.3e} 1/K',
+        f'  shift by a gradient across the beam: {per_gradient * 1e6:.3f} um per K/m',
+        f'  shift behind a boundary (3.4): {step * 1e6:.3f} um',
+        f'  noise of a dot: {rig.amplifier.noise * rig.amplifier.sensitivity * 1e6:.3f} um a sample, '
+        f'{rig.amplifier.noise * rig.amplifier.sensitivity * 1e6 / math.sqrt(block):.3f} um a mean of {block}',
+        f'  step of the converter: {rig.converter.volts_per_count * rig.amplifier.sensitivity * 1e6:.4f} um',
+        f'  hum that a mean of {block} leaves at {inputs["interference_frequency"]:g} Hz: {hum:.3f}',
+        f'  stop window of thesis_iteration: {math.degrees(window) * 1e3:.2f} mdeg',
+    ]
 
 
 def table(budget: Budget, load: tuple[float, ...]) -> str:

@@ -107,6 +107,7 @@ def appendix_b() -> str:
     errata += [f'  B2 {c.row}: thesis {c.printed}: {c.erratum}' for c in table_2 if not c.agrees]
     base = scaling.table_b1_cases()[0].link
     exact = scaling.torsion_to_bending_ratio_exact(base, scaling.FORCE)
+    poisson = scaling.YOUNGS_MODULUS / (2.0 * scaling.SHEAR_MODULUS) - 1.0
     virtual = scaling.table_b1_cases()[4].link.section.mean_radius
     return '\n'.join(
         [
@@ -121,6 +122,7 @@ def appendix_b() -> str:
             columns(rows_2),
             '',
             f'With the sine (B-5) the aluminium ratio is {exact:.6f}; with unequal links it is (L_CD/L_BC)^2 as large.',
+            f'E/G of its aluminium needs a Poisson ratio of {poisson:.4f}; alloy 6061 has 0.33.',
             f'Twice the length bends as before at a mean radius of {virtual * 1e3:.3f} mm (thesis: "EVD" 29.76 mm).',
             '',
             'Errata:',

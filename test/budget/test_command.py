@@ -56,6 +56,8 @@ def test_everything_is_explained(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['budget', '--explain', '--set', 'pointing_drift=2e-6']) == 0
     out = capsys.readouterr().out
     assert 'pointing_drift = 2e-06 rad' in out
+    assert 'spot on the sensor (3.1): 1.1110 mm' in out
+    assert 'stop window of thesis_iteration: 57.30 mdeg' in out
     for cause in CAUSES:
         assert cause.formula in out
     for entry in INPUTS:
@@ -78,6 +80,7 @@ def test_the_method_follows_the_rigs_solver(tmp_path: Path, capsys: pytest.Captu
         (['--monte-carlo', '1000', '--seed', '-1'], '--seed'),
         (['--load', 'nan', '0', '0'], 'must be finite'),
         (['--load', '0', '-500', '0'], 'take a smaller load'),
+        (['--load', '1e300', '0', '0'], 'than the link is long'),
         (['--out', 'budget.txt'], '.png, .svg or .pdf'),
         (['--inputs', 'absent.yaml'], 'absent.yaml'),
         (['--params-file', 'absent.yaml'], 'absent.yaml'),
