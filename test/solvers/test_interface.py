@@ -195,6 +195,8 @@ def test_options_are_checked(golden: Any) -> None:
 def test_a_variance_of_zero_is_refused(golden: Any, method: str) -> None:
     with pytest.raises(SolverError, match=r'variances must be above 0'):
         make_solver(method, golden.geometry()).solve((0.0,) * 4, (0.0,) * 4)
+    with pytest.raises(SolverError, match=r'variances must be above 0'):
+        make_solver(method, golden.geometry()).solve_many(np.zeros((1, 4)), np.array([1.0, 1.0, float('nan'), 1.0]))
 
 
 def test_the_rig_file_reaches_geometry_and_weights() -> None:
