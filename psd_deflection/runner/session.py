@@ -19,6 +19,9 @@ from psd_deflection.runner.processing import Processing
 from psd_deflection.runner.recorder import Recorder
 from psd_deflection.runner.simulated_rig import SimulatedRigProcess
 
+SIMULATED = ('serial', 'dataq', 'thorlabs', 'lines')
+"""Sources for which a simulated rig is started where no port is named."""
+
 
 class Session:
     """Opens on construction. ``say``: told of changes of state, one line each, from any thread.
@@ -32,7 +35,7 @@ class Session:
         self._closed = False
         # The geometry first: a rig that cannot be solved must not open a port.
         pipeline = Pipeline(rig)
-        if not rig.acquisition.port:
+        if not rig.acquisition.port and rig.acquisition.source in SIMULATED:
             self._simulated = SimulatedRigProcess(rig)
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)
@@ -40,7 +43,7 @@ class Session:
         try:
             self.acquisition = Acquisition(rig, say)
             self.acquisition.open()
-            say(', '.join(f'{name} {what}' for name, what in self.acquisition.source.describe().items()))
+            say('; '.join(f'{name}: {what}' for name, what in self.acquisition.source.describe().items()))
             self.processing = Processing(self.acquisition, pipeline, say)
             self.recorder = Recorder(rig.acquisition.queue_blocks, say)
             self.fanout = Fanout()
