@@ -1,1 +1,100 @@
-"""Blocks of N by sequence number: mean, covariance, present, lost."""
+"""Blocks of N by sequence number: which samples belong together, their mean and covariance.
+
+A block is ``seq // block_size``, so that a lost sample shortens one block and shifts none. A block
+is complete as soon as its last number came, or one of a later block; nothing is filled in.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from psd_deflection.records import FloatArray, RawChunk, SampleBlock
+
+
+class BlockCutter:
+    """Turns chunks of any size into whole blocks; what is not finished waits for the next chunk.
+
+    ``repeated`` counts samples passed over because their number does not rise.
+    """
+
+    def __init__(self, block_size: int) -> None:
+        self.block_size = block_size
+        self.repeated = 0
+        self._last_seq = -1
+        self._pending: list[SampleBlock] = []
+
+    def add(self, chunk: RawChunk, volts: np.ndarray[tuple[int, int], np.dtype[np.float32]]) -> list[SampleBlock]:
+        """The blocks that ``chunk`` completes. ``volts`` float32 (n, 6): its readings in volts."""
+        seq, t_ns, flags = chunk.seq, chunk.t_ns, chunk.flags
+        n = len(seq)
+        if n == 0:
+            return []
+        if seq[0] <= self._last_seq or (n > 1 and bool((seq[1:] <= seq[:-1]).any())):
+            highest = np.maximum.accumulate(np.concatenate(([self._last_seq], seq[:-1])))
+            keep = seq > highest
+            self.repeated += int(n - keep.sum())
+            seq, t_ns, flags, volts = seq[keep], t_ns[keep], flags[keep], volts[keep]
+            if len(seq) == 0:
+                return []
+        self._last_seq = int(seq[-1])
+        size = self.block_size
+        first, last = int(seq[0]) // size, self._last_seq // size
+        done: list[SampleBlock] = []
+        if first == last:
+            pieces = [SampleBlock(first, seq, t_ns, volts, flags)]
+        else:
+            index = seq // size
+            cuts = np.flatnonzero(np.diff(index)) + 1
+            bounds = [0, *cuts.tolist(), len(seq)]
+            pieces = [
+                SampleBlock(int(index[a]), seq[a:b], t_ns[a:b], volts[a:b], flags[a:b])
+                for a, b in itertools.pairwise(bounds)
+            ]
+        for piece in pieces:
+            if self._pending and self._pending[0].index != piece.index:
+                done.append(self._join())
+            self._pending.append(piece)
+            if int(piece.seq[-1]) % size == size - 1:
+                done.append(self._join())
+        return done
+
+    def flush(self) -> list[SampleBlock]:
+        """The unfinished block, where there is one: the stream has ended or started anew."""
+        return [self._join()] if self._pending else []
+
+    def _join(self) -> SampleBlock:
+        parts, self._pending = self._pending, []
+        if len(parts) == 1:
+            return parts[0]
+        return SampleBlock(
+            parts[0].index,
+            np.concatenate([p.seq for p in parts]),
+            np.concatenate([p.t_ns for p in parts]),
+            np.concatenate([p.volts for p in parts]),
+            np.concatenate([p.flags for p in parts]),
+        )
+
+
+def mean_and_covariance(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean (c,) and unbiased sample covariance (c, c) of ``values`` (n, c); zeros where n < 2."""
+    n, c = values.shape
+    mean = values.sum(axis=0) / n
+    if n < 2:
+        return mean, np.zeros((c, c))
+    centred = values - mean
+    return mean, (centred.T @ centred) / (n - 1)
+
+
+def block_middle_ns(block: SampleBlock, block_size: int, period_ns: float) -> int:
+    """When the middle of the whole block was, ns, from the samples that are present.
+
+    Each present sample says where slot (N-1)/2 is; the mean of these is taken, so that a lost
+    sample moves the stamp by no more than the clock's own jitter.
+    """
+    first = int(block.t_ns[0])
+    slots = block.seq - block.index * block_size
+    offsets = (block.t_ns - first).sum() / len(slots)
+    to_middle = (0.5 * (block_size - 1) - slots.sum() / len(slots)) * period_ns
+    return first + round(float(offsets) + float(to_middle))

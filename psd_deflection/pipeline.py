@@ -1,1 +1,195 @@
-"""From chunks of samples to records; owns no clock, thread or I/O. The same object live and in replay."""
+"""From chunks of samples to records: the same object live and in replay.
+
+It owns no clock, thread or I/O, so that what it gives depends on the rig, the samples and the order
+of calls alone, and ``replay`` can show that bit for bit. Counts -> volts -> blocks -> dots in
+metres -> health -> solvers -> estimates and the load that the link model needs for them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from psd_deflection.averaging import BlockCutter, block_middle_ns, mean_and_covariance
+from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_variances
+from psd_deflection.config import Rig, replace_values
+from psd_deflection.mechanics import LinkStatics
+from psd_deflection.records import (
+    FLAG_OVER_RANGE,
+    BlockStatus,
+    DeflectionEstimate,
+    RawChunk,
+    Record,
+    SampleBlock,
+    SpotMeans,
+    TipLoad,
+    ZeroChange,
+)
+from psd_deflection.solvers import solver_from_rig
+from psd_deflection.solvers._interface import SolverStatus
+
+ZERO_BLOCKS = 25
+"""Blocks whose mean is taken as the unloaded dots by :meth:`Pipeline.zero`: half a second."""
+
+Dots = tuple[float, float, float, float]
+
+
+@dataclass(slots=True)
+class PipelineCounters:
+    """What went through: samples, blocks, estimates of the primary solver, and blocks without one."""
+
+    samples: int = 0
+    blocks: int = 0
+    estimates: int = 0
+    refused: dict[str, int] = field(default_factory=dict)
+
+
+class Pipeline:
+    """Samples in, records out.
+
+    Raises SolverError or ConfigError where the rig cannot be solved.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.counters = PipelineCounters()
+        self.last_estimate: DeflectionEstimate | None = None
+        self.last_spots: SpotMeans | None = None
+        config = rig.estimator
+        self._cutter = BlockCutter(config.block_size)
+        self._period_ns = 1e9 / rig.converter.sample_rate_hz
+        self._statics = LinkStatics.from_rig(rig)
+        self._sum_min = config.sum_min
+        self._recent: list[Dots] = []
+        # The converter's last step on either side: beyond it the true value is not known.
+        self._rail = np.float32((2 ** (rig.converter.bits - 1) - 1) * rig.converter.volts_per_count)
+        self._half = tuple(half / 2.0 for psd in rig.psds for half in psd.active_area)
+        variances = dot_noise_variances(rig)
+        self._variances = [tuple(float(v) / n for v in variances) for n in range(1, config.block_size + 1)]
+        self._build(rig)
+
+    def _build(self, rig: Rig) -> None:
+        self.rig = rig
+        self._calibration = Calibration.from_rig(rig)
+        config = rig.estimator
+        names = [config.solver, *(name for name in config.solvers if name != config.solver)]
+        self._solvers = [(name, solver_from_rig(name, rig), name == config.solver) for name in names]
+
+    @property
+    def repeated(self) -> int:
+        """Samples passed over because their number did not rise."""
+        return self._cutter.repeated
+
+    def set_sum_min(self, volts: float) -> None:
+        """Change the level below which a laser counts as lost, V, from the next block on."""
+        self._sum_min = volts
+
+    def process(self, chunk: RawChunk) -> list[Record]:
+        """The records of every block that ``chunk`` completes."""
+        readings = chunk.readings
+        volts: npt.NDArray[np.float32]
+        if chunk.volts_per_count is not None:
+            volts = counts_to_volts(readings.astype(np.int16, copy=False), chunk.volts_per_count)
+        else:
+            volts = readings.astype(np.float32, copy=False)
+        records: list[Record] = []
+        for block in self._cutter.add(chunk, volts):
+            self._block(block, records)
+        return records
+
+    def flush(self) -> list[Record]:
+        """The records of the unfinished block: the stream has ended, or starts anew."""
+        records: list[Record] = []
+        for block in self._cutter.flush():
+            self._block(block, records)
+        return records
+
+    def zero(self) -> ZeroChange | None:
+        """Take the mean of the last blocks' dots as the unloaded ones, from the next block on.
+
+        None where no good block has come yet. The change is a record: replay applies it again.
+        """
+        if not self._recent or self.last_spots is None:
+            return None
+        dots = tuple(sum(column) / len(self._recent) for column in zip(*self._recent, strict=True))
+        change = ZeroChange(self.last_spots.t_ns, self.last_spots.index + 1, (dots[0], dots[1], dots[2], dots[3]))
+        self.apply_zero(change)
+        return change
+
+    def apply_zero(self, change: ZeroChange) -> None:
+        """Use these unloaded dots from now on."""
+        x1, y1, x2, y2 = change.dots
+        self._build(replace_values(self.rig, {'psd_1.zero': [x1, y1], 'psd_2.zero': [x2, y2]}, 'zero'))
+
+    def _block(self, block: SampleBlock, records: list[Record]) -> None:
+        size = self._cutter.block_size
+        present = len(block.seq)
+        self.counters.samples += present
+        self.counters.blocks += 1
+        volts = block.volts
+        mean, covariance = mean_and_covariance(self._calibration.dots(volts))
+        sums = volts[:, 2::3].astype(np.float64)
+        dots: Dots = (float(mean[0]), float(mean[1]), float(mean[2]), float(mean[3]))
+        status, reason = self._health(block, dots, sums)
+        t_ns = block_middle_ns(block, size, self._period_ns)
+        sum1, sum2 = (sums.sum(axis=0) / present).tolist()
+        estimates: list[DeflectionEstimate] = []
+        if status is BlockStatus.OK:
+            variances = self._variances[present - 1]
+            for name, solver, primary in self._solvers:
+                s = solver.solve(dots, variances)
+                if s.status is SolverStatus.OK:
+                    rms = (sum(r * r for r in s.residual) / len(s.residual)) ** 0.5
+                    estimates.append(
+                        DeflectionEstimate(
+                            t_ns, block.index, name, s.dx, s.dy, s.theta, s.phi, s.omega, s.covariance, rms, primary
+                        )
+                    )
+                elif primary:
+                    status = BlockStatus.NOT_SOLVED
+                    reason = f'{name}: {s.status.name.lower().replace("_", " ")}'
+        spots = SpotMeans(t_ns, block.index, dots, (sum1, sum2), covariance, present, size - present, status, reason)
+        self.last_spots = spots
+        if status is BlockStatus.OK:
+            best = estimates[0]
+            self.last_estimate = best
+            self.counters.estimates += 1
+            self._recent = [*self._recent[1 - ZERO_BLOCKS :], dots]
+            records.append(best)
+            fx, fy, tz = self._statics.tip_load(best.dx, best.dy, best.theta)
+            records.append(TipLoad(t_ns, fx, fy, tz))
+            records.extend(estimates[1:])
+        else:
+            self.last_estimate = None
+            # A mean taken across an outage must not become a zero.
+            self._recent = []
+            name = status.name.lower()
+            self.counters.refused[name] = self.counters.refused.get(name, 0) + 1
+        records.append(spots)
+        records.append(block)
+
+    def _health(self, block: SampleBlock, dots: Dots, sums: npt.NDArray[np.float64]) -> tuple[BlockStatus, str]:
+        """Why this block can have no estimate, the cause before its consequences."""
+        present = len(block.seq)
+        low = sums.min(axis=0).tolist()
+        for number, least in enumerate(low, start=1):
+            if least < self._sum_min:
+                return BlockStatus.LASER_LOST, f'laser {number} lost: sum {least:.3f} V, below {self._sum_min:g} V'
+        volts = block.volts
+        if float(np.abs(volts).max()) >= self._rail:
+            column = int(np.abs(volts).max(axis=0).argmax())
+            name = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')[column]
+            return BlockStatus.SATURATED, f'{name} saturated: {float(np.abs(volts[:, column]).max()):.3f} V'
+        if bool((block.flags & FLAG_OVER_RANGE).any()):
+            return BlockStatus.SATURATED, 'the device reports a channel over range'
+        if present < self.rig.estimator.min_samples:
+            return (
+                BlockStatus.TOO_FEW_SAMPLES,
+                f'{present} of {self._cutter.block_size} samples, at least {self.rig.estimator.min_samples} are needed',
+            )
+        for name, dot, half in zip(('x1', 'y1', 'x2', 'y2'), dots, self._half, strict=True):
+            if abs(dot) > half:
+                return BlockStatus.OUTSIDE_ACTIVE_AREA, f'{name} at {dot * 1e3:.3f} mm, outside the active area'
+        return BlockStatus.OK, ''

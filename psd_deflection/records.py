@@ -115,7 +115,16 @@ class DeflectionEstimate(NamedTuple):
 
 
 class TipLoad(NamedTuple):
-    """A load at the tip centroid in ``link_tip_rest``: N, N, N m."""
+    """The load at the tip that the link model needs for an estimate, in ``link_tip_rest``: N, N, N m."""
+
+    t_ns: int
+    fx: float
+    fy: float
+    tz: float
+
+
+class AppliedLoad(NamedTuple):
+    """A known load at the tip centroid in ``link_tip_rest``, held until the next one: N, N, N m."""
 
     t_ns: int
     fx: float
@@ -139,6 +148,14 @@ class TemperatureReading(NamedTuple):
     celsius: float
 
 
+class ZeroChange(NamedTuple):
+    """The unloaded dots were taken anew: (x1, y1, x2, y2) m, used from block ``block`` on."""
+
+    t_ns: int
+    block: int
+    dots: tuple[float, float, float, float]
+
+
 class DiagnosticEntry(NamedTuple):
     """One line of health: ``level`` 0 OK, 1 WARN, 2 ERROR, 3 STALE, as diagnostic_msgs has them."""
 
@@ -155,4 +172,14 @@ class DiagnosticReport(NamedTuple):
     entries: tuple[DiagnosticEntry, ...]
 
 
-Record = SampleBlock | SpotMeans | DeflectionEstimate | TipLoad | ReferencePose | TemperatureReading | DiagnosticReport
+Record = (
+    SampleBlock
+    | SpotMeans
+    | DeflectionEstimate
+    | TipLoad
+    | AppliedLoad
+    | ReferencePose
+    | TemperatureReading
+    | DiagnosticReport
+    | ZeroChange
+)

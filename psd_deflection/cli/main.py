@@ -50,7 +50,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             sub.description = module.__doc__
             module.add_arguments(sub)
             sub.set_defaults(run=module.run)
-    args = parser.parse_args(argv)
+    # `ros2 run` and `ros2 launch` add arguments of their own: they are for rclpy, not for argparse.
+    own, ros_arguments = _split_ros_arguments(argv)
+    args = parser.parse_args(own)
+    args.ros_arguments = ros_arguments
     try:
         return int(args.run(args))
     except PsdDeflectionError as error:
@@ -60,6 +63,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         # `psd-deflection ... | head` is not an error; keep the interpreter's own flush quiet too.
         sys.stderr.close()
         return 0
+
+
+def _split_ros_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    own: list[str] = []
+    for_ros: list[str] = []
+    inside = False
+    for argument in argv:
+        if argument == '--ros-args':
+            inside = True
+        (for_ros if inside else own).append(argument)
+        if argument == '--':
+            inside = False
+    return own, for_ros
 
 
 def estimator() -> int:

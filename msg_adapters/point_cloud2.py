@@ -1,0 +1,129 @@
+"""sensor_msgs/PointCloud2: the raw samples of one block, one point a sample.
+
+Little-endian fields in this order: ``seq`` UINT32 (the sample number modulo 2^32), ``dt`` UINT32
+(ns after header.stamp, which is the time of the first sample), then the six channels in volts,
+FLOAT32. A block in which some sample carries a flag has a ninth field, ``flags`` UINT32, so that
+replay sees all that the live pipeline saw; the others keep the eight that the contract names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from msg_adapters.header import Fields, header, stamp_ns
+from psd_deflection.records import CHANNELS, SampleBlock
+
+TYPE = 'sensor_msgs/msg/PointCloud2'
+FRAME = 'link_tip'
+
+UINT32 = 6
+FLOAT32 = 7
+
+PLAIN = np.dtype([('seq', '<u4'), ('dt', '<u4'), *((c, '<f4') for c in CHANNELS)])
+"""One sample: 32 bytes."""
+
+FLAGGED = np.dtype([*PLAIN.descr, ('flags', '<u4')])
+"""One sample of a block in which some sample carries a flag: 36 bytes."""
+
+MAX_SPAN_NS = 2**32 - 1
+"""The largest ``dt``: 4.29 s."""
+
+_FORMATS = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+
+
+# Every field is four bytes wide.
+_FLAGGED_FIELDS = [
+    {'name': name, 'offset': 4 * i, 'datatype': FLOAT32 if name in CHANNELS else UINT32, 'count': 1}
+    for i, name in enumerate(('seq', 'dt', *CHANNELS, 'flags'))
+]
+_PLAIN_FIELDS = _FLAGGED_FIELDS[:-1]
+
+
+def from_block(block: SampleBlock) -> Fields:
+    """Fields of one block whose samples lie at most ``MAX_SPAN_NS`` apart (see :func:`parts`)."""
+    flagged = bool(block.flags.any())
+    dtype = FLAGGED if flagged else PLAIN
+    width = len(block.seq)
+    t_ns = int(block.t_ns[0])
+    points = np.empty(width, dtype)
+    points['seq'] = block.seq & 0xFFFFFFFF
+    points['dt'] = block.t_ns - t_ns
+    for i, channel in enumerate(CHANNELS):
+        points[channel] = block.volts[:, i]
+    if flagged:
+        points['flags'] = block.flags
+    return {
+        'header': header(t_ns, FRAME),
+        'height': 1,
+        'width': width,
+        'fields': _FLAGGED_FIELDS if flagged else _PLAIN_FIELDS,
+        'is_bigendian': False,
+        'point_step': dtype.itemsize,
+        'row_step': dtype.itemsize * width,
+        'data': points.tobytes(),
+        'is_dense': True,
+    }
+
+
+def parts(block: SampleBlock) -> Iterator[SampleBlock]:
+    """The block itself or, where its samples lie too far apart for ``dt``, the block in pieces.
+
+    A device that was stopped within a block and started seconds later numbers on without a gap;
+    only then does one block take more than one message.
+    """
+    start = 0
+    while len(block.t_ns) > start:
+        if int(block.t_ns[-1]) - int(block.t_ns[start]) <= MAX_SPAN_NS:
+            end = len(block.t_ns)
+        else:
+            end = start + int(np.searchsorted(block.t_ns[start:] - block.t_ns[start], MAX_SPAN_NS, side='right'))
+        if start == 0 and end == len(block.t_ns):
+            yield block
+        else:
+            s = slice(start, end)
+            yield SampleBlock(block.index, block.seq[s], block.t_ns[s], block.volts[s], block.flags[s])
+        start = end
+
+
+def layout(fields: Mapping[str, Any]) -> npt.DTypeLike:
+    """The numpy dtype of the points of any PointCloud2 that has our fields, whatever else it has.
+
+    Raises ValueError naming the field that is absent, of another kind, or outside the point.
+    """
+    order = '>' if fields['is_bigendian'] else '<'
+    step = int(fields['point_step'])
+    names: list[str] = []
+    formats: list[str] = []
+    offsets: list[int] = []
+    for f in fields['fields']:
+        kind = _FORMATS.get(int(f['datatype']))
+        if kind is None or int(f['count']) != 1 or f['name'] in names or f['name'] == '':
+            continue
+        dtype = np.dtype(order + kind)
+        if int(f['offset']) + dtype.itemsize > step:
+            raise ValueError(f'field {f["name"]!r} at offset {f["offset"]} is outside a point of {step} bytes')
+        names.append(f['name'])
+        formats.append(dtype.str)
+        offsets.append(int(f['offset']))
+    for name in ('seq', 'dt', *CHANNELS):
+        if name not in names:
+            raise ValueError(f'has no field {name!r} (fields: {", ".join(names) or "none"})')
+    return np.dtype({'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': step})
+
+
+def to_points(fields: Mapping[str, Any]) -> tuple[int, npt.NDArray[np.void]]:
+    """(header.stamp in ns, the points as a structured array with at least our eight fields).
+
+    Raises ValueError where the layout or the size of the message contradicts itself.
+    """
+    width, height, step = int(fields['width']), int(fields['height']), int(fields['point_step'])
+    data = bytes(fields['data'])
+    if height != 1:
+        raise ValueError(f'height is {height}, not 1')
+    if step < 1 or width * step != len(data):
+        raise ValueError(f'{width} points of {step} bytes do not make {len(data)} bytes')
+    return stamp_ns(fields), np.frombuffer(data, layout(fields), count=width)

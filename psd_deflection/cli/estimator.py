@@ -1,0 +1,167 @@
+"""Acquire, estimate, publish on ROS 2 and record: the daemon.
+
+Without --port it starts a simulated rig of its own and says so, so that everything can be tried
+without hardware. Ctrl-C ends it and says how to replay what was recorded.
+
+  psd-deflection estimator                                   the simulated rig
+  psd-deflection estimator --port /dev/ttyACM0 --record      a device, recorded
+  ros2 run psd_deflection estimator --ros-args --params-file my_rig.yaml -p port:=/dev/ttyACM0
+
+While it runs:
+  ros2 topic echo /link_tip/deflection        the tip's pose, 50 a second
+  ros2 service call /estimator/zero std_srvs/srv/Trigger
+  ros2 service call /estimator/record std_srvs/srv/SetBool "{data: true}"
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import math
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from psd_deflection.config import read_parameter_file, rig_from_values
+from psd_deflection.errors import ConfigError
+from psd_deflection.runner.session import Session
+
+REFRESH_S = 0.25
+PLAIN_REFRESH_S = 5.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('--port', help='serial port of the device; without it a simulated rig is started')
+    parser.add_argument('--baud', type=int, help='line speed (default 921600; USB-CDC devices ignore it)')
+    parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig')
+    parser.add_argument(
+        '--record', nargs='?', const='', metavar='FOLDER', help='record from the start, below FOLDER (recordings/)'
+    )
+    parser.add_argument('--solver', help='solver whose answer is published as /link_tip/deflection')
+    parser.add_argument('--no-ros', action='store_true', help='acquire and record without ROS')
+    parser.add_argument('--ros-args', action='store_true', help='what follows is for ROS (ros2 run, ros2 launch)')
+
+
+def overrides_of(args: argparse.Namespace) -> dict[str, object]:
+    """The parameters that the arguments give; the file's values below the single ones."""
+    values: dict[str, object] = dict(read_parameter_file(args.params_file)) if args.params_file else {}
+    if args.port is not None:
+        values['port'] = args.port
+    if args.baud is not None:
+        values['baud'] = args.baud
+    if args.solver is not None:
+        values['solver'] = args.solver
+    if args.record is not None:
+        values['record'] = True
+        if args.record:
+            values['bag_dir'] = args.record
+    # Refuse them here, where the file's name is known.
+    rig_from_values(values, args.params_file or 'command line')
+    return values
+
+
+class Display:
+    """One live line on a terminal; a line every few seconds elsewhere. Its methods may be called by any thread."""
+
+    def __init__(self) -> None:
+        self._live = sys.stderr.isatty()
+        self._lock = threading.Lock()
+        self._last = 0.0
+        self._shown = False
+        self._samples = 0
+
+    def say(self, text: str) -> None:
+        """A message of its own line, above the live one."""
+        with self._lock:
+            self._clear()
+            print(text, file=sys.stderr, flush=True)
+
+    def update(self, session: Session) -> None:
+        """Show where things stand, when it is time to."""
+        now = time.monotonic()
+        passed = now - self._last
+        if passed < (REFRESH_S if self._live else PLAIN_REFRESH_S):
+            return
+        samples = session.acquisition.counters.samples
+        rate = (samples - self._samples) / passed if self._last else math.nan
+        self._last, self._samples = now, samples
+        text = live_line(session, rate)
+        with self._lock:
+            self._clear()
+            print(text, end='' if self._live else '\n', file=sys.stderr, flush=True)
+            self._shown = self._live
+
+    def _clear(self) -> None:
+        if self._shown:
+            print('\r\x1b[K', end='', file=sys.stderr)
+            self._shown = False
+
+
+def live_line(session: Session, rate: float) -> str:
+    """Rate, dX, dY in um, theta in mdeg with their standard deviations, losses."""
+    counters = session.acquisition.counters
+    estimate, spots = session.pipeline.last_estimate, session.pipeline.last_spots
+    head = f'{rate:6.0f} samples/s' if rate == rate else '     ? samples/s'
+    dropped = counters.queue_dropped + session.recorder.dropped
+    tail = f'lost {counters.lost + dropped}, bad frames {counters.bad}'
+    if session.recorder.folder is not None:
+        tail += '  ● rec'
+    if estimate is not None:
+        sd = [math.sqrt(estimate.covariance[i]) for i in (0, 4, 8)]
+        mdeg = 1e3 * 180.0 / math.pi
+        body = (
+            f'ΔX {estimate.dx * 1e6:+9.2f} ± {sd[0] * 1e6:.2f} µm  ΔY {estimate.dy * 1e6:+9.2f} ± {sd[1] * 1e6:.2f} µm  '
+            f'θ {estimate.theta * mdeg:+9.2f} ± {sd[2] * mdeg:.2f} mdeg'
+        )
+    else:
+        body = f'no estimate: {spots.reason}' if spots is not None and spots.reason else 'no estimate yet'
+    return f'{head}  {body}  {tail}'
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run until Ctrl-C."""
+    overrides = overrides_of(args)
+    display = Display()
+    recorded: list[Path] = []
+
+    def watch(session: Session) -> None:
+        folder = session.recorder.folder
+        if folder is not None and folder not in recorded:
+            recorded.append(folder)
+            display.say(f'recording to {folder}')
+        display.update(session)
+
+    if args.no_ros:
+        status = _run_without_ros(overrides, display, watch)
+    else:
+        if importlib.util.find_spec('rclpy') is None:
+            raise ConfigError(
+                "rclpy is not installed: source your ROS 2, or `pip install 'psd_deflection[ros]'`, "
+                'or run with --no-ros to acquire and record without it'
+            )
+        from psd_deflection.ros import estimator
+
+        status = estimator.run(args.ros_arguments, overrides, display.say, watch)
+    for folder in recorded:
+        display.say(f'recorded {folder}\n  replay it:  psd-deflection replay {folder} --compare')
+    return status
+
+
+def _run_without_ros(overrides: dict[str, object], display: Display, watch: Callable[[Session], None]) -> int:
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    session = Session(rig_from_values(overrides, 'command line'), display.say)
+    try:
+        session.start()
+        while not stop.wait(0.1) and session.processing.alive:
+            watch(session)
+    finally:
+        session.close()
+    if session.failed is not None:
+        raise session.failed
+    return 0

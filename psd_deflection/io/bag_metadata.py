@@ -1,0 +1,100 @@
+"""What rosbag2 Jazzy writes beside the messages: ``metadata.yaml`` version 9 and QoS profiles.
+
+The QoS of a topic stands twice in a bag, in ``metadata.yaml`` and in the MCAP channel; readers
+that compare them skip a topic where they differ, so both are made here from one value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+
+METADATA_VERSION = 9
+
+_INFINITE = {'sec': 9223372036, 'nsec': 854775807}
+
+Qos = Mapping[str, Any]
+
+
+def qos_profile(depth: int = 10, reliability: str = 'reliable', durability: str = 'volatile') -> Qos:
+    """One publisher's profile, named as rosbag2 names it from version 9 on."""
+    return {
+        'history': 'keep_last',
+        'depth': depth,
+        'reliability': reliability,
+        'durability': durability,
+        'deadline': dict(_INFINITE),
+        'lifespan': dict(_INFINITE),
+        'liveliness': 'automatic',
+        'liveliness_lease_duration': dict(_INFINITE),
+        'avoid_ros_namespace_conventions': False,
+    }
+
+
+DEFAULT_QOS = qos_profile()
+
+
+def qos_text(qos: Qos) -> str:
+    """The channel metadata ``offered_qos_profiles``."""
+    return to_yaml([dict(qos)])
+
+
+def to_yaml(tree: object) -> str:
+    """Block style, in the order given, as rosbag2 has it."""
+
+    class Dumper(yaml.SafeDumper):
+        def ignore_aliases(self, data: object) -> bool:
+            return True
+
+    text: str = yaml.dump(tree, Dumper=Dumper, sort_keys=False, default_flow_style=False, width=1000)
+    return text
+
+
+@dataclass(slots=True)
+class TopicCount:
+    """One topic of a bag."""
+
+    name: str
+    type: str
+    qos: Qos
+    type_hash: str
+    messages: int = 0
+
+
+def bag_information(
+    file_name: str, topics: Sequence[TopicCount], start_ns: int, end_ns: int, custom: Mapping[str, str]
+) -> dict[str, Any]:
+    """The tree below ``rosbag2_bagfile_information``; the bag is one file."""
+    count = sum(t.messages for t in topics)
+    # What rosbag2 has for a bag without a message.
+    start = {'nanoseconds_since_epoch': start_ns if count else 2**63 - 1}
+    duration = {'nanoseconds': end_ns - start_ns if count else 0}
+    return {
+        'version': METADATA_VERSION,
+        'storage_identifier': 'mcap',
+        'duration': duration,
+        'starting_time': start,
+        'message_count': count,
+        'topics_with_message_count': [
+            {
+                'topic_metadata': {
+                    'name': t.name,
+                    'type': t.type,
+                    'serialization_format': 'cdr',
+                    'offered_qos_profiles': [dict(t.qos)],
+                    'type_description_hash': t.type_hash,
+                },
+                'message_count': t.messages,
+            }
+            for t in topics
+        ],
+        'compression_format': '',
+        'compression_mode': '',
+        'relative_file_paths': [file_name],
+        'files': [{'path': file_name, 'starting_time': start, 'duration': duration, 'message_count': count}],
+        'custom_data': dict(custom),
+        'ros_distro': 'jazzy',
+    }

@@ -1,0 +1,86 @@
+"""A serial port as a source of bytes: opened by pyserial, read with select and ``os.read``.
+
+pyserial opens, locks and configures the port; reading one byte at a time through it would cost a
+quarter of a core at 1 kHz (field notes), so the bytes are read from the descriptor.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import select
+from pathlib import Path
+
+import serial
+
+from psd_deflection.errors import DeviceError
+
+READ_SIZE = 4096
+
+
+class PortClosedError(DeviceError):
+    """The port went away while it was open: unplugged, or the device restarted.
+
+    Example: ``/dev/ttyACM0: the device is gone``.
+    """
+
+
+class SerialPort:
+    """An open port. ``name`` as given; raises DeviceError naming it where it cannot be had."""
+
+    def __init__(self, name: str, baud: int) -> None:
+        self.name = name
+        try:
+            self._serial = serial.Serial(name, baud, timeout=0, write_timeout=1.0, exclusive=True)
+        except serial.SerialException as error:
+            raise DeviceError(f'{name}: {_why(error, name)}') from None
+        except (OSError, ValueError) as error:
+            raise DeviceError(f'{name}: cannot be opened at {baud} baud ({error})') from None
+        self._fd = self._serial.fileno()
+        if hasattr(self._serial, 'set_low_latency_mode'):
+            # Only some drivers have a latency timer to shorten.
+            with contextlib.suppress(OSError, ValueError, NotImplementedError):
+                self._serial.set_low_latency_mode(True)
+        self._serial.reset_input_buffer()
+
+    def read(self, timeout: float) -> bytes:
+        """What has come, at most 4096 bytes; empty after ``timeout`` s. PortClosedError if it is gone."""
+        try:
+            ready, _, _ = select.select((self._fd,), (), (), timeout)
+            if not ready:
+                return b''
+            received = os.read(self._fd, READ_SIZE)
+        except BlockingIOError:
+            return b''
+        except OSError as error:
+            raise PortClosedError(f'{self.name}: the device is gone ({error.strerror})') from None
+        if not received:
+            raise PortClosedError(f'{self.name}: the device is gone')
+        return received
+
+    def write(self, frame: bytes) -> None:
+        """Send to the device; PortClosedError if it is gone or takes nothing for a second."""
+        try:
+            self._serial.write(frame)
+        except (serial.SerialException, OSError) as error:
+            raise PortClosedError(f'{self.name}: cannot be written to ({error})') from None
+
+    def close(self) -> None:
+        """Give the port back."""
+        # A port that was pulled out has nothing left to close.
+        with contextlib.suppress(OSError):
+            self._serial.close()
+
+
+def _why(error: serial.SerialException, name: str) -> str:
+    number = error.errno if error.errno is not None else getattr(error.__context__, 'errno', None)
+    if number == errno.ENOENT or not Path(name).exists():
+        return 'no such port; `python -m serial.tools.list_ports` lists those that are there'
+    if number in (errno.EAGAIN, errno.EBUSY) or 'exclusively lock' in str(error):
+        return 'another program has the port open; close it (on Linux: `fuser NAME` names it)'.replace('NAME', name)
+    if number in (errno.EACCES, errno.EPERM):
+        return 'no permission; join the group that owns it (`sudo usermod -aG dialout $USER`, then log in anew)'
+    if number in (errno.ENOTTY, errno.EINVAL) or 'configure port' in str(error):
+        return 'not a serial port'
+    return f'cannot be opened ({error})'

@@ -1,0 +1,263 @@
+"""The serial frames of version 1: values on one side, bytes on the other.
+
+Theory of operation. A frame on the wire is ``COBS(type u8 | body | crc32 u32) 00``, little-endian,
+at most 512 bytes encoded, CRC-32 (zlib's) over type and body. COBS leaves no zero byte inside, so a
+zero always ends a frame and a receiver that joins late, or meets garbage, is in step again at the
+next zero. The decoder takes bytes, however they were split, and returns values; what it cannot
+accept is a :class:`BadFrame` with the reason, never an exception: the wire belongs to the world.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from enum import Enum, IntEnum
+from typing import NamedTuple
+
+from cobs import cobs
+
+PROTOCOL_VERSION = 1
+MAX_ENCODED = 512
+"""Longest encoded frame, without the closing zero."""
+
+NO_TEMPERATURE = 32767
+"""STATUS temperature of a device that has no thermometer."""
+
+
+class FrameType(IntEnum):
+    """First byte of a frame."""
+
+    SAMPLE = 0x01
+    STATUS = 0x02
+    HELLO = 0x10
+    HELLO_REQUEST = 0x11
+    PING = 0x12
+    PONG = 0x13
+    START = 0x14
+    STOP = 0x15
+
+
+class BadReason(Enum):
+    """Why bytes between two zeros are no frame."""
+
+    COBS = 'not COBS'
+    TOO_SHORT = 'shorter than type and CRC'
+    TOO_LONG = 'longer than 512 bytes'
+    CRC = 'CRC differs'
+    LENGTH = 'length does not fit the type'
+    BODY = 'body does not fit the type'
+    UNKNOWN_TYPE = 'unknown type'
+
+
+class SampleFrame(NamedTuple):
+    """SAMPLE: ``counts`` are x1 y1 sum1 x2 y2 sum2; ``t_device_us`` microseconds of device time."""
+
+    flags: int
+    seq: int
+    t_device_us: int
+    counts: tuple[int, int, int, int, int, int]
+
+
+class StatusFrame(NamedTuple):
+    """STATUS: samples the device dropped since power-up; temperature in 0.01 degrees C, or None."""
+
+    overruns: int
+    temperature_centi: int | None
+
+
+class HelloFrame(NamedTuple):
+    """HELLO: protocol version, and what the device says of itself (empty for another version)."""
+
+    version: int
+    info: dict[str, object]
+
+
+class HelloRequestFrame(NamedTuple):
+    """HELLO?: the host asks for a HELLO."""
+
+
+class PingFrame(NamedTuple):
+    """PING: the host asks the device for its time."""
+
+    cookie: int
+
+
+class PongFrame(NamedTuple):
+    """PONG: the device's time when it saw the PING with this cookie."""
+
+    cookie: int
+    t_device_us: int
+
+
+class StartFrame(NamedTuple):
+    """START: stream samples."""
+
+
+class StopFrame(NamedTuple):
+    """STOP: stream no samples."""
+
+
+class BadFrame(NamedTuple):
+    """Bytes that are no frame of ours: ``size`` encoded bytes up to the zero that ended them."""
+
+    reason: BadReason
+    size: int
+
+
+GoodFrame = SampleFrame | StatusFrame | HelloFrame | HelloRequestFrame | PingFrame | PongFrame | StartFrame | StopFrame
+Frame = GoodFrame | BadFrame
+
+_EMPTY: dict[int, GoodFrame] = {
+    FrameType.HELLO_REQUEST: HelloRequestFrame(),
+    FrameType.START: StartFrame(),
+    FrameType.STOP: StopFrame(),
+}
+MAX_DEVICE_US = 1 << 53
+"""285 years: a device time beyond it is no time, and would not fit the host's nanoseconds."""
+
+_SAMPLE = struct.Struct('<BBIQ6h')
+_STATUS = struct.Struct('<BIh')
+_PING = struct.Struct('<BQ')
+_PONG = struct.Struct('<BQQ')
+_CRC = struct.Struct('<I')
+
+
+def _seal(payload: bytes) -> bytes:
+    sealed: bytes = cobs.encode(payload + _CRC.pack(zlib.crc32(payload)))
+    return sealed + b'\x00'
+
+
+def encode(frame: GoodFrame) -> bytes:
+    """The bytes of one frame, closing zero included.
+
+    Raises ValueError where a field does not fit, or a HELLO is longer than 512 bytes encoded.
+    """
+    try:
+        match frame:
+            case SampleFrame(flags, seq, t_device_us, counts):
+                return _seal(_SAMPLE.pack(FrameType.SAMPLE, flags, seq, t_device_us, *counts))
+            case StatusFrame(overruns, temperature):
+                value = NO_TEMPERATURE if temperature is None else temperature
+                return _seal(_STATUS.pack(FrameType.STATUS, overruns, value))
+            case HelloFrame(version, info):
+                body = json.dumps(info, separators=(',', ':')).encode()
+                sealed = _seal(bytes((FrameType.HELLO, version)) + body)
+                if len(sealed) > MAX_ENCODED + 1:
+                    raise ValueError(f'HELLO is {len(sealed) - 1} bytes encoded, at most {MAX_ENCODED}')
+                return sealed
+            case HelloRequestFrame():
+                return _seal(bytes((FrameType.HELLO_REQUEST,)))
+            case PingFrame(cookie):
+                return _seal(_PING.pack(FrameType.PING, cookie))
+            case PongFrame(cookie, t_device_us):
+                return _seal(_PONG.pack(FrameType.PONG, cookie, t_device_us))
+            case StartFrame():
+                return _seal(bytes((FrameType.START,)))
+            case StopFrame():
+                return _seal(bytes((FrameType.STOP,)))
+    except struct.error as error:
+        raise ValueError(f'{frame!r}: {error}') from None
+
+
+def _parse(payload: bytes, size: int) -> Frame:
+    """``payload``: type, body and CRC, COBS taken off; ``size``: encoded, for the report."""
+    if len(payload) < 5:
+        return BadFrame(BadReason.TOO_SHORT, size)
+    body = payload[:-4]
+    if zlib.crc32(body) != _CRC.unpack_from(payload, len(payload) - 4)[0]:
+        return BadFrame(BadReason.CRC, size)
+    kind = body[0]
+    if kind == FrameType.SAMPLE:
+        if len(body) != _SAMPLE.size:
+            return BadFrame(BadReason.LENGTH, size)
+        _, flags, seq, t_device_us, *counts = _SAMPLE.unpack(body)
+        if t_device_us > MAX_DEVICE_US:
+            return BadFrame(BadReason.BODY, size)
+        return SampleFrame(flags, seq, t_device_us, tuple(counts))
+    if kind == FrameType.STATUS:
+        if len(body) != _STATUS.size:
+            return BadFrame(BadReason.LENGTH, size)
+        _, overruns, temperature = _STATUS.unpack(body)
+        return StatusFrame(overruns, None if temperature == NO_TEMPERATURE else temperature)
+    if kind == FrameType.HELLO:
+        return _parse_hello(body, size)
+    if kind == FrameType.PONG:
+        return PongFrame(*_PONG.unpack(body)[1:]) if len(body) == _PONG.size else BadFrame(BadReason.LENGTH, size)
+    if kind == FrameType.PING:
+        return PingFrame(*_PING.unpack(body)[1:]) if len(body) == _PING.size else BadFrame(BadReason.LENGTH, size)
+    empty = _EMPTY.get(kind)
+    if empty is None:
+        return BadFrame(BadReason.UNKNOWN_TYPE, size)
+    return empty if len(body) == 1 else BadFrame(BadReason.LENGTH, size)
+
+
+def _parse_hello(body: bytes, size: int) -> Frame:
+    if len(body) < 2:
+        return BadFrame(BadReason.LENGTH, size)
+    version = body[1]
+    if version != PROTOCOL_VERSION:
+        # What follows the version is that version's business; that it is another one is the news.
+        return HelloFrame(version, {})
+    try:
+        info = json.loads(body[2:].decode('utf-8'))
+    except (ValueError, RecursionError):
+        return BadFrame(BadReason.BODY, size)
+    if not isinstance(info, dict):
+        return BadFrame(BadReason.BODY, size)
+    return HelloFrame(version, info)
+
+
+class FrameDecoder:
+    """Cuts a stream at its zeros; holds at most one unfinished frame of ``MAX_ENCODED`` bytes.
+
+    What it returns does not depend on how the stream was split. The bytes before the first zero are
+    the tail of a frame that began before we listened: if they are no frame, they are passed over
+    without a :class:`BadFrame`.
+    """
+
+    def __init__(self) -> None:
+        self._rest = b''
+        self._dropped = 0
+        self._in_step = False
+
+    def feed(self, received: bytes) -> list[Frame]:
+        """The frames that end in ``received``, in order."""
+        pieces = received.split(b'\x00')
+        if len(pieces) == 1:
+            self._keep(received)
+            return []
+        frames: list[Frame] = []
+        self._keep(pieces[0])
+        self._close(frames)
+        for piece in pieces[1:-1]:
+            self._rest = piece
+            if len(piece) > MAX_ENCODED:
+                self._keep(b'')
+            self._close(frames)
+        self._keep(pieces[-1])
+        return frames
+
+    def _keep(self, more: bytes) -> None:
+        if self._dropped:
+            self._dropped += len(more)
+            return
+        self._rest = self._rest + more if self._rest else more
+        if len(self._rest) > MAX_ENCODED:
+            self._dropped, self._rest = len(self._rest), b''
+
+    def _close(self, frames: list[Frame]) -> None:
+        encoded, dropped, in_step = self._rest, self._dropped, self._in_step
+        self._rest, self._dropped, self._in_step = b'', 0, True
+        frame: Frame
+        if dropped:
+            frame = BadFrame(BadReason.TOO_LONG, dropped)
+        elif not encoded:
+            return
+        else:
+            try:
+                frame = _parse(cobs.decode(encoded), len(encoded))
+            except cobs.DecodeError:
+                frame = BadFrame(BadReason.COBS, len(encoded))
+        if in_step or not isinstance(frame, BadFrame):
+            frames.append(frame)

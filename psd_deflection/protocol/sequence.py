@@ -1,0 +1,64 @@
+"""Sequence numbers past 32 bits, and what a jump in them means.
+
+The wire's ``seq`` wraps at 2^32 (49 days at 1 kHz). Blocks are cut by the extended number, which
+only ever rises: a device that starts again from zero is put at the next multiple of
+``alignment`` above the last sample, so that its blocks stay aligned to its own numbers.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+WRAP = 1 << 32
+
+
+class Step(Enum):
+    """How a sample follows the one before it."""
+
+    FIRST = 'first'
+    NEXT = 'next'
+    GAP = 'gap'
+    REPEAT = 'repeat'
+    RESTART = 'restart'
+
+
+NEARBY = 64
+"""Samples within which a number is taken as a neighbour of the last one, whatever the clock says."""
+
+
+class SequenceExtender:
+    """Extends u32 sequence numbers to 64 bits.
+
+    A number just ahead of the last one follows it, even where the device's clock jumped. One
+    further ahead (modulo 2^32, less than half way round) is a gap if device time went on. One at
+    or just behind the last, with a device time that is not newer, is a duplicated frame. Anything
+    else is a device that started again.
+    """
+
+    def __init__(self, alignment: int) -> None:
+        self._alignment = alignment
+        self._last: int | None = None
+        self._last_time = 0
+        self._offset = 0
+
+    def extend(self, seq: int, t_device_us: int) -> tuple[int, Step, int]:
+        """``(extended number, step, samples missing before it)``.
+
+        After a RESTART the number of missing samples cannot be known and is given as 0. A REPEAT
+        leaves the state as it was.
+        """
+        last = self._last
+        if last is None:
+            self._last, self._last_time = seq, t_device_us
+            return seq, Step.FIRST, 0
+        ahead = (seq + self._offset - last) % WRAP
+        if 0 < ahead < NEARBY or (ahead < WRAP // 2 and ahead > 0 and t_device_us > self._last_time):
+            self._last, self._last_time = last + ahead, t_device_us
+            return last + ahead, (Step.NEXT if ahead == 1 else Step.GAP), ahead - 1
+        behind = -ahead % WRAP
+        if behind < NEARBY and t_device_us <= self._last_time:
+            return last - behind, Step.REPEAT, 0
+        base = -(-(last + 1) // self._alignment) * self._alignment
+        self._offset = base % WRAP
+        self._last, self._last_time = base + seq, t_device_us
+        return base + seq, Step.RESTART, 0

@@ -1,0 +1,80 @@
+"""The parameters of ``config.PARAMETERS`` as ROS parameters, with types, ranges and units.
+
+What is given on the command line, in a launch file or in a parameter file reaches the node as
+overrides. They are checked by the same code as everywhere else, so that ``0`` for a length is
+refused by name, and a whole number will do for a ``double``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+
+from psd_deflection import config
+from psd_deflection.config import PARAMETERS, Rig, check_value, rig_from_values
+from psd_deflection.errors import ConfigError
+from psd_deflection.runner.session import Session
+
+ROS_OWN = ('use_sim_time', 'start_type_description_service')
+QOS_PREFIX = 'qos_overrides.'
+SOURCE = 'ROS parameters'
+
+
+def rig_of_node(node: Node, extra: Mapping[str, object]) -> Rig:
+    """The rig that the node's overrides describe, with ``extra`` on top, and declare it.
+
+    The node was made with ``automatically_declare_parameters_from_overrides``. Raises ConfigError
+    for an unknown parameter, a wrong type or a value out of bounds.
+    """
+    given: dict[str, object] = {}
+    for name, parameter in node.get_parameters_by_prefix('').items():
+        if name in ROS_OWN or name.startswith(QOS_PREFIX):
+            continue
+        value = parameter.value
+        given[name] = list(value) if not isinstance(value, (str, bool, int, float)) and value is not None else value
+    rig = rig_from_values({**given, **extra}, SOURCE)
+    for parameter in PARAMETERS:
+        if node.has_parameter(parameter.name):
+            node.undeclare_parameter(parameter.name)
+        node.declare_parameter(parameter.name, rig.values[parameter.name], _descriptor(parameter), ignore_override=True)
+    return rig
+
+
+def _descriptor(parameter: config.Parameter) -> ParameterDescriptor:
+    unit = f' [{parameter.unit}]' if parameter.unit else ''
+    descriptor = ParameterDescriptor(
+        name=parameter.name,
+        description=parameter.description + unit,
+        additional_constraints=parameter.bound_text()
+        or (f'one of {", ".join(parameter.choices)}' if parameter.choices else ''),
+        read_only=not parameter.live,
+    )
+    low = parameter.minimum if parameter.minimum is not None else parameter.above
+    if low is not None and parameter.maximum is not None:
+        if parameter.kind == 'double':
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=parameter.maximum)]
+        elif parameter.kind == 'integer':
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(parameter.maximum), step=1)]
+    return descriptor
+
+
+def watch(node: Node, session: Session) -> None:
+    """Carry out changes of the parameters that may change while the node runs; refuse the others."""
+
+    def change(changed: list[RosParameter]) -> SetParametersResult:
+        for parameter in changed:
+            declared = config.BY_NAME.get(parameter.name)
+            if declared is None:
+                continue
+            try:
+                value = check_value(declared, parameter.value, SOURCE)
+            except ConfigError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+            if parameter.name == 'sum_min' and isinstance(value, float):
+                session.pipeline.set_sum_min(value)
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(change)

@@ -1,0 +1,331 @@
+"""The reader thread: bytes from the port to chunks with host times, in a bounded queue.
+
+The reader owns the port, the frame decoder, the sequence numbers and the clock. It hands over a
+chunk as soon as a block's last sample came, so that an estimate waits for nothing. When the
+consumer is too slow the newest chunk is dropped and counted; the reader never waits.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from psd_deflection.config import Rig
+from psd_deflection.errors import DeviceError
+from psd_deflection.io.serial_port import PortClosedError, SerialPort
+from psd_deflection.protocol.frames import (
+    PROTOCOL_VERSION,
+    BadFrame,
+    BadReason,
+    Frame,
+    FrameDecoder,
+    HelloFrame,
+    HelloRequestFrame,
+    SampleFrame,
+    StartFrame,
+    StatusFrame,
+    encode,
+)
+from psd_deflection.protocol.sequence import SequenceExtender, Step
+from psd_deflection.records import CHANNELS, RawChunk
+from psd_deflection.timing import ClockMap, ClockState
+
+SILENCE_S = 2.0
+"""A device that sends no frame for this long is reported."""
+
+RETRY_S = 0.25
+READ_TIMEOUT_S = 0.1
+
+Say = Callable[[str], None]
+
+
+@dataclass(slots=True)
+class Chunk:
+    """A RawChunk on its way, with the monotonic time at which its last byte was read, ns."""
+
+    raw: RawChunk
+    read_ns: int
+
+
+class Restarted:
+    """On the queue: the device started anew; the unfinished block is all there will be of it."""
+
+
+class Ended:
+    """On the queue: nothing follows."""
+
+
+Item = Chunk | Restarted | Ended
+
+
+@dataclass(slots=True)
+class AcquisitionCounters:
+    """What came off the wire. Written by the reader alone; anyone may read."""
+
+    bytes: int = 0
+    samples: int = 0
+    lost: int = 0
+    repeated: int = 0
+    queue_dropped: int = 0
+    device_dropped: int = 0
+    device_overruns: int = 0
+    restarts: int = 0
+    disconnects: int = 0
+    bad_frames: dict[str, int] = field(default_factory=dict)
+    temperature: float | None = None
+
+    @property
+    def bad(self) -> int:
+        """Frames that were none, of every reason."""
+        return sum(self.bad_frames.values())
+
+
+def check_hello(frame: HelloFrame, rig: Rig, port: str) -> float:
+    """Volts per count of a device that fits the rig; DeviceError naming what does not."""
+    if frame.version != PROTOCOL_VERSION:
+        raise DeviceError(
+            f'{port}: the device speaks protocol version {frame.version}, this is version {PROTOCOL_VERSION}; '
+            'update its firmware or psd_deflection'
+        )
+    info = frame.info
+    channels = info.get('channels')
+    if channels != list(CHANNELS):
+        raise DeviceError(f'{port}: HELLO has channels {channels!r}, needed are {list(CHANNELS)!r}')
+    rate = info.get('sample_rate_hz')
+    wanted = rig.converter.sample_rate_hz
+    if isinstance(rate, bool) or not isinstance(rate, (int, float)) or abs(rate - wanted) > 1e-3 * wanted:
+        raise DeviceError(
+            f'{port}: HELLO has sample_rate_hz {rate!r}, the rig file says {wanted:g}; '
+            'set converter.sample_rate_hz to what the device does'
+        )
+    volts = info.get('volts_per_count')
+    if isinstance(volts, bool) or not isinstance(volts, (int, float)) or not 0.0 < volts < 1.0:
+        raise DeviceError(f'{port}: HELLO has volts_per_count {volts!r}, needed is a number between 0 and 1 V')
+    expected = rig.converter.volts_per_count
+    if abs(volts - expected) > 1e-3 * expected:
+        raise DeviceError(
+            f'{port}: HELLO has volts_per_count {volts!r}, the rig file gives {expected:g} '
+            '(converter.full_scale and converter.bits); make them agree'
+        )
+    return float(volts)
+
+
+class Acquisition:
+    """Reads one device until stopped. ``say``: told of every change of state, one line each."""
+
+    def __init__(self, rig: Rig, say: Say) -> None:
+        self.counters = AcquisitionCounters()
+        self.hello: HelloFrame | None = None
+        self.queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self._rig = rig
+        self._name = rig.acquisition.port
+        self._say = say
+        self._block_size = rig.estimator.block_size
+        self._latency_ns = round(rig.acquisition.latency_offset * 1e9)
+        self._clock = ClockMap()
+        # Monotonic time is mapped to ROS time by one constant: a step of the wall clock while
+        # running must not tear the stamps apart.
+        self._to_ros_ns = time.time_ns() - time.monotonic_ns()
+        self._sequence = SequenceExtender(self._block_size)
+        self._decoder = FrameDecoder()
+        self._last_t_ns = 0
+        self._volts_per_count = rig.converter.volts_per_count
+        self._port: SerialPort | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name='reader', daemon=True)
+        self._seq: list[int] = []
+        self._t_us: list[int] = []
+        self._counts: list[tuple[int, ...]] = []
+        self._flags: list[int] = []
+
+    def open(self) -> None:
+        """Open the port and hear the device out.
+
+        Raises DeviceError where the port cannot be had, no frame comes in 2 s, or the device does
+        not fit the rig.
+        """
+        self._port = SerialPort(self._name, self._rig.acquisition.baud)
+        try:
+            self._port.write(b'\x00' + encode(HelloRequestFrame()) + encode(StartFrame()))
+            decoder = FrameDecoder()
+            received = frames = 0
+            deadline = time.monotonic() + SILENCE_S
+            while (left := deadline - time.monotonic()) > 0:
+                data = self._port.read(left)
+                received += len(data)
+                for frame in decoder.feed(data):
+                    frames += not isinstance(frame, BadFrame)
+                    if isinstance(frame, HelloFrame):
+                        self._volts_per_count = check_hello(frame, self._rig, self._name)
+                        self.hello = frame
+                        return
+        except BaseException:
+            self._port.close()
+            raise
+        self._port.close()
+        if frames:
+            raise DeviceError(f'{self._name}: samples come but no HELLO in {SILENCE_S:g} s; does the firmware send it?')
+        if received:
+            raise DeviceError(
+                f'{self._name}: {received} bytes but no frame in {SILENCE_S:g} s; is the baud rate '
+                f'({self._rig.acquisition.baud}) right, and is this the PSD device?'
+            )
+        raise DeviceError(f'{self._name}: no frame in {SILENCE_S:g} s; is the device powered and this its port?')
+
+    def start(self) -> None:
+        """Start the reader thread; :meth:`open` came before."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the reader and close the port; an Ended item is the last on the queue."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        if self._port is not None:
+            self._port.close()
+
+    def clock_state(self) -> ClockState:
+        """How the device's clock stands to the host's."""
+        return self._clock.state()
+
+    def _run(self) -> None:
+        silent_since = time.monotonic()
+        try:
+            while not self._stop.is_set():
+                port = self._port
+                if port is None:
+                    self._stop.wait(RETRY_S)
+                    self._reopen()
+                    silent_since = time.monotonic()
+                    continue
+                try:
+                    received = port.read(READ_TIMEOUT_S)
+                except PortClosedError as error:
+                    self._disconnected(error)
+                    continue
+                now = time.monotonic_ns()
+                if received:
+                    self.counters.bytes += len(received)
+                    if self._take(self._decoder.feed(received), now):
+                        silent_since = now / 1e9
+                elif self._seq:
+                    self._hand_over(now)
+                if now / 1e9 - silent_since > SILENCE_S:
+                    self._say(f'{self._name}: no frame for {SILENCE_S:g} s; still listening')
+                    silent_since = now / 1e9
+        finally:
+            self._hand_over(time.monotonic_ns())
+            self.queue.put(Ended())
+
+    def _disconnected(self, error: PortClosedError) -> None:
+        self.counters.disconnects += 1
+        self._hand_over(time.monotonic_ns())
+        if self._port is not None:
+            self._port.close()
+        self._port = None
+        self._say(f'{error}; waiting for it to come back')
+
+    def _reopen(self) -> None:
+        try:
+            port = SerialPort(self._name, self._rig.acquisition.baud)
+            port.write(b'\x00' + encode(HelloRequestFrame()) + encode(StartFrame()))
+        except DeviceError:
+            return
+        self._port = port
+        self._decoder = FrameDecoder()
+        self._say(f'{self._name}: the device is back')
+
+    def _take(self, frames: list[Frame], now: int) -> bool:
+        """Sort the frames of one read; True where one of them was a frame of ours."""
+        counters = self.counters
+        newest = -1
+        good = False
+        for frame in frames:
+            if type(frame) is SampleFrame:
+                good = True
+                flags, seq, t_us, counts = frame
+                number, step, missing = self._sequence.extend(seq, t_us)
+                if step is not Step.NEXT and not self._unusual(step, missing):
+                    continue
+                if flags & 2:
+                    counters.device_dropped += 1
+                if self._seq and number // self._block_size != self._seq[0] // self._block_size:
+                    self._hand_over(now)
+                newest = t_us
+                self._seq.append(number)
+                self._t_us.append(t_us)
+                self._counts.append(counts)
+                self._flags.append(flags)
+                counters.samples += 1
+                if number % self._block_size == self._block_size - 1:
+                    self._observe(newest, now)
+                    newest = -1
+                    self._hand_over(now)
+            elif type(frame) is BadFrame:
+                name = frame.reason.value
+                counters.bad_frames[name] = counters.bad_frames.get(name, 0) + 1
+                good = good or frame.reason is BadReason.UNKNOWN_TYPE
+            else:
+                good = True
+                self._other(frame)
+        if newest >= 0:
+            self._observe(newest, now)
+        return good
+
+    def _observe(self, t_us: int, now: int) -> None:
+        if self._clock.observe(t_us, now):
+            self._say(f"{self._name}: the device's clock jumped; times are laid anew")
+
+    def _unusual(self, step: Step, missing: int) -> bool:
+        """Count a sample that does not simply follow; False where it is to be passed over."""
+        if step is Step.REPEAT:
+            self.counters.repeated += 1
+            return False
+        if step is Step.GAP:
+            self.counters.lost += missing
+        elif step is Step.RESTART:
+            self.counters.restarts += 1
+            self._hand_over(time.monotonic_ns())
+            self.queue.put(Restarted())
+            self._say(f'{self._name}: the device started anew')
+        return True
+
+    def _other(self, frame: Frame) -> None:
+        if isinstance(frame, StatusFrame):
+            self.counters.device_overruns = frame.overruns
+            if frame.temperature_centi is not None:
+                self.counters.temperature = frame.temperature_centi / 100.0
+        elif isinstance(frame, HelloFrame) and frame != self.hello:
+            try:
+                self._volts_per_count = check_hello(frame, self._rig, self._name)
+                self.hello = frame
+            except DeviceError as error:
+                self._say(f'{error}; kept to the first HELLO')
+
+    def _hand_over(self, now: int) -> None:
+        if not self._seq:
+            return
+        seq, t_us, counts, flags = self._seq, self._t_us, self._counts, self._flags
+        self._seq, self._t_us, self._counts, self._flags = [], [], [], []
+        t_ns = self._clock.to_host_ns(np.array(t_us, np.int64)) + (self._to_ros_ns - self._latency_ns)
+        # A clock laid anew may point before what was already stamped: time does not go back.
+        if t_ns[0] <= self._last_t_ns or bool((t_ns[1:] <= t_ns[:-1]).any()):
+            steps = np.arange(1, len(t_ns) + 1)
+            t_ns = np.maximum.accumulate(np.maximum(t_ns - steps, self._last_t_ns)) + steps
+        self._last_t_ns = int(t_ns[-1])
+        if self.queue.qsize() >= self._rig.acquisition.queue_blocks:
+            self.counters.queue_dropped += len(seq)
+            return
+        raw = RawChunk(
+            np.array(seq, np.int64),
+            t_ns,
+            np.array(counts, np.int16),
+            np.array(flags, np.uint8),
+            self._volts_per_count,
+        )
+        self.queue.put(Chunk(raw, now))

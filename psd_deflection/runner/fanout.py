@@ -1,0 +1,45 @@
+"""Encodes each record once and hands the bytes to every wire: ROS publishers and the recorder."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from msg_adapters import to_messages
+from psd_deflection.io import cdr
+from psd_deflection.records import Record, ZeroChange
+
+
+class Wire(Protocol):
+    """Takes encoded messages."""
+
+    def put(self, topic: str, type_name: str, cdr: bytes, t_ns: int) -> None:
+        """``type_name`` as ``pkg/msg/Name``; ``t_ns`` is the header's stamp."""
+
+
+class ZeroWire(Protocol):
+    """Takes changes of the unloaded dots, which are no message."""
+
+    def put_zero(self, change: ZeroChange) -> None:
+        """Note the change."""
+
+
+class Fanout:
+    """A sink of records. ``wires`` in the order in which they are served."""
+
+    def __init__(self) -> None:
+        self.wires: list[Wire] = []
+        self.zero_wires: list[ZeroWire] = []
+
+    def put(self, record: Record) -> None:
+        """Encode and hand on."""
+        if isinstance(record, ZeroChange):
+            for zero_wire in self.zero_wires:
+                zero_wire.put_zero(record)
+            return
+        for topic, type_name, t_ns, fields in to_messages(record):
+            encoded = cdr.encode(type_name, fields)
+            for wire in self.wires:
+                wire.put(topic, type_name, encoded, t_ns)
+
+    def close(self) -> None:
+        """Nothing is held back."""

@@ -1,0 +1,147 @@
+"""Once a second: what the run looks like, in numbers, for ``/diagnostics`` and for the terminal."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from psd_deflection.records import BlockStatus, DiagnosticEntry, DiagnosticReport
+from psd_deflection.runner.session import Session
+
+OK, WARN, ERROR, STALE = 0, 1, 2, 3
+
+
+class _Seen(NamedTuple):
+    t_ns: int
+    samples: int
+    lost: int
+    bad: int
+    dropped: int
+    blocks: int
+    estimates: int
+
+
+class HealthReporter:
+    """Compares the run's counters with those of the last report."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._seen: _Seen | None = None
+
+    def report(self, t_ns: int) -> DiagnosticReport:
+        """The report for the time since the last one. ``t_ns``: now, ROS time."""
+        s = self._session
+        wire, pipeline = s.acquisition.counters, s.pipeline.counters
+        dropped = wire.queue_dropped + s.recorder.dropped
+        now = _Seen(t_ns, wire.samples, wire.lost, wire.bad, dropped, pipeline.blocks, pipeline.estimates)
+        # The first report counts from the start; its rates are those of an unknown time.
+        before = self._seen
+        self._seen = now
+        seconds = (now.t_ns - before.t_ns) / 1e9 if before is not None else 0.0
+        new = _Seen(0, *(b - a for a, b in zip(before[1:], now[1:], strict=True))) if before is not None else now
+
+        def rate(count: int) -> str:
+            return f'{count / seconds:.2f}' if seconds > 0 else 'unknown'
+
+        return DiagnosticReport(
+            t_ns,
+            (
+                self._acquisition(new, rate(new.samples)),
+                self._clock(),
+                self._estimates(new, rate(new.estimates)),
+                self._laser(1),
+                self._laser(2),
+                self._recording(),
+            ),
+        )
+
+    def _acquisition(self, new: _Seen, rate: str) -> DiagnosticEntry:
+        s = self._session
+        wire = s.acquisition.counters
+        level, message = OK, 'samples flow'
+        if new.samples == 0:
+            level, message = ERROR, 'no samples'
+        elif new.lost or new.bad or new.dropped:
+            level, message = WARN, f'{new.lost} samples lost, {new.bad} bad frames, {new.dropped} dropped'
+        values = [
+            ('port', s.rig.acquisition.port),
+            ('rate (samples/s)', rate),
+            ('samples', str(wire.samples)),
+            ('lost', str(wire.lost)),
+            ('repeated', str(wire.repeated)),
+            ('bad frames', str(wire.bad)),
+            *((f'bad frames: {reason}', str(count)) for reason, count in sorted(wire.bad_frames.items())),
+            ('dropped by the device', str(wire.device_overruns)),
+            ('dropped by a full queue', str(wire.queue_dropped)),
+            ('device restarts', str(wire.restarts)),
+            ('disconnects', str(wire.disconnects)),
+        ]
+        if wire.temperature is not None:
+            values.append(('device temperature (degC)', f'{wire.temperature:.2f}'))
+        return DiagnosticEntry('psd_deflection: acquisition', level, message, tuple(values))
+
+    def _clock(self) -> DiagnosticEntry:
+        clock = self._session.acquisition.clock_state()
+        values = (
+            ('skew (ppm)', f'{clock.skew_ppm:.2f}'),
+            ('offset (ns)', str(clock.offset_ns)),
+            ('residual (us)', f'{clock.residual_ns / 1e3:.1f}'),
+            ('seconds in the fit', str(clock.points)),
+            ('laid anew', str(clock.resets)),
+        )
+        return DiagnosticEntry('psd_deflection: clock', OK, f'skew {clock.skew_ppm:.1f} ppm', values)
+
+    def _estimates(self, new: _Seen, rate: str) -> DiagnosticEntry:
+        pipeline, latency = self._session.pipeline.counters, self._session.processing.latency()
+        spots = self._session.pipeline.last_spots
+        level, message = OK, 'estimates flow'
+        if new.estimates == 0:
+            level, message = ERROR, spots.reason if spots is not None and spots.reason else 'no blocks'
+        elif new.estimates < new.blocks:
+            level, message = WARN, f'{new.blocks - new.estimates} of {new.blocks} blocks have no estimate'
+        values = [
+            ('rate (estimates/s)', rate),
+            ('blocks', str(pipeline.blocks)),
+            ('estimates', str(pipeline.estimates)),
+            *((f'refused: {cause}', str(count)) for cause, count in sorted(pipeline.refused.items())),
+        ]
+        if latency is not None:
+            values.append(('latency, median (ms)', f'{latency.median * 1e3:.3f}'))
+            values.append(('latency, worst of a second (ms)', f'{latency.worst * 1e3:.3f}'))
+        return DiagnosticEntry('psd_deflection: estimates', level, message, tuple(values))
+
+    def _laser(self, psd: int) -> DiagnosticEntry:
+        name = f'psd_deflection: psd_{psd}'
+        spots = self._session.pipeline.last_spots
+        if spots is None:
+            return DiagnosticEntry(name, STALE, 'no block yet', ())
+        total = spots.sums[psd - 1]
+        x, y = spots.dots[2 * psd - 2], spots.dots[2 * psd - 1]
+        lost = total < self._session.rig.estimator.sum_min
+        mine = lost or (
+            spots.status in (BlockStatus.SATURATED, BlockStatus.OUTSIDE_ACTIVE_AREA) and f'{psd} ' in spots.reason
+        )
+        values = (
+            ('sum (V)', f'{total:.4f}'),
+            ('x (mm)', f'{x * 1e3:.4f}'),
+            ('y (mm)', f'{y * 1e3:.4f}'),
+            ('x, std in the block (um)', f'{spots.covariance[2 * psd - 2, 2 * psd - 2] ** 0.5 * 1e6:.2f}'),
+            ('y, std in the block (um)', f'{spots.covariance[2 * psd - 1, 2 * psd - 1] ** 0.5 * 1e6:.2f}'),
+        )
+        return DiagnosticEntry(
+            name, ERROR if mine else OK, (spots.reason or 'laser lost') if mine else 'dot seen', values
+        )
+
+    def _recording(self) -> DiagnosticEntry:
+        recorder = self._session.recorder
+        folder = recorder.folder
+        values = (
+            ('folder', str(folder or '')),
+            ('messages', str(recorder.written)),
+            ('dropped', str(recorder.dropped)),
+        )
+        return DiagnosticEntry(
+            'psd_deflection: recording',
+            WARN if recorder.dropped else OK,
+            'recording' if folder else 'not recording',
+            values,
+        )

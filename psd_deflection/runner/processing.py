@@ -1,0 +1,150 @@
+"""The pipeline thread: takes chunks off the queue, runs the pipeline, gives its records to the sinks.
+
+It is the only thread that touches the pipeline. Requests from other threads (take the zero, start
+or stop a recording) are carried out between two blocks, so that none of them falls into one.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import Record
+from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Restarted
+
+T = TypeVar('T')
+
+REQUEST_TIMEOUT_S = 1.0
+
+
+class RecordSink(Protocol):
+    """Takes records."""
+
+    def put(self, record: Record) -> None:
+        """One record, in order."""
+
+
+@dataclass(slots=True)
+class Latency:
+    """Last byte read -> records given to the first sink, over the last second, s."""
+
+    median: float
+    worst: float
+
+
+class Processing:
+    """Runs ``pipeline`` over what ``acquisition`` reads; ``sinks`` take the records in their order."""
+
+    def __init__(self, acquisition: Acquisition, pipeline: Pipeline, say: Callable[[str], None]) -> None:
+        self.pipeline = pipeline
+        self.sinks: list[RecordSink] = []
+        self.failed: BaseException | None = None
+        self._acquisition = acquisition
+        self._say = say
+        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._latencies: deque[float] = deque(maxlen=50)
+        self._thread = threading.Thread(target=self._run, name='pipeline', daemon=True)
+        self._refusal = ''
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def join(self, timeout: float | None = None) -> None:
+        """Wait until everything that was read is processed; the acquisition was stopped before."""
+        if self._thread.ident is not None:
+            self._thread.join(timeout)
+
+    @property
+    def alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread.is_alive()
+
+    def latency(self) -> Latency | None:
+        """How long the last second's blocks took, or None before the first."""
+        taken = sorted(self._latencies)
+        return Latency(taken[len(taken) // 2], taken[-1]) if taken else None
+
+    def request(self, action: Callable[[], T]) -> T:
+        """Run ``action`` between two blocks and return what it returns; its errors come through.
+
+        Raises TimeoutError where no data flows for a second.
+        """
+        box: queue.SimpleQueue[tuple[T | None, BaseException | None]] = queue.SimpleQueue()
+        cancelled = threading.Event()
+
+        def run() -> None:
+            if cancelled.is_set():
+                return
+            try:
+                box.put((action(), None))
+            except Exception as error:
+                box.put((None, error))
+
+        if not self.alive:
+            run()
+        else:
+            self._requests.put(run)
+        try:
+            value, error = box.get(timeout=REQUEST_TIMEOUT_S)
+        except queue.Empty:
+            cancelled.set()
+            raise TimeoutError('no data flows') from None
+        if error is not None:
+            raise error
+        return value  # type: ignore[return-value]
+
+    def give(self, records: list[Record]) -> None:
+        """Hand records to every sink, in order."""
+        for sink in self.sinks:
+            for record in records:
+                sink.put(record)
+
+    def _run(self) -> None:
+        try:
+            while True:
+                try:
+                    item = self._acquisition.queue.get(timeout=0.1)
+                except queue.Empty:
+                    self._carry_out()
+                    continue
+                if isinstance(item, Chunk):
+                    records = self.pipeline.process(item.raw)
+                    if records:
+                        self.give(records)
+                        self._latencies.append((time.monotonic_ns() - item.read_ns) / 1e9)
+                        self._tell_refusals()
+                elif isinstance(item, Restarted):
+                    self.give(self.pipeline.flush())
+                else:
+                    self.give(self.pipeline.flush())
+                    self._carry_out()
+                    return
+                self._carry_out()
+        except BaseException as error:
+            self.failed = error
+            raise
+
+    def _carry_out(self) -> None:
+        while not self._requests.empty():
+            self._requests.get()()
+
+    def _tell_refusals(self) -> None:
+        """Say once when estimates stop coming and why, and once when they are back."""
+        spots = self.pipeline.last_spots
+        if spots is None:
+            return
+        cause = spots.status.name if spots.reason else ''
+        if cause == self._refusal:
+            return
+        self._refusal = cause
+        self._say(f'no estimate: {spots.reason}' if cause else 'estimates are back')
+
+
+__all__ = ['Ended', 'Latency', 'Processing']

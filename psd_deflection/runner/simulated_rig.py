@@ -1,0 +1,50 @@
+"""Starts the simulated rig as a process of its own, as a device would be."""
+
+from __future__ import annotations
+
+import json
+import select
+import subprocess
+import sys
+
+from psd_deflection.config import Rig
+from psd_deflection.errors import DeviceError
+
+START_S = 20.0
+PORT_LINE = 'port: '
+
+
+class SimulatedRigProcess:
+    """The process behind ``port``; it ends when this one closes its standard input, or dies."""
+
+    def __init__(self, rig: Rig) -> None:
+        effects = {f'effects.{name}': value for name, value in rig.effects.items()}
+        # A session of its own: Ctrl-C in the terminal is for the daemon, which ends the rig itself.
+        self._process = subprocess.Popen(
+            [sys.executable, '-m', 'psd_deflection', 'simulate', '--serve', '--attached'],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+        if self._process.stdin is None or self._process.stdout is None:
+            raise DeviceError('the simulated rig has no pipes')
+        self._process.stdin.write(json.dumps({**rig.values, **effects}).encode() + b'\n')
+        self._process.stdin.flush()
+        ready, _, _ = select.select((self._process.stdout,), (), (), START_S)
+        line = self._process.stdout.readline().decode() if ready else ''
+        if not line.startswith(PORT_LINE):
+            self.close()
+            raise DeviceError('the simulated rig did not start; try `psd-deflection simulate --serve`')
+        self.port = line[len(PORT_LINE) :].strip()
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        try:
+            self._process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()

@@ -1,0 +1,229 @@
+"""``exact``: weighted rigid registration of the plate to the beams; the default.
+
+The flat plate's model, m_i = R(-theta)(l_i - d) - c_i, has no small angle in it. Minimise
+
+    F = sum_i wx_i rx_i^2 + wy_i ry_i^2,     r_i = q_i - R(-theta) l_i + f,   f = R(-theta) d,
+
+with w the inverse variances. For a given theta the best f is a weighted mean for each axis; what is
+left is a function of one angle,
+
+    F/2 = (P c^2 + 2 Q c s + R s^2)/2 - A c - B s + constant,     c = cos theta, s = sin theta.
+
+Where the weights of x and y agree, Q = 0 and P = R, and tan theta = B/A is the closed form (the
+orthogonal Procrustes problem: Schoenemann 1966; Arun, Huang & Blostein 1987). For two PSDs that is
+the turn of the base line between the dots, whatever the weights of the PSDs. Otherwise Newton's
+method starts there and doubles its digits each time. The covariance is (J^T W J)^-1 at the answer.
+"""
+
+from __future__ import annotations
+
+from math import atan2, cos, sin
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from psd_deflection.errors import SolverError
+from psd_deflection.records import FloatArray
+from psd_deflection.solvers._geometry import check_twist
+from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers._plane import interleave, split, turn_covariance, weighted_covariance
+
+_MAX_STEPS = 30
+_LAST_STEP = 1e-10
+"""rad. Newton's next correction would be of the order of its square, below the last digit."""
+
+_CHUNK = 4096
+"""Blocks worked on at once: their intermediate arrays stay in the processor's cache."""
+
+
+class ExactSolver(Solver):
+    """Maximum likelihood for a flat plate, P >= 2 PSDs, exact in the angle.
+
+    ``Geometry.heights`` and tilts are not in its model; cantilever tilts of the thesis rig cost it
+    at most some micrometres (``docs/methods.md``), the ``beam`` solver removes that.
+    """
+
+    name: ClassVar[str] = 'exact'
+
+    def __init__(self, geometry: Geometry) -> None:
+        """Bind to ``geometry``. Raises SolverError where the beams coincide."""
+        self._count = check_twist(geometry)
+        self._centers = np.asarray(geometry.centers, dtype=np.float64)
+        self._beams = np.asarray(geometry.beams, dtype=np.float64)
+        (self._c1x, self._c1y), (self._c2x, self._c2y) = self._centers[:2].tolist()
+        (self._l1x, self._l1y), (self._l2x, self._l2y) = self._beams[:2].tolist()
+
+    def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
+        """One block; pure floats for two PSDs. See :class:`Solver`."""
+        if self._count != 2:
+            return _one(self.solve_many(np.array([dots]), np.array(variances)))
+        x1, y1, x2, y2 = dots
+        vx1, vy1, vx2, vy2 = variances
+        try:
+            # Reduced weights of the differences between the two dots: 1/(1/w1 + 1/w2).
+            mx = 1.0 / (vx1 + vx2)
+            my = 1.0 / (vy1 + vy2)
+        except ZeroDivisionError:
+            raise SolverError('solve: variances must be above 0 m^2') from None
+        q1x = self._c1x + x1
+        q1y = self._c1y + y1
+        l1x = self._l1x
+        l1y = self._l1y
+        qx = q1x - self._c2x - x2
+        qy = q1y - self._c2y - y2
+        lx = l1x - self._l2x
+        ly = l1y - self._l2y
+        theta = atan2(qx * ly - qy * lx, qx * lx + qy * ly)
+        c = cos(theta)
+        s = sin(theta)
+        steps = 0
+        status = SolverStatus.OK
+        if mx != my:
+            theta, c, s, steps = _newton(
+                theta,
+                (mx - my) * (ly * ly - lx * lx),
+                (mx - my) * lx * ly,
+                mx * qx * lx + my * qy * ly,
+                mx * qx * ly - my * qy * lx,
+            )
+        if theta != theta or steps == _MAX_STEPS:
+            status = SolverStatus.NOT_CONVERGED
+        # The base line under the beams, in plate axes, and what the dots miss it by.
+        px = c * lx + s * ly
+        py = c * ly - s * lx
+        ex = (qx - px) * mx
+        ey = (qy - py) * my
+        rx1 = ex * vx1
+        ry1 = ey * vy1
+        # The plate point under beam 1: where dot 1 is, less its residual.
+        p1x = q1x - rx1
+        p1y = q1y - ry1
+        dx = l1x - c * p1x + s * p1y
+        dy = l1y - s * p1x - c * p1y
+        vtt = 1.0 / (mx * py * py + my * px * px)
+        # Weighted mean of the plate points: of y with the weights of x, and the other way round.
+        mean_y = p1y - py * vx1 * mx
+        mean_x = p1x - px * vy1 * my
+        vxt = mean_y * vtt
+        vyt = -mean_x * vtt
+        covariance = turn_covariance(
+            c, s, vx1 * vx2 * mx + mean_y * vxt, -mean_x * vxt, vy1 * vy2 * my - mean_x * vyt, vxt, vyt, vtt
+        )
+        return Solution(dx, dy, theta, 0.0, 0.0, covariance, (rx1, ry1, -ex * vx2, -ey * vy2), status, steps)
+
+    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
+        """N blocks. See :class:`Solver`."""
+        x, y, vx, vy = split(dots, variances)
+        n = x.shape[0]
+        pose = np.empty((n, 3))
+        covariance = np.empty((n, 3, 3))
+        residual = np.empty((n, 2 * self._count))
+        status = np.empty(n, dtype=np.int8)
+        for start in range(0, n, _CHUNK):
+            part = slice(start, start + _CHUNK)
+            v_part = part if vx.shape[0] > 1 else slice(None)
+            pose[part], covariance[part], residual[part], status[part] = self._chunk(
+                x[part], y[part], 1.0 / vx[v_part], 1.0 / vy[v_part]
+            )
+        return Solutions(pose, np.zeros((n, 2)), covariance, residual, status)
+
+    def _chunk(
+        self, x: FloatArray, y: FloatArray, wx: FloatArray, wy: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        qx = self._centers[:, 0] + x
+        qy = self._centers[:, 1] + y
+        lx = self._beams[:, 0]
+        ly = self._beams[:, 1]
+        theta = _procrustes(qx, qy, lx, ly, wx * wy / (wx + wy))
+        sum_x = wx.sum(axis=1, keepdims=True)
+        sum_y = wy.sum(axis=1, keepdims=True)
+        converged = np.isfinite(theta)
+        if (wx != wy).any():
+            # Each axis of the residual is centred with its own weights.
+            xx, xy, xq = (a - (wx * a).sum(axis=1, keepdims=True) / sum_x for a in (lx, ly, qx))
+            yx, yy, yq = (a - (wy * a).sum(axis=1, keepdims=True) / sum_y for a in (lx, ly, qy))
+            difference = (wx * (xy * xy - xx * xx) + wy * (yx * yx - yy * yy)).sum(axis=1)
+            mixed = (wx * xx * xy - wy * yx * yy).sum(axis=1)
+            along = (wx * xq * xx + wy * yq * yy).sum(axis=1)
+            across = (wx * xq * xy - wy * yq * yx).sum(axis=1)
+            theta, converged = _newton_many(theta, difference, mixed, along, across)
+        c = np.cos(theta)
+        s = np.sin(theta)
+        c1 = c[:, None]
+        s1 = s[:, None]
+        rx = qx - (c1 * lx + s1 * ly)
+        ry = qy - (c1 * ly - s1 * lx)
+        fx = -(wx * rx).sum(axis=1, keepdims=True) / sum_x
+        fy = -(wy * ry).sum(axis=1, keepdims=True) / sum_y
+        rx += fx
+        ry += fy
+        pose = np.column_stack((c * fx[:, 0] - s * fy[:, 0], s * fx[:, 0] + c * fy[:, 0], theta))
+        covariance = weighted_covariance(qx - rx, qy - ry, wx, wy, c, s)
+        status = np.where(converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED)
+        return pose, covariance, interleave(rx, ry), status
+
+
+def _one(many: Solutions) -> Solution:
+    dx, dy, theta = many.pose[0].tolist()
+    return Solution(
+        dx,
+        dy,
+        theta,
+        0.0,
+        0.0,
+        tuple(many.covariance[0].ravel().tolist()),
+        tuple(many.residual[0].tolist()),
+        SolverStatus(int(many.status[0])),
+        0,
+    )
+
+
+def _procrustes(qx: FloatArray, qy: FloatArray, lx: FloatArray, ly: FloatArray, w: FloatArray) -> FloatArray:
+    """The turn (n,) of q (n, P) onto l (P,) with weights (n or 1, P)."""
+    total = w.sum(axis=1, keepdims=True)
+    ax = w * (lx - (w * lx).sum(axis=1, keepdims=True) / total)
+    ay = w * (ly - (w * ly).sum(axis=1, keepdims=True) / total)
+    theta: FloatArray = np.arctan2((qx * ay - qy * ax).sum(axis=1), (qx * ax + qy * ay).sum(axis=1))
+    return theta
+
+
+def _newton(
+    theta: float, difference: float, mixed: float, along: float, across: float
+) -> tuple[float, float, float, int]:
+    """Minimise F from ``theta``: difference R - P, mixed Q, along A, across B of the module's text."""
+    c = cos(theta)
+    s = sin(theta)
+    steps = 0
+    while steps < _MAX_STEPS:
+        steps += 1
+        turned = c * c - s * s
+        slope = difference * s * c + mixed * turned + along * s - across * c
+        curvature = difference * turned - 4.0 * mixed * s * c + along * c + across * s
+        # The magnitude of the curvature: a step is always downhill.
+        step = slope / abs(curvature)
+        theta -= step
+        c = cos(theta)
+        s = sin(theta)
+        if abs(step) < _LAST_STEP:
+            break
+    return theta, c, s, steps
+
+
+def _newton_many(
+    theta: FloatArray, difference: FloatArray, mixed: FloatArray, along: FloatArray, across: FloatArray
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """:func:`_newton` for n blocks, until the slowest has ended; with which of them converged."""
+    converged = np.zeros(theta.shape, dtype=bool)
+    for _ in range(_MAX_STEPS):
+        c = np.cos(theta)
+        s = np.sin(theta)
+        turned = c * c - s * s
+        slope = difference * s * c + mixed * turned + along * s - across * c
+        curvature = difference * turned - 4.0 * mixed * s * c + along * c + across * s
+        step = slope / np.abs(curvature)
+        theta = theta - step
+        converged = np.abs(step) < _LAST_STEP
+        if converged.all():
+            break
+    return theta, converged

@@ -1,0 +1,174 @@
+"""``iterative``: the thesis's section 2.2 as it was meant.
+
+Turn both dots back about the tip's centroid by one trial angle theta; each PSD then says by itself
+how far the tip went (2.18, 2.19),
+
+    Delta_i = l_i - R(theta) q_i.
+
+At the right angle they agree. The thesis steps the angle by 0.01 degree and stops at the first
+trial where the differences are *below* a tolerance (2.20-2.23, without a magnitude), with one
+angle a PSD; that stops up to 57 mdeg too early, or at zero. Here the trial angle is one for both,
+the disagreement is counted alike in x and y and in both signs, and the angle is corrected by what
+the disagreement says until it changes no more. d is then the mean of the Delta_i.
+"""
+
+from __future__ import annotations
+
+from math import cos, sin
+from typing import ClassVar
+
+import numpy as np
+
+from psd_deflection.records import FloatArray
+from psd_deflection.solvers._geometry import check_twist
+from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers._plane import Covariance, interleave, split, turn_covariance, turn_covariance_many
+
+_MAX_TRIALS = 50
+_LAST_STEP = 1e-8
+"""rad. What is left after a correction is a third of its cube, below the last digit."""
+
+
+_LARGEST_STEP = 0.5
+"""rad. A larger correction is a tangent far from where it was drawn."""
+
+
+class IterativeSolver(Solver):
+    """Trial angles until the PSDs agree, P >= 2 PSDs. All dots count alike, whatever their noise.
+
+    The covariance is that of this unweighted answer: G V G^T, V the dots' own.
+    """
+
+    name: ClassVar[str] = 'iterative'
+
+    def __init__(self, geometry: Geometry) -> None:
+        """Bind to ``geometry``. Raises SolverError where the beams coincide."""
+        self._count = check_twist(geometry)
+        self._centers = np.asarray(geometry.centers, dtype=np.float64)
+        self._beams = np.asarray(geometry.beams, dtype=np.float64)
+        middle = self._beams.mean(axis=0)
+        mx, my = middle.tolist()
+        self._spread = float(((self._beams - middle) ** 2).sum())
+        self._lx = mx
+        self._ly = my
+        self._rows = tuple(
+            (cx, cy, lx - mx, ly - my)
+            for (cx, cy), (lx, ly) in zip(self._centers.tolist(), self._beams.tolist(), strict=True)
+        )
+
+    def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
+        """One block, pure floats. See :class:`Solver`."""
+        count = self._count
+        plate = [(r[0] + dots[2 * i], r[1] + dots[2 * i + 1], r[2], r[3]) for i, r in enumerate(self._rows)]
+        mx = my = 0.0
+        for qx, qy, _, _ in plate:
+            mx += qx
+            my += qy
+        mx /= count
+        my /= count
+        # How well the turned dots lie along the beams, and how far across: all that a trial needs.
+        along = across = 0.0
+        for qx, qy, lx, ly in plate:
+            along += (qx - mx) * lx + (qy - my) * ly
+            across += (qx - mx) * ly - (qy - my) * lx
+        theta = 0.0
+        status = SolverStatus.NOT_CONVERGED
+        trials = 0
+        while trials < _MAX_TRIALS:
+            trials += 1
+            c = cos(theta)
+            s = sin(theta)
+            disagreement = across * c - along * s
+            agreement = along * c + across * s
+            step = disagreement / abs(agreement) if agreement else 1.0
+            step = max(-_LARGEST_STEP, min(_LARGEST_STEP, step))
+            theta += step
+            if abs(step) < _LAST_STEP:
+                status = SolverStatus.OK
+                break
+        c = cos(theta)
+        s = sin(theta)
+        dx = self._lx - c * mx + s * my
+        dy = self._ly - s * mx - c * my
+        residual: list[float] = []
+        for qx, qy, lx, ly in plate:
+            residual.append(qx - mx - c * lx - s * ly)
+            residual.append(qy - my + s * lx - c * ly)
+        covariance = self._covariance(c, s, mx, my, variances)
+        return Solution(dx, dy, theta, 0.0, 0.0, covariance, tuple(residual), status, trials)
+
+    def _covariance(self, c: float, s: float, mx: float, my: float, variances: tuple[float, ...]) -> Covariance:
+        """G V G^T in plate axes, turned to the base's; (mx, my) is the centroid of the plate points."""
+        count = self._count
+        sum_x = sum_y = with_x = with_y = vtt = 0.0
+        for i, (_, _, lx, ly) in enumerate(self._rows):
+            vx = variances[2 * i]
+            vy = variances[2 * i + 1]
+            px = (c * lx + s * ly) / self._spread
+            py = (c * ly - s * lx) / self._spread
+            sum_x += vx
+            sum_y += vy
+            with_x += py * vx
+            with_y -= px * vy
+            vtt += py * py * vx + px * px * vy
+        with_x /= count
+        with_y /= count
+        squared = count * count
+        return turn_covariance(
+            c,
+            s,
+            sum_x / squared - 2.0 * my * with_x + my * my * vtt,
+            mx * with_x - my * with_y - mx * my * vtt,
+            sum_y / squared + 2.0 * mx * with_y + mx * mx * vtt,
+            my * vtt - with_x,
+            -mx * vtt - with_y,
+            vtt,
+        )
+
+    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
+        """N blocks. See :class:`Solver`."""
+        x, y, vx, vy = split(dots, variances)
+        n = x.shape[0]
+        qx = self._centers[:, 0] + x
+        qy = self._centers[:, 1] + y
+        lx = self._beams[:, 0] - self._lx
+        ly = self._beams[:, 1] - self._ly
+        mx = qx.mean(axis=1)
+        my = qy.mean(axis=1)
+        along = ((qx - mx[:, None]) * lx + (qy - my[:, None]) * ly).sum(axis=1)
+        across = ((qx - mx[:, None]) * ly - (qy - my[:, None]) * lx).sum(axis=1)
+        theta = np.zeros(n)
+        converged = np.zeros(n, dtype=bool)
+        for _ in range(_MAX_TRIALS):
+            c = np.cos(theta)
+            s = np.sin(theta)
+            agreement = np.abs(along * c + across * s)
+            step = np.divide(across * c - along * s, agreement, out=np.ones(n), where=agreement != 0.0)
+            step = np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
+            theta += step
+            converged = np.abs(step) < _LAST_STEP
+            if converged.all():
+                break
+        c = np.cos(theta)
+        s = np.sin(theta)
+        pose = np.column_stack((self._lx - c * mx + s * my, self._ly - s * mx - c * my, theta))
+        c1 = c[:, None]
+        s1 = s[:, None]
+        residual = interleave(qx - mx[:, None] - c1 * lx - s1 * ly, qy - my[:, None] + s1 * lx - c1 * ly)
+        px = (c1 * lx + s1 * ly) / self._spread
+        py = (c1 * ly - s1 * lx) / self._spread
+        with_x = (py * vx).mean(axis=1)
+        with_y = -(px * vy).mean(axis=1)
+        vtt = (py * py * vx + px * px * vy).sum(axis=1)
+        covariance = turn_covariance_many(
+            c,
+            s,
+            vx.mean(axis=1) / self._count - 2.0 * my * with_x + my * my * vtt,
+            mx * with_x - my * with_y - mx * my * vtt,
+            vy.mean(axis=1) / self._count + 2.0 * mx * with_y + mx * mx * vtt,
+            my * vtt - with_x,
+            -mx * vtt - with_y,
+            vtt,
+        )
+        status = np.where(converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED).astype(np.int8)
+        return Solutions(pose, np.zeros((n, 2)), covariance, residual, status)

@@ -1,0 +1,64 @@
+"""Records of every kind, made up for the tests of recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from psd_deflection.records import (
+    AppliedLoad,
+    BlockStatus,
+    DeflectionEstimate,
+    DiagnosticEntry,
+    DiagnosticReport,
+    Record,
+    ReferencePose,
+    SampleBlock,
+    SpotMeans,
+    TemperatureReading,
+    TipLoad,
+)
+
+T0 = 1_760_000_000_123_456_789
+STEP = 1_000_000
+
+
+def block(index: int, *, lost: tuple[int, ...] = (), flags: int = 0, t0: int = T0, first_index: int = 0) -> SampleBlock:
+    """Block ``index`` of 20 samples at 1 kHz whose time starts at ``t0`` with block ``first_index``."""
+    seq = np.array([s for s in range(20 * index, 20 * index + 20) if s - 20 * index not in lost], dtype=np.int64)
+    t_ns = t0 + (seq - 20 * first_index) * STEP
+    volts = np.random.default_rng(index).normal(0.0, 3.0, (len(seq), 6)).astype(np.float32)
+    flag = np.zeros(len(seq), dtype=np.uint8)
+    flag[0] = flags
+    return SampleBlock(index, seq, t_ns, volts, flag)
+
+
+def spots(index: int, status: BlockStatus = BlockStatus.OK) -> SpotMeans:
+    t_ns = T0 + 20 * STEP * index + 9_500_000
+    dots = (1e-3, -2e-3, 1e-4 * index, 0.0)
+    return SpotMeans(t_ns, index, dots, (5.0, 5.0), np.eye(4) * 1e-12, 20, 0, status, '')
+
+
+def estimate(index: int, solver: str = 'exact', primary: bool = True) -> DeflectionEstimate:
+    t_ns = T0 + 20 * STEP * index + 9_500_000
+    covariance = (1e-12, 1e-13, 2e-13, 1e-13, 3e-12, 1e-14, 2e-13, 1e-14, 1e-11)
+    return DeflectionEstimate(t_ns, index, solver, 1e-3 * index, -5e-4, 0.01, 1e-4, -2e-3, covariance, 1e-7, primary)
+
+
+def run(blocks: int) -> Iterator[Record]:
+    """What a live run hands to its recorder, one record of every kind at least."""
+    yield TemperatureReading(T0, 21.5)
+    for i in range(blocks):
+        lost = (3, 4) if i % 7 == 2 else ()
+        yield block(i, lost=lost, flags=2 if lost else 0)
+        yield spots(i)
+        yield estimate(i)
+        yield estimate(i, 'wls', primary=False)
+        yield TipLoad(T0 + 20 * STEP * i + 9_500_000, 0.5 * i, -0.25, 0.01)
+        if i % 10 == 0:
+            yield AppliedLoad(T0 + 20 * STEP * i, 0.5 * i, 0.0, 0.1)
+            yield ReferencePose(T0 + 20 * STEP * i, 1e-3, 2e-3, 3e-3)
+        if i % 50 == 49:
+            entry = DiagnosticEntry('psd_deflection: samples', 1, '2 lost', (('rate', '998.0'),))
+            yield DiagnosticReport(T0 + 20 * STEP * i, (entry,))

@@ -1,0 +1,232 @@
+"""Records to message fields and back, with rosbags' own message store as the judge of the bytes."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+from msg_adapters import (
+    DEFLECTION,
+    DEFLECTION_WITH_COVARIANCE,
+    SAMPLES,
+    SPOTS,
+    TOPIC_TYPES,
+    from_fields,
+    point_cloud2,
+    pose_with_covariance_stamped,
+    solver_topic,
+    to_messages,
+)
+from msg_adapters.header import header, stamp_ns
+from msg_adapters.orientation import angles, quaternion
+from psd_deflection.io import cdr
+from psd_deflection.io.ros2msg import TYPE_HASHES, definition
+from psd_deflection.records import (
+    CHANNELS,
+    AppliedLoad,
+    BlockStatus,
+    DiagnosticEntry,
+    DiagnosticReport,
+    FloatArray,
+    ReferencePose,
+    SampleBlock,
+    TemperatureReading,
+    TipLoad,
+)
+
+from .making import STEP, T0, block, estimate, run, spots
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+
+times = st.integers(0, 2**31 * 10**9 - 1)
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+
+
+def rotation(theta: float, phi: float, omega: float) -> FloatArray:
+    """R = Ry(omega) Rx(phi) Rz(theta), written out as matrices."""
+    s, c = math.sin, math.cos
+    ry = np.array([[c(omega), 0, s(omega)], [0, 1, 0], [-s(omega), 0, c(omega)]])
+    rx = np.array([[1, 0, 0], [0, c(phi), -s(phi)], [0, s(phi), c(phi)]])
+    rz = np.array([[c(theta), -s(theta), 0], [s(theta), c(theta), 0], [0, 0, 1]])
+    r: FloatArray = ry @ rx @ rz
+    return r
+
+
+@given(st.floats(-math.pi, math.pi), st.floats(-1.5, 1.5), st.floats(-math.pi, math.pi))
+def test_quaternion_is_the_rotation_of_the_contract(theta: float, phi: float, omega: float) -> None:
+    q = quaternion(theta, phi, omega)
+    x, y, z, w = (q[k] for k in 'xyzw')
+    assert abs(x * x + y * y + z * z + w * w - 1.0) < 1e-15
+    got = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    np.testing.assert_allclose(got, rotation(theta, phi, omega), atol=1e-14)
+    back = angles(q)
+    np.testing.assert_allclose(rotation(*back), rotation(theta, phi, omega), atol=1e-7)
+
+
+def test_a_quaternion_that_was_never_filled_in_has_no_angles() -> None:
+    assert all(map(math.isnan, angles({'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 0.0})))
+
+
+@given(times)
+def test_stamps_lose_no_nanosecond(t_ns: int) -> None:
+    assert stamp_ns({'header': header(t_ns, '')}) == t_ns
+
+
+@pytest.mark.parametrize('name', sorted(TYPE_HASHES))
+def test_definitions_are_the_standard_ones(name: str) -> None:
+    typed = get_typestore(Stores.EMPTY)
+    from rosbags.typesys import get_types_from_msg
+
+    typed.register(get_types_from_msg(definition(name), name))
+    assert typed.hash_rihs01(name) == STORE.hash_rihs01(name) == TYPE_HASHES[name]
+    for part, fields in typed.fielddefs.items():
+        assert fields == STORE.fielddefs[part]
+
+
+def test_every_topic_type_is_defined() -> None:
+    assert set(TOPIC_TYPES.values()) == set(TYPE_HASHES)
+
+
+@given(times, numbers, numbers, numbers)
+def test_inputs_come_back_as_they_went(t_ns: int, a: float, b: float, c: float) -> None:
+    for record in (AppliedLoad(t_ns, a, b, c), TemperatureReading(t_ns, a)):
+        (m,) = to_messages(record)
+        back = from_fields(m.topic, cdr.decode(m.type, cdr.encode(m.type, m.fields)))
+        assert back == record
+        assert type(back) is type(record)
+
+
+@given(times, numbers, numbers, st.floats(-3.1, 3.1))
+def test_a_reference_comes_back_as_it_went(t_ns: int, dx: float, dy: float, theta: float) -> None:
+    (m,) = to_messages(ReferencePose(t_ns, dx, dy, theta))
+    back = from_fields(m.topic, cdr.decode(m.type, cdr.encode(m.type, m.fields)))
+    assert isinstance(back, ReferencePose)
+    assert back[:3] == (t_ns, dx, dy)
+    assert back.theta == pytest.approx(theta, abs=1e-15, rel=1e-15)
+
+
+def test_an_estimated_load_is_no_input() -> None:
+    (m,) = to_messages(TipLoad(T0, 1.0, 2.0, 3.0))
+    assert m.topic == '/link_tip/wrench'
+    with pytest.raises(ValueError, match='not an input'):
+        from_fields(m.topic, m.fields)
+
+
+def test_an_independent_decoder_reads_every_message_as_the_fields_say() -> None:
+    seen = set()
+    for record in run(60):
+        for m in to_messages(record):
+            raw = cdr.encode(m.type, m.fields)
+            assert raw[:4] == b'\0\1\0\0'
+            decoded = STORE.deserialize_cdr(raw, m.type)
+            assert STORE.serialize_cdr(decoded, m.type) == raw or m.type == point_cloud2.TYPE
+            stamp = decoded.header.stamp
+            assert stamp.sec * 10**9 + stamp.nanosec == m.t_ns
+            assert cdr.decode(m.type, raw) == m.fields
+            seen.add(m.topic)
+    assert seen == {*TOPIC_TYPES, solver_topic('exact'), solver_topic('wls')}
+
+
+@pytest.mark.parametrize('flags', [0, 1])
+def test_an_independent_decoder_reads_the_samples_of_a_block(flags: int) -> None:
+    given_block = block(7, lost=(0, 13), flags=flags)
+    (m,) = to_messages(given_block)
+    cloud = STORE.deserialize_cdr(cdr.encode(m.type, m.fields), m.type)
+    names = [f.name for f in cloud.fields]
+    assert names == ['seq', 'dt', *CHANNELS] + (['flags'] if flags else [])
+    assert [f.offset for f in cloud.fields] == [4 * i for i in range(len(names))]
+    assert [f.datatype for f in cloud.fields][:8] == [6, 6, 7, 7, 7, 7, 7, 7]
+    assert (cloud.height, cloud.width, cloud.point_step) == (1, 18, 36 if flags else 32)
+    assert cloud.header.frame_id == 'link_tip'
+    formats = ['<u4', '<u4', *['<f4'] * 6, '<u4'][: len(names)]
+    points = np.frombuffer(cloud.data.tobytes(), np.dtype(list(zip(names, formats, strict=True))))
+    np.testing.assert_array_equal(points['seq'], given_block.seq)
+    np.testing.assert_array_equal(points['dt'] + given_block.t_ns[0], given_block.t_ns)
+    for i, c in enumerate(CHANNELS):
+        np.testing.assert_array_equal(points[c], given_block.volts[:, i])
+
+
+def test_seq_is_recorded_modulo_2_to_the_32() -> None:
+    start = 2**32 // 20
+    (m,) = to_messages(block(start, first_index=start))
+    _, points = point_cloud2.to_points(m.fields)
+    assert points['seq'][0] == 2**32 - 16
+    assert points['seq'][-1] == 3
+
+
+def test_a_block_with_a_long_pause_takes_two_messages() -> None:
+    whole = block(0)
+    t_ns = whole.t_ns.copy()
+    t_ns[12:] += 10 * 10**9
+    paused = SampleBlock(0, whole.seq, t_ns, whole.volts, whole.flags)
+    first, second = to_messages(paused)
+    assert (first.fields['width'], second.fields['width']) == (12, 8)
+    t, points = point_cloud2.to_points(second.fields)
+    np.testing.assert_array_equal(t + points['dt'].astype(np.int64), t_ns[12:])
+
+
+def test_points_that_contradict_themselves_are_refused() -> None:
+    (m,) = to_messages(block(0))
+    for change, message in (
+        ({'width': 21}, 'do not make'),
+        ({'height': 2}, 'height'),
+        ({'point_step': 28, 'width': 20, 'data': bytes(560)}, 'outside a point'),
+        ({'fields': m.fields['fields'][1:]}, "no field 'seq'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            point_cloud2.to_points({**m.fields, **change})
+
+
+@pytest.mark.parametrize('status', BlockStatus)
+def test_a_dot_that_was_not_seen_is_not_published(status: BlockStatus) -> None:
+    seen = status in (BlockStatus.OK, BlockStatus.OUTSIDE_ACTIVE_AREA, BlockStatus.NOT_SOLVED)
+    assert [m.topic for m in to_messages(spots(1, status))] == (list(SPOTS) if seen else [])
+
+
+def test_only_the_primary_estimate_is_the_deflection() -> None:
+    assert [m.topic for m in to_messages(estimate(1, 'wls', primary=False))] == ['/link_tip/wls/deflection']
+    primary = to_messages(estimate(1))
+    assert [m.topic for m in primary] == ['/link_tip/exact/deflection', DEFLECTION, DEFLECTION_WITH_COVARIANCE]
+    assert all(m.fields['header']['frame_id'] == 'link_tip_rest' for m in primary)
+
+
+def test_the_covariance_stands_at_x_y_and_yaw() -> None:
+    e = estimate(3)
+    fields = pose_with_covariance_stamped.from_estimate(e)
+    k = np.array(fields['pose']['covariance']).reshape(6, 6)
+    np.testing.assert_array_equal(k[np.ix_([0, 1, 5], [0, 1, 5])].ravel(), e.covariance)
+    np.testing.assert_array_equal(np.diag(k)[2:5], [1e6, 1e6, 1e6])
+    assert pose_with_covariance_stamped.to_covariance(fields) == e.covariance
+
+
+def test_diagnostics_keep_levels_and_values() -> None:
+    report = DiagnosticReport(T0, (DiagnosticEntry('clock', 2, 'lost', (('skew_ppm', '12.5'), ('µ', '°'))),))
+    (m,) = to_messages(report)
+    decoded = STORE.deserialize_cdr(cdr.encode(m.type, m.fields), m.type)
+    status = decoded.status[0]
+    assert (status.level, status.name, status.message) == (2, 'clock', 'lost')
+    assert [(v.key, v.value) for v in status.values] == [('skew_ppm', '12.5'), ('µ', '°')]
+
+
+def test_samples_are_stamped_with_their_first_one() -> None:
+    (m,) = to_messages(block(2, lost=(0, 1)))
+    assert m.topic == SAMPLES
+    assert m.t_ns == T0 + 42 * STEP
+
+
+@given(st.binary(max_size=200), st.sampled_from(sorted(TYPE_HASHES)))
+def test_bytes_that_are_no_message_are_refused_or_decoded(junk: bytes, name: str) -> None:
+    with contextlib.suppress(ValueError):
+        assert 'header' in cdr.decode(name, junk)

@@ -1,0 +1,215 @@
+"""What we write, read by readers that are not ours: rosbags and mcap."""
+
+from __future__ import annotations
+
+import collections
+import errno
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from mcap.reader import make_reader
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
+from rosbags.rosbag2 import Reader
+
+from msg_adapters import TOPIC_TYPES, to_messages
+from psd_deflection import __version__
+from psd_deflection.config import load_rig
+from psd_deflection.errors import RecordingError
+from psd_deflection.io import cdr
+from psd_deflection.io.bag_metadata import qos_profile
+from psd_deflection.io.bag_writer import META_HELLO, META_PARAMETERS, META_SEQUENCE, META_SOFTWARE, BagWriter, McapFile
+
+from .making import T0, block, estimate, run
+
+HELLO = {'serial': 'A1', 'firmware': '1.2', 'sample_rate_hz': 1000, 'channels': ['x1', 'y1']}
+
+
+def record(folder: Path, blocks: int = 120) -> Path:
+    with BagWriter(folder, rig_values=load_rig().values, device_hello=HELLO) as bag:
+        for r in run(blocks):
+            bag.write(r)
+    return folder
+
+
+def metadata_of(path: Path) -> dict[str, dict[str, str]]:
+    with path.open('rb') as f:
+        return {m.name: m.metadata for m in make_reader(f, validate_crcs=True).iter_metadata()}
+
+
+def test_an_independent_reader_gets_every_byte_that_was_written(tmp_path: Path) -> None:
+    folder = record(tmp_path / 'run')
+    expected: dict[str, list[tuple[int, bytes]]] = {}
+    for r in run(120):
+        for m in to_messages(r):
+            expected.setdefault(m.topic, []).append((m.t_ns, cdr.encode(m.type, m.fields)))
+    got: dict[str, list[tuple[int, bytes]]] = {}
+    with Reader(folder) as reader:
+        types = {c.topic: c.msgtype for c in reader.connections}
+        for connection, t_ns, raw in reader.messages():
+            got.setdefault(connection.topic, []).append((t_ns, bytes(raw)))
+    assert got == expected
+    assert {t: types[t] for t in TOPIC_TYPES} == TOPIC_TYPES
+    assert {c for c in types if c not in TOPIC_TYPES} == {'/link_tip/exact/deflection', '/link_tip/wls/deflection'}
+
+
+def test_metadata_yaml_is_what_rosbag2_writes(tmp_path: Path) -> None:
+    folder = record(tmp_path / 'run')
+    info = yaml.safe_load((folder / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+    assert list(info) == [
+        'version',
+        'storage_identifier',
+        'duration',
+        'starting_time',
+        'message_count',
+        'topics_with_message_count',
+        'compression_format',
+        'compression_mode',
+        'relative_file_paths',
+        'files',
+        'custom_data',
+        'ros_distro',
+    ]
+    assert (info['version'], info['storage_identifier'], info['ros_distro']) == (9, 'mcap', 'jazzy')
+    assert info['relative_file_paths'] == [f['path'] for f in info['files']] == ['run_0.mcap']
+    assert info['message_count'] == sum(t['message_count'] for t in info['topics_with_message_count'])
+    assert info['starting_time'] == {'nanoseconds_since_epoch': T0}
+    for topic in info['topics_with_message_count']:
+        assert list(topic['topic_metadata']) == [
+            'name',
+            'type',
+            'serialization_format',
+            'offered_qos_profiles',
+            'type_description_hash',
+        ]
+        (qos,) = topic['topic_metadata']['offered_qos_profiles']
+        assert qos['history'] == 'keep_last'
+        assert qos['deadline'] == {'sec': 9223372036, 'nsec': 854775807}
+    with (folder / 'run_0.mcap').open('rb') as f:
+        summary = make_reader(f).get_summary()
+    assert summary is not None
+    in_channels = {c.topic: yaml.safe_load(c.metadata['offered_qos_profiles']) for c in summary.channels.values()}
+    in_yaml = {
+        t['topic_metadata']['name']: t['topic_metadata']['offered_qos_profiles']
+        for t in info['topics_with_message_count']
+    }
+    assert in_channels == in_yaml
+    serialized = metadata_of(folder / 'run_0.mcap')['rosbag2']['serialized_metadata']
+    assert yaml.safe_load(serialized) == info
+
+
+def test_chunks_are_zstd_with_crc_and_span_less_than_a_second(tmp_path: Path) -> None:
+    folder = record(tmp_path / 'run', 200)
+    chunks = 0
+    with (folder / 'run_0.mcap').open('rb') as f:
+        for r in StreamReader(f, emit_chunks=True).records:
+            if isinstance(r, Chunk):
+                chunks += 1
+                assert r.compression == 'zstd'
+                assert r.uncompressed_crc != 0
+                assert 0 <= r.message_end_time - r.message_start_time < 1_000_000_000
+    assert chunks >= 4
+
+
+def test_a_late_message_does_not_stretch_a_chunk(tmp_path: Path) -> None:
+    with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
+        out.write(block(100))
+        out.write(block(0))
+        out.write(block(101))
+    with (tmp_path / 'a.mcap').open('rb') as f:
+        spans = [
+            r.message_end_time - r.message_start_time
+            for r in StreamReader(f, emit_chunks=True).records
+            if isinstance(r, Chunk)
+        ]
+    assert spans == [0, 0, 0]
+
+
+def test_parameters_version_and_hello_are_inside(tmp_path: Path) -> None:
+    folder = record(tmp_path / 'run', 1)
+    metadata = metadata_of(folder / 'run_0.mcap')
+    assert metadata[META_SOFTWARE]['version'] == __version__
+    parameters = {k: json.loads(v) for k, v in metadata[META_PARAMETERS].items()}
+    assert parameters == dict(load_rig().values)
+    assert {k: json.loads(v) for k, v in metadata[META_HELLO].items()} == HELLO
+    assert META_SEQUENCE not in metadata
+
+
+def test_a_hello_may_come_later(tmp_path: Path) -> None:
+    with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
+        out.write(block(0))
+        out.write_hello(HELLO)
+    assert json.loads(metadata_of(tmp_path / 'a.mcap')[META_HELLO]['serial']) == 'A1'
+
+
+def test_the_whole_number_is_noted_where_seq_starts_past_32_bits(tmp_path: Path) -> None:
+    with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
+        out.write(block(2**40, first_index=2**40))
+    assert metadata_of(tmp_path / 'a.mcap')[META_SEQUENCE] == {'first': str(20 * 2**40)}
+
+
+def test_an_empty_bag_opens(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'empty', rig_values={}):
+        pass
+    with Reader(tmp_path / 'empty') as reader:
+        assert reader.message_count == 0
+
+
+def test_qos_can_be_chosen_for_a_topic(tmp_path: Path) -> None:
+    with BagWriter(
+        tmp_path / 'run', rig_values={}, qos={'/psd/samples': qos_profile(50, reliability='best_effort')}
+    ) as bag:
+        bag.write(block(0))
+        bag.write(estimate(0))
+    with Reader(tmp_path / 'run') as reader:
+        assert len(list(reader.messages())) == 4
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    record(tmp_path / 'run', 1)
+    before = (tmp_path / 'run' / 'run_0.mcap').read_bytes()
+    with pytest.raises(RecordingError, match='run: exists already'):
+        BagWriter(tmp_path / 'run', rig_values={})
+    with pytest.raises(RecordingError, match='exists already'):
+        McapFile(tmp_path / 'run' / 'run_0.mcap', rig_values={})
+    assert (tmp_path / 'run' / 'run_0.mcap').read_bytes() == before
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(RecordingError, match='cannot be made'):
+        BagWriter(tmp_path / 'file' / 'run', rig_values={})
+
+
+class SmallDisk(io.FileIO):
+    """A file on a disk that has room for ``room`` bytes more."""
+
+    room = 100_000
+
+    def write(self, content: Any) -> int:
+        if self.room <= 0:
+            raise OSError(errno.ENOSPC, 'No space left on device')
+        written = super().write(memoryview(content)[: self.room])
+        self.room -= written
+        return written
+
+
+def test_a_full_disk_ends_the_recording_with_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, 'open', lambda path, mode: io.BufferedWriter(SmallDisk(path, mode)))
+    bag = BagWriter(tmp_path / 'run', rig_values={})
+    monkeypatch.undo()
+    records = list(run(1000))
+    with pytest.raises(RecordingError, match=r'run_0.mcap: cannot be written \(No space left on device\)'):
+        collections.deque(map(bag.write, records), maxlen=0)
+    assert bag.closed
+    with pytest.raises(RecordingError, match='is closed'):
+        bag.write(records[0])
+    bag.close()
+    assert not (tmp_path / 'run' / 'metadata.yaml').exists()
+    with bag.path.open('rb') as f:
+        first_chunk = next(r for r in StreamReader(f, emit_chunks=True).records if isinstance(r, Chunk))
+    assert first_chunk.message_start_time == T0
