@@ -92,9 +92,10 @@ def to_messages(record: Record) -> tuple[Message, ...]:
         if not record.primary:
             return (own,)
         with_covariance = pose_with_covariance_stamped.from_estimate(record)
+        # The one that a controller waits for goes first.
         return (
-            own,
             Message(DEFLECTION, pose_stamped.TYPE, t_ns, fields),
+            own,
             Message(DEFLECTION_WITH_COVARIANCE, pose_with_covariance_stamped.TYPE, t_ns, with_covariance),
         )
     if isinstance(record, SpotMeans):

@@ -32,6 +32,9 @@ FLAGGED = np.dtype([*PLAIN.descr, ('flags', '<u4')])
 MAX_SPAN_NS = 2**32 - 1
 """The largest ``dt``: 4.29 s."""
 
+MAX_STEP = 65_536
+"""Bytes of one point of anybody's cloud that is read."""
+
 _FORMATS = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 
 
@@ -124,6 +127,8 @@ def to_points(fields: Mapping[str, Any]) -> tuple[int, npt.NDArray[np.void]]:
     data = bytes(fields['data'])
     if height != 1:
         raise ValueError(f'height is {height}, not 1')
-    if step < 1 or width * step != len(data):
+    if not 1 <= step <= MAX_STEP:
+        raise ValueError(f'a point of {step} bytes is not one of ours')
+    if width * step != len(data):
         raise ValueError(f'{width} points of {step} bytes do not make {len(data)} bytes')
     return stamp_ns(fields), np.frombuffer(data, layout(fields), count=width)

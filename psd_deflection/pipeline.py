@@ -7,6 +7,7 @@ metres -> health -> solvers -> estimates and the load that the link model needs 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,12 +21,12 @@ from psd_deflection.records import (
     FLAG_OVER_RANGE,
     BlockStatus,
     DeflectionEstimate,
+    ParameterChange,
     RawChunk,
     Record,
     SampleBlock,
     SpotMeans,
     TipLoad,
-    ZeroChange,
 )
 from psd_deflection.solvers import solver_from_rig
 from psd_deflection.solvers._interface import SolverStatus
@@ -61,7 +62,6 @@ class Pipeline:
         self._cutter = BlockCutter(config.block_size)
         self._period_ns = 1e9 / rig.converter.sample_rate_hz
         self._statics = LinkStatics.from_rig(rig)
-        self._sum_min = config.sum_min
         self._recent: list[Dots] = []
         # The converter's last step on either side: beyond it the true value is not known.
         self._rail = np.float32((2 ** (rig.converter.bits - 1) - 1) * rig.converter.volts_per_count)
@@ -74,6 +74,7 @@ class Pipeline:
         self.rig = rig
         self._calibration = Calibration.from_rig(rig)
         config = rig.estimator
+        self._sum_min = config.sum_min
         names = [config.solver, *(name for name in config.solvers if name != config.solver)]
         self._solvers = [(name, solver_from_rig(name, rig), name == config.solver) for name in names]
 
@@ -81,10 +82,6 @@ class Pipeline:
     def repeated(self) -> int:
         """Samples passed over because their number did not rise."""
         return self._cutter.repeated
-
-    def set_sum_min(self, volts: float) -> None:
-        """Change the level below which a laser counts as lost, V, from the next block on."""
-        self._sum_min = volts
 
     def process(self, chunk: RawChunk) -> list[Record]:
         """The records of every block that ``chunk`` completes."""
@@ -106,22 +103,32 @@ class Pipeline:
             self._block(block, records)
         return records
 
-    def zero(self) -> ZeroChange | None:
+    def zero(self) -> ParameterChange | None:
         """Take the mean of the last blocks' dots as the unloaded ones, from the next block on.
 
         None where no good block has come yet. The change is a record: replay applies it again.
         """
         if not self._recent or self.last_spots is None:
             return None
-        dots = tuple(sum(column) / len(self._recent) for column in zip(*self._recent, strict=True))
-        change = ZeroChange(self.last_spots.t_ns, self.last_spots.index + 1, (dots[0], dots[1], dots[2], dots[3]))
-        self.apply_zero(change)
-        return change
+        x1, y1, x2, y2 = (sum(column) / len(self._recent) for column in zip(*self._recent, strict=True))
+        return self.change({'psd_1.zero': (x1, y1), 'psd_2.zero': (x2, y2)})
 
-    def apply_zero(self, change: ZeroChange) -> None:
-        """Use these unloaded dots from now on."""
-        x1, y1, x2, y2 = change.dots
-        self._build(replace_values(self.rig, {'psd_1.zero': [x1, y1], 'psd_2.zero': [x2, y2]}, 'zero'))
+    def change(self, values: Mapping[str, float | tuple[float, ...]]) -> ParameterChange:
+        """Change parameters from the next block on; the change as a record.
+
+        Raises ConfigError where a value is out of bounds; then nothing has changed.
+        """
+        last = self.last_spots
+        record = ParameterChange(
+            last.t_ns if last is not None else 0, last.index + 1 if last is not None else 0, tuple(values.items())
+        )
+        self.apply(record)
+        return record
+
+    def apply(self, change: ParameterChange) -> None:
+        """Use the changed values from now on. Raises ConfigError where one is out of bounds."""
+        values = {name: list(v) if isinstance(v, tuple) else v for name, v in change.values}
+        self._build(replace_values(self.rig, values, 'change'))
 
     def _block(self, block: SampleBlock, records: list[Record]) -> None:
         size = self._cutter.block_size

@@ -148,12 +148,16 @@ class TemperatureReading(NamedTuple):
     celsius: float
 
 
-class ZeroChange(NamedTuple):
-    """The unloaded dots were taken anew: (x1, y1, x2, y2) m, used from block ``block`` on."""
+class ParameterChange(NamedTuple):
+    """Parameters that changed while the run went on (``~/zero``, a live parameter).
+
+    ``values``: name and value, checked already; they hold from block ``block`` on. It is recorded,
+    and replay applies it at the same block.
+    """
 
     t_ns: int
     block: int
-    dots: tuple[float, float, float, float]
+    values: tuple[tuple[str, float | tuple[float, ...]], ...]
 
 
 class DiagnosticEntry(NamedTuple):
@@ -181,5 +185,5 @@ Record = (
     | ReferencePose
     | TemperatureReading
     | DiagnosticReport
-    | ZeroChange
+    | ParameterChange
 )

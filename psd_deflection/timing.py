@@ -60,6 +60,7 @@ class ClockMap:
         self._anchor_device = device_ns
         self._anchor_host = host_ns
         self._slope = 0.0
+        self._mapped = device_ns - SECOND_NS
         self._fit = (0.0, float(host_ns - device_ns))
         self._last_device = device_ns
         self._residual = 0.0
@@ -98,9 +99,10 @@ class ClockMap:
         return False
 
     def to_host_ns(self, t_device_us: IntArray) -> IntArray:
-        """Host time of samples, int64 ns, rising with device time."""
+        """Host time of samples in their order, (n,) int64 ns, n >= 1; rises with device time."""
         device = t_device_us * 1000
         since = device - self._anchor_device
+        self._mapped = max(self._mapped, int(device[-1]))
         host: IntArray = self._anchor_host + since + np.rint(since * self._slope).astype(np.int64)
         return host
 
@@ -123,14 +125,16 @@ class ClockMap:
         else:
             skew, intercept = lower_line([(d - self._origin, y) for d, y in self._minima])
         self._fit = (skew, intercept)
-        target = now + intercept + skew * (now - self._origin)
-        host = self._host(now)
+        # The map turns at the last stamp that was given: what follows joins on to it.
+        turn = max(self._mapped, self._anchor_device)
+        target = turn + intercept + skew * (turn - self._origin)
+        host = self._host(turn)
         error = target - host
         self._residual = error
         settling = now - self._origin < SETTLING_S * SECOND_NS
         limit = STEER_SETTLING if settling else STEER_RUNNING
         steer = min(max(error / (1.0 if settling else 5.0) / SECOND_NS, -limit), limit)
-        self._anchor_device, self._anchor_host, self._slope = now, host, skew + steer
+        self._anchor_device, self._anchor_host, self._slope = turn, host, skew + steer
 
 
 def lower_line(points: list[tuple[int, int]]) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Link statics: the contract's equations, both ways, scalar and vectorised alike."""
+"""Link statics both ways, and the cross-section they rest on."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import pytest
 
 from psd_deflection.config import load_rig
 from psd_deflection.mechanics import LinkStatics
+from psd_deflection.mechanics.section import TubeSection
 
 LINK = LinkStatics.from_rig(load_rig())
+SECTION = TubeSection(0.0159, 0.0138)
 
 
 def test_the_beam_constants_of_the_thesis_rig() -> None:
@@ -57,3 +59,38 @@ def test_the_full_compliance_is_reciprocal_and_holds_the_small_one() -> None:
     fx, fy, tz, mx, my = 1.0, 2.0, 3.0, 4.0, 5.0
     expected = (*LINK.deflection(fx, fy, tz, mx, my), *LINK.slopes(fx, fy, mx, my))
     assert full @ [fx, fy, tz, mx, my] == pytest.approx(expected, rel=1e-14)
+
+
+# ---- Cross-section ----
+
+
+def test_the_section_of_the_thesis_link() -> None:
+    # Errata G-10.
+    assert SECTION.second_moment == pytest.approx(2.171272689e-8, rel=1e-9)
+    assert SECTION.polar_moment == pytest.approx(4.342545378e-8, rel=1e-9)
+    assert load_rig().link.second_moment == pytest.approx(SECTION.second_moment, rel=1e-15)
+
+
+def test_the_section_agrees_with_integrals_over_the_ring() -> None:
+    # An independent route: thesis A-9 and A-12 by quadrature in r, closed form in the angle.
+    radii = np.linspace(0.0138, 0.0159, 2001)
+    middle, width = (radii[1:] + radii[:-1]) / 2.0, np.diff(radii)
+    assert SECTION.area == pytest.approx(float(np.sum(2.0 * np.pi * middle * width)), rel=1e-6)
+    assert SECTION.second_moment == pytest.approx(float(np.sum(np.pi * middle**3 * width)), rel=1e-6)
+    assert SECTION.bore_area + SECTION.area == pytest.approx(np.pi * 0.0159**2, rel=1e-15)
+
+
+def test_a_tube_is_found_for_a_stiffness() -> None:
+    tube = TubeSection.of_stiffness(8.0 * SECTION.second_moment, SECTION.wall)
+    assert tube.second_moment == pytest.approx(8.0 * SECTION.second_moment, rel=1e-14)
+    assert tube.wall == pytest.approx(SECTION.wall, rel=1e-12)
+    # Errata, EVD.
+    assert tube.mean_radius == pytest.approx(29.737e-3, abs=5e-7)
+
+
+def test_shear_strain_is_stress_over_modulus() -> None:
+    # Errata A-17: at 60 N gamma = 5.35e-4, and gamma L/r is the twist (A-16); the printed form gives 1867.
+    torque = 60.0 * 0.585
+    strain = SECTION.shear_strain(torque, SECTION.outer_radius, 24e9)
+    assert strain == pytest.approx(5.35e-4, abs=5e-7)
+    assert strain * 0.585 / SECTION.outer_radius == pytest.approx(0.01970186665973022, rel=1e-12)

@@ -114,7 +114,8 @@ def live_line(session: Session, rate: float) -> str:
         sd = [math.sqrt(estimate.covariance[i]) for i in (0, 4, 8)]
         mdeg = 1e3 * 180.0 / math.pi
         body = (
-            f'ΔX {estimate.dx * 1e6:+9.2f} ± {sd[0] * 1e6:.2f} µm  ΔY {estimate.dy * 1e6:+9.2f} ± {sd[1] * 1e6:.2f} µm  '
+            f'ΔX {estimate.dx * 1e6:+9.2f} ± {sd[0] * 1e6:.2f} µm  '
+            f'ΔY {estimate.dy * 1e6:+9.2f} ± {sd[1] * 1e6:.2f} µm  '
             f'θ {estimate.theta * mdeg:+9.2f} ± {sd[2] * mdeg:.2f} mdeg'
         )
     else:

@@ -22,7 +22,7 @@ from psd_deflection.errors import RecordingError
 from psd_deflection.io import cdr
 from psd_deflection.io.bag_metadata import DEFAULT_QOS, Qos, TopicCount, bag_information, qos_text, to_yaml
 from psd_deflection.io.ros2msg import TYPE_HASHES, definition
-from psd_deflection.records import Record, SampleBlock, ZeroChange
+from psd_deflection.records import ParameterChange, Record, SampleBlock
 
 NS_PER_S = 1_000_000_000
 
@@ -30,7 +30,7 @@ META_SOFTWARE = 'psd_deflection'
 META_PARAMETERS = 'psd_deflection.parameters'
 META_HELLO = 'psd_deflection.device_hello'
 META_SEQUENCE = 'psd_deflection.sequence'
-META_ZERO = 'psd_deflection.zero'
+META_CHANGE = 'psd_deflection.change.'
 """Names of the MCAP metadata records; every value in the last four is JSON."""
 
 
@@ -71,6 +71,7 @@ class McapFile:
         self._chunk_first: int | None = None
         self._chunk_last = 0
         self._sequence_noted = False
+        self._changes = 0
         self._stream: BinaryIO | None = None
         parameters = _json_values(rig_values)
         hello = None if device_hello is None else _json_values(device_hello)
@@ -119,11 +120,12 @@ class McapFile:
 
     def write(self, record: Record) -> None:
         """Write all messages of one record; the log time is the record's own stamp."""
-        if isinstance(record, ZeroChange):
+        if isinstance(record, ParameterChange):
             with self._guard():
-                dots = json.dumps(list(record.dots))
+                self._changes += 1
+                head = {'t_ns': str(record.t_ns), 'block': str(record.block)}
                 self._writer.add_metadata(
-                    META_ZERO, {'t_ns': str(record.t_ns), 'block': str(record.block), 'dots': dots}
+                    f'{META_CHANGE}{self._changes:06d}', {**head, 'values': json.dumps(dict(record.values))}
                 )
             return
         if isinstance(record, SampleBlock) and not self._sequence_noted:

@@ -42,7 +42,7 @@ class SerialPort:
             # Only some drivers have a latency timer to shorten.
             with contextlib.suppress(OSError, ValueError, NotImplementedError):
                 self._serial.set_low_latency_mode(True)
-        self._serial.reset_input_buffer()
+        self.discard_input()
 
     def read(self, timeout: float) -> bytes:
         """What has come, at most 4096 bytes; empty after ``timeout`` s. PortClosedError if it is gone."""
@@ -58,6 +58,11 @@ class SerialPort:
         if not received:
             raise PortClosedError(f'{self.name}: the device is gone')
         return received
+
+    def discard_input(self) -> None:
+        """Forget what has come and was not read: it is older than it would look."""
+        with contextlib.suppress(OSError, serial.SerialException):
+            self._serial.reset_input_buffer()
 
     def write(self, frame: bytes) -> None:
         """Send to the device; PortClosedError if it is gone or takes nothing for a second."""

@@ -132,7 +132,7 @@ class EstimatorNode:
         if change is None:
             response.success, response.message = False, 'not zeroed: no good block yet'
             return response
-        x1, y1, x2, y2 = change.dots
+        (x1, y1), (x2, y2) = (psd.zero for psd in self.session.rig.psds)
         text = f'unloaded dots (mm): psd_1 ({x1 * 1e3:.4f}, {y1 * 1e3:.4f}), psd_2 ({x2 * 1e3:.4f}, {y2 * 1e3:.4f})'
         self._say(text)
         response.success, response.message = True, text

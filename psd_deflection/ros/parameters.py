@@ -74,7 +74,10 @@ def watch(node: Node, session: Session) -> None:
             except ConfigError as error:
                 return SetParametersResult(successful=False, reason=str(error))
             if parameter.name == 'sum_min' and isinstance(value, float):
-                session.pipeline.set_sum_min(value)
+                try:
+                    session.set_sum_min(value)
+                except TimeoutError as error:
+                    return SetParametersResult(successful=False, reason=f'sum_min: not changed: {error}')
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(change)

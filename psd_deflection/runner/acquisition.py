@@ -32,7 +32,7 @@ from psd_deflection.protocol.frames import (
     encode,
 )
 from psd_deflection.protocol.sequence import SequenceExtender, Step
-from psd_deflection.records import CHANNELS, RawChunk
+from psd_deflection.records import CHANNELS, FLAG_DEVICE_DROPPED, RawChunk
 from psd_deflection.timing import ClockMap, ClockState
 
 SILENCE_S = 2.0
@@ -134,6 +134,7 @@ class Acquisition:
         self._sequence = SequenceExtender(self._block_size)
         self._decoder = FrameDecoder()
         self._last_t_ns = 0
+        self._first_number = 0
         self._volts_per_count = rig.converter.volts_per_count
         self._port: SerialPort | None = None
         self._stop = threading.Event()
@@ -179,6 +180,9 @@ class Acquisition:
 
     def start(self) -> None:
         """Start the reader thread; :meth:`open` came before."""
+        if self._port is not None:
+            # What came while the device was heard out is older than it would look.
+            self._port.discard_input()
         self._thread.start()
 
     def stop(self) -> None:
@@ -250,9 +254,11 @@ class Acquisition:
                 good = True
                 flags, seq, t_us, counts = frame
                 number, step, missing = self._sequence.extend(seq, t_us)
-                if step is not Step.NEXT and not self._unusual(step, missing):
+                if step is not Step.NEXT and not self._unusual(number, step, missing):
                     continue
-                if flags & 2:
+                if number < self._first_number:
+                    continue
+                if flags & FLAG_DEVICE_DROPPED:
                     counters.device_dropped += 1
                 if self._seq and number // self._block_size != self._seq[0] // self._block_size:
                     self._hand_over(now)
@@ -281,12 +287,15 @@ class Acquisition:
         if self._clock.observe(t_us, now):
             self._say(f"{self._name}: the device's clock jumped; times are laid anew")
 
-    def _unusual(self, step: Step, missing: int) -> bool:
+    def _unusual(self, number: int, step: Step, missing: int) -> bool:
         """Count a sample that does not simply follow; False where it is to be passed over."""
-        if step is Step.REPEAT:
+        if step is Step.FIRST:
+            # What we joined in the middle of is passed over: the first block is a whole one.
+            self._first_number = -(-number // self._block_size) * self._block_size
+        elif step is Step.REPEAT:
             self.counters.repeated += 1
             return False
-        if step is Step.GAP:
+        elif step is Step.GAP:
             self.counters.lost += missing
         elif step is Step.RESTART:
             self.counters.restarts += 1

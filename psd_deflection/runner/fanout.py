@@ -6,7 +6,7 @@ from typing import Protocol
 
 from msg_adapters import to_messages
 from psd_deflection.io import cdr
-from psd_deflection.records import Record, ZeroChange
+from psd_deflection.records import ParameterChange, Record
 
 
 class Wire(Protocol):
@@ -16,10 +16,10 @@ class Wire(Protocol):
         """``type_name`` as ``pkg/msg/Name``; ``t_ns`` is the header's stamp."""
 
 
-class ZeroWire(Protocol):
-    """Takes changes of the unloaded dots, which are no message."""
+class ChangeWire(Protocol):
+    """Takes changes of parameters, which are no message."""
 
-    def put_zero(self, change: ZeroChange) -> None:
+    def put_change(self, change: ParameterChange) -> None:
         """Note the change."""
 
 
@@ -28,13 +28,13 @@ class Fanout:
 
     def __init__(self) -> None:
         self.wires: list[Wire] = []
-        self.zero_wires: list[ZeroWire] = []
+        self.change_wires: list[ChangeWire] = []
 
     def put(self, record: Record) -> None:
         """Encode and hand on."""
-        if isinstance(record, ZeroChange):
-            for zero_wire in self.zero_wires:
-                zero_wire.put_zero(record)
+        if isinstance(record, ParameterChange):
+            for change_wire in self.change_wires:
+                change_wire.put_change(record)
             return
         for topic, type_name, t_ns, fields in to_messages(record):
             encoded = cdr.encode(type_name, fields)

@@ -15,7 +15,7 @@ from pathlib import Path
 from psd_deflection.config import Rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.io.bag_writer import BagWriter
-from psd_deflection.records import ZeroChange
+from psd_deflection.records import ParameterChange
 
 MESSAGES_PER_BLOCK = 10
 JOIN_S = 1.5
@@ -43,7 +43,7 @@ class Recorder:
         self._say = say
         self._limit = queue_blocks * MESSAGES_PER_BLOCK
         self._bag: BagWriter | None = None
-        self._queue: queue.SimpleQueue[Message | ZeroChange | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[Message | ParameterChange | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
 
     @property
@@ -72,8 +72,8 @@ class Recorder:
         if self._bag is not None:
             self._enqueue((topic, type_name, cdr, t_ns))
 
-    def put_zero(self, change: ZeroChange) -> None:
-        """Note that the unloaded dots changed."""
+    def put_change(self, change: ParameterChange) -> None:
+        """Note that parameters changed."""
         if self._bag is not None:
             self._enqueue(change)
 
@@ -89,16 +89,16 @@ class Recorder:
             self._say(f'{bag.folder}: the disk is slow; still writing in the background')
         return bag.folder
 
-    def _enqueue(self, item: Message | ZeroChange) -> None:
+    def _enqueue(self, item: Message | ParameterChange) -> None:
         if self._queue.qsize() >= self._limit:
             self.dropped += 1
         else:
             self._queue.put(item)
 
-    def _run(self, bag: BagWriter, items: queue.SimpleQueue[Message | ZeroChange | None]) -> None:
+    def _run(self, bag: BagWriter, items: queue.SimpleQueue[Message | ParameterChange | None]) -> None:
         try:
             while (item := items.get()) is not None:
-                if isinstance(item, ZeroChange):
+                if isinstance(item, ParameterChange):
                     bag.write(item)
                 else:
                     bag.write_encoded(*item)

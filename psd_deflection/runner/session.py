@@ -12,7 +12,7 @@ from pathlib import Path
 
 from psd_deflection.config import Rig, replace_values
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.records import ZeroChange
+from psd_deflection.records import ParameterChange
 from psd_deflection.runner.acquisition import Acquisition
 from psd_deflection.runner.fanout import Fanout
 from psd_deflection.runner.processing import Processing
@@ -43,7 +43,7 @@ class Session:
             self.processing = Processing(self.acquisition, pipeline, say)
             self.recorder = Recorder(rig.acquisition.queue_blocks, say)
             self.fanout = Fanout()
-            self.fanout.zero_wires.append(self.recorder)
+            self.fanout.change_wires.append(self.recorder)
             self.processing.sinks.append(self.fanout)
         except BaseException:
             if self._simulated is not None:
@@ -93,19 +93,26 @@ class Session:
 
         return self.processing.request(change)
 
-    def zero(self) -> ZeroChange | None:
+    def zero(self) -> ParameterChange | None:
         """Take the present dots as the unloaded ones; None where no good block has come yet.
 
         Raises TimeoutError where no data flows.
         """
 
-        def change() -> ZeroChange | None:
+        def change() -> ParameterChange | None:
             taken = self.pipeline.zero()
             if taken is not None:
                 self.processing.give([taken])
             return taken
 
         return self.processing.request(change)
+
+    def set_sum_min(self, volts: float) -> None:
+        """Change the level below which a laser counts as lost, V, between two blocks.
+
+        Raises TimeoutError where no data flows.
+        """
+        self.processing.request(lambda: self.processing.give([self.pipeline.change({'sum_min': volts})]))
 
     def close(self) -> Path | None:
         """Stop reading, process what was read, end the recording; returns its folder.

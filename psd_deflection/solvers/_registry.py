@@ -9,13 +9,36 @@ from typing import Any
 
 from psd_deflection.errors import ConfigError
 from psd_deflection.solvers._interface import Geometry, Solver
+from psd_deflection.solvers.appendix_d import AppendixDSolver
+from psd_deflection.solvers.appendix_d_least_squares import AppendixDOlsSolver, AppendixDWlsSolver
+from psd_deflection.solvers.base_pair import BasePairSolver
+from psd_deflection.solvers.beam import BeamSolver
 from psd_deflection.solvers.exact import ExactSolver
 from psd_deflection.solvers.iterative import IterativeSolver
+from psd_deflection.solvers.iterative_printed import IterativePrintedSolver
+from psd_deflection.solvers.minimum_tilt import MinimumTiltSolver
+from psd_deflection.solvers.ols import OlsSolver
+from psd_deflection.solvers.pose import PoseSolver
 from psd_deflection.solvers.wls import WlsSolver
+from psd_deflection.solvers.wls_exact import WlsExactSolver
 
-SOLVERS: MappingProxyType[str, Callable[..., Solver]] = MappingProxyType(
-    {cls.name: cls for cls in (ExactSolver, WlsSolver, IterativeSolver)}
+_CLASSES: tuple[type[Solver], ...] = (
+    ExactSolver,
+    WlsSolver,
+    IterativeSolver,
+    BeamSolver,
+    WlsExactSolver,
+    OlsSolver,
+    MinimumTiltSolver,
+    PoseSolver,
+    BasePairSolver,
+    IterativePrintedSolver,
+    AppendixDSolver,
+    AppendixDOlsSolver,
+    AppendixDWlsSolver,
 )
+
+SOLVERS: MappingProxyType[str, Callable[..., Solver]] = MappingProxyType({cls.name: cls for cls in _CLASSES})
 """Name to class, the default first."""
 
 

@@ -26,6 +26,6 @@ def solver_from_rig(name: str, rig: Rig) -> Solver:
     Raises ConfigError for an unknown name, SolverError where the method cannot solve the rig.
     """
     options: dict[str, Any] = {}
-    if name == 'wls':
+    if name in ('wls', 'wls_exact'):
         options = {'weights': rig.estimator.wls_weights, 'row_scaling': rig.estimator.wls_row_scaling}
     return make_solver(name, geometry_from_rig(rig), **options)

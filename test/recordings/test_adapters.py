@@ -183,6 +183,7 @@ def test_points_that_contradict_themselves_are_refused() -> None:
         ({'width': 21}, 'do not make'),
         ({'height': 2}, 'height'),
         ({'point_step': 28, 'width': 20, 'data': bytes(560)}, 'outside a point'),
+        ({'point_step': 2**32 - 1, 'width': 0, 'data': b''}, 'a point of'),
         ({'fields': m.fields['fields'][1:]}, "no field 'seq'"),
     ):
         with pytest.raises(ValueError, match=message):

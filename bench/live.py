@@ -1,0 +1,256 @@
+"""``make bench``, the live line: what it costs beside the least that ROS and MCAP allow.
+
+Every figure stands beside a peer's from the same run, as a ratio: machines differ and are shared.
+
+- Latency: last byte of a block written to the port -> callback in another process, beside a bare
+  publisher of the same message -> the same callback, both in the same subscriber at the same time.
+- CPU: the node with recording, as a share of one core.
+- Replay of ten minutes beside bare iteration of the same file with ``mcap``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def percentiles(values: list[float]) -> tuple[float, float]:
+    """Median and 99th percentile, in the unit of ``values``."""
+    return float(np.median(values)), float(np.percentile(values, 99))
+
+
+def until_stdin_closes() -> threading.Event:
+    """An event that is set when the parent closes our standard input."""
+    stop = threading.Event()
+
+    def wait() -> None:
+        sys.stdin.read()
+        stop.set()
+
+    threading.Thread(target=wait, daemon=True).start()
+    return stop
+
+
+def subscriber() -> None:
+    """Child process: prints, for each message, topic, stamp and the monotonic time of its callback."""
+    import rclpy
+    from geometry_msgs.msg import PoseStamped
+
+    rclpy.init()
+    node = rclpy.create_node('bench_subscriber')
+    rows: list[tuple[str, int, int]] = []
+
+    def listen(topic: str) -> None:
+        def received(message: PoseStamped) -> None:
+            stamp = message.header.stamp
+            rows.append((topic, stamp.sec * 10**9 + stamp.nanosec, time.monotonic_ns()))
+
+        node.create_subscription(PoseStamped, topic, received, 50)
+
+    listen('/link_tip/deflection')
+    listen('/bare')
+    print('ready', flush=True)
+    stop = until_stdin_closes()
+    while not stop.is_set():
+        rclpy.spin_once(node, timeout_sec=0.1)
+    json.dump(rows, sys.stdout)
+
+
+def bare_publisher() -> None:
+    """Child process: the same message at the same rate with nothing around it; prints when it published."""
+    import rclpy
+    from geometry_msgs.msg import PoseStamped
+
+    rclpy.init()
+    node = rclpy.create_node('bench_bare')
+    publisher = node.create_publisher(PoseStamped, '/bare', 10)
+    message = PoseStamped()
+    message.header.frame_id = 'link_tip_rest'
+    stop = until_stdin_closes()
+    rows: list[tuple[int, int]] = []
+    count = 0
+    while not stop.wait(0.02):
+        count += 1
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(count, 10**9)
+        now = time.monotonic_ns()
+        publisher.publish(message)
+        rows.append((count, now))
+    json.dump(rows, sys.stdout)
+
+
+class Device:
+    """Writes samples to a port by the clock; notes when the last byte of each block was written."""
+
+    def __init__(self) -> None:
+        from psd_deflection.config import load_rig
+        from psd_deflection.io.simulated_device import PseudoTerminal, SimulatedDevice
+
+        self.port = PseudoTerminal()
+        self.device = SimulatedDevice(load_rig(), lambda _, n: np.zeros((n, 3)))
+        self.written: list[int] = []
+        self.stop = threading.Event()
+        self.thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self) -> None:
+        start = time.monotonic_ns()
+        while not self.stop.is_set():
+            time.sleep(max(self.device.due_in_ns(time.monotonic_ns() - start), 0) / 1e9)
+            before = self.device.taken
+            stream = self.device.take(time.monotonic_ns() - start)
+            try:
+                asked = os.read(self.port.master, 4096)
+            except OSError:
+                asked = b''
+            try:
+                os.write(self.port.master, self.device.receive(asked, 0) + stream)
+            except OSError:
+                continue
+            if before // 20 != self.device.taken // 20:
+                self.written.append(time.monotonic_ns())
+
+
+def child(role: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, str(Path(__file__)), '--role', role],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
+
+
+def cpu_seconds(pid: int) -> float:
+    """User and system time of a process and all its threads, s."""
+    fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
+def live(seconds: float) -> None:
+    device = Device()
+    device.thread.start()
+    with tempfile.TemporaryDirectory() as folder:
+        node = subprocess.Popen(
+            [sys.executable, '-m', 'psd_deflection', 'estimator', '--port', device.port.name, '--record', folder],
+            cwd=ROOT,
+            stderr=subprocess.DEVNULL,
+        )
+        ear, bare = child('subscriber'), child('bare')
+        assert ear.stdout is not None
+        assert ear.stdin is not None
+        assert bare.stdin is not None
+        ear.stdout.readline()
+        time.sleep(5.0)
+        used, began = cpu_seconds(node.pid), time.monotonic()
+        time.sleep(seconds)
+        share = (cpu_seconds(node.pid) - used) / (time.monotonic() - began)
+        published, _ = bare.communicate()
+        heard, _ = ear.communicate()
+        node.terminate()
+        node.wait(10.0)
+    device.stop.set()
+    device.thread.join()
+    rows = json.loads(heard)
+    sent = dict(json.loads(published))
+    since = int((began + 0.0) * 1e9)
+    bare_ms = [(t - sent[s]) / 1e6 for topic, s, t in rows if topic == '/bare' and s in sent and t > since]
+    written = np.array(device.written)
+    ours_ms = []
+    for topic, _, t in rows:
+        if topic == '/link_tip/deflection' and t > since:
+            last = written[: int(np.searchsorted(written, t))]
+            ours_ms.append((t - int(last[-1])) / 1e6)
+    (m, p), (m0, p0) = percentiles(ours_ms), percentiles(bare_ms)
+    print(f'latency, last byte -> callback in another process, {len(ours_ms)} messages (ms)')
+    print(f'  {"":28}{"median":>10}{"p99":>10}')
+    print(f'  {"psd_deflection":28}{m:10.3f}{p:10.3f}')
+    print(f'  {"bare publish -> callback":28}{m0:10.3f}{p0:10.3f}   ({len(bare_ms)} messages)')
+    print(f'  {"ratio (bound 2, 3)":28}{m / m0:10.2f}{p / p0:10.2f}')
+    print(f'CPU of the node with recording: {100 * share:.1f} % of a core (bound 15 %)')
+
+
+def make_recording(folder: Path, minutes: float) -> tuple[Path, int]:
+    """Ten minutes as the daemon would have recorded them, without waiting for them."""
+    from psd_deflection.config import load_rig
+    from psd_deflection.io.bag_writer import BagWriter
+    from psd_deflection.pipeline import Pipeline
+    from psd_deflection.records import RawChunk
+    from psd_deflection.simulation.loads import CyclicLoads, thesis_load_cases
+    from psd_deflection.simulation.simulator import RigSimulator
+
+    rig = load_rig()
+    pipeline, simulator = Pipeline(rig), RigSimulator(rig, 1)
+    loads = CyclicLoads(thesis_load_cases())
+    path = folder / 'ten_minutes'
+    n, step = round(minutes * 60_000), 2000
+    with BagWriter(path, rig_values=dict(rig.values)) as bag:
+        for first in range(0, n, step):
+            counts: npt.NDArray[np.int16] = simulator.step(loads.take(step)).counts
+            seq = np.arange(first, first + step)
+            flags = np.zeros(step, np.uint8)
+            chunk = RawChunk(seq, seq * 1_000_000 + 10**18, counts, flags, rig.converter.volts_per_count)
+            for record in pipeline.process(chunk):
+                bag.write(record)
+    return path, n
+
+
+def replay(minutes: float) -> None:
+    from mcap.reader import make_reader
+
+    from psd_deflection.cli.replay import replayed, rig_of
+    from psd_deflection.io.recordings import open_recording
+    from psd_deflection.pipeline import Pipeline
+
+    with tempfile.TemporaryDirectory() as folder:
+        path, n = make_recording(Path(folder), minutes)
+        (file,) = path.glob('*.mcap')
+        rounds: list[tuple[float, float]] = []
+        for _ in range(3):
+            began = time.perf_counter()
+            with file.open('rb') as stream:
+                messages = sum(1 for _ in make_reader(stream).iter_messages())
+            middle = time.perf_counter()
+            recording = open_recording(path)
+            pipeline = Pipeline(rig_of(recording, None))
+            for _records in replayed(recording, pipeline, recording.blocks()):
+                pass
+            rounds.append((middle - began, time.perf_counter() - middle))
+            if pipeline.counters.samples != n:
+                raise SystemExit(f'replay saw {pipeline.counters.samples} of {n} samples')
+        raw, ours = (sorted(r[i] for r in rounds)[1] for i in (0, 1))
+        size = file.stat().st_size / 1e6
+    print(f'replay of {minutes:g} minutes ({n} samples, {messages} messages, {size:.1f} MB)')
+    print(f'  {"psd_deflection replay":28}{ours:8.2f} s   {minutes * 60 / ours:6.0f} times real time')
+    print(f'  {"bare mcap iteration":28}{raw:8.2f} s')
+    print(f'  {"ratio (bound 3)":28}{ours / raw:8.2f}')
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--seconds', type=float, default=30.0, help='of the live measurement')
+    parser.add_argument('--minutes', type=float, default=10.0, help='of the recording that is replayed')
+    parser.add_argument('--role', choices=('subscriber', 'bare'), help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.role == 'subscriber':
+        subscriber()
+    elif args.role == 'bare':
+        bare_publisher()
+    else:
+        live(args.seconds)
+        replay(args.minutes)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,71 @@
+"""Write the samples of a recording, and its loads, references and temperatures, in another form.
+
+OUT ending in .csv becomes a CSV recording, in .mcap a lone MCAP file, anything else a bag folder.
+Volts come through bit for bit. Estimates are not carried over: psd-deflection replay makes them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import heapq
+import itertools
+from collections.abc import Iterable
+from pathlib import Path
+
+from psd_deflection.config import EFFECTS_PREFIX, load_rig
+from psd_deflection.io.bag_writer import BagWriter, McapFile
+from psd_deflection.io.csv_writer import CsvSampleSink
+from psd_deflection.io.recording import Recording
+from psd_deflection.io.recordings import open_recording
+from psd_deflection.records import AppliedLoad, ReferencePose, SampleBlock, TemperatureReading
+
+Convertible = SampleBlock | AppliedLoad | ReferencePose | TemperatureReading
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
+    parser.add_argument('--out', metavar='OUT', required=True, help='what to make: X.csv, X.mcap or a bag folder')
+    parser.add_argument(
+        '--params-file', metavar='RIG.yaml', help="the rig to note in a bag; otherwise the recording's own"
+    )
+
+
+def _time(record: Convertible) -> int:
+    return int(record.t_ns[0]) if isinstance(record, SampleBlock) else record.t_ns
+
+
+def convert(recording: Recording, out: Path, parameters: dict[str, object]) -> int:
+    """Write ``recording`` to ``out``; returns the number of samples. Raises RecordingError."""
+    loads, references, temperatures = recording.loads(), recording.references(), recording.temperatures()
+    records: Iterable[Convertible] = heapq.merge(loads, references, temperatures, recording.blocks(), key=_time)
+    sink: CsvSampleSink | McapFile
+    if out.suffix.lower() == '.csv':
+        sink = CsvSampleSink(out, loads=bool(loads), references=bool(references), temperatures=bool(temperatures))
+        # A row takes what is waiting, and a block's last row what came during the block.
+        records = itertools.chain(loads, references, temperatures, recording.blocks())
+    elif out.suffix.lower() == '.mcap':
+        sink = McapFile(out, rig_values=parameters, device_hello=recording.hello)
+    else:
+        sink = BagWriter(out, rig_values=parameters, device_hello=recording.hello)
+    samples = 0
+    with contextlib.closing(sink):
+        for record in records:
+            sink.put(record)
+            samples += len(record.seq) if isinstance(record, SampleBlock) else 0
+    return samples
+
+
+def run(args: argparse.Namespace) -> int:
+    """Convert and say what was written."""
+    recording = open_recording(Path(args.recording))
+    parameters: dict[str, object] = dict(recording.parameters)
+    if args.params_file is not None:
+        rig = load_rig(args.params_file)
+        parameters = {**rig.values, **{EFFECTS_PREFIX + k: e for k, e in rig.effects.items()}}
+    samples = convert(recording, Path(args.out), parameters)
+    print(f'{args.out}: {samples} samples')
+    for warning in recording.warnings:
+        print(f'warning: {warning}')
+    return 0

@@ -1,0 +1,268 @@
+"""Size a link and place its sensors.
+
+Without a rig file: Tables B1 and B2 of the thesis recomputed, each cell beside what is printed,
+each that differs with the reason. With one: its link's stiffness, and which sensor placement is
+best conditioned inside the room that --radius, --keep-out and --box leave (m, in link_tip).
+
+    psd-deflection design
+    psd-deflection design --params-file config/thesis_rig.yaml --sigma 2e-6 --out placement.png
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from psd_deflection.cli._table import columns
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.errors import ConfigError
+from psd_deflection.mechanics import LinkStatics, placement, scaling
+from psd_deflection.mechanics.section import TubeSection
+from psd_deflection.records import FloatArray
+
+TILTED = np.array([0.0, 0.0, 0.0, math.radians(0.3), math.radians(0.1)])
+"""Where observability of tilt is stated: phi 0.3 deg, omega 0.1 deg. At rest coplanar sensors see none."""
+
+SIDEBAR_FORCE = 50.0
+"""N: the largest load of chapter 5, hung on a sidebar one link length long."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('--params-file', metavar='RIG.yaml', help='a ROS 2 parameter file: study its placement')
+    parser.add_argument(
+        '--sigma',
+        type=float,
+        metavar='M',
+        help='deviation of one dot reading, m (default: amplifier noise of one block mean)',
+    )
+    parser.add_argument(
+        '--radius',
+        type=float,
+        metavar='M',
+        help='sensor centres within this disc, m (default: as far out as the rig has them)',
+    )
+    parser.add_argument('--keep-out', type=float, default=0.0, metavar='M', help='and outside this one, m (default 0)')
+    parser.add_argument(
+        '--box', type=float, nargs=4, metavar=('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX'), help='and inside this box, m'
+    )
+    parser.add_argument('--out', metavar='FILE.png|svg', help='draw the placements')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the tables or the study."""
+    if args.params_file is None:
+        if args.out is not None:
+            raise ConfigError('--out draws the placement of a rig: give --params-file RIG.yaml')
+        print(appendix_b())
+        return 0
+    rig = load_rig(args.params_file)
+    sigma = rig.amplifier.noise * rig.amplifier.sensitivity / math.sqrt(rig.estimator.block_size)
+    if args.sigma is not None:
+        sigma = args.sigma
+    if not (sigma > 0.0 and math.isfinite(sigma)):
+        raise ConfigError(f'--sigma = {sigma} m: must be above 0')
+    radius = float(np.max(np.hypot(*rig.centers.T))) if args.radius is None else args.radius
+    room = placement.Room(radius, args.keep_out, tuple(args.box) if args.box else None)
+    candidates = placements(rig, room)
+    print(link_text(rig))
+    print()
+    print(placement_text(candidates, sigma))
+    print()
+    print(tilt_text(rig, radius, sigma))
+    print()
+    print(tied_text(rig, candidates[-1].centers, sigma))
+    if args.out is not None:
+        draw(candidates, room, rig, Path(args.out))
+        print(f'\n{args.out}')
+    return 0
+
+
+# ---- Appendix B ----
+
+
+def appendix_b() -> str:
+    """Tables B1 and B2 beside the thesis's own figures."""
+    cells = scaling.table_b1()
+    rows = [['case', 'length m', *scaling.COLUMNS]]
+    for case in scaling.table_b1_cases():
+        row = [f'{case.number} {case.what}', f'{case.link.length:g}']
+        for cell in cells:
+            if cell.row == str(case.number):
+                value = f'{float(scaling.round_as(cell.computed, cell.printed)):.4g}'
+                row.append(value if cell.agrees else f'{value} ({float(cell.printed):.4g})')
+        rows.append(row)
+    table_2 = scaling.table_b2()
+    rows_2 = [['material', 'E GPa', 'G GPa', 'TBR = 1.5 E/G', 'thesis']]
+    for material, cell in zip(scaling.MATERIALS, table_2, strict=True):
+        value = str(scaling.round_as(cell.computed, cell.printed))
+        moduli = (f'{material.youngs_modulus / 1e9:g}', f'{material.shear_modulus / 1e9:g}')
+        rows_2.append([material.name, *moduli, value, cell.printed])
+    errata = [f'  B1 case {c.row}, {c.column}: thesis {c.printed}: {c.erratum}' for c in cells if not c.agrees]
+    errata.append(f'  B1 case 1 experimental, D total: thesis 29.45: {scaling.EXPERIMENTAL_ERRATUM}')
+    errata += [f'  B2 {c.row}: thesis {c.printed}: {c.erratum}' for c in table_2 if not c.agrees]
+    base = scaling.table_b1_cases()[0].link
+    exact = scaling.torsion_to_bending_ratio_exact(base, scaling.FORCE)
+    virtual = scaling.table_b1_cases()[4].link.section.mean_radius
+    return '\n'.join(
+        [
+            f'Table B1: {scaling.FORCE:g} N at D, E {scaling.YOUNGS_MODULUS / 1e9:g} GPa, '
+            f'G {scaling.SHEAR_MODULUS / 1e9:g} GPa; I, J m^4; radii, bend m; twist rad; D mm',
+            'computed, rounded to the digits of the thesis; what it prints in brackets where that differs',
+            '',
+            columns(rows),
+            '',
+            'Table B2: torsion-to-bending ratio of two links of equal length',
+            '',
+            columns(rows_2),
+            '',
+            f'With the sine (B-5) the aluminium ratio is {exact:.6f}; with unequal links it is (L_CD/L_BC)^2 as large.',
+            f'Twice the length bends as before at a mean radius of {virtual * 1e3:.3f} mm (thesis: "EVD" 29.76 mm).',
+            '',
+            'Errata:',
+            *errata,
+        ]
+    )
+
+
+# ---- A rig's placement ----
+
+
+class Candidate(NamedTuple):
+    """A placement of two sensors, with what it is."""
+
+    name: str
+    centers: FloatArray
+
+
+def placements(rig: Rig, room: placement.Room) -> list[Candidate]:
+    """The rig's own placement, the same base line put opposite, and the best that the room holds."""
+    own = rig.centers
+    half = float(np.hypot(*(own[0] - own[1]))) / 2.0
+    return [
+        Candidate('this rig', own),
+        Candidate('same base line, opposite', placement.opposite(half)),
+        Candidate('best in the room', placement.best_pair(room)),
+    ]
+
+
+def link_text(rig: Rig) -> str:
+    """The link in one paragraph."""
+    section = TubeSection(rig.link.outer_radius, rig.link.inner_radius)
+    statics = LinkStatics.from_rig(rig)
+    bend, _, twist = np.diag(statics.compliance).tolist()
+    ratio = scaling.torsion_to_bending_ratio(rig.link.youngs_modulus, rig.link.shear_modulus)
+    return (
+        f'Link: L {rig.link.length:g} m, I {section.second_moment:.4e} m^4, J {section.polar_moment:.4e} m^4, '
+        f'area {section.area * 1e6:.1f} mm^2\n'
+        f'EI {statics.bending_stiffness:.1f} N m^2, GJ {statics.torsional_stiffness:.1f} N m^2; '
+        f'tip {bend * 1e6:.2f} um/N, {math.degrees(twist) * 1e3:.2f} mdeg/(N m); torsion-to-bending ratio {ratio:.3f}'
+    )
+
+
+def placement_text(candidates: list[Candidate], sigma: float) -> str:
+    """Spreads and condition numbers, and how much the best one gains."""
+    head = ['placement', 'c1 mm', 'c2 mm', 'dX um', 'dY um', 'theta mdeg', 'cond (0.1 m rad)', 'cond (m, rad)']
+    rows = [head]
+    spreads = []
+    for name, centers in candidates:
+        if not math.dist(centers[0], centers[1]) > 0.0:
+            rows.append([name, *_places(centers), *['unseen'] * 3, 'inf', 'inf'])
+            spreads.append(placement.Spread(math.inf, math.inf, math.inf))
+            continue
+        s = placement.spread_of_pair(centers, sigma)
+        spreads.append(s)
+        design = placement.design_matrix(centers)
+        in_metres, scaled = placement.condition(design, 1.0).two, placement.condition(design).two
+        theta = f'{math.degrees(s.theta) * 1e3:.3f}'
+        deviations = [f'{s.dx * 1e6:.3f}', f'{s.dy * 1e6:.3f}', theta]
+        rows.append([name, *_places(centers), *deviations, f'{scaled:.3f}', f'{in_metres:.3f}'])
+    own, best = spreads[0], spreads[-1]
+    gains = [a / b for a, b in zip(own, best, strict=True)]
+    return (
+        f'Placement, one standard deviation for {sigma * 1e6:.3f} um on each reading, at rest:\n\n'
+        + columns(rows)
+        + f'\n\n{candidates[-1].name} against this rig: deviation of dX {gains[0]:.2f}, dY {gains[1]:.2f}, '
+        f'theta {gains[2]:.2f} times smaller'
+    )
+
+
+def _places(centers: FloatArray) -> list[str]:
+    # Adding 0.0 turns the -0.0 of a rounding error into 0.
+    return [f'({x:.1f}, {y:.1f})' for x, y in (np.round(centers * 1e3, 1) + 0.0).tolist()]
+
+
+def tilt_text(rig: Rig, radius: float, sigma: float) -> str:
+    """What the sensors tell of the tilts, with all of dX, dY, theta, phi, omega free."""
+    three = placement.ring(3, radius)
+    stagger = np.array([radius, -radius / 2.0, -radius / 2.0])
+    rows = [['tilts left free, at phi 0.3, omega 0.1 deg', 'dX um', 'dY um', 'theta mdeg', 'phi mdeg', 'omega mdeg']]
+    for name, centers, heights in (
+        ('this rig, two sensors', rig.centers, rig.heights),
+        (f'three on a ring of {radius * 1e3:g} mm, one plane', three, np.zeros(3)),
+        (f'the same, heights {", ".join(f"{h * 1e3:+g}" for h in stagger)} mm', three, stagger),
+    ):
+        s = placement.pose_spread(TILTED, centers, heights, sigma) * np.array([1e6, 1e6, *[math.degrees(1e3)] * 3])
+        rows.append([name, *(f'{v:.3f}' if math.isfinite(v) else 'unseen' for v in s.tolist())])
+    return (
+        columns(rows)
+        + '\nTwo sensors give four readings for five unknowns: tie the tilts to the deflection, or ignore them.'
+    )
+
+
+def tied_text(rig: Rig, best: FloatArray, sigma: float) -> str:
+    """What two sensors tell of the slope ratio k once the tilts are tied to the deflection."""
+    link = rig.link
+    pose = np.array(LinkStatics.from_rig(rig).deflection(0.0, -SIDEBAR_FORCE, SIDEBAR_FORCE * link.length))
+    stagger = np.array([0.05, -0.05])
+    # Across the bending direction heights tell nothing of k: the best pair is turned into it.
+    turned = placement.opposite(float(np.hypot(*(best[0] - best[1]))) / 2.0)
+    rows = [[f'tilts tied, k free, at {SIDEBAR_FORCE:g} N', 'dX um', 'dY um', 'theta mdeg', 'k']]
+    for name, centers, heights in (
+        ('this rig', rig.centers, rig.heights),
+        ('this rig, heights +50, -50 mm', rig.centers, rig.heights + stagger),
+        ('opposite along Y, heights +50, -50 mm', turned, stagger),
+    ):
+        s = placement.slope_ratio_spread(pose, link.slope_ratio, link.length, centers, heights, sigma)
+        dx, dy, theta, ratio = (s * np.array([1e6, 1e6, math.degrees(1e3), 1.0])).tolist()
+        rows.append([name, f'{dx:.3f}', f'{dy:.3f}', f'{theta:.3f}', f'{ratio:.4f}'])
+    return columns(rows)
+
+
+def draw(candidates: list[Candidate], room: placement.Room, rig: Rig, path: Path) -> None:
+    """The placements seen from beyond the tip (X right, Y up), written to ``path``."""
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Circle, Rectangle
+
+    figure = Figure(figsize=(6.0, 6.0), layout='constrained')
+    axes: Any = figure.subplots()
+    axes.add_patch(Circle((0.0, 0.0), room.radius * 1e3, fill=False, linestyle=':', color='0.4', label='room'))
+    if room.keep_out > 0.0:
+        axes.add_patch(Circle((0.0, 0.0), room.keep_out * 1e3, fill=False, linestyle=':', color='0.4'))
+    if room.box is not None:
+        x_min, y_min, x_max, y_max = (1e3 * v for v in room.box)
+        axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, linestyle=':', color='0.4'))
+    axes.add_patch(Circle((0.0, 0.0), rig.link.outer_radius * 1e3, color='0.85', label='link'))
+    # Colours that also differ for a colour-blind reader (Okabe & Ito), and different marks.
+    for (name, centers), colour, mark in zip(candidates, ('#000000', '#0072B2', '#D55E00'), 's^o', strict=True):
+        places = 1e3 * centers
+        axes.plot(*places.T, color=colour, marker=mark, markersize=9, label=name)
+    axes.set(aspect='equal', xlabel='X, mm (link_tip)', ylabel='Y, mm', title='Sensor centres and base lines')
+    axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.1), ncols=3, frameon=False)
+    axes.grid(alpha=0.2)
+    save(figure, path)
+
+
+def save(figure: Any, path: Path) -> None:
+    """Write a figure; raises ConfigError for a kind or a place that cannot be written."""
+    kind = path.suffix.lower().lstrip('.')
+    if kind not in ('png', 'svg', 'pdf'):
+        raise ConfigError(f'--out {path}: the name must end in .png, .svg or .pdf')
+    try:
+        figure.savefig(path, dpi=150)
+    except OSError as error:
+        raise ConfigError(f'--out {path}: cannot be written ({error.strerror})') from None

@@ -1,0 +1,173 @@
+"""Run a recording through the same pipeline as the live node.
+
+REC is a bag folder, an .mcap or a .csv. With the parameters of the recording itself (the default)
+the estimates come out bit for bit as they were published; --compare shows it and exits 1 where
+anything differs. With --params-file another rig is used: what would it have measured?
+
+  psd-deflection replay recordings/psd_20260101_120000 --compare
+  psd-deflection replay run.csv --params-file my_rig.yaml --out estimates.csv
+  psd-deflection replay recordings/psd_20260101_120000 --out again.mcap
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from psd_deflection.config import Rig, load_rig, rig_from_values
+from psd_deflection.io.comparison import Comparison
+from psd_deflection.io.recording import Recording
+from psd_deflection.io.recordings import open_recording
+from psd_deflection.io.sinks import Sink, open_sink
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import DeflectionEstimate, RawChunk, Record, SampleBlock
+
+DIFFERS = 1
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
+    parser.add_argument(
+        '--params-file', metavar='RIG.yaml', help='use this rig instead of the parameters in the recording'
+    )
+    parser.add_argument('--out', metavar='OUT', help='write the estimates: OUT.csv, OUT.mcap, or a bag folder')
+    parser.add_argument(
+        '--compare', action='store_true', help='compare with the recorded estimates; exit 1 where a bit differs'
+    )
+    parser.add_argument('--json', action='store_true', help='print the summary as JSON')
+
+
+@dataclass
+class Totals:
+    """What came out, for the summary."""
+
+    blocks: int = 0
+    samples: int = 0
+    first_seq: int | None = None
+    last_seq: int = 0
+    poses: list[tuple[float, float, float]] = field(default_factory=list)
+
+    def add(self, record: Record) -> None:
+        """Count one record."""
+        if isinstance(record, SampleBlock):
+            self.blocks += 1
+            self.samples += len(record.seq)
+            if self.first_seq is None:
+                self.first_seq = int(record.seq[0])
+            self.last_seq = int(record.seq[-1])
+        elif isinstance(record, DeflectionEstimate) and record.primary:
+            self.poses.append((record.dx, record.dy, record.theta))
+
+    @property
+    def lost(self) -> int:
+        """Samples missing between the first and the last."""
+        return self.last_seq - self.first_seq + 1 - self.samples if self.first_seq is not None else 0
+
+
+def replayed(recording: Recording, pipeline: Pipeline, blocks: Iterable[SampleBlock]) -> Iterator[list[Record]]:
+    """The records of each step; recorded changes of parameters apply at their own block."""
+    changes = list(recording.changes)
+    for block in blocks:
+        while changes and changes[0].block <= block.index:
+            # What is unfinished belongs to the time before the change.
+            yield pipeline.flush()
+            change = changes.pop(0)
+            pipeline.apply(change)
+            yield [change]
+        yield pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags))
+    yield pipeline.flush()
+
+
+def rig_of(recording: Recording, params_file: str | None) -> Rig:
+    """The rig to use: of the file, else of the recording, else the thesis rig's."""
+    if params_file is not None:
+        return load_rig(params_file)
+    return rig_from_values(recording.parameters, f'{recording.path} (recorded parameters)')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay."""
+    recording = open_recording(args.recording)
+    rig = rig_of(recording, args.params_file)
+    recording = open_recording(
+        args.recording, block_size=rig.estimator.block_size, sample_rate_hz=rig.converter.sample_rate_hz
+    )
+    pipeline = Pipeline(rig)
+    comparison = Comparison(recording) if args.compare else None
+    sink: Sink | None = None
+    if args.out is not None:
+        effects = {f'effects.{name}': value for name, value in rig.effects.items()}
+        sink = open_sink(
+            args.out, rig_values={**rig.values, **effects}, solvers=rig.estimator.solvers, device_hello=recording.hello
+        )
+    totals = Totals()
+    began = time.perf_counter()
+    bar = tqdm(
+        recording.blocks(), unit=' blocks', delay=1.0, leave=False, disable=None if not args.json else True, ncols=80
+    )
+    try:
+        for records in replayed(recording, pipeline, bar):
+            for record in records:
+                totals.add(record)
+                if sink is not None:
+                    sink.put(record)
+            if comparison is not None:
+                comparison.add(records)
+    finally:
+        bar.close()
+        if sink is not None:
+            sink.close()
+    seconds = time.perf_counter() - began
+    for warning in recording.warnings:
+        print(f'warning: {warning}', file=sys.stderr)
+    _print_summary(args, rig, pipeline, totals, seconds)
+    if comparison is None:
+        return 0
+    comparison.finish()
+    print(comparison.summary(), file=sys.stderr if args.json else sys.stdout)
+    return 0 if comparison.same else DIFFERS
+
+
+def _print_summary(args: argparse.Namespace, rig: Rig, pipeline: Pipeline, totals: Totals, seconds: float) -> None:
+    counters = pipeline.counters
+    poses = np.array(totals.poses).reshape(-1, 3)
+    recorded_seconds = totals.blocks * rig.estimator.block_size / rig.converter.sample_rate_hz
+    if args.json:
+        summary = {
+            'recording': str(args.recording),
+            'samples': totals.samples,
+            'lost': totals.lost,
+            'blocks': totals.blocks,
+            'estimates': counters.estimates,
+            'refused': counters.refused,
+            'solver': rig.estimator.solver,
+            'seconds': recorded_seconds,
+            'replay_seconds': seconds,
+            'out': args.out,
+        }
+        print(json.dumps(summary))
+        return
+    print(
+        f'{args.recording}: {totals.samples} samples, {totals.lost} lost, {totals.blocks} blocks, '
+        f'{counters.estimates} estimates ({rig.estimator.solver})'
+    )
+    for cause, count in sorted(counters.refused.items()):
+        print(f'  no estimate: {count} blocks, {cause.replace("_", " ")}')
+    if len(poses):
+        low, high = poses.min(axis=0), poses.max(axis=0)
+        print(
+            f'  ΔX {low[0] * 1e6:+.2f} … {high[0] * 1e6:+.2f} µm, ΔY {low[1] * 1e6:+.2f} … {high[1] * 1e6:+.2f} µm, '
+            f'θ {np.rad2deg(low[2]) * 1e3:+.2f} … {np.rad2deg(high[2]) * 1e3:+.2f} mdeg'
+        )
+    print(f'  {recorded_seconds:.1f} s of data in {seconds:.2f} s')
+    if args.out is not None:
+        print(f'  written to {Path(args.out)}')

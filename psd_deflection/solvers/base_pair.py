@@ -1,0 +1,254 @@
+"""``base_pair``: lasers at the tip, PSDs at the base, in two planes (the thesis's section 5.3).
+
+Now the tip's tilt carries the beam along: PSD i, a distance L_i = -h_i below the tip, sees
+
+    X_i = dX + a_ix/cos(omega) - L_i tan(omega),
+    Y_i = dY + a_iy/cos(phi) - a_ix tan(omega) tan(phi) + L_i tan(phi)/cos(omega),     a_i = R(theta) l_i,
+
+which is exact for R = Ry(omega) Rx(phi) Rz(theta). 5.4-5.7 are its small-angle form with theta = 0
+(their tan phi is -tan phi here; 5.3's factor of 1.5 *opposes* the translation: for PSDs at the clamp
+a dot moves by (1 - k) dY, which at k = 1 is Fig. 5.9, nothing at all).
+
+5.6 takes both lasers' translations as equal, which any torsion breaks: four readings, five unknowns.
+0.1 degree of twist is then read as 1 mm of dY. So one must say what closes the system: ``no_twist``
+(5.3's own assumption: dX, dY, phi, omega), or ``beam`` (phi = -k dY/L, omega = +k dX/L: dX, dY, theta,
+and one plane will do unless k L_i/L = 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import cos, sin, tan
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from psd_deflection.errors import ConfigError, SolverError
+from psd_deflection.records import FloatArray
+from psd_deflection.solvers._gauss_newton import fit, fit_many
+from psd_deflection.solvers._geometry import SMALLEST_BASE_LINE, check_twist
+from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers._tilted_plate import Row
+from psd_deflection.solvers.beam import slope_per_metre
+
+Assume = Literal['beam', 'no_twist', 'nothing']
+
+_SMALLEST_GAIN = 1e-3
+"""Dot travel per travel of an unknown below which we say that it cannot be seen."""
+
+
+class BasePairSolver(Solver):
+    """PSDs fixed to the base, lasers on the tip plate, beams along -Z of the plate; P >= 2.
+
+    ``Geometry.centers``: of the PSDs, in base axes. ``heights``: of their planes over the tip section,
+    below zero: -L_i. ``beams`` = centers + zeros: where the lasers sit on the plate. Dots are read in
+    base axes.
+    """
+
+    name: ClassVar[str] = 'base_pair'
+
+    def __init__(self, geometry: Geometry, assume: Assume = 'beam') -> None:
+        """Bind to ``geometry`` under the assumption ``assume`` (see the module).
+
+        Raises ConfigError for another assumption, SolverError with the reason where that leaves
+        something unseen.
+        """
+        self._count = check_twist(geometry)
+        heights = np.asarray(geometry.heights, dtype=np.float64)
+        for i, height in enumerate(heights.tolist()):
+            if height >= 0.0:
+                raise SolverError(
+                    f'psd_{i + 1}.height = {height:g} m: a PSD at the base stands below the tip section; '
+                    'base_pair takes psd_N.height = -(its distance from the lasers)'
+                )
+        self._centers = np.asarray(geometry.centers, dtype=np.float64)
+        self._beams = np.asarray(geometry.beams, dtype=np.float64)
+        self._heights = heights
+        self._rows = tuple(
+            (cx, cy, lx, ly, h)
+            for (cx, cy), (lx, ly), h in zip(
+                self._centers.tolist(), self._beams.tolist(), heights.tolist(), strict=True
+            )
+        )
+        # From the unknowns that are solved for to (dX, dY, theta, phi, omega).
+        if assume == 'beam':
+            tie = slope_per_metre(geometry)
+            spread: tuple[tuple[float, ...], ...] = (
+                (1.0, 0.0, 0.0),
+                (0.0, 1.0, 0.0),
+                (0.0, 0.0, 1.0),
+                (0.0, -tie, 0.0),
+                (tie, 0.0, 0.0),
+            )
+        elif assume == 'no_twist':
+            spread = (
+                (1.0, 0.0, 0.0, 0.0),
+                (0.0, 1.0, 0.0, 0.0),
+                (0.0, 0.0, 0.0, 0.0),
+                (0.0, 0.0, 1.0, 0.0),
+                (0.0, 0.0, 0.0, 1.0),
+            )
+        elif assume == 'nothing':
+            spread = tuple(tuple(float(i == j) for j in range(5)) for i in range(5))
+        else:
+            raise ConfigError(f'assume = {assume!r}: must be one of beam, no_twist, nothing')
+        self._spread = spread
+        self._unknowns = len(self._spread[0])
+        self._matrix = np.array(self._spread)
+        self._refuse_what_is_unseen(geometry, assume)
+
+    def _refuse_what_is_unseen(self, geometry: Geometry, assume: Assume) -> None:
+        heights = self._heights
+        if assume == 'nothing' and self._count == 2:
+            _, jacobian = _landings(self._beams, heights, np.zeros((1, 5)))
+            null = np.linalg.svd(jacobian[0])[2][4]
+            per_degree = abs(null[1] / null[2]) * np.pi / 180.0
+            raise SolverError(
+                'two PSDs at the base give 4 readings for 5 unknowns: with torsion, one degree of twist looks like '
+                f'{per_degree * 1e3:.3g} mm of dY; assume no_twist, or beam (tilts tied to the deflection), '
+                'or put the PSDs at the tip'
+            )
+        if assume == 'no_twist' and np.ptp(heights) < SMALLEST_BASE_LINE:
+            raise SolverError(
+                f'all PSD planes are {-heights[0]:g} m from the lasers: translation and tilt move the dots alike; '
+                'put psd_1 and psd_2 in two planes (psd_N.height), or assume beam'
+            )
+        if assume == 'beam':
+            k = geometry.slope_ratio
+            gains = 1.0 + k * heights / geometry.link_length
+            if np.abs(gains).max() < _SMALLEST_GAIN:
+                raise SolverError(
+                    f'link.slope_ratio = {k:g} with all PSDs {-heights[0]:g} m from the lasers: the tilt carries each '
+                    'dot back by what the deflection moved it (Fig. 5.9): the deflection cannot be seen; '
+                    'put the PSDs in another plane'
+                )
+        _, jacobian = _landings(self._beams, heights, np.zeros((1, 5)))
+        length = float(np.hypot(*np.ptp(self._beams, axis=0)))
+        scale = np.array([1.0, 1.0, length, float(np.abs(heights).max()), float(np.abs(heights).max())])
+        seen = (jacobian[0] / scale) @ (scale[:, None] * self._matrix)
+        seen /= np.linalg.norm(seen, axis=0)
+        if np.linalg.svd(seen, compute_uv=False)[-1] < _SMALLEST_GAIN:
+            raise SolverError(
+                f'base_pair, assuming {assume}: some motion of the tip moves no dot with this geometry '
+                '(PSDs on one line in space, or in one plane); move one PSD'
+            )
+
+    def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
+        """One block, pure floats. See :class:`Solver`."""
+        measured: list[float] = []
+        for i, (cx, cy, _, _, _) in enumerate(self._rows):
+            measured.append(cx + dots[2 * i])
+            measured.append(cy + dots[2 * i + 1])
+        try:
+            found = fit(self._model, (0.0,) * self._unknowns, measured, variances)
+        except ZeroDivisionError:
+            raise SolverError('solve: variances must be above 0 m^2') from None
+        full = [sum([a * x for a, x in zip(row, found.parameters, strict=True)]) for row in self._spread]
+        spread = self._spread[:3]
+        half = [
+            [sum([a * v for a, v in zip(row, column, strict=True)]) for column in found.covariance] for row in spread
+        ]
+        v = [[sum([a * h for a, h in zip(row, line, strict=True)]) for row in spread] for line in half]
+        return Solution(
+            full[0],
+            full[1],
+            full[2],
+            full[3],
+            full[4],
+            (v[0][0], v[0][1], v[0][2], v[1][0], v[1][1], v[1][2], v[2][0], v[2][1], v[2][2]),
+            tuple(found.residual),
+            SolverStatus.OK if found.converged else SolverStatus.NOT_CONVERGED,
+            found.steps,
+        )
+
+    def _model(self, x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
+        dx, dy, theta, phi, omega = [sum([a * b for a, b in zip(row, x, strict=True)]) for row in self._spread]
+        predicted: list[float] = []
+        rows: list[Sequence[float]] = []
+        for _, _, lx, ly, height in self._rows:
+            px, py, jx, jy = _landing(lx, ly, height, dx, dy, theta, phi, omega)
+            predicted.append(px)
+            predicted.append(py)
+            for j in (jx, jy):
+                rows.append(
+                    [sum([a * row[i] for a, row in zip(j, self._spread, strict=True)]) for i in range(self._unknowns)]
+                )
+        return predicted, rows
+
+    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
+        """N blocks. See :class:`Solver`."""
+        measured = np.asarray(dots, dtype=np.float64) + self._centers.ravel()
+        spread = self._matrix
+
+        def model(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+            predicted, jacobian = _landings(self._beams, self._heights, x @ spread.T)
+            return predicted, jacobian @ spread
+
+        found = fit_many(model, np.zeros((len(measured), self._unknowns)), measured, variances)
+        full = found.parameters @ spread.T
+        covariance = spread[:3] @ found.covariance @ spread[:3].T
+        status = np.where(found.converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED).astype(np.int8)
+        return Solutions(full[:, :3].copy(), full[:, 3:].copy(), covariance, found.residual, status)
+
+
+def small_angle(geometry: Geometry, dots: tuple[float, ...]) -> tuple[float, float, float, float]:
+    """5.4-5.7 put right, for two PSDs and no twist: (dX, dY, tan of the slope toward +X, toward +Y).
+
+    Good to the square of the angles; ``no_twist`` solves the exact equations.
+    """
+    (x01, y01), (x02, y02) = np.asarray(geometry.zeros).tolist()
+    h1, h2 = np.asarray(geometry.heights).tolist()
+    x1, y1, x2, y2 = dots
+    slope_x = ((x2 - x02) - (x1 - x01)) / (h2 - h1)
+    slope_y = ((y2 - y02) - (y1 - y01)) / (h2 - h1)
+    return (x1 - x01) - h1 * slope_x, (y1 - y01) - h1 * slope_y, slope_x, slope_y
+
+
+def _landing(
+    lx: float, ly: float, height: float, dx: float, dy: float, theta: float, phi: float, omega: float
+) -> tuple[float, float, Row, Row]:
+    """Where laser (lx, ly) falls in the plane at ``height``, and the derivatives of that."""
+    ct = cos(theta)
+    st = sin(theta)
+    ax = ct * lx - st * ly
+    ay = st * lx + ct * ly
+    co = cos(omega)
+    cp = cos(phi)
+    to = tan(omega)
+    tp = tan(phi)
+    return (
+        dx + ax / co + height * to,
+        dy + ay / cp - ax * to * tp - height * tp / co,
+        (1.0, 0.0, -ay / co, 0.0, (ax * sin(omega) + height) / (co * co)),
+        (
+            0.0,
+            1.0,
+            ax / cp + ay * to * tp,
+            (ay * sin(phi) - ax * to - height / co) / (cp * cp),
+            -tp * (ax + height * sin(omega)) / (co * co),
+        ),
+    )
+
+
+def _landings(beams: FloatArray, heights: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The same for n poses (n, 5): places (n, 2P) and derivatives (n, 2P, 5)."""
+    dx, dy, theta, phi, omega = (poses[:, i, None] for i in range(5))
+    ax = np.cos(theta) * beams[:, 0] - np.sin(theta) * beams[:, 1]
+    ay = np.sin(theta) * beams[:, 0] + np.cos(theta) * beams[:, 1]
+    co = np.cos(omega)
+    cp = np.cos(phi)
+    to = np.tan(omega)
+    tp = np.tan(phi)
+    n, count = ax.shape
+    place = np.empty((n, 2 * count))
+    place[:, 0::2] = dx + ax / co + heights * to
+    place[:, 1::2] = dy + ay / cp - ax * to * tp - heights * tp / co
+    j = np.zeros((n, 2 * count, 5))
+    j[:, 0::2, 0] = 1.0
+    j[:, 1::2, 1] = 1.0
+    j[:, 0::2, 2] = -ay / co
+    j[:, 1::2, 2] = ax / cp + ay * to * tp
+    j[:, 1::2, 3] = (ay * np.sin(phi) - ax * to - heights / co) / (cp * cp)
+    j[:, 0::2, 4] = (ax * np.sin(omega) + heights) / (co * co)
+    j[:, 1::2, 4] = -tp * (ax + heights * np.sin(omega)) / (co * co)
+    return place, j

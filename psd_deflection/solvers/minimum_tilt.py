@@ -1,0 +1,259 @@
+"""``minimum_tilt``: what four readings leave of the thesis's section 2.3.
+
+Section 2.3 looks for two tilts beside dX, dY and theta. Four readings cannot give five unknowns: one
+dot fixes the translation, and M(q_1 - q_2) = l_1 - l_2 is two equations for three angles. Put right
+(:func:`tilt_branches`), its chain reproduces all four readings for *any* admissible trial angle, so
+that its stopping test (2.46-2.49) says nothing.
+
+What can be seen: the azimuth of the base line, which is theta to within phi omega / 2, and by how much
+the base line is foreshortened, |l_12| = |q_12| cos beta. The smallest tilt that explains it leans the
+plate by beta along the base line, one way *or the other*: the dots are the same for (phi, omega) and
+(-phi, -omega). A tilt about the base line leaves no trace. The answer carries the branch that leans
+PSD 1 towards the base; dX, dY and theta are the same for both.
+"""
+
+from __future__ import annotations
+
+from math import acos, asin, atan2, cos, hypot, nan, pi, remainder, sin, sqrt
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from psd_deflection.errors import SolverError
+from psd_deflection.records import FloatArray
+from psd_deflection.solvers._geometry import check_twist
+from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers._plane import Covariance, split, turn_covariance
+from psd_deflection.solvers.exact import ExactSolver
+
+_TOO_SHORT = 3.0
+"""Standard deviations by which the base line may be shorter than the beams' before we say so."""
+
+
+class TiltBranch(NamedTuple):
+    """One of the tilts that explain the dots at a given twist: m and rad."""
+
+    dx: float
+    dy: float
+    phi: float
+    omega: float
+
+
+def tilt_branches(geometry: Geometry, dots: tuple[float, ...], theta: float) -> tuple[TiltBranch, ...]:
+    """All (dX, dY, phi, omega) that give exactly these dots at twist ``theta``: none, or four.
+
+    The thesis's 2.32-2.43 put right, for two PSDs at height 0:
+
+    - 2.32: (X^_i, Y^_i) = R(theta) q_i, signs kept;
+    - 2.34, 2.35: Y_T,i = l_iy - dY; so 2.36: cos phi = (l_1y - l_2y)/(Y^_1 - Y^_2), dY = l_2y - Y^_2 cos phi;
+    - 2.37: Pr_i = +- Y^_i sin |phi|, the sign is not to be had;
+    - 2.38: DT^2 = (Pr_1 - Pr_2)^2 + (X^_1 - X^_2)^2, a sum;
+    - 2.40, 2.41: omega = atan2(Pr_1 - Pr_2, X^_1 - X^_2) +- acos((l_1x - l_2x)/DT);
+    - 2.42: dX = l_1x - X^_1 cos omega - Pr_1 sin omega.
+
+    Raises SolverError where the beams stand side by side or one above the other (l_1y = l_2y loses
+    phi, l_1x = l_2x loses omega).
+    """
+    if check_twist(geometry) != 2:
+        raise SolverError('tilt branches are those of two PSDs')
+    (l1x, l1y), (l2x, l2y) = geometry.beams.tolist()
+    (c1x, c1y), (c2x, c2y) = np.asarray(geometry.centers).tolist()
+    for axis, angle, apart in (('y', 'phi', l1y - l2y), ('x', 'omega', l1x - l2x)):
+        if abs(apart) < 1e-6:
+            raise SolverError(f'both beams have the same {axis}: {angle} has no part in their base line')
+    c = cos(theta)
+    s = sin(theta)
+    x1 = c * (c1x + dots[0]) - s * (c1y + dots[1])
+    y1 = s * (c1x + dots[0]) + c * (c1y + dots[1])
+    x2 = c * (c2x + dots[2]) - s * (c2y + dots[3])
+    y2 = s * (c2x + dots[2]) + c * (c2y + dots[3])
+    # Rounding may carry an untilted plate past 1 by a few digits; more is a contradiction.
+    cos_phi = (l1y - l2y) / (y1 - y2) if y1 != y2 else nan
+    if not abs(cos_phi) <= 1.0 + 1e-12:
+        return ()
+    cos_phi = min(1.0, cos_phi)
+    phi = acos(cos_phi)
+    dy = l2y - y2 * cos_phi
+    found = []
+    for signed in (phi, -phi):
+        p1 = y1 * sin(signed)
+        p2 = y2 * sin(signed)
+        cosine = (l1x - l2x) / hypot(p1 - p2, x1 - x2)
+        if not abs(cosine) <= 1.0 + 1e-12:
+            return ()
+        apart = acos(max(-1.0, min(1.0, cosine)))
+        middle = atan2(p1 - p2, x1 - x2)
+        for sum_ in (middle + apart, middle - apart):
+            omega = remainder(sum_, 2.0 * pi)
+            found.append(TiltBranch(l1x - x1 * cos(omega) - p1 * sin(omega), dy, signed, omega))
+    return tuple(found)
+
+
+class MinimumTiltSolver(Solver):
+    """The least tilt along the base line that explains its length; two PSDs at height 0.
+
+    ``theta`` is the turn of the base line's projection. ``INADMISSIBLE``: the base line on the plate
+    is shorter than between the beams by more than three standard deviations, which no tilt can do.
+    Within that, the tilt is 0 and the answer the flat plate's. The covariance holds away from zero
+    tilt; near it the tilt is not a smooth function of the readings.
+    """
+
+    name: ClassVar[str] = 'minimum_tilt'
+
+    def __init__(self, geometry: Geometry) -> None:
+        """Bind to ``geometry``. Raises SolverError where the beams coincide or there are not two."""
+        if check_twist(geometry) != 2:
+            raise SolverError('minimum_tilt takes two PSDs; with three at different heights use pose')
+        if np.any(geometry.heights):
+            raise SolverError(
+                f'psd heights {np.asarray(geometry.heights).tolist()} m: minimum_tilt takes both surfaces at 0; '
+                'the beam solver has heights in its model'
+            )
+        ((self._c1x, self._c1y), (self._c2x, self._c2y)) = np.asarray(geometry.centers).tolist()
+        (self._l1x, self._l1y), (self._l2x, self._l2y) = geometry.beams.tolist()
+        lx = self._l1x - self._l2x
+        ly = self._l1y - self._l2y
+        self._flat = ExactSolver(geometry)
+        self._length = hypot(lx, ly)
+        self._ex = lx / self._length
+        self._ey = ly / self._length
+
+    def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
+        """One block, pure floats. See :class:`Solver`."""
+        x1, y1, x2, y2 = dots
+        q1x = self._c1x + x1
+        q1y = self._c1y + y1
+        qx = q1x - self._c2x - x2
+        qy = q1y - self._c2y - y2
+        ex = self._ex
+        ey = self._ey
+        long = hypot(qx, qy)
+        if not long > self._length:
+            flat = self._flat.solve(dots, variances)
+            if flat.status is SolverStatus.OK and self._too_short(long, flat.theta, variances):
+                return flat._replace(status=SolverStatus.INADMISSIBLE)
+            return flat
+        theta = atan2(qx * ey - qy * ex, qx * ex + qy * ey)
+        c = cos(theta)
+        s = sin(theta)
+        cos_beta = self._length / long
+        sin_beta = sqrt((1.0 - cos_beta) * (1.0 + cos_beta))
+        # Plate point 1 in the base's axes, along and across the base line.
+        px = c * q1x - s * q1y
+        py = s * q1x + c * q1y
+        reach = px * ex + py * ey
+        off = py * ex - px * ey
+        back_e = self._l1x * ex + self._l1y * ey - cos_beta * reach
+        back_n = self._l1y * ex - self._l1x * ey - off
+        covariance = self._covariance(c * ex + s * ey, c * ey - s * ex, reach, off, cos_beta, long, variances)
+        return Solution(
+            back_e * ex - back_n * ey,
+            back_e * ey + back_n * ex,
+            theta,
+            -asin(sin_beta * ey),
+            atan2(sin_beta * ex, cos_beta),
+            covariance,
+            (0.0, 0.0, 0.0, 0.0),
+            SolverStatus.OK,
+            0,
+        )
+
+    def _too_short(self, long: float, theta: float, variances: tuple[float, ...]) -> bool:
+        """Whether noise along the base line cannot explain that it is too short for any tilt."""
+        ax = cos(theta) * self._ex + sin(theta) * self._ey
+        ay = cos(theta) * self._ey - sin(theta) * self._ex
+        vx1, vy1, vx2, vy2 = variances
+        return self._length - long > _TOO_SHORT * sqrt(ax * ax * (vx1 + vx2) + ay * ay * (vy1 + vy2))
+
+    def _covariance(
+        self,
+        ax: float,
+        ay: float,
+        reach: float,
+        off: float,
+        cos_beta: float,
+        long: float,
+        variances: tuple[float, ...],
+    ) -> Covariance:
+        """Sensitivities to noise along (e) and across (n) the base line, dot by dot; (ax, ay) is e."""
+        lever = reach / long
+        side = cos_beta * off / long
+        ee = en = et = nn = nt = tt = 0.0
+        for i, (e_along, e_across, n_across, t_across) in enumerate(
+            (
+                (-cos_beta * (1.0 - lever), -side, lever - 1.0, -1.0 / long),
+                (-cos_beta * lever, side, -lever, 1.0 / long),
+            )
+        ):
+            vx = variances[2 * i]
+            vy = variances[2 * i + 1]
+            along = ax * ax * vx + ay * ay * vy
+            across = ay * ay * vx + ax * ax * vy
+            mixed = ax * ay * (vy - vx)
+            ee += e_along * e_along * along + 2.0 * e_along * e_across * mixed + e_across * e_across * across
+            e_to_across = e_along * mixed + e_across * across
+            en += n_across * e_to_across
+            et += t_across * e_to_across
+            nn += n_across * n_across * across
+            nt += n_across * t_across * across
+            tt += t_across * t_across * across
+        return turn_covariance(self._ex, self._ey, ee, en, nn, et, nt, tt)
+
+    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
+        """N blocks. See :class:`Solver`."""
+        out = self._flat.solve_many(dots, variances)
+        x, y, vx, vy = split(dots, variances)
+        n = len(x)
+        ex = self._ex
+        ey = self._ey
+        q1x = self._c1x + x[:, 0]
+        q1y = self._c1y + y[:, 0]
+        qx = q1x - self._c2x - x[:, 1]
+        qy = q1y - self._c2y - y[:, 1]
+        long = np.hypot(qx, qy)
+        with np.errstate(divide='ignore', invalid='ignore'):
+            cos_beta = np.minimum(self._length / long, 1.0)
+        tilted = long > self._length
+        theta = np.arctan2(qx * ey - qy * ex, qx * ex + qy * ey)
+        c = np.cos(theta)
+        s = np.sin(theta)
+        px = c * q1x - s * q1y
+        py = s * q1x + c * q1y
+        reach = px * ex + py * ey
+        off = py * ex - px * ey
+        back_e = self._l1x * ex + self._l1y * ey - cos_beta * reach
+        back_n = self._l1y * ex - self._l1x * ey - off
+        ax = (c * ex + s * ey)[:, None]
+        ay = (c * ey - s * ex)[:, None]
+        # Noise of each dot along and across the base line, (n, 2 dots, 2, 2).
+        noise = np.empty((n, 2, 2, 2))
+        noise[..., 0, 0] = ax * ax * vx + ay * ay * vy
+        noise[..., 1, 1] = ay * ay * vx + ax * ax * vy
+        noise[..., 0, 1] = noise[..., 1, 0] = ax * ay * (vy - vx)
+        too_short = (self._length - long) ** 2 > _TOO_SHORT**2 * noise[..., 0, 0].sum(axis=1)
+        # Sensitivities of (along, across, theta), (n, 2 dots, 3, 2).
+        gain = np.zeros((n, 2, 3, 2))
+        lever = reach / self._length * cos_beta
+        side = cos_beta * off / self._length * cos_beta
+        gain[:, 0, 0, 0] = -cos_beta * (1.0 - lever)
+        gain[:, 1, 0, 0] = -cos_beta * lever
+        gain[:, 0, 0, 1] = -side
+        gain[:, 1, 0, 1] = side
+        gain[:, 0, 1, 1] = lever - 1.0
+        gain[:, 1, 1, 1] = -lever
+        gain[:, 0, 2, 1] = -cos_beta / self._length
+        gain[:, 1, 2, 1] = cos_beta / self._length
+        turn = np.array([[ex, -ey, 0.0], [ey, ex, 0.0], [0.0, 0.0, 1.0]])
+        gain = turn @ gain
+        covariance = np.einsum('ndij,ndjk,ndlk->nil', gain, noise, gain)
+        sin_beta = np.sqrt((1.0 - cos_beta) * (1.0 + cos_beta))
+        pose = np.column_stack((back_e * ex - back_n * ey, back_e * ey + back_n * ex, theta))
+        tilt = np.column_stack((-np.arcsin(sin_beta * ey), np.arctan2(sin_beta * ex, cos_beta)))
+        inadmissible = ~tilted & too_short & (out.status == SolverStatus.OK)
+        return Solutions(
+            np.where(tilted[:, None], pose, out.pose),
+            np.where(tilted[:, None], tilt, out.tilt),
+            np.where(tilted[:, None, None], covariance, out.covariance),
+            np.where(tilted[:, None], 0.0, out.residual),
+            np.where(inadmissible, SolverStatus.INADMISSIBLE, out.status).astype(np.int8),
+        )

@@ -1,0 +1,150 @@
+"""``wls_exact``: the linear answer of ``wls``, with what linearising did to it undone exactly.
+
+On a flat plate b = m - m_0 = (R(-theta) - I) l_i - f, f = R(-theta) d. Put into the weighted linear
+solution this gives, for any weights and any size of angle,
+
+    theta' = sin theta - kappa (1 - cos theta),
+    dX'    = f_x - ybar_x (sin theta - theta') + xbar_x (1 - cos theta),
+    dY'    = f_y + xbar_y (sin theta - theta') + ybar_y (1 - cos theta),
+
+with means of the beams weighted by wx (.._x) and wy (.._y) and kappa a number of the rig and the
+weights (0 where the weights of x and y agree: then theta = asin theta'). One arcsine inverts it. The
+readings are combined as ``wls`` combines them, ``thesis`` weights included.
+"""
+
+from __future__ import annotations
+
+from math import asin, atan, cos, hypot, sin
+from typing import ClassVar
+
+import numpy as np
+
+from psd_deflection.records import FloatArray
+from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers._plane import split, turn_covariance, turn_covariance_many
+from psd_deflection.solvers.wls import THESIS_ROW_SCALING, Weights, WlsSolver
+
+
+class WlsExactSolver(Solver):
+    """``wls`` without the small angle, P >= 2 PSDs; options as of :class:`WlsSolver`.
+
+    ``INADMISSIBLE``: the readings ask for a sine above 1. The residual is that of ``wls``'s linear
+    model, whose combination of the readings this is.
+    """
+
+    name: ClassVar[str] = 'wls_exact'
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        weights: Weights = 'inverse_variance',
+        row_scaling: tuple[float, ...] = THESIS_ROW_SCALING,
+    ) -> None:
+        """Bind to ``geometry``; options and errors as of :class:`WlsSolver`."""
+        self._wls = WlsSolver(geometry, weights, row_scaling)
+        self._beams = np.asarray(geometry.beams, dtype=np.float64)
+        self._rows = tuple((lx, ly) for lx, ly in self._beams.tolist())
+        self._fixed: tuple[float, ...] | None = None
+        self._weights: FloatArray | None = None
+        if weights == 'thesis':
+            self._weights = np.square(np.array([row_scaling], dtype=np.float64))
+            self._fixed = tuple(self._weights[0].tolist())
+
+    def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
+        """One block, pure floats. See :class:`Solver`."""
+        linear = self._wls.solve(dots, variances)
+        w = self._fixed if self._fixed is not None else tuple([1.0 / v for v in variances])
+        sum_x = sum_y = xx = xy = yx = yy = 0.0
+        for i, (lx, ly) in enumerate(self._rows):
+            wx = w[2 * i]
+            wy = w[2 * i + 1]
+            sum_x += wx
+            sum_y += wy
+            xx += wx * lx
+            xy += wx * ly
+            yx += wy * lx
+            yy += wy * ly
+        xx /= sum_x
+        xy /= sum_x
+        yx /= sum_y
+        yy /= sum_y
+        spread = mixed = 0.0
+        for i, (lx, ly) in enumerate(self._rows):
+            wx = w[2 * i]
+            wy = w[2 * i + 1]
+            spread += wx * (ly - xy) ** 2 + wy * (lx - yx) ** 2
+            mixed += wx * (ly - xy) * lx - wy * (lx - yx) * ly
+        kappa = mixed / spread
+        sine = (linear.theta + kappa) / hypot(1.0, kappa)
+        if not -1.0 <= sine <= 1.0:
+            status = SolverStatus.INADMISSIBLE if sine == sine else SolverStatus.NOT_CONVERGED
+            return linear._replace(status=status)
+        theta = asin(sine) - atan(kappa)
+        c = cos(theta)
+        s = sin(theta)
+        # (1 - cos) by the half angle: no digits are lost at small angles.
+        versine = 2.0 * sin(0.5 * theta) ** 2
+        fx = linear.dx + xy * (s - linear.theta) - xx * versine
+        fy = linear.dy - yx * (s - linear.theta) - yy * versine
+        # The way from a change of the linear answer to one of this answer, in plate axes.
+        slope = 1.0 / (c - kappa * s)
+        tx = -fy * slope + xy * (c * slope - 1.0) - xx * s * slope
+        ty = fx * slope - yx * (c * slope - 1.0) - yy * s * slope
+        vxx, vxy, vxt, _, vyy, vyt, _, _, vtt = linear.covariance
+        covariance = turn_covariance(
+            c,
+            s,
+            vxx + 2.0 * tx * vxt + tx * tx * vtt,
+            vxy + tx * vyt + ty * vxt + tx * ty * vtt,
+            vyy + 2.0 * ty * vyt + ty * ty * vtt,
+            (vxt + tx * vtt) * slope,
+            (vyt + ty * vtt) * slope,
+            vtt * slope * slope,
+        )
+        return linear._replace(dx=c * fx - s * fy, dy=s * fx + c * fy, theta=theta, covariance=covariance)
+
+    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
+        """N blocks. See :class:`Solver`."""
+        linear = self._wls.solve_many(dots, variances)
+        _, _, wx, wy = split(dots, self._weights if self._weights is not None else 1.0 / np.asarray(variances))
+        lx = self._beams[:, 0]
+        ly = self._beams[:, 1]
+        xx, xy = ((wx * a).sum(axis=1) / wx.sum(axis=1) for a in (lx, ly))
+        yx, yy = ((wy * a).sum(axis=1) / wy.sum(axis=1) for a in (lx, ly))
+        across = ly - xy[:, None]
+        along = lx - yx[:, None]
+        kappa = (wx * across * lx - wy * along * ly).sum(axis=1) / (wx * across**2 + wy * along**2).sum(axis=1)
+        rough = linear.pose[:, 2]
+        sine = (rough + kappa) / np.hypot(1.0, kappa)
+        admissible = np.abs(sine) <= 1.0
+        theta = np.arcsin(np.where(admissible, sine, 0.0)) - np.arctan(kappa)
+        c = np.cos(theta)
+        s = np.sin(theta)
+        versine = 2.0 * np.sin(0.5 * theta) ** 2
+        fx = linear.pose[:, 0] + xy * (s - rough) - xx * versine
+        fy = linear.pose[:, 1] - yx * (s - rough) - yy * versine
+        slope = 1.0 / (c - kappa * s)
+        tx = -fy * slope + xy * (c * slope - 1.0) - xx * s * slope
+        ty = fx * slope - yx * (c * slope - 1.0) - yy * s * slope
+        v = linear.covariance
+        covariance = turn_covariance_many(
+            c,
+            s,
+            v[:, 0, 0] + 2.0 * tx * v[:, 0, 2] + tx * tx * v[:, 2, 2],
+            v[:, 0, 1] + tx * v[:, 1, 2] + ty * v[:, 0, 2] + tx * ty * v[:, 2, 2],
+            v[:, 1, 1] + 2.0 * ty * v[:, 1, 2] + ty * ty * v[:, 2, 2],
+            (v[:, 0, 2] + tx * v[:, 2, 2]) * slope,
+            (v[:, 1, 2] + ty * v[:, 2, 2]) * slope,
+            v[:, 2, 2] * slope * slope,
+        )
+        pose = np.column_stack((c * fx - s * fy, s * fx + c * fy, theta))
+        status = np.where(admissible, linear.status, SolverStatus.INADMISSIBLE)
+        status = np.where(np.isfinite(sine), status, SolverStatus.NOT_CONVERGED).astype(np.int8)
+        ok = admissible[:, None]
+        return Solutions(
+            np.where(ok, pose, linear.pose),
+            linear.tilt,
+            np.where(ok[:, :, None], covariance, linear.covariance),
+            linear.residual,
+            status,
+        )

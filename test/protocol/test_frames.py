@@ -1,0 +1,160 @@
+"""The frames of contract section 5. The bytes of the case table were written down, not encoded by us."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psd_deflection.protocol.frames import (
+    MAX_ENCODED,
+    BadFrame,
+    BadReason,
+    Frame,
+    FrameDecoder,
+    GoodFrame,
+    HelloFrame,
+    HelloRequestFrame,
+    PingFrame,
+    PongFrame,
+    SampleFrame,
+    StartFrame,
+    StatusFrame,
+    StopFrame,
+    encode,
+)
+
+SAMPLE = SampleFrame(0, 1, 1000, (1, -1, 16384, 0, 0, 16384))
+SAMPLE_BYTES = bytes.fromhex('020102010101 03e803 01010101 01 0201 03ffff 0240 01010101 0640713ed6b200')
+
+GOOD: list[tuple[str, str, GoodFrame]] = [
+    ('a sample', SAMPLE_BYTES.hex(), SAMPLE),
+    (
+        'a sample with both flags, the last seq and the rails',
+        '0e 01 03 ff ff ff ff 08 07 06 05 04 03 02 03 ff 7f 02 80 01 02 01 02 02 02 03 05 78 eb d9 5f 00',
+        SampleFrame(3, 0xFFFFFFFF, 566265752454920, (32767, -32768, 0, 1, 2, 3)),
+    ),
+    ('status', '0302070101076608fcba8a2a00', StatusFrame(7, 2150)),
+    ('status without a thermometer', '020201010107ff7f885f6d5900', StatusFrame(0, None)),
+    ('hello', '1510017b2273657269616c223a2241227d5c9afeb600', HelloFrame(1, {'serial': 'A'})),
+    ('hello of another version', '0310020601 7b6cde0500', HelloFrame(2, {})),
+    ('hello?', '06117fcfb2b800', HelloRequestFrame()),
+    ('ping', '03120101010101010105c77e95a800', PingFrame(1)),
+    ('pong', '03 1301010101010101 0202010101010101 05a8a5696100', PongFrame(1, 2)),
+    ('start', '0614f03bd8c800', StartFrame()),
+    ('stop', '0615660bdfbf00', StopFrame()),
+]
+
+BAD: list[tuple[str, str, BadReason]] = [
+    ('unknown type', '087f010212a6f95700', BadReason.UNKNOWN_TYPE),
+    ('sample with too few bytes, CRC right', '02010601b383848900', BadReason.LENGTH),
+    ('start with a byte too many, CRC right', '0714090e7dab1600', BadReason.LENGTH),
+    ('hello whose JSON is cut', '1110017b2273657269616c223a6e519d9e00', BadReason.BODY),
+    ('hello that is a list', '0910015b5d624b0a3c00', BadReason.BODY),
+    (
+        'sample at a time that no clock has reached',
+        '02 01 02 01 01 01 01 01 01 01 01 01 01 02 10 01 01 01 01 01 01 01 01 01 01 01 05 58 db d3 7d 00',
+        BadReason.BODY,
+    ),
+    ('start with a wrong CRC', '0614f03bd8c900', BadReason.CRC),
+    ('too short for a CRC', '0314f000', BadReason.TOO_SHORT),
+    ('not COBS: the code points past the end', '0901020300', BadReason.COBS),
+    ('longer than a frame can be', '01' * (MAX_ENCODED + 1) + '00', BadReason.TOO_LONG),
+]
+
+
+def decode(stream: bytes) -> list[Frame]:
+    """As a receiver that is in step."""
+    return FrameDecoder().feed(b'\x00' + stream)
+
+
+@pytest.mark.parametrize(('label', 'wire', 'frame'), GOOD, ids=[c[0] for c in GOOD])
+def test_a_frame_and_its_bytes(label: str, wire: str, frame: GoodFrame) -> None:
+    received = bytes.fromhex(wire)
+    assert decode(received) == [frame]
+    if not (isinstance(frame, HelloFrame) and frame.version != 1):
+        assert encode(frame) == received
+
+
+@pytest.mark.parametrize(('label', 'wire', 'reason'), BAD, ids=[c[0] for c in BAD])
+def test_bytes_that_are_no_frame(label: str, wire: str, reason: BadReason) -> None:
+    received = bytes.fromhex(wire)
+    assert decode(received + SAMPLE_BYTES) == [BadFrame(reason, len(received) - 1), SAMPLE]
+
+
+def test_the_tail_of_a_frame_that_began_before_we_listened_is_passed_over() -> None:
+    for cut in range(1, len(SAMPLE_BYTES)):
+        assert FrameDecoder().feed(SAMPLE_BYTES[cut:] + SAMPLE_BYTES) == [SAMPLE]
+
+
+def test_empty_frames_are_nothing() -> None:
+    assert decode(b'\x00\x00' + SAMPLE_BYTES + b'\x00') == [SAMPLE]
+
+
+def test_a_hello_that_does_not_fit_is_refused() -> None:
+    with pytest.raises(ValueError, match='at most 512'):
+        encode(HelloFrame(1, {'serial': 'x' * 600}))
+
+
+def test_a_field_that_does_not_fit_is_refused() -> None:
+    with pytest.raises(ValueError, match='SampleFrame'):
+        encode(SAMPLE._replace(seq=1 << 32))
+
+
+samples = st.builds(
+    SampleFrame,
+    st.integers(0, 255),
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 2**53),
+    st.tuples(*[st.integers(-32768, 32767)] * 6),
+)
+frames = st.one_of(
+    samples,
+    st.builds(StatusFrame, st.integers(0, 2**32 - 1), st.none() | st.integers(-32768, 32766)),
+    st.builds(HelloFrame, st.just(1), st.dictionaries(st.text(max_size=8), st.integers(), max_size=4)),
+    st.builds(PongFrame, st.integers(0, 2**64 - 1), st.integers(0, 2**64 - 1)),
+)
+streams = st.lists(frames.map(encode) | st.binary(max_size=40), max_size=12).map(b''.join)
+
+
+@given(frames)
+def test_what_is_encoded_is_decoded(frame: GoodFrame) -> None:
+    assert decode(encode(frame)) == [frame]
+
+
+@given(streams, st.lists(st.integers(0, 2000), max_size=20))
+def test_any_split_of_the_stream_gives_the_same_frames(stream: bytes, cuts: list[int]) -> None:
+    whole = FrameDecoder().feed(stream)
+    bounds = [0, *sorted(min(c, len(stream)) for c in cuts), len(stream)]
+    decoder = FrameDecoder()
+    split: list[Frame] = []
+    for a, b in itertools.pairwise(bounds):
+        split += decoder.feed(stream[a:b])
+    assert split == whole
+    one_by_one = FrameDecoder()
+    assert [f for i in range(len(stream)) for f in one_by_one.feed(stream[i : i + 1])] == whole
+
+
+@given(st.binary(max_size=3000))
+def test_random_bytes_never_raise_and_never_grow(stream: bytes) -> None:
+    decoder = FrameDecoder()
+    decoder.feed(stream)
+    assert len(decoder._rest) <= MAX_ENCODED
+
+
+@given(samples, st.data())
+def test_one_flipped_bit_never_yields_a_sample(sample: SampleFrame, data: st.DataObject) -> None:
+    wire = bytearray(encode(sample))
+    bit = data.draw(st.integers(0, 8 * len(wire) - 1))
+    wire[bit // 8] ^= 1 << (bit % 8)
+    got = decode(bytes(wire) + b'\x00')
+    assert not any(isinstance(f, SampleFrame) for f in got)
+
+
+def test_every_single_flipped_bit_of_one_sample_is_noticed() -> None:
+    for bit in range(8 * len(SAMPLE_BYTES)):
+        wire = bytearray(SAMPLE_BYTES)
+        wire[bit // 8] ^= 1 << (bit % 8)
+        assert not any(isinstance(f, SampleFrame) for f in decode(bytes(wire) + b'\x00')), bit

@@ -1,0 +1,511 @@
+"""Bags of ours and of others, whole, cut, damaged and made up, as the reader gives them back."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagsWriter
+from rosbags.typesys import Stores, get_typestore
+
+import psd_deflection
+from msg_adapters import LOAD, SAMPLES, to_messages
+from psd_deflection.config import load_rig
+from psd_deflection.errors import RecordingError
+from psd_deflection.io import cdr
+from psd_deflection.io.bag_reader import BagRecording
+from psd_deflection.io.bag_writer import BagWriter, McapFile
+from psd_deflection.io.recordings import open_recording
+from psd_deflection.io.ros2msg import definition
+from psd_deflection.records import (
+    CHANNELS,
+    AppliedLoad,
+    DeflectionEstimate,
+    Record,
+    ReferencePose,
+    SampleBlock,
+    TemperatureReading,
+)
+
+from .making import STEP, T0, block, run
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+HELLO = {'serial': 'A1', 'sample_rate_hz': 1000}
+
+
+def same_block(a: SampleBlock, b: SampleBlock) -> bool:
+    return (
+        a.index == b.index
+        and all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ('seq', 't_ns', 'volts', 'flags'))
+        and all(getattr(a, n).dtype == getattr(b, n).dtype for n in ('seq', 't_ns', 'volts', 'flags'))
+    )
+
+
+def assert_same(got: Sequence[SampleBlock], expected: Sequence[SampleBlock]) -> None:
+    assert [b.index for b in got] == [b.index for b in expected]
+    assert all(same_block(a, b) for a, b in zip(got, expected, strict=True))
+
+
+def write_mcap(path: Path, records: Sequence[Record], **kwargs: Any) -> Path:
+    with McapFile(path, rig_values=kwargs.pop('rig_values', {}), **kwargs) as out:
+        for r in records:
+            out.write(r)
+    return path
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp('bags') / 'run'
+    with BagWriter(folder, rig_values=load_rig(None, {'sum_min': 1.5}).values, device_hello=HELLO) as out:
+        for r in run(150):
+            out.write(r)
+    return folder
+
+
+def test_every_record_comes_back(bag: Path) -> None:
+    recording = open_recording(bag)
+    records = list(run(150))
+    assert_same(list(recording.blocks()), [r for r in records if isinstance(r, SampleBlock)])
+    assert recording.loads() == [r for r in records if isinstance(r, AppliedLoad)]
+    assert recording.temperatures() == [r for r in records if isinstance(r, TemperatureReading)]
+    references = [r for r in records if isinstance(r, ReferencePose)]
+    np.testing.assert_allclose(recording.references(), references, rtol=1e-15)
+    assert recording.parameters == {**load_rig().values, 'sum_min': 1.5}
+    assert recording.hello == HELLO
+    assert recording.version == psd_deflection.__version__
+    assert recording.complete
+    assert not recording.warnings
+    assert recording.sample_rate_hz == pytest.approx(1000.0, rel=1e-12)
+
+
+def test_recorded_estimates_come_back(bag: Path) -> None:
+    series = open_recording(bag).estimates()
+    assert set(series) == {
+        '/link_tip/deflection',
+        '/link_tip/deflection_with_covariance',
+        '/link_tip/exact/deflection',
+        '/link_tip/wls/deflection',
+    }
+    expected = [r for r in run(150) if isinstance(r, DeflectionEstimate) and r.primary]
+    for topic in ('/link_tip/deflection', '/link_tip/deflection_with_covariance'):
+        got = series[topic]
+        np.testing.assert_array_equal(got.t_ns, [e.t_ns for e in expected])
+        np.testing.assert_array_equal(got.pose[:, :2], [(e.dx, e.dy) for e in expected])
+        np.testing.assert_allclose(got.pose[:, 2], [e.theta for e in expected], rtol=1e-12)
+        np.testing.assert_allclose(got.tilt, [(e.phi, e.omega) for e in expected], rtol=1e-9)
+    covariance = series['/link_tip/deflection_with_covariance'].covariance
+    assert covariance is not None
+    np.testing.assert_array_equal(covariance.reshape(-1, 9), [e.covariance for e in expected])
+    assert series['/link_tip/deflection'].covariance is None
+
+
+def test_the_samples_are_one_array(bag: Path) -> None:
+    recording = psd_deflection.open(bag)
+    blocks = list(recording.blocks())
+    samples = recording.samples
+    np.testing.assert_array_equal(samples['seq'], np.concatenate([b.seq for b in blocks]))
+    np.testing.assert_array_equal(samples['t_ns'], np.concatenate([b.t_ns for b in blocks]))
+    np.testing.assert_allclose(samples['t'], (samples['t_ns'] - T0) * 1e-9)
+    for i, c in enumerate(CHANNELS):
+        np.testing.assert_array_equal(samples[c], np.concatenate([b.volts[:, i] for b in blocks]))
+    assert (samples['flags'] != 0).sum() == sum((b.flags != 0).sum() for b in blocks) > 0
+
+
+def test_a_lone_file_and_a_folder_without_metadata_are_read(bag: Path, tmp_path: Path) -> None:
+    expected = list(open_recording(bag).blocks())
+    assert_same(list(open_recording(bag / 'run_0.mcap').blocks()), expected)
+    shutil.copytree(bag, tmp_path / 'bare')
+    (tmp_path / 'bare' / 'metadata.yaml').unlink()
+    bare = open_recording(tmp_path / 'bare')
+    assert_same(list(bare.blocks()), expected)
+    assert 'no metadata.yaml' in bare.warnings[0]
+    assert_same(list(open_recording(bag / 'metadata.yaml').blocks()), expected)
+
+
+def test_several_files_are_read_in_their_order(tmp_path: Path) -> None:
+    records = [block(i) for i in range(44)]
+    folder = tmp_path / 'run'
+    folder.mkdir()
+    for i in range(11):
+        write_mcap(folder / f'run_{i}.mcap', records[4 * i : 4 * i + 4])
+    assert_same(list(open_recording(folder).blocks()), records)
+    names = [f'run_{i}.mcap' for i in range(10, -1, -1)]
+    information = {'version': 9, 'storage_identifier': 'mcap', 'relative_file_paths': names[-3:]}
+    (folder / 'metadata.yaml').write_text(yaml.safe_dump({'rosbag2_bagfile_information': information}))
+    assert next(open_recording(folder).blocks()).index == 8
+
+
+# --- sample numbers -----------------------------------------------------------------------------
+
+
+def test_numbers_are_extended_past_32_bits_within_a_file(tmp_path: Path) -> None:
+    start = 2**32 // 20 - 3
+    records = [block(start + i, first_index=start, lost=(5,) if i == 2 else ()) for i in range(70)]
+    assert_same(list(open_recording(write_mcap(tmp_path / 'a.mcap', records)).blocks()), records)
+
+
+@pytest.mark.parametrize('epoch', [1, 2, 7])
+def test_blocks_of_a_run_past_its_wrap_are_cut_as_they_were(tmp_path: Path, epoch: int) -> None:
+    start = epoch * 2**32 // 20 + 2
+    records = [block(start + i, first_index=start) for i in range(60)]
+    assert_same(list(open_recording(write_mcap(tmp_path / 'a.mcap', records)).blocks()), records)
+
+
+def test_a_long_gap_with_a_wrap_in_it_is_a_gap(tmp_path: Path) -> None:
+    start, gap = 2**32 // 20 - 100_000, 300_000
+    records = [block(start, first_index=start), block(start + gap, first_index=start)]
+    assert_same(list(open_recording(write_mcap(tmp_path / 'a.mcap', records)).blocks()), records)
+
+
+def test_a_device_that_starts_anew_does_not_mix_blocks(tmp_path: Path) -> None:
+    again = [block(i, t0=T0 + 5 * 10**9) for i in range(3)]
+    recording = open_recording(write_mcap(tmp_path / 'a.mcap', [*(block(i) for i in range(5)), *again]))
+    blocks = list(recording.blocks())
+    assert [b.index for b in blocks] == list(range(8))
+    assert [len(b.seq) for b in blocks] == [20] * 8
+    np.testing.assert_array_equal(blocks[5].volts, again[0].volts)
+    assert any('start anew after 99' in w for w in recording.warnings)
+
+
+def test_a_block_in_two_messages_is_one_block_again(tmp_path: Path) -> None:
+    whole = block(1)
+    t_ns = whole.t_ns.copy()
+    t_ns[12:] += 10 * 10**9
+    paused = SampleBlock(1, whole.seq, t_ns, whole.volts, whole.flags)
+    later = block(2, t0=T0 + 10 * 10**9)
+    assert_same(
+        list(open_recording(write_mcap(tmp_path / 'a.mcap', [block(0), paused, later])).blocks()),
+        [block(0), paused, later],
+    )
+
+
+def test_another_block_size_cuts_the_same_samples_anew(bag: Path) -> None:
+    blocks = list(open_recording(bag, block_size=50).blocks())
+    assert [b.index for b in blocks] == list(range(60))
+    assert all(int(b.seq[0]) // 50 == int(b.seq[-1]) // 50 == b.index for b in blocks)
+    assert sum(len(b.seq) for b in blocks) == len(open_recording(bag).samples)
+
+
+def test_the_recorded_block_size_counts(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / 'a.mcap', [block(i) for i in range(5)], rig_values={'block_size': 10})
+    assert [len(b.seq) for b in open_recording(path).blocks()] == [10] * 10
+
+
+# --- recordings of other programs ---------------------------------------------------------------
+
+
+def cloud(
+    b: SampleBlock, names: Sequence[str], formats: dict[str, str], step: int, big: bool = False
+) -> dict[str, Any]:
+    """PointCloud2 fields with any layout that has our eight names."""
+    kinds = {'u4': 6, 'f4': 7, 'f8': 8, 'u2': 4}
+    order = '>' if big else '<'
+    offsets, at = [], 4
+    for n in names:
+        offsets.append(at)
+        at += int(formats.get(n, 'f4')[1])
+    dtype = np.dtype(
+        {
+            'names': list(names),
+            'formats': [order + formats.get(n, 'f4') for n in names],
+            'offsets': offsets,
+            'itemsize': step,
+        }
+    )
+    points = np.zeros(len(b.seq), dtype)
+    points['seq'] = b.seq
+    points['dt'] = b.t_ns - b.t_ns[0]
+    for i, c in enumerate(CHANNELS):
+        points[c] = b.volts[:, i]
+    (message,) = to_messages(b)
+    return {
+        **message.fields,
+        'header': {**message.fields['header'], 'frame_id': 'some_other_frame'},
+        'fields': [
+            {'name': n, 'offset': o, 'datatype': kinds[formats.get(n, 'f4')], 'count': 1}
+            for n, o in zip(names, offsets, strict=True)
+        ],
+        'is_bigendian': big,
+        'point_step': step,
+        'row_step': step * len(points),
+        'data': points.tobytes(),
+    }
+
+
+@pytest.mark.parametrize('big', [False, True])
+@pytest.mark.parametrize('compression', list(CompressionType))
+@pytest.mark.parametrize('chunked', [False, True])
+def test_other_layouts_compressions_and_no_chunks(
+    tmp_path: Path, big: bool, compression: CompressionType, chunked: bool
+) -> None:
+    names = ['intensity', *reversed(CHANNELS), 'dt', 'seq']
+    formats = {'seq': 'u4', 'dt': 'u4', 'intensity': 'u2', **dict.fromkeys(CHANNELS, 'f8')}
+    expected = [block(i) for i in range(60)]
+    with (tmp_path / 'a.mcap').open('wb') as stream:
+        writer = Writer(stream, compression=compression, use_chunking=chunked, index_types=IndexType.NONE)
+        writer.start('ros2')
+        schema = writer.register_schema(
+            'sensor_msgs/PointCloud2', 'ros2msg', definition('sensor_msgs/msg/PointCloud2').encode()
+        )
+        channel = writer.register_channel(SAMPLES, 'cdr', schema)
+        for b in expected:
+            message = cdr.encode('sensor_msgs/msg/PointCloud2', cloud(b, names, formats, 64, big))
+            writer.add_message(channel, int(b.t_ns[0]), message, int(b.t_ns[0]))
+        writer.finish()
+    recording = open_recording(tmp_path / 'a.mcap')
+    assert_same(list(recording.blocks()), expected)
+    assert (recording.complete, recording.parameters, recording.hello) == (True, {}, None)
+
+
+def test_a_bag_that_rosbags_wrote_is_read(tmp_path: Path) -> None:
+    types = STORE.types
+    header, time = types['std_msgs/msg/Header'], types['builtin_interfaces/msg/Time']
+    expected = [block(i, lost=(1,) if i % 3 == 0 else ()) for i in range(60)]
+    with RosbagsWriter(tmp_path / 'theirs', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        samples = writer.add_connection(SAMPLES, 'sensor_msgs/msg/PointCloud2', typestore=STORE)
+        load = writer.add_connection(LOAD, 'geometry_msgs/msg/WrenchStamped', typestore=STORE)
+        for b in expected:
+            (m,) = to_messages(b)
+            f = m.fields
+            t = int(b.t_ns[0])
+            stamp = header(time(t // 10**9, t % 10**9), 'link_tip')
+            points = types['sensor_msgs/msg/PointCloud2'](
+                stamp,
+                1,
+                f['width'],
+                [types['sensor_msgs/msg/PointField'](**field) for field in f['fields']],
+                False,
+                f['point_step'],
+                f['row_step'],
+                np.frombuffer(f['data'], np.uint8),
+                True,
+            )
+            writer.write(samples, t, STORE.serialize_cdr(points, 'sensor_msgs/msg/PointCloud2'))
+        vector = types['geometry_msgs/msg/Vector3']
+        wrench = types['geometry_msgs/msg/Wrench'](vector(1.0, 2.0, 0.0), vector(0.0, 0.0, 3.0))
+        known = types['geometry_msgs/msg/WrenchStamped'](header(time(5, 6), 'link_tip_rest'), wrench)
+        writer.write(load, T0, STORE.serialize_cdr(known, 'geometry_msgs/msg/WrenchStamped'))
+    recording = open_recording(tmp_path / 'theirs')
+    assert_same(list(recording.blocks()), expected)
+    assert recording.loads() == [AppliedLoad(5_000_000_006, 1.0, 2.0, 3.0)]
+    assert recording.topics() == {SAMPLES: 60, LOAD: 1}
+
+
+def test_samples_that_are_no_numbers_count_as_lost(tmp_path: Path) -> None:
+    b = block(0)
+    b.volts[3, 2] = np.nan
+    recording = open_recording(write_mcap(tmp_path / 'a.mcap', [b, block(1)]))
+    first, second = recording.blocks()
+    assert first.seq.tolist() == [0, 1, 2, *range(4, 20)]
+    assert len(second.seq) == 20
+    assert 'NaN' in recording.warnings[0]
+
+
+# --- what cannot be read ------------------------------------------------------------------------
+
+
+def information(folder: Path, **changes: object) -> Path:
+    folder.mkdir()
+    tree = {'storage_identifier': 'mcap', 'relative_file_paths': ['a_0.mcap'], **changes}
+    (folder / 'metadata.yaml').write_text(yaml.safe_dump({'rosbag2_bagfile_information': tree}))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'storage_identifier': 'sqlite3'}, 'sqlite3 storage; only mcap is read'),
+        ({'compression_mode': 'FILE'}, 'compressed by rosbag2'),
+        ({'relative_file_paths': []}, 'names no file'),
+        ({'relative_file_paths': [3]}, 'names no file'),
+        ({'relative_file_paths': ['../../etc/passwd']}, 'passwd: is named by metadata.yaml and is not there'),
+    ],
+)
+def test_bags_of_another_kind_are_refused(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    folder = information(tmp_path / 'b', **changes)
+    with pytest.raises(RecordingError, match=message) as caught:
+        open_recording(folder)
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('name', 'content', 'message'),
+    [
+        ('a.mcap', b'', 'is empty'),
+        ('a.mcap', b'\x89PNG and more', 'is not an MCAP file'),
+        ('a.db3', b'SQLite format 3\0', 'is no recording'),
+        ('a.mcap', b'\x89MCAP0\r\n', 'holds no samples before the cut'),
+        ('metadata.yaml', b'rosbag2_bagfile_information: [1', 'malformed YAML'),
+        ('metadata.yaml', b'- 1', 'has no rosbag2_bagfile_information'),
+        ('metadata.yaml', b'\xff\xfe\xff', 'cannot be read'),
+        ('metadata.yaml', b'[' * 5000, 'malformed YAML'),
+    ],
+)
+def test_files_that_are_none_are_refused_in_one_line(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(RecordingError, match=message) as caught:
+        list(open_recording(tmp_path / name).blocks())
+    assert str(tmp_path / name) in str(caught.value)
+    assert '\n' not in str(caught.value)
+
+
+def test_what_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match='no such recording'):
+        open_recording(tmp_path / 'nothing')
+    with pytest.raises(RecordingError, match='is no bag'):
+        open_recording(tmp_path)
+
+
+def test_another_type_on_our_topic_is_refused(tmp_path: Path) -> None:
+    with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
+        (m,) = to_messages(TemperatureReading(T0, 20.0))
+        out.write_encoded(SAMPLES, m.type, cdr.encode(m.type, m.fields), T0)
+    with pytest.raises(RecordingError, match=r"/psd/samples is 'sensor_msgs/msg/Temperature'"):
+        list(open_recording(tmp_path / 'a.mcap').blocks())
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        (lambda points: points['seq'].__setitem__(slice(None), 7), 'seq does not rise'),
+        (lambda points: points['dt'].__setitem__(5, 0), 'dt does not rise'),
+    ],
+)
+def test_points_out_of_order_are_refused(tmp_path: Path, change: Any, message: str) -> None:
+    (m,) = to_messages(block(0))
+    points = np.frombuffer(bytearray(m.fields['data']), np.dtype([('seq', '<u4'), ('dt', '<u4'), ('v', '<f4', 6)]))
+    change(points)
+    with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
+        out.write_encoded(SAMPLES, m.type, cdr.encode(m.type, {**m.fields, 'data': points.tobytes()}), T0)
+    with pytest.raises(RecordingError, match=message):
+        list(open_recording(tmp_path / 'a.mcap').blocks())
+
+
+# --- cut and damaged files ----------------------------------------------------------------------
+
+
+def readable(path: Path) -> list[SampleBlock]:
+    """What can be read; [] where the answer is a RecordingError of one line."""
+    blocks: list[SampleBlock] = []
+
+    def everything() -> None:
+        recording = BagRecording(path)
+        recording.topics()
+        blocks.extend(recording.blocks())
+        recording.loads()
+        recording.estimates()
+
+    said = ''
+    try:
+        everything()
+    except RecordingError as error:
+        said = str(error)
+    assert said.startswith(str(path)) or not said
+    assert '\n' not in said
+    return blocks
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = write_mcap(tmp_path_factory.mktemp('whole') / 'a.mcap', list(run(120)), device_hello=HELLO)
+    return path.read_bytes()
+
+
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(where=st.floats(0, 1))
+def test_everything_before_a_cut_is_read(tmp_path: Path, whole: bytes, where: float) -> None:
+    path = tmp_path / 'cut.mcap'
+    cut = int(where * (len(whole) - 1))
+    path.write_bytes(whole[:cut])
+    expected = [r for r in run(120) if isinstance(r, SampleBlock)]
+    got = readable(path)
+    assert_same(got, expected[: len(got)])
+    chunk_ends = [at + length for op, at, length in top_level(whole) if op == 6]
+    whole_seconds = sum(end <= cut for end in chunk_ends)
+    # 50 blocks a second, and a chunk spans just less than one.
+    assert len(got) >= min(49 * whole_seconds, 120)
+    if got:
+        recording = BagRecording(path)
+        assert not recording.complete
+        assert 'ends at byte' in recording.warnings[0]
+        assert recording.hello == HELLO
+
+
+def top_level(content: bytes) -> list[tuple[int, int, int]]:
+    """(opcode, offset of the content, length) of the records of a file."""
+    out, at = [], 8
+    while at + 9 <= len(content) - 8:
+        opcode, length = struct.unpack_from('<BQ', content, at)
+        out.append((opcode, at + 9, length))
+        at += 9 + length
+    return out
+
+
+def test_a_damaged_chunk_costs_its_own_second_only(tmp_path: Path, whole: bytes) -> None:
+    chunks = [(at, length) for op, at, length in top_level(whole) if op == 6]
+    at, length = chunks[1]
+    spoiled = bytearray(whole)
+    spoiled[at + length // 2] ^= 0xFF
+    (tmp_path / 'a.mcap').write_bytes(spoiled)
+    recording = BagRecording(tmp_path / 'a.mcap')
+    indices = [b.index for b in recording.blocks()]
+    assert indices[:49] == list(range(49))
+    assert indices[-1] == 119
+    assert 120 - len(indices) in range(49, 52)
+    assert not recording.complete
+    assert f'the chunk at byte {at} is damaged' in recording.warnings[0]
+
+
+def test_a_chunk_that_declares_too_much_is_not_unpacked(tmp_path: Path, whole: bytes) -> None:
+    at, _ = next((at, length) for op, at, length in top_level(whole) if op == 6)
+    for size in (2**62, 2**27):
+        spoiled = bytearray(whole)
+        struct.pack_into('<Q', spoiled, at + 16, size)
+        (tmp_path / 'a.mcap').write_bytes(spoiled)
+        recording = BagRecording(tmp_path / 'a.mcap')
+        assert next(recording.blocks()).index > 40
+        assert str(size) in recording.warnings[0]
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.tuples(st.floats(0, 1), st.binary(min_size=1, max_size=12)), min_size=1, max_size=4))
+def test_no_damage_ends_in_a_traceback(tmp_path: Path, changes: list[tuple[float, bytes]]) -> None:
+    # Uncompressed and without CRC, so that the damage reaches every parser.
+    plain = tmp_path / 'plain.mcap'
+    if not plain.exists():
+        with plain.open('wb') as stream:
+            writer = Writer(stream, compression=CompressionType.NONE, enable_crcs=False, chunk_size=4000)
+            writer.start('ros2')
+            channels: dict[str, int] = {}
+            for record in run(12):
+                for m in to_messages(record):
+                    if m.topic not in channels:
+                        schema = writer.register_schema(m.type, 'ros2msg', definition(m.type).encode())
+                        channels[m.topic] = writer.register_channel(m.topic, 'cdr', schema)
+                    writer.add_message(channels[m.topic], m.t_ns, cdr.encode(m.type, m.fields), m.t_ns)
+            writer.finish()
+    content = bytearray(plain.read_bytes())
+    for where, junk in changes:
+        at = int(where * (len(content) - len(junk)))
+        content[at : at + len(junk)] = junk
+    path = tmp_path / 'junk.mcap'
+    path.write_bytes(content)
+    for b in readable(path):
+        assert len(b.seq) == len(b.t_ns) == len(b.volts) == len(b.flags) > 0
+        assert np.isfinite(b.volts).all()
+        assert (np.diff(b.seq) > 0).all()
+
+
+def test_times_of_samples_are_those_of_the_device(bag: Path) -> None:
+    t_ns = open_recording(bag).samples['t_ns']
+    assert set(np.diff(t_ns).tolist()) == {STEP, 3 * STEP}

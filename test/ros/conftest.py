@@ -1,0 +1,180 @@
+"""Real rclpy and real DDS: a domain of its own for each worker, and the daemon as a process."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import pytest
+
+rclpy = pytest.importorskip('rclpy', reason='the ROS tests need rclpy: pip install .[ros]')
+
+WARNINGS = "error,ignore:module 'sre_parse' is deprecated:DeprecationWarning,"
+WARNINGS += "ignore:module 'sre_constants' is deprecated:DeprecationWarning"
+
+START_S = 60.0
+"""Longest that a test waits for a first message: discovery takes 0.1 or, at random, 2.7 s."""
+
+
+@pytest.fixture(scope='session')
+def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """A ROS_DOMAIN_ID that no other test on this machine uses, held by a lock."""
+    for candidate in range(20, 100):
+        path = Path(tempfile.gettempdir()) / f'psd_deflection_test_domain_{candidate}'
+        lock = path.open('w')
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.close()
+            continue
+        os.environ['ROS_DOMAIN_ID'] = str(candidate)
+        os.environ['ROS_LOG_DIR'] = str(tmp_path_factory.mktemp('ros_log'))
+        yield candidate
+        lock.close()
+        return
+    pytest.fail('no ROS domain is free')
+
+
+class Daemon:
+    """``psd-deflection estimator`` as a process; its output line by line."""
+
+    def __init__(self, arguments: list[str], cwd: Path) -> None:
+        self.lines: list[str] = []
+        self._new = threading.Condition()
+        self.process = subprocess.Popen(
+            [sys.executable, '-m', 'psd_deflection', 'estimator', *arguments],
+            cwd=Path(__file__).parent.parent.parent,
+            stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            text=True,
+            start_new_session=True,
+            env={**os.environ, 'PYTHONWARNINGS': WARNINGS, 'PYTHONUNBUFFERED': '1'},
+        )
+        self._thread = threading.Thread(target=self._read, args=(self.process.stderr,), daemon=True)
+        self._thread.start()
+
+    def _read(self, stream: IO[str]) -> None:
+        for line in stream:
+            with self._new:
+                self.lines.append(line.rstrip('\n'))
+                self._new.notify_all()
+
+    def said(self, pattern: str) -> str:
+        """Wait for a line that matches; it is returned."""
+        found: list[str] = []
+
+        def look() -> bool:
+            found.extend(line for line in self.lines if re.search(pattern, line))
+            return bool(found) or self.process.poll() is not None
+
+        with self._new:
+            self._new.wait_for(look, START_S)
+        if not found:
+            pytest.fail(f'the daemon did not say {pattern!r}; it said: {self.lines}')
+        return found[0]
+
+    def signal(self, number: int) -> None:
+        os.killpg(self.process.pid, number)
+
+    def wait(self, timeout: float) -> int:
+        status = self.process.wait(timeout)
+        self._thread.join(10.0)
+        return status
+
+    def end(self) -> None:
+        if self.process.poll() is None:
+            self.signal(signal.SIGTERM)
+            try:
+                self.process.wait(10.0)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+        self._thread.join(10.0)
+        if self.process.stderr is not None:
+            self.process.stderr.close()
+
+
+@pytest.fixture
+def start(domain: int, tmp_path: Path) -> Iterator[Callable[..., Daemon]]:
+    """Start a daemon; it ends with the test."""
+    started: list[Daemon] = []
+
+    def begin(*arguments: str) -> Daemon:
+        daemon = Daemon(list(arguments), tmp_path)
+        started.append(daemon)
+        return daemon
+
+    yield begin
+    for daemon in started:
+        daemon.end()
+
+
+class Peer:
+    """A second participant: collects messages, calls services."""
+
+    def __init__(self) -> None:
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = rclpy.create_node('peer', context=self.context)
+        self.executor = rclpy.executors.SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def collect(self, kind: Any, topic: str, qos: Any = 200) -> list[Any]:
+        """A list that fills while :meth:`until` spins."""
+        got: list[Any] = []
+        self.node.create_subscription(kind, topic, got.append, qos)
+        return got
+
+    def until(self, condition: Callable[[], bool], what: str, timeout: float = START_S) -> None:
+        deadline = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > deadline:
+                pytest.fail(f'waited {timeout:g} s for {what}')
+            self.executor.spin_once(timeout_sec=0.1)
+
+    def call(self, kind: Any, name: str, request: Any) -> Any:
+        client = self.node.create_client(kind, name)
+        self.until(client.service_is_ready, name)
+        future = client.call_async(request)
+        self.until(future.done, f'the answer of {name}')
+        self.node.destroy_client(client)
+        return future.result()
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+@pytest.fixture
+def peer(domain: int) -> Iterator[Peer]:
+    one = Peer()
+    yield one
+    one.close()
+
+
+@pytest.fixture
+def simulated_port(domain: int) -> Iterator[str]:
+    """The port of ``psd-deflection simulate --serve``, run alone."""
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'psd_deflection', 'simulate', '--serve'],
+        cwd=Path(__file__).parent.parent.parent,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert process.stdout is not None
+    yield process.stdout.readline().removeprefix('port: ').strip()
+    process.send_signal(signal.SIGINT)
+    assert process.wait(10.0) == 0
+    process.stdout.close()

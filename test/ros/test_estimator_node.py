@@ -1,0 +1,241 @@
+"""The node as a process of its own, seen from a second participant with its own rclpy."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+pytestmark = pytest.mark.ros
+pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped, WrenchStamped  # noqa: E402
+from rcl_interfaces.srv import DescribeParameters, SetParameters  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from sensor_msgs.msg import PointCloud2  # noqa: E402
+from std_srvs.srv import SetBool, Trigger  # noqa: E402
+
+MS = 1_000_000
+
+TOPICS = {
+    '/link_tip/deflection': 'geometry_msgs/msg/PoseStamped',
+    '/link_tip/deflection_with_covariance': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    '/link_tip/wrench': 'geometry_msgs/msg/WrenchStamped',
+    '/link_tip/exact/deflection': 'geometry_msgs/msg/PoseStamped',
+    '/link_tip/wls/deflection': 'geometry_msgs/msg/PoseStamped',
+    '/link_tip/iterative/deflection': 'geometry_msgs/msg/PoseStamped',
+    '/psd_1/spot': 'geometry_msgs/msg/PointStamped',
+    '/psd_2/spot': 'geometry_msgs/msg/PointStamped',
+    '/psd/samples': 'sensor_msgs/msg/PointCloud2',
+    '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
+    '/link_tip/load': 'geometry_msgs/msg/WrenchStamped',
+    '/reference/deflection': 'geometry_msgs/msg/PoseStamped',
+    '/environment/temperature': 'sensor_msgs/msg/Temperature',
+}
+
+
+def stamp(message: Any) -> int:
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+def test_what_is_published_and_how_often(start: Callable[..., Any], peer: Any) -> None:
+    start()
+    poses = peer.collect(PoseStamped, '/link_tip/deflection')
+    wide = peer.collect(PoseWithCovarianceStamped, '/link_tip/deflection_with_covariance')
+    wrenches = peer.collect(WrenchStamped, '/link_tip/wrench')
+    spots = peer.collect(PointStamped, '/psd_2/spot')
+    clouds = peer.collect(PointCloud2, '/psd/samples')
+    health = peer.collect(DiagnosticArray, '/diagnostics')
+    peer.until(lambda: len(poses) >= 251 and len(wrenches) >= 251 and len(health) >= 3, 'five seconds of estimates')
+    graph = dict(peer.node.get_topic_names_and_types())
+    for topic, kind in TOPICS.items():
+        assert graph.get(topic) == [kind], topic
+    for messages in (poses, wrenches):
+        stamps = np.array([stamp(m) for m in messages[:251]])
+        assert {m.header.frame_id for m in messages} == {'link_tip_rest'}
+        assert 49.5 <= 250 / ((stamps[-1] - stamps[0]) / 1e9) <= 50.5
+        assert abs(np.diff(stamps) - 20 * MS).max() < 100_000
+    # The stamp is the middle of a block whose samples are in /psd/samples, and now is just after it.
+    starts = {stamp(c): c for c in clouds}
+    matched = [p for p in poses if any(abs(stamp(p) - t - 9_500_000) < 50_000 for t in starts)]
+    assert len(matched) > 200
+    assert abs(time.time_ns() - stamp(poses[-1])) < 10 * 10**9
+    assert clouds[0].width == 20
+    assert clouds[0].point_step == 32
+    assert abs(poses[0].pose.orientation.w) > 0.99
+    covariance = np.array(wide[-1].pose.covariance).reshape(6, 6)
+    assert 1e-8 < math.sqrt(covariance[0, 0]) < 1e-6
+    assert covariance[5, 5] > 0
+    assert abs(spots[0].point.x) < 5e-3
+    names = {s.name for s in health[-1].status}
+    assert 'psd_deflection: acquisition' in names
+    values = {v.key: v.value for s in health[-1].status for v in s.values}
+    assert values['lost'] == '0'
+    assert values['bad frames'] == '0'
+    assert 900 < float(values['rate (samples/s)']) < 1100
+
+
+def test_another_vendors_dds_sees_the_same_values(start: Callable[..., Any], peer: Any) -> None:
+    start()
+    poses = peer.collect(PoseStamped, '/link_tip/deflection')
+    peer.until(lambda: len(poses) > 0, 'a first estimate')
+    # A process of its own, without the libraries that rclpy brought along.
+    clean = {k: v for k, v in os.environ.items() if k not in ('LD_LIBRARY_PATH', '_ROS_WHEELS_BOOTSTRAP_COMPLETE')}
+    script = Path(__file__).parent / 'cyclone_subscriber.py'
+    other = subprocess.Popen(
+        [sys.executable, str(script), 'rt/link_tip/deflection', '50'], stdout=subprocess.PIPE, text=True, env=clean
+    )
+    peer.until(lambda: other.poll() is not None, 'the other vendor to have 50 messages')
+    stdout, _ = other.communicate()
+    assert other.returncode == 0
+    seen = {row[0]: row[1:] for row in json.loads(stdout)}
+    assert len(seen) == 50
+    ours = {stamp(p): p for p in poses}
+    common = sorted(set(seen) & set(ours))
+    assert len(common) >= 45
+    for t in common:
+        p = ours[t]
+        o = p.pose.orientation
+        assert seen[t] == [
+            p.header.frame_id,
+            p.pose.position.x,
+            p.pose.position.y,
+            p.pose.position.z,
+            o.x,
+            o.y,
+            o.z,
+            o.w,
+        ]
+
+
+def test_zero_and_record(start: Callable[..., Any], peer: Any, tmp_path: Path, simulated_port: str) -> None:
+    rig = tmp_path / 'rig.yaml'
+    rig.write_text(
+        f'estimator:\n  ros__parameters:\n    bag_dir: {tmp_path / "bags"}\n    psd_1:\n      zero: [0.0002, 0.0001]\n'
+    )
+    start('--params-file', str(rig), '--port', simulated_port)
+    poses = peer.collect(PoseStamped, '/link_tip/deflection')
+    peer.until(lambda: len(poses) >= 30, 'estimates')
+    # The file's zero is wrong by tenths of a millimetre, and so is the deflection.
+    assert abs(poses[-1].pose.position.x) > 5e-5
+    answer = peer.call(Trigger, '/estimator/zero', Trigger.Request())
+    assert answer.success
+    assert 'psd_1 (' in answer.message
+    zeroed = len(poses)
+    peer.until(lambda: len(poses) >= zeroed + 10, 'estimates after the zero')
+    assert abs(poses[-1].pose.position.x) < 1e-5
+    begun = peer.call(SetBool, '/estimator/record', SetBool.Request(data=True))
+    assert begun.success
+    folder = Path(begun.message.removeprefix('recording to '))
+    assert folder.parent == tmp_path / 'bags'
+    now = len(poses)
+    peer.until(lambda: len(poses) >= now + 60, 'estimates after the zero')
+    ended = peer.call(SetBool, '/estimator/record', SetBool.Request(data=False))
+    assert ended.success
+    assert ended.message == f'recording ended: {folder}'
+    assert peer.call(SetBool, '/estimator/record', SetBool.Request(data=False)).message == 'no recording was made'
+    # An independent reader finds in the bag what was received.
+    store = get_typestore(Stores.ROS2_JAZZY)
+    received = {stamp(p): p.pose.position.x for p in poses}
+    with Reader(folder) as bag:
+        found = {
+            stamp(m): m.pose.position.x
+            for c, _, raw in bag.messages()
+            if c.topic == '/link_tip/deflection'
+            for m in [store.deserialize_cdr(raw, c.msgtype)]
+        }
+    assert len(found) >= 50
+    assert all(found[t] == received[t] for t in found if t in received)
+    assert len(set(found) & set(received)) >= 50
+
+
+def test_parameters_have_units_and_ranges_and_are_refused_by_name(start: Callable[..., Any], peer: Any) -> None:
+    start()
+    poses = peer.collect(PoseStamped, '/link_tip/deflection')
+    peer.until(lambda: len(poses) > 0, 'estimates')
+    request = DescribeParameters.Request(names=['link.length', 'block_size', 'sum_min', 'psd_1.center'])
+    length, block, sum_min, center = peer.call(
+        DescribeParameters, '/estimator/describe_parameters', request
+    ).descriptors
+    assert '[m]' in length.description
+    assert length.floating_point_range[0].to_value == 1000.0
+    assert length.read_only
+    assert block.integer_range[0].from_value == 1
+    assert not sum_min.read_only
+    assert center.type == Parameter.Type.DOUBLE_ARRAY.value
+
+    def put(name: str, value: object) -> Any:
+        parameter = Parameter(name, value=value).to_parameter_msg()
+        answer = peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[parameter]))
+        return answer.results[0]
+
+    assert not put('sum_min', -1.0).successful
+    assert not put('link.length', 2.0).successful
+    # A level above what the lasers give: they count as lost, and the estimates stop.
+    assert put('sum_min', 9.0).successful
+    health = peer.collect(DiagnosticArray, '/diagnostics')
+
+    def lost() -> bool:
+        return any('laser 1 lost' in s.message for m in health for s in m.status if 'estimates' in s.name)
+
+    peer.until(lost, 'the lost laser in /diagnostics')
+    assert put('sum_min', 2.5).successful
+    now = len(poses)
+    peer.until(lambda: len(poses) > now + 5, 'estimates again')
+
+
+@pytest.mark.parametrize('signals', [[signal.SIGINT], [signal.SIGTERM], [signal.SIGINT, signal.SIGINT]])
+def test_it_ends_within_two_seconds_and_leaves_a_whole_recording(
+    start: Callable[..., Any], peer: Any, tmp_path: Path, signals: list[int]
+) -> None:
+    daemon = start('--record', str(tmp_path))
+    poses = peer.collect(PoseStamped, '/link_tip/deflection')
+    peer.until(lambda: len(poses) >= 25, 'estimates')
+    began = time.monotonic()
+    for number in signals:
+        daemon.signal(number)
+    assert daemon.wait(30.0) == 0
+    assert time.monotonic() - began < 2.0
+    (folder,) = tmp_path.glob('psd_*')
+    assert f'psd-deflection replay {folder} --compare' in daemon.lines[-1]
+    with Reader(folder) as bag:
+        assert bag.message_count > 100
+    assert not any('Traceback' in line for line in daemon.lines)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'status', 'said'),
+    [
+        (
+            ['--ros-args', '-p', 'link.lenght:=1.0'],
+            3,
+            'link.lenght = 1.0: no parameter of that name; did you mean',
+        ),
+        (['--ros-args', '-p', 'amplifier.noise:=-1.0'], 3, 'amplifier.noise = -1.0 V: must be above 0'),
+        (['--ros-args', '-p', 'solver:=magic'], 3, 'magic'),
+        (['--port', '/dev/nothing_here'], 5, '/dev/nothing_here: no such port'),
+        (['--params-file', '/nowhere/rig.yaml'], 3, '/nowhere/rig.yaml: no such parameter file'),
+        (['--ros-args', '--params-file', '/nowhere/rig.yaml'], 3, '/nowhere/rig.yaml'),
+    ],
+)
+def test_what_cannot_run_says_why_in_one_line(
+    start: Callable[..., Any], arguments: list[str], status: int, said: str
+) -> None:
+    daemon = start(*arguments)
+    assert daemon.wait(60.0) == status
+    (line,) = [line for line in daemon.lines if said in line]
+    assert line.startswith('psd-deflection estimator: ')
+    assert not any('Traceback' in line for line in daemon.lines)

@@ -1,0 +1,110 @@
+"""A device whose every byte the test writes, on a pseudo-terminal that the daemon opens."""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.io.simulated_device import PseudoTerminal
+from psd_deflection.protocol.frames import (
+    FrameDecoder,
+    GoodFrame,
+    HelloFrame,
+    HelloRequestFrame,
+    SampleFrame,
+    encode,
+)
+from psd_deflection.records import CHANNELS
+
+HELLO = HelloFrame(
+    1,
+    {
+        'serial': 'T-1',
+        'firmware': 'test',
+        'sample_rate_hz': 1000.0,
+        'channels': list(CHANNELS),
+        'volts_per_count': 10.0 / 32768,
+    },
+)
+
+
+class ScriptedDevice:
+    """Answers HELLO? with ``hello`` (or with nothing); everything else it sends is the test's."""
+
+    def __init__(self, link: Path) -> None:
+        self.link = link
+        self.answer: bytes = encode(HELLO)
+        self.greeted = threading.Event()
+        self.plug()
+
+    def plug(self) -> None:
+        self.greeted.clear()
+        self.terminal = PseudoTerminal(self.link)
+        self._gone = threading.Event()
+        self._thread = threading.Thread(target=self._listen, args=(self.terminal.master, self._gone), daemon=True)
+        self._thread.start()
+
+    def _listen(self, master: int, gone: threading.Event) -> None:
+        decoder = FrameDecoder()
+        poll = select.poll()
+        poll.register(master, select.POLLIN)
+        while not gone.is_set():
+            events = poll.poll(10)
+            if events and events[0][1] & select.POLLHUP:
+                gone.wait(0.002)
+            elif events:
+                try:
+                    received = os.read(master, 4096)
+                except OSError:
+                    continue
+                for frame in decoder.feed(b'\x00' + received):
+                    if isinstance(frame, HelloRequestFrame):
+                        self.send(self.answer)
+                        self.greeted.set()
+
+    def send(self, stream: bytes) -> None:
+        while stream:
+            try:
+                stream = stream[os.write(self.terminal.master, stream) :]
+            except BlockingIOError:
+                select.select((), (self.terminal.master,), (), 1.0)
+
+    def send_frames(self, *frames: GoodFrame) -> None:
+        self.send(b''.join(encode(f) for f in frames))
+
+    def unplug(self) -> None:
+        self._gone.set()
+        self._thread.join()
+        self.terminal.close()
+
+
+@pytest.fixture(scope='session')
+def sample() -> Callable[..., SampleFrame]:
+    def make(seq: int, t_us: int | None = None, flags: int = 0) -> SampleFrame:
+        return SampleFrame(flags, seq % 2**32, seq * 1000 if t_us is None else t_us, (0, 0, 16384, 0, 0, 16384))
+
+    return make
+
+
+@pytest.fixture(scope='session')
+def hello() -> HelloFrame:
+    return HELLO
+
+
+@pytest.fixture
+def device(tmp_path: Path) -> Iterator[ScriptedDevice]:
+    scripted = ScriptedDevice(tmp_path / 'port')
+    yield scripted
+    if not scripted._gone.is_set():
+        scripted.unplug()
+
+
+@pytest.fixture
+def rig(device: ScriptedDevice) -> Rig:
+    return load_rig(overrides={'port': str(device.link)})

@@ -1,0 +1,202 @@
+"""The reader against a device whose every byte the test writes."""
+
+from __future__ import annotations
+
+import itertools
+import queue
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.errors import DeviceError
+from psd_deflection.protocol.frames import HelloFrame, encode
+from psd_deflection.runner import acquisition as module
+from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Item, Restarted
+
+
+def take(acquisition: Acquisition, n: int) -> list[Item]:
+    """The next items until ``n`` samples have come."""
+    items: list[Item] = []
+    while sum(len(i.raw.seq) for i in items if isinstance(i, Chunk)) < n:
+        items.append(acquisition.queue.get(timeout=10.0))
+    return items
+
+
+def numbers(items: list[Item]) -> list[int]:
+    return [int(s) for i in items if isinstance(i, Chunk) for s in i.raw.seq]
+
+
+class Run:
+    def __init__(self, rig: Rig) -> None:
+        self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.acquisition = Acquisition(rig, self.said.put)
+        self.acquisition.open()
+        self.acquisition.start()
+
+    def heard(self, text: str) -> str:
+        """Wait for a message that holds ``text``."""
+        while True:
+            message = self.said.get(timeout=10.0)
+            if text in message:
+                return message
+
+
+@pytest.fixture
+def run(device: Any, rig: Rig) -> Iterator[Run]:
+    started = Run(rig)
+    yield started
+    started.acquisition.stop()
+
+
+def test_samples_come_as_blocks_with_their_own_times(device: Any, run: Run, sample: Any) -> None:
+    device.send_frames(*[sample(s) for s in range(40)])
+    items = take(run.acquisition, 40)
+    assert numbers(items) == list(range(40))
+    chunks = [i.raw for i in items if isinstance(i, Chunk)]
+    assert {int(s) // 20 for s in chunks[0].seq} == {0}
+    t = [int(t) for c in chunks for t in c.t_ns]
+    assert all(abs(b - a - 1_000_000) < 3000 for a, b in itertools.pairwise(t))
+    assert run.acquisition.hello is not None
+    assert run.acquisition.hello.info['serial'] == 'T-1'
+
+
+def test_what_is_joined_in_the_middle_of_a_block_starts_with_the_next(device: Any, run: Run, sample: Any) -> None:
+    device.send_frames(*[sample(s) for s in range(33, 60)])
+    assert numbers(take(run.acquisition, 20)) == list(range(40, 60))
+    assert run.acquisition.counters.lost == 0
+
+
+def test_garbage_gaps_repeats_and_flags_are_counted_and_cost_nothing_else(device: Any, run: Run, sample: Any) -> None:
+    device.send_frames(*[sample(s) for s in range(5)])
+    device.send(b'\x00garbage\x00\x05rubbish\x00')
+    device.send_frames(sample(5), sample(5), sample(4), sample(9, flags=2), *[sample(s) for s in range(10, 20)])
+    assert numbers(take(run.acquisition, 17)) == [0, 1, 2, 3, 4, 5, *range(9, 20)]
+    counters = run.acquisition.counters
+    assert (counters.lost, counters.repeated, counters.device_dropped, counters.bad) == (3, 2, 1, 2)
+
+
+def test_a_restart_of_the_device_goes_on_with_a_new_block(device: Any, run: Run, sample: Any) -> None:
+    device.send_frames(*[sample(s) for s in range(4000, 4030)], *[sample(s) for s in range(20)])
+    items = take(run.acquisition, 50)
+    assert numbers(items) == [*range(4000, 4030), *range(4040, 4060)]
+    assert any(isinstance(i, Restarted) for i in items)
+    assert run.acquisition.counters.restarts == 1
+    t = [int(t) for i in items if isinstance(i, Chunk) for t in i.raw.t_ns]
+    assert all(b > a for a, b in itertools.pairwise(t))
+
+
+def test_an_unplugged_device_is_waited_for_and_goes_on(device: Any, run: Run, sample: Any) -> None:
+    device.send_frames(*[sample(s) for s in range(25)])
+    take(run.acquisition, 20)
+    device.unplug()
+    run.heard('waiting for it to come back')
+    device.plug()
+    run.heard('the device is back')
+    assert device.greeted.wait(10.0)
+    device.send_frames(*[sample(s) for s in range(1000, 1020)])
+    items = take(run.acquisition, 25)
+    assert numbers(items) == [*range(20, 25), *range(1000, 1020)]
+    assert run.acquisition.counters.disconnects == 1
+    assert run.acquisition.counters.lost == 975
+
+
+def test_a_full_queue_drops_the_newest_and_counts(device: Any, rig: Rig, sample: Any) -> None:
+    run = Run(load_rig(overrides={'port': rig.acquisition.port, 'queue_blocks': 2}))
+    device.send_frames(*[sample(s) for s in range(100)], HelloFrame(1, {'serial': 'last'}))
+    # The odd HELLO is refused with a message: by then all samples before it were handled.
+    run.heard('kept to the first HELLO')
+    run.acquisition.stop()
+    items: list[Item] = []
+    while not items or not isinstance(items[-1], Ended):
+        items.append(run.acquisition.queue.get(timeout=10.0))
+    assert numbers(items) == list(range(40))
+    assert run.acquisition.counters.queue_dropped == 60
+
+
+def test_stop_hands_over_what_was_read(device: Any, rig: Rig, sample: Any) -> None:
+    run = Run(rig)
+    device.send_frames(*[sample(s) for s in range(7)])
+    assert numbers(take(run.acquisition, 7)) == list(range(7))
+    run.acquisition.stop()
+    assert isinstance(run.acquisition.queue.get(timeout=10.0), Ended)
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.binary(max_size=60), max_size=8))
+def test_no_garbage_stops_the_reader(device: Any, rig: Rig, sample: Any, junk: list[bytes]) -> None:
+    run = Run(rig)
+    try:
+        for piece in junk:
+            device.send(piece + b'\x00')
+        device.send_frames(*[sample(s) for s in range(20)])
+        assert numbers(take(run.acquisition, 20))[-20:] == list(range(20))
+    finally:
+        run.acquisition.stop()
+
+
+@pytest.fixture
+def short_wait(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.setattr(module, 'SILENCE_S', 0.2)
+    return module
+
+
+def test_a_missing_port_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DeviceError, match=r'nowhere: no such port; .*list_ports'):
+        Acquisition(load_rig(overrides={'port': str(tmp_path / 'nowhere')}), print).open()
+
+
+def test_a_file_is_not_a_serial_port(tmp_path: Path) -> None:
+    path = tmp_path / 'file.txt'
+    path.write_text('x')
+    with pytest.raises(DeviceError, match=r'file\.txt: not a serial port'):
+        Acquisition(load_rig(overrides={'port': str(path)}), print).open()
+
+
+def test_a_port_in_use_is_named(run: Run, rig: Rig) -> None:
+    with pytest.raises(DeviceError, match='another program has the port open'):
+        Acquisition(rig, print).open()
+
+
+def test_a_silent_device_is_named(device: Any, rig: Rig, short_wait: ModuleType) -> None:
+    device.answer = b''
+    with pytest.raises(DeviceError, match=r'no frame in 0.2 s; is the device powered'):
+        Acquisition(rig, print).open()
+
+
+def test_a_device_that_talks_something_else_is_named(device: Any, rig: Rig, short_wait: ModuleType) -> None:
+    device.answer = b'$GPGGA,123519,4807.038,N\r\n'
+    with pytest.raises(DeviceError, match=r'26 bytes but no frame .* baud rate'):
+        Acquisition(rig, print).open()
+
+
+def test_samples_without_hello_are_named(device: Any, rig: Rig, sample: Any, short_wait: ModuleType) -> None:
+    device.answer = b'\x00' + encode(sample(1)) + encode(sample(2))
+    with pytest.raises(DeviceError, match='samples come but no HELLO'):
+        Acquisition(rig, print).open()
+
+
+@pytest.mark.parametrize(
+    ('version', 'info', 'said'),
+    [
+        (2, {}, 'protocol version 2, this is version 1'),
+        (1, {'sample_rate_hz': 500.0}, 'sample_rate_hz 500.0, the rig file says 1000'),
+        (1, {'channels': ['x1', 'y1']}, 'channels'),
+        (1, {'volts_per_count': 'many'}, "volts_per_count 'many'"),
+        (1, {'volts_per_count': 0.001}, 'the rig file gives 0.000305176'),
+        (1, {'volts_per_count': True}, 'volts_per_count True'),
+    ],
+)
+def test_a_device_that_does_not_fit_is_named(
+    device: Any, rig: Rig, hello: HelloFrame, version: int, info: dict[str, object], said: str
+) -> None:
+    device.answer = encode(HelloFrame(version, {**hello.info, **info}))
+    with pytest.raises(DeviceError) as error:
+        Acquisition(rig, print).open()
+    assert said in str(error.value)
+    assert rig.acquisition.port in str(error.value)

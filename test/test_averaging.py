@@ -1,0 +1,82 @@
+"""Blocks by sequence number: a loss shortens one block and shifts none."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import numpy.typing as npt
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psd_deflection.averaging import BlockCutter, block_middle_ns, mean_and_covariance
+from psd_deflection.records import RawChunk, SampleBlock
+
+
+def chunk_of(seq: list[int]) -> tuple[RawChunk, npt.NDArray[np.float32]]:
+    number = np.array(seq, np.int64)
+    volts = np.repeat(number[:, None], 6, axis=1).astype(np.float32)
+    return RawChunk(number, number * 1_000_000, volts, np.zeros(len(seq), np.uint8)), volts
+
+
+def cut(chunks: list[list[int]], size: int = 20) -> list[SampleBlock]:
+    cutter = BlockCutter(size)
+    blocks = [b for seq in chunks for b in cutter.add(*chunk_of(seq))]
+    return blocks + cutter.flush()
+
+
+def test_a_block_is_complete_with_its_last_sample() -> None:
+    cutter = BlockCutter(20)
+    assert cutter.add(*chunk_of(list(range(19)))) == []
+    (block,) = cutter.add(*chunk_of([19]))
+    assert block.index == 0
+    assert block.seq.tolist() == list(range(20))
+    assert cutter.flush() == []
+
+
+def test_a_lost_last_sample_is_not_waited_for_beyond_the_next_block() -> None:
+    cutter = BlockCutter(20)
+    assert cutter.add(*chunk_of(list(range(19)))) == []
+    (block,) = cutter.add(*chunk_of([20]))
+    assert len(block.seq) == 19
+
+
+def test_repeats_are_passed_over_and_counted() -> None:
+    cutter = BlockCutter(20)
+    cutter.add(*chunk_of([0, 1, 1, 2]))
+    cutter.add(*chunk_of([2, 3]))
+    (block,) = cutter.flush()
+    assert block.seq.tolist() == [0, 1, 2, 3]
+    assert cutter.repeated == 2
+
+
+@given(
+    st.lists(st.integers(0, 300), unique=True, min_size=1).map(sorted),
+    st.lists(st.integers(0, 300), max_size=10).map(sorted),
+    st.integers(1, 30),
+)
+def test_however_the_stream_is_cut_the_blocks_are_the_same(seq: list[int], cuts: list[int], size: int) -> None:
+    bounds = [0, *[min(c, len(seq)) for c in cuts], len(seq)]
+    pieces = [seq[a:b] for a, b in itertools.pairwise(bounds)]
+    got = cut(pieces, size)
+    assert [s for b in got for s in b.seq.tolist()] == seq
+    for block in got:
+        assert set((block.seq // size).tolist()) == {block.index}
+        assert (block.t_ns == block.seq * 1_000_000).all()
+        assert (block.volts == block.seq[:, None]).all()
+    assert len({b.index for b in got}) == len(got)
+
+
+@given(st.lists(st.integers(0, 19), unique=True, min_size=1).map(sorted), st.integers(0, 10**6))
+def test_the_middle_of_a_block_does_not_depend_on_which_samples_are_there(slots: list[int], index: int) -> None:
+    seq = np.array(slots, np.int64) + 20 * index
+    block = SampleBlock(index, seq, seq * 1_000_000, np.zeros((len(seq), 6), np.float32), np.zeros(len(seq), np.uint8))
+    assert block_middle_ns(block, 20, 1e6) == (20 * index) * 1_000_000 + 9_500_000
+
+
+def test_mean_and_covariance_are_numpys() -> None:
+    values = np.random.default_rng(0).normal(size=(20, 4))
+    mean, covariance = mean_and_covariance(values)
+    np.testing.assert_allclose(mean, values.mean(axis=0), rtol=1e-13)
+    np.testing.assert_allclose(covariance, np.cov(values.T), rtol=1e-12)
+    assert not mean_and_covariance(values[:1])[1].any()

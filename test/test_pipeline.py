@@ -1,0 +1,193 @@
+"""The pipeline on simulated samples: its accuracy against the bound, and what it refuses."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.mechanics import LinkStatics
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import (
+    BlockStatus,
+    DeflectionEstimate,
+    RawChunk,
+    Record,
+    SampleBlock,
+    SpotMeans,
+    TipLoad,
+)
+from psd_deflection.simulation.loads import direct, sidebar
+from psd_deflection.simulation.simulator import RigSimulator
+
+STEP = 10.0 / 32768
+
+
+def chunk_of(counts: npt.NDArray[np.int16], first: int = 0) -> RawChunk:
+    seq = np.arange(first, first + len(counts))
+    return RawChunk(seq, seq * 1_000_000, counts, np.zeros(len(counts), np.uint8), STEP)
+
+
+def still(pose: tuple[float, float, float], n: int, seed: int) -> npt.NDArray[np.int16]:
+    """Counts of a flat plate at rest in ``pose``: m = R(-theta)(l - d) - c, 2 mV noise, 16 bits."""
+    dx, dy, theta = pose
+    c, s = np.cos(theta), np.sin(theta)
+    volts = []
+    for x, y in ((0.0, 0.070), (-0.100, 0.0)):
+        u, v = x - dx, y - dy
+        volts += [(c * u + s * v - x) / 5e-4, (-s * u + c * v - y) / 5e-4, 5.0]
+    noisy = np.array(volts) + np.random.default_rng(seed).normal(0.0, 2e-3, (n, 6))
+    counts: npt.NDArray[np.int16] = np.rint(noisy / STEP).astype(np.int16)
+    return counts
+
+
+def estimates(records: list[Record], solver: str) -> npt.NDArray[np.float64]:
+    return np.array(
+        [(r.dx, r.dy, r.theta) for r in records if isinstance(r, DeflectionEstimate) and r.solver == solver]
+    )
+
+
+@pytest.fixture(scope='module')
+def rig() -> Rig:
+    return load_rig()
+
+
+# What 2 um on each channel leave at best (Cramer-Rao, errata section 2.7), and what a mean of 20
+# samples of 2 mV and one converter step leaves of 2 um.
+BOUND_2UM = np.array([1.657e-6, 1.830e-6, np.deg2rad(1.328e-3)])
+SCALE = np.sqrt(((2e-3) ** 2 + STEP**2 / 12) / 20) * 5e-4 / 2e-6
+
+
+@pytest.mark.parametrize('load', [(0.0, 0.0, 0.0), sidebar(10.0), sidebar(50.0), direct(30.0), (20.0, 5.0, -3.0)])
+def test_rms_errors_are_within_a_tenth_of_the_cramer_rao_bound(rig: Rig, load: tuple[float, float, float]) -> None:
+    pose = LinkStatics.from_rig(rig).deflection(*load)
+    pipeline = Pipeline(rig)
+    records = pipeline.process(chunk_of(still(pose, 20 * 2000, 7)))
+    got = estimates(records, 'exact')
+    assert len(got) == 2000
+    rms = np.sqrt(((got - pose) ** 2).mean(axis=0))
+    assert (rms <= 1.1 * BOUND_2UM * SCALE).all(), rms / (BOUND_2UM * SCALE)
+    # And no smaller than chance allows: an error that is hidden would show here.
+    assert (rms >= 0.9 * BOUND_2UM * SCALE).all(), rms / (BOUND_2UM * SCALE)
+    # The estimate's own covariance says the same.
+    one = next(r for r in records if isinstance(r, DeflectionEstimate) and r.primary)
+    stated = np.sqrt(np.array(one.covariance).reshape(3, 3).diagonal())
+    np.testing.assert_allclose(stated, BOUND_2UM * SCALE, rtol=0.02)
+    # The load that the link needs for it is the one that was applied.
+    wrench = np.array([(r.fx, r.fy, r.tz) for r in records if isinstance(r, TipLoad)]).mean(axis=0)
+    np.testing.assert_allclose(wrench, load, atol=5e-3)
+
+
+def test_iterative_agrees_with_exact_and_wls_shows_its_small_angle_error(rig: Rig) -> None:
+    pose = (0.002, -0.002, np.deg2rad(1.0))
+    records = Pipeline(rig).process(chunk_of(still(pose, 20 * 500, 3)))
+    exact, iterative, wls = (estimates(records, name) for name in ('exact', 'iterative', 'wls'))
+    assert abs(exact - iterative).max() < 1e-9
+    # Errata section 2.4: theta_hat = sin theta, d_hat = R(-theta) d + (1 - cos theta) mean(l).
+    error = (wls - pose).mean(axis=0)
+    np.testing.assert_allclose(error[:2], [-42.825e-6, -29.270e-6], atol=0.1e-6)
+    assert np.rad2deg(error[2]) * 1e3 == pytest.approx(-0.05077, abs=0.05)
+
+
+def test_the_records_do_not_depend_on_how_the_samples_were_chunked(rig: Rig) -> None:
+    counts = RigSimulator(rig, 1).step(np.tile(sidebar(30.0), (400, 1))).counts
+    whole = Pipeline(rig)
+    expected = whole.process(chunk_of(counts)) + whole.flush()
+    cuts = [0, 1, 7, 20, 59, 60, 61, 250, 400]
+    pieces = Pipeline(rig)
+    got: list[Record] = []
+    for a, b in itertools.pairwise(cuts):
+        got += pieces.process(chunk_of(counts[a:b], a))
+    got += pieces.flush()
+    assert [r for r in got if isinstance(r, DeflectionEstimate | TipLoad)] == [
+        r for r in expected if isinstance(r, DeflectionEstimate | TipLoad)
+    ]
+
+
+def spots_of(records: list[Record]) -> SpotMeans:
+    (spots,) = (r for r in records if isinstance(r, SpotMeans))
+    return spots
+
+
+REST = (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ('label', 'change', 'status', 'said'),
+    [
+        ('laser 1 off', lambda c: c.__setitem__((slice(3, 9), slice(0, 3)), 0), BlockStatus.LASER_LOST, 'laser 1'),
+        ('laser 2 off', lambda c: c.__setitem__((slice(None), slice(3, 6)), 0), BlockStatus.LASER_LOST, 'laser 2'),
+        ('y2 at the rail once', lambda c: c.__setitem__((4, 4), -32768), BlockStatus.SATURATED, 'y2'),
+        ('x1 at the rail', lambda c: c.__setitem__((slice(None), 0), 32767), BlockStatus.SATURATED, 'x1'),
+    ],
+)
+def test_a_block_that_cannot_be_trusted_has_no_estimate_and_says_why(
+    rig: Rig, label: str, change: object, status: BlockStatus, said: str
+) -> None:
+    counts = still(REST, 20, 0)
+    change(counts)  # type: ignore[operator]
+    records = Pipeline(rig).process(chunk_of(counts))
+    spots = spots_of(records)
+    assert spots.status is status
+    assert said in spots.reason
+    assert not any(isinstance(r, DeflectionEstimate | TipLoad) for r in records)
+    # The samples themselves are kept.
+    assert any(isinstance(r, SampleBlock) and len(r.seq) == 20 for r in records)
+
+
+def test_the_device_flag_over_range_is_believed(rig: Rig) -> None:
+    chunk = chunk_of(still(REST, 20, 0))
+    chunk.flags[3] = 1
+    assert spots_of(Pipeline(rig).process(chunk)).status is BlockStatus.SATURATED
+
+
+@pytest.mark.parametrize(('present', 'status'), [(9, BlockStatus.TOO_FEW_SAMPLES), (10, BlockStatus.OK)])
+def test_too_few_samples_are_no_block(rig: Rig, present: int, status: BlockStatus) -> None:
+    pipeline = Pipeline(rig)
+    assert pipeline.process(chunk_of(still(REST, present, 0))) == []
+    spots = spots_of(pipeline.flush())
+    assert spots.status is status
+    assert (spots.present, spots.lost) == (present, 20 - present)
+
+
+def test_fewer_samples_make_a_wider_covariance(rig: Rig) -> None:
+    pipeline = Pipeline(rig)
+    pipeline.process(chunk_of(still(REST, 10, 0)))
+    (half,) = (r for r in pipeline.flush() if isinstance(r, DeflectionEstimate) and r.primary)
+    (full,) = (
+        r
+        for r in Pipeline(rig).process(chunk_of(still(REST, 20, 0)))
+        if isinstance(r, DeflectionEstimate) and r.primary
+    )
+    np.testing.assert_allclose(np.array(half.covariance), 2.0 * np.array(full.covariance), rtol=1e-3, atol=1e-18)
+
+
+def test_zero_takes_the_present_dots_and_applies_from_the_next_block_on(rig: Rig) -> None:
+    pipeline = Pipeline(rig)
+    assert pipeline.zero() is None
+    pose = (1e-4, -2e-4, 1e-3)
+    before = pipeline.process(chunk_of(still(pose, 20 * 30, 5)))
+    change = pipeline.zero()
+    assert change is not None
+    assert change.block == 30
+    after = pipeline.process(chunk_of(still(pose, 20 * 30, 6), 600))
+    assert abs(estimates(before, 'exact').mean(axis=0) - pose).max() < 1e-6
+    assert abs(estimates(after, 'exact').mean(axis=0)).max() < 1e-6
+    # The same change in another pipeline gives the same bits.
+    other = Pipeline(rig)
+    other.process(chunk_of(still(pose, 20 * 30, 5)))
+    other.apply(change)
+    again = other.process(chunk_of(still(pose, 20 * 30, 6), 600))
+    assert (estimates(again, 'exact') == estimates(after, 'exact')).all()
+
+
+def test_a_zero_is_not_taken_across_an_outage(rig: Rig) -> None:
+    pipeline = Pipeline(rig)
+    pipeline.process(chunk_of(still(REST, 200, 1)))
+    dark = still(REST, 20, 2)
+    dark[:, :3] = 0
+    pipeline.process(chunk_of(dark, 200))
+    assert pipeline.zero() is None

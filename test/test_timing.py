@@ -1,0 +1,81 @@
+"""Device clock to host time: the figures of the field notes, on a simulated USB line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psd_deflection.timing import ClockMap, lower_line
+
+MS = 1_000_000
+
+
+def observe_usb(
+    clock: ClockMap, seconds: int, skew_ppm: float, seed: int, start_us: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Samples at 1 kHz through 1 ms USB polling with random delays; stamps and truth, ns."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = [], []
+    for k in range(seconds * 1000):
+        device_us = start_us + 1000 * k
+        true = round(1000 * 1000 * k * (1.0 - skew_ppm * 1e-6)) + 12345
+        frame = -(-true // MS) * MS
+        delay = 200_000 + int(rng.exponential(50_000)) + (5 * MS if rng.random() < 0.02 else 0)
+        clock.observe(device_us, frame + delay)
+        if k % 20 == 19:
+            block = np.arange(device_us - 19_000, device_us + 1, 1000, dtype=np.int64)
+            stamps.append(clock.to_host_ns(block)[0])
+            truth.append(true - round(19 * MS * (1.0 - skew_ppm * 1e-6)))
+    return np.array(stamps), np.array(truth)
+
+
+@pytest.mark.parametrize('skew', [30.0, -83.0])
+def test_stamps_follow_the_truth_within_50_us_after_three_minutes(skew: float) -> None:
+    clock = ClockMap()
+    stamps, truth = observe_usb(clock, 240, skew, 1)
+    error = (stamps - truth)[180 * 50 :]
+    assert error.std() < 50_000
+    # What is left is the least delay of the line, which no one-way clock can see.
+    assert 200_000 - 50_000 < error.mean() < 450_000
+    assert clock.state().skew_ppm == pytest.approx(-skew, abs=2.0)
+    assert clock.resets == 0
+
+
+def test_stamps_rise_evenly_from_the_first_second_on() -> None:
+    stamps, _ = observe_usb(ClockMap(), 30, 30.0, 2)
+    spacing = np.diff(stamps)
+    assert abs(spacing - 20 * MS).max() < 45_000
+
+
+def test_a_stall_of_the_host_does_not_move_the_clock() -> None:
+    clock = ClockMap()
+    observe_usb(clock, 20, 0.0, 3)
+    before = clock.to_host_ns(np.array([20_000_000], np.int64))[0]
+    # Three seconds of samples arrive at once, late.
+    for k in range(20_000, 23_000):
+        assert not clock.observe(1000 * k, 23_500 * MS)
+    after = clock.to_host_ns(np.array([20_000_000], np.int64))[0]
+    assert abs(after - before) < 1 * MS
+
+
+@pytest.mark.parametrize(('device_us', 'host_ms'), [(500, 20_001), (90_000_000, 20_001)])
+def test_a_clock_that_jumps_is_laid_anew_and_counted(device_us: int, host_ms: int) -> None:
+    clock = ClockMap()
+    observe_usb(clock, 20, 0.0, 4)
+    assert clock.observe(device_us, host_ms * MS)
+    assert clock.resets == 1
+    assert clock.to_host_ns(np.array([device_us], np.int64))[0] == host_ms * MS
+
+
+def test_an_uptime_of_years_loses_no_nanoseconds() -> None:
+    clock = ClockMap()
+    stamps, truth = observe_usb(clock, 15, 0.0, 5, start_us=10 * 365 * 86_400 * 1_000_000)
+    assert abs(np.diff(stamps)[-100:] - 20 * MS).max() < 45_000
+    assert (stamps - truth)[-100:].std() < 100_000
+
+
+def test_the_lower_line_touches_from_below() -> None:
+    points = [(0, 10), (10, 5), (20, 30), (30, 7), (40, 50)]
+    slope, intercept = lower_line(points)
+    assert slope == pytest.approx(0.1)
+    assert all(y >= slope * x + intercept - 1e-9 for x, y in points)
