@@ -52,12 +52,15 @@ class Dependence:
 @dataclass(frozen=True, slots=True, eq=False)
 class Localisation:
     """Cells, most conspicuous first; dependences likewise. ``excess``:
-    chi-square beyond noise in all significant places; ``p``: that noise alone does this."""
+    chi-square beyond noise in all significant places; ``p``: that noise alone does this. ``map``
+    (spans, 6, bands): all cells; ``spans``: recording, start and end of each load case, s."""
 
     cells: tuple[Cell, ...]
     dependences: tuple[Dependence, ...]
     excess: float
     p: float
+    map: FloatArray
+    spans: tuple[tuple[int, float, float], ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -255,7 +258,8 @@ def localise(
     total = float(raw_excess.reshape(len(layouts), -1)[significant].sum()) if significant.any() else 0.0
     total = max(total, depends[0].gain if depends and depends[0].p < 0.01 else 0.0)
     p = min(1.0, 2.0 * min(p_of(float(z.max())), depends[0].p if depends else 1.0))
-    return Localisation(tuple(cells), tuple(depends), total, p)
+    spans = tuple((x.recording, x.start * x.period, x.stop * x.period) for x in layouts)
+    return Localisation(tuple(cells), tuple(depends), total, p, raw_z, spans)
 
 
 def _plain(regressor: str) -> str:
