@@ -94,8 +94,11 @@ def _proposals(workspace: Workspace) -> dict[str, list[float]]:
     raw = workspace.raw_residual(workspace.base)
     observations = workspace.observations
     noise = observations[0].rig.amplifier.noise
+    sigmas, periods = [n.sigma for n in workspace.noise], [o.period for o in observations]
+    peaks = propose.spectral_peaks(raw, sigmas, periods)
     return {
-        'spectral': propose.spectral_peaks(raw, [n.sigma for n in workspace.noise], [o.period for o in observations]),
+        'spectral': peaks,
+        'line': propose.persistent(peaks, raw, sigmas, periods),
         'highest': propose.highest_voltages(observations, False, noise),
         'highest_sums': propose.highest_voltages(observations, True, noise),
     }
@@ -139,9 +142,31 @@ def discover(
     result = search.run()
     progress('weighing')
     kept, fit = _accept(search, result, rng)
+    fit, kept = _credible(search, result, fit, kept, rng)
     if lattice is not None:
         workspace.base = tuple(base)
     return _answer(search, result, fit, kept, lattice, rng, seed, progress)
+
+
+def _credible(
+    search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut], rng: np.random.Generator
+) -> tuple[Fit, list[HeldOut]]:
+    """Where something unknown remains, an effect that explains less than what remains is a stand-in for it."""
+    ws = search.workspace
+    while fit.effects:
+        left = localise(ws, fit.residual, fit.jacobian, rng)
+        if not _unknown(left, max(result.null.chi2 - fit.chi2, 0.0)):
+            break
+        weakest = int(np.argmin(result.delta_chi2))
+        if result.delta_chi2[weakest] >= left.excess:
+            break
+        search.trace.append(f'{fit.effects[weakest].label} explains less than what remains unknown')
+        rest = [a for j, a in enumerate(fit.effects) if j != weakest]
+        fit = refit(ws, rest, iterations=6) if rest else result.null
+        heldout = [h for j, h in enumerate(heldout) if j != weakest]
+        for listed in (result.p, result.delta_bic, result.delta_chi2):
+            del listed[weakest]
+    return fit, heldout
 
 
 def _lattice(workspace: Workspace, base: Sequence[ActiveEffect], without: Sequence[str]) -> ActiveEffect | None:

@@ -55,6 +55,32 @@ def spectral_peaks(
     return out[:limit]
 
 
+def persistent(
+    peaks: Sequence[float], residuals: Sequence[FloatArray], sigmas: Sequence[FloatArray], periods: Sequence[float]
+) -> list[float]:
+    """Those of ``peaks`` that hum all the time with one phase, as mains do and ringing does not.
+
+    Quarter by quarter of each recording the line's complex amplitude must be of one kind: its sum
+    as long as its parts together, and no quarter without.
+    """
+    out = []
+    for f in peaks:
+        steady = True
+        for residual, sigma, period in zip(residuals, sigmas, periods, strict=True):
+            n = len(residual) // 4
+            t = np.arange(4 * n) * period
+            scaled = residual[: 4 * n] / sigma
+            turned = np.exp(-2j * np.pi * f * t)[:, None] * (scaled - scaled.mean(axis=0))
+            quarters = turned.reshape(4, n, -1).mean(axis=1)
+            strongest = int(np.argmax(np.abs(quarters).sum(axis=0)))
+            q = quarters[:, strongest]
+            size = np.abs(q)
+            steady &= bool(abs(q.sum()) > 0.7 * size.sum() and size.min() > 0.4 * size.mean())
+        if steady:
+            out.append(f)
+    return out
+
+
 def highest_voltages(observations: Sequence[Observation], with_sums: bool, noise: float) -> list[float]:
     """Limits, V, at which the outputs may have clipped: the largest reading and a little less."""
     rows = [0, 1, 2, 3, 4, 5] if with_sums else [0, 1, 3, 4]

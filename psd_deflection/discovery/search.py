@@ -27,6 +27,8 @@ SHARE_ACCEPT = 0.002
 two exact but different discretisations for example, is not to be trusted to explain."""
 MAX_EFFECTS = 4
 TRIALS = 7
+BUDGET = 1000
+"""Forward simulations after which nothing more is added; what follows the search needs as many again."""
 SWAP_REACH = 0.6
 """Of what the named effect explains, the share an alternative must explain to be refitted."""
 
@@ -121,7 +123,7 @@ class Search:
         first_scores = scores
         current = null
         renoised = False
-        while len(current.effects) < MAX_EFFECTS:
+        while len(current.effects) < MAX_EFFECTS and ws.simulations < BUDGET:
             if current.effects:
                 scores = self.screen.score(current.residual, current.jacobian)
             taken = {key_of(a) for a in current.effects}
@@ -139,7 +141,7 @@ class Search:
                 renoised = True
                 current = self.renoise(current)
                 null = refit(ws, ())
-            if len(current.effects) == 2:
+            if len(current.effects) == 2 and ws.simulations < BUDGET:
                 current = self._try_pairs(null, current)
         current = self._drop(null, current)
         current, p, delta_bic, delta_chi2 = self._weigh(null, current)
@@ -203,7 +205,8 @@ class Search:
             if name not in best:
                 best[name] = s
         # The most likely eight: an exact confounder screens as high as the named effect itself.
-        ranked = sorted(best.values(), key=lambda s: -s.gain)[:8]
+        # Where the search itself was dear, the data are no simple case, and three must do.
+        ranked = sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.workspace.simulations < BUDGET else 3]
         fits = []
         for s in ranked:
             start = [*rest, s.candidate.from_coefficients(s.coefficients)]

@@ -46,6 +46,7 @@ class EffectParameter:
     size of a probe, about the prior's standard deviation. ``kind``: an ``amplitude`` switches the
     effect on; ``coupled`` and ``phase`` mean nothing while the amplitudes are nominal; a ``shape``
     likewise, and ``grid`` says where to look (``spectral``: at peaks of the residual's spectrum;
+    ``line``: at those that hum steadily;
     ``highest``: at the largest voltage seen); a ``choice`` takes the values of ``choices``.
     """
 
@@ -59,7 +60,7 @@ class EffectParameter:
     kind: Kind = 'amplitude'
     choices: tuple[int, ...] = ()
     grid: tuple[float, ...] = ()
-    propose: Literal['', 'spectral', 'highest', 'lattice'] = ''
+    propose: Literal['', 'spectral', 'line', 'highest', 'lattice'] = ''
     of_rig: str = ''
     required: bool = False
 

@@ -38,7 +38,7 @@ EFFECT = Effect(
             nominal=50.0,
             kind='shape',
             grid=(50.0, 60.0),
-            propose='spectral',
+            propose='line',
         ),
         *(EffectParameter(f'amplitude_{c}', 'V', -10.0, 10.0, 1e-3, f'its size on {c}') for c in CHANNELS),
         *(
