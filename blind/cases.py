@@ -136,7 +136,7 @@ def _mains(rng: np.random.Generator, size: float) -> dict[str, Any]:
 
 def _saturation(rng: np.random.Generator, size: float) -> dict[str, Any]:
     # What the size means is found by bisection: a small one clips only the highest peaks.
-    return {'limit': 7.0 / (1.0 + 0.1 * size), 'sums': int(rng.integers(0, 2))}
+    return {'limit': 10.0 * math.exp(-0.02 * size), 'sums': int(rng.integers(0, 2))}
 
 
 DRAWS: Mapping[str, Draw] = {

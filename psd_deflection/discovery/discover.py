@@ -142,20 +142,20 @@ def discover(
     result = search.run()
     progress('weighing')
     kept, fit = _accept(search, result, rng)
-    fit, kept = _credible(search, result, fit, kept, rng)
+    fit, kept, left = _credible(search, result, fit, kept, rng)
     if lattice is not None:
         workspace.base = tuple(base)
-    return _answer(search, result, fit, kept, lattice, rng, seed, progress)
+    return _answer(search, result, fit, kept, left, lattice, rng, seed, progress)
 
 
 def _credible(
     search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut], rng: np.random.Generator
-) -> tuple[Fit, list[HeldOut]]:
+) -> tuple[Fit, list[HeldOut], Localisation]:
     """Where something unknown remains, an effect that explains less than what remains is a stand-in for it."""
     ws = search.workspace
-    while fit.effects:
-        left = localise(ws, fit.residual, fit.jacobian, rng)
-        if not _unknown(left, max(result.null.chi2 - fit.chi2, 0.0)):
+    while True:
+        left = localise(ws, fit.residual, fit.jacobian if fit.free else None, rng)
+        if not fit.effects or not _unknown(left, max(result.null.chi2 - fit.chi2, 0.0)):
             break
         weakest = int(np.argmin(result.delta_chi2))
         if result.delta_chi2[weakest] >= left.excess:
@@ -166,7 +166,7 @@ def _credible(
         heldout = [h for j, h in enumerate(heldout) if j != weakest]
         for listed in (result.p, result.delta_bic, result.delta_chi2):
             del listed[weakest]
-    return fit, heldout
+    return fit, heldout, left
 
 
 def _lattice(workspace: Workspace, base: Sequence[ActiveEffect], without: Sequence[str]) -> ActiveEffect | None:
@@ -216,6 +216,7 @@ def _answer(
     result: SearchResult,
     fit: Fit,
     heldout: list[HeldOut],
+    left: Localisation,
     lattice: ActiveEffect | None,
     rng: np.random.Generator,
     seed: int,
@@ -255,8 +256,7 @@ def _answer(
         named.append(_named_lattice(ws, lattice))
         ws.base = ws.base[:-1]
     progress('where')
-    before = localise(ws, null.residual, None, rng)
-    left = localise(ws, fit.residual, fit.jacobian if fit.free else None, rng)
+    before = left if fit is null else localise(ws, null.residual, None, rng)
     floor = ws.floor()
     explained = max(null.chi2 - fit.chi2, 0.0)
     unknown = _unknown(left, explained)

@@ -22,7 +22,7 @@ from psd_deflection.simulation.simulator import ForwardModel
 BANDS = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, 125.0)
 CLIP = 6.0
 """Whitened values beyond this count as this: an outlier of heavy-tailed noise is no structure."""
-DRAWS = 99
+DRAWS = 39
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +221,7 @@ def localise(
         q, _ = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))
     present = (workspace.whiten([np.ones_like(m) for m in workspace.measured]) != 0.0).astype(np.float64)
     for draw in range(DRAWS):
-        e = rng.standard_normal(len(residual)) * present
+        e = rng.standard_normal(len(residual), dtype=np.float32) * present
         if q is not None:
             e -= q @ (q.T @ e)
         maxima[draw] = _energies(workspace.split(e), layouts)[0].max()

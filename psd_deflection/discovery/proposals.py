@@ -29,7 +29,8 @@ def spectral_peaks(
             continue
         scaled = residual / sigma
         window = np.hanning(n)
-        power = np.sum(np.abs(np.fft.rfft(scaled * window[:, None], axis=0)) ** 2, axis=1)
+        each = np.abs(np.fft.rfft(scaled * window[:, None], axis=0)) ** 2
+        power = each.sum(axis=1)
         power[: max(4, int(2.0 * n * period))] = 0.0
         median = float(np.median(power[power > 0.0]))
         t = np.arange(n, dtype=np.float64) * period
@@ -38,8 +39,11 @@ def spectral_peaks(
             if power[k] < PEAK * median or k < 2:
                 break
 
-            def loss(f: float, t: FloatArray = t, x: FloatArray = scaled * window[:, None]) -> float:
-                return -float(np.sum(np.abs(np.exp(-2j * np.pi * f * t) @ x) ** 2))
+            strongest = np.ascontiguousarray(scaled[:, int(np.argmax(each[k]))] * window)
+
+            def loss(f: float, t: FloatArray = t, x: FloatArray = strongest) -> float:
+                angle = 2.0 * np.pi * f * t
+                return -float((np.cos(angle) @ x) ** 2 + (np.sin(angle) @ x) ** 2)
 
             step = 1.0 / (n * period)
             found = minimize_scalar(

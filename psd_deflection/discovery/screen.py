@@ -69,16 +69,16 @@ class Screen:
             self.slices.append(slice(at, at + len(white)))
             at += len(white)
             parts += white
-        self.matrix = np.stack(parts, axis=1) if parts else np.empty((len(workspace.data), 0), dtype=np.float32)
-        self.fisher = (self.matrix.T @ self.matrix).astype(np.float64)
+        self.rows = np.stack(parts) if parts else np.empty((0, len(workspace.data)), dtype=np.float32)
+        self.fisher = (self.rows @ self.rows.T).astype(np.float64)
         self.lengths = np.maximum(np.diag(self.fisher).copy(), 1e-300)
 
     def _projected(self, residual: FloatArray, known: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-        g = (self.matrix.T @ residual.astype(np.float32)).astype(np.float64)
+        g = (self.rows @ residual.astype(np.float32)).astype(np.float64)
         fisher = self.fisher
         if known is not None and known.shape[1]:
             q, _ = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))
-            across = (self.matrix.T @ q.astype(np.float32)).astype(np.float64)
+            across = (self.rows @ q.astype(np.float32)).astype(np.float64)
             fisher = fisher - across @ across.T
             g = g - across @ (q.T @ residual)
         return g, fisher

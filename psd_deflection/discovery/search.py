@@ -27,7 +27,7 @@ SHARE_ACCEPT = 0.002
 two exact but different discretisations for example, is not to be trusted to explain."""
 MAX_EFFECTS = 4
 TRIALS = 7
-BUDGET = 1000
+BUDGET = 700
 """Forward simulations after which nothing more is added; what follows the search needs as many again."""
 SWAP_REACH = 0.6
 """Of what the named effect explains, the share an alternative must explain to be refitted."""
@@ -110,8 +110,16 @@ class Search:
         return float(-np.expm1(count * np.log1p(-min(local, 1.0 - 1e-16))))
 
     def renoise(self, fit: Fit) -> Fit:
-        """Noise again, now that most of the discrepancy is explained; then the fit under it."""
+        """Noise again, now that most of the discrepancy is explained; where it differs, the fit under it."""
+        before = self.workspace.noise
         self.workspace.estimate_noise([*self.workspace.base, *fit.effects])
+        now = self.workspace.noise
+        if all(
+            a.coloured == b.coloured and np.allclose(a.innovation, b.innovation, rtol=0.02)
+            for a, b in zip(before, now, strict=True)
+        ):
+            self.workspace.noise = before
+            return fit
         self.screen = self._make_screen(self.workspace)
         return refit(self.workspace, fit.effects, iterations=6)
 

@@ -111,11 +111,16 @@ def candidates(
                     yield Candidate(effect, start, free, off)
 
 
-def columns(candidate: Candidate, workspace: Workspace, nominal: list[FloatArray]) -> Columns:
-    """The candidate's signatures: change of the fine-block volts for one ``scale`` of each parameter."""
+def columns(
+    candidate: Candidate, workspace: Workspace, nominal: list[FloatArray], base: Sequence[ActiveEffect]
+) -> Columns:
+    """The candidate's signatures: change of the fine-block volts for one ``scale`` of each parameter.
+
+    ``nominal``: the simulation with ``base`` alone.
+    """
 
     def simulate(values: Mapping[str, float]) -> list[FloatArray]:
-        return workspace.simulate([*workspace.base, ActiveEffect(candidate.effect, values)])
+        return workspace.simulate([*base, ActiveEffect(candidate.effect, values)])
 
     def minus(a: list[FloatArray], b: list[FloatArray]) -> list[FloatArray]:
         return [x - y for x, y in zip(a, b, strict=True)]
@@ -149,17 +154,19 @@ class SignatureBank:
     def __init__(self) -> None:
         self._kept: dict[tuple[object, ...], Columns] = {}
         self._nominal: list[FloatArray] | None = None
+        self._base: tuple[ActiveEffect, ...] = ()
 
     def nominal(self, workspace: Workspace) -> list[FloatArray]:
         """The simulation without any effect (but those of the rig file)."""
         if self._nominal is None:
-            self._nominal = workspace.simulate(workspace.base)
+            self._base = workspace.base
+            self._nominal = workspace.simulate(self._base)
         return self._nominal
 
     def get(self, candidate: Candidate, workspace: Workspace) -> Columns:
         """The candidate's columns, simulated once."""
         found = self._kept.get(candidate.key)
         if found is None:
-            found = columns(candidate, workspace, self.nominal(workspace))
+            found = columns(candidate, workspace, self.nominal(workspace), self._base)
             self._kept[candidate.key] = found
         return found
