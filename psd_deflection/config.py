@@ -213,6 +213,41 @@ PARAMETERS: tuple[Parameter, ...] = (
     # Recording.
     Parameter('record', 'bool', False, '', 'record from the start'),
     Parameter('bag_dir', 'string', 'recordings', '', 'folder in which recordings are made'),
+    Parameter(
+        'bag_max_bytes',
+        'integer',
+        0,
+        'bytes',
+        'a file of a recording that is as large is ended and the next begun; 0: never',
+        minimum=0,
+        maximum=1_000_000_000_000,
+    ),
+    Parameter(
+        'bag_max_duration',
+        'double',
+        0.0,
+        's',
+        'a file of a recording that is as long is ended and the next begun; 0: never',
+        minimum=0.0,
+        maximum=1e7,
+    ),
+    Parameter(
+        'disk_reserve',
+        'integer',
+        500_000_000,
+        'bytes',
+        'recording stops before the disk has less room than this',
+        minimum=1_000_000,
+        maximum=1_000_000_000_000,
+    ),
+    Parameter(
+        'disk_full',
+        'string',
+        'stop',
+        '',
+        "when the reserve is reached: stop, or delete the oldest file of this recording (never another's)",
+        choices=('stop', 'delete_oldest'),
+    ),
 )
 
 BY_NAME: Mapping[str, Parameter] = MappingProxyType({p.name: p for p in PARAMETERS})
@@ -317,6 +352,10 @@ class AcquisitionConfig:
     queue_blocks: int
     record: bool
     bag_dir: str
+    bag_max_bytes: int
+    bag_max_duration: float
+    disk_reserve: int
+    disk_full: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -479,6 +518,10 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             queue_blocks=v['queue_blocks'],
             record=v['record'],
             bag_dir=v['bag_dir'],
+            bag_max_bytes=v['bag_max_bytes'],
+            bag_max_duration=v['bag_max_duration'],
+            disk_reserve=v['disk_reserve'],
+            disk_full=v['disk_full'],
         ),
         values=MappingProxyType(got),
         effects=MappingProxyType(effects),
