@@ -193,7 +193,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         length=4,
     ),
     # Acquisition.
-    Parameter('source', 'string', 'serial', '', 'where samples come from', choices=('serial',)),
+    Parameter('source', 'string', 'serial', '', 'what the device speaks: serial (our own frames), or a plug-in'),
     Parameter('port', 'string', '', '', 'serial port; empty starts the simulated rig'),
     Parameter(
         'baud', 'integer', 921_600, 'baud', 'line speed (USB-CDC devices ignore it)', minimum=1200, maximum=12_000_000

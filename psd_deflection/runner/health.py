@@ -75,6 +75,7 @@ class HealthReporter:
             ('device restarts', str(wire.restarts)),
             ('disconnects', str(wire.disconnects)),
         ]
+        values += s.acquisition.source.describe().items()
         if wire.temperature is not None:
             values.append(('device temperature (degC)', f'{wire.temperature:.2f}'))
         return DiagnosticEntry('psd_deflection: acquisition', level, message, tuple(values))

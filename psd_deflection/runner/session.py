@@ -40,6 +40,7 @@ class Session:
         try:
             self.acquisition = Acquisition(rig, say)
             self.acquisition.open()
+            say(', '.join(f'{name} {what}' for name, what in self.acquisition.source.describe().items()))
             self.processing = Processing(self.acquisition, pipeline, say)
             self.recorder = Recorder(rig.acquisition.queue_blocks, say)
             self.fanout = Fanout()
