@@ -114,6 +114,7 @@ def _psd(number: int, center: list[float]) -> list[Parameter]:
             minimum=-0.5,
             maximum=0.5,
             length=2,
+            live=True,
         ),
     ]
 
@@ -209,6 +210,26 @@ PARAMETERS: tuple[Parameter, ...] = (
     ),
     Parameter(
         'queue_blocks', 'integer', 250, 'blocks', 'blocks that may wait for a slow consumer', minimum=2, maximum=100_000
+    ),
+    Parameter(
+        'serial_number',
+        'string',
+        '',
+        '',
+        'serial number that the device must say (HELLO); with it the device is found again under another port name',
+    ),
+    # The node.
+    Parameter('autostart', 'bool', True, '', 'configure and activate at start; false: wait for lifecycle transitions'),
+    Parameter('keep_zero', 'bool', True, '', '~/zero holds for later runs with the same device as well'),
+    Parameter(
+        'zero_file',
+        'string',
+        '',
+        '',
+        'file in which the zero is kept; empty: by serial number below $XDG_STATE_HOME/psd_deflection',
+    ),
+    Parameter(
+        'realtime', 'bool', True, '', 'ask for SCHED_FIFO (reader) and locked memory; the log says what was granted'
     ),
     # Recording.
     Parameter('record', 'bool', False, '', 'record from the start'),
@@ -350,6 +371,10 @@ class AcquisitionConfig:
     baud: int
     latency_offset: float
     queue_blocks: int
+    serial_number: str
+    keep_zero: bool
+    zero_file: str
+    realtime: bool
     record: bool
     bag_dir: str
     bag_max_bytes: int
@@ -516,6 +541,10 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             baud=v['baud'],
             latency_offset=v['latency_offset'],
             queue_blocks=v['queue_blocks'],
+            serial_number=v['serial_number'],
+            keep_zero=v['keep_zero'],
+            zero_file=v['zero_file'],
+            realtime=v['realtime'],
             record=v['record'],
             bag_dir=v['bag_dir'],
             bag_max_bytes=v['bag_max_bytes'],

@@ -36,6 +36,7 @@ from psd_deflection.protocol.frames import (
 )
 from psd_deflection.protocol.sequence import SequenceExtender, Step
 from psd_deflection.records import CHANNELS, FLAG_DEVICE_DROPPED, IntArray, RawChunk
+from psd_deflection.runner.realtime import prefer_reader
 from psd_deflection.timing import ClockMap, ClockState
 
 SILENCE_S = 2.0
@@ -146,6 +147,7 @@ class Acquisition:
         self._first_number = 0
         self._volts_per_count: float | None = rig.converter.volts_per_count
         self._connected = False
+        self.beat = time.monotonic()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name='reader', daemon=True)
         self._seq: list[int] = []
@@ -186,9 +188,12 @@ class Acquisition:
         return self._clock.state()
 
     def _run(self) -> None:
+        if self._rig.acquisition.realtime:
+            self._say(prefer_reader())
         silent_since = time.monotonic()
         try:
             while not self._stop.is_set():
+                self.beat = time.monotonic()
                 if not self._connected:
                     self._stop.wait(RETRY_S)
                     self._reopen()

@@ -21,7 +21,7 @@ from psd_deflection.io.bag_writer import BagWriter
 from psd_deflection.records import ParameterChange
 
 MESSAGES_PER_BLOCK = 10
-JOIN_S = 1.5
+JOIN_S = 1.0
 IDLE_S = 0.5
 LOOK_EVERY = 250
 """Messages between two looks at the room on the disk: half a second's worth."""
