@@ -116,7 +116,7 @@ class Pipeline:
         x1, y1, x2, y2 = (sum(column) / len(self._recent) for column in zip(*self._recent, strict=True))
         return self.change({'psd_1.zero': (x1, y1), 'psd_2.zero': (x2, y2)})
 
-    def change(self, values: Mapping[str, float | tuple[float, ...]]) -> ParameterChange:
+    def change(self, values: Mapping[str, float | str | tuple[float, ...]]) -> ParameterChange:
         """Change parameters from the next block on; the change as a record.
 
         Raises ConfigError where a value is out of bounds; then nothing has changed.

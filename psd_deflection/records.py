@@ -157,7 +157,7 @@ class ParameterChange(NamedTuple):
 
     t_ns: int
     block: int
-    values: tuple[tuple[str, float | tuple[float, ...]], ...]
+    values: tuple[tuple[str, float | str | tuple[float, ...]], ...]
 
 
 class DiagnosticEntry(NamedTuple):

@@ -75,6 +75,7 @@ class HealthReporter:
             ('device restarts', str(wire.restarts)),
             ('disconnects', str(wire.disconnects)),
         ]
+        values += s.acquisition.source.describe().items()
         if wire.temperature is not None:
             values.append(('device temperature (degC)', f'{wire.temperature:.2f}'))
         return DiagnosticEntry('psd_deflection: acquisition', level, message, tuple(values))
@@ -138,10 +139,12 @@ class HealthReporter:
             ('folder', str(folder or '')),
             ('messages', str(recorder.written)),
             ('dropped', str(recorder.dropped)),
+            ('waiting for the disk', str(recorder.waiting)),
+            ('files deleted to make room', str(recorder.files_deleted)),
         )
-        return DiagnosticEntry(
-            'psd_deflection: recording',
-            WARN if recorder.dropped else OK,
-            'recording' if folder else 'not recording',
-            values,
-        )
+        level, message = OK, 'recording' if folder else 'not recording'
+        if recorder.failure:
+            level, message = ERROR, f'recording stopped: {recorder.failure}'
+        elif recorder.dropped:
+            level, message = WARN, f'{recorder.dropped} messages dropped: the disk is too slow'
+        return DiagnosticEntry('psd_deflection: recording', level, message, values)

@@ -39,6 +39,7 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
             continue
         os.environ['ROS_DOMAIN_ID'] = str(candidate)
         os.environ['ROS_LOG_DIR'] = str(tmp_path_factory.mktemp('ros_log'))
+        os.environ['XDG_STATE_HOME'] = str(tmp_path_factory.mktemp('state'))
         yield candidate
         lock.close()
         return
