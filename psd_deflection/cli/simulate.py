@@ -18,6 +18,7 @@ from psd_deflection.config import EFFECTS_PREFIX, Rig, load_rig, replace_values
 from psd_deflection.errors import ConfigError
 from psd_deflection.io.bag_writer import BagWriter, McapFile
 from psd_deflection.io.csv_writer import CsvSampleSink
+from psd_deflection.io.sinks import Sink
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import (
     AppliedLoad,
@@ -97,7 +98,7 @@ def write_recording(
 ) -> int:
     """Simulate and write; returns the number of samples. Raises RecordingError, ConfigError."""
     is_csv = out.suffix.lower() == '.csv'
-    sink: CsvSampleSink | McapFile
+    sink: Sink
     values = {**rig.values, **{EFFECTS_PREFIX + k: e for k, e in rig.effects.items()}}
     if is_csv:
         sink = CsvSampleSink(out, loads=True, references=reference, temperatures=temperature is not None)
