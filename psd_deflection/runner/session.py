@@ -117,9 +117,30 @@ class Session:
         hello = self.acquisition.hello.info if self.acquisition.hello is not None else None
 
         def change() -> Path | None:
-            return self.recorder.start(self.rig, hello) if wanted else self.recorder.stop()
+            if not wanted:
+                return self.recorder.stop()
+            folder = self.recorder.start(self.rig, hello)
+            held = self.pipeline.environment()
+            if held is not None:
+                self.recorder.put_change(held)
+            return folder
 
         return self.processing.request(change)
+
+    def temperature(self, celsius: float) -> None:
+        """The ambient temperature, for the corrections that need it; from the next block on.
+
+        Raises TimeoutError where no data flows.
+        """
+        if not self.pipeline.needs_temperature:
+            return
+
+        def change() -> None:
+            taken = self.pipeline.temperature(celsius)
+            if taken is not None:
+                self.processing.give([taken])
+
+        self.processing.request(change)
 
     def zero(self) -> ParameterChange | None:
         """Take the present dots as the unloaded ones; None where no good block has come yet.
