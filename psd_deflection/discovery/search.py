@@ -27,7 +27,7 @@ SHARE_ACCEPT = 0.002
 two exact but different discretisations for example, is not to be trusted to explain."""
 MAX_EFFECTS = 4
 TRIALS = 7
-BUDGET = 700
+BUDGET = 600
 """Forward simulations after which nothing more is added; the alternatives end at twice as many."""
 SWAP_REACH = 0.6
 """Of what the named effect explains, the share an alternative must explain to be refitted."""
@@ -173,7 +173,8 @@ class Search:
                 fits = self.alternatives(current, i, gains[i])
                 others.append(fits)
                 best = min([best, *fits], key=self._bic)
-            if swaps == 2 or self._bic(best) > self._bic(current) - 2.0:
+            spent = self.workspace.simulations > 1.5 * BUDGET
+            if swaps == 2 or spent or self._bic(best) > self._bic(current) - 2.0:
                 break
             self._say('swapping to ' + ', '.join(a.label for a in best.effects))
             current = refit(self.workspace, best.effects, iterations=8)
