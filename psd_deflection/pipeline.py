@@ -2,7 +2,8 @@
 
 It owns no clock, thread or I/O, so that what it gives depends on the rig, the samples and the order
 of calls alone, and ``replay`` can show that bit for bit. Counts -> volts -> blocks -> dots in
-metres -> health -> solvers -> estimates and the load that the link model needs for them.
+metres -> what the rig file knows to be wrong taken off -> health -> solvers -> estimates and the
+load that the link model needs for them.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from psd_deflection.records import (
     SpotMeans,
     TipLoad,
 )
+from psd_deflection.simulation.correction import Correction
 from psd_deflection.solvers import solver_from_rig
 from psd_deflection.solvers._interface import SolverStatus
 
@@ -73,6 +75,7 @@ class Pipeline:
     def _build(self, rig: Rig) -> None:
         self.rig = rig
         self._calibration = Calibration.from_rig(rig)
+        self._correction = Correction.from_rig(rig)
         config = rig.estimator
         self._sum_min = config.sum_min
         names = [config.solver, *(name for name in config.solvers if name != config.solver)]
@@ -136,10 +139,12 @@ class Pipeline:
         self.counters.samples += present
         self.counters.blocks += 1
         volts = block.volts
+        sums = volts[:, 2::3].astype(np.float64)
         samples = self._calibration.dots(volts)
+        if self._correction.active:
+            samples = self._correction.apply(samples, sums)
         x1, y1, x2, y2 = (samples.sum(axis=0) / present).tolist()
         dots: Dots = (x1, y1, x2, y2)
-        sums = volts[:, 2::3].astype(np.float64)
         status, reason = self._health(block, dots, sums)
         t_ns = block_middle_ns(block, size, self._period_ns)
         variances = self._variances[present - 1]

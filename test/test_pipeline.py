@@ -196,3 +196,28 @@ def test_a_zero_is_not_taken_across_an_outage(rig: Rig) -> None:
     dark[:, :3] = 0
     run(pipeline.process, chunk_of(dark, 200))
     assert pipeline.zero() is None
+
+
+@pytest.mark.parametrize(
+    'effect',
+    [
+        {'name': 'sensor_rotation', 'psd': 2, 'angle': 0.02},
+        {'name': 'sensor_gain', 'psd': 1, 'x': 0.02, 'y': -0.03},
+        {'name': 'axis_crosstalk', 'psd': 1, 'xy': 0.01, 'yx': -0.01},
+        {'name': 'sensor_nonlinearity', 'psd': 2, 'k': 2000.0},
+        {'name': 'plane_tilt', 'slope_ratio': 1.5},
+    ],
+    ids=lambda e: str(e['name']),
+)
+def test_an_effect_in_the_rig_file_is_simulated_and_corrected(rig: Rig, effect: dict[str, object]) -> None:
+    known = load_rig(overrides={f'effects.one.{k}': v for k, v in effect.items()})
+    load = np.tile(sidebar(50.0), (20 * 400, 1))
+    counts = RigSimulator(known, 4).step(load).counts
+    pose = LinkStatics.from_rig(rig).deflection(*sidebar(50.0))
+    # The last blocks: by then the link is at rest.
+    blind, corrected = (
+        abs(estimates(run(Pipeline(r).process, chunk_of(counts)), 'exact')[-50:].mean(axis=0) - pose)
+        for r in (rig, known)
+    )
+    assert (corrected < [3e-7, 3e-7, 5e-6]).all()
+    assert (blind > 3.0 * corrected).any()

@@ -49,6 +49,7 @@ SILENCE_S = 2.0
 
 RETRY_S = 0.2
 READ_TIMEOUT_S = 0.1
+READY_S = 10.0
 
 BY_DEVICE = 'dropped by the device'
 DAMAGED = 'damaged on the wire'
@@ -186,6 +187,7 @@ class Acquisition:
         self._connected = False
         self.beat = time.monotonic()
         self._stop = threading.Event()
+        self._ready = threading.Event()
         self._thread = threading.Thread(target=self._run, name='reader', daemon=True)
         self._seq: list[int] = []
         self._t: list[int] = []
@@ -209,10 +211,9 @@ class Acquisition:
         self._connected = True
 
     def start(self) -> None:
-        """Start the reader thread; :meth:`open` came before."""
-        if self._connected:
-            self.source.start()
+        """Start the reader thread; :meth:`open` came before. What comes from now on is read."""
         self._thread.start()
+        self._ready.wait(READY_S)
 
     def stop(self) -> None:
         """Stop the reader and close the port; an Ended item is the last on the queue."""
@@ -235,6 +236,10 @@ class Acquisition:
     def _run(self) -> None:
         if self._rig.acquisition.realtime:
             self._say(prefer_reader())
+        # Locking the memory takes its time: only what comes after it is as old as it looks.
+        if self._connected:
+            self.source.start()
+        self._ready.set()
         silent_since = time.monotonic()
         try:
             while not self._stop.is_set():
