@@ -160,8 +160,8 @@ def _run_without_ros(overrides: dict[str, object], display: Display, watch: Call
     session = Session(rig_from_values(overrides, 'command line'), display.say)
     watchdog = Watchdog()
     try:
-        session.start()
         settle()
+        session.start()
         watchdog.ready()
         while not stop.wait(0.1) and session.processing.alive:
             if session.responsive():

@@ -106,6 +106,7 @@ class EstimatorNode:
         self.session: Session | None = None
         self.error: Exception | None = None
         self._signals = signals
+        self._starting = False
         self._health: HealthReporter | None = None
         try:
             self.node = _ManagedNode(
@@ -142,23 +143,31 @@ class EstimatorNode:
             action()
         except PsdDeflectionError as error:
             self.error = error
-            self.node.get_logger().error(str(error))
-            return TransitionCallbackReturn.FAILURE
         except Exception as error:
             self.error = error
-            self.node.get_logger().error(f'{type(error).__name__}: {error}')
+            self._tell_error(f'{type(error).__name__}: {error}')
             return TransitionCallbackReturn.ERROR
-        self.error = None
-        return TransitionCallbackReturn.SUCCESS
+        else:
+            self.error = None
+            return TransitionCallbackReturn.SUCCESS
+        self._tell_error(str(self.error))
+        return TransitionCallbackReturn.FAILURE
+
+    def _tell_error(self, text: str) -> None:
+        # At start it is raised, and said by whoever started us.
+        if not self._starting:
+            self._say(text)
 
     def start(self) -> None:
         """Configure and activate, where ``autostart`` says so. Raises what stands in the way."""
         if not self.rig.values['autostart']:
             self._say('waiting to be configured: ros2 lifecycle set /estimator configure')
             return
+        self._starting = True
         for trigger in (self.node.trigger_configure, self.node.trigger_activate):
             if trigger() != TransitionCallbackReturn.SUCCESS:
                 raise self.error or ConfigError('the node does not start')
+        self._starting = False
 
     def configure(self) -> None:
         """Open the port and let samples flow; nothing is published yet."""
@@ -275,8 +284,8 @@ def run(
             failed: BaseException | None = None
             watchdog = Watchdog()
             try:
-                estimator.start()
                 settle()
+                estimator.start()
                 watchdog.ready()
                 while not signals.stop:
                     executor.spin_once(timeout_sec=SPIN_S)

@@ -65,7 +65,7 @@ class Spokesman:
         text = f'no estimate: {self._why}' if cause else 'estimates are back'
         if self._changes > 1 or (not cause and self._blocks):
             noun = 'block' if self._blocks == 1 else 'blocks'
-            text += f' ({self._blocks} {noun} without one since the last line, {self._changes} changes)'
+            text += f' ({self._blocks} {noun} without one since the last line)'
         self._last_line = now
         self._blocks = self._changes = 0
         self._say(text)

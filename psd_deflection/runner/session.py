@@ -11,7 +11,9 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from msg_adapters import TOPIC_TYPES
 from psd_deflection.config import Rig, replace_values
+from psd_deflection.io import cdr
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import ParameterChange
 from psd_deflection.runner.acquisition import Acquisition
@@ -101,6 +103,7 @@ class Session:
 
         The recorder is served last: what is published waits for no disk.
         """
+        cdr.prepare(TOPIC_TYPES.values())
         if self.rig.acquisition.realtime:
             self._say(lock_memory())
         self.fanout.wires.append(self.recorder)
