@@ -1,10 +1,19 @@
-# make run     set-up, then the daemon on the simulated rig (or PORT=/dev/ttyACM0)
-# make test    set-up, then lint, types, import contracts and every test
+# make run      set-up, then the daemon on the simulated rig, recorded below recordings/
+#               (make run PORT=/dev/ttyACM0 ARGS='--params-file my_rig.yaml' for a real one)
+# make test     set-up, then lint, types, import contracts and every test
+# make bench    what it costs, as ratios to peers measured in the same run (a few minutes)
+# make golden   make the recordings in bags/ anew
+# make colcon   build with colcon in a virtual environment of its own and look at what it installed
+# make clean    remove what the above made
 PYTHON ?= python3
 VENV ?= .venv
+# Further requirements, e.g. WITH='numpy<2' for what Ubuntu 24.04 has.
+WITH ?=
+PORT ?=
+ARGS ?=
 BIN := $(VENV)/bin
 
-.PHONY: run test lint types contracts unit clean help
+.PHONY: help run test lint types contracts unit bench golden colcon clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -14,7 +23,7 @@ SOURCES := $(shell find psd_deflection msg_adapters config launch resource -type
 $(VENV)/.requirements: setup.cfg
 	$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info[:2] <= (3, 12) else f"Python 3.11 or 3.12 is needed, this is {sys.version.split()[0]}: make PYTHON=python3.12")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[ros,test]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[ros,test]' $(if $(WITH),'$(WITH)')
 	touch $@
 
 # Installed as a user has it (a wheel, not a link to the checkout), so that `ros2 run` finds it.
@@ -37,5 +46,26 @@ contracts: $(VENV)/.installed
 unit: $(VENV)/.installed
 	$(BIN)/python -m pytest
 
+run: $(VENV)/.installed
+	$(BIN)/psd-deflection estimator --record recordings $(if $(PORT),--port $(PORT)) $(ARGS)
+
+bench: $(VENV)/.installed
+	$(BIN)/python bench/live.py
+	$(BIN)/python bench/solvers.py
+
+golden: $(VENV)/.installed
+	$(BIN)/python bags/make.py
+
+# colcon from PyPI wants an older setuptools than ours: a virtual environment of its own.
+colcon:
+	test -x $(VENV)-colcon/bin/colcon || ($(PYTHON) -m venv $(VENV)-colcon && $(VENV)-colcon/bin/python -m pip install --quiet --disable-pip-version-check colcon-core colcon-ros colcon-python-setup-py colcon-package-information colcon-recursive-crawl colcon-package-selection colcon-output colcon-defaults colcon-library-path)
+	rm -rf build/colcon && mkdir -p build/colcon
+	cd build/colcon && ../../$(VENV)-colcon/bin/colcon --log-base log build --base-paths ../.. --build-base build --install-base install
+	test -x build/colcon/install/psd_deflection/lib/psd_deflection/estimator
+	test -x build/colcon/install/psd_deflection/lib/psd_deflection/replay
+	test -f build/colcon/install/psd_deflection/share/ament_index/resource_index/packages/psd_deflection
+	test -f build/colcon/install/psd_deflection/share/psd_deflection/package.xml
+	test -f build/colcon/install/psd_deflection/share/psd_deflection/launch/estimator.launch.py
+
 clean:
-	rm -rf build dist $(VENV)
+	rm -rf build dist install log *.egg-info $(VENV) $(VENV)-colcon

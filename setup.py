@@ -45,6 +45,8 @@ if BUILDS_WHEEL:
     data_files.append((f'lib/{PACKAGE}', [str(shim_dir / name) for name in EXECUTABLES]))
 
 setup(
+    # colcon reads this file's arguments back as text, which a version specifier does not survive.
+    python_requires='>=3.11' if BUILDS_WHEEL else None,
     data_files=data_files,
     entry_points={
         'console_scripts': ['psd-deflection = psd_deflection.cli.main:main']

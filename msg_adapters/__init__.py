@@ -24,6 +24,7 @@ from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
     DiagnosticReport,
+    ParameterChange,
     Record,
     ReferencePose,
     SampleBlock,
@@ -85,6 +86,8 @@ def to_messages(record: Record) -> tuple[Message, ...]:
             Message(SAMPLES, point_cloud2.TYPE, int(part.t_ns[0]), point_cloud2.from_block(part))
             for part in point_cloud2.parts(record)
         )
+    if isinstance(record, ParameterChange):
+        return ()
     t_ns = record.t_ns
     if isinstance(record, DeflectionEstimate):
         fields = pose_stamped.from_estimate(record)

@@ -2,8 +2,9 @@
 
 Little-endian fields in this order: ``seq`` UINT32 (the sample number modulo 2^32), ``dt`` UINT32
 (ns after header.stamp, which is the time of the first sample), then the six channels in volts,
-FLOAT32. A block in which some sample carries a flag has a ninth field, ``flags`` UINT32, so that
-replay sees all that the live pipeline saw; the others keep the eight that the contract names.
+FLOAT32. Two more follow only in blocks that need them, so that replay sees all that the live
+pipeline saw: ``flags`` UINT32 where some sample carries a flag, and after it ``seq_high`` UINT32
+(seq div 2^32) once the sample number has passed 32 bits, after 49 days at 1 kHz.
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ PLAIN = np.dtype([('seq', '<u4'), ('dt', '<u4'), *((c, '<f4') for c in CHANNELS)
 FLAGGED = np.dtype([*PLAIN.descr, ('flags', '<u4')])
 """One sample of a block in which some sample carries a flag: 36 bytes."""
 
+LONG = np.dtype([*FLAGGED.descr, ('seq_high', '<u4')])
+"""One sample of a block in which some sample number has more than 32 bits: 40 bytes."""
+
 MAX_SPAN_NS = 2**32 - 1
 """The largest ``dt``: 4.29 s."""
 
@@ -39,17 +43,17 @@ _FORMATS = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f
 
 
 # Every field is four bytes wide.
-_FLAGGED_FIELDS = [
+_ALL_FIELDS = [
     {'name': name, 'offset': 4 * i, 'datatype': FLOAT32 if name in CHANNELS else UINT32, 'count': 1}
-    for i, name in enumerate(('seq', 'dt', *CHANNELS, 'flags'))
+    for i, name in enumerate(('seq', 'dt', *CHANNELS, 'flags', 'seq_high'))
 ]
-_PLAIN_FIELDS = _FLAGGED_FIELDS[:-1]
+_FIELDS = {dtype: _ALL_FIELDS[: dtype.itemsize // 4] for dtype in (PLAIN, FLAGGED, LONG)}
 
 
 def from_block(block: SampleBlock) -> Fields:
     """Fields of one block whose samples lie at most ``MAX_SPAN_NS`` apart (see :func:`parts`)."""
-    flagged = bool(block.flags.any())
-    dtype = FLAGGED if flagged else PLAIN
+    plain = FLAGGED if block.flags.any() else PLAIN
+    dtype = LONG if int(block.seq[-1]) >> 32 else plain
     width = len(block.seq)
     t_ns = int(block.t_ns[0])
     points = np.empty(width, dtype)
@@ -57,13 +61,15 @@ def from_block(block: SampleBlock) -> Fields:
     points['dt'] = block.t_ns - t_ns
     for i, channel in enumerate(CHANNELS):
         points[channel] = block.volts[:, i]
-    if flagged:
+    if dtype is not PLAIN:
         points['flags'] = block.flags
+    if dtype is LONG:
+        points['seq_high'] = block.seq >> 32
     return {
         'header': header(t_ns, FRAME),
         'height': 1,
         'width': width,
-        'fields': _FLAGGED_FIELDS if flagged else _PLAIN_FIELDS,
+        'fields': _FIELDS[dtype],
         'is_bigendian': False,
         'point_step': dtype.itemsize,
         'row_step': dtype.itemsize * width,

@@ -77,14 +77,14 @@ class BlockCutter:
         )
 
 
-def mean_and_covariance(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean (c,) and unbiased sample covariance (c, c) of ``values`` (n, c); zeros where n < 2."""
+def covariance(values: FloatArray) -> FloatArray:
+    """Unbiased sample covariance (c, c) of ``values`` (n, c); zeros where n < 2."""
     n, c = values.shape
-    mean = values.sum(axis=0) / n
     if n < 2:
-        return mean, np.zeros((c, c))
-    centred = values - mean
-    return mean, (centred.T @ centred) / (n - 1)
+        return np.zeros((c, c))
+    centred = values - values.sum(axis=0) / n
+    out: FloatArray = (centred.T @ centred) / (n - 1)
+    return out
 
 
 def block_middle_ns(block: SampleBlock, block_size: int, period_ns: float) -> int:

@@ -97,6 +97,15 @@ def _psd(number: int, center: list[float]) -> list[Parameter]:
             length=2,
         ),
         Parameter(
+            p + 'spot_radius',
+            'double',
+            0.5e-3,
+            'm',
+            'radius of the laser spot on it, to 1/e^2 of the peak',
+            above=0.0,
+            maximum=0.1,
+        ),
+        Parameter(
             p + 'zero',
             'double_array',
             [0.0, 0.0],
@@ -105,6 +114,7 @@ def _psd(number: int, center: list[float]) -> list[Parameter]:
             minimum=-0.5,
             maximum=0.5,
             length=2,
+            live=True,
         ),
     ]
 
@@ -184,7 +194,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         length=4,
     ),
     # Acquisition.
-    Parameter('source', 'string', 'serial', '', 'where samples come from', choices=('serial',)),
+    Parameter('source', 'string', 'serial', '', 'what the device speaks: serial (our own frames), or a plug-in'),
     Parameter('port', 'string', '', '', 'serial port; empty starts the simulated rig'),
     Parameter(
         'baud', 'integer', 921_600, 'baud', 'line speed (USB-CDC devices ignore it)', minimum=1200, maximum=12_000_000
@@ -201,9 +211,64 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter(
         'queue_blocks', 'integer', 250, 'blocks', 'blocks that may wait for a slow consumer', minimum=2, maximum=100_000
     ),
+    Parameter(
+        'serial_number',
+        'string',
+        '',
+        '',
+        'serial number that the device must say (HELLO); with it the device is found again under another port name',
+    ),
+    # The node.
+    Parameter('autostart', 'bool', True, '', 'configure and activate at start; false: wait for lifecycle transitions'),
+    Parameter('keep_zero', 'bool', True, '', '~/zero holds for later runs with the same device as well'),
+    Parameter(
+        'zero_file',
+        'string',
+        '',
+        '',
+        'file in which the zero is kept; empty: by serial number below $XDG_STATE_HOME/psd_deflection',
+    ),
+    Parameter(
+        'realtime', 'bool', True, '', 'ask for SCHED_FIFO (reader) and locked memory; the log says what was granted'
+    ),
     # Recording.
     Parameter('record', 'bool', False, '', 'record from the start'),
     Parameter('bag_dir', 'string', 'recordings', '', 'folder in which recordings are made'),
+    Parameter(
+        'bag_max_bytes',
+        'integer',
+        0,
+        'bytes',
+        'a file of a recording that is as large is ended and the next begun; 0: never',
+        minimum=0,
+        maximum=1_000_000_000_000,
+    ),
+    Parameter(
+        'bag_max_duration',
+        'double',
+        0.0,
+        's',
+        'a file of a recording that is as long is ended and the next begun; 0: never',
+        minimum=0.0,
+        maximum=1e7,
+    ),
+    Parameter(
+        'disk_reserve',
+        'integer',
+        500_000_000,
+        'bytes',
+        'recording stops before the disk has less room than this',
+        minimum=1_000_000,
+        maximum=1_000_000_000_000,
+    ),
+    Parameter(
+        'disk_full',
+        'string',
+        'stop',
+        '',
+        "when the reserve is reached: stop, or delete the oldest file of this recording (never another's)",
+        choices=('stop', 'delete_oldest'),
+    ),
 )
 
 BY_NAME: Mapping[str, Parameter] = MappingProxyType({p.name: p for p in PARAMETERS})
@@ -247,6 +312,7 @@ class PsdConfig:
     center: tuple[float, float]
     height: float
     active_area: tuple[float, float]
+    spot_radius: float
     zero: tuple[float, float]
 
 
@@ -305,8 +371,16 @@ class AcquisitionConfig:
     baud: int
     latency_offset: float
     queue_blocks: int
+    serial_number: str
+    keep_zero: bool
+    zero_file: str
+    realtime: bool
     record: bool
     bag_dir: str
+    bag_max_bytes: int
+    bag_max_duration: float
+    disk_reserve: int
+    disk_full: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -467,8 +541,16 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             baud=v['baud'],
             latency_offset=v['latency_offset'],
             queue_blocks=v['queue_blocks'],
+            serial_number=v['serial_number'],
+            keep_zero=v['keep_zero'],
+            zero_file=v['zero_file'],
+            realtime=v['realtime'],
             record=v['record'],
             bag_dir=v['bag_dir'],
+            bag_max_bytes=v['bag_max_bytes'],
+            bag_max_duration=v['bag_max_duration'],
+            disk_reserve=v['disk_reserve'],
+            disk_full=v['disk_full'],
         ),
         values=MappingProxyType(got),
         effects=MappingProxyType(effects),

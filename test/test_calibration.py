@@ -1,24 +1,45 @@
-"""Counts to volts to metres."""
+"""Counts to volts to metres; photocurrents to places and back; what not to believe."""
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_variances
-from psd_deflection.config import rig_from_values
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+
+from psd_deflection.calibration import (
+    Calibration,
+    Quadrant,
+    SensorFlag,
+    counts_to_volts,
+    dot_noise_variances,
+    make_sensor,
+)
+from psd_deflection.config import SENSOR_TYPES, PsdConfig, rig_from_values
+from psd_deflection.errors import ConfigError
 from psd_deflection.records import CHANNELS
+
+
+def psd(kind: str, spot_radius: float = 0.5e-3) -> PsdConfig:
+    return PsdConfig(kind, (0.0, 0.0), 0.0, (0.010, 0.008), spot_radius, (0.0, 0.0))
+
+
+def volts(*channels: float) -> Any:
+    return np.array([channels], dtype=np.float32)
 
 
 def test_counts_become_volts_rounded_once() -> None:
     counts = np.array([[-32768, -1, 0, 1, 16384, 32767]], dtype=np.int16)
-    volts = counts_to_volts(counts, 10.0 / 32768.0)
-    assert volts.dtype == np.float32
-    assert volts[0].tolist() == [np.float32(c * (10.0 / 32768.0)) for c in counts[0].tolist()]
+    got = counts_to_volts(counts, 10.0 / 32768.0)
+    assert got.dtype == np.float32
+    assert got[0].tolist() == [np.float32(c * (10.0 / 32768.0)) for c in counts[0].tolist()]
 
 
 def test_ten_volts_are_five_millimetres_and_channels_stay_in_order() -> None:
-    volts = np.array([[10.0, -10.0, 5.0, 2.0, -4.0, 5.0]], dtype=np.float32)
-    dots = Calibration.from_rig(rig_from_values({})).dots(volts)
+    dots = Calibration.from_rig(rig_from_values({})).dots(volts(10.0, -10.0, 5.0, 2.0, -4.0, 5.0))
     assert dots.dtype == np.float64
     np.testing.assert_allclose(dots, [[5e-3, -5e-3, 1e-3, -2e-3]], rtol=1e-15)
     assert [CHANNELS[i] for i in (0, 1, 3, 4)] == ['x1', 'y1', 'x2', 'y2']
@@ -30,8 +51,105 @@ def test_noise_is_the_amplifiers_and_the_converters() -> None:
     rng = np.random.default_rng(0)
     clean = rng.uniform(-5.0, 5.0, 200_000)
     read = np.round((clean + 2e-3 * rng.standard_normal(clean.shape)) / step) * step
-    seen = np.var((read - clean) * 0.5e-3)
-    np.testing.assert_allclose(dot_noise_variances(rig), seen, rtol=0.02)
-    np.testing.assert_allclose(
-        dot_noise_variances(rig_from_values({})), 1e-12 + 0.25e-6 * (20.0 / 65536.0) ** 2 / 12.0, rtol=1e-12
-    )
+    np.testing.assert_allclose(dot_noise_variances(rig), np.var((read - clean) * 0.5e-3), rtol=0.02)
+
+
+@pytest.mark.parametrize('kind', SENSOR_TYPES)
+@settings(deadline=None)
+@given(x=st.floats(-0.7e-3, 0.7e-3), y=st.floats(-0.7e-3, 0.7e-3), total=st.floats(1e-9, 1e-3))
+def test_currents_and_back(kind: str, x: float, y: float, total: float) -> None:
+    sensor = make_sensor(psd(kind))
+    currents = sensor.currents(np.array([[x, y]]), total)
+    assert currents.shape == (1, len(sensor.electrodes))
+    assert (currents > 0.0).all()
+    np.testing.assert_allclose(sensor.place(currents), [[x, y]], rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(sensor.sum_signal(currents), [total], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'currents', 'place'),
+    [
+        # 2.3, 2.4 times half the length: (3 - 1)/4 of 5 mm; (1 - 3)/4 of 4 mm.
+        ('duolateral', (3.0, 1.0, 1.0, 3.0), (2.5e-3, -2e-3)),
+        ('tetralateral', (3.0, 1.0, 1.0, 3.0), (2.5e-3, -2e-3)),
+        # Only X2, the upper right corner; then X2 and Y1, the right edge.
+        ('pincushion', (0.0, 1.0, 0.0, 0.0), (5e-3, 4e-3)),
+        ('pincushion', (0.0, 1.0, 1.0, 0.0), (5e-3, 0.0)),
+        # 2.1, 2.2: I1 and I4 are on the right, I1 and I2 above.
+        ('quadrant', (1.0, 1.0, 1.0, 1.0), (0.0, 0.0)),
+    ],
+)
+def test_the_formulas(kind: str, currents: tuple[float, ...], place: tuple[float, float]) -> None:
+    np.testing.assert_allclose(make_sensor(psd(kind)).place(np.array([currents])), [place], atol=1e-15)
+
+
+@pytest.mark.parametrize('kind', SENSOR_TYPES)
+def test_no_light_is_no_place(kind: str) -> None:
+    assert np.isnan(make_sensor(psd(kind)).place(np.zeros((1, 4)))).all()
+
+
+def test_a_quadrant_sees_the_light_of_a_gaussian_spot() -> None:
+    """The four currents, against the spot's intensity integrated over each half."""
+    w, x, y = 0.5e-3, 0.2e-3, -0.1e-3
+
+    def share(center: float) -> float:
+        density = lambda u: np.sqrt(2.0 / np.pi) / w * np.exp(-2.0 * (u - center) ** 2 / w**2)  # noqa: E731
+        return float(quad(density, 0.0, center + 6.0 * w)[0])
+
+    right, up = share(x), share(y)
+    want = [right * up, (1 - right) * up, (1 - right) * (1 - up), right * (1 - up)]
+    np.testing.assert_allclose(make_sensor(psd('quadrant', w)).currents(np.array([[x, y]]), 1.0)[0], want, rtol=1e-9)
+
+
+def test_a_quadrants_volts_are_unbent_and_agree_with_a_lateral_one_at_the_centre() -> None:
+    w = 0.5e-3
+    rig = rig_from_values({'psd_1.type': 'quadrant', 'psd_1.spot_radius': w, 'amplifier.sensitivity': 0.1e-3})
+    calibration = Calibration.from_rig(rig)
+    sensor = calibration.sensors[0]
+    assert isinstance(sensor, Quadrant)
+    place = 0.3e-3
+    ratio = float(sensor.to_ratios(np.array([[place, 0.0]]))[0, 0])
+    reading = ratio * w * np.sqrt(np.pi / 8.0) / 0.1e-3
+    dots = calibration.dots(volts(reading, 1e-3, 5.0, reading, 1e-3, 5.0))
+    np.testing.assert_allclose(dots[0, 0], place, rtol=1e-6)
+    np.testing.assert_allclose(dots[0, 1], 1e-3 * 0.1e-3, rtol=1e-6)
+    np.testing.assert_allclose(dots[0, 2:], [reading * 0.1e-3, 1e-3 * 0.1e-3], rtol=1e-6)
+    beyond = calibration.dots(volts(9.0, 0.0, 5.0, 0.0, 0.0, 5.0))
+    np.testing.assert_allclose(beyond[0, 0], 1.5 * w, rtol=1e-9)
+
+
+def test_currents_of_both_psds() -> None:
+    calibration = Calibration.from_rig(rig_from_values({'psd_2.type': 'pincushion'}))
+    currents = np.array([[3.0, 1.0, 2.0, 2.0, 0.0, 1.0, 1.0, 0.0]])
+    dots, sums = calibration.dots_of_currents(currents)
+    np.testing.assert_allclose(dots, [[2.5e-3, 0.0, 5e-3, 0.0]], atol=1e-15)
+    np.testing.assert_allclose(sums, [[4.0, 2.0]])
+
+
+@pytest.mark.parametrize(
+    ('channels', 'flags'),
+    [
+        ((0.0, 0.0, 5.0, 0.0, 0.0, 5.0), (0, 0)),
+        ((0.0, 0.0, 2.4, 0.0, 0.0, 5.0), (SensorFlag.LASER_LOST, 0)),
+        ((0.0, 0.0, float('nan'), 0.0, 0.0, 5.0), (SensorFlag.LASER_LOST, 0)),
+        ((0.0, 0.0, 5.0, 0.0, 0.0, 9.9997), (0, SensorFlag.SATURATED)),
+        # 4.6 mm: the centre of the spot is on, its rim of 0.5 mm is not.
+        ((0.0, 0.0, 5.0, 9.2, 0.0, 5.0), (0, SensorFlag.CLIPPED)),
+        ((0.0, -10.0, 5.0, 0.0, 0.0, 5.0), (SensorFlag.SATURATED | SensorFlag.OUTSIDE | SensorFlag.CLIPPED, 0)),
+    ],
+)
+def test_flags(channels: tuple[float, ...], flags: tuple[int, int]) -> None:
+    got = Calibration.from_rig(rig_from_values({})).flags(volts(*channels))
+    assert got.dtype == np.uint8
+    assert got.tolist() == [list(flags)]
+
+
+def test_a_quadrant_past_its_reach_is_outside() -> None:
+    calibration = Calibration.from_rig(rig_from_values({'psd_2.type': 'quadrant'}))
+    assert calibration.flags(volts(0.0, 0.0, 5.0, 0.3, 0.0, 5.0)).tolist() == [[0, 0]]
+    assert calibration.flags(volts(0.0, 0.0, 5.0, 8.0, 0.0, 5.0)).tolist() == [[0, SensorFlag.OUTSIDE]]
+
+
+def test_an_unknown_sensor_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"'camera': must be one of duolateral"):
+        make_sensor(psd('camera'))

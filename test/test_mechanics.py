@@ -14,7 +14,7 @@ SECTION = TubeSection(0.0159, 0.0138)
 
 
 def test_the_beam_constants_of_the_thesis_rig() -> None:
-    # Errata G-10: a 50 N sidebar load at a lever of one link length.
+    # A 50 N sidebar load at a lever of one link length.
     dx, dy, theta = LINK.deflection(0.0, -50.0, 50.0 * 0.585)
     assert dx == 0.0
     assert dy == pytest.approx(-2.2271675e-3, abs=1e-10)
@@ -65,7 +65,6 @@ def test_the_full_compliance_is_reciprocal_and_holds_the_small_one() -> None:
 
 
 def test_the_section_of_the_thesis_link() -> None:
-    # Errata G-10.
     assert SECTION.second_moment == pytest.approx(2.171272689e-8, rel=1e-9)
     assert SECTION.polar_moment == pytest.approx(4.342545378e-8, rel=1e-9)
     assert load_rig().link.second_moment == pytest.approx(SECTION.second_moment, rel=1e-15)
@@ -84,12 +83,12 @@ def test_a_tube_is_found_for_a_stiffness() -> None:
     tube = TubeSection.of_stiffness(8.0 * SECTION.second_moment, SECTION.wall)
     assert tube.second_moment == pytest.approx(8.0 * SECTION.second_moment, rel=1e-14)
     assert tube.wall == pytest.approx(SECTION.wall, rel=1e-12)
-    # Errata, EVD.
+    # The thesis's "equivalent virtual diameter", which it gives as 29.76 mm.
     assert tube.mean_radius == pytest.approx(29.737e-3, abs=5e-7)
 
 
 def test_shear_strain_is_stress_over_modulus() -> None:
-    # Errata A-17: at 60 N gamma = 5.35e-4, and gamma L/r is the twist; the printed form gives 1867.
+    # A-17 corrected: at 60 N gamma = 5.35e-4, and gamma L/r is the twist; the printed form gives 1867.
     torque = 60.0 * 0.585
     strain = SECTION.shear_strain(torque, SECTION.outer_radius, 24e9)
     assert strain == pytest.approx(5.35e-4, abs=5e-7)

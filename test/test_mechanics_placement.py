@@ -37,7 +37,7 @@ def test_condition_numbers_in_stated_units(units: str, length: float) -> None:
 def test_gain_matrices(name: str, scaling: FloatArray | None) -> None:
     in_millimetres = placement.design_matrix(THESIS) * [1.0, 1.0, 1e3]
     printed = in_millimetres.copy()
-    # The thesis's code: clockwise-positive, and the torsion entries of another rig (errata, part 1).
+    # The thesis's code: clockwise-positive, and the torsion entries of another rig.
     printed[:, 2] = [70.0, 0.0, 0.0, -100.0]
     for design, key in ((in_millimetres, 'gain_true_mm'), (printed, 'gain_code_mm')):
         assert placement.gain_matrix(design, scaling) == pytest.approx(np.array(CONSTANTS[key][name]), abs=1e-12)
@@ -54,7 +54,6 @@ def test_gain_matrices(name: str, scaling: FloatArray | None) -> None:
 def test_spreads_of_the_placements_compared(
     centers: FloatArray, expected: tuple[float, float, float], cond: float
 ) -> None:
-    # Errata 2.7, geometry.
     closed = np.array(placement.spread_of_pair(centers, SIGMA))
     assert closed * MICRO_MILLIDEGREE == pytest.approx(expected, abs=5e-3)
     assert placement.spread(centers, SIGMA) == pytest.approx(closed, rel=1e-12)
@@ -62,7 +61,7 @@ def test_spreads_of_the_placements_compared(
 
 
 def test_frobenius_condition_is_at_least_three() -> None:
-    # Errata 4.28: not 1, and reached by the opposite pair at the scaling length.
+    # The thesis's 4.28 says 1. Reached by the opposite pair at the scaling length.
     assert placement.condition(placement.design_matrix(placement.opposite(0.1))).frobenius == pytest.approx(3.0)
 
 

@@ -122,7 +122,7 @@ def test_the_ratio_depends_on_the_links_lengths_unless_they_are_equal() -> None:
 
 
 def test_the_sine_form_of_the_ratio() -> None:
-    # Errata G-10; with the extra L inside the sine, as B-5 prints it first, it would be 2.52.
+    # With the extra L inside the sine, as B-5 prints it first, it would be 2.52.
     link = CASES[0].link
     assert torsion_to_bending_ratio_exact(link, FORCE) == pytest.approx(4.312221, abs=5e-7)
     printed = math.sin(link.twist(FORCE) * link.length) * link.length / link.bending(FORCE)

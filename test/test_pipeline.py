@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
+from psd_deflection.cli.main import main
 from psd_deflection.config import Rig, load_rig
+from psd_deflection.io.recordings import open_recording
 from psd_deflection.mechanics import LinkStatics
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import (
@@ -44,6 +48,10 @@ def still(pose: tuple[float, float, float], n: int, seed: int) -> npt.NDArray[np
     return counts
 
 
+def run(step: Callable[..., Iterator[Record]], *chunk: RawChunk) -> list[Record]:
+    return list(step(*chunk))
+
+
 def estimates(records: list[Record], solver: str) -> npt.NDArray[np.float64]:
     return np.array(
         [(r.dx, r.dy, r.theta) for r in records if isinstance(r, DeflectionEstimate) and r.solver == solver]
@@ -65,7 +73,7 @@ SCALE = np.sqrt(((2e-3) ** 2 + STEP**2 / 12) / 20) * 5e-4 / 2e-6
 def test_rms_errors_are_within_a_tenth_of_the_cramer_rao_bound(rig: Rig, load: tuple[float, float, float]) -> None:
     pose = LinkStatics.from_rig(rig).deflection(*load)
     pipeline = Pipeline(rig)
-    records = pipeline.process(chunk_of(still(pose, 20 * 2000, 7)))
+    records = run(pipeline.process, chunk_of(still(pose, 20 * 2000, 7)))
     got = estimates(records, 'exact')
     assert len(got) == 2000
     rms = np.sqrt(((got - pose) ** 2).mean(axis=0))
@@ -83,7 +91,7 @@ def test_rms_errors_are_within_a_tenth_of_the_cramer_rao_bound(rig: Rig, load: t
 
 def test_iterative_agrees_with_exact_and_wls_shows_its_small_angle_error(rig: Rig) -> None:
     pose = (0.002, -0.002, np.deg2rad(1.0))
-    records = Pipeline(rig).process(chunk_of(still(pose, 20 * 500, 3)))
+    records = run(Pipeline(rig).process, chunk_of(still(pose, 20 * 500, 3)))
     exact, iterative, wls = (estimates(records, name) for name in ('exact', 'iterative', 'wls'))
     assert abs(exact - iterative).max() < 1e-9
     # Errata section 2.4: theta_hat = sin theta, d_hat = R(-theta) d + (1 - cos theta) mean(l).
@@ -95,13 +103,13 @@ def test_iterative_agrees_with_exact_and_wls_shows_its_small_angle_error(rig: Ri
 def test_the_records_do_not_depend_on_how_the_samples_were_chunked(rig: Rig) -> None:
     counts = RigSimulator(rig, 1).step(np.tile(sidebar(30.0), (400, 1))).counts
     whole = Pipeline(rig)
-    expected = whole.process(chunk_of(counts)) + whole.flush()
+    expected = run(whole.process, chunk_of(counts)) + run(whole.flush)
     cuts = [0, 1, 7, 20, 59, 60, 61, 250, 400]
     pieces = Pipeline(rig)
     got: list[Record] = []
     for a, b in itertools.pairwise(cuts):
-        got += pieces.process(chunk_of(counts[a:b], a))
-    got += pieces.flush()
+        got += run(pieces.process, chunk_of(counts[a:b], a))
+    got += run(pieces.flush)
     assert [r for r in got if isinstance(r, DeflectionEstimate | TipLoad)] == [
         r for r in expected if isinstance(r, DeflectionEstimate | TipLoad)
     ]
@@ -129,7 +137,7 @@ def test_a_block_that_cannot_be_trusted_has_no_estimate_and_says_why(
 ) -> None:
     counts = still(REST, 20, 0)
     change(counts)  # type: ignore[operator]
-    records = Pipeline(rig).process(chunk_of(counts))
+    records = run(Pipeline(rig).process, chunk_of(counts))
     spots = spots_of(records)
     assert spots.status is status
     assert said in spots.reason
@@ -141,25 +149,25 @@ def test_a_block_that_cannot_be_trusted_has_no_estimate_and_says_why(
 def test_the_device_flag_over_range_is_believed(rig: Rig) -> None:
     chunk = chunk_of(still(REST, 20, 0))
     chunk.flags[3] = 1
-    assert spots_of(Pipeline(rig).process(chunk)).status is BlockStatus.SATURATED
+    assert spots_of(run(Pipeline(rig).process, chunk)).status is BlockStatus.SATURATED
 
 
 @pytest.mark.parametrize(('present', 'status'), [(9, BlockStatus.TOO_FEW_SAMPLES), (10, BlockStatus.OK)])
 def test_too_few_samples_are_no_block(rig: Rig, present: int, status: BlockStatus) -> None:
     pipeline = Pipeline(rig)
-    assert pipeline.process(chunk_of(still(REST, present, 0))) == []
-    spots = spots_of(pipeline.flush())
+    assert run(pipeline.process, chunk_of(still(REST, present, 0))) == []
+    spots = spots_of(run(pipeline.flush))
     assert spots.status is status
     assert (spots.present, spots.lost) == (present, 20 - present)
 
 
 def test_fewer_samples_make_a_wider_covariance(rig: Rig) -> None:
     pipeline = Pipeline(rig)
-    pipeline.process(chunk_of(still(REST, 10, 0)))
-    (half,) = (r for r in pipeline.flush() if isinstance(r, DeflectionEstimate) and r.primary)
+    run(pipeline.process, chunk_of(still(REST, 10, 0)))
+    (half,) = (r for r in run(pipeline.flush) if isinstance(r, DeflectionEstimate) and r.primary)
     (full,) = (
         r
-        for r in Pipeline(rig).process(chunk_of(still(REST, 20, 0)))
+        for r in run(Pipeline(rig).process, chunk_of(still(REST, 20, 0)))
         if isinstance(r, DeflectionEstimate) and r.primary
     )
     np.testing.assert_allclose(np.array(half.covariance), 2.0 * np.array(full.covariance), rtol=1e-3, atol=1e-18)
@@ -169,25 +177,82 @@ def test_zero_takes_the_present_dots_and_applies_from_the_next_block_on(rig: Rig
     pipeline = Pipeline(rig)
     assert pipeline.zero() is None
     pose = (1e-4, -2e-4, 1e-3)
-    before = pipeline.process(chunk_of(still(pose, 20 * 30, 5)))
+    before = run(pipeline.process, chunk_of(still(pose, 20 * 30, 5)))
     change = pipeline.zero()
     assert change is not None
     assert change.block == 30
-    after = pipeline.process(chunk_of(still(pose, 20 * 30, 6), 600))
+    after = run(pipeline.process, chunk_of(still(pose, 20 * 30, 6), 600))
     assert abs(estimates(before, 'exact').mean(axis=0) - pose).max() < 1e-6
     assert abs(estimates(after, 'exact').mean(axis=0)).max() < 1e-6
     # The same change in another pipeline gives the same bits.
     other = Pipeline(rig)
-    other.process(chunk_of(still(pose, 20 * 30, 5)))
+    run(other.process, chunk_of(still(pose, 20 * 30, 5)))
     other.apply(change)
-    again = other.process(chunk_of(still(pose, 20 * 30, 6), 600))
+    again = run(other.process, chunk_of(still(pose, 20 * 30, 6), 600))
     assert (estimates(again, 'exact') == estimates(after, 'exact')).all()
 
 
 def test_a_zero_is_not_taken_across_an_outage(rig: Rig) -> None:
     pipeline = Pipeline(rig)
-    pipeline.process(chunk_of(still(REST, 200, 1)))
+    run(pipeline.process, chunk_of(still(REST, 200, 1)))
     dark = still(REST, 20, 2)
     dark[:, :3] = 0
-    pipeline.process(chunk_of(dark, 200))
+    run(pipeline.process, chunk_of(dark, 200))
     assert pipeline.zero() is None
+
+
+@pytest.mark.parametrize(
+    'effect',
+    [
+        {'name': 'sensor_rotation', 'psd': 2, 'angle': 0.02},
+        {'name': 'sensor_gain', 'psd': 1, 'x': 0.02, 'y': -0.03},
+        {'name': 'axis_crosstalk', 'psd': 1, 'xy': 0.01, 'yx': -0.01},
+        {'name': 'sensor_nonlinearity', 'psd': 2, 'k': 2000.0},
+        {'name': 'plane_tilt', 'slope_ratio': 1.5},
+    ],
+    ids=lambda e: str(e['name']),
+)
+def test_an_effect_in_the_rig_file_is_simulated_and_corrected(rig: Rig, effect: dict[str, object]) -> None:
+    known = load_rig(overrides={f'effects.one.{k}': v for k, v in effect.items()})
+    load = np.tile(sidebar(50.0), (20 * 400, 1))
+    counts = RigSimulator(known, 4).step(load).counts
+    pose = LinkStatics.from_rig(rig).deflection(*sidebar(50.0))
+    # The last blocks: by then the link is at rest.
+    blind, corrected = (
+        abs(estimates(run(Pipeline(r).process, chunk_of(counts)), 'exact')[-50:].mean(axis=0) - pose)
+        for r in (rig, known)
+    )
+    assert (corrected < [3e-7, 3e-7, 5e-6]).all()
+    assert (blind > 3.0 * corrected).any()
+
+
+@pytest.mark.parametrize(
+    ('effect', 'words'),
+    [
+        ({'name': 'thermal_drift', 'psd': 1, 'x': 3e-6, 'y': -2e-6}, ['--temperature', '20,30']),
+        ({'name': 'refraction', 'x': 1e-6, 'y': 2e-6}, ['--temperature', '20,30']),
+        ({'name': 'laser_pointing_drift', 'psd': 2, 'rate_x': 3e-6, 'rate_y': 1e-6}, []),
+    ],
+    ids=lambda e: str(e['name']) if isinstance(e, dict) else '',
+)
+def test_a_drift_in_the_rig_file_is_corrected_and_replayed_to_the_bit(
+    rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str], effect: dict[str, object], words: list[str]
+) -> None:
+    model = tmp_path / 'model.yaml'
+    body = ''.join(f'        {k}: {v}\n' for k, v in effect.items())
+    model.write_text(f'/**:\n  ros__parameters:\n    effects:\n      one:\n{body}')
+    bag = tmp_path / 'drifting'
+    argv = ['simulate', '--params-file', str(model), '--loads', 'constant:0,0,0:10', '--out', str(bag), *words]
+    assert main(argv) == 0
+    recorded = open_recording(bag).estimates()['/link_tip/deflection'].pose
+    # At rest, and so it is measured, from the first second to the last.
+    assert abs(recorded[-100:].mean(axis=0) - recorded[:100].mean(axis=0)).max() < 5e-7
+    assert main(['replay', str(bag), '--compare']) == 0
+    assert 'no bit differs' in capsys.readouterr().out
+    # Without the effect in the rig file the same samples seem to drift.
+    nominal = tmp_path / 'nominal.yaml'
+    nominal.write_text('/**:\n  ros__parameters:\n    min_samples: 10\n')
+    again = tmp_path / 'again.mcap'
+    assert main(['replay', str(bag), '--params-file', str(nominal), '--out', str(again)]) == 0
+    blind = open_recording(again).estimates()['/link_tip/deflection'].pose
+    assert abs(blind[-100:].mean(axis=0) - blind[:100].mean(axis=0)).max() > 3e-6

@@ -18,9 +18,9 @@ from psd_deflection.io.bag_writer import BagWriter, McapFile
 from psd_deflection.io.csv_writer import CsvSampleSink
 from psd_deflection.io.recording import Recording
 from psd_deflection.io.recordings import open_recording
-from psd_deflection.records import AppliedLoad, ReferencePose, SampleBlock, TemperatureReading
+from psd_deflection.records import AppliedLoad, ParameterChange, ReferencePose, SampleBlock, TemperatureReading
 
-Convertible = SampleBlock | AppliedLoad | ReferencePose | TemperatureReading
+Convertible = SampleBlock | ParameterChange | AppliedLoad | ReferencePose | TemperatureReading
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,9 +38,12 @@ def _time(record: Convertible) -> int:
 
 def convert(recording: Recording, out: Path, parameters: dict[str, object]) -> int:
     """Write ``recording`` to ``out``; returns the number of samples. Raises RecordingError."""
-    loads, references, temperatures = recording.loads(), recording.references(), recording.temperatures()
-    records: Iterable[Convertible] = heapq.merge(loads, references, temperatures, recording.blocks(), key=_time)
-    sink: CsvSampleSink | McapFile
+    changes, loads = recording.changes, recording.loads()
+    references, temperatures = recording.references(), recording.temperatures()
+    records: Iterable[Convertible] = heapq.merge(
+        changes, loads, references, temperatures, recording.blocks(), key=_time
+    )
+    sink: CsvSampleSink | McapFile | BagWriter
     if out.suffix.lower() == '.csv':
         sink = CsvSampleSink(out, loads=bool(loads), references=bool(references), temperatures=bool(temperatures))
         # A row takes what is waiting, and a block's last row what came during the block.

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from psd_deflection.cli._table import columns
+from psd_deflection.cli._report import columns, save_figure
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import ConfigError
 from psd_deflection.mechanics import LinkStatics, placement, scaling
@@ -107,6 +107,7 @@ def appendix_b() -> str:
     errata += [f'  B2 {c.row}: thesis {c.printed}: {c.erratum}' for c in table_2 if not c.agrees]
     base = scaling.table_b1_cases()[0].link
     exact = scaling.torsion_to_bending_ratio_exact(base, scaling.FORCE)
+    poisson = scaling.YOUNGS_MODULUS / (2.0 * scaling.SHEAR_MODULUS) - 1.0
     virtual = scaling.table_b1_cases()[4].link.section.mean_radius
     return '\n'.join(
         [
@@ -121,6 +122,7 @@ def appendix_b() -> str:
             columns(rows_2),
             '',
             f'With the sine (B-5) the aluminium ratio is {exact:.6f}; with unequal links it is (L_CD/L_BC)^2 as large.',
+            f'E/G of its aluminium needs a Poisson ratio of {poisson:.4f}; alloy 6061 has 0.33.',
             f'Twice the length bends as before at a mean radius of {virtual * 1e3:.3f} mm (thesis: "EVD" 29.76 mm).',
             '',
             'Errata:',
@@ -217,7 +219,7 @@ def tilt_text(rig: Rig, radius: float, sigma: float) -> str:
 def tied_text(rig: Rig, best: FloatArray, sigma: float) -> str:
     """What two sensors tell of the slope ratio k once the tilts are tied to the deflection."""
     link = rig.link
-    pose = np.array(LinkStatics.from_rig(rig).deflection(0.0, -SIDEBAR_FORCE, SIDEBAR_FORCE * link.length))
+    pose = np.array(LinkStatics.from_rig(rig).deflection(0.0, -SIDEBAR_FORCE, -SIDEBAR_FORCE * link.length))
     stagger = np.array([0.05, -0.05])
     # Across the bending direction heights tell nothing of k: the best pair is turned into it.
     turned = placement.opposite(float(np.hypot(*(best[0] - best[1]))) / 2.0)
@@ -254,15 +256,4 @@ def draw(candidates: list[Candidate], room: placement.Room, rig: Rig, path: Path
     axes.set(aspect='equal', xlabel='X, mm (link_tip)', ylabel='Y, mm', title='Sensor centres and base lines')
     axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.1), ncols=3, frameon=False)
     axes.grid(alpha=0.2)
-    save(figure, path)
-
-
-def save(figure: Any, path: Path) -> None:
-    """Write a figure; raises ConfigError for a kind or a place that cannot be written."""
-    kind = path.suffix.lower().lstrip('.')
-    if kind not in ('png', 'svg', 'pdf'):
-        raise ConfigError(f'--out {path}: the name must end in .png, .svg or .pdf')
-    try:
-        figure.savefig(path, dpi=150)
-    except OSError as error:
-        raise ConfigError(f'--out {path}: cannot be written ({error.strerror})') from None
+    save_figure(figure, path)

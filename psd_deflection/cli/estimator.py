@@ -27,6 +27,7 @@ from pathlib import Path
 
 from psd_deflection.config import read_parameter_file, rig_from_values
 from psd_deflection.errors import ConfigError
+from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import Session
 
 REFRESH_S = 0.25
@@ -157,11 +158,17 @@ def _run_without_ros(overrides: dict[str, object], display: Display, watch: Call
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     session = Session(rig_from_values(overrides, 'command line'), display.say)
+    watchdog = Watchdog()
     try:
+        settle()
         session.start()
+        watchdog.ready()
         while not stop.wait(0.1) and session.processing.alive:
+            if session.responsive():
+                watchdog.alive()
             watch(session)
     finally:
+        watchdog.stopping()
         session.close()
     if session.failed is not None:
         raise session.failed

@@ -63,6 +63,7 @@ def survey(recording: Recording) -> dict[str, Any]:
         'topics': topics,
         'parameters': dict(recording.parameters),
         'changed_parameters': changed_parameters(recording.parameters),
+        'changes': [{'t_ns': c.t_ns, 'block': c.block, 'values': dict(c.values)} for c in recording.changes],
         'complete': recording.complete,
         'warnings': list(recording.warnings),
     }
@@ -111,5 +112,9 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     else:
         out.append('  parameters that are not at their defaults')
         out += [f'    {k} = {v}' for k, v in sorted(found['changed_parameters'].items())]
+    out += [
+        f'  from block {c["block"]} on: ' + ', '.join(f'{k} = {v}' for k, v in c['values'].items())
+        for c in found['changes']
+    ]
     out += [f'  warning: {w}' for w in found['warnings']]
     return out

@@ -21,7 +21,10 @@ COMMANDS: dict[str, str] = {
     'discover': 'name what the simulation lacks to explain a recording, and add it',
     'info': 'say what is in a recording',
     'convert': 'write the samples of a recording as a CSV, an .mcap or a bag',
+    'recover': 'make a recording whole that a crash left without its end',
+    'budget': 'error budget: what each cause does to dX, dY and theta (chapter 3)',
     'design': 'size the link and place the sensors (appendix B, condition numbers)',
+    'compare-methods': 'how far each method is off, and where the figures of Table 5.1 come from',
     'params': 'list every parameter with unit, bounds and default',
 }
 """Command name to one-line summary; the module is ``psd_deflection.cli.NAME`` (``-`` as ``_``)."""

@@ -28,7 +28,7 @@ from psd_deflection.io.recording import Recording
 from psd_deflection.io.recordings import open_recording
 from psd_deflection.io.sinks import Sink, open_sink
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.records import DeflectionEstimate, RawChunk, Record, SampleBlock
+from psd_deflection.records import ENVIRONMENT, DeflectionEstimate, RawChunk, Record, SampleBlock
 
 DIFFERS = 1
 
@@ -76,15 +76,22 @@ class Totals:
 def replayed(recording: Recording, pipeline: Pipeline, blocks: Iterable[SampleBlock]) -> Iterator[list[Record]]:
     """The records of each step; recorded changes of parameters apply at their own block."""
     changes = list(recording.changes)
+    # What our own recorder noted says when a temperature took effect; of others' recordings, the stamps do.
+    noted = any(name in ENVIRONMENT for change in changes for name, _ in change.values)
+    temperatures = [] if noted or not pipeline.needs_temperature else recording.temperatures()
     for block in blocks:
+        while temperatures and temperatures[0].t_ns <= block.t_ns[0]:
+            warmer = pipeline.temperature(temperatures.pop(0).celsius)
+            if warmer is not None:
+                yield [warmer]
         while changes and changes[0].block <= block.index:
             # What is unfinished belongs to the time before the change.
-            yield pipeline.flush()
+            yield list(pipeline.flush())
             change = changes.pop(0)
             pipeline.apply(change)
             yield [change]
-        yield pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags))
-    yield pipeline.flush()
+        yield list(pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags)))
+    yield list(pipeline.flush())
 
 
 def rig_of(recording: Recording, params_file: str | None) -> Rig:
@@ -98,9 +105,7 @@ def run(args: argparse.Namespace) -> int:
     """Replay."""
     recording = open_recording(args.recording)
     rig = rig_of(recording, args.params_file)
-    recording = open_recording(
-        args.recording, block_size=rig.estimator.block_size, sample_rate_hz=rig.converter.sample_rate_hz
-    )
+    recording = open_recording(args.recording, block_size=rig.estimator.block_size)
     pipeline = Pipeline(rig)
     comparison = Comparison(recording) if args.compare else None
     sink: Sink | None = None
@@ -127,7 +132,7 @@ def run(args: argparse.Namespace) -> int:
         if sink is not None:
             sink.close()
     seconds = time.perf_counter() - began
-    for warning in recording.warnings:
+    for warning in [*recording.warnings, *_rate_warning(recording, rig)]:
         print(f'warning: {warning}', file=sys.stderr)
     _print_summary(args, rig, pipeline, totals, seconds)
     if comparison is None:
@@ -135,6 +140,16 @@ def run(args: argparse.Namespace) -> int:
     comparison.finish()
     print(comparison.summary(), file=sys.stderr if args.json else sys.stdout)
     return 0 if comparison.same else DIFFERS
+
+
+def _rate_warning(recording: Recording, rig: Rig) -> list[str]:
+    found, stated = recording.sample_rate_hz, rig.converter.sample_rate_hz
+    if not found or abs(found - stated) < 0.01 * stated:
+        return []
+    return [
+        f'{recording.path}: has {found:.4g} samples a second, the rig says {stated:g} '
+        '(converter.sample_rate_hz): the stamps of shortened blocks are off'
+    ]
 
 
 def _print_summary(args: argparse.Namespace, rig: Rig, pipeline: Pipeline, totals: Totals, seconds: float) -> None:

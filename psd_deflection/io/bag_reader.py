@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
@@ -29,10 +29,11 @@ from msg_adapters import (
     temperature,
     wrench_stamped,
 )
+from msg_adapters.header import header, stamp_ns
 from msg_adapters.orientation import angles
 from psd_deflection.errors import RecordingError
 from psd_deflection.io import cdr
-from psd_deflection.io.bag_writer import META_CHANGE, META_HELLO, META_PARAMETERS, META_SEQUENCE, META_SOFTWARE
+from psd_deflection.io.bag_writer import META_CHANGE, META_HELLO, META_PARAMETERS, META_SOFTWARE
 from psd_deflection.io.mcap_source import McapSource, RawMessage
 from psd_deflection.io.message_decode import CloudDecoder, Samples, header_and_doubles, joined_points
 from psd_deflection.io.recording import EstimateSeries, Recording, from_json
@@ -68,20 +69,6 @@ class BagRecording(Recording):
         self.hello = from_json(metadata[META_HELLO]) if META_HELLO in metadata else None
         self.version = metadata.get(META_SOFTWARE, {}).get('version', '')
         self.changes = self._changes_in(metadata)
-        first = metadata.get(META_SEQUENCE, {}).get('first', '')
-        self._first_seq = int(first) if re.fullmatch('[0-9]{1,18}', first) else 0
-
-    def _changes_in(self, metadata: Mapping[str, Mapping[str, str]]) -> list[ParameterChange]:
-        changes = []
-        for name in sorted(n for n in metadata if n.startswith(META_CHANGE)):
-            try:
-                entry = metadata[name]
-                values = json.loads(entry['values'])
-                held = tuple((str(k), tuple(v) if isinstance(v, list) else v) for k, v in values.items())
-                changes.append(ParameterChange(int(entry['t_ns']), int(entry['block']), held))
-            except (KeyError, ValueError, AttributeError, RecursionError):
-                raise RecordingError(f'{self.path}: metadata {name}: is no change of parameters') from None
-        return changes
 
     def _files_of(self, folder: Path) -> list[Path]:
         """The bag's files in order: as ``metadata.yaml`` names them, else by their number."""
@@ -126,7 +113,18 @@ class BagRecording(Recording):
         if line not in self._own_warnings:
             self._own_warnings.append(line)
 
-    def messages(self, topics: Sequence[str] | None = None) -> Iterator[RawMessage]:
+    def _changes_in(self, metadata: Mapping[str, Mapping[str, str]]) -> list[ParameterChange]:
+        out = []
+        for name in sorted(n for n in metadata if n.startswith(META_CHANGE)):
+            try:
+                change = _to_change(metadata[name])
+            except (KeyError, ValueError, TypeError, AttributeError, RecursionError):
+                self._warn(f'the change of parameters {name!r} is not readable and is left out')
+            else:
+                out.append(change)
+        return sorted(out, key=lambda change: change.block)
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Messages as they lie in the files: (channel, log_time, cdr), of ``topics`` or of all."""
         for source in self._sources:
             yield from source.messages(topics)
@@ -159,7 +157,7 @@ class BagRecording(Recording):
 
     def _samples_in_order(self) -> Iterator[tuple[IntArray, IntArray, npt.NDArray[np.float32], npt.NDArray[np.uint8]]]:
         """(seq, t_ns, volts, flags), many messages at once; seq extended, so that it rises throughout."""
-        count = _SequenceCounter(self._first_seq, self.block_size, self._warn)
+        count = _SequenceCounter(self.block_size, self._warn)
         for log_time, messages in self._clouds():
             together = joined_points(messages)
             parts = [together] if count.follows(together) else [joined_points([m]) for m in messages]
@@ -168,7 +166,7 @@ class BagRecording(Recording):
                     seq = count.extended(part)
                 except ValueError as error:
                     raise RecordingError(f'{self.path}: {SAMPLES} at log time {log_time} ns: {error}') from None
-                _, t_ns, volts, flags = part
+                _, _, t_ns, volts, flags = part
                 finite = np.isfinite(volts)
                 if finite.all():
                     yield seq, t_ns, volts, flags
@@ -204,11 +202,15 @@ class BagRecording(Recording):
             raise RecordingError(f'{self.path}: {topic} is {found!r} in {encoding!r}, not {wanted} in cdr')
 
     def _decoded(self, topic: str, convert: Callable[[dict[str, Any]], T]) -> list[T]:
+        """Every message of ``topic``; one without a stamp (0) has the time at which it came."""
         out = []
         for channel, log_time, message in self.messages([topic]):
             self._check_type(channel.type, channel.encoding, topic)
             try:
-                out.append(convert(cdr.decode(channel.type, message)))
+                fields = cdr.decode(channel.type, message)
+                if stamp_ns(fields) == 0:
+                    fields['header'] = header(log_time, fields['header']['frame_id'])
+                out.append(convert(fields))
             except ValueError as error:
                 raise RecordingError(f'{self.path}: {topic} at log time {log_time}: {error}') from None
         return out
@@ -245,17 +247,17 @@ class BagRecording(Recording):
 
 
 class _SequenceCounter:
-    """Extends sample numbers past the 32 bits that a recording has.
+    """Extends sample numbers past the 32 bits that others' recordings have, and ours until then.
 
     A number that goes back is a wrap where so many samples could have been taken meanwhile, else a
-    device that started anew; then counting goes on at a block's edge, so that nothing is mixed.
+    device that started anew; then counting goes on in the next block, so that nothing is mixed.
     """
 
     _FASTEST_HZ = 20_000
 
-    def __init__(self, first: int, block_size: int, warn: Callable[[str], None]) -> None:
-        self._base = first >> 32 << 32
-        self._first_raw = first & 0xFFFFFFFF
+    def __init__(self, block_size: int, warn: Callable[[str], None]) -> None:
+        self._wrapped = 0
+        self._moved = 0
         self._block_size = block_size
         self._warn = warn
         self._last: int | None = None
@@ -264,43 +266,45 @@ class _SequenceCounter:
     def follows(self, samples: Samples) -> bool:
         """Whether these samples go on from the last ones without any number or time going back."""
         return (
-            (self._last is None or int(samples.raw[0]) + self._base > self._last)
+            (self._last is None or int(samples.seq[0]) + self._base_of(samples) > self._last)
             and int(samples.t_ns[0]) > self._last_t
-            and bool((np.diff(samples.raw) > 0).all())
+            and bool((np.diff(samples.seq) > 0).all())
             and bool((np.diff(samples.t_ns) > 0).all())
         )
 
+    def _base_of(self, samples: Samples) -> int:
+        return self._moved if samples.whole else self._moved + self._wrapped
+
     def extended(self, samples: Samples) -> IntArray:
-        """int64 numbers, rising from call to call. Raises ValueError where they do not rise within one."""
-        seq, t_ns = samples.raw.copy(), samples.t_ns
-        if seq[-1] < seq[0]:
+        """Numbers that rise from call to call. Raises ValueError where they do not rise within one."""
+        seq, t_ns = samples.seq.copy(), samples.t_ns
+        if seq[-1] < seq[0] and not samples.whole:
             seq[seq < seq[0]] += 2**32
         if bool((np.diff(seq) <= 0).any()):
             raise ValueError('seq does not rise within the message')
         if bool((np.diff(t_ns) <= 0).any()):
             raise ValueError('dt does not rise within the message')
-        first = int(seq[0]) + self._base
-        if self._last is None:
-            if first & 0xFFFFFFFF < self._first_raw:
-                self._base += 2**32
-        elif first <= self._last:
-            self._base += self._step_over(first, int(t_ns[0])) - first
-        if self._last is not None and t_ns[0] <= self._last_t:
+        base = self._base_of(samples)
+        first = int(seq[0]) + base
+        if self._last is not None and first <= self._last:
+            self._go_on_from(first, int(t_ns[0]), samples.whole)
+            base = self._base_of(samples)
+        if t_ns[0] <= self._last_t:
             self._warn(f'time goes back in {SAMPLES} to {t_ns[0]} ns')
-        seq += self._base
+        seq += base
         self._last, self._last_t = int(seq[-1]), int(t_ns[-1])
         return seq
 
-    def _step_over(self, first: int, t_ns: int) -> int:
-        """What ``first`` is in truth, which is not above the last number."""
+    def _go_on_from(self, first: int, t_ns: int, whole: bool) -> None:
+        """Take up counting at ``first``, which is not above the last number."""
         assert self._last is not None
         step = (first - self._last) % 2**32
-        if 0 < step <= 1000 + (t_ns - self._last_t) * self._FASTEST_HZ // 1_000_000_000:
-            return self._last + step
+        if not whole and 0 < step <= 1000 + (t_ns - self._last_t) * self._FASTEST_HZ // 1_000_000_000:
+            self._wrapped += self._last + step - first
+            return
         self._warn(f'sample numbers start anew after {self._last}')
         size = self._block_size
-        blocks_back = (self._last // size + 1) - first // size
-        return first + blocks_back * size
+        self._moved += (self._last // size + 1 - first // size) * size
 
 
 def _joined(a: SampleBlock, b: SampleBlock) -> SampleBlock:
@@ -311,6 +315,22 @@ def _joined(a: SampleBlock, b: SampleBlock) -> SampleBlock:
         np.concatenate([a.volts, b.volts]),
         np.concatenate([a.flags, b.flags]),
     )
+
+
+def _to_change(entry: Mapping[str, str]) -> ParameterChange:
+    def number(value: object) -> float:
+        # As they are: a whole number must come back as one.
+        if isinstance(value, int | float):
+            return value
+        raise TypeError
+
+    values: list[tuple[str, float | str | tuple[float, ...]]] = []
+    for key, value in json.loads(entry['values']).items():
+        if isinstance(value, list):
+            values.append((key, tuple(map(number, value))))
+        else:
+            values.append((key, value if isinstance(value, str) else number(value)))
+    return ParameterChange(int(entry['t_ns']), int(entry['block']), tuple(values))
 
 
 def _series(topic: str, rows: list[tuple[int, tuple[float, ...]]]) -> EstimateSeries:

@@ -7,7 +7,7 @@ have no nanoseconds left in one. The file is read in passes and never held whole
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +16,7 @@ import numpy as np
 
 from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
 from psd_deflection.errors import RecordingError
+from psd_deflection.io.mcap_source import RawMessage
 from psd_deflection.io.recording import EstimateSeries, Recording
 from psd_deflection.records import CHANNELS, AppliedLoad, ReferencePose, SampleBlock, TemperatureReading
 
@@ -53,7 +54,7 @@ class CsvRecording(Recording):
         self._warnings: list[str] = []
         self._header, self._columns = self._read_header()
         self._step_ns = 1e9 / sample_rate_hz if sample_rate_hz else self._find_step()
-        self.__dict__['sample_rate_hz'] = 1e9 / self._step_ns
+        self.sample_rate_hz = 1e9 / self._step_ns
 
     @property
     def complete(self) -> bool:
@@ -220,6 +221,10 @@ class CsvRecording(Recording):
             if found:
                 counts[topic] = len(found)
         return counts
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """None: a CSV has rows."""
+        return iter(())
 
     def _optional(self, names: Sequence[str]) -> Iterator[tuple[int, tuple[float, ...]]]:
         """(t_ns, values) of each row whose cells of these columns are filled in."""

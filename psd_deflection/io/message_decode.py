@@ -101,9 +101,13 @@ def _learn(message: bytes, dtype: np.dtype[np.void]) -> _Layout:
 
 
 class Samples(NamedTuple):
-    """Samples in order: ``raw`` seq modulo 2^32, int64 (n,); ``t_ns`` (n,); ``volts`` (n, 6); ``flags`` (n,)."""
+    """Samples in order: ``seq`` int64 (n,), ``t_ns`` (n,), ``volts`` (n, 6), ``flags`` (n,).
 
-    raw: IntArray
+    ``whole``: False where ``seq`` is modulo 2^32.
+    """
+
+    whole: bool
+    seq: IntArray
     t_ns: IntArray
     volts: npt.NDArray[np.float32]
     flags: npt.NDArray[np.uint8]
@@ -114,8 +118,14 @@ def joined_points(messages: Sequence[tuple[int, npt.NDArray[np.void]]]) -> Sampl
     points = np.concatenate([p for _, p in messages])
     stamps = np.repeat([stamp for stamp, _ in messages], [len(p) for _, p in messages])
     names = points.dtype.names or ()
+    seq = points['seq'].astype(np.uint32).astype(np.int64)
+    whole = 'seq_high' in names
+    if whole:
+        # 31 bits more are enough for ever, and no file can make them negative.
+        seq += (points['seq_high'].astype(np.int64) & 0x3FFFFFFF) << 32
     return Samples(
-        points['seq'].astype(np.uint32).astype(np.int64),
+        whole,
+        seq,
         stamps + points['dt'].astype(np.int64),
         np.stack([points[c] for c in CHANNELS], axis=1).astype(np.float32),
         points['flags'].astype(np.uint8) if 'flags' in names else np.zeros(len(points), np.uint8),

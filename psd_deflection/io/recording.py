@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import functools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,8 +53,8 @@ class Recording(abc.ABC):
 
     ``path``: what was opened. ``parameters``: the flat parameter set it was made with, {} where
     none is inside. ``hello``: the device's, or None. ``version``: of the software that recorded,
-    or ''. ``changes``: of parameters while it was made, in order. ``warnings``: one line each,
-    complete after the first whole reading.
+    or ''. ``changes``: of parameters, made while the run went on, in their order. ``warnings``: one
+    line each, complete after the first whole reading.
     """
 
     def __init__(self, path: Path, block_size: int | None) -> None:
@@ -90,13 +90,13 @@ class Recording(abc.ABC):
         Raises RecordingError where there is none, or where what is there is not readable.
         """
 
-    def messages(self, topics: Sequence[str] | None = None) -> Iterator[RawMessage]:
-        """Messages as they lie in the files, of ``topics`` or of all; a CSV has none."""
-        return iter(())
-
     @abc.abstractmethod
     def topics(self) -> dict[str, int]:
         """How many messages of each topic it holds; for a CSV, as a bag of it would have them."""
+
+    @abc.abstractmethod
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Messages as they lie in the files, of ``topics`` or of all; none from a CSV."""
 
     @abc.abstractmethod
     def loads(self) -> list[AppliedLoad]:

@@ -81,9 +81,12 @@ def beam_jacobian(pose: FloatArray) -> FloatArray:
 
 
 def tied_pose(pose: FloatArray, slope_ratio: FloatArray | float, link_length: float) -> FloatArray:
-    """(..., 5) from (..., 3): the tilts of a cantilever, phi = -k dY/L, omega = +k dX/L."""
+    """(..., 5) from (..., 3): the tilts of a cantilever, phi = -k dY/L, omega = +k dX/L.
+
+    ``slope_ratio`` k: one, or (...,) of its own for each pose.
+    """
     tilt = np.asarray(slope_ratio)[..., None] / link_length * np.stack([-pose[..., 1], pose[..., 0]], axis=-1)
-    return np.concatenate([pose, tilt], axis=-1)
+    return np.concatenate([np.broadcast_to(pose, (*tilt.shape[:-1], 3)), tilt], axis=-1)
 
 
 def tie_matrix(slope_ratio: float, link_length: float) -> FloatArray:

@@ -39,7 +39,7 @@ def design_matrix(centers: FloatArray) -> FloatArray:
 def gain_matrix(design: FloatArray, row_scaling: FloatArray | None = None) -> FloatArray:
     """(3, 2P): readings to (dX, dY, theta) by least squares; ``row_scaling`` multiplies A's and b's rows.
 
-    The thesis's Po; the statistical weights are its squares (errata, 4.25).
+    The thesis's Po; the statistical weights are its squares.
     """
     scaling = np.ones(len(design)) if row_scaling is None else np.asarray(row_scaling, dtype=np.float64)
     return np.asarray(np.linalg.pinv(scaling[:, None] * design) * scaling)
@@ -90,6 +90,24 @@ def spread_of_pair(centers: FloatArray, sigma: float) -> Spread:
         math.hypot(sigma / math.sqrt(2.0), middle_x * theta),
         theta,
     )
+
+
+def error_bound(
+    design: FloatArray,
+    design_error: FloatArray,
+    readings_error: FloatArray,
+    answer: FloatArray,
+    order: int | None = None,
+) -> float:
+    """Bound on the norm of an answer's error, ||A+|| (||db|| + ||dA|| ||x||) (4.33).
+
+    ``order`` None: Frobenius norms of the matrices; 2: spectral. Its two flaws: the answer's norm
+    mixes lengths and angle, so say in which units A is; and it holds only where A x = b is
+    consistent. At 50 N it allows a thousand times what happens.
+    """
+    inverse = np.linalg.norm(np.linalg.pinv(design), order)
+    change = np.linalg.norm(design_error, order)
+    return float(inverse * (np.linalg.norm(readings_error) + change * np.linalg.norm(answer)))
 
 
 def opposite(radius: float, azimuth: float = math.pi / 2.0) -> FloatArray:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.records import FloatArray
+from psd_deflection.solvers._plane import positive
 
 Model = Callable[[Sequence[float]], tuple[list[float], list[Sequence[float]]]]
 """Parameters (p) to predicted readings (m) and rows of derivatives (m of p)."""
@@ -24,7 +25,7 @@ ModelMany = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 MAX_STEPS = 50
 LAST_STEP = 1e-12
-"""m and rad. The next step would be below the last digit of a double."""
+"""m and rad. The step after it would be below the last digit that matters."""
 
 CHUNK = 4096
 """Blocks worked on at once: their arrays stay in the processor's cache."""
@@ -72,16 +73,21 @@ def fit(model: Model, start: Sequence[float], measured: Sequence[float], varianc
             nan = float('nan')
             return Fit(x, [[nan] * p for _ in range(p)], residual, False, steps)
         largest = 0.0
+        step = []
         for i in range(p):
-            step = 0.0
+            change = 0.0
             for a, b in zip(inverse[i], right, strict=True):
-                step += a * b
-            x[i] += step
-            largest = max(largest, abs(step))
+                change += a * b
+            step.append(change)
+            x[i] += change
+            largest = max(largest, abs(change))
         steps += 1
         if largest < LAST_STEP:
-            # The step is below what the residual can show.
-            return Fit(x, inverse, residual, largest == largest, steps)
+            # So small a step moves the residual along the derivatives, to the last digit.
+            residual = [
+                r - sum([a * b for a, b in zip(row, step, strict=True)]) for r, row in zip(residual, rows, strict=True)
+            ]
+            return Fit(x, inverse, residual, True, steps)
         if not largest < float('inf') or steps == MAX_STEPS:
             return Fit(x, inverse, residual, False, steps)
 
@@ -122,33 +128,36 @@ def _invert(lower: list[list[float]]) -> list[list[float]] | None:
 
 
 def fit_many(model: ModelMany, start: FloatArray, measured: FloatArray, variances: FloatArray) -> Fits:
-    """N blocks: ``start`` (n, p), ``measured`` (n, m), ``variances`` (m,) or (n, m)."""
+    """N blocks: ``start`` (n, p), ``measured`` (n, m), ``variances`` (m,) or (n, m), above 0 (SolverError)."""
     n, p = start.shape
-    weights = np.broadcast_to(1.0 / np.atleast_2d(variances), measured.shape)
+    weights = np.broadcast_to(1.0 / positive(variances), measured.shape)
     out = Fits(start.copy(), np.empty((n, p, p)), np.empty(measured.shape), np.zeros(n, dtype=bool))
     for first in range(0, n, CHUNK):
-        part = slice(first, first + CHUNK)
-        x = out.parameters[part]
-        w = weights[part]
+        # A block that has converged is left alone: its answer does not depend on its neighbours.
+        active = np.arange(first, min(first + CHUNK, n))
         for _ in range(MAX_STEPS):
-            predicted, rows = model(x)
-            residual = measured[part] - predicted
-            weighted = rows * w[:, :, None]
-            normal = np.einsum('nmi,nmj->nij', weighted, rows)
-            right = np.einsum('nmi,nm->ni', weighted, residual)
-            try:
-                inverse = np.linalg.inv(normal)
-            except np.linalg.LinAlgError:
-                # One singular block must not spoil its neighbours.
-                singular = ~(np.linalg.matrix_rank(normal, hermitian=True) == p)
-                normal[singular] = np.nan
-                inverse = np.linalg.inv(normal)
-            step = np.einsum('nij,nj->ni', inverse, right)
-            x += step
+            predicted, rows = model(out.parameters[active])
+            residual = measured[active] - predicted
+            weighted = rows * weights[active][:, :, None]
+            inverse = _invert_many(np.einsum('nmi,nmj->nij', weighted, rows))
+            step = np.einsum('nij,nj->ni', inverse, np.einsum('nmi,nm->ni', weighted, residual))
+            out.parameters[active] += step
+            out.covariance[active] = inverse
+            out.residual[active] = residual - np.einsum('nmi,ni->nm', rows, step)
             largest = np.abs(step).max(axis=1)
-            if not (largest >= LAST_STEP).any():
+            out.converged[active] = largest < LAST_STEP
+            active = active[(largest >= LAST_STEP) & (largest < np.inf)]
+            if not active.size:
                 break
-        out.covariance[part] = inverse
-        out.residual[part] = residual
-        out.converged[part] = largest < LAST_STEP
     return out
+
+
+def _invert_many(normal: FloatArray) -> FloatArray:
+    """Inverses (n, p, p); NaN where a block is singular, so that it does not spoil its neighbours."""
+    try:
+        return np.asarray(np.linalg.inv(normal))
+    except np.linalg.LinAlgError:
+        singular = np.linalg.matrix_rank(normal, hermitian=True) < normal.shape[1]
+        out = np.full(normal.shape, np.nan)
+        out[~singular] = np.linalg.inv(normal[~singular])
+        return out

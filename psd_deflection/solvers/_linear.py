@@ -66,39 +66,34 @@ def condition_number(design: FloatArray, angle_length: float) -> ConditionNumber
 def error_bound(
     design: FloatArray,
     pose: FloatArray,
-    residual: FloatArray,
     design_error: FloatArray,
     reading_error: FloatArray,
     row_scaling: FloatArray | None = None,
 ) -> FloatArray:
-    """How far (dX, dY, theta) can be off, each by itself (3,): m, m, rad. Replaces 4.33 and 4.34.
+    """How far (dX, dY, theta) can be from the true pose, each by itself (3,): m, m, rad.
 
-    ``pose`` (3,) and ``residual`` (2P,) m as solved with ``design`` (2P, 3); the true matrix is off
-    by at most ``design_error`` (2P, 3) and the readings by at most ``reading_error`` (2P,) m, entry
-    by entry. ``row_scaling`` (2P,): Po, where the answer is a weighted one. Entries are infinite
-    where errors of that size could make the matrix singular.
+    ``pose`` (3,) as solved with ``design`` (2P, 3). The true matrix is off by at most ``design_error``
+    (2P, 3) and the readings, with all that the linear model lacks, by at most ``reading_error`` (2P,)
+    m, entry by entry. ``row_scaling`` (2P,): Po, where the answer is a weighted one. Infinite where
+    errors of that size could hide the pose altogether.
 
-    With A' = A + dA the matrix used, r its residual, N = A'^T A' and E >= |dA|, e >= |db|, the
-    normal equations of both systems subtract to
+    Replaces 4.33 and 4.34. Those add metres to radians in one norm, so that the number depends on the
+    unit (in mm it is a thousand times too large for the thesis's own example), and 4.32, on which they
+    stand, holds for consistent equations only: with a residual r it lacks (A^T A)^-1 dA^T r, and 4.33 is
+    broken by up to nine times. Asked for the distance to the *pose* x*, the residual drops out: with
+    (A + dA) x* = b + db and x = G b, G A = I,
 
-        (N - dN) dx = A^T (db - dA x) + dA^T r,
+        x - x* = G (dA x* - db),     |x - x*| <= (I - |G| E)^-1 |G| (e + E |x|),
 
-    of which 4.32 has only the first term, and 4.33 a norm that adds metres to radians. In magnitudes,
-    with v = e + E |x|:  |dx| <= (I - K)^-1 ( |A'+| v + |N^-1| E^T (v + |r|) ),
-    K = |A'+| E + |N^-1| E^T (|A'| + E). Nothing is neglected.
+    where E >= |dA|, e >= |db|, in magnitudes, and nothing is neglected.
     """
     scale = np.ones(len(design)) if row_scaling is None else np.asarray(row_scaling, dtype=np.float64)
-    a = scale[:, None] * design
-    e_a = scale[:, None] * np.abs(design_error)
-    e_b = scale * np.abs(reading_error)
-    inverse = np.abs(np.linalg.pinv(a))
-    normal = np.abs(np.linalg.inv(a.T @ a))
-    v = e_b + e_a @ np.abs(pose)
-    k = inverse @ e_a + normal @ e_a.T @ (np.abs(a) + e_a)
+    gain = np.abs(gain_matrix(design, scale))
+    e_a = np.abs(design_error)
+    k = gain @ e_a
     if np.abs(np.linalg.eigvals(k)).max() >= 1.0:
         return np.full(3, np.inf)
-    first = inverse @ v + normal @ e_a.T @ (v + scale * np.abs(residual))
-    bound: FloatArray = np.linalg.solve(np.eye(3) - k, first)
+    bound: FloatArray = np.linalg.solve(np.eye(3) - k, gain @ (np.abs(reading_error) + e_a @ np.abs(pose)))
     return bound
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from psd_deflection.errors import SolverError
 from psd_deflection.records import FloatArray
 
 Covariance = tuple[float, float, float, float, float, float, float, float, float]
@@ -37,9 +38,17 @@ def turn_covariance(
     return (xx, xy, xt, xy, yy, yt, xt, yt, vtt)
 
 
-def split(dots: FloatArray, variances: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """x, y (n, P) and their variances, each (n, P) or (1, P)."""
+def positive(variances: FloatArray) -> FloatArray:
+    """Variances as (n or 1, 2P). Raises SolverError where one is not above 0."""
     v = np.atleast_2d(np.asarray(variances, dtype=np.float64))
+    if not (v > 0.0).all():
+        raise SolverError('solve: variances must be above 0 m^2')
+    return v
+
+
+def split(dots: FloatArray, variances: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """x, y (n, P) and their variances, each (n, P) or (1, P). Raises SolverError as :func:`positive`."""
+    v = positive(variances)
     m = np.atleast_2d(np.asarray(dots, dtype=np.float64))
     return m[:, 0::2], m[:, 1::2], v[:, 0::2], v[:, 1::2]
 
@@ -81,9 +90,11 @@ def turn_covariance_many(
     vxt: FloatArray,
     vyt: FloatArray,
     vtt: FloatArray,
+    out: FloatArray | None = None,
 ) -> FloatArray:
-    """:func:`turn_covariance` for n blocks: (n, 3, 3)."""
-    out = np.empty((c.shape[0], 3, 3))
+    """:func:`turn_covariance` for n blocks: (n, 3, 3), written into ``out`` where it is given."""
+    if out is None:
+        out = np.empty((c.shape[0], 3, 3))
     cs = c * s
     mixed = 2.0 * cs * vxy
     cc = c * c

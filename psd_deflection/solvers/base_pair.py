@@ -100,7 +100,7 @@ class BasePairSolver(Solver):
     def _refuse_what_is_unseen(self, geometry: Geometry, assume: Assume) -> None:
         heights = self._heights
         if assume == 'nothing' and self._count == 2:
-            _, jacobian = _landings(self._beams, heights, np.zeros((1, 5)))
+            _, jacobian = landings(self._beams, heights, np.zeros((1, 5)))
             null = np.linalg.svd(jacobian[0])[2][4]
             per_degree = abs(null[1] / null[2]) * np.pi / 180.0
             raise SolverError(
@@ -122,7 +122,7 @@ class BasePairSolver(Solver):
                     'dot back by what the deflection moved it (Fig. 5.9): the deflection cannot be seen; '
                     'put the PSDs in another plane'
                 )
-        _, jacobian = _landings(self._beams, heights, np.zeros((1, 5)))
+        _, jacobian = landings(self._beams, heights, np.zeros((1, 5)))
         length = float(np.hypot(*np.ptp(self._beams, axis=0)))
         scale = np.array([1.0, 1.0, length, float(np.abs(heights).max()), float(np.abs(heights).max())])
         seen = (jacobian[0] / scale) @ (scale[:, None] * self._matrix)
@@ -181,7 +181,7 @@ class BasePairSolver(Solver):
         spread = self._matrix
 
         def model(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-            predicted, jacobian = _landings(self._beams, self._heights, x @ spread.T)
+            predicted, jacobian = landings(self._beams, self._heights, x @ spread.T)
             return predicted, jacobian @ spread
 
         found = fit_many(model, np.zeros((len(measured), self._unknowns)), measured, variances)
@@ -230,7 +230,7 @@ def _landing(
     )
 
 
-def _landings(beams: FloatArray, heights: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+def landings(beams: FloatArray, heights: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The same for n poses (n, 5): places (n, 2P) and derivatives (n, 2P, 5)."""
     dx, dy, theta, phi, omega = (poses[:, i, None] for i in range(5))
     ax = np.cos(theta) * beams[:, 0] - np.sin(theta) * beams[:, 1]

@@ -27,7 +27,14 @@ from psd_deflection.errors import SolverError
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers._geometry import check_twist
 from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver, SolverStatus
-from psd_deflection.solvers._plane import interleave, split, turn_covariance, weighted_covariance
+from psd_deflection.solvers._plane import (
+    interleave,
+    positive,
+    split,
+    turn_covariance,
+    turn_covariance_many,
+    weighted_covariance,
+)
 
 _MAX_STEPS = 30
 _LAST_STEP = 1e-10
@@ -114,23 +121,92 @@ class ExactSolver(Solver):
 
     def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
         """N blocks. See :class:`Solver`."""
-        x, y, vx, vy = split(dots, variances)
-        n = x.shape[0]
-        pose = np.empty((n, 3))
-        covariance = np.empty((n, 3, 3))
-        residual = np.empty((n, 2 * self._count))
-        status = np.empty(n, dtype=np.int8)
+        m = np.atleast_2d(np.asarray(dots, dtype=np.float64))
+        v = positive(variances)
+        n = len(m)
+        out = Solutions(
+            np.empty((n, 3)),
+            np.zeros((n, 2)),
+            np.empty((n, 3, 3)),
+            np.empty((n, 2 * self._count)),
+            np.empty(n, dtype=np.int8),
+        )
+        chunk = self._chunk_of_two if self._count == 2 else self._chunk
         for start in range(0, n, _CHUNK):
             part = slice(start, start + _CHUNK)
-            v_part = part if vx.shape[0] > 1 else slice(None)
-            pose[part], covariance[part], residual[part], status[part] = self._chunk(
-                x[part], y[part], 1.0 / vx[v_part], 1.0 / vy[v_part]
-            )
-        return Solutions(pose, np.zeros((n, 2)), covariance, residual, status)
+            chunk(m[part], v[part] if len(v) > 1 else v, out, part)
+        return out
 
-    def _chunk(
-        self, x: FloatArray, y: FloatArray, wx: FloatArray, wy: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def _chunk_of_two(self, m: FloatArray, v: FloatArray, out: Solutions, part: slice) -> None:
+        """The lines of :meth:`solve`, for arrays."""
+        x1, y1, x2, y2 = m.T
+        vx1, vy1, vx2, vy2 = v.T
+        mx = 1.0 / (vx1 + vx2)
+        my = 1.0 / (vy1 + vy2)
+        q1x = self._c1x + x1
+        q1y = self._c1y + y1
+        qx = q1x - self._c2x - x2
+        qy = q1y - self._c2y - y2
+        lx = self._l1x - self._l2x
+        ly = self._l1y - self._l2y
+        across = qx * ly - qy * lx
+        along = qx * lx + qy * ly
+        theta = np.arctan2(across, along)
+        if (mx == my).all():
+            converged = np.isfinite(theta)
+            # cos and sin of the arctangent, for the price of one root.
+            size = np.hypot(along, across)
+            with np.errstate(invalid='ignore'):
+                c = np.where(size != 0.0, along / size, 1.0)
+                s = np.where(size != 0.0, across / size, 0.0)
+        else:
+            theta, converged = _newton_many(
+                theta,
+                (mx - my) * (ly * ly - lx * lx),
+                (mx - my) * lx * ly,
+                mx * qx * lx + my * qy * ly,
+                mx * qx * ly - my * qy * lx,
+            )
+            c = np.cos(theta)
+            s = np.sin(theta)
+        px = c * lx + s * ly
+        py = c * ly - s * lx
+        ex = (qx - px) * mx
+        ey = (qy - py) * my
+        residual = out.residual[part]
+        rx1 = residual[:, 0] = ex * vx1
+        ry1 = residual[:, 1] = ey * vy1
+        residual[:, 2] = -ex * vx2
+        residual[:, 3] = -ey * vy2
+        p1x = q1x - rx1
+        p1y = q1y - ry1
+        pose = out.pose[part]
+        pose[:, 0] = self._l1x - c * p1x + s * p1y
+        pose[:, 1] = self._l1y - s * p1x - c * p1y
+        pose[:, 2] = theta
+        vtt = 1.0 / (mx * py * py + my * px * px)
+        mean_y = p1y - py * (vx1 * mx)
+        mean_x = p1x - px * (vy1 * my)
+        vxt = mean_y * vtt
+        vyt = -mean_x * vtt
+        turn_covariance_many(
+            c,
+            s,
+            vx1 * vx2 * mx + mean_y * vxt,
+            -mean_x * vxt,
+            vy1 * vy2 * my - mean_x * vyt,
+            vxt,
+            vyt,
+            vtt,
+            out.covariance[part],
+        )
+        out.status[part] = np.where(converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED)
+
+    def _chunk(self, m: FloatArray, v: FloatArray, out: Solutions, part: slice) -> None:
+        """Any number of PSDs."""
+        x, y, vx, vy = split(m, v)
+        wx = 1.0 / vx
+        wy = 1.0 / vy
         qx = self._centers[:, 0] + x
         qy = self._centers[:, 1] + y
         lx = self._beams[:, 0]
@@ -158,10 +234,10 @@ class ExactSolver(Solver):
         fy = -(wy * ry).sum(axis=1, keepdims=True) / sum_y
         rx += fx
         ry += fy
-        pose = np.column_stack((c * fx[:, 0] - s * fy[:, 0], s * fx[:, 0] + c * fy[:, 0], theta))
-        covariance = weighted_covariance(qx - rx, qy - ry, wx, wy, c, s)
-        status = np.where(converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED)
-        return pose, covariance, interleave(rx, ry), status
+        out.pose[part] = np.column_stack((c * fx[:, 0] - s * fy[:, 0], s * fx[:, 0] + c * fy[:, 0], theta))
+        out.covariance[part] = weighted_covariance(qx - rx, qy - ry, wx, wy, c, s)
+        out.residual[part] = interleave(rx, ry)
+        out.status[part] = np.where(converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED)
 
 
 def _one(many: Solutions) -> Solution:
@@ -221,7 +297,7 @@ def _newton_many(
         turned = c * c - s * s
         slope = difference * s * c + mixed * turned + along * s - across * c
         curvature = difference * turned - 4.0 * mixed * s * c + along * c + across * s
-        step = slope / np.abs(curvature)
+        step = np.where(converged, 0.0, slope / np.abs(curvature))
         theta = theta - step
         converged = np.abs(step) < _LAST_STEP
         if converged.all():

@@ -144,7 +144,7 @@ class IterativeSolver(Solver):
             s = np.sin(theta)
             agreement = np.abs(along * c + across * s)
             step = np.divide(across * c - along * s, agreement, out=np.ones(n), where=agreement != 0.0)
-            step = np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
+            step = np.where(converged, 0.0, np.clip(step, -_LARGEST_STEP, _LARGEST_STEP))
             theta += step
             converged = np.abs(step) < _LAST_STEP
             if converged.all():

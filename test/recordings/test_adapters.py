@@ -158,12 +158,15 @@ def test_an_independent_decoder_reads_the_samples_of_a_block(flags: int) -> None
         np.testing.assert_array_equal(points[c], given_block.volts[:, i])
 
 
-def test_seq_is_recorded_modulo_2_to_the_32() -> None:
+def test_seq_is_recorded_modulo_2_to_the_32_with_what_is_above_beside_it() -> None:
     start = 2**32 // 20
     (m,) = to_messages(block(start, first_index=start))
     _, points = point_cloud2.to_points(m.fields)
-    assert points['seq'][0] == 2**32 - 16
-    assert points['seq'][-1] == 3
+    assert points['seq'][[0, -1]].tolist() == [2**32 - 16, 3]
+    assert points['seq_high'][[0, -1]].tolist() == [0, 1]
+    assert [f['name'] for f in m.fields['fields']] == ['seq', 'dt', *CHANNELS, 'flags', 'seq_high']
+    (before,) = to_messages(block(start - 1, first_index=start - 1))
+    assert before.fields['point_step'] == 32
 
 
 def test_a_block_with_a_long_pause_takes_two_messages() -> None:
@@ -199,7 +202,7 @@ def test_a_dot_that_was_not_seen_is_not_published(status: BlockStatus) -> None:
 def test_only_the_primary_estimate_is_the_deflection() -> None:
     assert [m.topic for m in to_messages(estimate(1, 'wls', primary=False))] == ['/link_tip/wls/deflection']
     primary = to_messages(estimate(1))
-    assert [m.topic for m in primary] == ['/link_tip/exact/deflection', DEFLECTION, DEFLECTION_WITH_COVARIANCE]
+    assert [m.topic for m in primary] == [DEFLECTION, '/link_tip/exact/deflection', DEFLECTION_WITH_COVARIANCE]
     assert all(m.fields['header']['frame_id'] == 'link_tip_rest' for m in primary)
 
 

@@ -22,7 +22,7 @@ from psd_deflection.config import load_rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.io import cdr
 from psd_deflection.io.bag_metadata import qos_profile
-from psd_deflection.io.bag_writer import META_HELLO, META_PARAMETERS, META_SEQUENCE, META_SOFTWARE, BagWriter, McapFile
+from psd_deflection.io.bag_writer import META_HELLO, META_PARAMETERS, META_SOFTWARE, BagWriter, McapFile
 
 from .making import T0, block, estimate, run
 
@@ -136,7 +136,6 @@ def test_parameters_version_and_hello_are_inside(tmp_path: Path) -> None:
     parameters = {k: json.loads(v) for k, v in metadata[META_PARAMETERS].items()}
     assert parameters == dict(load_rig().values)
     assert {k: json.loads(v) for k, v in metadata[META_HELLO].items()} == HELLO
-    assert META_SEQUENCE not in metadata
 
 
 def test_a_hello_may_come_later(tmp_path: Path) -> None:
@@ -144,12 +143,6 @@ def test_a_hello_may_come_later(tmp_path: Path) -> None:
         out.write(block(0))
         out.write_hello(HELLO)
     assert json.loads(metadata_of(tmp_path / 'a.mcap')[META_HELLO]['serial']) == 'A1'
-
-
-def test_the_whole_number_is_noted_where_seq_starts_past_32_bits(tmp_path: Path) -> None:
-    with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
-        out.write(block(2**40, first_index=2**40))
-    assert metadata_of(tmp_path / 'a.mcap')[META_SEQUENCE] == {'first': str(20 * 2**40)}
 
 
 def test_an_empty_bag_opens(tmp_path: Path) -> None:

@@ -1,0 +1,87 @@
+"""Makes the golden recordings and the truth beside them: ``make golden``.
+
+The bytes of the simulated device go through the same decoder, clock map, pipeline and bag writer as
+in the daemon, with the script's own clock, so that the files come out the same on every run with the
+same libraries. CI replays the files that are committed; it does not make them anew.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.io.bag_writer import BagWriter
+from psd_deflection.io.simulated_device import SimulatedDevice
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.protocol.frames import FrameDecoder, HelloFrame, SampleFrame
+from psd_deflection.records import FloatArray, RawChunk
+from psd_deflection.simulation.loads import LoadHistory, direct, sidebar, steps
+
+HERE = Path(__file__).resolve().parent
+START_NS = 1_767_225_600_000_000_000
+"""2026-01-01 00:00 UTC."""
+
+SECONDS = 4
+
+RECORDINGS: dict[str, dict[str, object]] = {
+    'clean': {},
+    'lost_samples': {'lose': frozenset({45, 46, 200, *range(1003, 1030), *range(2000, 2145), 3999})},
+    'laser_off': {'dark': ((2, 1507, 2523),)},
+}
+
+
+def history() -> LoadHistory:
+    """Nothing, 30 N on the sidebar, 50 N on the link, nothing: a second each."""
+    return steps([(0.0, 0.0, 0.0), sidebar(30.0), direct(50.0), (0.0, 0.0, 0.0)], 1.0)
+
+
+def record(rig: Rig, name: str, options: dict[str, object]) -> None:
+    """One recording ``bags/NAME`` and ``bags/NAME_truth.csv``."""
+    loads = history().loads
+
+    def held(first: int, n: int) -> FloatArray:
+        index = np.minimum(np.arange(first, first + n), len(loads) - 1)
+        return loads[index]
+
+    device = SimulatedDevice(rig, held, seed=2026, serial='GOLDEN', **options)  # type: ignore[arg-type]
+    device.poses = []
+    frames = FrameDecoder().feed(b'\x00' + device.take(SECONDS * 1_000_000_000 - 1, room=1 << 30))
+    hello = next(f for f in frames if isinstance(f, HelloFrame))
+    samples = [f for f in frames if isinstance(f, SampleFrame)]
+    pipeline = Pipeline(rig)
+    folder = HERE / name
+    shutil.rmtree(folder, ignore_errors=True)
+    with BagWriter(folder, rig_values=dict(rig.values), device_hello=hello.info) as bag:
+        chunk = RawChunk(
+            np.array([f.seq for f in samples], np.int64),
+            START_NS + np.array([f.t_device_us for f in samples], np.int64) * 1000,
+            np.array([f.counts for f in samples], np.int16),
+            np.array([f.flags for f in samples], np.uint8),
+            rig.converter.volts_per_count,
+        )
+        for step in (pipeline.process(chunk), pipeline.flush()):
+            for item in step:
+                bag.write(item)
+    poses = np.concatenate(device.poses)[: SECONDS * 1000]
+    rows = poses.reshape(-1, rig.estimator.block_size, 3).mean(axis=1)
+    with (HERE / f'{name}_truth.csv').open('w', encoding='ascii') as stream:
+        stream.write('block,dx,dy,theta\n')
+        for block, (dx, dy, theta) in enumerate(rows.tolist()):
+            stream.write(f'{block},{dx!r},{dy!r},{theta!r}\n')
+
+
+def main() -> int:
+    """Make all of them."""
+    rig = load_rig()
+    for name, options in RECORDINGS.items():
+        record(rig, name, options)
+        print(f'bags/{name}: {sum(p.stat().st_size for p in (HERE / name).iterdir())} bytes')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,167 @@
+"""Speed of the solvers, beside their peers in the same run: ``python bench/solvers.py``.
+
+Ratios carry from machine to machine better than times do. A peer's rate is measured on fewer blocks,
+enough for a tenth of a second or more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from psd_deflection.records import FloatArray
+from psd_deflection.solvers import SOLVERS, Solver, make_solver
+from psd_deflection.solvers.comparison import VARIANCES, dots_of, thesis_geometry
+
+STEP = np.radians(0.01)
+
+
+def best_of(action: Callable[[], Any], repeats: int = 5) -> float:
+    """Least time, s: what the machine can do when nothing else wants it."""
+    action()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        action()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def some_blocks(count: int) -> FloatArray:
+    """Dots (count, 4), m, of poses within 2 mm and 2 degrees, with 2 um of noise."""
+    rng = np.random.default_rng(0)
+    poses = np.zeros((count, 5))
+    poses[:, :3] = rng.uniform(-1, 1, (count, 3)) * (2e-3, 2e-3, np.radians(2.0))
+    return dots_of(thesis_geometry(), poses) + 2e-6 * rng.standard_normal((count, 4))
+
+
+def peer_least_squares(dots: FloatArray) -> None:
+    """scipy.optimize.least_squares on the flat plate, Levenberg-Marquardt, derivatives given."""
+    geometry = thesis_geometry()
+    centers, beams = geometry.centers, geometry.beams
+
+    def residual(p: FloatArray, m: FloatArray) -> FloatArray:
+        c, s = np.cos(p[2]), np.sin(p[2])
+        u, v = (beams - p[:2]).T
+        return np.array([c * u + s * v - centers[:, 0], c * v - s * u - centers[:, 1]]).T.ravel() - m
+
+    def jacobian(p: FloatArray, m: FloatArray) -> FloatArray:
+        c, s = np.cos(p[2]), np.sin(p[2])
+        u, v = (beams - p[:2]).T
+        j = np.empty((4, 3))
+        j[0::2, 0], j[0::2, 1], j[0::2, 2] = -c, -s, c * v - s * u
+        j[1::2, 0], j[1::2, 1], j[1::2, 2] = s, -c, -(c * u + s * v)
+        return j
+
+    for m in dots:
+        least_squares(residual, np.zeros(3), jacobian, method='lm', x_scale=(1e-3, 1e-3, 1e-2), args=(m,))
+
+
+def peer_lstsq(dots: FloatArray) -> None:
+    """numpy.linalg.lstsq on the linearised plate: no exact rotation, no covariance."""
+    geometry = thesis_geometry()
+    a = np.zeros((4, 3))
+    a[0::2, 0] = a[1::2, 1] = -1.0
+    a[0::2, 2], a[1::2, 2] = geometry.beams[:, 1], -geometry.beams[:, 0]
+    for m in dots:
+        np.linalg.lstsq(a, m, rcond=None)
+
+
+def peer_thesis_loop(dots: FloatArray) -> None:
+    """Section 2.2 trial by trial, 0.01 degree each, with numpy's small arrays."""
+    geometry = thesis_geometry()
+    for m in dots:
+        q = geometry.centers + m.reshape(2, 2)
+        for trial in range(401):
+            found = False
+            for theta in (-STEP * trial, STEP * trial):
+                c, s = np.cos(theta), np.sin(theta)
+                delta = geometry.beams - q @ np.array([[c, s], [-s, c]])
+                if (np.abs(delta[0] - delta[1]) < 1e-4).all():
+                    found = True
+                    break
+            if found:
+                break
+
+
+def peer_thesis_at_once(dots: FloatArray) -> None:
+    """The same 401 trials both ways, all of a block's in one array."""
+    geometry = thesis_geometry()
+    theta = STEP * np.arange(-400, 401)
+    c, s = np.cos(theta), np.sin(theta)
+    bx, by = (geometry.beams[0] - geometry.beams[1]).tolist()
+    for m in dots:
+        qx, qy = geometry.centers[0] + m[:2] - geometry.centers[1] - m[2:]
+        hit = (np.abs(bx - c * qx + s * qy) < 1e-4) & (np.abs(by - s * qx - c * qy) < 1e-4)
+        np.abs(np.flatnonzero(hit) - 400).min()
+
+
+def repeat(solver: Solver, dots: tuple[float, ...], variances: tuple[float, ...]) -> None:
+    """200 calls of a single block."""
+    for _ in range(200):
+        solver.solve(dots, variances)
+
+
+def main() -> None:
+    """Print both tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--blocks', type=int, default=1_000_000, help='blocks of the vectorised solve')
+    blocks = parser.parse_args().blocks
+    geometry = thesis_geometry()
+    dots = some_blocks(blocks)
+
+    print(f'{blocks} blocks at once, with covariance, residual and status')
+    seconds = {}
+    for name, options, label in (
+        ('exact', {}, 'exact, one set of variances'),
+        ('exact', {'each': True}, 'exact, variances of each block, x and y unlike'),
+        ('wls', {}, 'wls'),
+        ('iterative', {}, 'iterative'),
+        ('beam', {}, 'beam'),
+    ):
+        variances = np.tile((4e-12, 1e-12, 9e-12, 2e-12), (blocks, 1)) if options else VARIANCES
+        solver = make_solver(name, geometry)
+        seconds[label] = best_of(functools.partial(solver.solve_many, dots, variances), 3) / blocks
+    peers: dict[str, float] = {}
+    for text, peer, count in (
+        ('scipy.optimize.least_squares a block', peer_least_squares, 500),
+        ("the thesis's 0.01 degree loop in numpy", peer_thesis_loop, 100),
+        ('  the same, all trials of a block in one array', peer_thesis_at_once, 5000),
+    ):
+        part = dots[:count]
+        peers[text] = best_of(functools.partial(peer, part), 3) / len(part)
+    for label, value in seconds.items():
+        print(f'  {label:50} {1e6 * value:9.3f} us a block')
+    default = seconds['exact, one set of variances']
+    for text, value in peers.items():
+        print(f'  {text:50} {1e6 * value:9.1f} us a block, exact is {value / default:.0f} times as fast')
+
+    print('one block at a time, with covariance')
+    one = tuple(dots[0].tolist())
+    default = 0.0
+    for name in SOLVERS:
+        if name in ('pose', 'base_pair'):
+            continue
+        solver = make_solver(name, geometry)
+        for label, single in (('', (4e-12,) * 4), (', x and y unlike', (4e-12, 1e-12, 9e-12, 2e-12))):
+            if label and name != 'exact':
+                continue
+            value = best_of(functools.partial(repeat, solver, one, single)) / 200
+            default = default or value
+            print(f'  {name + label:50} {1e6 * value:9.1f} us')
+    for text, peer in (
+        ('scipy.optimize.least_squares', peer_least_squares),
+        ('numpy.linalg.lstsq, linear, no covariance', peer_lstsq),
+    ):
+        value = best_of(functools.partial(peer, dots[:200])) / 200
+        print(f'  {text:50} {1e6 * value:9.1f} us, exact is {value / default:.0f} times as fast')
+
+
+if __name__ == '__main__':
+    main()

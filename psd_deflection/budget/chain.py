@@ -1,0 +1,147 @@
+"""The measuring chain with its imperfections, exact: from a pose of the tip to readings and stored zeros.
+
+Theory of operation. A sensor stands at C = (c + error, h + error) on the plate, its axes turned and
+tilted by R_s = Ry Rx Rz. Its beam was set so that the dot lies at m_0 before load: it passes through
+C + R_s (m_0, 0) and runs along (u_x, u_y, 1). Under load the plate is at d + R(.), with the tilts of a
+cantilever, so the dot is where the beam meets the plane through d + R C with normal R R_s e_z. Nothing
+is linearised: every error of the budget is a field of :class:`Chain`, and what it does is computed,
+not estimated. What happens since the zero was stored (``..._shift``) acts on the loaded reading only.
+
+Arrays have a leading axis of n trials or of 1, then P sensors, then x and y.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import ndtr
+
+from psd_deflection.config import Rig
+from psd_deflection.mechanics.dots import tied_pose
+from psd_deflection.records import FloatArray
+
+
+def _none(*shape: int) -> FloatArray:
+    return np.zeros(shape)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chain:
+    """A rig as it is, beside what its parameter file says (the first block).
+
+    ``centers`` (P, 2), ``heights`` (P,), ``zeros`` (P, 2), ``half_area`` (P, 2), ``link_length``: m.
+    ``slope_ratio`` (n,): the k that the link really has. Then the errors, all 0 in a rig as drawn:
+    """
+
+    centers: FloatArray
+    heights: FloatArray
+    zeros: FloatArray
+    half_area: FloatArray
+    link_length: float
+    slope_ratio: FloatArray
+
+    center_error: FloatArray = field(default_factory=lambda: _none(1, 1, 2))
+    """m, true centre minus stated."""
+    height_error: FloatArray = field(default_factory=lambda: _none(1, 1))
+    """m."""
+    rotation: FloatArray = field(default_factory=lambda: _none(1, 1))
+    """rad, the sensor's axes about +Z of the plate."""
+    tilt: FloatArray = field(default_factory=lambda: _none(1, 1, 2))
+    """rad, the sensor's surface about X and Y of the plate."""
+    beam_slope: FloatArray = field(default_factory=lambda: _none(1, 1, 2))
+    """dx/dz, dy/dz of the beam."""
+    center_shift: FloatArray = field(default_factory=lambda: _none(1, 1, 2))
+    """m, the centre has moved since the zero was stored."""
+    beam_shift: FloatArray = field(default_factory=lambda: _none(1, 1, 2))
+    """m, the dot has moved with the beam since."""
+    spot_diameter: FloatArray = field(default_factory=lambda: _none(1, 1))
+    """m, 1/e^2; 0 is a point that no edge clips."""
+    nonlinearity: FloatArray = field(default_factory=lambda: _none(1, 1))
+    """1/m^2: r becomes r (1 + k r^2)."""
+    background: FloatArray = field(default_factory=lambda: _none(1, 1))
+    """Current that is not the spot's, centred, over the spot's."""
+    gain: FloatArray = field(default_factory=lambda: _none(1, 1, 2))
+    """Scale error."""
+    reading_shift: FloatArray = field(default_factory=lambda: _none(1, 1, 2))
+    """m, added to the loaded reading: drift and noise."""
+    zero_shift: FloatArray = field(default_factory=lambda: _none(1, 1, 2))
+    """m, added to the stored zero."""
+
+    @classmethod
+    def of(cls, rig: Rig) -> Chain:
+        """The rig as drawn."""
+        half_area = np.array([p.active_area for p in rig.psds]) / 2.0
+        slope_ratio = np.array([rig.link.slope_ratio])
+        return cls(rig.centers, rig.heights, rig.zeros, half_area, rig.link.length, slope_ratio)
+
+
+def _turn(phi: FloatArray, omega: FloatArray, theta: FloatArray) -> FloatArray:
+    """Ry(omega) Rx(phi) Rz(theta), (..., 3, 3)."""
+    phi, omega, theta = np.broadcast_arrays(phi, omega, theta)
+    cp, sp, co, so = np.cos(phi), np.sin(phi), np.cos(omega), np.sin(omega)
+    ct, st = np.cos(theta), np.sin(theta)
+    rows = [
+        [co * ct + so * sp * st, so * sp * ct - co * st, so * cp],
+        [cp * st, cp * ct, -sp],
+        [co * sp * st - so * ct, co * sp * ct + so * st, co * cp],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _lift(across: FloatArray, z: FloatArray | float) -> FloatArray:
+    """(..., 3) from (..., 2) and z (...)."""
+    shape = np.broadcast_shapes(across.shape[:-1], np.shape(z))
+    return np.concatenate(
+        [np.broadcast_to(across, (*shape, 2)), np.broadcast_to(z, shape)[..., None]], axis=-1, dtype=np.float64
+    )
+
+
+def dots(chain: Chain, pose: FloatArray, dz: float = 0.0) -> FloatArray:
+    """(n, P, 2), m: where the dots lie in each sensor's own axes at ``pose`` (3,): dX, dY, theta.
+
+    ``dz``: the tip's shortening, m; matters to inclined beams only.
+    """
+    tilted = tied_pose(pose, chain.slope_ratio, chain.link_length)
+    plate = _turn(tilted[..., 3], tilted[..., 4], tilted[..., 2])[:, None]
+    own = _turn(chain.tilt[..., 0], chain.tilt[..., 1], chain.rotation)
+    centre = _lift(chain.centers + chain.center_error, chain.heights + chain.height_error)
+    start = centre + np.einsum('...ij,...j->...i', own[..., :2], chain.zeros)
+    start = start + _lift(chain.beam_shift, 0.0)
+    along = _lift(chain.beam_slope, 1.0)
+    moved = centre + _lift(chain.center_shift, 0.0)
+    origin = np.einsum('...ij,...j->...i', plate, moved) + np.array([pose[0], pose[1], dz])
+    sensor = plate @ own
+    normal = sensor[..., 2]
+    reach = np.sum(normal * (origin - start), axis=-1) / np.sum(normal * along, axis=-1)
+    hit = start + reach[..., None] * along - origin
+    return np.asarray(np.einsum('...ji,...j->...i', sensor, hit)[..., :2])
+
+
+def clipped(places: FloatArray, diameter: FloatArray, half_area: FloatArray) -> FloatArray:
+    """Centroid (n, P, 2) of what the active area catches of a Gaussian spot at ``places``.
+
+    Beam diameter D (1/e^2) is four standard deviations of the intensity, and the area's edges cut x and
+    y apart, so each is the mean of a truncated normal. A spot on the area to 6 deviations is untouched.
+    """
+    if not np.any(diameter > 0.0):
+        return places
+    deviation = np.maximum(diameter[..., None] / 4.0, 1e-12)
+    low, high = (-half_area - places) / deviation, (half_area - places) / deviation
+    caught = np.maximum(ndtr(high) - ndtr(low), 1e-300)
+    pull = (np.exp(-(low**2) / 2.0) - np.exp(-(high**2) / 2.0)) / np.sqrt(2.0 * np.pi) / caught
+    return np.asarray(places + deviation * pull)
+
+
+def _read(chain: Chain, places: FloatArray) -> FloatArray:
+    places = clipped(places, chain.spot_diameter, chain.half_area)
+    places = places * (1.0 + chain.nonlinearity[..., None] * np.sum(places**2, axis=-1, keepdims=True))
+    return np.asarray(places / (1.0 + chain.background[..., None]) * (1.0 + chain.gain))
+
+
+def measure(chain: Chain, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Readings and stored zeros, (n, P, 2) each, m, at ``pose`` (3,)."""
+    readings = _read(chain, dots(chain, pose)) + chain.reading_shift
+    zeros = _read(chain, chain.zeros[None]) + chain.zero_shift
+    shape = np.broadcast_shapes(readings.shape, zeros.shape)
+    return np.broadcast_to(readings, shape), np.broadcast_to(zeros, shape)

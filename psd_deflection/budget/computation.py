@@ -1,0 +1,100 @@
+"""E_C, what the method itself gets wrong on perfect readings (last row of Table 3.1; 3.9 ... 3.18 corrected).
+
+An exact method: nothing. Least squares of chapter 4 linearises: theta comes out as its sine and d
+unturned, d^ - d = -theta z x d + theta^2 l/2. The iteration of section 2.2 stops at the first trial angle
+inside a window, which is always short of the true one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from psd_deflection.budget.chain import Chain, measure
+from psd_deflection.budget.term import Cause, Contribution, Kind, Situation
+from psd_deflection.errors import ConfigError
+from psd_deflection.records import FloatArray
+
+
+def twist_of_residuals(
+    points: FloatArray, beams: FloatArray, residual_x: float = 0.0, residual_y: float = 0.0
+) -> float:
+    """The angle at which the two sensors disagree by the given residuals, rad (3.16 with its sign put right).
+
+    ``points`` and ``beams`` (2, 2) m: q_i, l_i; residuals m: of R(theta)(q_1 - q_2) - (l_1 - l_2). With
+    D = q_1 - q_2 and E = l_1 - l_2 + residual, sin theta = (D x E)/D^2. The residuals are not
+    independent of each other near the truth (T_x = -E_y delta, T_y = E_x delta), so as a bound on the
+    stop window this averages them: see :func:`stop_window`. Raises ConfigError where the points coincide.
+    """
+    across = points[0] - points[1]
+    target = beams[0] - beams[1] + np.array([residual_x, residual_y])
+    square = float(across @ across)
+    if square == 0.0:
+        raise ConfigError('the two dots coincide: the twist cannot be seen')
+    return math.asin(max(-1.0, min(1.0, float(across[0] * target[1] - across[1] * target[0]) / square)))
+
+
+def stop_window(beams: FloatArray, tolerance: float) -> float:
+    """How far from the true angle both of 3.9 and 3.10 first hold, rad: tolerance / max(|E_x|, |E_y|)."""
+    base = np.abs(beams[0] - beams[1])
+    return tolerance / float(base.max())
+
+
+def _iteration(at: Situation) -> Contribution:
+    twist = float(at.pose[2])
+    window, step = stop_window(at.rig.centers + at.rig.zeros, at['iteration_tolerance']), at['iteration_step']
+    if window < step / 2.0:
+        raise ConfigError(
+            f'iteration_tolerance = {at["iteration_tolerance"]:g} m: its window of +-{window:g} rad is narrower than '
+            f'iteration_step = {step:g} rad: the iteration may step over it; take a finer step'
+        )
+    # The first trial inside the window lies anywhere within one step of its edge.
+    short, deviation = window - step / 2.0, step / math.sqrt(12.0)
+    if abs(twist) <= window:
+        short, deviation = abs(twist), 0.0
+    # The thesis takes d from PSD 1: d = l_1 - R(theta) q_1, so an angle error swings it by l_1 - d.
+    arm = at.rig.centers[0] + at.rig.zeros[0] - at.pose[:2]
+    response = np.array([arm[1], -arm[0], 1.0])
+    return Contribution(-math.copysign(short, twist) * response, deviation**2 * np.outer(response, response))
+
+
+class Computation(Cause):
+    """E_C of the chosen method."""
+
+    name = 'computation'
+    row = 'E_C'
+    kind = Kind.KNOWN
+    formula = (
+        "the method's answer to perfect readings of its own model, less the truth; thesis_iteration: its stop rule"
+    )
+    inputs = ('iteration_tolerance', 'iteration_step')
+
+    def contribution(self, at: Situation) -> Contribution:
+        """As declared; the stop rule leaves a bias and, by its grid, a little chance."""
+        if at.method == 'thesis_iteration':
+            return _iteration(at)
+        return Contribution(perfect_answer(at) - at.pose, np.zeros((3, 3)))
+
+    def without(self, chain: Chain, at: Situation) -> Chain:
+        """As declared: the chain is innocent."""
+        return chain
+
+    def perturb(self, chain: Chain, at: Situation, count: int, random: np.random.Generator) -> Chain:
+        """As declared."""
+        return chain
+
+    def beside(self, at: Situation, count: int, random: np.random.Generator) -> FloatArray:
+        """As declared."""
+        bias, covariance = self.contribution(at)
+        return np.asarray(random.multivariate_normal(bias, covariance, size=count, method='svd'))
+
+
+COMPUTATION = Computation()
+
+
+def perfect_answer(at: Situation) -> FloatArray:
+    """(3,): the estimator's answer where the chain is as the estimator models it."""
+    chain = replace(at.chain, slope_ratio=np.array([at.estimator.slope_ratio]))
+    return np.asarray(at.estimator.estimate(*measure(chain, at.pose))[0])

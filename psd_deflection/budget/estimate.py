@@ -1,0 +1,135 @@
+"""The estimators whose errors are budgeted, and their first-order response.
+
+Each takes readings and stored zeros, (n, P, 2) m, and gives (n, 3): dX, dY, theta. Its ``response`` is
+the Jacobian of that answer by readings and by zeros at a true pose, (3, 2P) each: for the exact
+methods S = (J^T J)^-1 J^T with J the Jacobian of the exact model, and -S M^-1 for the zeros, because
+a zero moves the beam that it stands for.
+"""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+
+import numpy as np
+
+from psd_deflection.config import Rig
+from psd_deflection.errors import ConfigError
+from psd_deflection.mechanics.dots import beam_jacobian, plate_jacobian, plate_points, tie_matrix, tied_pose
+from psd_deflection.mechanics.placement import design_matrix, gain_matrix
+from psd_deflection.records import FloatArray
+
+
+class Estimator(abc.ABC):
+    """One way from readings to a pose. ``slope_ratio``: the k that it takes the link to have; 0 for a flat plate."""
+
+    slope_ratio: float
+
+    @abc.abstractmethod
+    def estimate(self, readings: FloatArray, zeros: FloatArray) -> FloatArray:
+        """(n, 3): dX, dY m, theta rad."""
+
+    @abc.abstractmethod
+    def response(self, pose: FloatArray, zeros: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(3, 2P) by readings and (3, 2P) by zeros, at ``pose`` (3,) with ``zeros`` (P, 2)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExactEstimator(Estimator):
+    """Least squares on the exact model: the plate flat (``slope_ratio`` 0), or tilting as a cantilever.
+
+    Flat, two or more sensors of equal weight have a closed form: theta from the base lines'
+    cross and dot products, d from the centroids (orthogonal Procrustes). Tied, Gauss-Newton from there.
+    """
+
+    centers: FloatArray
+    heights: FloatArray
+    link_length: float
+    slope_ratio: float
+
+    def estimate(self, readings: FloatArray, zeros: FloatArray) -> FloatArray:
+        """As declared."""
+        points, beams = self.centers + readings, self.centers + zeros
+        pose = _register(points, beams)
+        if self.slope_ratio == 0.0:
+            return pose
+        tie = tie_matrix(self.slope_ratio, self.link_length)
+        # Six steps take any pose in a sensor's range to rounding: the start is off by the tilt alone.
+        for _ in range(6):
+            full = tied_pose(pose, self.slope_ratio, self.link_length)
+            model = plate_points(full, beams, self.heights)
+            jacobian = _rows(plate_jacobian(full, model, self.heights)) @ tie
+            residual = (points - model).reshape(len(pose), -1, 1)
+            transposed = np.swapaxes(jacobian, -1, -2)
+            pose = pose + np.linalg.solve(transposed @ jacobian, transposed @ residual)[..., 0]
+        return pose
+
+    def response(self, pose: FloatArray, zeros: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As declared."""
+        full = tied_pose(pose, self.slope_ratio, self.link_length)
+        model = plate_points(full, self.centers + zeros, self.heights)
+        jacobian = _rows(plate_jacobian(full, model, self.heights)) @ tie_matrix(self.slope_ratio, self.link_length)
+        by_readings: FloatArray = np.asarray(np.linalg.pinv(jacobian), dtype=np.float64)
+        by_zeros = -by_readings @ np.kron(np.eye(len(self.centers)), beam_jacobian(full))
+        return by_readings, np.asarray(by_zeros, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearEstimator(Estimator):
+    """The thesis's direct method (4.24, 4.27) with the corrected A: linear in the displacement of the dots.
+
+    ``gain`` (3, 2P): what ``placement.gain_matrix`` gives.
+    """
+
+    gain: FloatArray
+    slope_ratio: float = 0.0
+
+    def estimate(self, readings: FloatArray, zeros: FloatArray) -> FloatArray:
+        """As declared."""
+        return np.asarray((readings - zeros).reshape(len(readings), -1) @ self.gain.T)
+
+    def response(self, pose: FloatArray, zeros: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As declared: the same at every pose."""
+        return self.gain, -self.gain
+
+
+METHODS = ('exact', 'beam', 'wls', 'thesis_iteration')
+"""``exact``, ``beam``, ``wls``: the solvers of these names; ``thesis_iteration``: section 2.2 with its stop rule."""
+
+METHOD_OF_SOLVER = {'beam': 'beam', 'wls': 'wls', 'ols': 'wls'}
+"""The method by which a configured solver is budgeted; all others are exact on a flat plate."""
+
+
+def estimator_of(rig: Rig, method: str) -> Estimator:
+    """The estimator of one of ``METHODS``.
+
+    ``thesis_iteration`` gives the exact angle less what its stop rule leaves (``budget.computation``), so
+    it responds to errors as ``exact`` does. Raises ConfigError for another name, or where the two
+    centres coincide.
+    """
+    if method not in METHODS:
+        raise ConfigError(f'--method = {method!r}: must be one of {", ".join(METHODS)}')
+    if not np.any(rig.centers[0] != rig.centers[1]):
+        raise ConfigError('psd_1.center and psd_2.center coincide: the twist cannot be seen')
+    if method == 'wls':
+        scaling = np.array(rig.estimator.wls_row_scaling) if rig.estimator.wls_weights == 'thesis' else None
+        return LinearEstimator(gain_matrix(design_matrix(rig.centers + rig.zeros), scaling))
+    slope_ratio = rig.link.slope_ratio if method == 'beam' else 0.0
+    return ExactEstimator(rig.centers, rig.heights, rig.link.length, slope_ratio)
+
+
+def _rows(jacobian: FloatArray) -> FloatArray:
+    """(..., P, 2, 5) to (..., 2P, 5)."""
+    out: FloatArray = jacobian.reshape(*jacobian.shape[:-3], -1, jacobian.shape[-1])
+    return out
+
+
+def _register(points: FloatArray, beams: FloatArray) -> FloatArray:
+    points_mean, beams_mean = points.mean(axis=-2), beams.mean(axis=-2)
+    p, b = points - points_mean[..., None, :], beams - beams_mean[..., None, :]
+    cross = np.sum(p[..., 0] * b[..., 1] - p[..., 1] * b[..., 0], axis=-1)
+    theta = np.arctan2(cross, np.sum(p * b, axis=(-2, -1)))
+    c, s = np.cos(theta), np.sin(theta)
+    x, y = points_mean[..., 0], points_mean[..., 1]
+    moved = np.stack([c * x - s * y, s * x + c * y], axis=-1)
+    return np.concatenate([beams_mean - moved, theta[..., None]], axis=-1)

@@ -1,0 +1,75 @@
+"""The budget: every cause at one situation, the totals, and the Monte Carlo that must agree with them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from psd_deflection.budget import environment, installation, sensor
+from psd_deflection.budget.chain import measure
+from psd_deflection.budget.computation import COMPUTATION
+from psd_deflection.budget.term import Cause, Contribution, Kind, Situation
+from psd_deflection.records import FloatArray
+
+CAUSES: tuple[Cause, ...] = (*sensor.TERMS, *environment.TERMS, *installation.TERMS, COMPUTATION)
+"""Every line of the budget."""
+
+TABLE_3_1 = ('E_LP', 'E_DC', 'E_R', 'E_TH', 'E_RF', 'E_EMF', 'E_Algn', 'E_Tilt', 'E_C')
+"""The rows of the thesis's Table 3.1."""
+
+_CHUNK = 10_000
+"""Draws at once: bounds the memory of a long Monte Carlo."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Budget:
+    """Contributions of all causes at ``at``, in the order of ``CAUSES``."""
+
+    at: Situation
+    lines: tuple[tuple[Cause, Contribution], ...]
+
+    def total(self, *kinds: Kind) -> Contribution:
+        """Of the causes of these kinds (none named: all): biases add with their signs, covariances add."""
+        chosen = [c for cause, c in self.lines if not kinds or cause.kind in kinds]
+        bias = np.sum([c.bias for c in chosen], axis=0, dtype=np.float64) + np.zeros(3)
+        covariance = np.sum([c.covariance for c in chosen], axis=0, dtype=np.float64) + np.zeros((3, 3))
+        return Contribution(bias, covariance)
+
+    def shares(self, line: Contribution) -> FloatArray:
+        """(3,): mean square of a line over the total's, for dX, dY, theta.
+
+        They add to 1 but for the products of biases, which no single line owns.
+        """
+        whole = self.total().rms ** 2
+        return np.asarray(np.divide(line.rms**2, whole, out=np.zeros(3), where=whole > 0.0))
+
+
+def evaluate(at: Situation) -> Budget:
+    """Every cause, to first order."""
+    return Budget(at, tuple((cause, cause.contribution(at)) for cause in CAUSES))
+
+
+def monte_carlo(at: Situation, count: int, seed: int, causes: Sequence[Cause] = CAUSES) -> Contribution:
+    """Mean error and covariance of ``count`` draws of all ``causes`` at once.
+
+    Through the exact chain and the exact estimator: nothing here is linearised. What is not among
+    ``causes`` is as drawn, the tilt of the tip included; errors are counted from the answer without
+    ``causes``.
+    """
+    random = np.random.default_rng(seed)
+    plain = at.chain
+    for cause in causes:
+        plain = cause.without(plain, at)
+    nothing = at.estimator.estimate(*measure(plain, at.pose))[0]
+    errors = []
+    for start in range(0, count, _CHUNK):
+        size = min(_CHUNK, count - start)
+        chain, beside = at.chain, np.zeros((size, 3))
+        for cause in causes:
+            chain = cause.perturb(chain, at, size, random)
+            beside = beside + cause.beside(at, size, random)
+        errors.append(at.estimator.estimate(*measure(chain, at.pose)) - nothing + beside)
+    everything = np.concatenate(errors)
+    return Contribution(everything.mean(axis=0), np.cov(everything.T))

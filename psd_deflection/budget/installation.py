@@ -1,0 +1,133 @@
+"""Terms of the installation: where the sensors sit, how they are turned, and how the tip tilts (Table 3.1, 3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from psd_deflection.budget.chain import Chain
+from psd_deflection.budget.term import ROOT_3, Kind, Situation, Term, adds_to
+from psd_deflection.records import FloatArray
+
+
+def _tolerance(name: str, count: int) -> Callable[[Situation], FloatArray]:
+    """``count`` error parameters, uniform within the input ``name`` to either side."""
+    return lambda at: np.full(count, at[name] / ROOT_3)
+
+
+# ---- E_Algn: alignment ----
+
+SENSOR_ROTATION = Term(
+    'sensor_rotation',
+    'E_Algn',
+    Kind.SYSTEMATIC,
+    "rotation_tolerance / sqrt 3: the sensor's axes turned in the plate",
+    ('rotation_tolerance',),
+    _tolerance('rotation_tolerance', 2),
+    adds_to('rotation'),
+)
+
+BEAM_MISALIGNMENT = Term(
+    'beam_misalignment',
+    'E_Algn',
+    Kind.SYSTEMATIC,
+    'beam_tolerance / sqrt 3: the beam out of parallel, times the way of the plate along it',
+    ('beam_tolerance',),
+    _tolerance('beam_tolerance', 4),
+    adds_to('beam_slope'),
+)
+
+
+# ---- E_Tilt: tilt of the plane of the sensors ----
+
+
+def _tilt(chain: Chain, values: FloatArray, at: Situation) -> Chain:
+    modelled = at.estimator.slope_ratio
+    return replace(chain, slope_ratio=modelled + values[:, 0] * (at.rig.link.slope_ratio - modelled))
+
+
+PLANE_TILT = Term(
+    'plane_tilt',
+    'E_Tilt',
+    Kind.KNOWN,
+    'the tip tilts by phi = -k dY/L, omega = +k dX/L, the method takes k as 0 (beam: as it is)',
+    (),
+    lambda at: np.ones(1),
+    _tilt,
+)
+
+
+def _vary_slope_ratio(chain: Chain, values: FloatArray, at: Situation) -> Chain:
+    return replace(chain, slope_ratio=chain.slope_ratio + values[:, 0])
+
+
+SLOPE_RATIO = Term(
+    'slope_ratio',
+    'E_Tilt',
+    Kind.SYSTEMATIC,
+    'slope_ratio_tolerance / sqrt 3: k is not what the rig file says',
+    ('slope_ratio_tolerance',),
+    _tolerance('slope_ratio_tolerance', 1),
+    _vary_slope_ratio,
+)
+
+SENSOR_TILT = Term(
+    'sensor_tilt',
+    'E_Tilt',
+    Kind.SYSTEMATIC,
+    "tilt_tolerance / sqrt 3: the sensor's surface tilted on the plate",
+    ('tilt_tolerance',),
+    _tolerance('tilt_tolerance', 4),
+    adds_to('tilt'),
+)
+
+
+# ---- Section 3.2: where the centres are ----
+
+CENTER_POSITION = Term(
+    'center_position',
+    'e_Xo, e_Yo',
+    Kind.SYSTEMATIC,
+    'center_tolerance / sqrt 3 in x and y; the same error in l and in q (3.19 corrected)',
+    ('center_tolerance',),
+    _tolerance('center_tolerance', 4),
+    adds_to('center_error'),
+)
+
+SENSOR_HEIGHT = Term(
+    'sensor_height',
+    '',
+    Kind.SYSTEMATIC,
+    'height_tolerance / sqrt 3, times the tilt of the plate',
+    ('height_tolerance',),
+    _tolerance('height_tolerance', 2),
+    adds_to('height_error'),
+)
+
+
+def _expand(chain: Chain, values: FloatArray, at: Situation) -> Chain:
+    return replace(chain, center_shift=chain.center_shift + values[:, :, None] * at.chain.centers)
+
+
+BRACKET_EXPANSION = Term(
+    'bracket_expansion',
+    '',
+    Kind.SYSTEMATIC,
+    'expansion_coefficient x bracket_temperature x c_i since zeroing',
+    ('expansion_coefficient', 'bracket_temperature'),
+    lambda at: np.array([at['expansion_coefficient'] * at['bracket_temperature']]),
+    _expand,
+)
+
+TERMS = (
+    SENSOR_ROTATION,
+    BEAM_MISALIGNMENT,
+    PLANE_TILT,
+    SLOPE_RATIO,
+    SENSOR_TILT,
+    CENTER_POSITION,
+    SENSOR_HEIGHT,
+    BRACKET_EXPANSION,
+)

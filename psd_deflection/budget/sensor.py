@@ -1,0 +1,193 @@
+"""Terms of the sensor itself: the first group of Table 3.1, and the amplifier and converter behind it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from psd_deflection.budget.chain import Chain
+from psd_deflection.budget.optics import beam_diameter
+from psd_deflection.budget.term import ROOT_3, Kind, Situation, Term, adds_to
+from psd_deflection.records import FloatArray
+
+
+def spot_diameter(at: Situation) -> float:
+    """1/e^2 diameter on the sensor, m (3.1 corrected)."""
+    return beam_diameter(at['laser_diameter'], at['laser_wavelength'], at.rig.link.length)
+
+
+def averaged(deviation: float, at: Situation) -> float:
+    """Deviation of a block's mean for that of one sample, the samples being independent."""
+    return deviation / math.sqrt(at.rig.estimator.block_size)
+
+
+# ---- E_LP: size of the spot ----
+
+
+def _light_profile(at: Situation) -> FloatArray:
+    # A profile that stays as it is moves nothing: the sensor reads the centroid wherever that lies.
+    return np.full(4, at['profile_change'] * spot_diameter(at))
+
+
+LIGHT_PROFILE = Term(
+    'light_profile',
+    'E_LP',
+    Kind.SYSTEMATIC,
+    'profile_change x D(L), D by 3.1 corrected',
+    ('profile_change', 'laser_diameter', 'laser_wavelength'),
+    _light_profile,
+    adds_to('reading_shift'),
+)
+
+
+def _clip(chain: Chain, values: FloatArray, at: Situation) -> Chain:
+    return replace(chain, spot_diameter=values * spot_diameter(at))
+
+
+SPOT_CLIPPING = Term(
+    'spot_clipping',
+    'E_LP',
+    Kind.KNOWN,
+    'centroid of the part of a Gaussian spot of diameter D(L) on the active area',
+    ('laser_diameter', 'laser_wavelength'),
+    lambda at: np.ones(1),
+    _clip,
+)
+
+
+# ---- E_DC: dark current ----
+
+
+def _dark_current(at: Situation) -> FloatArray:
+    return np.full(2, at['dark_current'] / ROOT_3 / (at['responsivity'] * at['laser_power']))
+
+
+DARK_CURRENT = Term(
+    'dark_current',
+    'E_DC',
+    Kind.SYSTEMATIC,
+    'x -> x/(1 + I_d/I_s), I_s = responsivity x laser_power, I_d uniform up to dark_current',
+    ('dark_current', 'responsivity', 'laser_power'),
+    _dark_current,
+    adds_to('background'),
+)
+
+
+# ---- E_R: resistivity ----
+
+
+def _resistivity(at: Situation) -> FloatArray:
+    # r (1 + k r^2) is off by nonlinearity x length at 80 % of the half-length.
+    length = at.area.mean(axis=1)
+    return np.asarray(at['nonlinearity'] * length / (0.4 * length) ** 3 / ROOT_3)
+
+
+RESISTIVITY = Term(
+    'resistivity',
+    'E_R',
+    Kind.SYSTEMATIC,
+    'x -> x (1 + k r^2), k r^3 = nonlinearity x length at r = 0.4 length; over sqrt 3',
+    ('nonlinearity',),
+    _resistivity,
+    adds_to('nonlinearity'),
+)
+
+
+# ---- E_TH: thermal drift ----
+
+
+def _thermal_drift(at: Situation) -> FloatArray:
+    return np.asarray(at['drift_coefficient'] * at['temperature_change'] / ROOT_3 * at.area.ravel())
+
+
+THERMAL_DRIFT = Term(
+    'thermal_drift',
+    'E_TH',
+    Kind.SYSTEMATIC,
+    'drift_coefficient x length x temperature_change / sqrt 3, each axis by itself',
+    ('drift_coefficient', 'temperature_change'),
+    _thermal_drift,
+    adds_to('reading_shift'),
+)
+
+
+# ---- Amplifier and converter ----
+
+
+def _amplifier_noise(at: Situation) -> FloatArray:
+    amplifier = at.rig.amplifier
+    return np.full(4, averaged(amplifier.noise * amplifier.sensitivity, at))
+
+
+AMPLIFIER_NOISE = Term(
+    'amplifier_noise',
+    '',
+    Kind.PER_ESTIMATE,
+    'amplifier.noise x amplifier.sensitivity / sqrt(block_size)',
+    (),
+    _amplifier_noise,
+    adds_to('reading_shift'),
+)
+
+
+def _quantisation(at: Situation) -> FloatArray:
+    step = at.rig.converter.volts_per_count
+    deviation = step * at.rig.amplifier.sensitivity / math.sqrt(12.0)
+    # Noise of half a step or more makes the rounding errors of successive samples independent.
+    dithered = at.rig.amplifier.noise >= step / 2.0
+    return np.full(4, averaged(deviation, at) if dithered else deviation)
+
+
+QUANTISATION = Term(
+    'quantisation',
+    '',
+    Kind.PER_ESTIMATE,
+    'step x sensitivity / sqrt 12, over sqrt(block_size) where the noise is half a step or more',
+    (),
+    _quantisation,
+    adds_to('reading_shift'),
+)
+
+
+def _zeroing(at: Situation) -> FloatArray:
+    return np.hypot(_amplifier_noise(at), _quantisation(at)) / math.sqrt(at['zero_blocks'])
+
+
+ZEROING = Term(
+    'zeroing',
+    '',
+    Kind.SYSTEMATIC,
+    'noise and quantisation of a block / sqrt(zero_blocks), in the stored zero',
+    ('zero_blocks',),
+    _zeroing,
+    adds_to('zero_shift'),
+)
+
+
+def _sensor_gain(at: Situation) -> FloatArray:
+    return np.full(4, at['gain_tolerance'] / ROOT_3)
+
+
+SENSOR_GAIN = Term(
+    'sensor_gain',
+    '',
+    Kind.SYSTEMATIC,
+    'x -> x (1 + g), g = gain_tolerance / sqrt 3, each channel by itself',
+    ('gain_tolerance',),
+    _sensor_gain,
+    adds_to('gain'),
+)
+
+TERMS = (
+    LIGHT_PROFILE,
+    SPOT_CLIPPING,
+    DARK_CURRENT,
+    RESISTIVITY,
+    THERMAL_DRIFT,
+    SENSOR_GAIN,
+    AMPLIFIER_NOISE,
+    QUANTISATION,
+    ZEROING,
+)

@@ -1,0 +1,24 @@
+"""Counts to volts to metres; the sensor types."""
+
+from psd_deflection.calibration.sensors import (
+    Duolateral,
+    Pincushion,
+    Quadrant,
+    Sensor,
+    Tetralateral,
+    make_sensor,
+)
+from psd_deflection.calibration.volts import Calibration, SensorFlag, counts_to_volts, dot_noise_variances
+
+__all__ = [
+    'Calibration',
+    'Duolateral',
+    'Pincushion',
+    'Quadrant',
+    'Sensor',
+    'SensorFlag',
+    'Tetralateral',
+    'counts_to_volts',
+    'dot_noise_variances',
+    'make_sensor',
+]

@@ -1,0 +1,202 @@
+"""From photocurrents to the place of the spot and back, one class a kind of sensor.
+
+A lateral sensor is one sheet: the photocurrent divides between electrodes as a resistor divides it, so
+that differences over sums are linear in the place (2.3, 2.4 times half the active length). A segmented
+one is four separate diodes: what it says depends on how the spot's light is spread, and saturates when
+the spot has left the cross in its middle. 2.1, 2.2 give it as a pure number; for a laser's Gaussian
+spot of radius w (to 1/e^2) that number is erf(sqrt(2) x/w), which is inverted here.
+
+The sensors are ideal; what real ones add (``sensor_nonlinearity``, ``axis_crosstalk``,
+``ambient_light`` ...) is an effect of the simulation.
+"""
+
+from __future__ import annotations
+
+import abc
+from math import erf, pi, sqrt
+from typing import ClassVar
+
+import numpy as np
+from scipy.special import erf as erf_many
+from scipy.special import erfinv
+
+from psd_deflection.config import PsdConfig
+from psd_deflection.errors import ConfigError
+from psd_deflection.records import FloatArray
+
+
+class Sensor(abc.ABC):
+    """One position sensing detector. ``electrodes`` names the four currents, in their order."""
+
+    name: ClassVar[str]
+    electrodes: ClassVar[tuple[str, str, str, str]]
+
+    def __init__(self, active_area: tuple[float, float], spot_radius: float) -> None:
+        """``active_area``: width and height, m. ``spot_radius``: to 1/e^2 of the peak, m."""
+        self.half = np.array(active_area, dtype=np.float64) / 2.0
+        self.spot_radius = spot_radius
+
+    @abc.abstractmethod
+    def ratios(self, currents: FloatArray) -> FloatArray:
+        """Differences over sums (n, 2), -1 to 1, of currents (n, 4); NaN without light."""
+
+    @abc.abstractmethod
+    def currents(self, place: FloatArray, total: FloatArray | float) -> FloatArray:
+        """Currents (n, 4) of a spot at ``place`` (n, 2) m whose photocurrent is ``total`` (n,) A."""
+
+    def sum_signal(self, currents: FloatArray) -> FloatArray:
+        """The photocurrent (n,), A: what a sum channel shows."""
+        total: FloatArray = np.asarray(currents, dtype=np.float64).sum(axis=1)
+        return total
+
+    def place(self, currents: FloatArray) -> FloatArray:
+        """Where the spot is (n, 2), m from the centre; NaN without light."""
+        return self.from_ratios(self.ratios(currents))
+
+    def from_ratios(self, ratios: FloatArray) -> FloatArray:
+        """Places (n, 2), m, of ratios (n, 2): half the active length times them (2.3, 2.4)."""
+        return np.asarray(ratios * self.half)
+
+    def to_ratios(self, place: FloatArray) -> FloatArray:
+        """The inverse of :meth:`from_ratios`."""
+        return np.asarray(place / self.half)
+
+    def from_linear(self, place: FloatArray) -> FloatArray:
+        """Places (n, 2), m, of ``place``: volts times the sensitivity at the centre, m.
+
+        The same for a lateral sensor; undoes the bend of a segmented one.
+        """
+        return place
+
+    def reach(self) -> FloatArray:
+        """How far from the centre a reading is a place (2,), m."""
+        return self.half
+
+
+class Duolateral(Sensor):
+    """Two resistive sheets: x between two electrodes in front, y between two behind.
+
+    x = (Lx/2)(I_x1 - I_x2)/(I_x1 + I_x2), electrode 1 on the positive side (2.3, 2.4; Hamamatsu's and
+    On-Trak's sheets number them the other way round). Each pair carries the whole photocurrent.
+    """
+
+    name: ClassVar[str] = 'duolateral'
+    electrodes: ClassVar[tuple[str, str, str, str]] = ('x1', 'x2', 'y1', 'y2')
+
+    def ratios(self, currents: FloatArray) -> FloatArray:
+        """See :class:`Sensor`."""
+        x1, x2, y1, y2 = np.asarray(currents, dtype=np.float64).T
+        return _over(np.column_stack((x1 - x2, y1 - y2)), np.column_stack((x1 + x2, y1 + y2)))
+
+    def currents(self, place: FloatArray, total: FloatArray | float) -> FloatArray:
+        """See :class:`Sensor`."""
+        x, y = self.to_ratios(place).T
+        half = np.broadcast_to(total, x.shape) / 2.0
+        return np.column_stack((half * (1.0 + x), half * (1.0 - x), half * (1.0 + y), half * (1.0 - y)))
+
+    def sum_signal(self, currents: FloatArray) -> FloatArray:
+        """The photocurrent (n,), A: it passes both pairs, and is counted once."""
+        return super().sum_signal(currents) / 2.0
+
+
+class Tetralateral(Sensor):
+    """One sheet with an electrode along each edge: both axes share the photocurrent (2.3, 2.4)."""
+
+    name: ClassVar[str] = 'tetralateral'
+    electrodes: ClassVar[tuple[str, str, str, str]] = ('x1', 'x2', 'y1', 'y2')
+
+    def ratios(self, currents: FloatArray) -> FloatArray:
+        """See :class:`Sensor`."""
+        x1, x2, y1, y2 = np.asarray(currents, dtype=np.float64).T
+        return _over(np.column_stack((x1 - x2, y1 - y2)), np.column_stack((x1 + x2, y1 + y2)))
+
+    def currents(self, place: FloatArray, total: FloatArray | float) -> FloatArray:
+        """See :class:`Sensor`."""
+        x, y = self.to_ratios(place).T
+        part = np.broadcast_to(total, x.shape) / 4.0
+        return np.column_stack((part * (1.0 + x), part * (1.0 - x), part * (1.0 + y), part * (1.0 - y)))
+
+
+class Pincushion(Sensor):
+    """One sheet with an electrode in each corner and edges bent so that the ratios come out linear.
+
+    x = (Lx/2)[(X2 + Y1) - (X1 + Y2)]/sum, y = (Ly/2)[(X2 + Y2) - (X1 + Y1)]/sum (Hamamatsu, improved
+    tetralateral PSDs).
+    """
+
+    name: ClassVar[str] = 'pincushion'
+    electrodes: ClassVar[tuple[str, str, str, str]] = ('X1', 'X2', 'Y1', 'Y2')
+
+    def ratios(self, currents: FloatArray) -> FloatArray:
+        """See :class:`Sensor`."""
+        x1, x2, y1, y2 = np.asarray(currents, dtype=np.float64).T
+        total = (x1 + x2 + y1 + y2)[:, None]
+        return _over(np.column_stack((x2 + y1 - x1 - y2, x2 + y2 - x1 - y1)), total)
+
+    def currents(self, place: FloatArray, total: FloatArray | float) -> FloatArray:
+        """See :class:`Sensor`."""
+        x, y = self.to_ratios(place).T
+        part = np.broadcast_to(total, x.shape) / 4.0
+        right, left, up, down = 1.0 + x, 1.0 - x, 1.0 + y, 1.0 - y
+        return np.column_stack((part * left * down, part * right * up, part * right * down, part * left * up))
+
+
+class Quadrant(Sensor):
+    """Four diodes, I1 to I4 counter-clockwise from the upper right, no gap between them (2.1, 2.2).
+
+    A Gaussian spot of radius w at x gives X = erf(sqrt(2) x/w), whatever y. Useful to 1.5 w: there
+    99.7 % of the light is on one side, and a reading changes by a hundredth of what it does in the middle.
+    """
+
+    name: ClassVar[str] = 'quadrant'
+    electrodes: ClassVar[tuple[str, str, str, str]] = ('I1', 'I2', 'I3', 'I4')
+
+    _REACH = 1.5
+
+    def ratios(self, currents: FloatArray) -> FloatArray:
+        """See :class:`Sensor`."""
+        i1, i2, i3, i4 = np.asarray(currents, dtype=np.float64).T
+        total = (i1 + i2 + i3 + i4)[:, None]
+        return _over(np.column_stack((i1 + i4 - i2 - i3, i1 + i2 - i3 - i4)), total)
+
+    def currents(self, place: FloatArray, total: FloatArray | float) -> FloatArray:
+        """See :class:`Sensor`."""
+        x, y = self.to_ratios(place).T
+        part = np.broadcast_to(total, x.shape) / 4.0
+        right, left, up, down = 1.0 + x, 1.0 - x, 1.0 + y, 1.0 - y
+        return np.column_stack((part * right * up, part * left * up, part * left * down, part * right * down))
+
+    def from_ratios(self, ratios: FloatArray) -> FloatArray:
+        """Places (n, 2), m, of ratios (n, 2): w/sqrt(2) erfinv; held at 1.5 w beyond it."""
+        limit = erf(sqrt(2.0) * self._REACH)
+        return np.asarray(self.spot_radius / sqrt(2.0) * erfinv(np.clip(ratios, -limit, limit)))
+
+    def to_ratios(self, place: FloatArray) -> FloatArray:
+        """erf(sqrt(2) x/w), (n, 2)."""
+        return np.asarray(erf_many(sqrt(2.0) / self.spot_radius * np.asarray(place)))
+
+    def from_linear(self, place: FloatArray) -> FloatArray:
+        """At the centre dX/dx = sqrt(8/pi)/w: a ratio is ``place`` times that."""
+        return self.from_ratios(np.asarray(place) * (sqrt(8.0 / pi) / self.spot_radius))
+
+    def reach(self) -> FloatArray:
+        """1.5 w, or the edge of the diodes where that is nearer."""
+        return np.minimum(self.half, self._REACH * self.spot_radius)
+
+
+SENSORS: dict[str, type[Sensor]] = {cls.name: cls for cls in (Duolateral, Tetralateral, Pincushion, Quadrant)}
+
+
+def make_sensor(psd: PsdConfig) -> Sensor:
+    """The sensor that ``psd_N.type`` names. Raises ConfigError for another name."""
+    cls = SENSORS.get(psd.type)
+    if cls is None:
+        raise ConfigError(f'psd type = {psd.type!r}: must be one of {", ".join(SENSORS)}')
+    return cls(psd.active_area, psd.spot_radius)
+
+
+def _over(difference: FloatArray, total: FloatArray) -> FloatArray:
+    """Their ratio; NaN where there is no light."""
+    out = np.full(difference.shape, np.nan)
+    np.divide(difference, total, out=out, where=np.broadcast_to(total > 0.0, difference.shape))
+    return out

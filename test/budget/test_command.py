@@ -1,0 +1,93 @@
+"""``psd-deflection budget``: what it prints, draws and refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.budget.evaluate import CAUSES
+from psd_deflection.budget.inputs import INPUTS
+from psd_deflection.cli.main import main
+
+RIG = str(Path(__file__).parent.parent.parent / 'config' / 'thesis_rig.yaml')
+
+
+def test_the_table_has_every_term_and_the_totals_add_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(['budget', '--params-file', RIG, '--monte-carlo', '2000']) == 0
+    out = capsys.readouterr().out
+    rows = {line.split()[0]: line.split() for line in out.splitlines() if line}
+    for cause in CAUSES:
+        assert cause.name in rows
+    parts = [
+        [float(v) for v in next(line for line in out.splitlines() if line.startswith(f'all {kind}')).split()[-3:]]
+        for kind in ('per estimate', 'systematic', 'known bias')
+    ]
+    total = [float(v) for v in next(line for line in out.splitlines() if line.startswith('total')).split()[-3:]]
+    for column, whole in zip(zip(*parts, strict=True), total, strict=True):
+        # Root sum of squares, to the printed digits and the small biases that systematic terms have.
+        assert whole == pytest.approx(sum(v**2 for v in column) ** 0.5, rel=0.01)
+    assert 'Monte Carlo, 2000 draws' in out
+    assert out.rstrip().endswith('budget.png')
+    assert (tmp_path / 'budget.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_json_has_the_figures_in_si(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = tmp_path / 'chart.svg'
+    arguments = ['--json', '--out', str(out), '--method', 'beam', '--load', '1', '-2', '0.5', '--monte-carlo', '100']
+    assert main(['budget', *arguments, '--set', 'air_gradient=0', '--set', 'air_step = 0']) == 0
+    got = json.loads(capsys.readouterr().out)
+    assert got['method'] == 'beam'
+    assert got['load'] == [1.0, -2.0, 0.5]
+    assert [t['name'] for t in got['terms']] == [c.name for c in CAUSES]
+    refraction = next(t for t in got['terms'] if t['name'] == 'refraction')
+    assert refraction['rms'] == [0.0, 0.0, 0.0]
+    assert refraction['inputs']['air_gradient'] == 0.0
+    assert set(got['totals']) == {'per_estimate', 'systematic', 'known', 'total', 'monte_carlo'}
+    assert got['totals']['total']['rms'][0] < 1e-4
+    assert out.read_text(encoding='utf-8').startswith('<?xml')
+
+
+def test_everything_is_explained(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['budget', '--explain', '--set', 'pointing_drift=2e-6']) == 0
+    out = capsys.readouterr().out
+    assert 'pointing_drift = 2e-06 rad' in out
+    assert 'spot on the sensor (3.1): 1.1110 mm' in out
+    assert 'stop window of thesis_iteration: 57.30 mdeg' in out
+    for cause in CAUSES:
+        assert cause.formula in out
+    for entry in INPUTS:
+        assert entry.source in out
+
+
+def test_the_method_follows_the_rigs_solver(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = tmp_path / 'rig.yaml'
+    rig.write_text('/**:\n  ros__parameters:\n    solver: wls\n')
+    assert main(['budget', '--params-file', str(rig), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['method'] == 'wls'
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'said'),
+    [
+        (['--set', 'nothing'], 'NAME=VALUE'),
+        (['--set', 'nothing=1'], 'no input of that name'),
+        (['--monte-carlo', '1'], '--monte-carlo'),
+        (['--monte-carlo', '1000', '--seed', '-1'], '--seed'),
+        (['--load', 'nan', '0', '0'], 'must be finite'),
+        (['--load', '0', '-500', '0'], 'take a smaller load'),
+        (['--load', '1e300', '0', '0'], 'than the link is long'),
+        (['--out', 'budget.txt'], '.png, .svg or .pdf'),
+        (['--inputs', 'absent.yaml'], 'absent.yaml'),
+        (['--params-file', 'absent.yaml'], 'absent.yaml'),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['budget', *arguments]) == 3
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count('\n') == 1

@@ -1,0 +1,103 @@
+"""Equations 3.1 to 3.4, corrected: reference values, and that what is printed in the thesis is another thing."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from psd_deflection.budget.environment import averaging_gain
+from psd_deflection.budget.optics import (
+    air_index,
+    air_index_short,
+    beam_diameter,
+    boundary_shift,
+    gradient_shift,
+    index_per_kelvin,
+    refracted_angle,
+)
+from psd_deflection.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ('diameter', 'distance', 'expected', 'printed'),
+    [
+        (1.0e-3, 0.585, 1.111035814e-3, 1.007298385e-3),
+        (2.0e-3, 0.585, 2.014596770e-3, 2.000915418e-3),
+        (0.5e-3, 0.585, 1.089771683e-3, 0.555517907e-3),
+        (1.0e-3, 10.0, 8.3363e-3, 2.2980e-3),
+    ],
+)
+def test_beam_diameter(diameter: float, distance: float, expected: float, printed: float) -> None:
+    got = beam_diameter(diameter, 650e-9, distance)
+    assert got == pytest.approx(expected, rel=1e-5 if distance > 1.0 else 1e-9)
+    # 3.1 as printed puts diameters into the law of the radii.
+    as_printed = diameter * math.sqrt(1.0 + (650e-9 * distance / (math.pi * diameter**2)) ** 2)
+    assert as_printed == pytest.approx(printed, rel=1e-4 if distance > 1.0 else 1e-9)
+    # Far from the waist the full divergence is 4 lambda/(pi D0).
+    assert beam_diameter(diameter, 650e-9, 1e6) / 1e6 == pytest.approx(4.0 * 650e-9 / (math.pi * diameter), rel=1e-6)
+
+
+def test_the_short_form_of_the_index_of_air() -> None:
+    assert air_index_short(101_325.0, 293.15, 50.0, 400.0) == pytest.approx(1.000271314677, abs=1e-12)
+    # As printed, 0.54 (C - 300)/1e-6, it is right at 300 ppm alone.
+    printed = 1.0 + 271.8e-6 * (1.0 + 0.54 * 100.0 / 1e-6) - 1e-8 * 50.0
+    assert printed == pytest.approx(14678.2002713, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('temperature', 'co2', 'humidity', 'expected'),
+    [
+        (293.15, 400.0, 50.0, 1.000271368329),
+        (288.15, 400.0, 50.0, 1.000276207236),
+        (288.15, 450.0, 0.0, 1.000276528867),
+    ],
+)
+def test_the_index_of_air(temperature: float, co2: float, humidity: float, expected: float) -> None:
+    got = air_index(101_325.0, temperature, humidity, co2, 633e-9)
+    assert got == pytest.approx(expected, abs=1e-12)
+    # The short form stays within 2e-7 of it.
+    assert air_index_short(101_325.0, temperature, humidity, co2) == pytest.approx(got, abs=2e-7)
+
+
+def test_standard_air_agrees_with_another_authors_formula() -> None:
+    # Ciddor (Applied Optics 35, 1996) for dry air at 15 degrees, 450 ppm CO2: 1.00027653 at 633 nm.
+    assert air_index(101_325.0, 288.15, 0.0) == pytest.approx(1.00027653, abs=5e-9)
+
+
+@pytest.mark.parametrize(('degrees', 'micrometres'), [(5.0, 0.46), (45.0, 10.488010), (80.0, 987.0)])
+def test_shift_behind_a_boundary(degrees: float, micrometres: float) -> None:
+    cold, warm = (air_index_short(101_325.0, t, 50.0, 400.0) for t in (293.15, 303.15))
+    got = 1e6 * boundary_shift(math.radians(degrees), cold, warm, 0.585)
+    assert got == pytest.approx(micrometres, abs={5.0: 5e-3, 45.0: 5e-7, 80.0: 0.5}[degrees])
+
+
+def test_a_boundary_met_at_right_angles_shifts_nothing() -> None:
+    assert boundary_shift(0.0, 1.0003, 1.0002, 0.585) == 0.0
+
+
+def test_snells_law_and_its_limit() -> None:
+    angle = refracted_angle(0.5, 1.0, 1.5)
+    assert 1.5 * math.sin(angle) == pytest.approx(math.sin(0.5), rel=1e-15)
+    with pytest.raises(ConfigError, match='reflected totally'):
+        refracted_angle(1.2, 1.5, 1.0)
+
+
+def test_a_gradient_bends_the_beam() -> None:
+    per_kelvin = index_per_kelvin(293.15)
+    assert 1e6 * gradient_shift(abs(per_kelvin), 0.585) == pytest.approx(0.159, abs=5e-4)
+    # Slices of a layered medium, refracted one after the other, give the same.
+    gradient, length, slices = 1e-4, 0.585, 2000
+    slope, place, step = 0.0, 0.0, 0.585 / 2000
+    for _ in range(slices):
+        slope += gradient * step / 2.0
+        place += slope * step
+        slope += gradient * step / 2.0
+    assert place == pytest.approx(gradient_shift(gradient, length), rel=1e-9)
+
+
+def test_what_averaging_leaves_of_hum() -> None:
+    assert averaging_gain(20, 50.0, 1000.0) == pytest.approx(0.0, abs=1e-12)
+    assert averaging_gain(20, 60.0, 1000.0) == pytest.approx(0.157, abs=1e-3)
+    # An alias of a constant is not averaged at all.
+    assert averaging_gain(20, 1000.0, 1000.0) == 1.0

@@ -1,0 +1,347 @@
+"""Every term: in the table, right where a closed form says what it must be, and as Monte Carlo has it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psd_deflection.budget.chain import measure
+from psd_deflection.budget.computation import COMPUTATION, stop_window, twist_of_residuals
+from psd_deflection.budget.evaluate import CAUSES, TABLE_3_1, evaluate, monte_carlo
+from psd_deflection.budget.inputs import INPUTS, read_inputs
+from psd_deflection.budget.installation import CENTER_POSITION, PLANE_TILT, SENSOR_HEIGHT, SENSOR_ROTATION
+from psd_deflection.budget.sensor import AMPLIFIER_NOISE, QUANTISATION, SENSOR_GAIN, ZEROING
+from psd_deflection.budget.term import Cause, Kind, Situation
+from psd_deflection.config import Rig, load_rig, replace_values
+from psd_deflection.errors import ConfigError
+from psd_deflection.mechanics import placement
+from psd_deflection.mechanics.dots import plate_points
+from psd_deflection.records import FloatArray
+
+GOLDEN: dict[str, Any] = json.loads((Path(__file__).parent.parent / 'data' / 'golden.json').read_text(encoding='utf-8'))
+CASES = {c['name']: c for c in GOLDEN['cases']}
+RIG = load_rig()
+SIDEBAR = (0.0, -50.0, -29.25)
+MICRO_MILLIDEGREE = np.array([1e6, 1e6, math.degrees(1e3)])
+
+
+def _at(
+    load: tuple[float, float, float] = SIDEBAR, method: str = 'exact', rig: Rig = RIG, **settings: float
+) -> Situation:
+    return Situation.at_load(rig, read_inputs(None, settings), load, method)
+
+
+def _at_pose(pose: FloatArray, method: str = 'exact', rig: Rig = RIG) -> Situation:
+    return replace(_at((0.0, 0.0, 0.0), method, rig), pose=pose)
+
+
+def _cause(name: str) -> Cause:
+    return next(c for c in CAUSES if c.name == name)
+
+
+# ---- The list ----
+
+
+def test_every_row_of_table_3_1_is_there() -> None:
+    assert set(TABLE_3_1) <= {c.row for c in CAUSES}
+    names = [c.name for c in CAUSES]
+    assert len(set(names)) == len(names)
+
+
+def test_terms_name_inputs_that_there_are_and_each_input_serves_a_term() -> None:
+    declared = {i.parameter.name for i in INPUTS}
+    used = {name for c in CAUSES for name in c.inputs}
+    assert used == declared
+    assert all(c.formula for c in CAUSES)
+    assert all(i.source for i in INPUTS)
+
+
+@pytest.mark.parametrize('cause', [c for c in CAUSES if c.kind is not Kind.KNOWN], ids=lambda c: str(c.name))
+def test_an_input_that_is_named_has_an_effect(cause: Cause) -> None:
+    before = cause.contribution(_at()).rms
+    for name in cause.inputs:
+        default = next(i.parameter.default for i in INPUTS if i.parameter.name == name)
+        after = cause.contribution(_at(**{name: 1.1 * default})).rms
+        assert np.any(np.abs(after / before - 1.0) > 1e-6), name
+
+
+# ---- First order and Monte Carlo ----
+
+DRAWS = 10_000
+# Four standard errors of a deviation from that many normal draws, and 1 % for what is beyond second order.
+TOLERANCE = 4.0 / math.sqrt(2.0 * DRAWS) + 0.01
+
+
+@pytest.mark.parametrize(
+    ('method', 'load'), [('exact', SIDEBAR), ('exact', (40.0, 20.0, 15.0)), ('beam', SIDEBAR), ('wls', SIDEBAR)]
+)
+@pytest.mark.parametrize('cause', CAUSES, ids=lambda c: str(c.name))
+def test_first_order_agrees_with_monte_carlo(cause: Cause, load: tuple[float, float, float], method: str) -> None:
+    at = _at(load, method)
+    first = cause.contribution(at)
+    sampled = monte_carlo(at, DRAWS, 7, [cause])
+    # A femtometre is rounding: E_C of an exact method, and the tilt where it is in the model.
+    floor = np.array([1e-15, 1e-15, 1e-14])
+    deviation = np.sqrt(np.diag(first.covariance))
+    assert np.sqrt(np.diag(sampled.covariance)) == pytest.approx(deviation, rel=TOLERANCE, abs=1e-15)
+    largest = np.abs(first.bias) * TOLERANCE + 4.0 * deviation / math.sqrt(DRAWS) + floor
+    assert np.all(np.abs(sampled.bias - first.bias) <= largest)
+
+
+@pytest.mark.parametrize('method', ['exact', 'beam', 'wls', 'thesis_iteration'])
+def test_the_total_agrees_with_drawing_everything_at_once(method: str) -> None:
+    at = _at(method=method)
+    total, sampled = evaluate(at).total(), monte_carlo(at, DRAWS, 11)
+    assert sampled.rms == pytest.approx(total.rms, rel=TOLERANCE)
+    deviation = np.sqrt(np.diag(total.covariance))
+    assert np.all(np.abs(sampled.bias - total.bias) <= 5.0 * deviation / math.sqrt(DRAWS))
+    # Not the deviations only: how dX, dY and theta go together.
+    correlation = total.covariance / np.outer(deviation, deviation)
+    drawn = sampled.covariance / np.sqrt(np.outer(np.diag(sampled.covariance), np.diag(sampled.covariance)))
+    assert drawn == pytest.approx(correlation, abs=4.0 / math.sqrt(DRAWS) + 0.01)
+
+
+# ---- Closed forms ----
+
+
+def test_noise_is_that_of_the_placement() -> None:
+    at = _at((0.0, 0.0, 0.0))
+    per_block = 2e-3 * 0.5e-3 / math.sqrt(20.0)
+    expected = placement.spread_of_pair(RIG.centers, per_block)
+    assert AMPLIFIER_NOISE.contribution(at).rms == pytest.approx(expected, rel=1e-9)
+    step = 10.0 / 2**15 * 0.5e-3
+    expected = placement.spread_of_pair(RIG.centers, step / math.sqrt(12.0 * 20.0))
+    assert QUANTISATION.contribution(at).rms == pytest.approx(expected, rel=1e-9)
+    # At rest a stored zero is read with the same noise, so it counts once more.
+    both = np.hypot(AMPLIFIER_NOISE.contribution(at).rms, QUANTISATION.contribution(at).rms)
+    assert ZEROING.contribution(at).rms == pytest.approx(both, rel=1e-9)
+    assert ZEROING.contribution(_at((0.0, 0.0, 0.0), zero_blocks=4.0)).rms == pytest.approx(both / 2.0, rel=1e-9)
+
+
+def test_quantisation_without_noise_is_not_averaged() -> None:
+    quiet = _at(rig=replace_values(RIG, {'amplifier.noise': 1e-6}))
+    assert QUANTISATION.contribution(quiet).rms == pytest.approx(QUANTISATION.contribution(_at()).rms * math.sqrt(20.0))
+
+
+def test_noise_of_the_tied_method_is_the_golden_covariance() -> None:
+    # Golden case G5 at 2 um a channel.
+    rig = replace_values(RIG, {'amplifier.noise': 4e-3 * math.sqrt(20.0)})
+    dx, dy, _, theta, _, _ = CASES['G5']['pose']
+    got = AMPLIFIER_NOISE.contribution(_at_pose(np.array([dx, dy, theta]), 'beam', rig)).covariance
+    assert got == pytest.approx(np.array(GOLDEN['constants']['cov_beam_G5_2um']), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('scaling', 'expected'), [([0.03, 0.5, 10.0, 0.1], (2.00, 2.00, 1.55)), ([3.0, 0.5, 10.0, 0.1], (2.00, 1.93, 2.31))]
+)
+def test_the_weights_of_the_thesis_are_not_those_of_noise(
+    scaling: list[float], expected: tuple[float, float, float]
+) -> None:
+    rig = replace_values(
+        RIG, {'amplifier.noise': 4e-3 * math.sqrt(20.0), 'wls.weights': 'thesis', 'wls.row_scaling': scaling}
+    )
+    got = AMPLIFIER_NOISE.contribution(_at((0.0, 0.0, 0.0), 'wls', rig)).rms
+    assert got * MICRO_MILLIDEGREE == pytest.approx(expected, abs=5e-3)
+
+
+def test_a_gain_error_scales_the_dots() -> None:
+    # Without twist both dots move by -d, so each coordinate of d is off by the mean of two scale errors.
+    got = SENSOR_GAIN.contribution(_at((0.0, -50.0, 0.0), gain_tolerance=0.01, method='wls'))
+    deviation = 0.01 / math.sqrt(3.0)
+    gain = placement.gain_matrix(placement.design_matrix(RIG.centers))
+    by_hand = deviation * 2.2271675e-3 * np.hypot(gain[:, 1], gain[:, 3])
+    # The cosine of the tip's tilt is 1.6e-5 off 1, and its lever on the dots a little more.
+    assert got.rms == pytest.approx(by_hand, rel=1e-3)
+
+
+def test_a_turned_sensor_turns_what_it_reads() -> None:
+    # Figure 3.3: with d along Y alone the turned sensor reads some of it on X.
+    got = SENSOR_ROTATION.contribution(_at((0.0, -50.0, 0.0), method='wls', rotation_tolerance=0.01))
+    gain = placement.gain_matrix(placement.design_matrix(RIG.centers))
+    by_hand = 0.01 / math.sqrt(3.0) * 2.2271675e-3 * np.hypot(gain[0, 0], gain[0, 2])
+    assert got.rms[0] == pytest.approx(by_hand, rel=1e-3)
+
+
+def test_a_wrong_centre_is_in_the_beam_and_in_the_dot() -> None:
+    # 3.19 perturbs the dots alone: 389 mdeg for 1 mm at 1 degree, where 4.6 mdeg is what happens.
+    pose = np.array([0.001, -0.002, math.radians(1.0)])
+    at = _at_pose(pose)
+    moved = np.zeros((1, 4))
+    moved[0, 1] = 1e-3
+    wrong, right = CENTER_POSITION.apply(at.chain, moved, at), CENTER_POSITION.without(at.chain, at)
+    error = at.estimator.estimate(*measure(wrong, pose))[0] - at.estimator.estimate(*measure(right, pose))[0]
+    assert abs(math.degrees(error[2]) * 1e3) == pytest.approx(4.64, abs=0.05)
+
+
+def test_the_tilt_left_out_is_the_golden_difference() -> None:
+    # G5: cantilever tilt at 50 N; the flat method's answer less the truth.
+    dx, dy, _, theta, _, _ = CASES['G5']['pose']
+    pose = np.array([dx, dy, theta])
+    expected = np.array(CASES['G5']['procrustes']) - pose
+    assert PLANE_TILT.contribution(_at_pose(pose)).bias == pytest.approx(expected, rel=2e-3)
+    assert np.all(PLANE_TILT.contribution(_at_pose(pose, 'beam')).bias == 0.0)
+
+
+def test_a_sensor_off_the_section_needs_the_tilt() -> None:
+    # 20 mm of height make dY of a 50 N load 115 um wrong in a flat model, and nothing in the tied one.
+    rig = replace_values(RIG, {'psd_1.height': 0.02, 'psd_2.height': 0.02})
+    assert abs(PLANE_TILT.contribution(_at(rig=rig)).bias[1]) == pytest.approx(115e-6, abs=2e-6)
+    assert np.all(PLANE_TILT.contribution(_at(rig=rig, method='beam')).bias == 0.0)
+    # So does not knowing the height: 1 mm of both would be 5.7 um.
+    height = SENSOR_HEIGHT.contribution(_at(height_tolerance=1e-3 * math.sqrt(3.0))).rms[1]
+    tilt = 1.5 * 2.2271675e-3 / 0.585
+    assert height == pytest.approx(tilt * 1e-3 * math.hypot(0.8356, 0.1644), rel=0.02)
+
+
+# ---- E_C ----
+
+
+@pytest.mark.parametrize(
+    ('degrees', 'd', 'expected'),
+    [
+        (1.0, (0.0, 0.0), (-7.6152, 5.3307, -0.05077)),
+        (1.0, (2e-3, -2e-3), (-42.825, -29.270, -0.05077)),
+        (3.0, (5e-3, -5e-3), (-337.055, -206.861, -1.37059)),
+    ],
+)
+def test_what_linearising_costs(degrees: float, d: tuple[float, float], expected: tuple[float, float, float]) -> None:
+    pose = np.array([*d, math.radians(degrees)])
+    assert COMPUTATION.contribution(_at_pose(pose, 'wls')).bias * MICRO_MILLIDEGREE == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize('method', ['exact', 'beam'])
+def test_an_exact_method_costs_nothing(method: str) -> None:
+    pose = np.array([0.003, -0.004, math.radians(2.5)])
+    assert np.max(np.abs(COMPUTATION.contribution(_at_pose(pose, method)).bias)) < 1e-15
+
+
+@pytest.mark.parametrize('name', ['G3', 'G4', 'G6', 'G9', 'G10'])
+def test_the_stop_rule_is_short_by_its_window(name: str) -> None:
+    # The golden answers stop at the first trial within 0.1 mm of agreement, in steps of 0.01 degree.
+    dx, dy, _, theta, _, _ = CASES[name]['pose']
+    at = _at_pose(np.array([dx, dy, theta]), 'thesis_iteration')
+    got = COMPUTATION.contribution(at)
+    stopped = np.array(CASES[name]['iter_22_abs']) - at.pose
+    window = stop_window(RIG.centers, 0.1e-3)
+    assert window * MICRO_MILLIDEGREE[2] == pytest.approx(57.30, abs=5e-3)
+    step = math.radians(0.01)
+    assert window - step - 1e-6 <= abs(stopped[2]) <= window + 1e-6
+    # Uniform within one step: within half of one of the mean, and sqrt 12 times the deviation wide.
+    assert abs(stopped[2] - got.bias[2]) <= step / 2.0 + 1e-6
+    assert math.sqrt(12.0 * got.covariance[2, 2]) == pytest.approx(step, rel=1e-6)
+    # The thesis takes d from PSD 1: so wrong an angle swings it by the arm.
+    assert stopped[:2] / stopped[2] == pytest.approx(got.bias[:2] / got.bias[2], rel=0.02, abs=1e-3)
+
+
+def test_a_twist_inside_the_window_is_missed_whole() -> None:
+    at = _at_pose(np.array([0.0, 0.001, math.radians(0.03)]), 'thesis_iteration')
+    assert COMPUTATION.contribution(at).bias[2] == pytest.approx(-math.radians(0.03))
+
+
+def test_a_window_that_may_be_stepped_over_is_refused() -> None:
+    with pytest.raises(ConfigError, match='iteration_step'):
+        COMPUTATION.contribution(_at(method='thesis_iteration', iteration_tolerance=1e-6))
+
+
+@pytest.mark.parametrize(
+    ('residual', 'error'),
+    [
+        ((0.0, 0.0), 0.0),
+        ((1e-4, 1e-4), 12.677143),
+        ((1e-4, -1e-4), -65.169028),
+        ((-1e-4, 1e-4), 65.170320),
+        ((-1e-4, -1e-4), -12.677094),
+    ],
+)
+def test_the_angle_of_given_residuals(residual: tuple[float, float], error: float) -> None:
+    # 3.16 with its sign put right: as printed it gives -1 degree here.
+    pose = np.array([0.001, -0.002, math.radians(1.0), 0.0, 0.0])
+    points = plate_points(pose, RIG.centers, np.zeros(2))
+    got = math.degrees(twist_of_residuals(points, RIG.centers, *residual))
+    assert 1e3 * (got - 1.0) == pytest.approx(error, abs=5e-6)
+    # 3.11 and 3.12, corrected: at the angle found the two sensors disagree by just that, along the base line.
+    if residual == (0.0, 0.0):
+        c, s = math.cos(math.radians(got)), math.sin(math.radians(got))
+        across = points[0] - points[1]
+        turned = np.array([c * across[0] - s * across[1], s * across[0] + c * across[1]])
+        assert turned - (RIG.centers[0] - RIG.centers[1]) == pytest.approx(0.0, abs=1e-15)
+
+
+def test_dots_in_one_place_tell_no_angle() -> None:
+    with pytest.raises(ConfigError, match='coincide'):
+        twist_of_residuals(np.zeros((2, 2)), RIG.centers)
+
+
+def test_the_bound_of_chapter_4_and_what_happens() -> None:
+    # 4.33 at 50 N in mm: R1, R2 off by 1 mm, 2 um on each reading.
+    design = placement.design_matrix(RIG.centers) * [1.0, 1.0, 1e3]
+    change = placement.design_matrix(RIG.centers + np.array([[0.0, 1e-3], [-1e-3, 0.0]])) * [1.0, 1.0, 1e3] - design
+    answer, readings = np.array([0.12, -2.2272, -0.016418]), np.full(4, 2e-3)
+    assert placement.error_bound(design, change, readings, answer) == pytest.approx(3.868396, abs=5e-7)
+    assert placement.error_bound(design, change, readings, answer, 2) == pytest.approx(3.158496, abs=5e-7)
+    # 4.32, what really happens, is a thousand times less.
+    actual = placement.gain_matrix(design) @ (readings - change @ answer)
+    assert np.linalg.norm(actual) == pytest.approx(0.003753514, abs=5e-10)
+
+
+# ---- Where the budget cannot be drawn up ----
+
+
+def test_a_load_that_throws_a_dot_off_its_sensor_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r'psd_1 would lie at y = 8\.9.* mm, outside its \+-5 mm'):
+        _at((0.0, -200.0, 0.0))
+
+
+def test_totals_of_nothing_are_zero() -> None:
+    budget = replace(evaluate(_at()), lines=())
+    assert budget.total(Kind.KNOWN).rms.tolist() == [0.0, 0.0, 0.0]
+    assert budget.shares(budget.total()).tolist() == [0.0, 0.0, 0.0]
+
+
+def test_shares_add_to_one_where_one_bias_stands_alone() -> None:
+    budget = evaluate(_at())
+    assert np.sum([budget.shares(line) for _, line in budget.lines], axis=0) == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ('settings', 'said'),
+    [
+        ({'rotation': 0.1}, 'did you mean rotation_tolerance'),
+        ({'laser_power': 0.0}, 'above 0'),
+        ({'dark_current': 'much'}, 'must be a number'),
+        ({'temperature': 20.0}, 'above 223.15'),
+    ],
+)
+def test_a_bad_input_is_refused_by_name(settings: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        read_inputs(None, settings)
+    assert said in str(error.value)
+    assert next(iter(settings)) in str(error.value)
+
+
+@pytest.mark.parametrize(('text', 'said'), [('- 1', 'name: value'), ('{', 'cannot be read'), ('x: 1', 'no input')])
+def test_a_bad_file_of_inputs_is_refused_by_name(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / 'inputs.yaml'
+    path.write_text(text)
+    with pytest.raises(ConfigError) as error:
+        read_inputs(path)
+    assert said in str(error.value)
+    assert 'inputs.yaml' in str(error.value)
+
+
+def test_inputs_come_from_file_and_settings_in_this_order(tmp_path: Path) -> None:
+    path = tmp_path / 'inputs.yaml'
+    path.write_text('nonlinearity: 5e-4\nair_gradient: 3\n')
+    got = read_inputs(path, {'air_gradient': '4.5'})
+    assert (got['nonlinearity'], got['air_gradient'], got['gain_tolerance']) == (5e-4, 4.5, 2e-3)
+    empty = tmp_path / 'empty.yaml'
+    empty.write_text('')
+    assert read_inputs(empty) == read_inputs()
+    with pytest.raises(ConfigError, match='no such file'):
+        read_inputs(tmp_path / 'absent.yaml')

@@ -1,0 +1,131 @@
+"""The command line: help that teaches, and one clear line for what goes wrong."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.cli.main import COMMANDS, main
+
+ROOT = Path(__file__).parent.parent.parent
+BAGS = ROOT / 'bags'
+
+
+@pytest.mark.parametrize('command', sorted(COMMANDS))
+def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as done:
+        main([command, '--help'])
+    assert done.value.code == 0
+    text = capsys.readouterr().out
+    assert f'psd-deflection {command}' in text
+    assert len(text.splitlines()) > 4
+
+
+def test_the_command_line_without_a_command_names_them(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as done:
+        main([])
+    assert done.value.code == 2
+    with pytest.raises(SystemExit):
+        main(['--help'])
+    text = capsys.readouterr().out
+    assert all(name in text for name in COMMANDS)
+
+
+def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
+    status = main(list(argv))
+    err = capsys.readouterr().err.strip()
+    assert err.count('\n') == 0, err
+    assert err.startswith(f'psd-deflection {argv[0]}: ')
+    return status, err
+
+
+def test_recordings_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / 'folder'
+    folder.mkdir()
+    empty = tmp_path / 'empty.mcap'
+    empty.touch()
+    text = tmp_path / 'notes.txt'
+    text.write_text('hello')
+    fake = tmp_path / 'fake.mcap'
+    fake.write_text('hello, this is no mcap')
+    no_column = tmp_path / 'a.csv'
+    no_column.write_text('t,x1,y1,sum1,x2,sum2\n0,0,0,5,0,5\n')
+    no_number = tmp_path / 'b.csv'
+    no_number.write_text('t,x1,y1,sum1,x2,y2,sum2\n0,0,0,5,0,0,5\n0.001,0,0,5,0,abc,5\n')
+    for path, said in (
+        (tmp_path / 'nowhere', 'no such recording'),
+        (empty, 'is empty'),
+        (text, 'is no recording'),
+        (fake, 'is not an MCAP file'),
+        (folder, 'is no bag'),
+        (no_column, 'y2'),
+        (no_number, "b.csv:3: column y2 holds 'abc'"),
+    ):
+        status, err = refused(capsys, 'replay', str(path))
+        assert status == 4
+        assert said in err
+        assert str(path) in err
+
+
+def test_a_bag_that_lost_its_tail_is_read_up_to_the_cut(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = (BAGS / 'clean' / 'clean_0.mcap').read_bytes()
+    cut = tmp_path / 'cut_0.mcap'
+    cut.write_bytes(whole[: len(whole) * 6 // 10])
+    assert main(['replay', str(cut)]) == 0
+    out, err = capsys.readouterr()
+    assert 'warning' in err
+    assert 'cut_0.mcap' in err
+    samples = int(out.split(': ')[1].split(' samples')[0])
+    assert 1000 < samples < 4000
+
+
+def test_bad_parameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = tmp_path / 'rig.yaml'
+    rig.write_text('/**:\n  ros__parameters:\n    block_size: 0\n')
+    status, err = refused(capsys, 'replay', str(BAGS / 'clean'), '--params-file', str(rig))
+    assert status == 3
+    assert f'{rig}: block_size = 0 samples: must be at least 1' in err
+    rig.write_text('/**: [')
+    status, err = refused(capsys, 'params', '--params-file', str(rig))
+    assert status == 3
+    assert f'{rig}:1:' in err
+
+
+def test_a_rig_that_cannot_be_solved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = tmp_path / 'rig.yaml'
+    rig.write_text('/**:\n  ros__parameters:\n    psd_2:\n      center: [0.0, 0.07]\n')
+    status, err = refused(capsys, 'replay', str(BAGS / 'clean'), '--params-file', str(rig))
+    assert status == 6
+    assert 'coincide' in err
+
+
+def test_output_that_is_there_already_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / 'out.csv'
+    out.write_text('mine')
+    status, err = refused(capsys, 'replay', str(BAGS / 'clean'), '--out', str(out))
+    assert status == 4
+    assert 'never overwritten' in err
+    assert out.read_text() == 'mine'
+
+
+def test_params_lists_each_with_unit_and_bounds(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['params']) == 0
+    out = capsys.readouterr().out
+    assert 'link.length = 0.585 m' in out
+    assert 'above 0 and at most 1000' in out
+
+
+def test_a_closed_pipe_is_no_error() -> None:
+    done = subprocess.run(
+        f'"{sys.executable}" -m psd_deflection params | head -1',
+        shell=True,
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+    )
+    assert done.returncode == 0
+    assert 'Traceback' not in done.stderr

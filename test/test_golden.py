@@ -1,0 +1,132 @@
+"""The golden recordings of ``bags/``: replayed on every run, held against their truth."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from psd_deflection.cli.main import main
+from psd_deflection.cli.replay import replayed, rig_of
+from psd_deflection.io.recordings import open_recording
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import DeflectionEstimate, SpotMeans
+
+BAGS = Path(__file__).parent.parent / 'bags'
+
+LOST = {45, 46, 200, *range(1003, 1030), *range(2000, 2145), 3999}
+WITHOUT_ESTIMATE = {
+    'clean': {},
+    # 3 and 11 of 20 are left of blocks 50 and 51; blocks 100 to 106 are gone altogether; 107 has 15.
+    'lost_samples': {50: 'TOO_FEW_SAMPLES'},
+    # Samples 1507 to 2522, so blocks 75 to 126.
+    'laser_off': dict.fromkeys(range(75, 127), 'LASER_LOST'),
+}
+GONE = {'clean': set(), 'lost_samples': set(range(100, 107)), 'laser_off': set()}
+
+
+def truth(name: str) -> npt.NDArray[np.float64]:
+    """(200, 3): dX, dY, theta, means over each block."""
+    with (BAGS / f'{name}_truth.csv').open() as stream:
+        rows = list(csv.DictReader(stream))
+    return np.array([[float(r[k]) for k in ('dx', 'dy', 'theta')] for r in rows])
+
+
+@pytest.mark.parametrize('name', sorted(WITHOUT_ESTIMATE))
+def test_a_golden_recording_gives_its_estimates_and_they_are_true(name: str) -> None:
+    recording = open_recording(BAGS / name)
+    assert recording.complete
+    assert recording.hello is not None
+    assert recording.hello['serial'] == 'GOLDEN'
+    rig = rig_of(recording, None)
+    pipeline = Pipeline(rig)
+    records = [r for step in replayed(recording, pipeline, recording.blocks()) for r in step]
+    best = {r.block: r for r in records if isinstance(r, DeflectionEstimate) and r.primary}
+    spots = {r.index: r for r in records if isinstance(r, SpotMeans)}
+    assert {i: s.status.name for i, s in spots.items() if s.reason} == WITHOUT_ESTIMATE[name]
+    assert set(range(200)) - set(spots) == GONE[name]
+    assert set(best) == set(spots) - set(WITHOUT_ESTIMATE[name])
+    lost = sum(s.lost for s in spots.values()) + 20 * len(GONE[name])
+    assert lost == (len(LOST) if name == 'lost_samples' else 0)
+    # Against the truth. Where the link still rings, the mean of a block whose samples are not all
+    # there is not the block's mean; whole blocks are.
+    expected = truth(name)
+    whole = [i for i in best if spots[i].present == 20]
+    error = np.array([best[i][3:6] for i in whole]) - expected[whole]
+    sd = np.sqrt([np.array(best[i].covariance)[[0, 4, 8]] for i in whole])
+    # While it rings, the mean dots are not the dots of the mean pose: a turn that varies by 6 mrad
+    # within a block, with a shift that varies by 1 mm, leaves some micrometres.
+    assert (abs(error) < 5.0 * sd + [4e-6, 4e-6, 1.7e-5]).all()
+    # At rest, in the first second, noise alone is left.
+    quiet = [k for k, i in enumerate(whole) if i < 50]
+    assert len(quiet) > 40
+    ratio = np.sqrt((error[quiet] ** 2).mean(axis=0)) / sd[0]
+    assert (ratio < 1.3).all()
+    assert (ratio > 0.7).all()
+    # What was recorded is what comes out; to the last bits, which another processor may round elsewhere.
+    for topic, solver in (('/link_tip/deflection', 'exact'), ('/link_tip/wls/deflection', 'wls')):
+        recorded = recording.estimates()[topic]
+        again = np.array([r[3:6] for r in records if isinstance(r, DeflectionEstimate) and r.solver == solver])
+        np.testing.assert_allclose(recorded.pose, again, rtol=0, atol=1e-12)
+
+
+def test_a_fresh_recording_of_this_machine_replays_to_the_last_bit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Replayed here into a bag of its own, which then is of this machine.
+    again = tmp_path / 'again'
+    assert main(['replay', str(BAGS / 'lost_samples'), '--out', str(again)]) == 0
+    assert main(['replay', str(again), '--compare']) == 0
+    assert 'no bit differs' in capsys.readouterr().out
+
+
+def test_compare_names_the_largest_difference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = tmp_path / 'rig.yaml'
+    rig.write_text('/**:\n  ros__parameters:\n    amplifier:\n      sensitivity: 0.00051\n')
+    assert main(['replay', str(BAGS / 'clean'), '--params-file', str(rig), '--compare']) == 1
+    out = capsys.readouterr().out
+    assert 'differ' in out
+    assert '/link_tip/deflection ΔY (m)' in out
+
+
+def test_a_zero_that_was_taken_while_recording_is_taken_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from psd_deflection.io.bag_writer import BagWriter
+    from psd_deflection.records import RawChunk
+
+    recording = open_recording(BAGS / 'clean')
+    rig = rig_of(recording, None)
+    pipeline = Pipeline(rig)
+    folder = tmp_path / 'zeroed'
+    with BagWriter(folder, rig_values=dict(rig.values)) as bag:
+        for block in recording.blocks():
+            for record in pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags)):
+                bag.write(record)
+            if block.index in (40, 120):
+                change = pipeline.zero()
+                assert change is not None
+                bag.write(change)
+            if block.index == 150:
+                bag.write(pipeline.change({'sum_min': 6.0}))
+    assert main(['replay', str(folder), '--compare']) == 0
+    out = capsys.readouterr().out
+    assert 'no bit differs' in out
+    assert '49 blocks, laser lost' in out
+
+
+def test_csv_out_has_the_contracts_columns(tmp_path: Path) -> None:
+    out = tmp_path / 'estimates.csv'
+    assert main(['replay', str(BAGS / 'clean'), '--out', str(out)]) == 0
+    with out.open() as stream:
+        rows = list(csv.DictReader(stream))
+    names = ['t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta']
+    assert list(rows[0])[:7] == names
+    for solver in ('exact', 'wls', 'iterative'):
+        assert {f'{solver}_dx', f'{solver}_dy', f'{solver}_theta'} <= set(rows[0])
+    assert len(rows) == 200
+    estimates = open_recording(BAGS / 'clean').estimates()['/link_tip/deflection'].pose
+    np.testing.assert_allclose([float(r['dy']) for r in rows], estimates[:, 1], rtol=0, atol=1e-12)
