@@ -120,7 +120,15 @@ class Session:
         hello = self.acquisition.hello.info if self.acquisition.hello is not None else None
 
         def change() -> Path | None:
-            return self.recorder.start(self.rig, hello) if wanted else self.recorder.stop()
+            if not wanted:
+                return self.recorder.stop()
+            running = self.recorder.folder
+            folder = self.recorder.start(self.rig, hello)
+            # What the next block depends on besides itself: without it no replay would be the same.
+            memory = self.pipeline.memory()
+            if memory is not None and folder != running:
+                self.recorder.put_change(memory)
+            return folder
 
         return self.processing.request(change)
 
