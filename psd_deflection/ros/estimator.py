@@ -34,6 +34,7 @@ from psd_deflection.ros.wires import InputRecorder, PublisherWire
 from psd_deflection.runner.health import STALE, HealthReporter
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import Session
+from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 
 NODE_NAME = 'estimator'
 
@@ -131,7 +132,8 @@ class EstimatorNode:
 
     def _wires(self) -> tuple[PublisherWire, InputRecorder]:
         outputs = {topic: kind for topic, kind in TOPIC_TYPES.items() if topic not in INPUTS}
-        outputs.update({solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in self.rig.estimator.solvers})
+        solvers = (*self.rig.estimator.solvers, ONE_PSD)
+        outputs.update({solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in solvers})
         try:
             return PublisherWire(self.node, outputs), InputRecorder(self.node)
         except (InvalidQosOverridesError, ValueError) as error:
