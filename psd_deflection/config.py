@@ -213,6 +213,13 @@ PARAMETERS: tuple[Parameter, ...] = (
     # Recording.
     Parameter('record', 'bool', False, '', 'record from the start'),
     Parameter('bag_dir', 'string', 'recordings', '', 'folder in which recordings are made'),
+    # The live page.
+    Parameter('monitor', 'bool', False, '', 'serve the live page'),
+    Parameter('monitor_address', 'string', '127.0.0.1', '', 'address it is served on; 0.0.0.0 shows it to the network'),
+    Parameter(
+        'monitor_port', 'integer', 8790, '', 'port it is served on; 0 takes any free one', minimum=0, maximum=65535
+    ),
+    Parameter('monitor_control', 'bool', False, '', 'let the page take the zero and record'),
 )
 
 BY_NAME: Mapping[str, Parameter] = MappingProxyType({p.name: p for p in PARAMETERS})
@@ -320,6 +327,16 @@ class AcquisitionConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class MonitorConfig:
+    """The live page: whether, where, and whether its buttons work."""
+
+    enabled: bool
+    address: str
+    port: int
+    control: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Rig:
     """The whole parameter set. ``values`` is what it was made of, flat, defaults included."""
 
@@ -331,6 +348,7 @@ class Rig:
     dynamics: DynamicsConfig
     estimator: EstimatorConfig
     acquisition: AcquisitionConfig
+    monitor: MonitorConfig
     values: Mapping[str, Value] = field(repr=False)
     effects: Mapping[str, Any] = field(default_factory=dict)
 
@@ -479,6 +497,12 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             queue_blocks=v['queue_blocks'],
             record=v['record'],
             bag_dir=v['bag_dir'],
+        ),
+        monitor=MonitorConfig(
+            enabled=v['monitor'],
+            address=v['monitor_address'],
+            port=v['monitor_port'],
+            control=v['monitor_control'],
         ),
         values=MappingProxyType(got),
         effects=MappingProxyType(effects),

@@ -25,6 +25,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters import INPUTS, TOPIC_TYPES, solver_topic
 from psd_deflection.errors import ConfigError, PsdDeflectionError
+from psd_deflection.monitor.start import start_monitor
 from psd_deflection.records import DiagnosticReport
 from psd_deflection.ros.parameters import rig_of_node, watch
 from psd_deflection.runner.health import HealthReporter
@@ -85,6 +86,7 @@ class EstimatorNode:
             raise
         try:
             self._join_ros()
+            self._monitor = start_monitor(self.session, self._say)
         except BaseException:
             self.session.close()
             self.node.destroy_node()
@@ -156,6 +158,8 @@ class EstimatorNode:
 
     def close(self) -> None:
         """End the session, then the node."""
+        if self._monitor is not None:
+            self._monitor.close()
         self.session.close()
         self.node.destroy_node()
 

@@ -21,15 +21,17 @@ from psd_deflection.runner.simulated_rig import SimulatedRigProcess
 
 
 class Session:
-    """Opens on construction. ``say``: told of changes of state, one line each, from any thread.
+    """Opens on construction. ``say``: told of changes of state, one line each, from any thread; so
+    is whoever else is put on ``listeners``.
 
     Raises DeviceError, ConfigError, SolverError or RecordingError where the run cannot start.
     """
 
     def __init__(self, rig: Rig, say: Callable[[str], None]) -> None:
         self._simulated: SimulatedRigProcess | None = None
-        self._say = say
         self._closed = False
+        self.listeners: list[Callable[[str], None]] = [say]
+        say = self._tell
         # The geometry first: a rig that cannot be solved must not open a port.
         pipeline = Pipeline(rig)
         if not rig.acquisition.port:
@@ -49,6 +51,10 @@ class Session:
             if self._simulated is not None:
                 self._simulated.close()
             raise
+
+    def _tell(self, text: str) -> None:
+        for listener in tuple(self.listeners):
+            listener(text)
 
     @property
     def pipeline(self) -> Pipeline:
