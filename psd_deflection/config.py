@@ -114,6 +114,7 @@ def _psd(number: int, center: list[float]) -> list[Parameter]:
             minimum=-0.5,
             maximum=0.5,
             length=2,
+            live=True,
         ),
     ]
 
@@ -164,6 +165,52 @@ PARAMETERS: tuple[Parameter, ...] = (
         'a sum signal below this means that the laser is lost',
         minimum=0.0,
         maximum=100.0,
+        live=True,
+    ),
+    Parameter(
+        'sum_max',
+        'double',
+        7.5,
+        'V',
+        'a sum signal above this means that other light falls on the detector',
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    ),
+    Parameter(
+        'splitter',
+        'bool',
+        False,
+        '',
+        'both detectors share two lasers over a beam splitter (thesis 5.4): one lost halves both sums',
+    ),
+    Parameter(
+        'degraded',
+        'string',
+        'off',
+        '',
+        'with one detector lost: off (no estimate), hold (translation with the last twist), zero (with no twist)',
+        choices=('off', 'hold', 'zero'),
+        live=True,
+    ),
+    Parameter(
+        'twist_sd',
+        'double',
+        0.01,
+        'rad',
+        'standard deviation of the twist where it is not measured (degraded)',
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    ),
+    Parameter(
+        'twist_hold',
+        'double',
+        0.1,
+        's',
+        'time in which a held twist is forgotten: its variance grows to twist_sd^2 (degraded: hold)',
+        above=0.0,
+        maximum=1e6,
         live=True,
     ),
     Parameter('solver', 'string', 'exact', '', 'the solver whose answer is /link_tip/deflection'),
@@ -223,6 +270,26 @@ PARAMETERS: tuple[Parameter, ...] = (
         'queue_blocks', 'integer', 250, 'blocks', 'blocks that may wait for a slow consumer', minimum=2, maximum=100_000
     ),
     Parameter(
+        'serial_number',
+        'string',
+        '',
+        '',
+        'serial number that the device must say (HELLO); with it the device is found again under another port name',
+    ),
+    # The node.
+    Parameter('autostart', 'bool', True, '', 'configure and activate at start; false: wait for lifecycle transitions'),
+    Parameter('keep_zero', 'bool', True, '', '~/zero holds for later runs with the same device as well'),
+    Parameter(
+        'zero_file',
+        'string',
+        '',
+        '',
+        'file in which the zero is kept; empty: by serial number below $XDG_STATE_HOME/psd_deflection',
+    ),
+    Parameter(
+        'realtime', 'bool', True, '', 'ask for SCHED_FIFO (reader) and locked memory; the log says what was granted'
+    ),
+    Parameter(
         'thorlabs.x_sign',
         'double',
         1.0,
@@ -242,6 +309,48 @@ PARAMETERS: tuple[Parameter, ...] = (
     # Recording.
     Parameter('record', 'bool', False, '', 'record from the start'),
     Parameter('bag_dir', 'string', 'recordings', '', 'folder in which recordings are made'),
+    Parameter(
+        'bag_max_bytes',
+        'integer',
+        0,
+        'bytes',
+        'a file of a recording that is as large is ended and the next begun; 0: never',
+        minimum=0,
+        maximum=1_000_000_000_000,
+    ),
+    Parameter(
+        'bag_max_duration',
+        'double',
+        0.0,
+        's',
+        'a file of a recording that is as long is ended and the next begun; 0: never',
+        minimum=0.0,
+        maximum=1e7,
+    ),
+    Parameter(
+        'disk_reserve',
+        'integer',
+        500_000_000,
+        'bytes',
+        'recording stops before the disk has less room than this',
+        minimum=1_000_000,
+        maximum=1_000_000_000_000,
+    ),
+    Parameter(
+        'disk_full',
+        'string',
+        'stop',
+        '',
+        "when the reserve is reached: stop, or delete the oldest file of this recording (never another's)",
+        choices=('stop', 'delete_oldest'),
+    ),
+    # The live page.
+    Parameter('monitor', 'bool', False, '', 'serve the live page'),
+    Parameter('monitor_address', 'string', '127.0.0.1', '', 'address it is served on; 0.0.0.0 shows it to the network'),
+    Parameter(
+        'monitor_port', 'integer', 8790, '', 'port it is served on; 0 takes any free one', minimum=0, maximum=65535
+    ),
+    Parameter('monitor_control', 'bool', False, '', 'let the page take the zero and record'),
 )
 
 BY_NAME: Mapping[str, Parameter] = MappingProxyType({p.name: p for p in PARAMETERS})
@@ -329,6 +438,11 @@ class EstimatorConfig:
     block_size: int
     min_samples: int
     sum_min: float
+    sum_max: float
+    splitter: bool
+    degraded: str
+    twist_sd: float
+    twist_hold: float
     solver: str
     solvers: tuple[str, ...]
     wls_weights: str
@@ -344,8 +458,26 @@ class AcquisitionConfig:
     baud: int
     latency_offset: float
     queue_blocks: int
+    serial_number: str
+    keep_zero: bool
+    zero_file: str
+    realtime: bool
     record: bool
     bag_dir: str
+    bag_max_bytes: int
+    bag_max_duration: float
+    disk_reserve: int
+    disk_full: str
+
+
+@dataclass(frozen=True, slots=True)
+class MonitorConfig:
+    """The live page: whether, where, and whether its buttons work."""
+
+    enabled: bool
+    address: str
+    port: int
+    control: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,6 +492,7 @@ class Rig:
     dynamics: DynamicsConfig
     estimator: EstimatorConfig
     acquisition: AcquisitionConfig
+    monitor: MonitorConfig
     values: Mapping[str, Value] = field(repr=False)
     effects: Mapping[str, Any] = field(default_factory=dict)
 
@@ -495,6 +628,11 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             block_size=v['block_size'],
             min_samples=v['min_samples'],
             sum_min=v['sum_min'],
+            sum_max=v['sum_max'],
+            splitter=v['splitter'],
+            degraded=v['degraded'],
+            twist_sd=v['twist_sd'],
+            twist_hold=v['twist_hold'],
             solver=v['solver'],
             solvers=tuple(v['solvers']),
             wls_weights=v['wls.weights'],
@@ -506,8 +644,22 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             baud=v['baud'],
             latency_offset=v['latency_offset'],
             queue_blocks=v['queue_blocks'],
+            serial_number=v['serial_number'],
+            keep_zero=v['keep_zero'],
+            zero_file=v['zero_file'],
+            realtime=v['realtime'],
             record=v['record'],
             bag_dir=v['bag_dir'],
+            bag_max_bytes=v['bag_max_bytes'],
+            bag_max_duration=v['bag_max_duration'],
+            disk_reserve=v['disk_reserve'],
+            disk_full=v['disk_full'],
+        ),
+        monitor=MonitorConfig(
+            enabled=v['monitor'],
+            address=v['monitor_address'],
+            port=v['monitor_port'],
+            control=v['monitor_control'],
         ),
         values=MappingProxyType(got),
         effects=MappingProxyType(effects),

@@ -16,11 +16,14 @@ from psd_deflection.errors import PsdDeflectionError
 
 COMMANDS: dict[str, str] = {
     'estimator': 'acquire, estimate, publish on ROS 2 and record (the daemon)',
+    'monitor': 'serve a live page: of the rig, or of a recording that plays',
     'replay': 'run a recording through the same pipeline',
     'simulate': 'simulate the rig: as a recording, or as a device on a pseudo-terminal',
     'devices': 'list serial ports, say what answers on each, suggest the parameters',
+    'discover': 'name what the simulation lacks to explain a recording, and add it',
     'info': 'say what is in a recording',
     'convert': 'write the samples of a recording as a CSV, an .mcap or a bag',
+    'recover': 'make a recording whole that a crash left without its end',
     'budget': 'error budget: what each cause does to dX, dY and theta (chapter 3)',
     'design': 'size the link and place the sensors (appendix B, condition numbers)',
     'compare-methods': 'how far each method is off, and where the figures of Table 5.1 come from',

@@ -118,7 +118,8 @@ class SimulatedDevice:
                 case HelloRequestFrame():
                     replies += encode(self.hello)
                 case PingFrame(cookie):
-                    elapsed = since_power_up_ns / self._period_host_ns * self._period_device_us
+                    # The clock of the samples, which a device that has run for long has from its first one.
+                    elapsed = (self._first_seq + since_power_up_ns / self._period_host_ns) * self._period_device_us
                     replies += encode(PongFrame(cookie, int(elapsed)))
                 case StartFrame():
                     self._streaming = True

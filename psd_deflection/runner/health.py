@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from psd_deflection.records import BlockStatus, DiagnosticEntry, DiagnosticReport
+from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.runner.session import Session
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
+
+CLOCK_STEP_NS = 20_000_000
+"""A system clock that has moved by more against CLOCK_MONOTONIC was set."""
 
 
 class _Seen(NamedTuple):
@@ -18,6 +21,7 @@ class _Seen(NamedTuple):
     dropped: int
     blocks: int
     estimates: int
+    degraded: int
 
 
 class HealthReporter:
@@ -32,7 +36,9 @@ class HealthReporter:
         s = self._session
         wire, pipeline = s.acquisition.counters, s.pipeline.counters
         dropped = wire.queue_dropped + s.recorder.dropped
-        now = _Seen(t_ns, wire.samples, wire.lost, wire.bad, dropped, pipeline.blocks, pipeline.estimates)
+        now = _Seen(
+            t_ns, wire.samples, wire.lost, wire.bad, dropped, pipeline.blocks, pipeline.estimates, pipeline.degraded
+        )
         # The first report counts from the start; its rates are those of an unknown time.
         before = self._seen
         self._seen = now
@@ -67,6 +73,7 @@ class HealthReporter:
             ('rate (samples/s)', rate),
             ('samples', str(wire.samples)),
             ('lost', str(wire.lost)),
+            *((f'lost: {cause}', str(count)) for cause, count in sorted(wire.lost_by.items())),
             ('repeated', str(wire.repeated)),
             ('bad frames', str(wire.bad)),
             *((f'bad frames: {reason}', str(count)) for reason, count in sorted(wire.bad_frames.items())),
@@ -74,6 +81,9 @@ class HealthReporter:
             ('dropped by a full queue', str(wire.queue_dropped)),
             ('device restarts', str(wire.restarts)),
             ('disconnects', str(wire.disconnects)),
+            ('silences', str(wire.silences)),
+            ('refused on coming back', str(wire.refused_reopenings)),
+            ('blocks waiting', str(s.acquisition.queue.qsize())),
         ]
         values += s.acquisition.source.describe().items()
         if wire.temperature is not None:
@@ -81,15 +91,27 @@ class HealthReporter:
         return DiagnosticEntry('psd_deflection: acquisition', level, message, tuple(values))
 
     def _clock(self) -> DiagnosticEntry:
-        clock = self._session.acquisition.clock_state()
-        values = (
+        acquisition = self._session.acquisition
+        clock, wire = acquisition.clock_state(), acquisition.counters
+        stepped = acquisition.system_clock_step_ns()
+        values = [
             ('skew (ppm)', f'{clock.skew_ppm:.2f}'),
             ('offset (ns)', str(clock.offset_ns)),
             ('residual (us)', f'{clock.residual_ns / 1e3:.1f}'),
             ('seconds in the fit', str(clock.points)),
+            ('device clock jumps', str(wire.clock_jumps)),
             ('laid anew', str(clock.resets)),
-        )
-        return DiagnosticEntry('psd_deflection: clock', OK, f'skew {clock.skew_ppm:.1f} ppm', values)
+            ('pings', str(wire.pings)),
+            ('pings answered', str(wire.pongs)),
+            ('system clock moved since the start (ms)', f'{stepped / 1e6:.3f}'),
+        ]
+        if clock.round_trip_ns is not None:
+            values.append(('least round trip (us)', f'{clock.round_trip_ns / 1e3:.0f}'))
+        level, message = OK, f'skew {clock.skew_ppm:.1f} ppm'
+        if abs(stepped) > CLOCK_STEP_NS:
+            level = WARN
+            message = f'the system clock was set by {stepped / 1e9:+.3f} s; stamps go on as before until the next start'
+        return DiagnosticEntry('psd_deflection: clock', level, message, tuple(values))
 
     def _estimates(self, new: _Seen, rate: str) -> DiagnosticEntry:
         pipeline, latency = self._session.pipeline.counters, self._session.processing.latency()
@@ -99,10 +121,20 @@ class HealthReporter:
             level, message = ERROR, spots.reason if spots is not None and spots.reason else 'no blocks'
         elif new.estimates < new.blocks:
             level, message = WARN, f'{new.blocks - new.estimates} of {new.blocks} blocks have no estimate'
+        elif new.degraded and spots is not None:
+            rule = self._session.rig.estimator.degraded
+            twist = 'held' if rule == 'hold' else 'assumed 0'
+            level = WARN
+            message = (
+                f'degraded: {new.degraded} of {new.blocks} blocks from one detector, twist {twist}; {spots.reason}'
+            )
         values = [
             ('rate (estimates/s)', rate),
             ('blocks', str(pipeline.blocks)),
             ('estimates', str(pipeline.estimates)),
+            ('degraded', str(pipeline.degraded)),
+            ('status', spots.status.name if spots is not None else 'none yet'),
+            *((f'found: {finding}', str(count)) for finding, count in sorted(pipeline.findings.items())),
             *((f'refused: {cause}', str(count)) for cause, count in sorted(pipeline.refused.items())),
         ]
         if latency is not None:
@@ -117,10 +149,15 @@ class HealthReporter:
             return DiagnosticEntry(name, STALE, 'no block yet', ())
         total = spots.sums[psd - 1]
         x, y = spots.dots[2 * psd - 2], spots.dots[2 * psd - 1]
-        lost = total < self._session.rig.estimator.sum_min
-        mine = lost or (
-            spots.status in (BlockStatus.SATURATED, BlockStatus.OUTSIDE_ACTIVE_AREA) and f'{psd} ' in spots.reason
-        )
+        # Reasons and findings name the detector they are about.
+        names = (f'laser {psd} ', f'x{psd} ', f'y{psd} ', f'sum{psd} ', f'psd_{psd} ')
+        fault = spots.reason if spots.reason.startswith(names) else ''
+        found = [f for f in spots.findings if f.startswith((f'psd_{psd}', 'one of the two lasers'))]
+        level, message = OK, 'dot seen'
+        if found:
+            level, message = WARN, '; '.join(found)
+        if fault or total < self._session.rig.estimator.sum_min * 0.5:
+            level, message = ERROR, fault or 'laser lost'
         values = (
             ('sum (V)', f'{total:.4f}'),
             ('x (mm)', f'{x * 1e3:.4f}'),
@@ -128,9 +165,7 @@ class HealthReporter:
             ('x, std in the block (um)', f'{spots.covariance[2 * psd - 2, 2 * psd - 2] ** 0.5 * 1e6:.2f}'),
             ('y, std in the block (um)', f'{spots.covariance[2 * psd - 1, 2 * psd - 1] ** 0.5 * 1e6:.2f}'),
         )
-        return DiagnosticEntry(
-            name, ERROR if mine else OK, (spots.reason or 'laser lost') if mine else 'dot seen', values
-        )
+        return DiagnosticEntry(name, level, message, values)
 
     def _recording(self) -> DiagnosticEntry:
         recorder = self._session.recorder
@@ -139,10 +174,12 @@ class HealthReporter:
             ('folder', str(folder or '')),
             ('messages', str(recorder.written)),
             ('dropped', str(recorder.dropped)),
+            ('waiting for the disk', str(recorder.waiting)),
+            ('files deleted to make room', str(recorder.files_deleted)),
         )
-        return DiagnosticEntry(
-            'psd_deflection: recording',
-            WARN if recorder.dropped else OK,
-            'recording' if folder else 'not recording',
-            values,
-        )
+        level, message = OK, 'recording' if folder else 'not recording'
+        if recorder.failure:
+            level, message = ERROR, f'recording stopped: {recorder.failure}'
+        elif recorder.dropped:
+            level, message = WARN, f'{recorder.dropped} messages dropped: the disk is too slow'
+        return DiagnosticEntry('psd_deflection: recording', level, message, values)

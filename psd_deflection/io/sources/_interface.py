@@ -124,6 +124,9 @@ class Source(abc.ABC):
         del cookie
         return False
 
+    def wake(self) -> None:  # noqa: B027 - most devices cannot be asked
+        """The device has been silent for long: ask it for samples once more. Raises PortClosedError."""
+
     @abc.abstractmethod
     def describe(self) -> Mapping[str, str]:
         """What it is and how it does, name to text, for the log and for diagnostics."""
