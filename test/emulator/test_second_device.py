@@ -92,7 +92,7 @@ def test_it_works_unchanged_with_the_daemon(port: str) -> None:
     assert hello.info['serial'] == 'SECOND-7'
     try:
         session.start()
-        while session.processing.alive and session.pipeline.counters.estimates < 40:
+        while session.pipeline.counters.estimates < 40 and session.acquisition.counters.samples < 20_000:
             session.processing.request(lambda: None)
     finally:
         session.close()
