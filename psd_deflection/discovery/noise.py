@@ -1,9 +1,9 @@
 """The noise: from rest and from where no effect is, never from the residual that is to be explained.
 
-The level comes from the upper half of the residual's spectrum (no link motion there), by its lower
-nine tenths over frequencies, which lines of mains and modes do not move. The colour comes from rest: before the
-first load, and long after the last change. Only where rest shows memory beyond doubt is an
-autoregressive model fitted; otherwise the noise is white, which is sharper.
+The level comes from the upper half of the residual's spectrum (no link motion there), from the lower
+nine tenths over frequencies, which lines of mains and modes do not move. The colour comes from rest:
+before the first load, and long after the last change. Only where rest shows memory beyond doubt is
+an autoregressive model fitted; otherwise the noise is white, which is sharper.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _level(power: FloatArray) -> float:
     The mean of an exponential below its 0.9 quantile is (1 - 0.1 (1 + ln 10))/0.9 of the whole.
     """
     below = power[power <= np.quantile(power, 0.9)]
-    return float(below.mean()) * 0.9 / (1.0 - 0.1 * (1.0 + np.log(10.0)))
+    return float(below.mean() * 0.9 / (1.0 - 0.1 * (1.0 + np.log(10.0))))
 
 
 def _ar_density(phi: FloatArray, frequency: FloatArray) -> FloatArray:
@@ -150,12 +150,8 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
         coloured.append(bool(memory))
         if memory:
             phi = solve_toeplitz(pooled[:-1], pooled[1:])
-            shape = (
-                1.0 / np.abs(1.0 - np.exp(-2j * np.pi * np.outer(frequency[upper], np.arange(1, ORDER + 1))) @ phi) ** 2
-            )
-            scale = level / float(np.median(shape))
-            grid = np.arange(4096) / 4096.0
-            density = scale / np.abs(1.0 - np.exp(-2j * np.pi * np.outer(grid, np.arange(1, ORDER + 1))) @ phi) ** 2
+            scale = _level(power[upper] / _ar_density(phi, frequency[upper]))
+            density = scale * _ar_density(phi, np.arange(4096) / 4096.0)
             acov = np.real(np.fft.ifft(density))[:lags]
         sigma[c] = np.sqrt(acov[0])
         of_fine = _block_autocovariance(acov, fine, ORDER + 1)
