@@ -151,7 +151,7 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
         if memory:
             phi = solve_toeplitz(pooled[:-1], pooled[1:])
             scale = _level(power[upper] / _ar_density(phi, frequency[upper]))
-            density = scale * _ar_density(phi, np.arange(4096) / 4096.0)
+            density = scale * _ar_density(phi, np.arange(4096, dtype=np.float64) / 4096.0)
             acov = np.real(np.fft.ifft(density))[:lags]
         sigma[c] = np.sqrt(acov[0])
         of_fine = _block_autocovariance(acov, fine, ORDER + 1)
