@@ -129,7 +129,7 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
     ar = np.zeros((6, ORDER))
     coloured = []
     present = float(np.mean(np.isfinite(residual[:, 0])))
-    frequency = np.fft.rfftfreq(n, 1.0)
+    frequency = np.asarray(np.fft.rfftfreq(n, 1.0), dtype=np.float64)
     upper = frequency > 0.2
     for c in range(6):
         power = np.abs(np.fft.rfft(filled[:, c] * np.hanning(n))) ** 2 / (0.375 * n) / max(present, 0.1)
@@ -151,7 +151,7 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
         if memory:
             phi = solve_toeplitz(pooled[:-1], pooled[1:])
             scale = _level(power[upper] / _ar_density(phi, frequency[upper]))
-            density = scale * _ar_density(phi, np.arange(4096, dtype=np.float64) / 4096.0)
+            density = scale * _ar_density(phi, np.linspace(0.0, 1.0, 4096, endpoint=False))
             acov = np.real(np.fft.ifft(density))[:lags]
         sigma[c] = np.sqrt(acov[0])
         of_fine = _block_autocovariance(acov, fine, ORDER + 1)
