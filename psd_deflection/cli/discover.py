@@ -60,13 +60,14 @@ def run(args: argparse.Namespace) -> int:
 
         def progress(words: str) -> None:
             bar.set_description_str(words)
-            bar.update(min(1, bar.total - 1 - bar.n))
+            if bar.n < STEPS - 1:
+                bar.update()
 
         found = discover(observations, rig, seed=args.seed, without=args.without, progress=progress)
         progress('report')
         page = report_html(found)
         bar.set_description_str('done')
-        bar.update(bar.total - bar.n)
+        bar.update(STEPS - bar.n)
     files = {
         'model.yaml': model_yaml(rig, found.active_effects),
         'result.json': json.dumps(result(found), indent=1, allow_nan=False) + '\n',
