@@ -167,6 +167,52 @@ PARAMETERS: tuple[Parameter, ...] = (
         maximum=100.0,
         live=True,
     ),
+    Parameter(
+        'sum_max',
+        'double',
+        7.5,
+        'V',
+        'a sum signal above this means that other light falls on the detector',
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    ),
+    Parameter(
+        'splitter',
+        'bool',
+        False,
+        '',
+        'both detectors share two lasers over a beam splitter (thesis 5.4): one lost halves both sums',
+    ),
+    Parameter(
+        'degraded',
+        'string',
+        'off',
+        '',
+        'with one detector lost: off (no estimate), hold (translation with the last twist), zero (with no twist)',
+        choices=('off', 'hold', 'zero'),
+        live=True,
+    ),
+    Parameter(
+        'twist_sd',
+        'double',
+        0.01,
+        'rad',
+        'standard deviation of the twist where it is not measured (degraded)',
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    ),
+    Parameter(
+        'twist_hold',
+        'double',
+        0.1,
+        's',
+        'time in which a held twist is forgotten: its variance grows to twist_sd^2 (degraded: hold)',
+        above=0.0,
+        maximum=1e6,
+        live=True,
+    ),
     Parameter('solver', 'string', 'exact', '', 'the solver whose answer is /link_tip/deflection'),
     Parameter(
         'solvers',
@@ -194,8 +240,20 @@ PARAMETERS: tuple[Parameter, ...] = (
         length=4,
     ),
     # Acquisition.
-    Parameter('source', 'string', 'serial', '', 'what the device speaks: serial (our own frames), or a plug-in'),
-    Parameter('port', 'string', '', '', 'serial port; empty starts the simulated rig'),
+    Parameter(
+        'source',
+        'string',
+        'serial',
+        '',
+        'what the device speaks: serial (our own frames), dataq, thorlabs, lines, replay, or the name of a plug-in',
+    ),
+    Parameter(
+        'port',
+        'string',
+        '',
+        '',
+        'serial port (two with a comma between for thorlabs, a recording for replay); empty starts the simulated rig',
+    ),
     Parameter(
         'baud', 'integer', 921_600, 'baud', 'line speed (USB-CDC devices ignore it)', minimum=1200, maximum=12_000_000
     ),
@@ -230,6 +288,23 @@ PARAMETERS: tuple[Parameter, ...] = (
     ),
     Parameter(
         'realtime', 'bool', True, '', 'ask for SCHED_FIFO (reader) and locked memory; the log says what was granted'
+    ),
+    Parameter(
+        'thorlabs.x_sign',
+        'double',
+        1.0,
+        '',
+        'sign of x of both aligners, 1 or -1: which it is shows when a dot is moved',
+        minimum=-1.0,
+        maximum=1.0,
+    ),
+    Parameter(
+        'replay.stamps',
+        'string',
+        'now',
+        '',
+        'times of replayed samples: of now in the recorded rhythm, or as recorded',
+        choices=('now', 'recorded'),
     ),
     # Recording.
     Parameter('record', 'bool', False, '', 'record from the start'),
@@ -269,6 +344,13 @@ PARAMETERS: tuple[Parameter, ...] = (
         "when the reserve is reached: stop, or delete the oldest file of this recording (never another's)",
         choices=('stop', 'delete_oldest'),
     ),
+    # The live page.
+    Parameter('monitor', 'bool', False, '', 'serve the live page'),
+    Parameter('monitor_address', 'string', '127.0.0.1', '', 'address it is served on; 0.0.0.0 shows it to the network'),
+    Parameter(
+        'monitor_port', 'integer', 8790, '', 'port it is served on; 0 takes any free one', minimum=0, maximum=65535
+    ),
+    Parameter('monitor_control', 'bool', False, '', 'let the page take the zero and record'),
 )
 
 BY_NAME: Mapping[str, Parameter] = MappingProxyType({p.name: p for p in PARAMETERS})
@@ -356,6 +438,11 @@ class EstimatorConfig:
     block_size: int
     min_samples: int
     sum_min: float
+    sum_max: float
+    splitter: bool
+    degraded: str
+    twist_sd: float
+    twist_hold: float
     solver: str
     solvers: tuple[str, ...]
     wls_weights: str
@@ -384,6 +471,16 @@ class AcquisitionConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class MonitorConfig:
+    """The live page: whether, where, and whether its buttons work."""
+
+    enabled: bool
+    address: str
+    port: int
+    control: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Rig:
     """The whole parameter set. ``values`` is what it was made of, flat, defaults included."""
 
@@ -395,6 +492,7 @@ class Rig:
     dynamics: DynamicsConfig
     estimator: EstimatorConfig
     acquisition: AcquisitionConfig
+    monitor: MonitorConfig
     values: Mapping[str, Value] = field(repr=False)
     effects: Mapping[str, Any] = field(default_factory=dict)
 
@@ -530,6 +628,11 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             block_size=v['block_size'],
             min_samples=v['min_samples'],
             sum_min=v['sum_min'],
+            sum_max=v['sum_max'],
+            splitter=v['splitter'],
+            degraded=v['degraded'],
+            twist_sd=v['twist_sd'],
+            twist_hold=v['twist_hold'],
             solver=v['solver'],
             solvers=tuple(v['solvers']),
             wls_weights=v['wls.weights'],
@@ -551,6 +654,12 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             bag_max_duration=v['bag_max_duration'],
             disk_reserve=v['disk_reserve'],
             disk_full=v['disk_full'],
+        ),
+        monitor=MonitorConfig(
+            enabled=v['monitor'],
+            address=v['monitor_address'],
+            port=v['monitor_port'],
+            control=v['monitor_control'],
         ),
         values=MappingProxyType(got),
         effects=MappingProxyType(effects),
