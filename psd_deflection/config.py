@@ -240,8 +240,20 @@ PARAMETERS: tuple[Parameter, ...] = (
         length=4,
     ),
     # Acquisition.
-    Parameter('source', 'string', 'serial', '', 'what the device speaks: serial (our own frames), or a plug-in'),
-    Parameter('port', 'string', '', '', 'serial port; empty starts the simulated rig'),
+    Parameter(
+        'source',
+        'string',
+        'serial',
+        '',
+        'what the device speaks: serial (our own frames), dataq, thorlabs, lines, replay, or the name of a plug-in',
+    ),
+    Parameter(
+        'port',
+        'string',
+        '',
+        '',
+        'serial port (two with a comma between for thorlabs, a recording for replay); empty starts the simulated rig',
+    ),
     Parameter(
         'baud', 'integer', 921_600, 'baud', 'line speed (USB-CDC devices ignore it)', minimum=1200, maximum=12_000_000
     ),
@@ -276,6 +288,23 @@ PARAMETERS: tuple[Parameter, ...] = (
     ),
     Parameter(
         'realtime', 'bool', True, '', 'ask for SCHED_FIFO (reader) and locked memory; the log says what was granted'
+    ),
+    Parameter(
+        'thorlabs.x_sign',
+        'double',
+        1.0,
+        '',
+        'sign of x of both aligners, 1 or -1: which it is shows when a dot is moved',
+        minimum=-1.0,
+        maximum=1.0,
+    ),
+    Parameter(
+        'replay.stamps',
+        'string',
+        'now',
+        '',
+        'times of replayed samples: of now in the recorded rhythm, or as recorded',
+        choices=('now', 'recorded'),
     ),
     # Recording.
     Parameter('record', 'bool', False, '', 'record from the start'),

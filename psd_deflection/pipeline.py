@@ -6,7 +6,7 @@ metres -> what the rig file knows to be wrong taken off -> health -> solvers -> 
 load that the link model needs for them.
 
 What it remembers from block to block (the twist that ``degraded: hold`` holds, how long a detector
-has stood still) is told as a record when a recording starts (:meth:`Pipeline.memory`).
+has stood still) is told as a record when a recording starts (:meth:`Pipeline.environment`).
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from psd_deflection.calibration.health import OpticsHealth, Verdict
 from psd_deflection.config import Rig, replace_values
 from psd_deflection.mechanics import LinkStatics
 from psd_deflection.records import (
+    ENVIRONMENT,
     BlockStatus,
     DeflectionEstimate,
     FloatArray,
@@ -46,7 +47,9 @@ ZERO_BLOCKS = 25
 """Blocks whose mean is taken as the unloaded dots by :meth:`Pipeline.zero`: half a second."""
 
 HELD, FROZEN = 'state.held_twist', 'state.frozen_blocks'
-"""Names under which :meth:`Pipeline.memory` tells what is remembered."""
+"""Names under which :meth:`Pipeline.environment` tells what is remembered."""
+
+START, FIRST_TEMPERATURE, TEMPERATURE = ENVIRONMENT
 
 Dots = tuple[float, float, float, float]
 
@@ -92,6 +95,7 @@ class Pipeline:
         self._recent: list[Dots] = []
         self._held: _Held | None = None
         self._frozen = (0, 0)
+        self._environment: dict[str, float] = {}
         variances = dot_noise_variances(rig)
         self._variances = [tuple(float(v) / n for v in variances) for n in range(1, config.block_size + 1)]
         self._build(rig)
@@ -111,6 +115,11 @@ class Pipeline:
         """Samples passed over because their number did not rise."""
         return self._cutter.repeated
 
+    @property
+    def needs_temperature(self) -> bool:
+        """Whether a corrected effect goes with the ambient temperature."""
+        return self._correction.uses_temperature
+
     def process(self, chunk: RawChunk) -> Iterator[Record]:
         """The records of every block that ``chunk`` completes, each as soon as it is known.
 
@@ -124,6 +133,8 @@ class Pipeline:
         else:
             volts = readings.astype(np.float32, copy=False)
         for block in self._cutter.add(chunk, volts):
+            if self._correction.uses_time and START not in self._environment:
+                yield self._environment_change(block.index, {START: float(block.t_ns[0])})
             yield from self._block(block)
 
     def flush(self) -> Iterator[Record]:
@@ -161,20 +172,45 @@ class Pipeline:
             self._held = _Held(int(held[0]), held[1], held[2])
         if isinstance(frozen, list) and len(frozen) == 2:
             self._frozen = (int(frozen[0]), int(frozen[1]))
+        for name in ENVIRONMENT:
+            value = values.pop(name, None)
+            if isinstance(value, (int, float)):
+                self._environment[name] = float(value)
         if values:
             self._build(replace_values(self.rig, values, 'change'))
 
-    def memory(self) -> ParameterChange | None:
-        """What the next block depends on beside its samples and the rig, or None where that is nothing."""
-        values: list[tuple[str, tuple[float, ...]]] = []
-        if self._held is not None and self.rig.estimator.degraded == 'hold':
-            values.append((HELD, tuple(self._held)))
-        if self._frozen != (0, 0):
-            values.append((FROZEN, self._frozen))
-        last = self.last_spots
-        if not values or last is None:
+    def temperature(self, celsius: float) -> ParameterChange | None:
+        """The ambient temperature from the next block on; None where no correction needs it."""
+        if not self._correction.uses_temperature:
             return None
-        return ParameterChange(last.t_ns, last.index + 1, tuple(values))
+        index = self.last_spots.index + 1 if self.last_spots is not None else 0
+        first = self._environment.get(FIRST_TEMPERATURE, celsius)
+        return self._environment_change(index, {FIRST_TEMPERATURE: first, TEMPERATURE: celsius})
+
+    def environment(self) -> ParameterChange | None:
+        """What the estimates depend on now besides the rig and the samples: a recording starts with it."""
+        values: dict[str, float | tuple[float, ...]] = dict(self._environment)
+        if self._held is not None and self.rig.estimator.degraded == 'hold':
+            values[HELD] = tuple(self._held)
+        if self._frozen != (0, 0):
+            values[FROZEN] = self._frozen
+        if not values:
+            return None
+        last = self.last_spots
+        return ParameterChange(
+            last.t_ns if last is not None else 0, last.index + 1 if last is not None else 0, tuple(values.items())
+        )
+
+    def _environment_change(self, block: int, values: Mapping[str, float]) -> ParameterChange:
+        self._environment.update(values)
+        t_ns = self.last_spots.t_ns if self.last_spots is not None else 0
+        return ParameterChange(t_ns, block, tuple(self._environment.items()))
+
+    def _corrected(self, block: SampleBlock, samples: FloatArray, sums: FloatArray) -> FloatArray:
+        held = self._environment
+        warmer = held.get(TEMPERATURE, 0.0) - held.get(FIRST_TEMPERATURE, 0.0)
+        t: FloatArray = (block.t_ns - held.get(START, float(block.t_ns[0]))) * np.float64(1e-9)
+        return self._correction.apply(samples, sums, warmer, t)
 
     def _block(self, block: SampleBlock) -> Iterator[Record]:
         size = self._cutter.block_size
@@ -185,7 +221,7 @@ class Pipeline:
         sums = volts[:, 2::3].astype(np.float64)
         samples = self._calibration.dots(volts)
         if self._correction.active:
-            samples = self._correction.apply(samples, sums)
+            samples = self._corrected(block, samples, sums)
         x1, y1, x2, y2 = (samples.sum(axis=0) / present).tolist()
         dots: Dots = (x1, y1, x2, y2)
         still = self._optics.still(volts)

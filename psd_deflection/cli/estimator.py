@@ -37,6 +37,9 @@ PLAIN_REFRESH_S = 5.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('--port', help='serial port of the device; without it a simulated rig is started')
+    parser.add_argument(
+        '--source', help='what the device speaks: serial (our own frames), dataq, thorlabs, lines, replay'
+    )
     parser.add_argument('--baud', type=int, help='line speed (default 921600; USB-CDC devices ignore it)')
     parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig')
     parser.add_argument(
@@ -52,6 +55,8 @@ def overrides_of(args: argparse.Namespace) -> dict[str, object]:
     values: dict[str, object] = dict(read_parameter_file(args.params_file)) if args.params_file else {}
     if args.port is not None:
         values['port'] = args.port
+    if args.source is not None:
+        values['source'] = args.source
     if args.baud is not None:
         values['baud'] = args.baud
     if args.solver is not None:

@@ -118,7 +118,9 @@ def records(
     """What the rig would have recorded, and the estimates that the daemon would have made of it."""
     simulator, pipeline = RigSimulator(rig, seed), Pipeline(rig)
     period = 1e9 / rig.converter.sample_rate_hz
+    # A temperature takes effect with the block that follows it: then block by block.
     size = max(1, round(CHUNK_SECONDS * rig.converter.sample_rate_hz))
+    size = rig.estimator.block_size if temperature is not None else size
     last: tuple[float, ...] | None = None
     last_temperature: float | None = None
     block = rig.estimator.block_size
@@ -135,6 +137,9 @@ def records(
             if temperature is not None and i % block == 0 and float(temperature[i]) != last_temperature:
                 last_temperature = float(temperature[i])
                 yield TemperatureReading(int(t_ns[i - start]), last_temperature)
+                warmer = pipeline.temperature(last_temperature)
+                if warmer is not None:
+                    yield warmer
         part = simulator.step(loads[start:stop], None if temperature is None else temperature[start:stop])
         if reference:
             for i in range(0, stop - start, block):

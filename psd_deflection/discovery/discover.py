@@ -19,7 +19,7 @@ from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.localise import Localisation, localise
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.screen import Screen
-from psd_deflection.discovery.search import BIC_ACCEPT, P_ACCEPT, Search, SearchResult
+from psd_deflection.discovery.search import BIC_ACCEPT, BUDGET, P_ACCEPT, Search, SearchResult
 from psd_deflection.discovery.signatures import SignatureBank, candidates
 from psd_deflection.discovery.validate import HeldOut, heldout_gain, heldout_gap
 from psd_deflection.discovery.workspace import Workspace
@@ -142,20 +142,21 @@ def discover(
     result = search.run()
     progress('weighing')
     kept, fit = _accept(search, result, rng)
-    fit, kept, left = _credible(search, result, fit, kept, rng)
+    seen = 0.0 if lattice is None else 2.0 * _lattice_gain(workspace, lattice)
+    fit, kept, left = _credible(search, result, fit, kept, seen, rng)
     if lattice is not None:
         workspace.base = tuple(base)
     return _answer(search, result, fit, kept, left, lattice, rng, seed, progress)
 
 
 def _credible(
-    search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut], rng: np.random.Generator
+    search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut], seen: float, rng: np.random.Generator
 ) -> tuple[Fit, list[HeldOut], Localisation]:
     """Where something unknown remains, an effect that explains less than what remains is a stand-in for it."""
     ws = search.workspace
     while True:
         left = localise(ws, fit.residual, fit.jacobian if fit.free else None, rng)
-        if not fit.effects or not _unknown(left, max(result.null.chi2 - fit.chi2, 0.0)):
+        if not fit.effects or not _unknown(left, max(result.null.chi2 - fit.chi2, 0.0) + seen):
             break
         weakest = int(np.argmin(result.delta_chi2))
         if result.delta_chi2[weakest] >= left.excess:
@@ -230,7 +231,8 @@ def _answer(
     named: list[NamedEffect] = []
     progress('alternatives')
     for i, active in enumerate(fit.effects):
-        fits = search.alternatives(fit, i, result.delta_chi2[i])
+        # Where the joint rule has taken effects out, what stood beside them is no longer comparable.
+        fits = result.alternatives[i] if fit is result.fit else search.alternatives(fit, i, result.delta_chi2[i])
         rows, equal = [], []
         for f in fits:
             loss = f.chi2 - fit.chi2
@@ -249,7 +251,7 @@ def _answer(
                 heldout[i],
                 names,
                 tuple(rows),
-                suggest(ws, fit, equal[:3]) if equal else None,
+                suggest(ws, fit, equal[: 3 if ws.simulations < BUDGET else 1]) if equal else None,
             )
         )
     if lattice is not None:
@@ -258,7 +260,8 @@ def _answer(
     progress('where')
     before = left if fit is null else localise(ws, null.residual, None, rng)
     floor = ws.floor()
-    explained = max(null.chi2 - fit.chi2, 0.0)
+    # Coarse steps make noise that comes and goes with the signal; what they explain stands against that.
+    explained = max(null.chi2 - fit.chi2, 0.0) + (0.0 if lattice is None else 2.0 * _lattice_gain(ws, lattice))
     unknown = _unknown(left, explained)
     verdict = 'unknown_effect' if unknown else 'effects_found' if named else 'nothing_missing'
     channels = ws.gap_per_channel(null.difference), ws.gap_per_channel(fit.difference)
@@ -291,11 +294,16 @@ def _answer(
     )
 
 
+def _lattice_gain(workspace: Workspace, lattice: ActiveEffect) -> float:
+    """Log-likelihood of all readings lying on the lattice: by chance each does with 1 in step/LSB."""
+    lsb = workspace.observations[0].rig.converter.volts_per_count
+    return workspace.size * workspace.fine[0] * float(np.log(max(lattice.values['step'] / lsb, 1.0)))
+
+
 def _named_lattice(workspace: Workspace, lattice: ActiveEffect) -> NamedEffect:
-    """Coarse steps are seen in the values themselves: each reading lies on the lattice, by chance 1 in step/LSB."""
-    rig = workspace.observations[0].rig
-    step, lsb = lattice.values['step'], rig.converter.volts_per_count
-    gain = workspace.size * workspace.fine[0] * float(np.log(max(step / lsb, 1.0)))
+    """Coarse steps are seen in the values themselves."""
+    lsb = workspace.observations[0].rig.converter.volts_per_count
+    step, gain = lattice.values['step'], _lattice_gain(workspace, lattice)
     # The lattice's far ends fix the step to a fraction of a count over their distance.
     span = max(float(np.nanmax(np.abs(o.volts))) for o in workspace.observations)
     sd = 0.3 * lsb * step / max(span, step)

@@ -27,8 +27,8 @@ SHARE_ACCEPT = 0.002
 two exact but different discretisations for example, is not to be trusted to explain."""
 MAX_EFFECTS = 4
 TRIALS = 7
-BUDGET = 700
-"""Forward simulations after which nothing more is added; what follows the search needs as many again."""
+BUDGET = 600
+"""Forward simulations after which nothing more is added; the alternatives end at twice as many."""
 SWAP_REACH = 0.6
 """Of what the named effect explains, the share an alternative must explain to be refitted."""
 
@@ -36,7 +36,8 @@ SWAP_REACH = 0.6
 @dataclass(slots=True, eq=False)
 class SearchResult:
     """``fit``: the model chosen. ``null``: the rig file's own. ``p``: library-wide, per effect.
-    ``delta_bic``: what dropping each effect would cost. ``candidates_tried``: for the report.
+    ``delta_bic``: what dropping each effect would cost. ``alternatives``: for each effect of ``fit``,
+    refits with another in its place.
     """
 
     null: Fit
@@ -45,6 +46,7 @@ class SearchResult:
     delta_bic: list[float]
     delta_chi2: list[float]
     first_scores: list[Score]
+    alternatives: list[list[Fit]]
     trace: list[str] = field(default_factory=list)
 
 
@@ -85,17 +87,17 @@ class Search:
         self.trace: list[str] = []
 
     def _say(self, text: str) -> None:
-        self.trace.append(text)
+        self.trace.append(f'{text} [{self.workspace.simulations}]')
         self._progress(text)
 
     def _bic(self, fit: Fit) -> float:
         return fit.chi2 + self.penalty * fit.parameters
 
-    def _best_of(self, starts: Sequence[Sequence[ActiveEffect]], keep: int = 3) -> Fit | None:
+    def _best_of(self, starts: Sequence[Sequence[ActiveEffect]], keep: int, iterations: int) -> Fit | None:
         """Refit each start a little, the best few in full."""
-        fits = [refit(self.workspace, s, iterations=2) for s in starts]
+        fits = [refit(self.workspace, s, iterations=3) for s in starts]
         fits.sort(key=self._bic)
-        full = [refit(self.workspace, f.effects, iterations=12) for f in fits[:keep]]
+        full = [refit(self.workspace, f.effects, iterations=iterations) for f in fits[:keep]]
         return min(full, key=self._bic, default=None)
 
     def _passes(self, smaller: Fit, larger: Fit, null: Fit) -> bool:
@@ -138,9 +140,10 @@ class Search:
             scores = [s for s in scores if s.candidate.variant not in taken]
             if not scores or min(s.p for s in scores) > P_ACCEPT:
                 break
+            # From the second on, what is left is smaller and the first guess better.
             tried = promising(scores, self.penalty, 0.3, TRIALS if not current.effects else 4)
             starts = [[*current.effects, s.candidate.from_coefficients(s.coefficients)] for s in tried]
-            better = self._best_of(starts)
+            better = self._best_of(starts, 2, 6) if current.effects else self._best_of(starts, 4, 12)
             if better is None or not self._passes(current, better, null):
                 break
             self._say('adding ' + better.effects[-1].label)
@@ -152,8 +155,31 @@ class Search:
             if len(current.effects) == 2 and ws.simulations < BUDGET:
                 current = self._try_pairs(null, current)
         current = self._drop(null, current)
-        current, p, delta_bic, delta_chi2 = self._weigh(null, current)
-        return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, self.trace)
+        if current.effects:
+            current = self.renoise(current)
+            null = refit(ws, ())
+        current, others = self._swap(null, current)
+        p, delta_bic, delta_chi2 = self._weigh(null, current)
+        return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace)
+
+    def _swap(self, null: Fit, current: Fit) -> tuple[Fit, list[list[Fit]]]:
+        """Each effect against what might stand in its place; the better model stays, twice at most."""
+        others: list[list[Fit]] = []
+        for swaps in range(3):
+            others = []
+            _, _, gains = self._weigh(null, current)
+            best = current
+            for i in range(len(current.effects)):
+                fits = self.alternatives(current, i, gains[i])
+                others.append(fits)
+                best = min([best, *fits], key=self._bic)
+            spent = self.workspace.simulations > 1.5 * BUDGET
+            if swaps == 2 or spent or self._bic(best) > self._bic(current) - 2.0:
+                break
+            self._say('swapping to ' + ', '.join(a.label for a in best.effects))
+            current = refit(self.workspace, best.effects, iterations=8)
+            current = self._drop(null, current)
+        return current, others
 
     def _try_pairs(self, null: Fit, current: Fit) -> Fit:
         pairs = self.screen.pairs(null.residual, self.penalty, 5)
@@ -163,7 +189,7 @@ class Search:
                 starts.append(
                     [a.candidate.from_coefficients(a.coefficients), b.candidate.from_coefficients(b.coefficients)]
                 )
-        best = self._best_of(starts, keep=2)
+        best = self._best_of(starts, 2, 8)
         if best is not None and self._bic(best) < self._bic(current) - 2.0:
             self._say('a better pair: ' + ', '.join(a.label for a in best.effects))
             return best
@@ -182,7 +208,7 @@ class Search:
             current = best
         return current
 
-    def _weigh(self, null: Fit, current: Fit) -> tuple[Fit, list[float], list[float], list[float]]:
+    def _weigh(self, null: Fit, current: Fit) -> tuple[list[float], list[float], list[float]]:
         p, delta_bic, delta_chi2 = [], [], []
         for i in range(len(current.effects)):
             rest = [a for j, a in enumerate(current.effects) if j != i]
@@ -191,13 +217,15 @@ class Search:
             delta_chi2.append(gain)
             delta_bic.append(self._bic(without) - self._bic(current))
             p.append(self.library_p(gain, len(current.columns_of(i))))
-        return current, p, delta_bic, delta_chi2
+        return p, delta_bic, delta_chi2
 
     def alternatives(self, current: Fit, index: int, gain: float) -> list[Fit]:
         """Refits with effect ``index`` swapped for each effect that might do as well, best first.
 
         ``gain``: what the named effect explains, in chi-square.
         """
+        if self.workspace.simulations > 2 * BUDGET:
+            return []
         named = current.effects[index]
         rest = [a for j, a in enumerate(current.effects) if j != index]
         without = refit(self.workspace, rest, iterations=4) if rest else refit(self.workspace, ())
@@ -214,12 +242,12 @@ class Search:
                 best[name] = s
         # The most likely eight: an exact confounder screens as high as the named effect itself.
         # Where the search itself was dear, the data are no simple case, and three must do.
-        ranked = sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.workspace.simulations < BUDGET else 3]
+        ranked = sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.workspace.simulations < BUDGET else 2]
         fits = []
         for s in ranked:
             start = [*rest, s.candidate.from_coefficients(s.coefficients)]
             quick = refit(self.workspace, start, iterations=3)
-            if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain):
+            if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain) and self.workspace.simulations < 2 * BUDGET:
                 quick = refit(self.workspace, quick.effects, iterations=8)
             fits.append(quick)
         fits.sort(key=lambda f: f.chi2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -11,7 +12,9 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from msg_adapters import DIAGNOSTICS, INPUTS, SAMPLES, TOPIC_TYPES
+from msg_adapters import DIAGNOSTICS, INPUTS, SAMPLES, TEMPERATURE, TOPIC_TYPES, from_fields
+from psd_deflection.io import cdr
+from psd_deflection.records import TemperatureReading
 from psd_deflection.runner.session import Session
 
 DEPTH = 10
@@ -78,3 +81,13 @@ class InputRecorder:
             self.refused += 1
         elif self.session is not None:
             self.session.recorder.put(topic, TOPIC_TYPES[topic], bytes(message), self._clock.now().nanoseconds)
+            if topic == TEMPERATURE and self.session.pipeline.needs_temperature:
+                self._correct_for(message, self.session)
+
+    def _correct_for(self, message: bytes, session: Session) -> None:
+        try:
+            reading = from_fields(TEMPERATURE, cdr.decode(TOPIC_TYPES[TEMPERATURE], bytes(message)))
+            if isinstance(reading, TemperatureReading) and math.isfinite(reading.celsius):
+                session.temperature(reading.celsius)
+        except (ValueError, TimeoutError):
+            self.refused += 1

@@ -30,6 +30,9 @@ HUNG_S = 5.0
 JOIN_S = 0.5
 """How long the last blocks may take at the end."""
 
+SIMULATED = ('serial', 'dataq', 'thorlabs', 'lines')
+"""Sources for which a simulated rig is started where no port is named."""
+
 
 class Session:
     """Opens on construction. ``say``: told of changes of state, one line each, from any thread.
@@ -43,7 +46,7 @@ class Session:
         self._closed = False
         # The geometry first: a rig that cannot be solved must not open a port.
         pipeline = Pipeline(rig)
-        if not rig.acquisition.port:
+        if not rig.acquisition.port and rig.acquisition.source in SIMULATED:
             self._simulated = SimulatedRigProcess(rig)
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)
@@ -60,7 +63,7 @@ class Session:
                 if about:
                     say(about)
                     pipeline = Pipeline(rig)
-            say(', '.join(f'{name} {what}' for name, what in self.acquisition.source.describe().items()))
+            say('; '.join(f'{name}: {what}' for name, what in self.acquisition.source.describe().items()))
             self.processing = Processing(self.acquisition, pipeline, say)
             self.recorder = Recorder(rig.acquisition.queue_blocks, say)
             self.fanout = Fanout()
@@ -125,12 +128,27 @@ class Session:
             running = self.recorder.folder
             folder = self.recorder.start(self.rig, hello)
             # What the next block depends on besides itself: without it no replay would be the same.
-            memory = self.pipeline.memory()
-            if memory is not None and folder != running:
-                self.recorder.put_change(memory)
+            held = self.pipeline.environment()
+            if held is not None and folder != running:
+                self.recorder.put_change(held)
             return folder
 
         return self.processing.request(change)
+
+    def temperature(self, celsius: float) -> None:
+        """The ambient temperature, for the corrections that need it; from the next block on.
+
+        Raises TimeoutError where no data flows.
+        """
+        if not self.pipeline.needs_temperature:
+            return
+
+        def change() -> None:
+            taken = self.pipeline.temperature(celsius)
+            if taken is not None:
+                self.processing.give([taken])
+
+        self.processing.request(change)
 
     def zero(self) -> ParameterChange | None:
         """Take the present dots as the unloaded ones; None where no good block has come yet.

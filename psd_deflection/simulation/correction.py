@@ -55,6 +55,16 @@ class Correction:
         """Whether there is anything to correct."""
         return bool(self._sensors) or self._moves_optics
 
+    @property
+    def uses_time(self) -> bool:
+        """Whether a corrected effect goes on with time."""
+        return 'laser_pointing_drift' in self.names
+
+    @property
+    def uses_temperature(self) -> bool:
+        """Whether a corrected effect goes with temperature."""
+        return bool({'thermal_drift', 'refraction'} & set(self.names))
+
     def apply(
         self,
         dots: FloatArray,

@@ -25,6 +25,10 @@ GROUP = 'psd_deflection.sources'
 SOURCES: MappingProxyType[str, str] = MappingProxyType(
     {
         'serial': 'psd_deflection.io.sources.contract_frames:ContractFrames',
+        'dataq': 'psd_deflection.io.sources.dataq:Dataq',
+        'thorlabs': 'psd_deflection.io.sources.thorlabs:ThorlabsPair',
+        'lines': 'psd_deflection.io.sources.text_lines:TextLines',
+        'replay': 'psd_deflection.io.sources.replay:Replay',
     }
 )
 """Name to ``module:class``, the default first; a module is imported when its source is asked for."""
