@@ -23,7 +23,7 @@ SOURCES := $(shell find psd_deflection msg_adapters config launch resource -type
 $(VENV)/.requirements: setup.cfg
 	$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info[:2] <= (3, 12) else f"Python 3.11 or 3.12 is needed, this is {sys.version.split()[0]}: make PYTHON=python3.12")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[ros,test]' $(if $(WITH),'$(WITH)')
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[ros,monitor,test]' $(if $(WITH),'$(WITH)')
 	touch $@
 
 # Installed as a user has it (a wheel, not a link to the checkout), so that `ros2 run` finds it.
@@ -47,7 +47,7 @@ unit: $(VENV)/.installed
 	$(BIN)/python -m pytest
 
 run: $(VENV)/.installed
-	$(BIN)/psd-deflection estimator --record recordings $(if $(PORT),--port $(PORT)) $(ARGS)
+	$(BIN)/psd-deflection estimator --monitor --record recordings $(if $(PORT),--port $(PORT)) $(ARGS)
 
 bench: $(VENV)/.installed
 	$(BIN)/python bench/live.py

@@ -344,6 +344,13 @@ PARAMETERS: tuple[Parameter, ...] = (
         "when the reserve is reached: stop, or delete the oldest file of this recording (never another's)",
         choices=('stop', 'delete_oldest'),
     ),
+    # The live page.
+    Parameter('monitor', 'bool', False, '', 'serve the live page'),
+    Parameter('monitor_address', 'string', '127.0.0.1', '', 'address it is served on; 0.0.0.0 shows it to the network'),
+    Parameter(
+        'monitor_port', 'integer', 8790, '', 'port it is served on; 0 takes any free one', minimum=0, maximum=65535
+    ),
+    Parameter('monitor_control', 'bool', False, '', 'let the page take the zero and record'),
 )
 
 BY_NAME: Mapping[str, Parameter] = MappingProxyType({p.name: p for p in PARAMETERS})
@@ -464,6 +471,16 @@ class AcquisitionConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class MonitorConfig:
+    """The live page: whether, where, and whether its buttons work."""
+
+    enabled: bool
+    address: str
+    port: int
+    control: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Rig:
     """The whole parameter set. ``values`` is what it was made of, flat, defaults included."""
 
@@ -475,6 +492,7 @@ class Rig:
     dynamics: DynamicsConfig
     estimator: EstimatorConfig
     acquisition: AcquisitionConfig
+    monitor: MonitorConfig
     values: Mapping[str, Value] = field(repr=False)
     effects: Mapping[str, Any] = field(default_factory=dict)
 
@@ -636,6 +654,12 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             bag_max_duration=v['bag_max_duration'],
             disk_reserve=v['disk_reserve'],
             disk_full=v['disk_full'],
+        ),
+        monitor=MonitorConfig(
+            enabled=v['monitor'],
+            address=v['monitor_address'],
+            port=v['monitor_port'],
+            control=v['monitor_control'],
         ),
         values=MappingProxyType(got),
         effects=MappingProxyType(effects),

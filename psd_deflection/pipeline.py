@@ -6,7 +6,7 @@ metres -> what the rig file knows to be wrong taken off -> health -> solvers -> 
 load that the link model needs for them.
 
 What it remembers from block to block (the twist that ``degraded: hold`` holds, how long a detector
-has stood still) is told as a record when a recording starts (:meth:`Pipeline.environment`).
+has stood still) is told as a record when a recording starts (:meth:`Pipeline.memory`).
 """
 
 from __future__ import annotations
@@ -46,10 +46,9 @@ from psd_deflection.solvers.one_psd import OnePsd
 ZERO_BLOCKS = 25
 """Blocks whose mean is taken as the unloaded dots by :meth:`Pipeline.zero`: half a second."""
 
-HELD, FROZEN = 'state.held_twist', 'state.frozen_blocks'
-"""Names under which :meth:`Pipeline.environment` tells what is remembered."""
-
 START, FIRST_TEMPERATURE, TEMPERATURE = ENVIRONMENT
+HELD, FROZEN = 'state.held_twist', 'state.frozen_blocks'
+"""Names under which :meth:`Pipeline.memory` tells what is remembered."""
 
 Dots = tuple[float, float, float, float]
 
@@ -93,9 +92,9 @@ class Pipeline:
         self._period_ns = 1e9 / rig.converter.sample_rate_hz
         self._statics = LinkStatics.from_rig(rig)
         self._recent: list[Dots] = []
+        self._environment: dict[str, float] = {}
         self._held: _Held | None = None
         self._frozen = (0, 0)
-        self._environment: dict[str, float] = {}
         variances = dot_noise_variances(rig)
         self._variances = [tuple(float(v) / n for v in variances) for n in range(1, config.block_size + 1)]
         self._build(rig)
@@ -167,17 +166,29 @@ class Pipeline:
     def apply(self, change: ParameterChange) -> None:
         """Use the changed values from now on. Raises ConfigError where one is out of bounds."""
         values = {name: list(v) if isinstance(v, tuple) else v for name, v in change.values}
+        for name in ENVIRONMENT:
+            value = values.pop(name, None)
+            if isinstance(value, (int, float)):
+                self._environment[name] = float(value)
         held, frozen = values.pop(HELD, None), values.pop(FROZEN, None)
         if isinstance(held, list) and len(held) == 3:
             self._held = _Held(int(held[0]), held[1], held[2])
         if isinstance(frozen, list) and len(frozen) == 2:
             self._frozen = (int(frozen[0]), int(frozen[1]))
-        for name in ENVIRONMENT:
-            value = values.pop(name, None)
-            if isinstance(value, (int, float)):
-                self._environment[name] = float(value)
         if values:
             self._build(replace_values(self.rig, values, 'change'))
+
+    def memory(self) -> ParameterChange | None:
+        """What the next block depends on beside its samples and the rig, or None where that is nothing."""
+        values: list[tuple[str, float | str | tuple[float, ...]]] = list(self._environment.items())
+        if self._held is not None and self.rig.estimator.degraded == 'hold':
+            values.append((HELD, tuple(self._held)))
+        if self._frozen != (0, 0):
+            values.append((FROZEN, self._frozen))
+        last = self.last_spots
+        if not values or last is None:
+            return None
+        return ParameterChange(last.t_ns, last.index + 1, tuple(values))
 
     def temperature(self, celsius: float) -> ParameterChange | None:
         """The ambient temperature from the next block on; None where no correction needs it."""
@@ -186,20 +197,6 @@ class Pipeline:
         index = self.last_spots.index + 1 if self.last_spots is not None else 0
         first = self._environment.get(FIRST_TEMPERATURE, celsius)
         return self._environment_change(index, {FIRST_TEMPERATURE: first, TEMPERATURE: celsius})
-
-    def environment(self) -> ParameterChange | None:
-        """What the estimates depend on now besides the rig and the samples: a recording starts with it."""
-        values: dict[str, float | tuple[float, ...]] = dict(self._environment)
-        if self._held is not None and self.rig.estimator.degraded == 'hold':
-            values[HELD] = tuple(self._held)
-        if self._frozen != (0, 0):
-            values[FROZEN] = self._frozen
-        if not values:
-            return None
-        last = self.last_spots
-        return ParameterChange(
-            last.t_ns if last is not None else 0, last.index + 1 if last is not None else 0, tuple(values.items())
-        )
 
     def _environment_change(self, block: int, values: Mapping[str, float]) -> ParameterChange:
         self._environment.update(values)

@@ -27,6 +27,7 @@ from pathlib import Path
 
 from psd_deflection.config import read_parameter_file, rig_from_values
 from psd_deflection.errors import ConfigError
+from psd_deflection.monitor.start import start_monitor
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import Session
 
@@ -46,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--record', nargs='?', const='', metavar='FOLDER', help='record from the start, below FOLDER (recordings/)'
     )
     parser.add_argument('--solver', help='solver whose answer is published as /link_tip/deflection')
+    parser.add_argument('--monitor', action='store_true', help='serve the live page and print its address')
     parser.add_argument('--no-ros', action='store_true', help='acquire and record without ROS')
     parser.add_argument('--ros-args', action='store_true', help='what follows is for ROS (ros2 run, ros2 launch)')
 
@@ -65,6 +67,8 @@ def overrides_of(args: argparse.Namespace) -> dict[str, object]:
         values['record'] = True
         if args.record:
             values['bag_dir'] = args.record
+    if args.monitor:
+        values['monitor'] = True
     # Refuse them here, where the file's name is known.
     rig_from_values(values, args.params_file or 'command line')
     return values
@@ -143,7 +147,7 @@ def run(args: argparse.Namespace) -> int:
         display.update(session)
 
     if args.no_ros:
-        status = _run_without_ros(overrides, display, watch)
+        status = run_without_ros(overrides, display, watch)
     else:
         if importlib.util.find_spec('rclpy') is None:
             raise ConfigError(
@@ -158,14 +162,17 @@ def run(args: argparse.Namespace) -> int:
     return status
 
 
-def _run_without_ros(overrides: dict[str, object], display: Display, watch: Callable[[Session], None]) -> int:
+def run_without_ros(overrides: dict[str, object], display: Display, watch: Callable[[Session], None]) -> int:
+    """Run a session, and its live page where the parameters say so, until SIGINT or SIGTERM."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     session = Session(rig_from_values(overrides, 'command line'), display.say)
     watchdog = Watchdog()
+    monitor = None
     try:
         settle()
+        monitor = start_monitor(session, display.say)
         session.start()
         watchdog.ready()
         while not stop.wait(0.1) and session.processing.alive:
@@ -174,6 +181,8 @@ def _run_without_ros(overrides: dict[str, object], display: Display, watch: Call
             watch(session)
     finally:
         watchdog.stopping()
+        if monitor is not None:
+            monitor.close()
         session.close()
     if session.failed is not None:
         raise session.failed

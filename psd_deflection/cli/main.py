@@ -16,6 +16,7 @@ from psd_deflection.errors import PsdDeflectionError
 
 COMMANDS: dict[str, str] = {
     'estimator': 'acquire, estimate, publish on ROS 2 and record (the daemon)',
+    'monitor': 'serve a live page: of the rig, or of a recording that plays',
     'replay': 'run a recording through the same pipeline',
     'simulate': 'simulate the rig: as a recording, or as a device on a pseudo-terminal',
     'discover': 'name what the simulation lacks to explain a recording, and add it',

@@ -15,6 +15,7 @@ import os
 import signal
 import types
 from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import rclpy
 from rclpy.exceptions import ParameterException
@@ -28,6 +29,7 @@ from std_srvs.srv import SetBool, Trigger
 from msg_adapters import DEFLECTION, DIAGNOSTICS, INPUTS, TOPIC_TYPES, solver_topic, to_messages
 from psd_deflection.errors import ConfigError, PsdDeflectionError
 from psd_deflection.io import cdr
+from psd_deflection.monitor.start import start_monitor
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.parameters import LiveParameters, rig_of_node
 from psd_deflection.ros.wires import InputRecorder, PublisherWire
@@ -35,6 +37,9 @@ from psd_deflection.runner.health import STALE, HealthReporter
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import Session
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
+
+if TYPE_CHECKING:
+    from psd_deflection.monitor.server import MonitorServer
 
 NODE_NAME = 'estimator'
 
@@ -109,6 +114,7 @@ class EstimatorNode:
         self._signals = signals
         self._starting = False
         self._health: HealthReporter | None = None
+        self._monitor: MonitorServer | None = None
         try:
             self.node = _ManagedNode(
                 NODE_NAME,
@@ -182,6 +188,7 @@ class EstimatorNode:
             session.fanout.wires.insert(0, self._wire)
             self._inputs.session = session
             session.start()
+            self._monitor = start_monitor(session, self._say)
         except BaseException:
             self.cleanup()
             raise
@@ -205,6 +212,9 @@ class EstimatorNode:
         self._inputs.session = None
         self._live.session = None
         self._health = None
+        monitor, self._monitor = self._monitor, None
+        if monitor is not None:
+            monitor.close()
         session, self.session = self.session, None
         if session is not None:
             session.close()

@@ -35,15 +35,17 @@ SIMULATED = ('serial', 'dataq', 'thorlabs', 'lines')
 
 
 class Session:
-    """Opens on construction. ``say``: told of changes of state, one line each, from any thread.
+    """Opens on construction. ``say``: told of changes of state, one line each, from any thread; so
+    is whoever else is put on ``listeners``.
 
     Raises DeviceError, ConfigError, SolverError or RecordingError where the run cannot start.
     """
 
     def __init__(self, rig: Rig, say: Callable[[str], None]) -> None:
         self._simulated: SimulatedRigProcess | None = None
-        self._say = say
         self._closed = False
+        self.listeners: list[Callable[[str], None]] = [say]
+        say = self._tell
         # The geometry first: a rig that cannot be solved must not open a port.
         pipeline = Pipeline(rig)
         if not rig.acquisition.port and rig.acquisition.source in SIMULATED:
@@ -75,6 +77,10 @@ class Session:
             if self._simulated is not None:
                 self._simulated.close()
             raise
+
+    def _tell(self, text: str) -> None:
+        for listener in tuple(self.listeners):
+            listener(text)
 
     @property
     def pipeline(self) -> Pipeline:
@@ -108,7 +114,7 @@ class Session:
         """
         cdr.prepare(TOPIC_TYPES.values())
         if self.rig.acquisition.realtime:
-            self._say(lock_memory())
+            self._tell(lock_memory())
         self.fanout.wires.append(self.recorder)
         if self.rig.acquisition.record:
             self.record(True)
@@ -128,9 +134,9 @@ class Session:
             running = self.recorder.folder
             folder = self.recorder.start(self.rig, hello)
             # What the next block depends on besides itself: without it no replay would be the same.
-            held = self.pipeline.environment()
-            if held is not None and folder != running:
-                self.recorder.put_change(held)
+            memory = self.pipeline.memory()
+            if memory is not None and folder != running:
+                self.recorder.put_change(memory)
             return folder
 
         return self.processing.request(change)
@@ -180,7 +186,7 @@ class Session:
     def _keep_zero(self) -> None:
         trouble = self._store.save(self.rig) if self._store is not None else ''
         if trouble:
-            self._say(trouble)
+            self._tell(trouble)
 
     def close(self) -> Path | None:
         """Stop reading, process what was read, end the recording; returns its folder.
@@ -195,7 +201,7 @@ class Session:
         self.acquisition.stop()
         self.processing.join(JOIN_S)
         if self.processing.alive:
-            self._say('a subscriber or the disk holds up the last blocks; they are not waited for')
+            self._tell('a subscriber or the disk holds up the last blocks; they are not waited for')
         folder = self.recorder.stop()
         if self._simulated is not None:
             self._simulated.close()

@@ -1,0 +1,137 @@
+"""Serve a live page: both detectors, deflection and twist, spectrum, rates, losses, clock, health.
+
+Without REC it acquires, without ROS, from --port or from a simulated rig of its own. With REC (a bag
+folder, an .mcap or a .csv) it plays that recording. The page is for this machine alone unless
+--address says otherwise; its buttons (zero, record) are off unless --control allows them, and need
+the token in the printed address where others can reach the page. Ctrl-C ends it.
+
+  psd-deflection monitor                                     the simulated rig
+  psd-deflection monitor --port /dev/ttyACM0 --control       a device, with buttons
+  psd-deflection monitor recordings/psd_20260101_120000 --speed 2 --loop
+
+The node serves the same page:  psd-deflection estimator --monitor, or the parameter monitor:=true.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import signal
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+from psd_deflection.cli.estimator import Display, run_without_ros
+from psd_deflection.cli.replay import replayed, rig_of
+from psd_deflection.config import read_parameter_file, replace_values, rig_from_values
+from psd_deflection.errors import ConfigError
+from psd_deflection.io.recordings import open_recording
+from psd_deflection.monitor.feed import Feed
+from psd_deflection.monitor.source import ReplaySource
+from psd_deflection.monitor.start import need_server
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import Record
+from psd_deflection.runner.session import Session
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('recording', nargs='?', metavar='REC', help='a bag folder, an .mcap or a .csv to play')
+    parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig')
+    page = parser.add_argument_group('the page')
+    page.add_argument('--http-port', type=int, metavar='N', help='port of the page (default 8790; 0: any free one)')
+    page.add_argument('--address', help='address to serve on (default 127.0.0.1; 0.0.0.0 shows it to the network)')
+    page.add_argument('--control', action='store_true', help='let the page take the zero and record')
+    live = parser.add_argument_group('the rig (without REC)')
+    live.add_argument('--port', help='serial port of the device; without it a simulated rig is started')
+    live.add_argument('--baud', type=int, help='line speed (default 921600)')
+    live.add_argument(
+        '--record', nargs='?', const='', metavar='FOLDER', help='record from the start, below FOLDER (recordings/)'
+    )
+    play = parser.add_argument_group('a recording (with REC)')
+    play.add_argument('--speed', type=float, default=1.0, help='times as fast as recorded (default 1)')
+    play.add_argument('--loop', action='store_true', help='start anew at its end')
+
+
+def overrides_of(args: argparse.Namespace) -> dict[str, object]:
+    """The parameters that the arguments give."""
+    values: dict[str, object] = {'monitor': True}
+    if args.http_port is not None:
+        values['monitor_port'] = args.http_port
+    if args.address is not None:
+        values['monitor_address'] = args.address
+    if args.control:
+        values['monitor_control'] = True
+    for name in ('port', 'baud'):
+        if getattr(args, name) is not None:
+            values[name] = getattr(args, name)
+    if args.record is not None:
+        values['record'] = True
+        if args.record:
+            values['bag_dir'] = args.record
+    return values
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until Ctrl-C."""
+    overrides = overrides_of(args)
+    need_server()
+    if args.recording is not None:
+        return _play(args, overrides)
+    values = dict(read_parameter_file(args.params_file)) if args.params_file else {}
+    rig_from_values({**values, **overrides}, args.params_file or 'command line')
+    display = Display()
+    recorded: list[Path] = []
+
+    def watch(session: Session) -> None:
+        folder = session.recorder.folder
+        if folder is not None and folder not in recorded:
+            recorded.append(folder)
+        display.update(session)
+
+    status = run_without_ros({**values, **overrides}, display, watch)
+    for folder in recorded:
+        display.say(f'recorded {folder}\n  replay it:  psd-deflection replay {folder} --compare')
+    return status
+
+
+def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
+    from psd_deflection.monitor.server import MonitorServer
+
+    if not math.isfinite(args.speed) or args.speed <= 0.0:
+        raise ConfigError(f'--speed {args.speed:g}: must be above 0')
+    for name in ('port', 'baud', 'record'):
+        if getattr(args, name) is not None:
+            raise ConfigError(f'--{name} is for a rig; {args.recording} is played')
+    rig = replace_values(rig_of(open_recording(args.recording), args.params_file), overrides, 'command line')
+
+    def open_steps() -> tuple[Pipeline, Iterator[list[Record]]]:
+        recording = open_recording(args.recording, block_size=rig.estimator.block_size)
+        pipeline = Pipeline(rig)
+        return pipeline, replayed(recording, pipeline, recording.blocks())
+
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    display = Display()
+    feed = Feed()
+    server: MonitorServer | None = None
+
+    def say(text: str) -> None:
+        display.say(text)
+        if server is not None:
+            server.tell(text)
+
+    source = ReplaySource(str(args.recording), open_steps, feed, say, speed=args.speed, loop=args.loop)
+    server = MonitorServer(source, feed, rig.monitor, display.say)
+    server.start()
+    try:
+        source.start()
+        while not stop.wait(0.1) and source.failed is None:
+            pass
+    finally:
+        source.close()
+        server.close()
+    if source.failed is not None:
+        raise source.failed
+    return 0

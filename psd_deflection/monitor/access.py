@@ -1,0 +1,64 @@
+"""Who may see the page and who may press its buttons.
+
+A browser sends what any web page tells it to, also to 127.0.0.1. So a request must name this
+machine as its host (else a foreign name could be made to point here: DNS rebinding), and one that
+comes from a page must come from ours (else any site could take the zero: cross-site request
+forgery, cross-site websocket hijacking). Where others on the network can reach the page, its
+buttons need a token besides.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import socket
+from collections.abc import Mapping
+from urllib.parse import urlsplit
+
+
+def host_name(host_header: str) -> str:
+    """The name in a Host header, without port and brackets, lower case; '' where it is malformed."""
+    try:
+        return (urlsplit('//' + host_header).hostname or '').rstrip('.')
+    except ValueError:
+        return ''
+
+
+def is_address(name: str) -> bool:
+    """Whether ``name`` is an IP address: one that no foreign name server can point elsewhere."""
+    try:
+        ipaddress.ip_address(name.partition('%')[0])
+    except ValueError:
+        return False
+    return True
+
+
+def is_loopback(address: str) -> bool:
+    """Whether only this machine reaches a server bound to ``address``."""
+    if address == 'localhost':
+        return True
+    return is_address(address) and ipaddress.ip_address(address).is_loopback
+
+
+def is_own_host(host_header: str, address: str) -> bool:
+    """Whether the Host header names this machine: an address, localhost, or the name it goes by."""
+    name = host_name(host_header)
+    if not name:
+        return False
+    if is_loopback(address):
+        return is_loopback(name)
+    own = socket.gethostname().lower()
+    return is_address(name) or name in ('localhost', address.lower(), own, own + '.local')
+
+
+def is_own_page(headers: Mapping[str, str]) -> bool:
+    """Whether a request comes from our page, or from no page at all (curl has no Origin)."""
+    if headers.get('Sec-Fetch-Site', 'same-origin') not in ('same-origin', 'none'):
+        return False
+    origin = headers.get('Origin')
+    return origin is None or origin.lower() == f'http://{headers.get("Host", "").lower()}'
+
+
+def is_token(given: str | None, expected: str) -> bool:
+    """Whether the token is right; takes as long for a near miss as for a far one."""
+    return given is not None and hmac.compare_digest(given.encode(), expected.encode())

@@ -1,0 +1,94 @@
+"""From the pipeline thread to the page's thread: a sink that never waits and never grows.
+
+What does not fit into the queue is counted and passed over; the estimates that are published and
+recorded do not know that anyone looks on.
+"""
+
+from __future__ import annotations
+
+import math
+import queue
+from typing import NamedTuple
+
+from psd_deflection.records import DeflectionEstimate, Record, SampleBlock, SpotMeans
+
+QUEUE_ITEMS = 2000
+"""Ten seconds of a block's two items at 100 blocks/s."""
+
+COLUMNS = (
+    't',
+    'block',
+    'x1',
+    'y1',
+    'x2',
+    'y2',
+    'sum1',
+    'sum2',
+    'dx',
+    'dy',
+    'theta',
+    'sd_dx',
+    'sd_dy',
+    'sd_theta',
+    'present',
+    'lost',
+    'status',
+)
+"""A row as the page gets it: s, -, m, V, m, rad, their standard deviations, samples, BlockStatus."""
+
+
+class BlockResult(NamedTuple):
+    """One block's dots, and its primary estimate where it has one."""
+
+    spots: SpotMeans
+    estimate: DeflectionEstimate | None
+
+
+class Feed:
+    """A sink of records; :meth:`take` is for one other thread. ``dropped``: items that did not fit."""
+
+    def __init__(self, limit: int = QUEUE_ITEMS) -> None:
+        self.dropped = 0
+        self._limit = limit
+        self._estimate: DeflectionEstimate | None = None
+        self._queue: queue.SimpleQueue[BlockResult | SampleBlock] = queue.SimpleQueue()
+
+    def put(self, record: Record) -> None:
+        """Take one record; kinds that the page does not show are passed over."""
+        if isinstance(record, DeflectionEstimate):
+            if record.primary:
+                self._estimate = record
+        elif isinstance(record, SpotMeans):
+            best, self._estimate = self._estimate, None
+            self._offer(BlockResult(record, best if best is not None and best.block == record.index else None))
+        elif isinstance(record, SampleBlock):
+            self._offer(record)
+
+    @property
+    def waiting(self) -> int:
+        """Items that nobody has taken yet."""
+        return self._queue.qsize()
+
+    def take(self) -> list[BlockResult | SampleBlock]:
+        """What came since the last call, in order; does not wait."""
+        return [self._queue.get_nowait() for _ in range(self._queue.qsize())]
+
+    def _offer(self, item: BlockResult | SampleBlock) -> None:
+        if self._queue.qsize() >= self._limit:
+            self.dropped += 1
+        else:
+            self._queue.put(item)
+
+
+def row_json(result: BlockResult) -> str:
+    """One row in the order of ``COLUMNS``, as JSON; null where there is no number."""
+    spots, estimate = result
+    values: list[float] = [*spots.dots, *spots.sums]
+    if estimate is not None:
+        c = estimate.covariance
+        values += [estimate.dx, estimate.dy, estimate.theta, *(math.sqrt(max(c[i], 0.0)) for i in (0, 4, 8))]
+    numbers = [f'{v:.7g}' if math.isfinite(v) else 'null' for v in values]
+    numbers += ['null'] * (12 - len(numbers))
+    # Microseconds are all that a double can hold of a time since the epoch.
+    seconds = f'{spots.t_ns // 1_000_000_000}.{spots.t_ns % 1_000_000_000 // 1000:06d}'
+    return f'[{seconds},{spots.index},{",".join(numbers)},{spots.present},{spots.lost},{int(spots.status)}]'

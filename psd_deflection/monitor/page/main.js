@@ -1,0 +1,321 @@
+// Connects, keeps the last minute, draws. Nothing here grows with time: the rows are a ring, the
+// messages a list of fifty, and whatever is drawn is drawn into what is there.
+
+import { Detector, signed } from '/page/detector.js';
+import { Plots } from '/page/plots.js';
+import { Rows } from '/page/rows.js';
+
+const TRACES_MS = 80;
+const NUMBERS_MS = 150;
+const STALE_MS = 1500;
+const SILENT_MS = 4000;
+const RETRY_MS = [300, 600, 1200, 2500];
+const MESSAGES = 50;
+const GAP_BLOCKS = 3.5;
+
+const $ = (id) => document.getElementById(id);
+const body = document.body;
+const styles = getComputedStyle(document.documentElement);
+const color = (name) => styles.getPropertyValue(name).trim();
+
+const KEEP = ['t', 'x1', 'y1', 'x2', 'y2', 'sum1', 'sum2', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta', 'lost', 'status',
+  'dx_low', 'dx_high', 'dy_low', 'dy_high', 'theta_low', 'theta_high'];
+const MICRO = 1e6;
+const MDEG = (180 / Math.PI) * 1e3;
+const SCALES = { dx: MICRO, dy: MICRO, theta: MDEG };
+
+let hello = null;
+let rows = null;
+let plots = null;
+let detectors = [];
+let health = null;
+let socket = null;
+let heard = 0;
+let fresh = false;
+let density;
+let newDensity = false;
+let attempts = 0;
+let received = 0;
+let lastRowAt = 0;
+let token = takeToken();
+
+function takeToken() {
+  const given = new URLSearchParams(location.hash.slice(1)).get('token');
+  if (given) {
+    sessionStorage.setItem('token', given);
+    history.replaceState(null, '', location.pathname);
+  }
+  return given || sessionStorage.getItem('token') || '';
+}
+
+// From the server.
+
+function connect() {
+  socket = new WebSocket(`ws://${location.host}/ws`);
+  heard = performance.now();
+  socket.onmessage = (event) => {
+    heard = performance.now();
+    take(JSON.parse(event.data));
+  };
+  socket.onclose = () => {
+    setTimeout(connect, RETRY_MS[Math.min(attempts, RETRY_MS.length - 1)]);
+    attempts += 1;
+    showState();
+  };
+}
+
+function take(message) {
+  if (message.hello) greet(message.hello);
+  if (message.rows) message.rows.forEach(takeRow);
+  if (message.messages) message.messages.forEach(([t, text]) => tell(t, text));
+  if (message.health) showHealth(message.health);
+  if ('spectrum' in message) {
+    density = message.spectrum;
+    newDensity = true;
+  }
+}
+
+function greet(found) {
+  attempts = 0;
+  const other = hello === null || JSON.stringify([hello.rows, hello.frequency, hello.active_areas, hello.modes])
+    !== JSON.stringify([found.rows, found.frequency, found.active_areas, found.modes]);
+  const anew = hello !== null && hello.instance !== found.instance;
+  hello = found;
+  hello.at = Object.fromEntries(found.columns.map((name, i) => [name, i]));
+  if (other) {
+    rows = new Rows(KEEP, found.rows);
+    detectors = [1, 2].map((n) => new Detector($(`detector_${n}`), n, found.active_areas[n - 1], color));
+    if (plots) {
+      plots.hello = found;
+      plots.build();
+    } else plots = new Plots(found, color);
+  }
+  rows.clear();
+  if (anew) notice('connected to a daemon that was started anew');
+  body.dataset.instance = found.instance;
+  $('messages').replaceChildren();
+  buttons();
+}
+
+const blank = new Array(KEEP.length).fill(null);
+const row = new Array(KEEP.length).fill(null);
+
+function takeRow(values) {
+  const at = hello.at;
+  const t = values[at.t];
+  const last = rows.last('t');
+  if (last !== null && t <= last) rows.clear();
+  else if (last !== null && t - last > GAP_BLOCKS * hello.block_s) {
+    blank[0] = last + hello.block_s;
+    rows.push(blank);
+  }
+  for (let i = 0; i < 15; i++) row[i] = values[at[KEEP[i]]];
+  let i = 15;
+  for (const name of ['dx', 'dy', 'theta']) {
+    const [k, s] = [at[name], at[`sd_${name}`]];
+    const scale = SCALES[name];
+    const there = values[k] !== null;
+    row[KEEP.indexOf(name)] = there ? values[k] * scale : null;
+    row[KEEP.indexOf(`sd_${name}`)] = there ? values[s] * scale : null;
+    row[i++] = there ? (values[k] - 2 * values[s]) * scale : null;
+    row[i++] = there ? (values[k] + 2 * values[s]) * scale : null;
+  }
+  rows.push(row);
+  received += 1;
+  lastRowAt = performance.now();
+  fresh = true;
+}
+
+// To the eye.
+
+let tracesAt = 0;
+let numbersAt = 0;
+
+function frame(now) {
+  requestAnimationFrame(frame);
+  if (!hello || document.hidden) return;
+  if (fresh && !held()) {
+    if (now - tracesAt >= TRACES_MS) {
+      tracesAt = now;
+      fresh = false;
+      if (!rows.empty) plots.traces(rows, Number($('span').value));
+    }
+    const seen = rows.last('status') === 0;
+    for (const detector of detectors) detector.draw(rows, hello, seen);
+  }
+  if (newDensity && !held()) {
+    newDensity = false;
+    plots.spectrum(density);
+  }
+  if (now - numbersAt >= NUMBERS_MS) {
+    numbersAt = now;
+    numbers();
+    showState();
+  }
+}
+
+const held = () => $('hold').getAttribute('aria-pressed') === 'true';
+
+function numbers() {
+  body.dataset.rows = String(received);
+  if (rows.empty || held()) return;
+  for (const name of ['dx', 'dy', 'theta']) {
+    const value = rows.last(name);
+    const sd = rows.last(`sd_${name}`);
+    $(name).textContent = value === null ? '–' : signed(value, 2);
+    $(`sd_${name}`).textContent = value === null ? '' : `± ${sd.toFixed(2)}`;
+  }
+  for (const detector of detectors) detector.write(rows, hello);
+}
+
+function showState() {
+  const now = performance.now();
+  let [state, text] = ['live', 'live'];
+  if (socket.readyState !== WebSocket.OPEN) [state, text] = hello ? ['offline', 'connection lost, trying again'] : ['connecting', 'connecting'];
+  else if (!hello) [state, text] = ['connecting', 'connecting'];
+  else if (now - heard > SILENT_MS) {
+    // A connection that says nothing is none, whatever the browser thinks of it.
+    [state, text] = ['offline', 'connection lost, trying again'];
+    socket.close();
+  } else if (received === 0) [state, text] = ['connecting', 'waiting for samples'];
+  else if (now - lastRowAt > STALE_MS) [state, text] = ['stale', hello.kind === 'replay' ? 'end of recording' : 'no samples'];
+  else {
+    const status = rows.last('status');
+    if (status > 0) [state, text] = ['refused', hello.statuses[status]];
+    else if (held()) text = 'live, held';
+    else if (hello.kind === 'replay') text = 'playing';
+  }
+  if (body.dataset.state !== state) body.dataset.state = state;
+  if ($('state').textContent !== text) $('state').textContent = text;
+  const kinds = { simulated: 'simulated rig on', live: '', replay: 'recording' };
+  const source = hello ? `${kinds[hello.kind]} ${hello.name}`.trim() : '';
+  if ($('source').textContent !== source) $('source').textContent = source;
+}
+
+const TILES = [
+  ['samples/s', 'rate (samples/s)'], ['estimates/s', 'rate (estimates/s)'], ['lost samples', 'lost'], ['bad frames', 'bad frames'],
+  ['dropped, queue', 'dropped by a full queue'], ['dropped, device', 'dropped by the device'], ['disconnects', 'disconnects'],
+  ['latency, median (ms)', 'latency, median (ms)'], ['latency, worst (ms)', 'latency, worst of a second (ms)'],
+  ['clock skew (ppm)', 'skew (ppm)'], ['clock residual (µs)', 'residual (us)'],
+];
+const LOSSES = new Set(['lost', 'bad frames', 'dropped by a full queue', 'dropped by the device', 'disconnects']);
+
+function showHealth(found) {
+  health = found;
+  hello.kind = found.kind;
+  hello.name = found.name;
+  const values = new Map(found.entries.filter((e) => e.name !== 'recording').flatMap((e) => e.values));
+  const tiles = TILES.filter(([, key]) => values.has(key)).map(([label, key]) => [label, values.get(key), LOSSES.has(key) && values.get(key) !== '0']);
+  tiles.push(['not shown (page too slow)', String(found.dropped), found.dropped > 0]);
+  list($('tiles'), tiles);
+  const there = new Set();
+  for (const entry of found.entries) {
+    there.add(entry.name);
+    let details = $('entries').querySelector(`[data-name="${CSS.escape(entry.name)}"]`);
+    if (!details) {
+      details = document.createElement('details');
+      details.dataset.name = entry.name;
+      details.append(document.createElement('summary'), document.createElement('dl'));
+      details.firstChild.append(document.createElement('b'), document.createElement('span'));
+      $('entries').append(details);
+    }
+    details.className = `level-${entry.level}`;
+    details.querySelector('b').textContent = `${entry.name} `;
+    details.querySelector('span').textContent = entry.message;
+    list(details.querySelector('dl'), entry.values);
+  }
+  for (const details of [...$('entries').children]) if (!there.has(details.dataset.name)) details.remove();
+  buttons();
+}
+
+// Writes into the elements that are there: a list made anew every second would shed garbage.
+function list(element, pairs) {
+  while (element.children.length > 2 * pairs.length) element.lastChild.remove();
+  while (element.children.length < 2 * pairs.length) element.append(document.createElement(element.children.length % 2 ? 'dd' : 'dt'));
+  pairs.forEach(([label, value, bad], i) => {
+    const [dt, dd] = [element.children[2 * i], element.children[2 * i + 1]];
+    if (dt.textContent !== label) dt.textContent = label;
+    if (dd.textContent !== value) dd.textContent = value;
+    dd.classList.toggle('bad', Boolean(bad));
+  });
+}
+
+function tell(t, text) {
+  const messages = $('messages');
+  const item = document.createElement('li');
+  const time = document.createElement('time');
+  time.textContent = new Date(t * 1000).toLocaleTimeString([], { hour12: false });
+  item.append(time, text);
+  messages.prepend(item);
+  while (messages.children.length > MESSAGES) messages.lastChild.remove();
+}
+
+// From the hand.
+
+function buttons() {
+  const recording = Boolean(health && health.recording);
+  for (const id of ['zero', 'record']) {
+    $(id).disabled = !hello.control || (id === 'record' && hello.kind === 'replay');
+    if (!hello.control) $(id).title = 'off; monitor_control:=true (or --control) allows it';
+  }
+  $('record').setAttribute('aria-pressed', String(recording));
+  $('record').textContent = recording ? '● Recording' : 'Record';
+  if (recording) $('record').title = health.recording;
+}
+
+function notice(text, bad = false) {
+  $('notice').textContent = text;
+  $('notice').className = bad ? 'bad' : '';
+  $('notice').hidden = false;
+  clearTimeout(notice.timer);
+  notice.timer = setTimeout(() => { $('notice').hidden = true; }, 8000);
+}
+
+async function act(path, content) {
+  if (hello.needs_token && !token && !(token = await askToken())) return;
+  try {
+    const answer = await fetch(path, {
+      method: 'POST',
+      headers: { 'Content-Type': 'application/json', ...(token ? { 'X-Monitor-Token': token } : {}) },
+      body: JSON.stringify(content),
+    });
+    const result = await answer.json();
+    if (answer.status === 401) {
+      token = '';
+      sessionStorage.removeItem('token');
+    }
+    notice(result.message, !result.ok);
+  } catch {
+    notice('no answer: the connection is lost', true);
+  }
+}
+
+function askToken() {
+  return new Promise((resolve) => {
+    const ask = $('ask');
+    ask.onclose = () => {
+      const given = ask.returnValue === 'ok' ? $('token').value.trim() : '';
+      if (given) sessionStorage.setItem('token', given);
+      $('token').value = '';
+      resolve(given);
+    };
+    ask.returnValue = '';
+    ask.showModal();
+  });
+}
+
+$('zero').onclick = () => act('/api/zero', {});
+$('record').onclick = () => act('/api/record', { record: !(health && health.recording) });
+$('span').onchange = () => { fresh = true; };
+$('hold').onclick = () => {
+  $('hold').setAttribute('aria-pressed', String(!held()));
+  $('hold').textContent = held() ? 'Held' : 'Hold';
+  fresh = true;
+};
+matchMedia('(prefers-color-scheme: dark)').onchange = () => {
+  if (plots) plots.build();
+  fresh = newDensity = true;
+};
+
+connect();
+requestAnimationFrame(frame);

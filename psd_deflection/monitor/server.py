@@ -1,0 +1,346 @@
+"""The page's own thread: an aiohttp server with the page, a websocket and two buttons.
+
+Everything it holds has a fixed size: the rows of the last minute, the last messages, one cursor a
+browser. A browser that is too slow misses rows (its traces have gaps), and nothing waits for it:
+each gets what is new when its last message has left.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import json
+import os
+import secrets
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+from aiohttp import WSCloseCode, WSMsgType, web
+
+from psd_deflection import __version__
+from psd_deflection.config import MonitorConfig
+from psd_deflection.errors import ConfigError
+from psd_deflection.monitor import access
+from psd_deflection.monitor.feed import COLUMNS, BlockResult, Feed, row_json
+from psd_deflection.monitor.source import RefusedError, Source
+from psd_deflection.monitor.spectrum import Spectrum
+from psd_deflection.records import BlockStatus, DiagnosticReport
+
+PAGE = Path(__file__).parent / 'page'
+TOKEN_VARIABLE = 'PSD_DEFLECTION_MONITOR_TOKEN'
+TOKEN_HEADER = 'X-Monitor-Token'
+
+PUMP_S = 0.03
+SPECTRUM_S = 0.5
+HISTORY_S = 60.0
+MESSAGES = 50
+BROWSERS = 16
+START_S = 10.0
+CLOSE_S = 3.0
+
+HEADERS = {
+    'Content-Security-Policy': "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    'X-Content-Type-Options': 'nosniff',
+    'X-Frame-Options': 'DENY',
+    'Referrer-Policy': 'no-referrer',
+    'Cross-Origin-Resource-Policy': 'same-origin',
+    'Cache-Control': 'no-cache',
+}
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class MonitorServer:
+    """Serves ``source``, fed by ``feed``, from :meth:`start` to :meth:`close`. ``say``: where it tells its address."""
+
+    def __init__(self, source: Source, feed: Feed, config: MonitorConfig, say: Callable[[str], None]) -> None:
+        self.token = ''
+        self.url = ''
+        self._source = source
+        self._feed = feed
+        self._config = config
+        self._say = say
+        self._instance = secrets.token_hex(8)
+        rate = source.rig.converter.sample_rate_hz / source.rig.estimator.block_size
+        self._rows: deque[str] = deque(maxlen=max(100, round(HISTORY_S * rate)))
+        self._row_count = 0
+        self._messages: deque[tuple[int, float, str]] = deque(maxlen=MESSAGES)
+        self._message_count = 0
+        self._health: tuple[int, str] = (0, 'null')
+        self._spectrum = Spectrum(source.rig)
+        self._density: tuple[int, str] = (0, 'null')
+        self._browsers: dict[web.WebSocketResponse, asyncio.Event] = {}
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._ended: asyncio.Event | None = None
+        self._started: Future[str] = Future()
+        self._thread = threading.Thread(target=self._run, name='monitor', daemon=True)
+        if config.control and not access.is_loopback(config.address):
+            self.token = os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(16)
+
+    def start(self) -> str:
+        """Start the thread; returns the page's address. Raises ConfigError where it cannot be served."""
+        self._thread.start()
+        self.url = self._started.result(START_S)
+        self._say(f'monitor: {self.url}' + (f'#token={self.token}' if self.token else ''))
+        return self.url
+
+    def close(self) -> None:
+        """Say goodbye to the browsers and end the thread; does nothing the second time."""
+        if self._loop is not None and self._ended is not None and self._thread.is_alive():
+            with contextlib.suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(self._ended.set)
+            self._thread.join(CLOSE_S)
+
+    def tell(self, text: str) -> None:
+        """Show a message on the page; from any thread."""
+        self._message_count += 1
+        self._messages.append((self._message_count, time.time(), text))
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._serve())
+        except Exception as error:
+            if not self._started.done():
+                self._started.set_exception(error)
+            else:
+                self._say(f'monitor: ended: {type(error).__name__}: {error}')
+
+    async def _serve(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._ended = asyncio.Event()
+        application = web.Application(middlewares=[self._guard], client_max_size=4096)
+        application.router.add_get('/', self._index)
+        application.router.add_get('/ws', self._websocket)
+        application.router.add_post('/api/zero', self._zero)
+        application.router.add_post('/api/record', self._record)
+        application.router.add_static('/page', PAGE)
+        application.on_response_prepare.append(_add_headers)
+        runner = web.AppRunner(application, handle_signals=False, access_log=None, shutdown_timeout=1.0)
+        await runner.setup()
+        tasks: list[asyncio.Task[None]] = []
+        try:
+            self._started.set_result(await self._listen(runner))
+            tasks = [asyncio.create_task(self._pump()), asyncio.create_task(self._once_a_second())]
+            ended = asyncio.create_task(self._ended.wait())
+            done, _ = await asyncio.wait([ended, *tasks], return_when=asyncio.FIRST_COMPLETED)
+            for task in done - {ended}:
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            for browser in list(self._browsers):
+                with contextlib.suppress(ConnectionError, TimeoutError):
+                    await asyncio.wait_for(browser.close(code=WSCloseCode.GOING_AWAY), 1.0)
+            await runner.cleanup()
+
+    async def _listen(self, runner: web.AppRunner) -> str:
+        address, port = self._config.address, self._config.port
+        try:
+            try:
+                await web.TCPSite(runner, address, port).start()
+            except OSError as error:
+                if error.errno != errno.EADDRINUSE:
+                    raise
+                # Measuring goes on without its usual address rather than not at all.
+                self._say(f'monitor: port {port} is in use (by another monitor?); taking a free one')
+                await web.TCPSite(runner, address, 0).start()
+        except (OSError, UnicodeError) as error:
+            reason = error.strerror or str(error) if isinstance(error, OSError) else str(error)
+            raise ConfigError(
+                f'monitor_address = {address!r}, monitor_port = {port}: cannot be served there ({reason}); '
+                'monitor_address is an address of this machine, 127.0.0.1 for itself, 0.0.0.0 for all'
+            ) from None
+        port = runner.addresses[0][1]
+        name = {'0.0.0.0': socket.gethostname(), '::': socket.gethostname()}.get(address, address)
+        return f'http://{f"[{name}]" if ":" in name else name}:{port}/'
+
+    # What the threads of the run bring.
+
+    async def _pump(self) -> None:
+        due = 0.0
+        while True:
+            new = False
+            for item in self._feed.take():
+                if isinstance(item, BlockResult):
+                    self._rows.append(row_json(item))
+                    self._row_count += 1
+                    new = True
+                else:
+                    self._spectrum.add(item)
+            now = time.monotonic()
+            if self._browsers and now >= due:
+                due = now + SPECTRUM_S
+                self._density = (self._density[0] + 1, self._spectrum_json())
+                new = True
+            if new:
+                self._wake()
+            await asyncio.sleep(PUMP_S)
+
+    async def _once_a_second(self) -> None:
+        while True:
+            if self._browsers:
+                self._take_health()
+            await asyncio.sleep(1.0)
+
+    def _take_health(self) -> None:
+        report = self._source.health(time.time_ns())
+        self._health = (self._health[0] + 1, self._health_json(report))
+        self._wake()
+
+    def _wake(self) -> None:
+        for event in self._browsers.values():
+            event.set()
+
+    def _spectrum_json(self) -> str:
+        density = self._spectrum.density()
+        if density is None:
+            return 'null'
+        return '[' + ','.join('[' + ','.join(f'{v:.3g}' for v in channel) + ']' for channel in density.tolist()) + ']'
+
+    def _health_json(self, report: DiagnosticReport) -> str:
+        entries = [
+            {
+                'name': e.name.removeprefix('psd_deflection: '),
+                'level': e.level,
+                'message': e.message,
+                'values': e.values,
+            }
+            for e in report.entries
+        ]
+        return json.dumps(
+            {
+                't': report.t_ns / 1e9,
+                'entries': entries,
+                'dropped': self._feed.dropped,
+                'browsers': len(self._browsers),
+                **self._source.describe(),
+            }
+        )
+
+    # What browsers ask.
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        if not access.is_own_host(request.headers.get('Host', ''), self._config.address):
+            return web.Response(status=403, text='this is not the name of this machine')
+        if (request.method != 'GET' or request.path == '/ws') and not access.is_own_page(request.headers):
+            return web.Response(status=403, text='refused: asked for by another site')
+        return await handler(request)
+
+    async def _index(self, request: web.Request) -> web.StreamResponse:
+        return web.FileResponse(PAGE / 'index.html')
+
+    async def _websocket(self, request: web.Request) -> web.StreamResponse:
+        if len(self._browsers) >= BROWSERS:
+            return web.Response(status=503, text=f'{BROWSERS} browsers look on already')
+        # Who does not read for this long is gone.
+        browser = web.WebSocketResponse(heartbeat=10.0, max_msg_size=1024)
+        await browser.prepare(request)
+        event = asyncio.Event()
+        self._browsers[browser] = event
+        sender = asyncio.create_task(self._send(browser, event))
+        try:
+            self._take_health()
+            async for message in browser:
+                if message.type is WSMsgType.ERROR:
+                    break
+        finally:
+            del self._browsers[browser]
+            sender.cancel()
+            with contextlib.suppress(asyncio.CancelledError, ConnectionError):
+                await sender
+        return browser
+
+    async def _send(self, browser: web.WebSocketResponse, event: asyncio.Event) -> None:
+        await browser.send_str(json.dumps({'hello': self._hello()}))
+        rows = self._row_count - len(self._rows)
+        messages = health = density = 0
+        while True:
+            parts = []
+            if (new := min(self._row_count - rows, len(self._rows))) > 0:
+                rows = self._row_count
+                parts.append('"rows":[' + ','.join([self._rows[i] for i in range(-new, 0)]) + ']')
+            if self._message_count > messages:
+                told = [m for m in tuple(self._messages) if m[0] > messages]
+                messages = self._message_count
+                parts.append('"messages":' + json.dumps([m[1:] for m in told]))
+            if self._health[0] > health:
+                health, text = self._health
+                parts.append('"health":' + text)
+            if self._density[0] > density:
+                density, text = self._density
+                parts.append('"spectrum":' + text)
+            if parts:
+                await browser.send_str('{' + ','.join(parts) + '}')
+            await event.wait()
+            event.clear()
+
+    def _hello(self) -> dict[str, Any]:
+        rig = self._source.rig
+        frequencies = self._spectrum.frequencies
+        return {
+            'instance': self._instance,
+            'version': __version__,
+            'columns': COLUMNS,
+            'statuses': [s.name.lower().replace('_', ' ') for s in BlockStatus],
+            'history_s': HISTORY_S,
+            'rows': self._rows.maxlen,
+            'block_s': rig.estimator.block_size / rig.converter.sample_rate_hz,
+            'block_size': rig.estimator.block_size,
+            'sample_rate_hz': rig.converter.sample_rate_hz,
+            'active_areas': [psd.active_area for psd in rig.psds],
+            'sum_nominal': rig.amplifier.sum_nominal,
+            'sum_min': rig.estimator.sum_min,
+            'modes': [['bending', rig.dynamics.bending_frequency], ['torsion', rig.dynamics.torsion_frequency]],
+            'frequency': [frequencies[0], len(frequencies)],
+            'solver': rig.estimator.solver,
+            'control': self._config.control,
+            'needs_token': bool(self.token),
+            **self._source.describe(),
+        }
+
+    async def _zero(self, request: web.Request) -> web.StreamResponse:
+        return await self._act(request, lambda wanted: self._source.zero())
+
+    async def _record(self, request: web.Request) -> web.StreamResponse:
+        return await self._act(request, self._source.record)
+
+    async def _act(self, request: web.Request, action: Callable[[bool], str]) -> web.StreamResponse:
+        if not self._config.control:
+            return _answer(403, 'refused: the buttons are off; monitor_control:=true (--control) allows them')
+        if self.token and not access.is_token(request.headers.get(TOKEN_HEADER), self.token):
+            return _answer(401, 'refused: the token is missing or wrong; the address printed at the start has it')
+        # A type that no foreign form can send.
+        if request.content_type != 'application/json':
+            return _answer(415, 'refused: Content-Type must be application/json')
+        try:
+            body = json.loads(await request.text() or '{}')
+        except ValueError:
+            return _answer(400, 'refused: not JSON')
+        wanted = body.get('record', True) if isinstance(body, dict) else None
+        if not isinstance(wanted, bool):
+            return _answer(400, 'refused: expected {"record": true} or {"record": false}')
+        try:
+            text = await asyncio.get_running_loop().run_in_executor(None, action, wanted)
+        except RefusedError as error:
+            return _answer(409, str(error))
+        self._say(f'monitor: {text}')
+        if self._browsers:
+            self._take_health()
+        return _answer(200, text)
+
+
+def _answer(status: int, text: str) -> web.Response:
+    return web.json_response({'ok': status == 200, 'message': text}, status=status)
+
+
+async def _add_headers(request: web.Request, response: web.StreamResponse) -> None:
+    response.headers.update(HEADERS)

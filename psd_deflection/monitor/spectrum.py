@@ -1,0 +1,62 @@
+"""Amplitude spectral density of the dots from the last seconds of raw samples.
+
+Welch's method (P. D. Welch, IEEE Trans. Audio Electroacoust. 15, 1967): Hann windows, half
+overlapping, linear trend left in but for the mean. A segment holds only samples that follow each
+other: a lost sample ends one, and nothing is filled in.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from psd_deflection.calibration import Calibration
+from psd_deflection.config import Rig
+from psd_deflection.records import FloatArray, SampleBlock
+
+SEGMENT = 1024
+SECONDS = 4.0
+
+
+class Spectrum:
+    """Remembers the last four seconds; one thread at a time."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rate_hz = rig.converter.sample_rate_hz
+        self._calibration = Calibration.from_rig(rig)
+        blocks = max(2, round(max(SECONDS * self.rate_hz, 2.0 * SEGMENT) / rig.estimator.block_size))
+        self._blocks: deque[SampleBlock] = deque(maxlen=blocks)
+        self._window = np.hanning(SEGMENT + 1)[:-1]
+
+    def add(self, block: SampleBlock) -> None:
+        """Take one more block, in the order of time."""
+        if self._blocks and block.seq[0] <= self._blocks[-1].seq[-1]:
+            self._blocks.clear()
+        self._blocks.append(block)
+
+    @property
+    def frequencies(self) -> FloatArray:
+        """(k,), Hz, without the mean's 0 Hz."""
+        return np.arange(1, SEGMENT // 2 + 1, dtype=np.float64) * (self.rate_hz / SEGMENT)
+
+    def density(self) -> FloatArray | None:
+        """(4, k) of x1 y1 x2 y2, m/sqrt(Hz), one-sided; None while no stretch without a loss is long enough."""
+        if not self._blocks:
+            return None
+        seq = np.concatenate([b.seq for b in self._blocks])
+        dots = self._calibration.dots(np.concatenate([b.volts for b in self._blocks])).astype(np.float64)
+        total = np.zeros((SEGMENT // 2 + 1, 4))
+        count = 0
+        for run in np.split(dots, np.flatnonzero(np.diff(seq) != 1) + 1):
+            for start in range(0, len(run) - SEGMENT + 1, SEGMENT // 2):
+                part = run[start : start + SEGMENT]
+                if not np.isfinite(part).all():
+                    continue
+                transform = np.fft.rfft((part - part.mean(axis=0)) * self._window[:, None], axis=0)
+                total += np.abs(transform) ** 2
+                count += 1
+        if count == 0:
+            return None
+        power = 2.0 * total / (count * self.rate_hz * float((self._window**2).sum()))
+        return np.asarray(np.sqrt(power[1:]).T, np.float64)

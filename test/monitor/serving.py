@@ -1,0 +1,109 @@
+"""A server whose source and clock are the test's."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.monitor.feed import Feed
+from psd_deflection.monitor.server import MonitorServer
+from psd_deflection.monitor.source import RefusedError
+from psd_deflection.records import (
+    BlockStatus,
+    DeflectionEstimate,
+    DiagnosticEntry,
+    DiagnosticReport,
+    SpotMeans,
+)
+
+START_NS = 1_700_000_000_000_000_000
+BLOCK_NS = 20_000_000
+
+
+class StillSource:
+    """Remembers what was asked of it; ``refusal`` is what it answers, where there is one."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.zeros = 0
+        self.recordings: list[str | None] = []
+        self.refusal = ''
+        self.acted = threading.Event()
+
+    def describe(self) -> dict[str, Any]:
+        return {'kind': 'live', 'name': 'test', 'recording': self.recordings[-1] if self.recordings else None}
+
+    def health(self, t_ns: int) -> DiagnosticReport:
+        return DiagnosticReport(
+            t_ns, (DiagnosticEntry('psd_deflection: acquisition', 0, 'samples flow', (('rate (samples/s)', '1000'),)),)
+        )
+
+    def zero(self) -> str:
+        if self.refusal:
+            raise RefusedError(self.refusal)
+        self.zeros += 1
+        self.acted.set()
+        return 'unloaded dots taken'
+
+    def record(self, wanted: bool) -> str:
+        if self.refusal:
+            raise RefusedError(self.refusal)
+        self.recordings.append('recordings/test' if wanted else None)
+        return 'recording' if wanted else 'recording ended'
+
+
+def spots_of(index: int, *, status: BlockStatus = BlockStatus.OK, lost: int = 0) -> SpotMeans:
+    phase = index / 10.0
+    dots = (1e-3 * np.cos(phase), 2e-3 * np.sin(phase), 0.5e-3, -1e-3 * np.sin(phase))
+    return SpotMeans(
+        START_NS + index * BLOCK_NS,
+        index,
+        (float(dots[0]), float(dots[1]), dots[2], float(dots[3])),
+        (5.0, 5.0),
+        np.zeros((4, 4)),
+        20 - lost,
+        lost,
+        status,
+        '' if status is BlockStatus.OK else 'a reason',
+    )
+
+
+def estimate_of(index: int, *, primary: bool = True) -> DeflectionEstimate:
+    phase = index / 10.0
+    sd = (2e-7, 3e-7, 3e-6)
+    covariance = (sd[0] ** 2, 0.0, 0.0, 0.0, sd[1] ** 2, 0.0, 0.0, 0.0, sd[2] ** 2)
+    return DeflectionEstimate(
+        START_NS + index * BLOCK_NS,
+        index,
+        'exact',
+        float(1e-3 * np.sin(phase)),
+        float(-1e-3 * np.cos(phase)),
+        float(1e-2 * np.sin(phase)),
+        0.0,
+        0.0,
+        covariance,
+        1e-7,
+        primary,
+    )
+
+
+class Serving:
+    """A started server with what it shows."""
+
+    def __init__(self, overrides: dict[str, object]) -> None:
+        self.rig = load_rig(overrides={'monitor_port': 0, **overrides})
+        self.source = StillSource(self.rig)
+        self.feed = Feed()
+        self.said: list[str] = []
+        self.server = MonitorServer(self.source, self.feed, self.rig.monitor, self.said.append)
+        self.url = self.server.start()
+        self.port = int(self.url.rstrip('/').rpartition(':')[2])
+
+    def give(self, first: int, count: int, **options: Any) -> None:
+        for index in range(first, first + count):
+            if options.get('status', BlockStatus.OK) is BlockStatus.OK:
+                self.feed.put(estimate_of(index))
+            self.feed.put(spots_of(index, **options))

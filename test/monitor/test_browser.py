@@ -1,0 +1,243 @@
+"""The page in headless Chromium, before the real daemon and the simulated rig."""
+
+from __future__ import annotations
+
+import http.server
+import importlib.util
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip('selenium', reason='the browser tests need selenium: pip install .[test]')
+
+from selenium.webdriver.common.by import By
+
+from .browsing import Page, Program, Start
+from .serving import Serving
+
+pytestmark = pytest.mark.browser
+
+BAGS = Path(__file__).parent.parent.parent / 'bags'
+HOUR_BLOCKS = 180_000
+"""50 blocks a second for an hour."""
+
+
+@pytest.fixture(scope='module')
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    one = Page(tmp_path_factory.mktemp('profile'))
+    yield one
+    one.close()
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    started: list[Program] = []
+
+    def begin(*arguments: str) -> Program:
+        program = Program(arguments, tmp_path)
+        started.append(program)
+        return program
+
+    yield begin
+    for program in started:
+        program.end()
+
+
+def parameter_file(folder: Path, **values: object) -> str:
+    path = folder / 'rig.yaml'
+    lines = [f'    {name}: {str(value).lower()}\n' for name, value in values.items()]
+    path.write_text('/**:\n  ros__parameters:\n' + ''.join(lines))
+    return str(path)
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(('127.0.0.1', 0))
+        return int(one.getsockname()[1])
+
+
+def picture(page: Page, selector: str) -> str:
+    return str(page.js('document.querySelector(arguments[0]).toDataURL()', selector))
+
+
+COLORED = """(() => {
+  const canvas = document.querySelector('#plot_shift canvas');
+  const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+  let n = 0;
+  for (let i = 0; i < data.length; i += 4) n += data[i + 3] > 200 && data[i] - data[i + 2] > 60;
+  return n;
+})()"""
+"""Pixels in the colour of dY."""
+
+
+@pytest.mark.parametrize('how', ['node', 'alone'])
+def test_the_daemon_on_the_simulated_rig_shows_moving_dots_and_traces(
+    page: Page, start: Start, tmp_path: Path, how: str
+) -> None:
+    if how == 'node' and importlib.util.find_spec('rclpy') is None:
+        pytest.skip('the node needs rclpy: pip install .[ros]')
+    arguments = ['--params-file', parameter_file(tmp_path, monitor=True, monitor_port=0)]
+    # As `make run` starts it, but for the port, which others may have.
+    program = start('estimator', *arguments, *([] if how == 'node' else ['--no-ros']))
+    page.open(program.url())
+    page.live()
+    first = [picture(page, f'#detector_{n} canvas') for n in (1, 2)]
+    # The rig's loads come after some seconds; noise alone moves the dot by less than a pixel.
+    page.until('Math.abs(document.querySelector("#detector_1 canvas").dataset.y) > 1e-4')
+    page.until('Math.abs(document.querySelector("#detector_2 canvas").dataset.y) > 1e-4')
+    assert [picture(page, f'#detector_{n} canvas') for n in (1, 2)] != first
+    page.until(f'{COLORED} > 200', 'a trace of dY')
+    page.until('document.querySelectorAll("#tiles dd").length > 5')
+    page.until('[...document.querySelectorAll("#entries b")].some((b) => b.textContent.startsWith("clock"))')
+    # Not allowed: neither by the page nor past it.
+    assert page.js('document.getElementById("zero").disabled && document.getElementById("record").disabled')
+    answer = page.later(
+        'fetch("/api/zero", {method: "POST", headers: {"Content-Type": "application/json"}, body: "{}"})'
+        '.then((r) => r.json().then((j) => [r.status, j.message]))'
+    )
+    assert answer[0] == 403
+    assert 'monitor_control' in answer[1]
+    assert page.complaints() == [] or all('403' in c for c in page.complaints())
+
+
+def test_zero_and_record_work_where_they_are_allowed(page: Page, start: Start, tmp_path: Path) -> None:
+    # Taken as unloaded: dots 0.5 mm off those that the device has at rest. Its loads act along Y.
+    port = start('simulate', '--serve').said('port: (.+)')
+    rig = parameter_file(tmp_path, **{'psd_1.zero': [5e-4, 0.0], 'psd_2.zero': [5e-4, 0.0]})
+    program = start('monitor', '--port', port, '--params-file', rig, '--http-port', '0', '--control')
+    page.open(program.url())
+    page.live()
+    dx = 'Number(document.getElementById("dx").textContent.replace("\\u2212", "-"))'
+    page.until(f'{dx} > 400')
+    page.driver.find_element(By.ID, 'zero').click()
+    page.until('document.getElementById("notice").textContent.startsWith("unloaded dots (mm): psd_1 (")')
+    page.until(f'Math.abs({dx}) < 20')
+    record = page.driver.find_element(By.ID, 'record')
+    record.click()
+    page.until('document.getElementById("record").getAttribute("aria-pressed") === "true"')
+    record.click()
+    page.until('document.getElementById("record").getAttribute("aria-pressed") === "false"')
+    assert program.end() == 0
+    assert [p.name for p in (tmp_path / 'recordings').glob('psd_*/metadata.yaml')] == ['metadata.yaml']
+    assert page.complaints() == []
+
+
+def test_another_site_cannot_press_the_button_nor_look_on(page: Page, serve: Callable[..., Serving]) -> None:
+    serving = serve(monitor_control=True)
+    server = http.server.HTTPServer(('127.0.0.1', 0), http.server.BaseHTTPRequestHandler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        # An error page is a page of that other origin as well.
+        page.open(f'http://localhost:{server.server_port}/')
+        target = f'http://127.0.0.1:{serving.port}'
+        for options in ('mode: "no-cors"', 'headers: {"Content-Type": "application/json"}'):
+            page.later(f'fetch("{target}/api/zero", {{method: "POST", body: "{{}}", {options}}}).then((r) => r.type)')
+        socket_of = f'new WebSocket("ws://127.0.0.1:{serving.port}/ws")'
+        events = 's.onopen = () => ok("open"); s.onclose = () => ok("closed");'
+        opened = page.later(f'new Promise((ok) => {{ const s = {socket_of}; {events} }})')
+        assert opened == 'closed'
+        assert serving.source.zeros == 0
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def test_the_token_of_the_printed_address_opens_the_buttons(page: Page, serve: Callable[..., Serving]) -> None:
+    serving = serve(monitor_control=True, monitor_address='0.0.0.0')
+    address = f'http://127.0.0.1:{serving.port}/'
+    serving.give(0, 10)
+    page.open(f'{address}#token=wrong')
+    page.until('document.getElementById("zero").disabled === false')
+    page.driver.find_element(By.ID, 'zero').click()
+    page.until('document.getElementById("notice").textContent.includes("token is missing or wrong")')
+    assert serving.source.zeros == 0
+    page.driver.find_element(By.ID, 'zero').click()
+    page.until('document.getElementById("ask").open')
+    page.driver.find_element(By.ID, 'token').send_keys(serving.server.token)
+    page.driver.find_element(By.CSS_SELECTOR, '#ask button.main').click()
+    page.until('document.getElementById("notice").textContent === "unloaded dots taken"')
+    assert serving.source.zeros == 1
+    assert serving.server.token not in str(page.js('location.href'))
+
+
+def test_the_page_outlives_an_unplugged_device(page: Page, start: Start, tmp_path: Path) -> None:
+    link = str(tmp_path / 'port')
+    device = start('simulate', '--serve', '--link', link)
+    device.said('(port: )')
+    program = start('monitor', '--port', link, '--http-port', '0')
+    page.open(program.url())
+    page.live()
+    device.end()
+    page.until('document.body.dataset.state === "stale"')
+    page.until('document.querySelector("#messages").textContent.includes("waiting for it to come back")')
+    before = page.rows()
+    again = start('simulate', '--serve', '--link', link)
+    again.said('(port: )')
+    page.live()
+    page.until(f'document.body.dataset.rows > {before + 50}')
+    page.until('document.querySelector("#messages").textContent.includes("the device is back")')
+    assert page.complaints() == []
+
+
+def test_the_page_finds_a_daemon_that_was_started_anew(page: Page, start: Start) -> None:
+    port = str(free_port())
+    first = start('monitor', str(BAGS / 'clean'), '--loop', '--http-port', port)
+    page.open(first.url())
+    page.until('document.body.dataset.rows > 20')
+    instance = page.js('document.body.dataset.instance')
+    assert first.end() == 0
+    page.until('document.body.dataset.state === "offline"')
+    before = page.rows()
+    start('monitor', str(BAGS / 'clean'), '--loop', '--http-port', port).url()
+    page.live()
+    page.until(f'document.body.dataset.rows > {before + 20}')
+    assert page.js('document.body.dataset.instance') != instance
+    assert [c for c in page.complaints() if 'ERR_CONNECTION_REFUSED' not in c] == []
+
+
+def test_a_lost_laser_is_seen(page: Page, start: Start) -> None:
+    page.open(start('monitor', str(BAGS / 'laser_off'), '--loop', '--http-port', '0').url())
+    page.until('document.getElementById("state").textContent === "laser lost"')
+    page.until('document.getElementById("detector_2").classList.contains("low")')
+    page.until('document.getElementById("dx").textContent === "–"')
+    page.live()
+    page.until('!document.getElementById("detector_2").classList.contains("low")')
+
+
+def test_an_hour_leaves_the_heap_as_it_was(page: Page, serve: Callable[..., Serving]) -> None:
+    serving = serve()
+    page.open(serving.url)
+    given = 0
+
+    def give_until(count: int) -> None:
+        nonlocal given
+        while given < count:
+            # Some are short, so that losses are drawn too.
+            serving.give(given, 1790)
+            serving.give(given + 1790, 10, lost=1)
+            serving.server.tell(f'{given} blocks')
+            given += 1800
+            page.until(f'document.body.dataset.rows >= {given}')
+
+    for number in range(100):
+        serving.server.tell(f'message {number}')
+    # At both times the page's rings are filled to the same place.
+    ring = 3000
+    early = 9 * ring
+    give_until(early)
+    heap, nodes = page.heap_bytes(), page.nodes()
+    give_until(HOUR_BLOCKS)
+    assert (HOUR_BLOCKS - early) % ring == 0
+    assert page.rows() == HOUR_BLOCKS
+    grown = page.heap_bytes() - heap
+    print(f'heap {heap / 1e6:.2f} MB after {early} blocks, {grown / 1e3:+.0f} kB after {HOUR_BLOCKS}')
+    # A row that stayed would be 170 bytes, the hour's 26 MB; the rest is what a collector may leave.
+    assert grown < 250_000
+    assert page.nodes() == nodes
+    assert serving.feed.dropped == 0
+    assert page.complaints() == []

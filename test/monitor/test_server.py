@@ -1,0 +1,219 @@
+"""The server as any client sees it: what it sends, whom it obeys."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable
+from typing import Any
+
+import aiohttp
+import pytest
+
+from psd_deflection.config import load_rig
+from psd_deflection.errors import ConfigError
+from psd_deflection.monitor.feed import Feed
+from psd_deflection.monitor.server import MonitorServer
+from psd_deflection.records import BlockStatus
+
+from .serving import Serving, StillSource
+
+WAIT_S = 30.0
+Serve = Callable[..., Serving]
+
+
+def ask(
+    url: str, method: str = 'POST', *, body: object = None, headers: dict[str, str] | None = None
+) -> tuple[int, str, dict[str, str]]:
+    """Status, text and headers of one request."""
+
+    async def go() -> tuple[int, str, dict[str, str]]:
+        async with aiohttp.ClientSession() as session:
+            content = {'data': body} if isinstance(body, str) else {'json': {} if body is None else body}
+            async with session.request(method, url, headers=headers, **(content if method == 'POST' else {})) as answer:
+                return answer.status, await answer.text(), dict(answer.headers)
+
+    return asyncio.run(asyncio.wait_for(go(), WAIT_S))
+
+
+def listen(url: str, until: Callable[[dict[str, Any]], bool], headers: dict[str, str] | None = None) -> list[Any]:
+    """Messages of the websocket up to the one that ``until`` accepts."""
+
+    async def go() -> list[Any]:
+        got: list[Any] = []
+        async with (
+            aiohttp.ClientSession() as session,
+            session.ws_connect(url + 'ws', headers=headers, max_msg_size=0) as socket,
+        ):
+            async for message in socket:
+                got.append(json.loads(message.data))
+                if until(got[-1]):
+                    break
+        return got
+
+    return asyncio.run(asyncio.wait_for(go(), WAIT_S))
+
+
+def rows_in(messages: list[Any]) -> list[Any]:
+    return [row for m in messages for row in m.get('rows', [])]
+
+
+def test_a_browser_gets_the_last_minute_then_what_is_new(serve: Serve) -> None:
+    serving = serve()
+    serving.give(0, 5)
+    serving.server.tell('a message')
+    seen: list[Any] = []
+
+    def more(message: dict[str, Any]) -> bool:
+        seen.extend(message.get('rows', []))
+        if len(seen) == 5:
+            serving.give(5, 3, status=BlockStatus.LASER_LOST)
+        return len(seen) >= 8 and any('health' in m for m in (message, *got))
+
+    got: list[Any] = []
+    messages = listen(serving.url, lambda m: (got.append(m), more(m))[1])  # type: ignore[func-returns-value]
+    hello = messages[0]['hello']
+    assert hello['columns'][:2] == ['t', 'block']
+    assert hello['active_areas'] == [[0.01, 0.01], [0.01, 0.01]]
+    assert hello['control'] is False
+    rows = rows_in(messages)
+    assert [r[1] for r in rows] == list(range(8))
+    assert {len(r) for r in rows} == {len(hello['columns'])}
+    assert rows[6][8:14] == [None] * 6
+    told = [text for m in messages for _, text in m.get('messages', [])]
+    assert told == ['a message']
+    health = next(m['health'] for m in messages if 'health' in m)
+    assert health['entries'][0]['name'] == 'acquisition'
+
+
+def test_it_remembers_a_minute_and_not_more(serve: Serve) -> None:
+    serving = serve()
+    for first in range(0, 5000, 500):
+        serving.give(first, 500)
+        # Taken in between, as in life: the queue is for a pause, not for a minute.
+        listen(serving.url, lambda m, last=first + 499: any(r[1] == last for r in m.get('rows', [])))  # type: ignore[misc]
+    rows = rows_in(listen(serving.url, lambda m: 'rows' in m))
+    assert [r[1] for r in rows] == list(range(2000, 5000))
+
+
+def test_the_page_is_whole_and_loads_nothing_from_elsewhere(serve: Serve) -> None:
+    serving = serve()
+    status, page, headers = ask(serving.url, 'GET')
+    assert status == 200
+    assert "default-src 'none'" in headers['Content-Security-Policy']
+    assert headers['X-Frame-Options'] == 'DENY'
+    names = [part.split('"')[0] for part in page.replace('src="', 'href="').split('href="')[1:]]
+    assert len(names) >= 4
+    names += ['/page/rows.js', '/page/plots.js', '/page/detector.js', '/page/vendor/uPlot.LICENSE']
+    for name in names:
+        assert name.startswith('/page/')
+        status, text, headers = ask(serving.url + name[1:], 'GET')
+        assert status == 200, name
+        assert headers['X-Content-Type-Options'] == 'nosniff'
+        assert 'https://' not in text.replace('https://github.com/leeoniya/uPlot', ''), name
+    for name in ('page/../server.py', 'page/%2e%2e/server.py', 'page/', 'server.py'):
+        assert ask(serving.url + name, 'GET')[0] in (403, 404)
+
+
+def test_the_buttons_are_off_unless_allowed(serve: Serve) -> None:
+    serving = serve()
+    for path in ('api/zero', 'api/record'):
+        status, text, _ = ask(serving.url + path)
+        assert status == 403
+        assert 'monitor_control' in text
+    assert serving.source.zeros == 0
+    assert not serving.source.recordings
+
+
+def test_allowed_buttons_work_and_say_what_they_did(serve: Serve) -> None:
+    serving = serve(monitor_control=True)
+    assert ask(serving.url + 'api/zero')[:2] == (200, '{"ok": true, "message": "unloaded dots taken"}')
+    assert serving.source.zeros == 1
+    assert ask(serving.url + 'api/record', body={'record': True})[0] == 200
+    assert serving.source.recordings == ['recordings/test']
+    assert ask(serving.url + 'api/record', body={'record': False})[0] == 200
+    assert serving.source.recordings == ['recordings/test', None]
+    assert any('unloaded dots taken' in line for line in serving.said)
+    serving.source.refusal = 'no good block yet'
+    status, text, _ = ask(serving.url + 'api/zero')
+    assert (status, json.loads(text)) == (409, {'ok': False, 'message': 'no good block yet'})
+
+
+@pytest.mark.parametrize(
+    ('headers', 'body', 'status'),
+    [
+        ({'Host': 'evil.example'}, None, 403),
+        ({'Origin': 'http://evil.example'}, None, 403),
+        ({'Origin': 'null'}, None, 403),
+        ({'Sec-Fetch-Site': 'cross-site'}, None, 403),
+        # What a form or an image of another site can send without asking first.
+        ({'Content-Type': 'text/plain'}, '{}', 415),
+        ({'Content-Type': 'application/x-www-form-urlencoded'}, 'record=true', 415),
+        ({'Content-Type': 'application/json'}, '{', 400),
+        ({}, [], 400),
+        ({}, {'record': 'yes'}, 400),
+    ],
+)
+def test_what_another_site_sends_is_refused(serve: Serve, headers: dict[str, str], body: object, status: int) -> None:
+    serving = serve(monitor_control=True)
+    for path in ('api/zero', 'api/record'):
+        assert ask(serving.url + path, body=body, headers=headers)[0] == status
+    assert serving.source.zeros == 0
+    assert not serving.source.recordings
+
+
+@pytest.mark.parametrize('headers', [{'Origin': 'http://evil.example'}, {'Host': 'evil.example'}])
+def test_another_site_cannot_listen(serve: Serve, headers: dict[str, str]) -> None:
+    serving = serve()
+    with pytest.raises(aiohttp.WSServerHandshakeError, match='403'):
+        listen(serving.url, lambda m: True, headers)
+    assert ask(serving.url, 'GET', headers={'Host': 'evil.example'})[0] == 403
+
+
+def test_on_the_network_the_buttons_need_the_token(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    serving = serve(monitor_control=True, monitor_address='0.0.0.0')
+    url = f'http://127.0.0.1:{serving.port}/'
+    assert serving.said[0].endswith(f'#token={serving.server.token}')
+    assert len(serving.server.token) >= 20
+    assert ask(url + 'api/zero')[0] == 401
+    assert ask(url + 'api/zero', headers={'X-Monitor-Token': serving.server.token[:-1]})[0] == 401
+    assert serving.source.zeros == 0
+    assert ask(url + 'api/zero', headers={'X-Monitor-Token': serving.server.token})[0] == 200
+    assert serving.source.zeros == 1
+    hello = listen(url, lambda m: 'hello' in m)[0]['hello']
+    assert hello['needs_token'] is True
+    assert serving.server.token not in json.dumps(hello)
+    monkeypatch.setenv('PSD_DEFLECTION_MONITOR_TOKEN', 'of my own')
+    assert serve(monitor_control=True, monitor_address='0.0.0.0').server.token == 'of my own'
+
+
+def test_a_port_in_use_is_told_and_another_taken(serve: Serve) -> None:
+    first = serve()
+    second = serve(monitor_port=first.port)
+    assert second.port != first.port
+    assert 'is in use' in second.said[0]
+    assert ask(second.url, 'GET')[0] == 200
+
+
+def test_an_address_of_another_machine_is_refused() -> None:
+    rig = load_rig(overrides={'monitor_address': '192.0.2.1', 'monitor_port': 0})
+    server = MonitorServer(StillSource(rig), Feed(), rig.monitor, lambda text: None)
+    with pytest.raises(ConfigError, match=r"monitor_address = '192\.0\.2\.1'"):
+        server.start()
+    server.close()
+
+
+def test_browsers_are_told_when_it_ends_and_closing_twice_is_once(serve: Serve) -> None:
+    serving = serve()
+
+    async def go() -> int | None:
+        async with aiohttp.ClientSession() as session, session.ws_connect(serving.url + 'ws') as socket:
+            await socket.receive()
+            closing = asyncio.get_running_loop().run_in_executor(None, serving.server.close)
+            async for _ in socket:
+                pass
+            await closing
+            return socket.close_code
+
+    assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == 1001
+    serving.server.close()

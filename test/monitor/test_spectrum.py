@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from psd_deflection.config import load_rig
+from psd_deflection.monitor.spectrum import SEGMENT, Spectrum
+from psd_deflection.records import SampleBlock
+
+RIG = load_rig()
+
+
+def blocks(volts: npt.NDArray[np.float64], lose: frozenset[int] = frozenset()) -> list[SampleBlock]:
+    """Blocks of 20 of x1 in V; the other channels at rest."""
+    readings = np.zeros((len(volts), 6), np.float32)
+    readings[:, 0] = volts
+    readings[:, 2::3] = 5.0
+    seq = np.array([i for i in range(len(volts)) if i not in lose], np.int64)
+    return [
+        SampleBlock(k, part, part * 1_000_000, readings[part], np.zeros(len(part), np.uint8))
+        for k in range(len(volts) // 20)
+        if len(part := seq[seq // 20 == k])
+    ]
+
+
+def test_white_noise_has_its_density_and_a_sine_its_power() -> None:
+    rng = np.random.default_rng(1)
+    # 2 mV rms of white noise at 1 kHz is 2 mV / sqrt(500 Hz), times 0.5 mm/V.
+    spectrum = Spectrum(RIG)
+    for block in blocks(rng.normal(0.0, 2e-3, 4000)):
+        spectrum.add(block)
+    density = spectrum.density()
+    assert density is not None
+    assert density.shape == (4, SEGMENT // 2)
+    assert np.sqrt((density[0] ** 2).mean()) == pytest.approx(2e-3 * 0.5e-3 / np.sqrt(500.0), rel=0.05)
+    t = np.arange(4000) / 1000.0
+    spectrum = Spectrum(RIG)
+    for block in blocks(0.1 * np.sin(2.0 * np.pi * 14.0 * t)):
+        spectrum.add(block)
+    density = spectrum.density()
+    assert density is not None
+    frequencies = spectrum.frequencies
+    assert frequencies[int(density[0].argmax())] == pytest.approx(14.0, abs=1.0)
+    # Parseval: the area under the squared density is the variance of the dot, (0.1 V * 0.5 mm/V)^2 / 2.
+    area = (density[0] ** 2).sum() * (frequencies[1] - frequencies[0])
+    assert area == pytest.approx((0.1 * 0.5e-3) ** 2 / 2.0, rel=0.02)
+    assert density[1:].max() == 0.0
+
+
+def test_a_segment_never_spans_a_loss() -> None:
+    rng = np.random.default_rng(2)
+    spectrum = Spectrum(RIG)
+    for block in blocks(rng.normal(0.0, 1.0, 4000), lose=frozenset(range(500, 4000, 1000))):
+        spectrum.add(block)
+    assert spectrum.density() is None
+    # A step where samples are missing: seen as one segment it would be a large low-frequency line.
+    volts = np.where(np.arange(4000) < 2000, 0.0, 1.0)
+    spectrum = Spectrum(RIG)
+    for block in blocks(volts, lose=frozenset({1999})):
+        spectrum.add(block)
+    density = spectrum.density()
+    assert density is not None
+    assert density[0].max() < 1e-12
+
+
+def test_it_keeps_four_seconds_and_starts_anew_when_numbers_go_back() -> None:
+    spectrum = Spectrum(RIG)
+    noisy = np.zeros(12_000)
+    noisy[:6000] = np.random.default_rng(3).normal(0.0, 1.0, 6000)
+    for block in blocks(noisy):
+        spectrum.add(block)
+    density = spectrum.density()
+    assert density is not None
+    assert density[0].max() == 0.0
+    spectrum.add(blocks(noisy)[0])
+    assert spectrum.density() is None
