@@ -98,7 +98,7 @@ class SerialPort:
 def _why(error: serial.SerialException, name: str) -> str:
     number = error.errno if error.errno is not None else getattr(error.__context__, 'errno', None)
     if number == errno.ENOENT or not Path(name).exists():
-        return 'no such port; `python -m serial.tools.list_ports` lists those that are there'
+        return 'no such port; `psd-deflection devices` lists those that are there'
     if number in (errno.EAGAIN, errno.EBUSY) or 'exclusively lock' in str(error):
         return 'another program has the port open; close it (on Linux: `fuser NAME` names it)'.replace('NAME', name)
     if number in (errno.EACCES, errno.EPERM):

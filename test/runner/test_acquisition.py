@@ -155,7 +155,7 @@ def short_wait(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_a_missing_port_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DeviceError, match=r'nowhere: no such port; .*list_ports'):
+    with pytest.raises(DeviceError, match=r'nowhere: no such port; .*psd-deflection devices'):
         Acquisition(load_rig(overrides={'port': str(tmp_path / 'nowhere')}), print).open()
 
 
