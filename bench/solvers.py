@@ -7,6 +7,7 @@ enough for a tenth of a second or more.
 from __future__ import annotations
 
 import argparse
+import functools
 import time
 from collections.abc import Callable
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers import SOLVERS, make_solver
+from psd_deflection.solvers import SOLVERS, Solver, make_solver
 from psd_deflection.solvers.comparison import VARIANCES, dots_of, thesis_geometry
 
 STEP = np.radians(0.01)
@@ -101,6 +102,12 @@ def peer_thesis_at_once(dots: FloatArray) -> None:
         np.abs(np.flatnonzero(hit) - 400).min()
 
 
+def repeat(solver: Solver, dots: tuple[float, ...], variances: tuple[float, ...]) -> None:
+    """200 calls of a single block."""
+    for _ in range(200):
+        solver.solve(dots, variances)
+
+
 def main() -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -120,7 +127,7 @@ def main() -> None:
     ):
         variances = np.tile((4e-12, 1e-12, 9e-12, 2e-12), (blocks, 1)) if options else VARIANCES
         solver = make_solver(name, geometry)
-        seconds[label] = best_of(lambda s=solver, v=variances: s.solve_many(dots, v), 3) / blocks
+        seconds[label] = best_of(functools.partial(solver.solve_many, dots, variances), 3) / blocks
     peers: dict[str, float] = {}
     for text, peer, count in (
         ('scipy.optimize.least_squares a block', peer_least_squares, 500),
@@ -128,7 +135,7 @@ def main() -> None:
         ('  the same, all trials of a block in one array', peer_thesis_at_once, 5000),
     ):
         part = dots[:count]
-        peers[text] = best_of(lambda p=peer, d=part: p(d), 3) / len(part)
+        peers[text] = best_of(functools.partial(peer, part), 3) / len(part)
     for label, value in seconds.items():
         print(f'  {label:50} {1e6 * value:9.3f} us a block')
     default = seconds['exact, one set of variances']
@@ -142,17 +149,17 @@ def main() -> None:
         if name in ('pose', 'base_pair'):
             continue
         solver = make_solver(name, geometry)
-        for label, variances in (('', (4e-12,) * 4), (', x and y unlike', (4e-12, 1e-12, 9e-12, 2e-12))):
+        for label, single in (('', (4e-12,) * 4), (', x and y unlike', (4e-12, 1e-12, 9e-12, 2e-12))):
             if label and name != 'exact':
                 continue
-            value = best_of(lambda s=solver, v=variances: [s.solve(one, v) for _ in range(200)]) / 200
+            value = best_of(functools.partial(repeat, solver, one, single)) / 200
             default = default or value
             print(f'  {name + label:50} {1e6 * value:9.1f} us')
     for text, peer in (
         ('scipy.optimize.least_squares', peer_least_squares),
         ('numpy.linalg.lstsq, linear, no covariance', peer_lstsq),
     ):
-        value = best_of(lambda p=peer: p(dots[:200])) / 200
+        value = best_of(functools.partial(peer, dots[:200])) / 200
         print(f'  {text:50} {1e6 * value:9.1f} us, exact is {value / default:.0f} times as fast')
 
 

@@ -114,6 +114,7 @@ def _psd(number: int, center: list[float]) -> list[Parameter]:
             minimum=-0.5,
             maximum=0.5,
             length=2,
+            live=True,
         ),
     ]
 
@@ -193,8 +194,20 @@ PARAMETERS: tuple[Parameter, ...] = (
         length=4,
     ),
     # Acquisition.
-    Parameter('source', 'string', 'serial', '', 'where samples come from', choices=('serial',)),
-    Parameter('port', 'string', '', '', 'serial port; empty starts the simulated rig'),
+    Parameter(
+        'source',
+        'string',
+        'serial',
+        '',
+        'what the device speaks: serial (our own frames), dataq, thorlabs, lines, replay, or the name of a plug-in',
+    ),
+    Parameter(
+        'port',
+        'string',
+        '',
+        '',
+        'serial port (two with a comma between for thorlabs, a recording for replay); empty starts the simulated rig',
+    ),
     Parameter(
         'baud', 'integer', 921_600, 'baud', 'line speed (USB-CDC devices ignore it)', minimum=1200, maximum=12_000_000
     ),
@@ -210,9 +223,81 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter(
         'queue_blocks', 'integer', 250, 'blocks', 'blocks that may wait for a slow consumer', minimum=2, maximum=100_000
     ),
+    Parameter(
+        'serial_number',
+        'string',
+        '',
+        '',
+        'serial number that the device must say (HELLO); with it the device is found again under another port name',
+    ),
+    # The node.
+    Parameter('autostart', 'bool', True, '', 'configure and activate at start; false: wait for lifecycle transitions'),
+    Parameter('keep_zero', 'bool', True, '', '~/zero holds for later runs with the same device as well'),
+    Parameter(
+        'zero_file',
+        'string',
+        '',
+        '',
+        'file in which the zero is kept; empty: by serial number below $XDG_STATE_HOME/psd_deflection',
+    ),
+    Parameter(
+        'realtime', 'bool', True, '', 'ask for SCHED_FIFO (reader) and locked memory; the log says what was granted'
+    ),
+    Parameter(
+        'thorlabs.x_sign',
+        'double',
+        1.0,
+        '',
+        'sign of x of both aligners, 1 or -1: which it is shows when a dot is moved',
+        minimum=-1.0,
+        maximum=1.0,
+    ),
+    Parameter(
+        'replay.stamps',
+        'string',
+        'now',
+        '',
+        'times of replayed samples: of now in the recorded rhythm, or as recorded',
+        choices=('now', 'recorded'),
+    ),
     # Recording.
     Parameter('record', 'bool', False, '', 'record from the start'),
     Parameter('bag_dir', 'string', 'recordings', '', 'folder in which recordings are made'),
+    Parameter(
+        'bag_max_bytes',
+        'integer',
+        0,
+        'bytes',
+        'a file of a recording that is as large is ended and the next begun; 0: never',
+        minimum=0,
+        maximum=1_000_000_000_000,
+    ),
+    Parameter(
+        'bag_max_duration',
+        'double',
+        0.0,
+        's',
+        'a file of a recording that is as long is ended and the next begun; 0: never',
+        minimum=0.0,
+        maximum=1e7,
+    ),
+    Parameter(
+        'disk_reserve',
+        'integer',
+        500_000_000,
+        'bytes',
+        'recording stops before the disk has less room than this',
+        minimum=1_000_000,
+        maximum=1_000_000_000_000,
+    ),
+    Parameter(
+        'disk_full',
+        'string',
+        'stop',
+        '',
+        "when the reserve is reached: stop, or delete the oldest file of this recording (never another's)",
+        choices=('stop', 'delete_oldest'),
+    ),
     # The live page.
     Parameter('monitor', 'bool', False, '', 'serve the live page'),
     Parameter('monitor_address', 'string', '127.0.0.1', '', 'address it is served on; 0.0.0.0 shows it to the network'),
@@ -322,8 +407,16 @@ class AcquisitionConfig:
     baud: int
     latency_offset: float
     queue_blocks: int
+    serial_number: str
+    keep_zero: bool
+    zero_file: str
+    realtime: bool
     record: bool
     bag_dir: str
+    bag_max_bytes: int
+    bag_max_duration: float
+    disk_reserve: int
+    disk_full: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -495,8 +588,16 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             baud=v['baud'],
             latency_offset=v['latency_offset'],
             queue_blocks=v['queue_blocks'],
+            serial_number=v['serial_number'],
+            keep_zero=v['keep_zero'],
+            zero_file=v['zero_file'],
+            realtime=v['realtime'],
             record=v['record'],
             bag_dir=v['bag_dir'],
+            bag_max_bytes=v['bag_max_bytes'],
+            bag_max_duration=v['bag_max_duration'],
+            disk_reserve=v['disk_reserve'],
+            disk_full=v['disk_full'],
         ),
         monitor=MonitorConfig(
             enabled=v['monitor'],

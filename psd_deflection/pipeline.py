@@ -2,7 +2,8 @@
 
 It owns no clock, thread or I/O, so that what it gives depends on the rig, the samples and the order
 of calls alone, and ``replay`` can show that bit for bit. Counts -> volts -> blocks -> dots in
-metres -> health -> solvers -> estimates and the load that the link model needs for them.
+metres -> what the rig file knows to be wrong taken off -> health -> solvers -> estimates and the
+load that the link model needs for them.
 """
 
 from __future__ import annotations
@@ -18,9 +19,11 @@ from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_v
 from psd_deflection.config import Rig, replace_values
 from psd_deflection.mechanics import LinkStatics
 from psd_deflection.records import (
+    ENVIRONMENT,
     FLAG_OVER_RANGE,
     BlockStatus,
     DeflectionEstimate,
+    FloatArray,
     ParameterChange,
     RawChunk,
     Record,
@@ -28,11 +31,14 @@ from psd_deflection.records import (
     SpotMeans,
     TipLoad,
 )
+from psd_deflection.simulation.correction import Correction
 from psd_deflection.solvers import solver_from_rig
 from psd_deflection.solvers._interface import SolverStatus
 
 ZERO_BLOCKS = 25
 """Blocks whose mean is taken as the unloaded dots by :meth:`Pipeline.zero`: half a second."""
+
+START, FIRST_TEMPERATURE, TEMPERATURE = ENVIRONMENT
 
 Dots = tuple[float, float, float, float]
 
@@ -63,6 +69,7 @@ class Pipeline:
         self._period_ns = 1e9 / rig.converter.sample_rate_hz
         self._statics = LinkStatics.from_rig(rig)
         self._recent: list[Dots] = []
+        self._environment: dict[str, float] = {}
         # The converter's last step on either side: beyond it the true value is not known.
         self._rail = np.float32((2 ** (rig.converter.bits - 1) - 1) * rig.converter.volts_per_count)
         self._half = tuple(half / 2.0 for psd in rig.psds for half in psd.active_area)
@@ -73,6 +80,7 @@ class Pipeline:
     def _build(self, rig: Rig) -> None:
         self.rig = rig
         self._calibration = Calibration.from_rig(rig)
+        self._correction = Correction.from_rig(rig)
         config = rig.estimator
         self._sum_min = config.sum_min
         names = [config.solver, *(name for name in config.solvers if name != config.solver)]
@@ -82,6 +90,11 @@ class Pipeline:
     def repeated(self) -> int:
         """Samples passed over because their number did not rise."""
         return self._cutter.repeated
+
+    @property
+    def needs_temperature(self) -> bool:
+        """Whether a corrected effect goes with the ambient temperature."""
+        return self._correction.uses_temperature
 
     def process(self, chunk: RawChunk) -> Iterator[Record]:
         """The records of every block that ``chunk`` completes, each as soon as it is known.
@@ -96,6 +109,8 @@ class Pipeline:
         else:
             volts = readings.astype(np.float32, copy=False)
         for block in self._cutter.add(chunk, volts):
+            if self._correction.uses_time and START not in self._environment:
+                yield self._environment_change(block.index, {START: float(block.t_ns[0])})
             yield from self._block(block)
 
     def flush(self) -> Iterator[Record]:
@@ -113,7 +128,7 @@ class Pipeline:
         x1, y1, x2, y2 = (sum(column) / len(self._recent) for column in zip(*self._recent, strict=True))
         return self.change({'psd_1.zero': (x1, y1), 'psd_2.zero': (x2, y2)})
 
-    def change(self, values: Mapping[str, float | tuple[float, ...]]) -> ParameterChange:
+    def change(self, values: Mapping[str, float | str | tuple[float, ...]]) -> ParameterChange:
         """Change parameters from the next block on; the change as a record.
 
         Raises ConfigError where a value is out of bounds; then nothing has changed.
@@ -128,7 +143,38 @@ class Pipeline:
     def apply(self, change: ParameterChange) -> None:
         """Use the changed values from now on. Raises ConfigError where one is out of bounds."""
         values = {name: list(v) if isinstance(v, tuple) else v for name, v in change.values}
-        self._build(replace_values(self.rig, values, 'change'))
+        for name in ENVIRONMENT:
+            value = values.pop(name, None)
+            if isinstance(value, (int, float)):
+                self._environment[name] = float(value)
+        if values:
+            self._build(replace_values(self.rig, values, 'change'))
+
+    def temperature(self, celsius: float) -> ParameterChange | None:
+        """The ambient temperature from the next block on; None where no correction needs it."""
+        if not self._correction.uses_temperature:
+            return None
+        index = self.last_spots.index + 1 if self.last_spots is not None else 0
+        first = self._environment.get(FIRST_TEMPERATURE, celsius)
+        return self._environment_change(index, {FIRST_TEMPERATURE: first, TEMPERATURE: celsius})
+
+    def environment(self) -> ParameterChange | None:
+        """What the estimates depend on now besides the rig: the start of a recording holds it."""
+        if not self._environment:
+            return None
+        index = self.last_spots.index + 1 if self.last_spots is not None else 0
+        return self._environment_change(index, {})
+
+    def _environment_change(self, block: int, values: Mapping[str, float]) -> ParameterChange:
+        self._environment.update(values)
+        t_ns = self.last_spots.t_ns if self.last_spots is not None else 0
+        return ParameterChange(t_ns, block, tuple(self._environment.items()))
+
+    def _corrected(self, block: SampleBlock, samples: FloatArray, sums: FloatArray) -> FloatArray:
+        held = self._environment
+        warmer = held.get(TEMPERATURE, 0.0) - held.get(FIRST_TEMPERATURE, 0.0)
+        t: FloatArray = (block.t_ns - held.get(START, float(block.t_ns[0]))) * np.float64(1e-9)
+        return self._correction.apply(samples, sums, warmer, t)
 
     def _block(self, block: SampleBlock) -> Iterator[Record]:
         size = self._cutter.block_size
@@ -136,10 +182,12 @@ class Pipeline:
         self.counters.samples += present
         self.counters.blocks += 1
         volts = block.volts
+        sums = volts[:, 2::3].astype(np.float64)
         samples = self._calibration.dots(volts)
+        if self._correction.active:
+            samples = self._corrected(block, samples, sums)
         x1, y1, x2, y2 = (samples.sum(axis=0) / present).tolist()
         dots: Dots = (x1, y1, x2, y2)
-        sums = volts[:, 2::3].astype(np.float64)
         status, reason = self._health(block, dots, sums)
         t_ns = block_middle_ns(block, size, self._period_ns)
         variances = self._variances[present - 1]

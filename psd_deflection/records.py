@@ -148,16 +148,21 @@ class TemperatureReading(NamedTuple):
     celsius: float
 
 
-class ParameterChange(NamedTuple):
-    """Parameters that changed while the run went on (``~/zero``, a live parameter).
+ENVIRONMENT = ('environment.start_ns', 'environment.first_temperature', 'environment.temperature')
+"""Changes that are no parameters: the stream's first sample (ns), and degrees Celsius then and now."""
 
-    ``values``: name and value, checked already; they hold from block ``block`` on. It is recorded,
-    and replay applies it at the same block.
+
+class ParameterChange(NamedTuple):
+    """What the estimates depend on and that changed while the run went on.
+
+    Parameters (``~/zero``, a live one), and what :data:`ENVIRONMENT` names. ``values``: name and
+    value, checked already; they hold from block ``block`` on. It is recorded, and replay applies it
+    at the same block.
     """
 
     t_ns: int
     block: int
-    values: tuple[tuple[str, float | tuple[float, ...]], ...]
+    values: tuple[tuple[str, float | str | tuple[float, ...]], ...]
 
 
 class DiagnosticEntry(NamedTuple):

@@ -5,7 +5,15 @@ clocks' offset plus a delay that is never negative and often far above its least
 delay of each second of device time is kept (``WINDOW_S`` of them), and the line that matters is the
 lower edge of these points: the edge of their lower convex hull that spans their middle (field
 notes: 12 us standard deviation at 30 ppm skew and 1 ms USB polling; the mean of arrivals has 770).
-Until ``FIT_AFTER_S`` points are there, the clocks are taken to run equally fast.
+Until ``FIT_AFTER_S`` points are there, a one-sided filter holds (Olson, "A passive solution to the
+sensor synchronization problem", IROS 2010): the least delay so far, where an older one counts less by
+the most that the clocks may have drifted apart since (``MAX_SKEW``).
+
+Samples at 1 kHz beat with the 1 ms polling of USB: their least delay of a second may stay high for
+many seconds. Where the device answers pings, their answers come at random phase and go into the same
+minima. A round trip also bounds what no one-way clock can see: the constant part of the delay is at
+most the least round trip (``ClockState.round_trip_ns``), and ``latency_offset`` takes it off where
+it is known.
 
 A better fit is not jumped to. The map from device to host time stays continuous and rises
 everywhere; it is steered to the fit within a bounded slope, so that stamps stay evenly spaced.
@@ -30,18 +38,23 @@ STEER_SETTLING = 2e-3
 STEER_RUNNING = 2e-4
 EARLY_NS = 50_000_000
 """A sample that comes this much before the map says it can: the device's clock jumped ahead."""
+MAX_SKEW = 1e-4
 LATE_NS = 5 * SECOND_NS
 """A whole second of samples this late: the device's clock jumped back, or stood still."""
 
 
 class ClockState(NamedTuple):
-    """For diagnostics: skew in ppm, offset (host minus device) and residual in ns, resets."""
+    """For diagnostics: skew in ppm, offset (host minus device) and residual in ns, resets.
+
+    ``round_trip_ns``: the least of the pings since the map was laid, None where none was answered.
+    """
 
     skew_ppm: float
     offset_ns: int
     residual_ns: float
     points: int
     resets: int
+    round_trip_ns: int | None = None
 
 
 class ClockMap:
@@ -64,10 +77,14 @@ class ClockMap:
         self._fit = (0.0, float(host_ns - device_ns))
         self._last_device = device_ns
         self._residual = 0.0
+        self._round_trip: int | None = None
 
-    def observe(self, t_device_us: int, t_host_ns: int) -> bool:
+    def observe(self, t_device_us: int, t_host_ns: int, passed_us: float | None = None) -> bool:
         """One pair: the newest sample of a read, and when the read returned.
 
+        ``passed_us``: device time that the sample numbers say has passed since the last pair, where
+        they say so. A sample that comes too early for the map, by a clock that agrees with them,
+        shows that the first samples came late; the map is laid anew and nothing jumped.
         Returns True where the device's clock jumped and the map was laid anew.
         """
         device = t_device_us * 1000
@@ -81,10 +98,16 @@ class ClockMap:
         if not jumped and bucket != self._bucket and self._bucket_min is not None:
             jumped = self._bucket_min[1] - (self._host(self._bucket_min[0]) - self._bucket_min[0]) > LATE_NS
         if jumped:
-            self.resets += 1
+            steady = (
+                passed_us is not None
+                and device > self._last_device
+                and abs(device - self._last_device - passed_us * 1000.0) < EARLY_NS
+                and early > EARLY_NS
+            )
+            self.resets += not steady
             self._start(device, t_host_ns)
             self._bucket_min = (device, delay)
-            return True
+            return not steady
         self._last_device = device
         if bucket != self._bucket:
             if self._bucket_min is not None:
@@ -98,6 +121,18 @@ class ClockMap:
                 self._refit(device)
         return False
 
+    def observe_reply(self, t_device_us: int, sent_ns: int, t_host_ns: int) -> None:
+        """A ping sent at ``sent_ns`` was answered with this device time, and the answer read at ``t_host_ns``."""
+        device = t_device_us * 1000
+        delay = t_host_ns - device
+        # It says nothing of a clock that jumped: the samples do.
+        if not self._started or self._bucket_min is None or abs(self._host(device) - t_host_ns) > EARLY_NS:
+            return
+        trip = t_host_ns - sent_ns
+        self._round_trip = trip if self._round_trip is None else min(self._round_trip, trip)
+        if (device - self._origin) // SECOND_NS == self._bucket and delay < self._bucket_min[1]:
+            self._bucket_min = (device, delay)
+
     def to_host_ns(self, t_device_us: IntArray) -> IntArray:
         """Host time of samples in their order, (n,) int64 ns, n >= 1; rises with device time."""
         device = t_device_us * 1000
@@ -109,7 +144,12 @@ class ClockMap:
     def state(self) -> ClockState:
         """Where the clocks stand."""
         return ClockState(
-            self._fit[0] * 1e6, self._anchor_host - self._anchor_device, self._residual, len(self._minima), self.resets
+            self._fit[0] * 1e6,
+            self._anchor_host - self._anchor_device,
+            self._residual,
+            len(self._minima),
+            self.resets,
+            self._round_trip,
         )
 
     def _host(self, device: int) -> int:
@@ -121,7 +161,7 @@ class ClockMap:
         if not points:
             return
         if len(self._minima) < FIT_AFTER_S:
-            skew, intercept = 0.0, float(min(delay for _, delay in points))
+            skew, intercept = 0.0, float(min(delay + MAX_SKEW * max(now - device, 0) for device, delay in points))
         else:
             skew, intercept = lower_line([(d - self._origin, y) for d, y in self._minima])
         self._fit = (skew, intercept)

@@ -18,13 +18,24 @@ def test_tables(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['compare-methods']) == 0
     lines = capsys.readouterr().out.splitlines()
     assert max(len(line) for line in lines) <= 120
-    rows = {m.label: [line for line in lines if line.startswith(m.label + '  ')] for m in METHODS}
+    end = next(i for i, line in enumerate(lines) if line.startswith('Standard deviations'))
+    rows = {m.label: [line for line in lines[:end] if line.startswith(m.label + '  ')] for m in METHODS}
     assert all(len(found) == 2 for found in rows.values())
     rms, largest = rows['exact (default)']
     assert '0 / 0 / 0' in rms
     assert '3.34 / 2.67 / 1.83' in rms
     assert '8.98 / 6.3 / 3.32' in largest
     assert rows['Appendix D iterative'][0].endswith('5.8 %')
+    squeezed = [' '.join(line.split()) for line in lines[end:]]
+    for said in (
+        'exact, ols, wls 1.63 / 1.83 / 1.33',
+        'wls, thesis weights, sidebar 2.00 / 2.00 / 1.55',
+        'wls, thesis weights, direct 2.00 / 1.93 / 2.31',
+        'Appendix D weighted, direct -0.995 mdeg',
+        'A in mm 149.53 (122.07)',
+        '4.33, mm and rad in one norm 3.868',
+    ):
+        assert said in squeezed
     for cause in CAUSES:
         assert sum(line.startswith(cause.label + ' ') for line in lines) == 1
     (alone,) = (line for line in lines if line.startswith('the algorithms alone'))
@@ -46,6 +57,12 @@ def test_a_folder_that_cannot_be_made(tmp_path: Path, capsys: pytest.CaptureFixt
     (tmp_path / 'taken').write_text('')
     assert main(['compare-methods', '--out', str(tmp_path / 'taken')]) == 3
     assert 'taken: cannot be made a folder' in capsys.readouterr().err
+
+
+def test_a_figure_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / 'sign_convention.png').mkdir()
+    assert main(['compare-methods', '--out', str(tmp_path)]) == 3
+    assert f'--out {tmp_path}: cannot be written' in capsys.readouterr().err
 
 
 def test_the_page_has_every_method_and_every_figure() -> None:

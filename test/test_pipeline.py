@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
+from psd_deflection.cli.main import main
 from psd_deflection.config import Rig, load_rig
+from psd_deflection.io.recordings import open_recording
 from psd_deflection.mechanics import LinkStatics
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import (
@@ -196,3 +199,60 @@ def test_a_zero_is_not_taken_across_an_outage(rig: Rig) -> None:
     dark[:, :3] = 0
     run(pipeline.process, chunk_of(dark, 200))
     assert pipeline.zero() is None
+
+
+@pytest.mark.parametrize(
+    'effect',
+    [
+        {'name': 'sensor_rotation', 'psd': 2, 'angle': 0.02},
+        {'name': 'sensor_gain', 'psd': 1, 'x': 0.02, 'y': -0.03},
+        {'name': 'axis_crosstalk', 'psd': 1, 'xy': 0.01, 'yx': -0.01},
+        {'name': 'sensor_nonlinearity', 'psd': 2, 'k': 2000.0},
+        {'name': 'plane_tilt', 'slope_ratio': 1.5},
+    ],
+    ids=lambda e: str(e['name']),
+)
+def test_an_effect_in_the_rig_file_is_simulated_and_corrected(rig: Rig, effect: dict[str, object]) -> None:
+    known = load_rig(overrides={f'effects.one.{k}': v for k, v in effect.items()})
+    load = np.tile(sidebar(50.0), (20 * 400, 1))
+    counts = RigSimulator(known, 4).step(load).counts
+    pose = LinkStatics.from_rig(rig).deflection(*sidebar(50.0))
+    # The last blocks: by then the link is at rest.
+    blind, corrected = (
+        abs(estimates(run(Pipeline(r).process, chunk_of(counts)), 'exact')[-50:].mean(axis=0) - pose)
+        for r in (rig, known)
+    )
+    assert (corrected < [3e-7, 3e-7, 5e-6]).all()
+    assert (blind > 3.0 * corrected).any()
+
+
+@pytest.mark.parametrize(
+    ('effect', 'words'),
+    [
+        ({'name': 'thermal_drift', 'psd': 1, 'x': 3e-6, 'y': -2e-6}, ['--temperature', '20,30']),
+        ({'name': 'refraction', 'x': 1e-6, 'y': 2e-6}, ['--temperature', '20,30']),
+        ({'name': 'laser_pointing_drift', 'psd': 2, 'rate_x': 3e-6, 'rate_y': 1e-6}, []),
+    ],
+    ids=lambda e: str(e['name']) if isinstance(e, dict) else '',
+)
+def test_a_drift_in_the_rig_file_is_corrected_and_replayed_to_the_bit(
+    rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str], effect: dict[str, object], words: list[str]
+) -> None:
+    model = tmp_path / 'model.yaml'
+    body = ''.join(f'        {k}: {v}\n' for k, v in effect.items())
+    model.write_text(f'/**:\n  ros__parameters:\n    effects:\n      one:\n{body}')
+    bag = tmp_path / 'drifting'
+    argv = ['simulate', '--params-file', str(model), '--loads', 'constant:0,0,0:10', '--out', str(bag), *words]
+    assert main(argv) == 0
+    recorded = open_recording(bag).estimates()['/link_tip/deflection'].pose
+    # At rest, and so it is measured, from the first second to the last.
+    assert abs(recorded[-100:].mean(axis=0) - recorded[:100].mean(axis=0)).max() < 5e-7
+    assert main(['replay', str(bag), '--compare']) == 0
+    assert 'no bit differs' in capsys.readouterr().out
+    # Without the effect in the rig file the same samples seem to drift.
+    nominal = tmp_path / 'nominal.yaml'
+    nominal.write_text('/**:\n  ros__parameters:\n    min_samples: 10\n')
+    again = tmp_path / 'again.mcap'
+    assert main(['replay', str(bag), '--params-file', str(nominal), '--out', str(again)]) == 0
+    blind = open_recording(again).estimates()['/link_tip/deflection'].pose
+    assert abs(blind[-100:].mean(axis=0) - blind[:100].mean(axis=0)).max() > 3e-6

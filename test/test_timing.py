@@ -79,3 +79,51 @@ def test_the_lower_line_touches_from_below() -> None:
     slope, intercept = lower_line(points)
     assert slope == pytest.approx(0.1)
     assert all(y >= slope * x + intercept - 1e-9 for x, y in points)
+
+
+def test_a_start_that_came_late_is_no_jump_of_the_clock() -> None:
+    clock = ClockMap()
+    # The host was busy: the first sample is seen 80 ms late, the next ones in time.
+    clock.observe(0, 80 * MS)
+    assert not clock.observe(20_000, 20 * MS + 500_000, passed_us=20_000.0)
+    assert clock.resets == 0
+    assert abs(int(clock.to_host_ns(np.array([20_000], np.int64))[0]) - 20 * MS) < 1 * MS
+    # By the same arrival, but a clock that does not agree with the numbers, it did jump.
+    assert clock.observe(200_000, 41 * MS, passed_us=20_000.0)
+    assert clock.resets == 1
+
+
+def test_pings_at_random_phase_take_off_what_beats() -> None:
+    rng = np.random.default_rng(6)
+    plain, asked = ClockMap(), ClockMap()
+    for k in range(40_000):
+        # In step with the polling: every sample waits 0.9 ms.
+        host = k * MS + 900_000 + int(rng.exponential(20_000))
+        for clock in (plain, asked):
+            clock.observe(1000 * k, host)
+        if k % 100 == 99:
+            phase = int(rng.integers(0, 1000))
+            sent = k * MS + phase * 1000 - 150_000
+            asked.observe_reply(1000 * k + phase, sent, -(-(k * MS + phase * 1000) // MS) * MS + 30_000)
+        if k % 20 == 19:
+            for clock in (plain, asked):
+                clock.to_host_ns(np.array([1000 * k], np.int64))
+    last = np.array([39_999_000], np.int64)
+    assert int(plain.to_host_ns(last)[0]) - 39_999 * MS > 850_000
+    assert int(asked.to_host_ns(last)[0]) - 39_999 * MS < 200_000
+    trip = asked.state().round_trip_ns
+    assert trip is not None
+    assert 100_000 < trip < 500_000
+    assert plain.state().round_trip_ns is None
+
+
+def test_while_warming_up_a_clock_that_runs_away_is_followed() -> None:
+    rng = np.random.default_rng(7)
+    clock = ClockMap()
+    error = 0
+    for k in range(9000):
+        true = round(k * MS * (1.0 + 83e-6))
+        clock.observe(1000 * k, true + 300_000 + int(rng.exponential(50_000)))
+        error = int(clock.to_host_ns(np.array([1000 * k], np.int64))[0]) - true
+    # The least delay of nine seconds ago alone would be stale by 750 us.
+    assert abs(error - 300_000) < 250_000

@@ -234,9 +234,9 @@ def exact() -> Figure:
 def appendix_d() -> Figure:
     """Where the code of Appendix D finds the twist, a wrong one, or none."""
     geometry = thesis_geometry()
-    dy, theta = np.meshgrid(np.linspace(-4e-3, 4e-3, 202), np.radians(np.linspace(-2, 2, 202)))
+    dy, theta = np.meshgrid(np.linspace(-4e-3, 4e-3, 121), np.radians(np.linspace(-2, 2, 121)))
     # Off any regular grid, which would beat with the trial angles.
-    theta = theta + np.radians(0.02) * np.random.default_rng(4).uniform(-1.0, 1.0, theta.shape)
+    theta = theta + np.radians(0.03) * np.random.default_rng(4).uniform(-1.0, 1.0, theta.shape)
     poses = np.zeros((dy.size, 5))
     poses[:, 0], poses[:, 1], poses[:, 2] = 1e-4, dy.ravel(), theta.ravel()
     found = make_solver('appendix_d', geometry).solve_many(dots_of(geometry, poses), VARIANCES)
@@ -245,18 +245,20 @@ def appendix_d() -> Figure:
     figure, ax = plt.subplots(figsize=(6.4, 3.8), layout='constrained')
     ax.grid(visible=False)
     extent = (-4.0, 4.0, -2.0, 2.0)
-    ax.imshow(np.isnan(off).reshape(dy.shape), extent=extent, origin='lower', aspect='auto', cmap='Greys', vmax=1.4)
+    silent = np.isnan(off).reshape(dy.shape)
+    ax.imshow(silent, extent=extent, origin='lower', aspect='auto', interpolation='nearest', cmap='Greys', vmax=1.4)
     image = ax.imshow(
         np.log10(np.maximum(off, 1.0)).reshape(dy.shape),
         extent=extent,
         origin='lower',
         aspect='auto',
-        cmap='viridis',
-        vmin=0,
-        vmax=3.7,
+        interpolation='nearest',
+        cmap=plt.get_cmap('viridis', 8),
+        vmin=0.0,
+        vmax=4.0,
     )
-    bar = figure.colorbar(image, ticks=[0, 1, 2, 3])
-    bar.ax.set_yticklabels(['1', '10', '100', '1000'])
+    bar = figure.colorbar(image, ticks=[0, 1, 2, 3, 4])
+    bar.ax.set_yticklabels(['1', '10', '100', '1000', '10000'])
     bar.set_label('error of theta, mdeg')
     ax.set(
         xlabel='dY, mm',

@@ -2,7 +2,8 @@
 
 Exact readings of the thesis's rig go through every method; no noise. The first table has the rms
 error over a grid of poses (flat plate, independent tilts, tilts of a cantilever), then the largest.
-The second takes Table 5.1 apart by cause. --out draws the figures of docs/methods.md as well.
+Then come noise, condition and error bound of the linear methods, and Table 5.1 taken apart by cause.
+--out draws the figures of docs/methods.md as well.
 """
 
 from __future__ import annotations
@@ -10,21 +11,33 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from psd_deflection.errors import ConfigError
+from psd_deflection.records import FloatArray
+from psd_deflection.solvers import Geometry, make_solver
+from psd_deflection.solvers._linear import condition_number, design_matrix, error_bound
 from psd_deflection.solvers.comparison import (
     CAUSES,
     CONDITIONS,
+    DIRECT,
     METHODS,
     REPORTED,
+    SIDEBAR,
+    SIDEBAR_POSE,
+    VARIANCES,
     Errors,
+    dots_of,
     errors,
     grid,
     table_5_1,
     thesis_geometry,
 )
 
-_UNITS = (1e6, 1e6, 1e3 * 180.0 / math.pi)
+_MDEG_PER_RAD = 1e3 * 180.0 / math.pi
+_UNITS = (1e6, 1e6, _MDEG_PER_RAD)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
             Path(args.out).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(f'--out {args.out}: cannot be made a folder ({error.strerror})') from None
-    print('\n'.join([*error_table(), '', *cause_table()]))
+    print('\n'.join([*error_table(), '', *linear_table(), '', *cause_table()]))
     if args.out is not None:
         # matplotlib takes a second to import; who only reads the tables need not wait for it.
         from psd_deflection.cli._method_figures import draw_all
@@ -82,6 +95,53 @@ def _short(value: float) -> str:
     if value < 1e-6:
         return '0'
     return f'{value:.0f}' if value >= 100.0 else f'{value:.3g}'
+
+
+def linear_table() -> list[str]:
+    """Lines about noise, condition and error bound."""
+    geometry = thesis_geometry()
+    lines = ['Standard deviations for 2 um a reading: dX um / dY um / theta mdeg']
+    half = float(np.hypot(*np.ptp(geometry.centers, axis=0))) / 2.0
+    opposite = Geometry(np.array([[half, 0.0], [-half, 0.0]]), np.zeros((2, 2)), np.zeros(2), 0.585)
+    cases: list[tuple[str, str, Geometry, dict[str, Any]]] = [
+        ('exact, ols, wls', 'exact', geometry, {}),
+        ('wls, thesis weights, sidebar', 'wls', geometry, {'weights': 'thesis', 'row_scaling': SIDEBAR}),
+        ('wls, thesis weights, direct', 'wls', geometry, {'weights': 'thesis', 'row_scaling': DIRECT}),
+        ('exact, PSDs opposite, same base line', 'exact', opposite, {}),
+    ]
+    for label, name, rig, options in cases:
+        covariance = make_solver(name, rig, **options).solve_many(np.zeros((1, 4)), VARIANCES).covariance[0]
+        deviations = np.sqrt(np.diag(covariance)) * _UNITS
+        lines.append(f'{label:38} ' + ' / '.join(f'{v:.2f}' for v in deviations))
+    lines += ['', 'What the least squares of Appendix D make of a twist of 1 mdeg, both counter-clockwise']
+    dots = dots_of(geometry, np.array([[0.0, 0.0, 1.0 / _MDEG_PER_RAD, 0.0, 0.0]]))
+    for method in METHODS:
+        if method.name in ('appendix_d_ols', 'appendix_d_wls'):
+            solver = make_solver(method.name, geometry, **method.options)
+            found = float(solver.solve_many(dots, VARIANCES).pose[0, 2]) * _MDEG_PER_RAD
+            lines.append(f'{method.label:38} {found:.3f} mdeg')
+    design = design_matrix(geometry)
+    lines += ['', 'Condition number of A (4.28), Frobenius (2-norm)']
+    for label, length in (('A in mm', 1e-3), ('A in m', 1.0), ('theta times 0.1 m', 0.1)):
+        number = condition_number(design, length)
+        lines.append(f'{label:38} {number.frobenius:.2f} ({number.two:.2f})')
+    design_error = np.zeros((4, 3))
+    design_error[0, 2] = design_error[3, 2] = 1e-3
+    bound = error_bound(design, SIDEBAR_POSE, design_error, np.full(4, 2e-6)) * (1e6, 1e6, 1e3)
+    lines += [
+        '',
+        'Error bound at 50 N, R1 and R2 off by 1 mm, readings by 2 um',
+        f'{"for each component":38} {bound[0]:.1f} um, {bound[1]:.1f} um, {bound[2]:.2f} mrad',
+        f'{"4.33, mm and rad in one norm":38} {_printed_bound(design):.3f}',
+    ]
+    return lines
+
+
+def _printed_bound(design: FloatArray) -> float:
+    """4.33 as printed, with A in mm."""
+    inverse = float(np.linalg.norm(np.linalg.pinv(design * (1.0, 1.0, 1e3))))
+    pose = SIDEBAR_POSE * (1e3, 1e3, 1.0)
+    return inverse * float(np.linalg.norm(np.full(4, 2e-3)) + np.sqrt(2.0) * np.linalg.norm(pose))
 
 
 def cause_table() -> list[str]:

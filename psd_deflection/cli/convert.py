@@ -43,7 +43,7 @@ def convert(recording: Recording, out: Path, parameters: dict[str, object]) -> i
     records: Iterable[Convertible] = heapq.merge(
         changes, loads, references, temperatures, recording.blocks(), key=_time
     )
-    sink: CsvSampleSink | McapFile
+    sink: CsvSampleSink | McapFile | BagWriter
     if out.suffix.lower() == '.csv':
         sink = CsvSampleSink(out, loads=bool(loads), references=bool(references), temperatures=bool(temperatures))
         # A row takes what is waiting, and a block's last row what came during the block.

@@ -28,6 +28,7 @@ from pathlib import Path
 from psd_deflection.config import read_parameter_file, rig_from_values
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor.start import start_monitor
+from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import Session
 
 REFRESH_S = 0.25
@@ -37,6 +38,9 @@ PLAIN_REFRESH_S = 5.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('--port', help='serial port of the device; without it a simulated rig is started')
+    parser.add_argument(
+        '--source', help='what the device speaks: serial (our own frames), dataq, thorlabs, lines, replay'
+    )
     parser.add_argument('--baud', type=int, help='line speed (default 921600; USB-CDC devices ignore it)')
     parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig')
     parser.add_argument(
@@ -53,6 +57,8 @@ def overrides_of(args: argparse.Namespace) -> dict[str, object]:
     values: dict[str, object] = dict(read_parameter_file(args.params_file)) if args.params_file else {}
     if args.port is not None:
         values['port'] = args.port
+    if args.source is not None:
+        values['source'] = args.source
     if args.baud is not None:
         values['baud'] = args.baud
     if args.solver is not None:
@@ -162,13 +168,19 @@ def run_without_ros(overrides: dict[str, object], display: Display, watch: Calla
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     session = Session(rig_from_values(overrides, 'command line'), display.say)
+    watchdog = Watchdog()
     monitor = None
     try:
         monitor = start_monitor(session, display.say)
+        settle()
         session.start()
+        watchdog.ready()
         while not stop.wait(0.1) and session.processing.alive:
+            if session.responsive():
+                watchdog.alive()
             watch(session)
     finally:
+        watchdog.stopping()
         if monitor is not None:
             monitor.close()
         session.close()

@@ -28,7 +28,7 @@ from psd_deflection.io.recording import Recording
 from psd_deflection.io.recordings import open_recording
 from psd_deflection.io.sinks import Sink, open_sink
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.records import DeflectionEstimate, RawChunk, Record, SampleBlock
+from psd_deflection.records import ENVIRONMENT, DeflectionEstimate, RawChunk, Record, SampleBlock
 
 DIFFERS = 1
 
@@ -76,7 +76,14 @@ class Totals:
 def replayed(recording: Recording, pipeline: Pipeline, blocks: Iterable[SampleBlock]) -> Iterator[list[Record]]:
     """The records of each step; recorded changes of parameters apply at their own block."""
     changes = list(recording.changes)
+    # What our own recorder noted says when a temperature took effect; of others' recordings, the stamps do.
+    noted = any(name in ENVIRONMENT for change in changes for name, _ in change.values)
+    temperatures = [] if noted or not pipeline.needs_temperature else recording.temperatures()
     for block in blocks:
+        while temperatures and temperatures[0].t_ns <= block.t_ns[0]:
+            warmer = pipeline.temperature(temperatures.pop(0).celsius)
+            if warmer is not None:
+                yield [warmer]
         while changes and changes[0].block <= block.index:
             # What is unfinished belongs to the time before the change.
             yield list(pipeline.flush())

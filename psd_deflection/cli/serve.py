@@ -9,12 +9,21 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable, Sequence
 
 from psd_deflection.config import Rig, load_rig, rig_from_values
 from psd_deflection.errors import ConfigError
-from psd_deflection.io.simulated_device import PseudoTerminal, SimulatedDevice, serve
+from psd_deflection.io.simulated_dataq import SimulatedDataq
+from psd_deflection.io.simulated_device import LineDevice, PseudoTerminal, SimulatedDevice, serve
+from psd_deflection.io.simulated_lines import SimulatedLines
+from psd_deflection.io.simulated_thorlabs import SharedRig, SimulatedAligner
+from psd_deflection.records import FloatArray
+from psd_deflection.runner.session import SIMULATED
 from psd_deflection.runner.simulated_rig import PORT_LINE
 from psd_deflection.simulation.loads import CyclicLoads, thesis_load_cases
+
+DEVICES = SIMULATED
+"""What can be simulated, named as the sources that read it."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,6 +31,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('as a device (--serve)')
     group.add_argument(
         '--serve', action='store_true', help='be a device on a pseudo-terminal, in real time, and print its port'
+    )
+    group.add_argument(
+        '--device',
+        choices=DEVICES,
+        help='what it speaks: our own frames (serial), a DATAQ converter, a pair of Thorlabs aligners (two ports), '
+        'lines of text; default: what source: of the rig says',
     )
     group.add_argument('--link', metavar='PATH', help='a symbolic link to the port, for a name that stays')
     group.add_argument('--skew-ppm', type=float, default=0.0, help="how much too fast the device's clock runs")
@@ -37,21 +52,54 @@ def run_device(args: argparse.Namespace) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     loads = CyclicLoads(thesis_load_cases(rate=rig.converter.sample_rate_hz))
-    device = SimulatedDevice(
-        rig, lambda _, n: loads.take(n), seed=args.seed, skew_ppm=args.skew_ppm, first_seq=args.first_seq
-    )
-    port = PseudoTerminal(args.link)
+    name = args.device or rig.acquisition.source
+    if name not in DEVICES:
+        raise ConfigError(f'source = {name!r}: cannot be simulated; --device takes one of {", ".join(DEVICES)}')
+    devices = make_devices(name, rig, lambda _, n: loads.take(n), args)
+    links = [args.link] if len(devices) == 1 or args.link is None else [f'{args.link}_{i}' for i in (1, 2)]
+    ports = [PseudoTerminal(link) for link in (links if args.link else [None] * len(devices))]
+    names = ','.join(port.name for port in ports)
     try:
-        print(f'{PORT_LINE}{port.name}', flush=True)
+        print(f'{PORT_LINE}{names}', flush=True)
         if not args.attached:
+            source = '' if name == 'serial' else f' --source {name}'
             print(
-                f'a simulated rig answers there; try:  psd-deflection estimator --port {port.name}\nCtrl-C ends it',
+                f'a simulated rig answers there; try:  psd-deflection estimator --port {names}{source}\nCtrl-C ends it',
                 file=sys.stderr,
             )
-        serve(device, port, stop.is_set)
+        serve_all(devices, ports, stop.is_set)
     finally:
-        port.close()
+        for port in ports:
+            port.close()
     return 0
+
+
+def make_devices(
+    name: str, rig: Rig, loads: Callable[[int, int], FloatArray], args: argparse.Namespace
+) -> list[LineDevice]:
+    """The device, or the two of a pair."""
+    options = {'seed': args.seed, 'skew_ppm': args.skew_ppm}
+    if name == 'dataq':
+        return [SimulatedDataq(rig, loads, **options)]
+    if name == 'lines':
+        return [SimulatedLines(rig, loads, first_seq=args.first_seq, **options)]
+    if name == 'thorlabs':
+        shared = SharedRig(rig, loads, args.seed)
+        return [SimulatedAligner(shared, psd) for psd in (1, 2)]
+    return [SimulatedDevice(rig, loads, first_seq=args.first_seq, **options)]
+
+
+def serve_all(devices: Sequence[LineDevice], ports: Sequence[PseudoTerminal], stopped: Callable[[], bool]) -> None:
+    """Serve each on its port until ``stopped()``, the first in this thread."""
+    others = [
+        threading.Thread(target=serve, args=(device, port, stopped), name=port.name, daemon=True)
+        for device, port in zip(devices[1:], ports[1:], strict=True)
+    ]
+    for thread in others:
+        thread.start()
+    serve(devices[0], ports[0], stopped)
+    for thread in others:
+        thread.join()
 
 
 def _attached_rig(stop: threading.Event) -> Rig:

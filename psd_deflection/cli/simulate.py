@@ -1,19 +1,151 @@
-"""Simulate the rig: as a device on a pseudo-terminal (--serve)."""
+"""Simulate the rig: as a recording (--out), or as a device on a pseudo-terminal (--serve).
+
+The rig file says what the rig is and which effects are on; --effect adds one more. A recording
+holds the samples, the loads, the temperature where one is given, and with --reference the true pose.
+"""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
 
 from psd_deflection.cli import serve
+from psd_deflection.config import EFFECTS_PREFIX, Rig, load_rig, replace_values
+from psd_deflection.errors import ConfigError
+from psd_deflection.io.bag_writer import BagWriter, McapFile
+from psd_deflection.io.csv_writer import CsvSampleSink
+from psd_deflection.io.sinks import Sink
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import (
+    AppliedLoad,
+    FloatArray,
+    RawChunk,
+    Record,
+    ReferencePose,
+    TemperatureReading,
+)
+from psd_deflection.simulation.catalogue import effects_of_rig
+from psd_deflection.simulation.load_words import HELP, load_history, temperature_history
+from psd_deflection.simulation.simulator import RigSimulator
+
+CHUNK_SECONDS = 1.0
+BAG_START_NS = 1_000_000_000
+"""A bag's stamps start here: zero means "no stamp" to many tools."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig')
+    parser.epilog = HELP
+    parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig and its effects')
     parser.add_argument('--seed', type=int, default=0, help='seed of the noise')
+    group = parser.add_argument_group('as a recording (--out)')
+    group.add_argument('--out', metavar='OUT', help='X.csv, X.mcap or a bag folder')
+    group.add_argument(
+        '--loads', metavar='WORDS', action='append', help='a load history, see below (default: thesis); repeatable'
+    )
+    group.add_argument('--temperature', metavar='T0[,T1...]', help='degrees Celsius, straight lines through these')
+    group.add_argument(
+        '--effect',
+        metavar='NAME,KEY=VALUE,...',
+        action='append',
+        default=[],
+        help='switch an effect on, for example sensor_rotation,psd=2,angle=0.01; repeatable',
+    )
+    group.add_argument('--reference', action='store_true', help='record the true pose as an independent measurement')
     serve.add_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve."""
-    return serve.run_device(args)
+    """Serve or write."""
+    if args.serve or args.attached:
+        return serve.run_device(args)
+    if args.out is None:
+        raise ConfigError('simulate: --out OUT or --serve is needed')
+    rig = with_effects(load_rig(args.params_file), args.effect)
+    rate = rig.converter.sample_rate_hz
+    parts = [load_history(words, rate) for words in args.loads or ['thesis']]
+    history = parts[0].then(*parts[1:])
+    temperature = None if args.temperature is None else temperature_history(args.temperature, len(history))
+    out = Path(args.out)
+    count = write_recording(out, rig, history.loads, temperature, args.seed, args.reference)
+    names = ', '.join(a.label for a in effects_of_rig(rig)) or 'none'
+    print(f'{out}: {count} samples, {count / rate:.1f} s; effects: {names}')
+    return 0
+
+
+def with_effects(rig: Rig, words: Sequence[str]) -> Rig:
+    """``rig`` with the effects of ``NAME,KEY=VALUE,...``; raises ConfigError."""
+    changes: dict[str, object] = {}
+    for i, text in enumerate(words):
+        name, *pairs = text.split(',')
+        changes[f'{EFFECTS_PREFIX}effect_{i}.name'] = name
+        for pair in pairs:
+            key, equals, value = pair.partition('=')
+            if not equals:
+                raise ConfigError(f'--effect {text}: {pair!r} is not KEY=VALUE')
+            changes[f'{EFFECTS_PREFIX}effect_{i}.{key}'] = value
+    changed = replace_values(rig, changes, '--effect') if changes else rig
+    effects_of_rig(changed)
+    return changed
+
+
+def write_recording(
+    out: Path, rig: Rig, loads: FloatArray, temperature: FloatArray | None, seed: int, reference: bool
+) -> int:
+    """Simulate and write; returns the number of samples. Raises RecordingError, ConfigError."""
+    is_csv = out.suffix.lower() == '.csv'
+    sink: Sink
+    values = {**rig.values, **{EFFECTS_PREFIX + k: e for k, e in rig.effects.items()}}
+    if is_csv:
+        sink = CsvSampleSink(out, loads=True, references=reference, temperatures=temperature is not None)
+    elif out.suffix.lower() == '.mcap':
+        sink = McapFile(out, rig_values=values)
+    else:
+        sink = BagWriter(out, rig_values=values)
+    with contextlib.closing(sink):
+        for record in records(rig, loads, temperature, seed, reference, 0 if is_csv else BAG_START_NS):
+            sink.put(record)
+    return len(loads)
+
+
+def records(
+    rig: Rig, loads: FloatArray, temperature: FloatArray | None, seed: int, reference: bool, start_ns: int
+) -> Iterator[Record]:
+    """What the rig would have recorded, and the estimates that the daemon would have made of it."""
+    simulator, pipeline = RigSimulator(rig, seed), Pipeline(rig)
+    period = 1e9 / rig.converter.sample_rate_hz
+    # A temperature takes effect with the block that follows it: then block by block.
+    size = max(1, round(CHUNK_SECONDS * rig.converter.sample_rate_hz))
+    size = rig.estimator.block_size if temperature is not None else size
+    last: tuple[float, ...] | None = None
+    last_temperature: float | None = None
+    block = rig.estimator.block_size
+    for start in range(0, len(loads), size):
+        stop = min(start + size, len(loads))
+        seq = np.arange(start, stop, dtype=np.int64)
+        t_ns = start_ns + np.rint(seq * period).astype(np.int64)
+        for i in range(start, stop):
+            load = (float(loads[i, 0]), float(loads[i, 1]), float(loads[i, 2]))
+            if load != last:
+                last = load
+                yield AppliedLoad(int(t_ns[i - start]), *load)
+            # The thermometer reads as often as an estimate comes: it is slow, and so is the air.
+            if temperature is not None and i % block == 0 and float(temperature[i]) != last_temperature:
+                last_temperature = float(temperature[i])
+                yield TemperatureReading(int(t_ns[i - start]), last_temperature)
+                warmer = pipeline.temperature(last_temperature)
+                if warmer is not None:
+                    yield warmer
+        part = simulator.step(loads[start:stop], None if temperature is None else temperature[start:stop])
+        if reference:
+            for i in range(0, stop - start, block):
+                # The middle of the block is where the estimate stands.
+                k = min(i + block // 2, stop - start - 1)
+                yield ReferencePose(int(t_ns[k]), *(float(v) for v in part.pose[k]))
+        flags = np.zeros(stop - start, dtype=np.uint8)
+        yield from pipeline.process(RawChunk(seq, t_ns, part.counts, flags, rig.converter.volts_per_count))
+    yield from pipeline.flush()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -55,28 +56,45 @@ def to_yaml(tree: object) -> str:
 
 @dataclass(slots=True)
 class TopicCount:
-    """One topic of a bag."""
+    """One topic of a bag. ``qos``: one profile, or the list of all that were offered."""
 
     name: str
     type: str
-    qos: Qos
+    qos: Qos | list[Qos]
     type_hash: str
     messages: int = 0
 
 
-def bag_information(
-    file_name: str, topics: Sequence[TopicCount], start_ns: int, end_ns: int, custom: Mapping[str, str]
-) -> dict[str, Any]:
-    """The tree below ``rosbag2_bagfile_information``; the bag is one file."""
-    count = sum(t.messages for t in topics)
+@dataclass(frozen=True, slots=True)
+class FileCount:
+    """One file of a bag: ``path`` relative to its folder; times are log times, ns."""
+
+    path: str
+    start_ns: int
+    end_ns: int
+    messages: int
+
+
+def _times(start_ns: int, end_ns: int, count: int) -> dict[str, Any]:
     # What rosbag2 has for a bag without a message.
-    start = {'nanoseconds_since_epoch': start_ns if count else 2**63 - 1}
-    duration = {'nanoseconds': end_ns - start_ns if count else 0}
+    return {
+        'starting_time': {'nanoseconds_since_epoch': start_ns if count else 2**63 - 1},
+        'duration': {'nanoseconds': end_ns - start_ns if count else 0},
+    }
+
+
+def bag_information(
+    files: Sequence[FileCount], topics: Sequence[TopicCount], custom: Mapping[str, str]
+) -> dict[str, Any]:
+    """The tree below ``rosbag2_bagfile_information``."""
+    count = sum(t.messages for t in topics)
+    filled = [f for f in files if f.messages]
+    times = _times(min((f.start_ns for f in filled), default=0), max((f.end_ns for f in filled), default=0), count)
     return {
         'version': METADATA_VERSION,
         'storage_identifier': 'mcap',
-        'duration': duration,
-        'starting_time': start,
+        'duration': times['duration'],
+        'starting_time': times['starting_time'],
         'message_count': count,
         'topics_with_message_count': [
             {
@@ -84,7 +102,7 @@ def bag_information(
                     'name': t.name,
                     'type': t.type,
                     'serialization_format': 'cdr',
-                    'offered_qos_profiles': [dict(t.qos)],
+                    'offered_qos_profiles': [dict(q) for q in t.qos] if isinstance(t.qos, list) else [dict(t.qos)],
                     'type_description_hash': t.type_hash,
                 },
                 'message_count': t.messages,
@@ -93,8 +111,17 @@ def bag_information(
         ],
         'compression_format': '',
         'compression_mode': '',
-        'relative_file_paths': [file_name],
-        'files': [{'path': file_name, 'starting_time': start, 'duration': duration, 'message_count': count}],
+        'relative_file_paths': [f.path for f in files],
+        'files': [
+            {'path': f.path, **_times(f.start_ns, f.end_ns, f.messages), 'message_count': f.messages} for f in files
+        ],
         'custom_data': dict(custom),
         'ros_distro': 'jazzy',
     }
+
+
+def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:
+    """``metadata.yaml`` as a whole or not at all. Raises OSError."""
+    partial = folder / 'metadata.yaml.partial'
+    partial.write_text(to_yaml({'rosbag2_bagfile_information': information}), encoding='utf-8')
+    partial.replace(folder / 'metadata.yaml')

@@ -324,9 +324,12 @@ def _to_change(entry: Mapping[str, str]) -> ParameterChange:
             return value
         raise TypeError
 
-    values: list[tuple[str, float | tuple[float, ...]]] = []
+    values: list[tuple[str, float | str | tuple[float, ...]]] = []
     for key, value in json.loads(entry['values']).items():
-        values.append((key, tuple(map(number, value)) if isinstance(value, list) else number(value)))
+        if isinstance(value, list):
+            values.append((key, tuple(map(number, value))))
+        else:
+            values.append((key, value if isinstance(value, str) else number(value)))
     return ParameterChange(int(entry['t_ns']), int(entry['block']), tuple(values))
 
 

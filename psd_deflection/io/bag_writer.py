@@ -1,14 +1,17 @@
 """Writes recordings: rosbag2 bags (a folder with ``metadata.yaml`` and MCAP) and lone MCAP files.
 
-A crash must cost at most a second: chunks span less than one second of log time and are handed to
-the operating system as they end; parameters, version and hello are at the front of the file. What
-a crash leaves is read up to the cut by :mod:`psd_deflection.io.bag_reader`.
+A crash must cost at most a second: chunks span less than half a second of log time and are handed
+to the operating system as they end (``durable``: to the disk); parameters, version and hello are at
+the front of every file. What a crash leaves is read up to the cut by
+:mod:`psd_deflection.io.bag_reader` and made whole again by :mod:`psd_deflection.io.recover`.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -20,17 +23,30 @@ from msg_adapters import to_messages
 from psd_deflection import __version__
 from psd_deflection.errors import RecordingError
 from psd_deflection.io import cdr
-from psd_deflection.io.bag_metadata import DEFAULT_QOS, Qos, TopicCount, bag_information, qos_text, to_yaml
+from psd_deflection.io.bag_metadata import (
+    DEFAULT_QOS,
+    FileCount,
+    Qos,
+    TopicCount,
+    bag_information,
+    qos_text,
+    to_yaml,
+    write_metadata,
+)
 from psd_deflection.io.ros2msg import TYPE_HASHES, definition
 from psd_deflection.records import ParameterChange, Record
 
-NS_PER_S = 1_000_000_000
+CHUNK_NS = 500_000_000
+"""Log time that a chunk spans at most: with what waits in queues, a crash costs less than a second."""
 
 META_SOFTWARE = 'psd_deflection'
 META_PARAMETERS = 'psd_deflection.parameters'
 META_HELLO = 'psd_deflection.device_hello'
 META_CHANGE = 'psd_deflection.change.'
 """Names of the MCAP metadata records; every value in the last three is JSON."""
+
+
+CUSTOM = {'psd_deflection_version': __version__}
 
 
 def _json_values(values: Mapping[str, object]) -> dict[str, str]:
@@ -49,7 +65,8 @@ class McapFile:
 
     ``write`` takes the records of one thread. Raises RecordingError where the file exists, cannot
     be made, or the disk refuses more; after such an error the file is closed and holds all chunks
-    that were complete.
+    that were complete. While it is written the file is locked (``flock``), so that nobody repairs it.
+    ``durable``: chunks reach the disk before the next one begins, not only the operating system.
     """
 
     def __init__(
@@ -59,8 +76,10 @@ class McapFile:
         rig_values: Mapping[str, object],
         device_hello: Mapping[str, object] | None = None,
         qos: Mapping[str, Qos] | None = None,
+        durable: bool = False,
     ) -> None:
         self.path = path
+        self._durable = durable
         self.topics: dict[str, TopicCount] = {}
         self.start_ns = 0
         self.end_ns = 0
@@ -69,7 +88,7 @@ class McapFile:
         self._channels: dict[str, int] = {}
         self._chunk_first: int | None = None
         self._chunk_last = 0
-        self._changes = 0
+        self.changes: list[ParameterChange] = []
         self._stream: BinaryIO | None = None
         parameters = _json_values(rig_values)
         hello = None if device_hello is None else _json_values(device_hello)
@@ -79,6 +98,8 @@ class McapFile:
             raise RecordingError(f'{path}: exists already; a recording is never overwritten') from None
         except OSError as error:
             raise RecordingError(f'{path}: cannot be made ({error.strerror or error})') from None
+        with contextlib.suppress(OSError):
+            fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._writer = Writer(self._stream, compression=CompressionType.ZSTD, enable_crcs=True)
         with self._guard():
             self._writer.start(profile='ros2', library=f'psd_deflection {__version__}')
@@ -86,12 +107,28 @@ class McapFile:
             self._writer.add_metadata(META_PARAMETERS, parameters)
             if hello is not None:
                 self._writer.add_metadata(META_HELLO, hello)
-            self._writer.flush()
+            self._flush()
 
     @property
     def closed(self) -> bool:
         """True once nothing more can be written, be it after ``close`` or after an error."""
         return self._stream is None
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file so far; what is in the unfinished chunk not counted."""
+        return self._stream.tell() if self._stream is not None else 0
+
+    def flush(self) -> None:
+        """End the chunk, so that a crash from now on does not cost it."""
+        with self._guard():
+            self._flush()
+            self._chunk_first = None
+
+    def _flush(self) -> None:
+        self._writer.flush()
+        if self._durable and self._stream is not None:
+            os.fsync(self._stream.fileno())
 
     @contextlib.contextmanager
     def _guard(self) -> Any:
@@ -120,10 +157,10 @@ class McapFile:
         """Write all messages of one record; the log time is the record's own stamp."""
         if isinstance(record, ParameterChange):
             with self._guard():
-                self._changes += 1
+                self.changes.append(record)
                 head = {'t_ns': str(record.t_ns), 'block': str(record.block)}
                 self._writer.add_metadata(
-                    f'{META_CHANGE}{self._changes:06d}', {**head, 'values': json.dumps(dict(record.values))}
+                    f'{META_CHANGE}{len(self.changes):06d}', {**head, 'values': json.dumps(dict(record.values))}
                 )
             return
         for message in to_messages(record):
@@ -139,8 +176,8 @@ class McapFile:
             if channel is None:
                 channel = self._register(topic, type_name)
             first = self._chunk_first
-            if first is not None and max(self._chunk_last, t_ns) - min(first, t_ns) >= NS_PER_S:
-                self._writer.flush()
+            if first is not None and max(self._chunk_last, t_ns) - min(first, t_ns) >= CHUNK_NS:
+                self._flush()
                 first = None
             self._chunk_first = t_ns if first is None else min(first, t_ns)
             self._chunk_last = t_ns if first is None else max(self._chunk_last, t_ns)
@@ -166,23 +203,22 @@ class McapFile:
         self.topics[topic] = TopicCount(topic, type_name, qos, type_hash)
         return channel
 
-    def information(self) -> dict[str, Any]:
-        """The tree of ``metadata.yaml`` for what was written so far."""
-        return bag_information(
-            self.path.name,
-            list(self.topics.values()),
-            self.start_ns,
-            self.end_ns,
-            {'psd_deflection_version': __version__},
-        )
+    def count(self) -> FileCount:
+        """The file as ``metadata.yaml`` has it."""
+        messages = sum(t.messages for t in self.topics.values())
+        return FileCount(self.path.name, self.start_ns, self.end_ns, messages)
 
     def close(self) -> None:
         """Write index and summary and close; does nothing the second time."""
         if self._stream is None:
             return
         with self._guard():
-            self._writer.add_metadata('rosbag2', {'serialized_metadata': to_yaml(self.information())})
+            information = bag_information([self.count()], list(self.topics.values()), CUSTOM)
+            self._writer.add_metadata('rosbag2', {'serialized_metadata': to_yaml(information)})
             self._writer.finish()
+            if self._durable:
+                self._stream.flush()
+                os.fsync(self._stream.fileno())
             self._stream.close()
         self._stream = None
 
@@ -198,12 +234,14 @@ class McapFile:
         self.close()
 
 
-class BagWriter(McapFile):
-    """A rosbag2 bag being written: ``NAME/NAME_0.mcap``, and ``NAME/metadata.yaml`` at the end.
+class BagWriter:
+    """A rosbag2 bag being written: ``NAME/NAME_0.mcap`` and so on, ``NAME/metadata.yaml`` at the end.
 
     ``rig_values``: the flat parameter set, effects included. ``qos``: topic to profile
     (:func:`psd_deflection.io.bag_metadata.qos_profile`) where it is not the default one.
-    Raises RecordingError where the folder exists already or cannot be made.
+    ``max_bytes``, ``max_s``: a file that is as large, or spans as much log time, is ended and the
+    next one begun (0: never); each file can be read alone. Raises RecordingError where the folder
+    exists already or cannot be made; :meth:`write` and the others as :class:`McapFile` does.
     """
 
     def __init__(
@@ -213,6 +251,9 @@ class BagWriter(McapFile):
         rig_values: Mapping[str, object],
         device_hello: Mapping[str, object] | None = None,
         qos: Mapping[str, Qos] | None = None,
+        max_bytes: int = 0,
+        max_s: float = 0.0,
+        durable: bool = False,
     ) -> None:
         self.folder = Path(folder)
         try:
@@ -221,22 +262,117 @@ class BagWriter(McapFile):
             raise RecordingError(f'{self.folder}: exists already; a recording is never overwritten') from None
         except OSError as error:
             raise RecordingError(f'{self.folder}: cannot be made ({error.strerror or error})') from None
-        name = self.folder.resolve().name
-        super().__init__(self.folder / f'{name}_0.mcap', rig_values=rig_values, device_hello=device_hello, qos=qos)
+        self._name = self.folder.resolve().name
+        self._rig_values, self._hello, self._qos = rig_values, device_hello, qos
+        self._max_bytes, self._max_ns, self._durable = max_bytes, round(max_s * 1e9), durable
+        self._number = 0
+        self._ended: list[tuple[FileCount, list[TopicCount]]] = []
+        self._file = self._begin()
+
+    @property
+    def path(self) -> Path:
+        """The file that is written at present."""
+        return self._file.path
+
+    @property
+    def closed(self) -> bool:
+        """True once nothing more can be written, be it after ``close`` or after an error."""
+        return self._file.closed
+
+    @property
+    def ended_files(self) -> list[Path]:
+        """The files that are whole already, oldest first."""
+        return [self.folder / count.path for count, _ in self._ended]
+
+    def _begin(self) -> McapFile:
+        file = McapFile(
+            self.folder / f'{self._name}_{self._number}.mcap',
+            rig_values=self._rig_values,
+            device_hello=self._hello,
+            qos=self._qos,
+            durable=self._durable,
+        )
+        self._number += 1
+        return file
+
+    def write_hello(self, device_hello: Mapping[str, object]) -> None:
+        """Note the device's hello when it comes after the start of the recording; the last one counts."""
+        self._hello = device_hello
+        self._file.write_hello(device_hello)
+
+    def write(self, record: Record) -> None:
+        """Write all messages of one record; the log time is the record's own stamp."""
+        if isinstance(record, ParameterChange):
+            self._file.write(record)
+            return
+        for message in to_messages(record):
+            self.write_encoded(message.topic, message.type, cdr.encode(message.type, message.fields), message.t_ns)
+
+    def write_encoded(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
+        """Write one message that is CDR already, at log time ``t_ns``; begin a new file where it is time to."""
+        file = self._file
+        full = self._max_bytes and file.size >= self._max_bytes
+        if full or (self._max_ns and file.topics and t_ns - file.start_ns >= self._max_ns):
+            self.rotate()
+        self._file.write_encoded(topic, type_name, message, t_ns)
+
+    def rotate(self) -> None:
+        """End the file and begin the next; what changed so far stands in it as well."""
+        before = self._file
+        before.close()
+        self._ended.append((before.count(), list(before.topics.values())))
+        self._file = self._begin()
+        for change in before.changes:
+            self._file.write(change)
+
+    def drop_oldest(self) -> Path | None:
+        """Delete the oldest file that is whole; None where there is only the one being written."""
+        if not self._ended:
+            return None
+        count, _ = self._ended.pop(0)
+        path = self.folder / count.path
+        try:
+            path.unlink()
+        except OSError as error:
+            raise RecordingError(f'{path}: cannot be deleted ({error.strerror or error})') from None
+        return path
+
+    def flush(self) -> None:
+        """End the chunk, so that a crash from now on does not cost it."""
+        self._file.flush()
+
+    def information(self) -> dict[str, Any]:
+        """The tree of ``metadata.yaml`` for what was written so far."""
+        parts = [*self._ended, (self._file.count(), list(self._file.topics.values()))]
+        topics: dict[str, TopicCount] = {}
+        for _, counts in parts:
+            for t in counts:
+                known = topics.setdefault(t.name, TopicCount(t.name, t.type, t.qos, t.type_hash))
+                known.messages += t.messages
+        return bag_information([count for count, _ in parts], list(topics.values()), CUSTOM)
 
     def close(self) -> None:
         """Close the file, then write ``metadata.yaml``; does nothing the second time.
 
-        A bag whose file ended with an error gets no ``metadata.yaml``: ``ros2 bag reindex`` makes
-        one of what is there, and our reader needs none.
+        A bag whose file ended with an error gets no ``metadata.yaml``: ``psd-deflection recover``
+        makes one of what is there, and our reader needs none.
         """
         if self.closed:
             return
-        super().close()
-        target = self.folder / 'metadata.yaml'
-        partial = self.folder / 'metadata.yaml.partial'
+        self._file.close()
         try:
-            partial.write_text(to_yaml({'rosbag2_bagfile_information': self.information()}), encoding='utf-8')
-            partial.replace(target)
+            write_metadata(self.folder, self.information())
         except OSError as error:
-            raise RecordingError(f'{target}: cannot be written ({error.strerror or error})') from None
+            reason = error.strerror or error
+            raise RecordingError(f'{self.folder / "metadata.yaml"}: cannot be written ({reason})') from None
+
+    # A recorder is a sink like any other.
+    put = write
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

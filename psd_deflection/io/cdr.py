@@ -6,7 +6,7 @@ The node publishes and the recorder writes the very same bytes (XCDR1, little-en
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from typing import Any
 
@@ -30,6 +30,12 @@ def _decoder(type_name: str) -> Callable[[bytes], Any]:
 def encode(type_name: str, fields: Mapping[str, Any]) -> bytes:
     """CDR of one message, encapsulation header included. Raises KeyError for a type that is not ours."""
     return _encoder(type_name)(fields)
+
+
+def prepare(type_names: Iterable[str]) -> None:
+    """Make the encoders now: the first message of a stream must not wait for them."""
+    for type_name in type_names:
+        _encoder(type_name)
 
 
 def decode(type_name: str, cdr: bytes) -> dict[str, Any]:

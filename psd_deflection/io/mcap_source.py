@@ -26,8 +26,8 @@ MAX_CHUNK_BYTES = 256 * 2**20
 
 MAX_METADATA_BYTES = 16 * 2**20
 
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
-_METADATA, _DATA_END = 0x0C, 0x0F
+_FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x02, 0x03, 0x04, 0x05, 0x06
+METADATA, DATA_END = 0x0C, 0x0F
 
 _RECORD = struct.Struct('<BQ')
 _RECORD_AND_MESSAGE = struct.Struct('<BQHIQQ')
@@ -50,35 +50,39 @@ class RawMessage(NamedTuple):
     cdr: bytes
 
 
-class _DamagedError(Exception):
+class DamagedError(Exception):
     """What was read contradicts itself."""
 
 
-class _Cursor:
-    """Takes fields off a record; raises _DamagedError where the record ends before the field does."""
+class Cursor:
+    """Takes fields off a record; raises DamagedError where the record ends before the field does."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content
         self._at = 0
 
     def take(self, size: int) -> bytes:
+        """The next ``size`` bytes."""
         piece = self._content[self._at : self._at + size]
         if len(piece) != size:
-            raise _DamagedError('a field is longer than its record')
+            raise DamagedError('a field is longer than its record')
         self._at += size
         return piece
 
     def number(self, size: int) -> int:
+        """The next unsigned number, little-endian."""
         return int.from_bytes(self.take(size), 'little')
 
     def text(self) -> str:
+        """The next text, with its length before it."""
         try:
             return self.take(self.number(4)).decode()
         except UnicodeDecodeError:
-            raise _DamagedError('a text is not UTF-8') from None
+            raise DamagedError('a text is not UTF-8') from None
 
     def mapping(self) -> dict[str, str]:
-        inner = _Cursor(self.take(self.number(4)))
+        """The next map of texts."""
+        inner = Cursor(self.take(self.number(4)))
         out = {}
         while inner._at < len(inner._content):
             key = inner.text()
@@ -115,7 +119,7 @@ class McapSource:
         if line not in self.warnings:
             self.warnings.append(line)
 
-    def _records(self, stream: BinaryIO) -> Iterator[tuple[int, int, int]]:
+    def records(self, stream: BinaryIO) -> Iterator[tuple[int, int, int]]:
         """(opcode, offset of the content, its length) of every record that is whole."""
         at = len(MAGIC)
         while True:
@@ -152,8 +156,8 @@ class McapSource:
         if len(magic) < len(MAGIC):
             self._cut(len(magic))
             return
-        for opcode, at, length in self._records(stream):
-            if opcode not in (_SCHEMA, _CHANNEL, _METADATA):
+        for opcode, at, length in self.records(stream):
+            if opcode not in (SCHEMA, CHANNEL, METADATA):
                 continue
             if length > MAX_METADATA_BYTES:
                 self._warn(f'the record at byte {at} has {length} bytes and is left out')
@@ -161,18 +165,18 @@ class McapSource:
             stream.seek(at)
             try:
                 self._note(opcode, stream.read(length))
-            except _DamagedError as error:
+            except DamagedError as error:
                 self._warn(f'the record at byte {at} is damaged ({error}) and is left out')
 
     def _note(self, opcode: int, content: bytes) -> None:
-        cursor = _Cursor(content)
-        if opcode == _METADATA:
+        cursor = Cursor(content)
+        if opcode == METADATA:
             name = cursor.text()
             self.metadata[name] = cursor.mapping()
-        elif opcode == _SCHEMA:
+        elif opcode == SCHEMA:
             number = cursor.number(2)
             self._schemas[number] = cursor.text()
-        elif opcode == _CHANNEL:
+        elif opcode == CHANNEL:
             number, schema = cursor.number(2), cursor.number(2)
             topic, encoding = cursor.text(), cursor.text()
             type_name = self._schemas.get(schema, '')
@@ -187,19 +191,19 @@ class McapSource:
         """
         try:
             with self.path.open('rb') as stream:
-                for opcode, at, length in self._records(stream):
-                    if opcode == _DATA_END:
+                for opcode, at, length in self.records(stream):
+                    if opcode == DATA_END:
                         return
-                    if opcode not in (_CHUNK, _MESSAGE):
+                    if opcode not in (CHUNK, MESSAGE):
                         continue
                     stream.seek(at)
                     content = stream.read(length)
                     try:
-                        if opcode == _CHUNK:
-                            yield from self._in_chunk(_unpack_chunk(content), topics)
+                        if opcode == CHUNK:
+                            yield from self._in_chunk(unpack_chunk(content), topics)
                         else:
                             yield from self._in_chunk(_RECORD.pack(opcode, length) + content, topics)
-                    except _DamagedError as error:
+                    except DamagedError as error:
                         self._warn(f'the chunk at byte {at} is damaged ({error}); what it held is missing')
         except OSError as error:
             raise self._refuse(f'cannot be read ({error.strerror or error})') from None
@@ -215,35 +219,36 @@ class McapSource:
                 opcode, length = _RECORD.unpack_from(content, at)
                 number = log_time = 0
             else:
-                raise _DamagedError('it ends within a record')
+                raise DamagedError('it ends within a record')
             at += _RECORD.size
             if length > end - at:
-                raise _DamagedError('a record in it is longer than the chunk')
-            if opcode == _MESSAGE:
+                raise DamagedError('a record in it is longer than the chunk')
+            if opcode == MESSAGE:
                 channel = wanted.get(number)
                 if channel is not None:
                     if length < _MESSAGE_HEAD.size:
-                        raise _DamagedError('a message in it has no head')
+                        raise DamagedError('a message in it has no head')
                     yield RawMessage(channel, log_time, content[at + _MESSAGE_HEAD.size : at + length])
-            elif opcode in (_SCHEMA, _CHANNEL):
+            elif opcode in (SCHEMA, CHANNEL):
                 self._note(opcode, content[at : at + length])
                 wanted = {n: c for n, c in self._channels.items() if topics is None or c.topic in topics}
             at += length
 
 
-def _unpack_chunk(content: bytes) -> bytes:
-    cursor = _Cursor(content)
+def unpack_chunk(content: bytes) -> bytes:
+    """The records of a chunk record's content. Raises DamagedError where it contradicts itself."""
+    cursor = Cursor(content)
     cursor.take(16)  # first and last log time
     size, crc = cursor.number(8), cursor.number(4)
     compression = cursor.text()
     packed = cursor.take(cursor.number(8))
     if size > MAX_CHUNK_BYTES:
-        raise _DamagedError(f'it declares {size} bytes, more than {MAX_CHUNK_BYTES}')
+        raise DamagedError(f'it declares {size} bytes, more than {MAX_CHUNK_BYTES}')
     plain = _decompress(packed, compression, size)
     if len(plain) != size:
-        raise _DamagedError(f'it holds {len(plain)} bytes and declares {size}')
+        raise DamagedError(f'it holds {len(plain)} bytes and declares {size}')
     if crc and zlib.crc32(plain) != crc:
-        raise _DamagedError('its CRC does not match')
+        raise DamagedError('its CRC does not match')
     return plain
 
 
@@ -256,11 +261,11 @@ def _decompress(packed: bytes, compression: str, size: int) -> bytes:
         if compression == 'zstd':
             declared = zstandard.frame_content_size(packed)
             if declared > size:
-                raise _DamagedError(f'its frame declares {declared} bytes and the chunk {size}')
+                raise DamagedError(f'its frame declares {declared} bytes and the chunk {size}')
             return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
         if compression == 'lz4':
             plain: bytes = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size)
             return plain
     except (zstandard.ZstdError, RuntimeError, EOFError, ValueError) as error:
-        raise _DamagedError(str(error)) from None
-    raise _DamagedError(f'compression {compression!r} is not known')
+        raise DamagedError(str(error)) from None
+    raise DamagedError(f'compression {compression!r} is not known')

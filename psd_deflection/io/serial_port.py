@@ -29,10 +29,10 @@ class PortClosedError(DeviceError):
 class SerialPort:
     """An open port. ``name`` as given; raises DeviceError naming it where it cannot be had."""
 
-    def __init__(self, name: str, baud: int) -> None:
+    def __init__(self, name: str, baud: int, rtscts: bool = False) -> None:
         self.name = name
         try:
-            self._serial = serial.Serial(name, baud, timeout=0, write_timeout=1.0, exclusive=True)
+            self._serial = serial.Serial(name, baud, timeout=0, write_timeout=1.0, exclusive=True, rtscts=rtscts)
         except serial.SerialException as error:
             raise DeviceError(f'{name}: {_why(error, name)}') from None
         except (OSError, ValueError) as error:
@@ -58,6 +58,10 @@ class SerialPort:
         if not received:
             raise PortClosedError(f'{self.name}: the device is gone')
         return received
+
+    def fileno(self) -> int:
+        """The descriptor, for ``select``."""
+        return self._fd
 
     def discard_input(self) -> None:
         """Forget what has come and was not read: it is older than it would look."""

@@ -14,6 +14,7 @@ import time
 import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -96,6 +97,10 @@ class SimulatedDevice:
             },
         )
 
+    def greeting(self) -> bytes:
+        """What it sends when someone opens its port: the end of what was half sent, and HELLO."""
+        return b'\x00' + encode(self.hello)
+
     @property
     def taken(self) -> int:
         """Samples taken since power-up."""
@@ -113,7 +118,8 @@ class SimulatedDevice:
                 case HelloRequestFrame():
                     replies += encode(self.hello)
                 case PingFrame(cookie):
-                    elapsed = since_power_up_ns / self._period_host_ns * self._period_device_us
+                    # The clock of the samples, which a device that has run for long has from its first one.
+                    elapsed = (self._first_seq + since_power_up_ns / self._period_host_ns) * self._period_device_us
                     replies += encode(PongFrame(cookie, int(elapsed)))
                 case StartFrame():
                     self._streaming = True
@@ -189,7 +195,23 @@ class PseudoTerminal:
             self._link.unlink(missing_ok=True)
 
 
-def serve(device: SimulatedDevice, port: PseudoTerminal, stopped: Callable[[], bool]) -> None:
+class LineDevice(Protocol):
+    """A device without its line and clock; times are host nanoseconds since power-up."""
+
+    def greeting(self) -> bytes:
+        """What it sends when someone opens its port."""
+
+    def due_in_ns(self, since_power_up_ns: int) -> int:
+        """Until it next has something to send; 0 or less: it has."""
+
+    def receive(self, received: bytes, since_power_up_ns: int) -> bytes:
+        """Replies to what the host sent."""
+
+    def take(self, since_power_up_ns: int, room: int = OUTPUT_LIMIT) -> bytes:
+        """What is due, at most about ``room`` bytes."""
+
+
+def serve(device: LineDevice, port: PseudoTerminal, stopped: Callable[[], bool]) -> None:
     """Run the device in real time until ``stopped()``."""
     poll = select.poll()
     poll.register(port.master, select.POLLIN)
@@ -209,7 +231,7 @@ def serve(device: SimulatedDevice, port: PseudoTerminal, stopped: Callable[[], b
             continue
         if not listening:
             listening = True
-            pending = b'\x00' + encode(device.hello)
+            pending = device.greeting()
         try:
             if mask & select.POLLIN:
                 pending += device.receive(os.read(port.master, 4096), now)

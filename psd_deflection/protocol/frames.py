@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import struct
 import zlib
-from enum import Enum, IntEnum
+from enum import IntEnum, StrEnum
 from typing import NamedTuple
 
 from cobs import cobs
@@ -38,7 +38,7 @@ class FrameType(IntEnum):
     STOP = 0x15
 
 
-class BadReason(Enum):
+class BadReason(StrEnum):
     """Why bytes between two zeros are no frame."""
 
     COBS = 'not COBS'
@@ -99,9 +99,12 @@ class StopFrame(NamedTuple):
 
 
 class BadFrame(NamedTuple):
-    """Bytes that are no frame of ours: ``size`` encoded bytes up to the zero that ended them."""
+    """Bytes that are no frame of ours: ``size`` encoded bytes up to the zero that ended them.
 
-    reason: BadReason
+    ``reason``: a :class:`BadReason` here; other protocols have reasons of their own.
+    """
+
+    reason: str
     size: int
 
 

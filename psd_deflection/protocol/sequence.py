@@ -58,7 +58,16 @@ class SequenceExtender:
         behind = -ahead % WRAP
         if behind < NEARBY and t_device_us <= self._last_time:
             return last - behind, Step.REPEAT, 0
-        base = -(-(last + 1) // self._alignment) * self._alignment
+        base = self._next_base()
         self._offset = base % WRAP
         self._last, self._last_time = base + seq, t_device_us
         return base + seq, Step.RESTART, 0
+
+    def restart(self) -> None:
+        """What comes next was numbered anew, from 0: for a device whose samples the host numbers."""
+        if self._last is not None:
+            base = self._next_base()
+            self._offset, self._last, self._last_time = base % WRAP, base - 1, -1
+
+    def _next_base(self) -> int:
+        return -(-((self._last or 0) + 1) // self._alignment) * self._alignment

@@ -2,149 +2,251 @@
 
 A message is encoded once; the same bytes are published and recorded. The executor in the main
 thread serves parameters, services, inputs and the 1 Hz diagnostics, nothing faster.
+
+It is a lifecycle node (REP-2002 states). *Configured*, it has the port, reads, estimates and
+records; *active*, it publishes as well. Deactivation stops publishing and nothing else, cleanup
+frees the port. With ``autostart`` (the default) it does both steps itself, so that whoever knows
+nothing of lifecycles meets an ordinary node.
 """
 
 from __future__ import annotations
 
-import importlib
+import os
 import signal
-import threading
+import types
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
-from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
-from msg_adapters import INPUTS, TOPIC_TYPES, solver_topic
+from msg_adapters import DEFLECTION, DIAGNOSTICS, INPUTS, TOPIC_TYPES, solver_topic, to_messages
 from psd_deflection.errors import ConfigError, PsdDeflectionError
+from psd_deflection.io import cdr
 from psd_deflection.monitor.start import start_monitor
-from psd_deflection.records import DiagnosticReport
-from psd_deflection.ros.parameters import rig_of_node, watch
-from psd_deflection.runner.health import HealthReporter
+from psd_deflection.records import DiagnosticEntry, DiagnosticReport
+from psd_deflection.ros.parameters import LiveParameters, rig_of_node
+from psd_deflection.ros.wires import InputRecorder, PublisherWire
+from psd_deflection.runner.health import STALE, HealthReporter
+from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import Session
 
+if TYPE_CHECKING:
+    from psd_deflection.monitor.server import MonitorServer
+
 NODE_NAME = 'estimator'
-DEPTH = 10
-SAMPLES_DEPTH = 50
-"""A second of raw blocks: a subscriber that stutters misses none."""
 
 SPIN_S = 0.1
 """How long a signal may wait to be seen."""
 
 
-def message_class(type_name: str) -> Any:
-    """The class of ``pkg/msg/Name``."""
-    package, _, name = type_name.split('/')
-    return getattr(importlib.import_module(f'{package}.msg'), name)
+class _StopRequestedError(BaseException):
+    """SIGINT or SIGTERM came while the main thread waits for a device. Like KeyboardInterrupt, no Exception."""
 
 
-class PublisherWire:
-    """Publishes encoded messages: a wire of the fan-out."""
+class Signals:
+    """SIGINT and SIGTERM: ``stop`` is set at once; inside :meth:`interruptible` they end the waiting too."""
 
-    def __init__(self, node: Node, topics: Mapping[str, str]) -> None:
-        options = QoSOverridingOptions.with_default_policies()
-        self._publishers: dict[str, Publisher] = {}
-        for topic, type_name in topics.items():
-            depth = SAMPLES_DEPTH if topic == '/psd/samples' else DEPTH
-            qos = QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
-            self._publishers[topic] = node.create_publisher(
-                message_class(type_name), topic, qos, qos_overriding_options=options
-            )
+    def __init__(self) -> None:
+        self.stop = False
+        self._raise = False
+        self._previous = {s: signal.signal(s, self._received) for s in (signal.SIGINT, signal.SIGTERM)}
 
-    def put(self, topic: str, type_name: str, cdr: bytes, t_ns: int) -> None:
-        """Publish; the stamp is in the message."""
-        self._publishers[topic].publish(cdr)
+    def _received(self, number: int, frame: types.FrameType | None) -> None:
+        self.stop = True
+        if self._raise:
+            self._raise = False
+            raise _StopRequestedError
+
+    def interruptible(self, action: Callable[[], Session]) -> Session:
+        """``action()``; a signal before or during it ends it."""
+        self._raise = True
+        try:
+            if self.stop:
+                raise _StopRequestedError
+            return action()
+        finally:
+            self._raise = False
+
+    def restore(self) -> None:
+        """Give the signals back to who had them."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+
+class _ManagedNode(LifecycleNode):  # type: ignore[misc]
+    """Hands its transitions to the :class:`EstimatorNode` that owns it."""
+
+    owner: EstimatorNode
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self.owner.transition(self.owner.configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self.owner.transition(self.owner.activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self.owner.transition(self.owner.deactivate)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self.owner.transition(self.owner.cleanup)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self.owner.transition(self.owner.cleanup)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self.owner.transition(self.owner.cleanup)
 
 
 class EstimatorNode:
-    """Node and session together. Raises the errors of both where the run cannot start."""
+    """Node and, while it is configured, session. Raises ConfigError where the parameters are refused."""
 
-    def __init__(self, overrides: Mapping[str, object], say: Callable[[str], None] | None) -> None:
+    def __init__(self, overrides: Mapping[str, object], say: Callable[[str], None] | None, signals: Signals) -> None:
+        self.session: Session | None = None
+        self.error: Exception | None = None
+        self._signals = signals
+        self._starting = False
+        self._health: HealthReporter | None = None
+        self._monitor: MonitorServer | None = None
         try:
-            self.node = Node(
+            self.node = _ManagedNode(
                 NODE_NAME,
                 automatically_declare_parameters_from_overrides=True,
                 parameter_overrides=[RosParameter(name, value=value) for name, value in overrides.items()],
             )
         except ParameterException as error:
             raise ConfigError(f'ROS parameters: {error}') from None
+        self.node.owner = self
         try:
-            logger = self.node.get_logger()
-            self._say = say or logger.info
-            rig = rig_of_node(self.node, {})
-            self.session = Session(rig, self._say)
+            self._say = say or self.node.get_logger().info
+            self.rig = rig_of_node(self.node, {})
+            self._live = LiveParameters(self.node)
+            self.node.create_service(Trigger, '~/zero', self._zero)
+            self.node.create_service(SetBool, '~/record', self._record)
+            self._wire, self._inputs = self._wires()
+            self.node.create_timer(1.0, self._report)
         except BaseException:
-            self.node.destroy_node()
-            raise
-        try:
-            self._join_ros()
-            self._monitor = start_monitor(self.session, self._say)
-        except BaseException:
-            self.session.close()
             self.node.destroy_node()
             raise
 
-    def _join_ros(self) -> None:
-        node, session = self.node, self.session
+    def _wires(self) -> tuple[PublisherWire, InputRecorder]:
         outputs = {topic: kind for topic, kind in TOPIC_TYPES.items() if topic not in INPUTS}
-        outputs.update({solver_topic(s): TOPIC_TYPES['/link_tip/deflection'] for s in session.rig.estimator.solvers})
+        outputs.update({solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in self.rig.estimator.solvers})
         try:
-            session.fanout.wires.insert(0, PublisherWire(node, outputs))
-            for topic in INPUTS:
-                self._record_input(topic)
+            return PublisherWire(self.node, outputs), InputRecorder(self.node)
         except (InvalidQosOverridesError, ValueError) as error:
             raise ConfigError(f'ROS parameters: qos_overrides: {error}') from None
-        watch(node, session)
-        node.create_service(Trigger, '~/zero', self._zero)
-        node.create_service(SetBool, '~/record', self._record)
-        self._health = HealthReporter(session)
-        node.create_timer(1.0, self._report)
 
-    def _record_input(self, topic: str) -> None:
-        """Known loads, references and temperatures go into the recording as they come."""
-        type_name = TOPIC_TYPES[topic]
-        session, clock = self.session, self.node.get_clock()
+    def transition(self, action: Callable[[], None]) -> TransitionCallbackReturn:
+        """Run one transition; what goes wrong outside is said, kept in ``error``, and leaves the state as it was."""
+        try:
+            action()
+        except PsdDeflectionError as error:
+            self.error = error
+        except Exception as error:
+            self.error = error
+            self._tell_error(f'{type(error).__name__}: {error}')
+            return TransitionCallbackReturn.ERROR
+        else:
+            self.error = None
+            return TransitionCallbackReturn.SUCCESS
+        self._tell_error(str(self.error))
+        return TransitionCallbackReturn.FAILURE
 
-        def received(message: bytes) -> None:
-            session.recorder.put(topic, type_name, bytes(message), clock.now().nanoseconds)
+    def _tell_error(self, text: str) -> None:
+        # At start it is raised, and said by whoever started us.
+        if not self._starting:
+            self._say(text)
 
-        self.node.create_subscription(
-            message_class(type_name),
-            topic,
-            received,
-            QoSProfile(depth=SAMPLES_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT),
-            raw=True,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
+    def start(self) -> None:
+        """Configure and activate, where ``autostart`` says so. Raises what stands in the way."""
+        if not self.rig.values['autostart']:
+            self._say('waiting to be configured: ros2 lifecycle set /estimator configure')
+            return
+        self._starting = True
+        for trigger in (self.node.trigger_configure, self.node.trigger_activate):
+            if trigger() != TransitionCallbackReturn.SUCCESS:
+                raise self.error or ConfigError('the node does not start')
+        self._starting = False
+
+    def configure(self) -> None:
+        """Open the port and let samples flow; nothing is published yet."""
+        session = self._signals.interruptible(lambda: Session(self.rig, self._say))
+        self.session = session
+        try:
+            self._live.session = session
+            self._live.show(session.rig)
+            self._health = HealthReporter(session)
+            session.fanout.wires.insert(0, self._wire)
+            self._inputs.session = session
+            self._monitor = start_monitor(session, self._say)
+            session.start()
+        except BaseException:
+            self.cleanup()
+            raise
+
+    def activate(self) -> None:
+        """Publish."""
+        self._wire.active = True
+        domain = os.environ.get('ROS_DOMAIN_ID') or '0'
+        node = self.node.get_fully_qualified_name()
+        topics = ', '.join(self._wire.names((DEFLECTION, '/link_tip/wrench', '/psd/samples', DIAGNOSTICS)))
+        self._say(f'publishing on ROS domain {domain}: {topics} …; services {node}/zero, {node}/record')
+
+    def deactivate(self) -> None:
+        """Publish no more; reading and recording go on."""
+        self._wire.active = False
+        self._say('not publishing; reading and recording go on')
+
+    def cleanup(self) -> None:
+        """End the session: the port is free."""
+        self._wire.active = False
+        self._inputs.session = None
+        self._live.session = None
+        self._health = None
+        monitor, self._monitor = self._monitor, None
+        if monitor is not None:
+            monitor.close()
+        session, self.session = self.session, None
+        if session is not None:
+            session.close()
 
     def _zero(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = False
+        if self.session is None:
+            response.message = 'not zeroed: the node is not configured'
+            return response
         try:
             change = self.session.zero()
         except TimeoutError as error:
-            response.success, response.message = False, f'not zeroed: {error}'
+            response.message = f'not zeroed: {error}'
             return response
         if change is None:
-            response.success, response.message = False, 'not zeroed: no good block yet'
+            response.message = 'not zeroed: no good block yet'
             return response
-        (x1, y1), (x2, y2) = (psd.zero for psd in self.session.rig.psds)
+        rig = self.session.rig
+        self._live.show(rig)
+        (x1, y1), (x2, y2) = (psd.zero for psd in rig.psds)
         text = f'unloaded dots (mm): psd_1 ({x1 * 1e3:.4f}, {y1 * 1e3:.4f}), psd_2 ({x2 * 1e3:.4f}, {y2 * 1e3:.4f})'
         self._say(text)
         response.success, response.message = True, text
         return response
 
     def _record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        response.success = False
+        if self.session is None:
+            response.message = 'the node is not configured'
+            return response
         try:
             folder = self.session.record(request.data)
         except (PsdDeflectionError, TimeoutError) as error:
-            response.success, response.message = False, str(error)
+            response.message = str(error)
             return response
         response.success = True
         verb = 'recording to' if request.data else 'recording ended:'
@@ -153,14 +255,17 @@ class EstimatorNode:
         return response
 
     def _report(self) -> None:
-        report: DiagnosticReport = self._health.report(self.node.get_clock().now().nanoseconds)
-        self.session.fanout.put(report)
+        now = self.node.get_clock().now().nanoseconds
+        if self.session is not None and self._health is not None:
+            self.session.fanout.put(self._health.report(now))
+            return
+        entry = DiagnosticEntry('psd_deflection: node', STALE, 'not configured', ())
+        (message,) = to_messages(DiagnosticReport(now, (entry,)))
+        self._wire.put(message.topic, message.type, cdr.encode(message.type, message.fields), now)
 
     def close(self) -> None:
         """End the session, then the node."""
-        if self._monitor is not None:
-            self._monitor.close()
-        self.session.close()
+        self.cleanup()
         self.node.destroy_node()
 
 
@@ -176,32 +281,43 @@ def run(
     about ten times a second, for a display. Raises the errors of the package where the run cannot
     start, or where the pipeline failed.
     """
-    stop = threading.Event()
-    previous = {s: signal.signal(s, lambda *_: stop.set()) for s in (signal.SIGINT, signal.SIGTERM)}
+    signals = Signals()
     try:
         try:
             rclpy.init(args=[NODE_NAME, *ros_args], signal_handler_options=SignalHandlerOptions.NO)
         except RuntimeError as error:
             raise ConfigError('ROS arguments: ' + str(error).splitlines()[0]) from None
         try:
-            estimator = EstimatorNode(overrides, say)
+            estimator = EstimatorNode(overrides, say, signals)
             executor = SingleThreadedExecutor()
             executor.add_node(estimator.node)
+            failed: BaseException | None = None
+            watchdog = Watchdog()
             try:
-                estimator.session.start()
-                while not stop.is_set() and estimator.session.processing.alive:
+                settle()
+                estimator.start()
+                watchdog.ready()
+                while not signals.stop:
                     executor.spin_once(timeout_sec=SPIN_S)
-                    if while_running is not None:
-                        while_running(estimator.session)
+                    session = estimator.session
+                    if session is not None and not session.processing.alive:
+                        failed = session.failed
+                        break
+                    if session is None or session.responsive():
+                        watchdog.alive()
+                    if while_running is not None and session is not None:
+                        while_running(session)
+            except _StopRequestedError:
+                pass
             finally:
+                watchdog.stopping()
                 executor.remove_node(estimator.node)
-                executor.shutdown(timeout_sec=0.5)
+                executor.shutdown(timeout_sec=0.2)
                 estimator.close()
-            if estimator.session.failed is not None:
-                raise estimator.session.failed
+            if failed is not None:
+                raise failed
         finally:
             rclpy.try_shutdown()
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        signals.restore()
     return 0

@@ -61,23 +61,56 @@ def _descriptor(parameter: config.Parameter) -> ParameterDescriptor:
     return descriptor
 
 
-def watch(node: Node, session: Session) -> None:
-    """Carry out changes of the parameters that may change while the node runs; refuse the others."""
+class LiveParameters:
+    """Carries out changes of the parameters that may change while the node runs; refuses the others."""
 
-    def change(changed: list[RosParameter]) -> SetParametersResult:
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._showing = False
+        self.session: Session | None = None
+        node.add_on_set_parameters_callback(self._change)
+
+    def show(self, rig: Rig) -> None:
+        """Let the node's parameters say what the rig has now: a zero that was taken can be read there."""
+        changed = [
+            RosParameter(p.name, value=rig.values[p.name])
+            for p in PARAMETERS
+            if p.live and self._node.get_parameter(p.name).value != rig.values[p.name]
+        ]
+        self._showing = True
+        try:
+            self._node.set_parameters(changed)
+        finally:
+            self._showing = False
+
+    def _change(self, changed: list[RosParameter]) -> SetParametersResult:
+        if self._showing:
+            return SetParametersResult(successful=True)
+        values: dict[str, float | str | tuple[float, ...]] = {}
         for parameter in changed:
             declared = config.BY_NAME.get(parameter.name)
             if declared is None:
                 continue
+            value = parameter.value
+            if not isinstance(value, (str, bool, int, float)) and value is not None:
+                value = list(value)
             try:
-                value = check_value(declared, parameter.value, SOURCE)
+                checked = check_value(declared, value, SOURCE)
             except ConfigError as error:
                 return SetParametersResult(successful=False, reason=str(error))
-            if parameter.name == 'sum_min' and isinstance(value, float):
-                try:
-                    session.set_sum_min(value)
-                except TimeoutError as error:
-                    return SetParametersResult(successful=False, reason=f'sum_min: not changed: {error}')
+            if not declared.live:
+                return SetParametersResult(successful=False, reason=f'{parameter.name}: cannot change while it runs')
+            if isinstance(checked, list):
+                values[parameter.name] = tuple(float(v) for v in checked)
+            else:
+                values[parameter.name] = checked
+        if not values:
+            return SetParametersResult(successful=True)
+        if self.session is None:
+            return SetParametersResult(successful=False, reason='not changed: the node is not configured')
+        try:
+            # All of them or none, between two blocks.
+            self.session.change(values)
+        except (TimeoutError, ConfigError) as error:
+            return SetParametersResult(successful=False, reason=f'not changed: {error}')
         return SetParametersResult(successful=True)
-
-    node.add_on_set_parameters_callback(change)

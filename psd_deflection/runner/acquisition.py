@@ -1,13 +1,17 @@
-"""The reader thread: bytes from the port to chunks with host times, in a bounded queue.
+"""The reader thread: what a source gives, to chunks with host times, in a bounded queue.
 
-The reader owns the port, the frame decoder, the sequence numbers and the clock. It hands over a
+The reader owns the source, the sequence numbers and the clock. It hands over a
 chunk as soon as a block's last sample came, so that an estimate waits for nothing. When the
 consumer is too slow the newest chunk is dropped and counted; the reader never waits.
+
+Every sample that is missing is counted once, under its cause (``lost_by``), as far as it can be
+known: the device said so, frames around it were damaged, the port was away, or none of these.
 """
 
 from __future__ import annotations
 
 import queue
+import random
 import threading
 import time
 from collections.abc import Callable
@@ -17,29 +21,47 @@ import numpy as np
 
 from psd_deflection.config import Rig
 from psd_deflection.errors import DeviceError
-from psd_deflection.io.serial_port import PortClosedError, SerialPort
+from psd_deflection.io.sources._interface import (
+    Clock,
+    Event,
+    PortClosedError,
+    Sample,
+    Source,
+    SourceEndedError,
+)
+from psd_deflection.io.sources._registry import make_source
 from psd_deflection.protocol.frames import (
     PROTOCOL_VERSION,
     BadFrame,
     BadReason,
-    Frame,
-    FrameDecoder,
     HelloFrame,
-    HelloRequestFrame,
+    PongFrame,
     SampleFrame,
-    StartFrame,
     StatusFrame,
-    encode,
 )
-from psd_deflection.protocol.sequence import SequenceExtender, Step
-from psd_deflection.records import CHANNELS, FLAG_DEVICE_DROPPED, RawChunk
+from psd_deflection.protocol.sequence import NEARBY, WRAP, SequenceExtender, Step
+from psd_deflection.records import CHANNELS, FLAG_DEVICE_DROPPED, IntArray, RawChunk
+from psd_deflection.runner.realtime import prefer_reader
 from psd_deflection.timing import ClockMap, ClockState
 
 SILENCE_S = 2.0
 """A device that sends no frame for this long is reported."""
 
-RETRY_S = 0.25
+RETRY_S = 0.2
 READ_TIMEOUT_S = 0.1
+READY_S = 10.0
+
+BY_DEVICE = 'dropped by the device'
+DAMAGED = 'damaged on the wire'
+AWAY = 'while the port was away'
+UNSEEN = 'on the wire, without a trace'
+"""Why samples are missing."""
+
+PING_S = (0.1, 0.4)
+"""Bounds of the random time between two pings: their phase to the samples must not repeat."""
+
+UNANSWERED = 20
+"""A device that has left so many pings unanswered in a row does not know them: it is asked no more."""
 
 Say = Callable[[str], None]
 
@@ -70,12 +92,18 @@ class AcquisitionCounters:
     bytes: int = 0
     samples: int = 0
     lost: int = 0
+    lost_by: dict[str, int] = field(default_factory=dict)
     repeated: int = 0
     queue_dropped: int = 0
     device_dropped: int = 0
     device_overruns: int = 0
     restarts: int = 0
     disconnects: int = 0
+    silences: int = 0
+    refused_reopenings: int = 0
+    clock_jumps: int = 0
+    pings: int = 0
+    pongs: int = 0
     bad_frames: dict[str, int] = field(default_factory=dict)
     temperature: float | None = None
 
@@ -84,9 +112,14 @@ class AcquisitionCounters:
         """Frames that were none, of every reason."""
         return sum(self.bad_frames.values())
 
+    def count_lost(self, missing: int, cause: str) -> None:
+        """``missing`` samples will not come."""
+        self.lost += missing
+        self.lost_by[cause] = self.lost_by.get(cause, 0) + missing
 
-def check_hello(frame: HelloFrame, rig: Rig, port: str) -> float:
-    """Volts per count of a device that fits the rig; DeviceError naming what does not."""
+
+def check_hello(frame: HelloFrame, rig: Rig, port: str) -> float | None:
+    """Volts per count of a device that fits the rig, None where it gives volts; DeviceError naming what does not."""
     if frame.version != PROTOCOL_VERSION:
         raise DeviceError(
             f'{port}: the device speaks protocol version {frame.version}, this is version {PROTOCOL_VERSION}; '
@@ -104,6 +137,8 @@ def check_hello(frame: HelloFrame, rig: Rig, port: str) -> float:
             'set converter.sample_rate_hz to what the device does'
         )
     volts = info.get('volts_per_count')
+    if volts is None and 'volts_per_count' in info:
+        return None
     if isinstance(volts, bool) or not isinstance(volts, (int, float)) or not 0.0 < volts < 1.0:
         raise DeviceError(f'{port}: HELLO has volts_per_count {volts!r}, needed is a number between 0 and 1 V')
     expected = rig.converter.volts_per_count
@@ -116,178 +151,236 @@ def check_hello(frame: HelloFrame, rig: Rig, port: str) -> float:
 
 
 class Acquisition:
-    """Reads one device until stopped. ``say``: told of every change of state, one line each."""
+    """Reads one device until stopped. ``say``: told of every change of state, one line each.
+
+    Raises ConfigError where there is no source of the name that the rig has.
+    """
 
     def __init__(self, rig: Rig, say: Say) -> None:
+        self.source: Source = make_source(rig)
         self.counters = AcquisitionCounters()
         self.hello: HelloFrame | None = None
         self.queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
         self._rig = rig
-        self._name = rig.acquisition.port
+        self._name = self.source.name
         self._say = say
         self._block_size = rig.estimator.block_size
         self._latency_ns = round(rig.acquisition.latency_offset * 1e9)
         self._clock = ClockMap()
+        self._regressed = self.source.clock in (Clock.DEVICE, Clock.COUNTED)
         # Monotonic time is mapped to ROS time by one constant: a step of the wall clock while
         # running must not tear the stamps apart.
         self._to_ros_ns = time.time_ns() - time.monotonic_ns()
         self._sequence = SequenceExtender(self._block_size)
-        self._decoder = FrameDecoder()
         self._last_t_ns = 0
         self._first_number = 0
-        self._volts_per_count = rig.converter.volts_per_count
-        self._port: SerialPort | None = None
+        self._period_us = 1e6 / rig.converter.sample_rate_hz
+        self._observed: tuple[int, int] | None = None
+        self._bad_since_sample = 0
+        self._was_away = False
+        self._refusal = ''
+        self._random = random.Random()
+        self._next_ping = 0.0
+        self._sent: dict[int, int] = {}
+        self._unanswered = 0
+        self._volts_per_count: float | None = rig.converter.volts_per_count
+        self._connected = False
+        self.beat = time.monotonic()
         self._stop = threading.Event()
+        self._ready = threading.Event()
         self._thread = threading.Thread(target=self._run, name='reader', daemon=True)
         self._seq: list[int] = []
-        self._t_us: list[int] = []
-        self._counts: list[tuple[int, ...]] = []
+        self._t: list[int] = []
+        self._readings: list[tuple[float, ...]] = []
         self._flags: list[int] = []
 
     def open(self) -> None:
-        """Open the port and hear the device out.
+        """Open the source and hear the device out.
 
-        Raises DeviceError where the port cannot be had, no frame comes in 2 s, or the device does
-        not fit the rig.
+        Raises DeviceError where the port cannot be had, nothing of use comes in 2 s, or the device
+        does not fit the rig.
         """
-        self._port = SerialPort(self._name, self._rig.acquisition.baud)
+        hello = self.source.open(SILENCE_S)
         try:
-            self._port.write(b'\x00' + encode(HelloRequestFrame()) + encode(StartFrame()))
-            decoder = FrameDecoder()
-            received = frames = 0
-            deadline = time.monotonic() + SILENCE_S
-            while (left := deadline - time.monotonic()) > 0:
-                data = self._port.read(left)
-                received += len(data)
-                for frame in decoder.feed(data):
-                    frames += not isinstance(frame, BadFrame)
-                    if isinstance(frame, HelloFrame):
-                        self._volts_per_count = check_hello(frame, self._rig, self._name)
-                        self.hello = frame
-                        return
+            self._volts_per_count = check_hello(hello, self._rig, self._name)
         except BaseException:
-            self._port.close()
+            self.source.close()
             raise
-        self._port.close()
-        if frames:
-            raise DeviceError(f'{self._name}: samples come but no HELLO in {SILENCE_S:g} s; does the firmware send it?')
-        if received:
-            raise DeviceError(
-                f'{self._name}: {received} bytes but no frame in {SILENCE_S:g} s; is the baud rate '
-                f'({self._rig.acquisition.baud}) right, and is this the PSD device?'
-            )
-        raise DeviceError(f'{self._name}: no frame in {SILENCE_S:g} s; is the device powered and this its port?')
+        self.hello = hello
+        self._name = self.source.name
+        self._connected = True
 
     def start(self) -> None:
-        """Start the reader thread; :meth:`open` came before."""
-        if self._port is not None:
-            # What came while the device was heard out is older than it would look.
-            self._port.discard_input()
+        """Start the reader thread; :meth:`open` came before. What comes from now on is read."""
         self._thread.start()
+        self._ready.wait(READY_S)
 
     def stop(self) -> None:
         """Stop the reader and close the port; an Ended item is the last on the queue."""
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join()
-        if self._port is not None:
-            self._port.close()
+        self.source.close()
 
     def clock_state(self) -> ClockState:
         """How the device's clock stands to the host's."""
         return self._clock.state()
 
+    def system_clock_step_ns(self) -> int:
+        """How far the system clock has moved against CLOCK_MONOTONIC since the start.
+
+        Stamps do not follow it: they would tear apart. The next start takes it over.
+        """
+        return time.time_ns() - time.monotonic_ns() - self._to_ros_ns
+
     def _run(self) -> None:
+        if self._rig.acquisition.realtime:
+            self._say(prefer_reader())
+        # Locking the memory takes its time: only what comes after it is as old as it looks.
+        if self._connected:
+            self.source.start()
+        self._ready.set()
         silent_since = time.monotonic()
         try:
             while not self._stop.is_set():
-                port = self._port
-                if port is None:
+                self.beat = time.monotonic()
+                if not self._connected:
                     self._stop.wait(RETRY_S)
                     self._reopen()
                     silent_since = time.monotonic()
                     continue
                 try:
-                    received = port.read(READ_TIMEOUT_S)
+                    events, now, size = self.source.read(READ_TIMEOUT_S)
+                    if size:
+                        self.counters.bytes += size
+                        if self._take(events, now):
+                            silent_since = now / 1e9
+                    elif self._seq:
+                        self._hand_over(now)
+                    if now / 1e9 - silent_since > SILENCE_S:
+                        silent_since = now / 1e9
+                        self._silent(size)
+                    if now / 1e9 >= self._next_ping:
+                        self._ping(now)
                 except PortClosedError as error:
                     self._disconnected(error)
-                    continue
-                now = time.monotonic_ns()
-                if received:
-                    self.counters.bytes += len(received)
-                    if self._take(self._decoder.feed(received), now):
-                        silent_since = now / 1e9
-                elif self._seq:
-                    self._hand_over(now)
-                if now / 1e9 - silent_since > SILENCE_S:
-                    self._say(f'{self._name}: no frame for {SILENCE_S:g} s; still listening')
-                    silent_since = now / 1e9
+                except SourceEndedError as end:
+                    self._say(f'{self._name}: {end}')
+                    break
         finally:
             self._hand_over(time.monotonic_ns())
             self.queue.put(Ended())
 
+    def _silent(self, size: int) -> None:
+        self.counters.silences += 1
+        what = 'bytes but no frame (is the baud rate right?)' if size else 'no frame'
+        self._say(f'{self._name}: {what} for {SILENCE_S:g} s; still listening')
+        # It may have been stopped, by itself or by another program.
+        self.source.wake()
+
+    def _ping(self, now: int) -> None:
+        self._next_ping = now / 1e9 + self._random.uniform(*PING_S)
+        if self._unanswered >= UNANSWERED:
+            return
+        cookie = self._random.getrandbits(63)
+        sent = time.monotonic_ns()
+        if not self.source.ping(cookie):
+            self._unanswered = UNANSWERED
+            return
+        self.counters.pings += 1
+        self._unanswered += 1
+        self._sent = {cookie: sent}
+
     def _disconnected(self, error: PortClosedError) -> None:
         self.counters.disconnects += 1
         self._hand_over(time.monotonic_ns())
-        if self._port is not None:
-            self._port.close()
-        self._port = None
+        self.source.close()
+        self._connected = False
+        self._was_away = True
+        self._refusal = ''
         self._say(f'{error}; waiting for it to come back')
 
     def _reopen(self) -> None:
         try:
-            port = SerialPort(self._name, self._rig.acquisition.baud)
-            port.write(b'\x00' + encode(HelloRequestFrame()) + encode(StartFrame()))
-        except DeviceError:
+            hello = self.source.reopen()
+            if hello is not None:
+                # Another device on the same port must not go on as if it were the first.
+                self._volts_per_count = check_hello(hello, self._rig, self.source.name)
+                self.hello = hello
+        except DeviceError as error:
+            self.source.close()
+            self.counters.refused_reopenings += 1
+            refusal = str(error)
+            # Why it is not taken back is news once; that there is no port yet is none.
+            if 'no such port' not in refusal and refusal != self._refusal:
+                self._refusal = refusal
+                self._say(f'{refusal}; still trying')
             return
-        self._port = port
-        self._decoder = FrameDecoder()
+        self._connected = True
+        self._name = self.source.name
+        self._bad_since_sample = 0
+        if not self.source.numbered:
+            self._sequence.restart()
+            self._restarted()
         self._say(f'{self._name}: the device is back')
 
-    def _take(self, frames: list[Frame], now: int) -> bool:
+    def _take(self, events: list[Event], now: int) -> bool:
         """Sort the frames of one read; True where one of them was a frame of ours."""
         counters = self.counters
-        newest = -1
         good = False
-        for frame in frames:
-            if type(frame) is SampleFrame:
+        if self._regressed:
+            self._observe_newest(events, now)
+        for frame in events:
+            if type(frame) is SampleFrame or type(frame) is Sample:
                 good = True
-                flags, seq, t_us, counts = frame
-                number, step, missing = self._sequence.extend(seq, t_us)
-                if step is not Step.NEXT and not self._unusual(number, step, missing):
+                flags, seq, t, readings = frame
+                number, step, missing = self._sequence.extend(seq, t)
+                if step is not Step.NEXT and not self._unusual(number, step, missing, flags):
                     continue
+                self._bad_since_sample = 0
+                self._was_away = False
                 if number < self._first_number:
                     continue
                 if flags & FLAG_DEVICE_DROPPED:
                     counters.device_dropped += 1
                 if self._seq and number // self._block_size != self._seq[0] // self._block_size:
                     self._hand_over(now)
-                newest = t_us
                 self._seq.append(number)
-                self._t_us.append(t_us)
-                self._counts.append(counts)
+                self._t.append(t)
+                self._readings.append(readings)
                 self._flags.append(flags)
                 counters.samples += 1
                 if number % self._block_size == self._block_size - 1:
-                    self._observe(newest, now)
-                    newest = -1
                     self._hand_over(now)
             elif type(frame) is BadFrame:
-                name = frame.reason.value
-                counters.bad_frames[name] = counters.bad_frames.get(name, 0) + 1
-                good = good or frame.reason is BadReason.UNKNOWN_TYPE
+                reason = str(frame.reason)
+                counters.bad_frames[reason] = counters.bad_frames.get(reason, 0) + 1
+                self._bad_since_sample += frame.reason != BadReason.UNKNOWN_TYPE
+                good = good or frame.reason == BadReason.UNKNOWN_TYPE
             else:
                 good = True
-                self._other(frame)
-        if newest >= 0:
-            self._observe(newest, now)
+                self._other(frame, now)
         return good
 
-    def _observe(self, t_us: int, now: int) -> None:
-        if self._clock.observe(t_us, now):
+    def _observe_newest(self, events: list[Event], now: int) -> None:
+        """Only the newest sample of a read says how late the line is; before any of them is stamped."""
+        newest = next((e for e in reversed(events) if type(e) is SampleFrame or type(e) is Sample), None)
+        if newest is None:
+            return
+        _, seq, t_us, _ = newest
+        passed = None
+        if self._observed is not None:
+            last_seq, last_t = self._observed
+            if (last_seq - seq) % WRAP < NEARBY and t_us <= last_t:
+                # Repeated: it says nothing.
+                return
+            passed = (seq - last_seq) % WRAP * self._period_us
+        self._observed = (seq, t_us)
+        if self._clock.observe(t_us, now, passed):
+            self.counters.clock_jumps += 1
             self._say(f"{self._name}: the device's clock jumped; times are laid anew")
 
-    def _unusual(self, number: int, step: Step, missing: int) -> bool:
+    def _unusual(self, number: int, step: Step, missing: int, flags: int) -> bool:
         """Count a sample that does not simply follow; False where it is to be passed over."""
         if step is Step.FIRST:
             # What we joined in the middle of is passed over: the first block is a whole one.
@@ -296,16 +389,32 @@ class Acquisition:
             self.counters.repeated += 1
             return False
         elif step is Step.GAP:
-            self.counters.lost += missing
+            if self._was_away:
+                cause = AWAY
+            elif flags & FLAG_DEVICE_DROPPED:
+                cause = BY_DEVICE
+            else:
+                cause = DAMAGED if self._bad_since_sample else UNSEEN
+            self.counters.count_lost(missing, cause)
         elif step is Step.RESTART:
-            self.counters.restarts += 1
-            self._hand_over(time.monotonic_ns())
-            self.queue.put(Restarted())
+            self._restarted()
             self._say(f'{self._name}: the device started anew')
         return True
 
-    def _other(self, frame: Frame) -> None:
-        if isinstance(frame, StatusFrame):
+    def _restarted(self) -> None:
+        self.counters.restarts += 1
+        self._hand_over(time.monotonic_ns())
+        self.queue.put(Restarted())
+
+    def _other(self, frame: Event, now: int) -> None:
+        if isinstance(frame, PongFrame):
+            sent = self._sent.pop(frame.cookie, None)
+            if sent is not None:
+                self.counters.pongs += 1
+                self._unanswered = 0
+                if self._regressed:
+                    self._clock.observe_reply(frame.t_device_us, sent, now)
+        elif isinstance(frame, StatusFrame):
             self.counters.device_overruns = frame.overruns
             if frame.temperature_centi is not None:
                 self.counters.temperature = frame.temperature_centi / 100.0
@@ -319,9 +428,9 @@ class Acquisition:
     def _hand_over(self, now: int) -> None:
         if not self._seq:
             return
-        seq, t_us, counts, flags = self._seq, self._t_us, self._counts, self._flags
-        self._seq, self._t_us, self._counts, self._flags = [], [], [], []
-        t_ns = self._clock.to_host_ns(np.array(t_us, np.int64)) + (self._to_ros_ns - self._latency_ns)
+        seq, t, readings, flags = self._seq, self._t, self._readings, self._flags
+        self._seq, self._t, self._readings, self._flags = [], [], [], []
+        t_ns = self._ros_time_ns(np.array(t, np.int64))
         # A clock laid anew may point before what was already stamped: time does not go back.
         if t_ns[0] <= self._last_t_ns or bool((t_ns[1:] <= t_ns[:-1]).any()):
             steps = np.arange(1, len(t_ns) + 1)
@@ -333,8 +442,15 @@ class Acquisition:
         raw = RawChunk(
             np.array(seq, np.int64),
             t_ns,
-            np.array(counts, np.int16),
+            np.array(readings, np.float32) if self._volts_per_count is None else np.array(readings, np.int16),
             np.array(flags, np.uint8),
             self._volts_per_count,
         )
         self.queue.put(Chunk(raw, now))
+
+    def _ros_time_ns(self, t: IntArray) -> IntArray:
+        """``t``: as the source gives it."""
+        if self.source.clock is Clock.RECORDED:
+            return t
+        host = self._clock.to_host_ns(t) if self._regressed else t
+        return host + (self._to_ros_ns - self._latency_ns)

@@ -9,6 +9,9 @@ from psd_deflection.runner.session import Session
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 
+CLOCK_STEP_NS = 20_000_000
+"""A system clock that has moved by more against CLOCK_MONOTONIC was set."""
+
 
 class _Seen(NamedTuple):
     t_ns: int
@@ -67,6 +70,7 @@ class HealthReporter:
             ('rate (samples/s)', rate),
             ('samples', str(wire.samples)),
             ('lost', str(wire.lost)),
+            *((f'lost: {cause}', str(count)) for cause, count in sorted(wire.lost_by.items())),
             ('repeated', str(wire.repeated)),
             ('bad frames', str(wire.bad)),
             *((f'bad frames: {reason}', str(count)) for reason, count in sorted(wire.bad_frames.items())),
@@ -74,21 +78,37 @@ class HealthReporter:
             ('dropped by a full queue', str(wire.queue_dropped)),
             ('device restarts', str(wire.restarts)),
             ('disconnects', str(wire.disconnects)),
+            ('silences', str(wire.silences)),
+            ('refused on coming back', str(wire.refused_reopenings)),
+            ('blocks waiting', str(s.acquisition.queue.qsize())),
         ]
+        values += s.acquisition.source.describe().items()
         if wire.temperature is not None:
             values.append(('device temperature (degC)', f'{wire.temperature:.2f}'))
         return DiagnosticEntry('psd_deflection: acquisition', level, message, tuple(values))
 
     def _clock(self) -> DiagnosticEntry:
-        clock = self._session.acquisition.clock_state()
-        values = (
+        acquisition = self._session.acquisition
+        clock, wire = acquisition.clock_state(), acquisition.counters
+        stepped = acquisition.system_clock_step_ns()
+        values = [
             ('skew (ppm)', f'{clock.skew_ppm:.2f}'),
             ('offset (ns)', str(clock.offset_ns)),
             ('residual (us)', f'{clock.residual_ns / 1e3:.1f}'),
             ('seconds in the fit', str(clock.points)),
+            ('device clock jumps', str(wire.clock_jumps)),
             ('laid anew', str(clock.resets)),
-        )
-        return DiagnosticEntry('psd_deflection: clock', OK, f'skew {clock.skew_ppm:.1f} ppm', values)
+            ('pings', str(wire.pings)),
+            ('pings answered', str(wire.pongs)),
+            ('system clock moved since the start (ms)', f'{stepped / 1e6:.3f}'),
+        ]
+        if clock.round_trip_ns is not None:
+            values.append(('least round trip (us)', f'{clock.round_trip_ns / 1e3:.0f}'))
+        level, message = OK, f'skew {clock.skew_ppm:.1f} ppm'
+        if abs(stepped) > CLOCK_STEP_NS:
+            level = WARN
+            message = f'the system clock was set by {stepped / 1e9:+.3f} s; stamps go on as before until the next start'
+        return DiagnosticEntry('psd_deflection: clock', level, message, tuple(values))
 
     def _estimates(self, new: _Seen, rate: str) -> DiagnosticEntry:
         pipeline, latency = self._session.pipeline.counters, self._session.processing.latency()
@@ -138,10 +158,12 @@ class HealthReporter:
             ('folder', str(folder or '')),
             ('messages', str(recorder.written)),
             ('dropped', str(recorder.dropped)),
+            ('waiting for the disk', str(recorder.waiting)),
+            ('files deleted to make room', str(recorder.files_deleted)),
         )
-        return DiagnosticEntry(
-            'psd_deflection: recording',
-            WARN if recorder.dropped else OK,
-            'recording' if folder else 'not recording',
-            values,
-        )
+        level, message = OK, 'recording' if folder else 'not recording'
+        if recorder.failure:
+            level, message = ERROR, f'recording stopped: {recorder.failure}'
+        elif recorder.dropped:
+            level, message = WARN, f'{recorder.dropped} messages dropped: the disk is too slow'
+        return DiagnosticEntry('psd_deflection: recording', level, message, values)

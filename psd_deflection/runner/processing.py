@@ -38,6 +38,39 @@ class Latency:
     worst: float
 
 
+class Spokesman:
+    """Says when estimates stop and why, and when they are back: one line a second at most.
+
+    What came and went meanwhile is counted in the next line.
+    """
+
+    def __init__(self, say: Callable[[str], None], interval_s: float = 1.0) -> None:
+        self._say = say
+        self._interval = interval_s
+        self._last_line = -interval_s
+        self._now = ''
+        self._why = ''
+        self._blocks = 0
+        self._changes = 0
+
+    def block(self, cause: str, reason: str, now: float) -> None:
+        """One block: ``cause`` '' where it has an estimate; ``reason`` in words; ``now`` monotonic, s."""
+        if cause != self._now:
+            self._changes += 1
+            self._now, self._why = cause, reason
+        self._blocks += bool(cause)
+        if not self._changes or now - self._last_line < self._interval:
+            return
+        # A change and back within the second is news as well.
+        text = f'no estimate: {self._why}' if cause else 'estimates are back'
+        if self._changes > 1 or (not cause and self._blocks):
+            noun = 'block' if self._blocks == 1 else 'blocks'
+            text += f' ({self._blocks} {noun} without one since the last line)'
+        self._last_line = now
+        self._blocks = self._changes = 0
+        self._say(text)
+
+
 class Processing:
     """Runs ``pipeline`` over what ``acquisition`` reads; ``sinks`` take the records in their order."""
 
@@ -45,12 +78,13 @@ class Processing:
         self.pipeline = pipeline
         self.sinks: list[RecordSink] = []
         self.failed: BaseException | None = None
+        self.beat = time.monotonic()
         self._acquisition = acquisition
         self._say = say
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._latencies: deque[float] = deque(maxlen=50)
         self._thread = threading.Thread(target=self._run, name='pipeline', daemon=True)
-        self._refusal = ''
+        self._spokesman = Spokesman(say)
 
     def start(self) -> None:
         """Start the thread."""
@@ -112,6 +146,7 @@ class Processing:
     def _run(self) -> None:
         try:
             while True:
+                self.beat = time.monotonic()
                 try:
                     item = self._acquisition.queue.get(timeout=0.1)
                 except queue.Empty:
@@ -137,15 +172,10 @@ class Processing:
             self._requests.get()()
 
     def _tell_refusals(self) -> None:
-        """Say once when estimates stop coming and why, and once when they are back."""
         spots = self.pipeline.last_spots
-        if spots is None:
-            return
-        cause = spots.status.name if spots.reason else ''
-        if cause == self._refusal:
-            return
-        self._refusal = cause
-        self._say(f'no estimate: {spots.reason}' if cause else 'estimates are back')
+        if spots is not None:
+            cause = spots.status.name if spots.reason else ''
+            self._spokesman.block(cause, spots.reason, time.monotonic())
 
 
 __all__ = ['Ended', 'Latency', 'Processing']

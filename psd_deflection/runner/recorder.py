@@ -1,26 +1,33 @@
 """The recorder thread: what was published, written to a bag without holding up what is to come.
 
 It takes encoded messages from a bounded queue; what does not fit is counted, never waited for. An
-error of the disk ends the recording with a message; acquisition and publishing go on.
+error of the disk, or a disk with less room than the reserve, ends the recording with a message;
+acquisition and publishing go on. Once a chunk is on the disk a crash does not cost it any more; a
+chunk ends after half a second of log time, or of nothing to write.
 """
 
 from __future__ import annotations
 
 import queue
+import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from psd_deflection.config import Rig
+from psd_deflection.config import AcquisitionConfig, Rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.io.bag_writer import BagWriter
 from psd_deflection.records import ParameterChange
 
 MESSAGES_PER_BLOCK = 10
-JOIN_S = 1.5
+JOIN_S = 1.0
+IDLE_S = 0.5
+LOOK_EVERY = 250
+"""Messages between two looks at the room on the disk: half a second's worth."""
 
 Message = tuple[str, str, bytes, int]
+Item = Message | ParameterChange | None
 
 
 def new_folder(parent: Path, now: float | None = None) -> Path:
@@ -34,35 +41,62 @@ def new_folder(parent: Path, now: float | None = None) -> Path:
     return folder
 
 
+class _FullError(Exception):
+    """The disk has less room than the reserve."""
+
+
 class Recorder:
-    """One recording at a time; a wire like any other. ``say`` is told when one ends by itself."""
+    """One recording at a time; a wire like any other. ``say`` is told when one ends by itself.
+
+    ``failure``: why the last recording ended by itself, empty while all is well; for diagnostics.
+    """
 
     def __init__(self, queue_blocks: int, say: Callable[[str], None]) -> None:
         self.dropped = 0
         self.written = 0
+        self.files_deleted = 0
+        self.failure = ''
         self._say = say
         self._limit = queue_blocks * MESSAGES_PER_BLOCK
         self._bag: BagWriter | None = None
-        self._queue: queue.SimpleQueue[Message | ParameterChange | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
 
     @property
     def folder(self) -> Path | None:
         """Where the recording goes, or None while none is made."""
-        return self._bag.folder if self._bag is not None else None
+        bag = self._bag
+        return bag.folder if bag is not None else None
+
+    @property
+    def waiting(self) -> int:
+        """Messages that wait for the disk."""
+        return self._queue.qsize() if self._bag is not None else 0
 
     def start(self, rig: Rig, hello: Mapping[str, object] | None) -> Path:
         """Start a recording in ``bag_dir``; the one that runs, if one does.
 
-        Raises RecordingError where the folder cannot be made.
+        Raises RecordingError where the folder cannot be made or the disk has no room.
         """
         if self._bag is not None:
             return self._bag.folder
         effects = {f'effects.{name}': value for name, value in rig.effects.items()}
-        folder = new_folder(Path(rig.acquisition.bag_dir).expanduser())
-        bag = BagWriter(folder, rig_values={**rig.values, **effects}, device_hello=hello)
+        config = rig.acquisition
+        folder = new_folder(Path(config.bag_dir).expanduser())
+        missing = _missing_room(_nearest(folder), config.disk_reserve)
+        if missing:
+            raise RecordingError(f'{folder}: {missing}')
+        bag = BagWriter(
+            folder,
+            rig_values={**rig.values, **effects},
+            device_hello=hello,
+            max_bytes=config.bag_max_bytes,
+            max_s=config.bag_max_duration,
+            durable=True,
+        )
+        self.failure = ''
         self._queue = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, args=(bag, self._queue), name='recorder', daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(bag, self._queue, config), name='recorder', daemon=True)
         self._bag = bag
         self._thread.start()
         return folder
@@ -73,9 +107,9 @@ class Recorder:
             self._enqueue((topic, type_name, cdr, t_ns))
 
     def put_change(self, change: ParameterChange) -> None:
-        """Note that parameters changed."""
+        """Note that parameters changed. Never dropped: without it no replay is the same."""
         if self._bag is not None:
-            self._enqueue(change)
+            self._queue.put(change)
 
     def stop(self) -> Path | None:
         """End the recording and return its folder; None where none was made."""
@@ -89,22 +123,78 @@ class Recorder:
             self._say(f'{bag.folder}: the disk is slow; still writing in the background')
         return bag.folder
 
-    def _enqueue(self, item: Message | ParameterChange) -> None:
+    def _enqueue(self, item: Message) -> None:
         if self._queue.qsize() >= self._limit:
             self.dropped += 1
         else:
             self._queue.put(item)
 
-    def _run(self, bag: BagWriter, items: queue.SimpleQueue[Message | ParameterChange | None]) -> None:
+    def _run(self, bag: BagWriter, items: queue.SimpleQueue[Item], config: AcquisitionConfig) -> None:
         try:
-            while (item := items.get()) is not None:
-                if isinstance(item, ParameterChange):
-                    bag.write(item)
-                else:
-                    bag.write_encoded(*item)
-                self.written += 1
-            bag.close()
+            try:
+                self._write(bag, items, config)
+            except _FullError as error:
+                # There is room for index and summary: that is what the reserve is for.
+                bag.close()
+                self._ended(bag, f'{bag.folder}: {error}; it is complete up to here')
+            else:
+                bag.close()
         except RecordingError as error:
-            if self._bag is bag:
-                self._bag = None
-            self._say(f'recording stopped: {error}')
+            self._ended(bag, f'{error}; `psd-deflection recover {bag.folder}` makes it whole')
+
+    def _ended(self, bag: BagWriter, why: str) -> None:
+        if self._bag is bag:
+            self._bag = None
+        self.failure = why
+        self._say(f'recording stopped: {why}')
+
+    def _write(self, bag: BagWriter, items: queue.SimpleQueue[Item], config: AcquisitionConfig) -> None:
+        since_look = 0
+        unwritten = False
+        while True:
+            try:
+                item = items.get(timeout=IDLE_S)
+            except queue.Empty:
+                if unwritten:
+                    bag.flush()
+                    unwritten = False
+                continue
+            if item is None:
+                return
+            if isinstance(item, ParameterChange):
+                bag.write(item)
+            else:
+                bag.write_encoded(*item)
+                self.written += 1
+            unwritten = True
+            since_look += 1
+            if since_look >= LOOK_EVERY:
+                since_look = 0
+                self._make_room(bag, config)
+
+    def _make_room(self, bag: BagWriter, config: AcquisitionConfig) -> None:
+        while missing := _missing_room(bag.folder, config.disk_reserve):
+            if config.disk_full != 'delete_oldest':
+                raise _FullError(missing)
+            deleted = bag.drop_oldest()
+            if deleted is None:
+                raise _FullError(f'{missing} and there is no older file of this recording to delete')
+            self.files_deleted += 1
+            self._say(f'{deleted}: deleted, {missing} (disk_full is delete_oldest)')
+
+
+def _nearest(folder: Path) -> Path:
+    """The folder, or the nearest above it that exists."""
+    return next((p for p in (folder, *folder.absolute().parents) if p.exists()), Path('/'))
+
+
+def _missing_room(folder: Path, reserve: int) -> str:
+    """What to say where the disk of ``folder`` has less than ``reserve`` bytes of room; else ''."""
+    try:
+        free = shutil.disk_usage(folder).free
+    except OSError:
+        # A disk that does not say is written to until it refuses.
+        return ''
+    if free >= reserve:
+        return ''
+    return f'the disk has {free / 1e6:.0f} MB left, less than disk_reserve = {reserve / 1e6:.0f} MB'

@@ -7,17 +7,31 @@ opens, asks and closes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from msg_adapters import TOPIC_TYPES
 from psd_deflection.config import Rig, replace_values
+from psd_deflection.io import cdr
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import ParameterChange
 from psd_deflection.runner.acquisition import Acquisition
 from psd_deflection.runner.fanout import Fanout
 from psd_deflection.runner.processing import Processing
+from psd_deflection.runner.realtime import lock_memory
 from psd_deflection.runner.recorder import Recorder
 from psd_deflection.runner.simulated_rig import SimulatedRigProcess
+from psd_deflection.runner.zero_store import ZEROS, ZeroStore
+
+HUNG_S = 5.0
+"""A thread that has not come round for this long hangs: the watchdog is not fed any more."""
+
+JOIN_S = 0.5
+"""How long the last blocks may take at the end."""
+
+SIMULATED = ('serial', 'dataq', 'thorlabs', 'lines')
+"""Sources for which a simulated rig is started where no port is named."""
 
 
 class Session:
@@ -34,7 +48,7 @@ class Session:
         say = self._tell
         # The geometry first: a rig that cannot be solved must not open a port.
         pipeline = Pipeline(rig)
-        if not rig.acquisition.port:
+        if not rig.acquisition.port and rig.acquisition.source in SIMULATED:
             self._simulated = SimulatedRigProcess(rig)
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)
@@ -42,12 +56,24 @@ class Session:
         try:
             self.acquisition = Acquisition(rig, say)
             self.acquisition.open()
+            hello = self.acquisition.hello
+            self._store: ZeroStore | None = None
+            # The rig that we simulate ourselves is unloaded anew each time.
+            if rig.acquisition.keep_zero and not self.simulated:
+                self._store = ZeroStore(rig, hello.info.get('serial') if hello is not None else None)
+                rig, about = self._store.load(rig)
+                if about:
+                    say(about)
+                    pipeline = Pipeline(rig)
+            say('; '.join(f'{name}: {what}' for name, what in self.acquisition.source.describe().items()))
             self.processing = Processing(self.acquisition, pipeline, say)
             self.recorder = Recorder(rig.acquisition.queue_blocks, say)
             self.fanout = Fanout()
             self.fanout.change_wires.append(self.recorder)
             self.processing.sinks.append(self.fanout)
         except BaseException:
+            if hasattr(self, 'acquisition'):
+                self.acquisition.stop()
             if self._simulated is not None:
                 self._simulated.close()
             raise
@@ -76,11 +102,19 @@ class Session:
         """What ended the pipeline thread, if something did."""
         return self.processing.failed
 
+    def responsive(self) -> bool:
+        """Whether reader and pipeline came round lately; a device that is away does not hold them up."""
+        now = time.monotonic()
+        return all(now - beat < HUNG_S for beat in (self.acquisition.beat, self.processing.beat))
+
     def start(self) -> None:
         """Start recording where the rig says so, and let samples flow.
 
         The recorder is served last: what is published waits for no disk.
         """
+        cdr.prepare(TOPIC_TYPES.values())
+        if self.rig.acquisition.realtime:
+            self._tell(lock_memory())
         self.fanout.wires.append(self.recorder)
         if self.rig.acquisition.record:
             self.record(True)
@@ -95,14 +129,35 @@ class Session:
         hello = self.acquisition.hello.info if self.acquisition.hello is not None else None
 
         def change() -> Path | None:
-            return self.recorder.start(self.rig, hello) if wanted else self.recorder.stop()
+            if not wanted:
+                return self.recorder.stop()
+            folder = self.recorder.start(self.rig, hello)
+            held = self.pipeline.environment()
+            if held is not None:
+                self.recorder.put_change(held)
+            return folder
 
         return self.processing.request(change)
+
+    def temperature(self, celsius: float) -> None:
+        """The ambient temperature, for the corrections that need it; from the next block on.
+
+        Raises TimeoutError where no data flows.
+        """
+        if not self.pipeline.needs_temperature:
+            return
+
+        def change() -> None:
+            taken = self.pipeline.temperature(celsius)
+            if taken is not None:
+                self.processing.give([taken])
+
+        self.processing.request(change)
 
     def zero(self) -> ParameterChange | None:
         """Take the present dots as the unloaded ones; None where no good block has come yet.
 
-        Raises TimeoutError where no data flows.
+        They are kept for the next run where the rig says so. Raises TimeoutError where no data flows.
         """
 
         def change() -> ParameterChange | None:
@@ -111,25 +166,40 @@ class Session:
                 self.processing.give([taken])
             return taken
 
-        return self.processing.request(change)
+        taken = self.processing.request(change)
+        if taken is not None:
+            self._keep_zero()
+        return taken
 
-    def set_sum_min(self, volts: float) -> None:
-        """Change the level below which a laser counts as lost, V, between two blocks.
+    def change(self, values: Mapping[str, float | str | tuple[float, ...]]) -> None:
+        """Change live parameters, together, between two blocks.
 
-        Raises TimeoutError where no data flows.
+        Raises TimeoutError where no data flows, ConfigError where a value is out of bounds; then
+        nothing has changed.
         """
-        self.processing.request(lambda: self.processing.give([self.pipeline.change({'sum_min': volts})]))
+        self.processing.request(lambda: self.processing.give([self.pipeline.change(values)]))
+        if any(name in ZEROS for name in values):
+            self._keep_zero()
+
+    def _keep_zero(self) -> None:
+        trouble = self._store.save(self.rig) if self._store is not None else ''
+        if trouble:
+            self._tell(trouble)
 
     def close(self) -> Path | None:
         """Stop reading, process what was read, end the recording; returns its folder.
 
-        Does nothing the second time.
+        Ends within two seconds whatever hangs. Does nothing the second time.
         """
         if self._closed:
             return None
         self._closed = True
+        if self._simulated is not None:
+            self._simulated.hang_up()
         self.acquisition.stop()
-        self.processing.join()
+        self.processing.join(JOIN_S)
+        if self.processing.alive:
+            self._tell('a subscriber or the disk holds up the last blocks; they are not waited for')
         folder = self.recorder.stop()
         if self._simulated is not None:
             self._simulated.close()

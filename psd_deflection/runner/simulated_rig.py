@@ -30,19 +30,27 @@ class SimulatedRigProcess:
             raise DeviceError('the simulated rig has no pipes')
         self._process.stdin.write(json.dumps({**rig.values, **effects}).encode() + b'\n')
         self._process.stdin.flush()
-        ready, _, _ = select.select((self._process.stdout,), (), (), START_S)
+        try:
+            ready, _, _ = select.select((self._process.stdout,), (), (), START_S)
+        except BaseException:
+            self.close()
+            raise
         line = self._process.stdout.readline().decode() if ready else ''
         if not line.startswith(PORT_LINE):
             self.close()
             raise DeviceError('the simulated rig did not start; try `psd-deflection simulate --serve`')
         self.port = line[len(PORT_LINE) :].strip()
 
-    def close(self) -> None:
-        """End the process."""
+    def hang_up(self) -> None:
+        """Tell the process to end; does not wait."""
         if self._process.stdin is not None:
             self._process.stdin.close()
+
+    def close(self) -> None:
+        """End the process."""
+        self.hang_up()
         try:
-            self._process.wait(1.0)
+            self._process.wait(0.3)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

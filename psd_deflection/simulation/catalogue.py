@@ -22,6 +22,7 @@ from typing import Any, Literal
 
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError
+from psd_deflection.records import FloatArray
 from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.physics import Physics
 
@@ -33,12 +34,20 @@ Values = Mapping[str, float]
 STAGES: tuple[Stage, ...] = ('load', 'link', 'optics', 'psd', 'electronics')
 
 
+Kind = Literal['amplitude', 'coupled', 'phase', 'shape', 'choice']
+
+
 @dataclass(frozen=True, slots=True)
 class EffectParameter:
-    """One parameter. ``nominal`` is the value at which the effect is off (or what a shape
-    parameter takes when it is not given); ``scale`` is the size that is worth a probe, about the
-    prior's standard deviation. ``choices``: a discrete parameter, its values searched apart.
-    ``kind`` ``shape``: means nothing while the others are nominal; ``grid`` has where to look.
+    """One parameter of an effect, with its bounds and what a search has to know of it.
+
+    ``nominal``: the value at which the effect is off, or that a parameter takes when it is not
+    given; NaN means the rig file's own, the field ``of_rig`` of :class:`Physics`. ``scale``: the
+    size of a probe, about the prior's standard deviation. ``kind``: an ``amplitude`` switches the
+    effect on; ``coupled`` and ``phase`` mean nothing while the amplitudes are nominal; a ``shape``
+    likewise, and ``grid`` says where to look (``spectral``: at peaks of the residual's spectrum;
+    ``line``: at those that hum steadily;
+    ``highest``: at the largest voltage seen); a ``choice`` takes the values of ``choices``.
     """
 
     name: str
@@ -48,10 +57,32 @@ class EffectParameter:
     scale: float
     description: str
     nominal: float = 0.0
-    kind: Literal['amplitude', 'shape', 'choice'] = 'amplitude'
+    kind: Kind = 'amplitude'
     choices: tuple[int, ...] = ()
     grid: tuple[float, ...] = ()
+    propose: Literal['', 'spectral', 'line', 'highest', 'lattice'] = ''
+    of_rig: str = ''
     required: bool = False
+
+    def off(self, physics: Physics) -> float:
+        """The nominal value on this rig."""
+        return float(getattr(physics, self.of_rig)) if self.of_rig else self.nominal
+
+
+PSD = EffectParameter('psd', '', 1, 2, 1, 'which PSD', nominal=1, kind='choice', choices=(1, 2), required=True)
+"""The parameter of every effect that belongs to one detector."""
+
+
+@dataclass(slots=True, eq=False)
+class Reading:
+    """n readings on their way back to what the PSDs would have shown: ``dots`` (4, n) m,
+    ``sums`` (2, n) V, ``warmer`` (n,) K, ``t`` (n,) s. Changed in place.
+    """
+
+    dots: FloatArray
+    sums: FloatArray
+    warmer: FloatArray
+    t: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +90,10 @@ class Effect:
     """One physical effect: what it is, where it acts, and how.
 
     ``equation`` and ``source`` are for the reader. ``needs``: the excitation that shows it.
-    ``configure`` changes the constants before a run; ``apply`` changes a chunk at ``point``.
-    ``finite``: its signature vanishes or is not defined at the nominal value, so that it is probed
-    at ``probes`` (values of the first amplitude parameter) instead of by a derivative.
+    ``configure`` changes the constants before a run; ``apply`` changes a chunk at ``point``;
+    ``correct`` undoes it on a reading, where that is possible without the load. ``order``: among
+    the effects of one stage. ``finite``: the signature at the nominal value vanishes, so that
+    only the values of ``grid`` are probed, each as it is.
     """
 
     name: str
@@ -74,8 +106,8 @@ class Effect:
     point: Point
     configure: Callable[[Physics, Values], None] | None = None
     apply: Callable[[Chunk, Values, State], None] | None = None
+    correct: Callable[[Reading, Values], None] | None = None
     finite: bool = False
-    probes: tuple[float, ...] = ()
     order: int = 0
 
     def parameter(self, name: str) -> EffectParameter:
@@ -187,6 +219,7 @@ def effects_to_values(effects: Sequence[ActiveEffect]) -> dict[str, dict[str, ob
         body: dict[str, object] = {'name': active.effect.name}
         for p in active.effect.parameters:
             value = float(active.values[p.name])
-            body[p.name] = int(value) if p.kind == 'choice' else value
+            if math.isfinite(value):
+                body[p.name] = int(value) if p.kind == 'choice' else value
         out[key] = body
     return out

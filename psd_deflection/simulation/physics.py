@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from psd_deflection.config import Rig
+from psd_deflection.mechanics import LinkStatics
 from psd_deflection.records import FloatArray
 
 
@@ -70,11 +71,15 @@ class Physics:
         )
 
     @property
+    def _statics(self) -> LinkStatics:
+        return LinkStatics(self.length, self.bending_stiffness, self.torsional_stiffness)
+
+    @property
     def force_compliance(self) -> float:
         """Tip deflection per force at the tip, m/N: L^3/3EI, and the clamp's turn by F L times L."""
-        return self.length**3 / (3.0 * self.bending_stiffness) + self.clamp_bending * self.length**2
+        return self._statics.deflection(1.0, 0.0, 0.0)[0] + self.clamp_bending * self.length**2
 
     @property
     def torque_compliance(self) -> float:
         """Twist per torque, rad/(N m): L/GJ and the clamp's own."""
-        return self.length / self.torsional_stiffness + self.clamp_torsion
+        return self._statics.deflection(0.0, 0.0, 1.0)[2] + self.clamp_torsion

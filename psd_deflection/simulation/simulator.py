@@ -104,6 +104,18 @@ class ForwardModel:
         """What acts on the signal with its noise on it: clipping and coarse steps."""
         self._at('output', chunk)
 
+    def expect(self, loads: FloatArray, temperature: FloatArray | None = None, noise: float | None = None) -> Chunk:
+        """Like :meth:`run`, then the mean of the output over the noise (``noise`` V rms).
+
+        What leaves the converter's range stays at its ends, as in a recording.
+        """
+        chunk = self.run(loads, temperature)
+        chunk.noise = self.physics.noise if noise is None else noise
+        self.finish(chunk)
+        full = self.physics.full_scale
+        np.clip(chunk.volts, -full, full - self.physics.volts_per_count, out=chunk.volts)
+        return chunk
+
     def _at(self, point: str, chunk: Chunk) -> None:
         for active, state in zip(self.effects, self._states, strict=True):
             if active.effect.point == point and active.effect.apply is not None:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.records import FloatArray
+from psd_deflection.solvers._plane import positive
 
 Model = Callable[[Sequence[float]], tuple[list[float], list[Sequence[float]]]]
 """Parameters (p) to predicted readings (m) and rows of derivatives (m of p)."""
@@ -127,9 +128,9 @@ def _invert(lower: list[list[float]]) -> list[list[float]] | None:
 
 
 def fit_many(model: ModelMany, start: FloatArray, measured: FloatArray, variances: FloatArray) -> Fits:
-    """N blocks: ``start`` (n, p), ``measured`` (n, m), ``variances`` (m,) or (n, m)."""
+    """N blocks: ``start`` (n, p), ``measured`` (n, m), ``variances`` (m,) or (n, m), above 0 (SolverError)."""
     n, p = start.shape
-    weights = np.broadcast_to(1.0 / np.atleast_2d(variances), measured.shape)
+    weights = np.broadcast_to(1.0 / positive(variances), measured.shape)
     out = Fits(start.copy(), np.empty((n, p, p)), np.empty(measured.shape), np.zeros(n, dtype=bool))
     for first in range(0, n, CHUNK):
         # A block that has converged is left alone: its answer does not depend on its neighbours.

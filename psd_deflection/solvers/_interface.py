@@ -39,7 +39,7 @@ class Geometry:
     """Where the PSDs, the beams and the link are.
 
     ``centers`` (P, 2): c_i, m, in ``link_tip``. ``zeros`` (P, 2): m_i0, the dots before load, m.
-    ``heights`` (P,): h_i, the sensitive surface above the reference section, m.
+    ``heights`` (P,): h_i, the sensitive surface above the reference section, m (``base_pair``: -L_i).
     ``link_length``: L, m. ``slope_ratio``: k of phi = -k dY/L, omega = +k dX/L.
     """
 
@@ -59,7 +59,8 @@ class Solution(NamedTuple):
     """One block's answer.
 
     ``dx``, ``dy`` m; ``theta``, ``phi``, ``omega`` rad, right-hand positive (tilts are 0 where the
-    method has none). ``covariance``: 3 x 3 of (dx, dy, theta), row by row. ``residual``:
+    method has none). ``covariance``: 3 x 3 of (dx, dy, theta), row by row; NaN of a printed threshold
+    method, which has none. ``residual``:
     (x1, y1, x2, y2, ...) measured minus modelled dots, m. ``iterations``: 0 for a closed form.
     """
 

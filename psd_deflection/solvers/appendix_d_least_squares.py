@@ -1,10 +1,10 @@
 """``appendix_d_ols``, ``appendix_d_wls``: the thesis's MATLAB least squares; for comparison only.
 
 Its matrix (4.12 with theta_1 = -90, theta_2 = -180 degrees) has rows of two different rigs: with PSD 1
-above and PSD 2 on the -X side, the torsion entries of the two PSDs disagree in sign. A true twist theta
-then comes out as 0.342 theta with the wrong sign in plain least squares. The pre-load readings are not
-subtracted. The weights Po = [0.03, 0.5, 10, 0.1] silence x1 and with it the contradiction, which is why
-the source found them "closest to calibration data".
+above and PSD 2 on the -X side, the torsion entries of the two PSDs disagree in sign. A twist theta then
+comes out as 0.342 theta in plain least squares, 0.912 theta with the sidebar's weights (which silence x1,
+and with it most of the contradiction: the source found them "closest to calibration data"), and -0.995
+theta with those for direct loads (which silence y2). The pre-load readings are not subtracted.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ def test_it_answers_hello_and_ping_and_stops_and_starts() -> None:
     d = device(first_seq=1000)
     (hello,) = frames(d.receive(encode(HelloRequestFrame()), 0))
     assert isinstance(hello, HelloFrame)
-    assert frames(d.receive(encode(PingFrame(77)), 250 * MS)) == [PongFrame(77, 250_000)]
+    assert frames(d.receive(encode(PingFrame(77)), 250 * MS)) == [PongFrame(77, 1_250_000)]
     d.receive(encode(StopFrame()), 0)
     assert not samples(d.take(100 * MS))
     d.receive(encode(StartFrame()), 0)

@@ -61,3 +61,13 @@ def test_whatever_comes_a_number_that_is_kept_is_above_those_before(samples: lis
         if step is not Step.REPEAT:
             assert number > last
             last = number
+
+
+def test_numbers_given_anew_go_on_at_the_next_block() -> None:
+    sequence = SequenceExtender(20)
+    sequence.restart()
+    assert sequence.extend(0, 0) == (0, Step.FIRST, 0)
+    assert sequence.extend(1, 1000) == (1, Step.NEXT, 0)
+    sequence.restart()
+    assert sequence.extend(0, 0) == (20, Step.NEXT, 0)
+    assert sequence.extend(3, 3000) == (23, Step.GAP, 2)

@@ -17,6 +17,8 @@ from typing import IO, Any
 
 import pytest
 
+from test.runner.conftest import ScriptedDevice
+
 rclpy = pytest.importorskip('rclpy', reason='the ROS tests need rclpy: pip install .[ros]')
 
 WARNINGS = "error,ignore:module 'sre_parse' is deprecated:DeprecationWarning,"
@@ -39,6 +41,7 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
             continue
         os.environ['ROS_DOMAIN_ID'] = str(candidate)
         os.environ['ROS_LOG_DIR'] = str(tmp_path_factory.mktemp('ros_log'))
+        os.environ['XDG_STATE_HOME'] = str(tmp_path_factory.mktemp('state'))
         yield candidate
         lock.close()
         return
@@ -178,3 +181,11 @@ def simulated_port(domain: int) -> Iterator[str]:
     process.send_signal(signal.SIGINT)
     assert process.wait(10.0) == 0
     process.stdout.close()
+
+
+@pytest.fixture
+def device(tmp_path: Path) -> Iterator[ScriptedDevice]:
+    """A device whose every byte the test writes."""
+    scripted = ScriptedDevice(tmp_path / 'port')
+    yield scripted
+    scripted.unplug()

@@ -19,6 +19,14 @@ from psd_deflection.protocol.frames import HelloFrame, encode
 from psd_deflection.runner import acquisition as module
 from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Item, Restarted
 
+HELLO_INFO: dict[str, object] = {
+    'serial': 'T-1',
+    'firmware': 'test',
+    'sample_rate_hz': 1000.0,
+    'channels': ['x1', 'y1', 'sum1', 'x2', 'y2', 'sum2'],
+    'volts_per_count': 10.0 / 32768,
+}
+
 
 def take(acquisition: Acquisition, n: int) -> list[Item]:
     """The next items until ``n`` samples have come."""
@@ -200,3 +208,104 @@ def test_a_device_that_does_not_fit_is_named(
         Acquisition(rig, print).open()
     assert said in str(error.value)
     assert rig.acquisition.port in str(error.value)
+
+
+def loss_of(run: Run) -> dict[str, int]:
+    return run.acquisition.counters.lost_by
+
+
+def test_every_lost_sample_has_a_cause(device: Any, run: Run, sample: Any) -> None:
+    device.send_frames(*[sample(s) for s in range(10)])
+    device.send_frames(sample(13, flags=2), sample(14))
+    damaged = bytearray(encode(sample(15)) + encode(sample(16)))
+    damaged[5] ^= 0x10
+    damaged[40] ^= 0x10
+    device.send(bytes(damaged))
+    device.send_frames(sample(17), *[sample(s) for s in range(22, 40)])
+    take(run.acquisition, 31)
+    assert loss_of(run) == {'dropped by the device': 3, 'damaged on the wire': 2, 'on the wire, without a trace': 4}
+    assert run.acquisition.counters.lost == 9
+    assert run.acquisition.counters.bad == 2
+
+
+def test_a_device_is_found_again_under_another_name_by_its_serial_number(
+    device: Any, tmp_path: Path, sample: Any
+) -> None:
+    device.answer = encode(HelloFrame(1, {**HELLO_INFO, 'serial': 'MINE'}))
+    run = Run(load_rig(overrides={'port': str(tmp_path / 'port*'), 'serial_number': 'MINE'}))
+    try:
+        device.send_frames(*[sample(s) for s in range(20)])
+        take(run.acquisition, 20)
+        device.unplug()
+        run.heard('waiting for it to come back')
+        # Another device takes the old name, ours comes back under a new one.
+        other = type(device)(tmp_path / 'port')
+        other.answer = encode(HelloFrame(1, {**HELLO_INFO, 'serial': 'OTHER'}))
+        device.link = tmp_path / 'port_b'
+        device.plug()
+        assert 'port_b: the device is back' in run.heard('the device is back')
+        device.send_frames(*[sample(s) for s in range(1000, 1020)])
+        assert numbers(take(run.acquisition, 20)) == list(range(1000, 1020))
+        assert loss_of(run) == {'while the port was away': 980}
+        other.unplug()
+    finally:
+        run.acquisition.stop()
+
+
+def test_another_device_on_the_same_port_is_not_taken(device: Any, run: Run) -> None:
+    device.unplug()
+    run.heard('waiting for it to come back')
+    device.answer = encode(HelloFrame(1, {**HELLO_INFO, 'serial': 'OTHER'}))
+    device.plug()
+    assert "serial number 'OTHER' and not 'T-1'" in run.heard('another device answers')
+    device.unplug()
+    device.answer = encode(HelloFrame(1, HELLO_INFO))
+    device.plug()
+    run.heard('the device is back')
+
+
+def test_a_wanted_serial_number_is_held_against_the_first_device_too(device: Any, rig: Rig) -> None:
+    with pytest.raises(DeviceError, match="serial number 'T-1' and not 'X'"):
+        Acquisition(load_rig(overrides={'port': rig.acquisition.port, 'serial_number': 'X'}), print).open()
+
+
+def test_a_pattern_without_a_port_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DeviceError, match=r'tty\*: no port of such a name'):
+        Acquisition(load_rig(overrides={'port': str(tmp_path / 'tty*')}), print).open()
+
+
+def test_a_silent_device_is_woken(device: Any, run: Run, short_wait: ModuleType, sample: Any) -> None:
+    assert device.greeted.wait(10.0)
+    device.greeted.clear()
+    run.heard('no frame for 0.2 s')
+    assert device.greeted.wait(10.0)
+    device.send(b'\x01rubbish without an end\x00' * 3)
+    device.send_frames(*[sample(s) for s in range(20)])
+    assert numbers(take(run.acquisition, 20)) == list(range(20))
+    assert run.acquisition.counters.silences >= 1
+
+
+def test_pings_are_answered_and_a_device_that_knows_none_is_left_in_peace(
+    device: Any, rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, 'PING_S', (0.0, 0.001))
+    monkeypatch.setattr(module, 'READ_TIMEOUT_S', 0.001)
+    run = Run(rig)
+    while run.acquisition.counters.pings < module.UNANSWERED:
+        device.greeted.wait(0.001)
+    run.acquisition.stop()
+    assert run.acquisition.counters.pings == module.UNANSWERED
+    assert run.acquisition.counters.pongs == 0
+
+
+def test_a_clock_jump_of_the_device_is_told_and_time_goes_on(device: Any, run: Run, sample: Any) -> None:
+    device.send_frames(*[sample(s) for s in range(40)])
+    before = take(run.acquisition, 40)
+    device.send_frames(*[sample(s, t_us=s * 1000 + 10**9) for s in range(40, 80)])
+    run.heard("the device's clock jumped")
+    items = before + take(run.acquisition, 40)
+    t = [int(t) for i in items if isinstance(i, Chunk) for t in i.raw.t_ns]
+    assert all(b > a for a, b in itertools.pairwise(t))
+    assert t[-1] - t[0] < 10**9
+    assert run.acquisition.counters.clock_jumps == 1
+    assert numbers(items) == list(range(80))

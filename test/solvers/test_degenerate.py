@@ -95,3 +95,10 @@ def test_tilt_branches_name_their_degenerate_rigs() -> None:
     ):
         with pytest.raises(SolverError, match=said):
             tilt_branches(rig(centers), (0.0,) * (2 * len(centers)), 0.0)
+
+
+def test_no_tilt_lengthens_the_base_line_beyond_the_beams(golden: Any) -> None:
+    """Dots closer together than the beams, along y and along x: no branch."""
+    geometry = golden.geometry()
+    assert tilt_branches(geometry, (0.0, -1e-4, 0.0, 0.0), 0.0) == ()
+    assert tilt_branches(geometry, (-1e-4, 0.0, 0.0, 0.0), 0.0) == ()

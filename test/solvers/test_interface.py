@@ -199,6 +199,15 @@ def test_a_variance_of_zero_is_refused(golden: Any, method: str) -> None:
         make_solver(method, golden.geometry()).solve_many(np.zeros((1, 4)), np.array([1.0, 1.0, float('nan'), 1.0]))
 
 
+def test_a_variance_of_zero_is_refused_elsewhere_too() -> None:
+    for method, geometry in (('pose', STAGGERED), ('base_pair', AT_THE_BASE)):
+        count = 2 * len(geometry.centers)
+        with pytest.raises(SolverError, match=r'variances must be above 0'):
+            make_solver(method, geometry).solve((0.0,) * count, (0.0,) * count)
+        with pytest.raises(SolverError, match=r'variances must be above 0'):
+            make_solver(method, geometry).solve_many(np.zeros((1, count)), np.zeros(count))
+
+
 def test_the_rig_file_reaches_geometry_and_weights() -> None:
     rig = rig_from_values({'psd_2.center': [0.06, 0.01], 'psd_1.zero': [1e-4, 2e-4], 'wls.weights': 'thesis'})
     geometry = geometry_from_rig(rig)

@@ -1,0 +1,172 @@
+"""discover on data that no one here made: a two-link flexible arm, through the adapter. ``python -m blind.arm``.
+
+Stage 1 of the arm: a geared motor turns a hub, a flexible link carries the rest. Written from the
+equations of motion (hub angle h, tip angle against the hub d, motor current u)::
+
+    J1 h'' = Ks d - B1 h' + B2 d' - T(h') + Kt u
+    d'' = -(1/J1 + 1/J2)(Ks d + B2 d') + (B1 h' + T(h') - Kt u)/J1
+
+with u = K (reference - state), K the linear-quadratic gain of the nominal arm. The maker's model has
+B2 = 0 and no Coulomb friction T. Each measured step is simulated in closed loop from its first state.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import solve_continuous_are
+
+from psd_deflection.discovery.adapter import Model, PlantDiscovery, PlantEffect, discover_in
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.catalogue import EffectParameter
+
+DATA = Path(__file__).parent.parent / 'test' / 'data' / 'two_link_arm' / 'excerpt.csv'
+RATE = 500.0
+EVERY = 5
+SUBSTEPS = 2
+CREEP_RATE = 0.02
+"""Hub rate, rad/s, below which Coulomb friction fades: a sign function would stop any integrator."""
+
+KS = 2.068427e11 * (3.0 * 0.0254) * (0.050 * 0.0254) ** 3 / (4.0 * 0.202)
+B1 = 4.0
+KT = 0.75 * 0.119 * 100.0
+J1 = 100.0**2 * 6.28e-6 + 0.00073616
+J2 = 0.18028257 - 1.578 * 0.079**2
+
+
+def _scale(name: str, words: str) -> PlantEffect:
+    p = EffectParameter('scale', '', -0.8, 4.0, 0.1, words)
+    return PlantEffect(name, (p,), {'scale': 0.05})
+
+
+LIBRARY = (
+    PlantEffect('coulomb_friction', (EffectParameter('torque', 'N m', 0.0, 20.0, 1.0, 'at the hub'),), {'torque': 0.5}),
+    PlantEffect(
+        'tip_damping', (EffectParameter('damping', 'N m s', 0.0, 2.0, 0.05, 'of the link itself'),), {'damping': 0.02}
+    ),
+    _scale('hub_damping', 'relative change of B1'),
+    _scale('link_stiffness', 'relative change of Ks'),
+    _scale('hub_inertia', 'relative change of J1'),
+    _scale('tip_inertia', 'relative change of J2'),
+    _scale('motor_gain', 'relative change of Kt'),
+    PlantEffect('input_delay', (EffectParameter('delay', 's', 0.0, 0.03, 0.004, 'of the current'),), {'delay': 0.003}),
+    PlantEffect('current_limit', (EffectParameter('limit', 'A', 0.05, 20.0, 1.0, 'of the amplifier'),), {'limit': 2.0}),
+    PlantEffect('tip_gain', (EffectParameter('scale', '', -0.8, 4.0, 0.1, 'strain reading'),), {'scale': 0.05}),
+    PlantEffect('tip_offset', (EffectParameter('offset', 'rad', -0.01, 0.01, 1e-3, 'strain zero'),), {'offset': 1e-4}),
+)
+
+
+class Arm:
+    """The adapter: measured segments, the nominal model, and what might be missing from it."""
+
+    channels = ('theta_hub', 'theta_tip')
+    library = LIBRARY
+
+    def __init__(self, path: Path = DATA) -> None:
+        rows: dict[str, list[list[float]]] = {}
+        with path.open(newline='') as stream:
+            for row in csv.DictReader(stream):
+                names = ('t', 'ref', 'theta_hub', 'theta_tip', 'rate_hub', 'rate_tip')
+                rows.setdefault(row['segment'], []).append([float(row[n] or 'nan') for n in names])
+        self.cases = tuple(rows)
+        tables = [np.array(rows[c]) for c in self.cases]
+        self._measured = [np.ascontiguousarray(t[:, 2:4].T) for t in tables]
+        self._start = np.array([t[0, 2:6] for t in tables])
+        n = len(tables[0])
+        fine = np.arange(n * EVERY) / RATE
+        self._reference = np.array([np.interp(fine, t[:, 0], t[:, 1]) for t in tables])
+        a = np.array(
+            [
+                [0.0, 0.0, 1.0, 0.0],
+                [0.0, 0.0, 0.0, 1.0],
+                [0.0, KS / J1, -B1 / J1, 0.0],
+                [0.0, -KS * (1.0 / J1 + 1.0 / J2), B1 / J1, 0.0],
+            ]
+        )
+        b = np.array([[0.0], [0.0], [KT / J1], [-KT / J1]])
+        cost = np.diag([2500.0, 1.0, 1.0, 100.0])
+        self._gain = (b.T @ solve_continuous_are(a, b, cost, np.array([[10.0]])) / 10.0)[0]
+
+    def measured(self) -> list[FloatArray]:
+        """Hub and tip angle, rad, of each segment."""
+        return self._measured
+
+    def simulate(self, model: Model, cases: Sequence[int]) -> list[FloatArray]:
+        """All listed segments at once, second-order Runge-Kutta with the current held over each sample."""
+
+        def of(name: str, parameter: str, default: float) -> float:
+            return model[name][parameter] if name in model else default
+
+        ks = KS * (1.0 + of('link_stiffness', 'scale', 0.0))
+        b1 = B1 * (1.0 + of('hub_damping', 'scale', 0.0))
+        j1 = J1 * (1.0 + of('hub_inertia', 'scale', 0.0))
+        j2 = J2 * (1.0 + of('tip_inertia', 'scale', 0.0))
+        kt = KT * (1.0 + of('motor_gain', 'scale', 0.0))
+        b2 = of('tip_damping', 'damping', 0.0)
+        friction = of('coulomb_friction', 'torque', 0.0)
+        limit = of('current_limit', 'limit', np.inf)
+        late = of('input_delay', 'delay', 0.0) * RATE
+        read, zero = 1.0 + of('tip_gain', 'scale', 0.0), of('tip_offset', 'offset', 0.0)
+
+        def slope(x: FloatArray, torque: FloatArray) -> FloatArray:
+            hub = torque - b1 * x[2] - friction * np.tanh(x[2] / CREEP_RATE)
+            spring = ks * x[1] + b2 * x[3]
+            return np.stack((x[2], x[3], (hub + spring) / j1, -(1.0 / j1 + 1.0 / j2) * spring - hub / j1))
+
+        x = self._start[list(cases)].T.copy()
+        reference = self._reference[list(cases)]
+        n = reference.shape[1]
+        out = np.empty((len(cases), 2, n // EVERY))
+        h = 1.0 / (RATE * SUBSTEPS)
+        whole = int(late)
+        past = [np.zeros(len(cases)) for _ in range(whole + 2)]
+        for i in range(n):
+            if i % EVERY == 0:
+                out[:, 0, i // EVERY] = x[0]
+                out[:, 1, i // EVERY] = x[1] * read + zero
+            u = self._gain[0] * (reference[:, i] - x[0]) - self._gain[1] * (x[1] * read + zero)
+            u = np.clip(u - self._gain[2] * x[2] - self._gain[3] * x[3], -limit, limit)
+            past = [u, *past[:-1]]
+            part = late - whole
+            torque = kt * ((1.0 - part) * past[whole] + part * past[whole + 1])
+            for _ in range(SUBSTEPS):
+                middle = x + 0.5 * h * slope(x, torque)
+                x = x + h * slope(middle, torque)
+        return [np.clip(rows, -10.0, 10.0) for rows in out]
+
+
+def report(found: PlantDiscovery) -> str:
+    """The steps in words."""
+
+    def mrad(values: Sequence[float]) -> str:
+        return ', '.join(f'{n} {1e3 * v:.3f}' for n, v in zip(Arm.channels, values, strict=True))
+
+    lines = [f'compare: rms of measured minus simulated, mrad: {mrad(found.gap_before)}', 'where, worst first:']
+    lines += [f'  {case:16s} {channel:10s} {1e3 * v:.3f} mrad' for case, channel, v in found.where[:6]]
+    lines.append('which (BIC gained if added alone):')
+    lines += [f'  {name:18s} {gain:9.1f}' for name, gain in found.tried]
+    lines.append('added:')
+    for s in found.steps:
+        values = ', '.join(f'{k} {v:.4g}' for k, v in s.values.items())
+        lines.append(
+            f'  {s.name} ({values}): BIC better by {s.delta_bic:.1f}, unseen segments {s.heldout_gain:+.1f} '
+            f'+- {s.heldout_error:.1f}; gap then {mrad(s.gap_after)}'
+        )
+    lines.append(f'held out, before, mrad: {mrad(found.heldout_before)}')
+    lines.append(f'held out, after,  mrad: {mrad(found.heldout_after)}')
+    lines.append(f'{found.simulations} simulations')
+    return '\n'.join(lines)
+
+
+def main() -> int:
+    """Run the five steps and print them."""
+    print(report(discover_in(Arm())))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

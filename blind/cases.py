@@ -1,0 +1,299 @@
+"""What is hidden: every case of the suite, drawn from its own seed, scaled to a stated gap.
+
+The gap is the rms over x1 y1 x2 y2 of the block-mean dots, effect minus nominal, both without
+noise, in units of what the noise leaves (2 mV rms over 20 samples: 0.2236 um). Mains hum is null in
+block means at some frequencies: its gap is that of single samples over their noise.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from blind import generator
+from blind.generator import Array, Generator
+
+BLOCK = 20
+FLOOR = generator.SIGMA * generator.MM_PER_V / math.sqrt(BLOCK)
+SIZES = (1.0, 3.0, 10.0)
+
+SHOWS_ACROSS_LENGTHS = frozenset(
+    (
+        *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
+        *('self_weight', 'mount_tilt'),
+    )
+)
+"""Effects that one link length cannot tell from another of them: half of their cases have two."""
+
+MIMICKED: Mapping[str, str] = {
+    'bending_stiffness': 'clamp_bending_compliance',
+    'clamp_bending_compliance': 'bending_stiffness',
+    'torsional_stiffness': 'clamp_torsional_compliance',
+    'clamp_torsional_compliance': 'torsional_stiffness',
+    'sensor_rotation': 'axis_crosstalk',
+    'self_weight': 'mount_tilt',
+    'mount_tilt': 'sensor_position of both PSDs',
+    'refraction': 'thermal_drift of both PSDs',
+    'axis_crosstalk': 'sensor_rotation and sensor_gain on the diagonals these loads give',
+}
+"""What the rest of the catalogue can do just as well: leaving it out leaves nothing unknown."""
+
+
+def histories() -> tuple[Array, Array]:
+    """Loads (n, 3) and temperature (n,) of the suite's own experiment: 24 s."""
+    levels = [
+        *((0, 0, 0), (0, -30, -17.55), (0, -50, -29.25), (0, -10, -5.85), (0, 0, 0), (0, -50, 0)),
+        *((30, 0, 0), (-20, -20, 15), (0, 20, 25), (0, 0, 0)),
+    ]
+    held = np.repeat(np.array(levels, dtype=np.float64), 2000, axis=0)
+    t = np.arange(4000) / 1000.0
+    sweep = np.sin(2 * np.pi * (2.0 * t + 3.5 * t * t))[:, None] * np.array([4.0, 4.0, 3.0])
+    loads = np.concatenate((held, sweep))
+    at = np.arange(len(loads)) / 1000.0
+    return loads, 21.0 + 3.0 * np.sin(0.21 * at) + 0.8 * np.sin(0.9 * at)
+
+
+@functools.cache
+def designs(name: str) -> tuple[Generator, ...]:
+    """``one``: a link of 0.585 m; ``two``: that and one of 0.400 m."""
+    loads, temperature = histories()
+    lengths = (0.585,) if name == 'one' else (0.585, 0.400)
+    return tuple(Generator(loads, temperature, length) for length in lengths)
+
+
+Draw = Callable[[np.random.Generator, float], dict[str, Any]]
+
+
+def _signed(rng: np.random.Generator) -> tuple[float, float]:
+    angle = float(rng.uniform(0, 2 * math.pi))
+    return math.cos(angle), math.sin(angle)
+
+
+def _xy(scale: float, names: tuple[str, str] = ('x', 'y'), psd: bool = False, **more: Any) -> Draw:
+    def draw(rng: np.random.Generator, size: float) -> dict[str, Any]:
+        a, b = _signed(rng)
+        out = {
+            names[0]: scale * size * a,
+            names[1]: scale * size * b,
+            **{k: int(rng.choice(v)) for k, v in more.items()},
+        }
+        return {'psd': int(rng.integers(1, 3)), **out} if psd else out
+
+    return draw
+
+
+def _one(name: str, scale: float, signed: bool = True, psd: bool = False, **more: Any) -> Draw:
+    def draw(rng: np.random.Generator, size: float) -> dict[str, Any]:
+        sign = float(rng.choice((-1.0, 1.0))) if signed else 1.0
+        out: dict[str, Any] = {name: sign * scale * size}
+        out.update({k: int(rng.choice(v)) for k, v in more.items()})
+        return {'psd': int(rng.integers(1, 3)), **out} if psd else out
+
+    return draw
+
+
+def _creep(rng: np.random.Generator, size: float) -> dict[str, Any]:
+    return {'time_constant': float(np.exp(rng.uniform(math.log(0.5), math.log(12.0)))), 'amplitude': 1e-3 * size}
+
+
+def _damping(rng: np.random.Generator, size: float) -> dict[str, Any]:
+    a, b = _signed(rng)
+    return {'bending_ratio': max(0.0, 0.02 + 2e-4 * size * a), 'torsion_ratio': max(0.0, 0.02 + 2e-4 * size * b)}
+
+
+def _second(rng: np.random.Generator, size: float) -> dict[str, Any]:
+    return {
+        'frequency': float(rng.uniform(60.0, 110.0)),
+        'damping_ratio': float(rng.uniform(0.01, 0.03)),
+        'shares': int(rng.integers(0, 3)),
+        'gain': 1e-3 * size,
+    }
+
+
+def _ambient(rng: np.random.Generator, size: float) -> dict[str, Any]:
+    return {
+        'psd': int(rng.integers(1, 3)),
+        'x': float(rng.uniform(-3e-3, 3e-3)),
+        'y': float(rng.uniform(-3e-3, 3e-3)),
+        'level': 1e-3 * size,
+    }
+
+
+def _mains(rng: np.random.Generator, size: float) -> dict[str, Any]:
+    amplitude = rng.uniform(0.3, 1.0, 6) * np.array([1, 1, 0.5, 1, 1, 0.5])
+    return {
+        'frequency': float(rng.choice((50.0, 60.0)) + rng.uniform(-0.1, 0.1)),
+        'amplitude': (2e-3 * size * amplitude).tolist(),
+        'phase': rng.uniform(-3.0, 3.0, 6).tolist(),
+    }
+
+
+def _saturation(rng: np.random.Generator, size: float) -> dict[str, Any]:
+    # What the size means is found by bisection: a small one clips only the highest peaks.
+    return {'limit': 10.0 * math.exp(-0.02 * size), 'sums': int(rng.integers(0, 2))}
+
+
+DRAWS: Mapping[str, Draw] = {
+    'bending_stiffness': _one('scale', 1e-3, moves_frequency=(0, 1)),
+    'torsional_stiffness': _one('scale', 1e-3, moves_frequency=(0, 1)),
+    'clamp_bending_compliance': _one('compliance', 1e-7, signed=False),
+    'clamp_torsional_compliance': _one('compliance', 1e-6, signed=False),
+    'clamp_friction': _one('width', 1e-6, signed=False, axis=(1, 2, 3)),
+    'creep': _creep,
+    'damping': _damping,
+    'tip_mass': _one('mass', 1e-3, signed=False),
+    'second_bending_mode': _second,
+    'self_weight': _one('weight_per_length', 0.1, signed=False),
+    'mount_tilt': _xy(1e-6),
+    'load_offset': _xy(1e-4),
+    'load_direction': _one('angle', 1e-3),
+    'plane_tilt': _one('slope_ratio', 1.0, signed=False),
+    'laser_pointing_drift': _xy(1e-7, ('rate_x', 'rate_y'), psd=True),
+    'refraction': _xy(1e-7),
+    'sensor_rotation': _one('angle', 1e-3, psd=True),
+    'sensor_position': _xy(1e-4, psd=True, aimed=(0, 1)),
+    'sensor_gain': _xy(1e-3, psd=True),
+    'sensor_nonlinearity': _one('k', 100.0, psd=True),
+    'axis_crosstalk': _xy(1e-3, ('xy', 'yx'), psd=True),
+    'ambient_light': _ambient,
+    'thermal_drift': _xy(1e-7, psd=True),
+    'spot_clipping': _one('radius', 1e-3, signed=False, psd=True, profile=(1, 2)),
+    'mains_interference': _mains,
+    'amplifier_saturation': _saturation,
+    'amplifier_lag': _one('time_constant', 1e-4, signed=False),
+    'channel_skew': _one('delay', 1e-4, signed=False, psd=True),
+    'quantisation': _one('step', 1e-3, signed=False),
+    'alien_cubic_spring': _one('size', 1e-4),
+    'alien_quadratic_load': _one('size', 1e-9),
+    'alien_soft_mode': _one('size', 1e-4),
+    'alien_square_crosstalk': _one('size', 1.0),
+    'alien_thermal_square': _one('size', 1e-7),
+    'alien_jump': _one('size', 1e-6),
+    'alien_gain_drift': _one('size', 1e-4),
+    'alien_thermal_gain': _one('size', 1e-4),
+    'alien_rectifier': _one('size', 1e-3),
+    'alien_walk': _one('size', 1e-8, seed=tuple(range(100))),
+    'alien_backlash': _one('size', 1e-6, signed=False),
+    'alien_beat': _one('size', 1e-6),
+}
+EFFECTS = tuple(n for n in DRAWS if not n.startswith('alien_'))
+ALIENS = tuple(n for n in DRAWS if n.startswith('alien_'))
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run. ``wanted``: (effect, gap in floors), not yet scaled. ``without``: left out of the library."""
+
+    key: str
+    kind: str
+    design: str
+    wanted: tuple[tuple[str, float], ...]
+    noise: str = 'white'
+    without: tuple[str, ...] = field(default=())
+
+    @property
+    def seed(self) -> int:
+        """Of its noise and its draws; from its name, so that adding cases changes none."""
+        return zlib.crc32(self.key.encode())
+
+
+def _blocks(volts: Array) -> Array:
+    n = len(volts) // BLOCK * BLOCK
+    rows = volts[:n, [0, 1, 3, 4]].reshape(-1, BLOCK, 4)
+    return np.asarray(rows.mean(axis=1) * generator.MM_PER_V)
+
+
+def gap_of(design: tuple[Generator, ...], effect: Mapping[str, Any]) -> float:
+    """Gap in floors that this effect alone makes, without noise."""
+    total, count = 0.0, 0
+    for g in design:
+        v = g.clean([effect])
+        nominal = g.clean([])
+        if effect['name'] in ('amplifier_saturation', 'quantisation'):
+            # These meet the signal with its noise on it; the same noise on both leaves the effect.
+            hiss = generator.noise(len(v), 'white', 12345)
+            v, nominal = generator.output(v + hiss, [effect]), generator.output(nominal + hiss, [])
+        if effect['name'] == 'mains_interference':
+            d = (v - nominal)[:, [0, 1, 3, 4]] * generator.MM_PER_V / math.sqrt(BLOCK)
+        else:
+            d = _blocks(v) - _blocks(nominal)
+        total, count = total + float(np.sum(d**2)), count + d.size
+    return math.sqrt(total / count) / FLOOR
+
+
+def scaled(case_seed: int, name: str, gap: float, design: tuple[Generator, ...]) -> dict[str, Any]:
+    """The effect with its size such that its gap is ``gap`` floors, within 3 %; secant in logarithms."""
+
+    def at(size: float) -> dict[str, Any]:
+        rng = np.random.default_rng((case_seed, zlib.crc32(name.encode())))
+        return {'name': name, **DRAWS[name](rng, size)}
+
+    size, low, high = 1.0, 0.0, math.inf
+    best: tuple[float, dict[str, Any]] = (math.inf, at(1.0))
+    for _ in range(40):
+        effect = at(size)
+        got = gap_of(design, effect)
+        error = abs(math.log(max(got, 1e-9) / gap))
+        if error < best[0]:
+            best = (error, effect)
+        if error < 0.03:
+            break
+        if got < gap:
+            low = size
+        else:
+            high = size
+        # Proportional first; once bracketed and outside, bisection.
+        step = size * min(max(gap / max(got, 1e-9), 0.05), 20.0)
+        if not low < step < high:
+            step = math.sqrt(low * high) if low > 0.0 and high < math.inf else (2.0 * size if got < gap else 0.5 * size)
+        size = step
+    return best[1]
+
+
+def all_cases(seeds: int = 4, nulls: int = 300, wrong: int = 102, pairs: int = 60, first: int = 0) -> Iterator[Case]:
+    """The whole suite. ``first``: number of the first seed, for a run on cases never seen before."""
+    for seed in range(first, first + seeds):
+        for name in EFFECTS:
+            two = name in SHOWS_ACROSS_LENGTHS and seed % 2 == 1
+            for gap in SIZES:
+                yield Case(f'single-{name}-{gap:g}-{seed}', 'single', 'two' if two else 'one', ((name, gap),))
+    rng = np.random.default_rng(20240501 + first)
+    for i in range(first, first + pairs):
+        a, b = (str(n) for n in rng.choice(EFFECTS, 2, replace=False))
+        gaps = tuple(float(g) for g in np.exp(rng.uniform(math.log(3.0), math.log(10.0), 2)))
+        two = bool({a, b} & SHOWS_ACROSS_LENGTHS)
+        yield Case(f'pair-{i}-{a}-{b}', 'pair', 'two' if two else 'one', ((a, gaps[0]), (b, gaps[1])))
+    for name in EFFECTS:
+        if name not in MIMICKED:
+            for gap in (3.0, 10.0):
+                yield Case(f'leftout-{name}-{gap:g}-{first}', 'leftout', 'one', ((name, gap),), without=(name,))
+    for name in ALIENS:
+        for gap in (3.0, 10.0):
+            for seed in range(first, first + 2):
+                yield Case(f'alien-{name}-{gap:g}-{seed}', 'alien', 'one', ((name, gap),))
+    for i in range(first, first + wrong):
+        yield Case(f'wrong-{i}', 'wrong', 'one', (), noise=('heavy', 'coloured', 'loud')[i % 3])
+    for i in range(first, first + nulls):
+        yield Case(f'null-{i}', 'null', 'one', ())
+
+
+def short_cases() -> list[Case]:
+    """A slice for every change: a few of each kind."""
+    out = [
+        Case(f'single-{name}-{gap:g}-s', 'single', 'one', ((name, gap),))
+        for name, gap in (
+            *(('sensor_rotation', 3.0), ('plane_tilt', 3.0), ('creep', 3.0), ('amplifier_lag', 10.0)),
+            *(('quantisation', 3.0), ('spot_clipping', 10.0)),
+        )
+    ]
+    out.append(Case('pair-s', 'pair', 'one', (('sensor_gain', 5.0), ('load_direction', 5.0))))
+    out.append(Case('alien-s', 'alien', 'one', (('alien_square_crosstalk', 10.0),)))
+    out += [Case(f'null-s{i}', 'null', 'one', ()) for i in range(3)]
+    out += [Case(f'wrong-s{i}', 'wrong', 'one', (), noise=k) for i, k in enumerate(('heavy', 'coloured', 'loud'))]
+    return out

@@ -1,0 +1,384 @@
+"""A second rig, written from the contract alone: nothing of ``psd_deflection.simulation`` is imported.
+
+Its own way in everything: the motion is integrated by Runge-Kutta of order four at a fifth of a
+millisecond (as one matrix polynomial a step, the loads held over each sample), the optics intersect
+each beam with the plate in three dimensions by solving a linear system, lag and delay act on the
+five times finer signal, and hysteresis runs sample by sample. Where its physics goes beyond the
+nominal, that is an effect and stands in the truth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+from scipy.stats import norm
+
+Array = npt.NDArray[np.float64]
+Spec = Mapping[str, Any]
+
+RATE = 1000.0
+FINER = 5
+STEP = 1.0 / (RATE * FINER)
+
+EI = 69e9 * math.pi / 4.0 * (0.0159**4 - 0.0138**4)
+GJ = 24e9 * math.pi / 2.0 * (0.0159**4 - 0.0138**4)
+PLACES = ((0.0, 0.070), (-0.100, 0.0))
+MM_PER_V = 0.5e-3
+LSB = 20.0 / 65536.0
+SIGMA = 2e-3
+
+
+def find(effects: Sequence[Spec], name: str) -> list[Spec]:
+    """All effects of that name."""
+    return [e for e in effects if e['name'] == name]
+
+
+def _rk4(a: Array, b: Array) -> tuple[Array, Array]:
+    """One step of classical Runge-Kutta for y' = a y + b u with u held: y <- p y + q u."""
+    n = len(a)
+    ha = STEP * a
+    p = np.eye(n) + ha @ (np.eye(n) + ha / 2.0 @ (np.eye(n) + ha / 3.0 @ (np.eye(n) + ha / 4.0)))
+    q = STEP * (np.eye(n) + ha / 2.0 @ (np.eye(n) + ha / 3.0 @ (np.eye(n) + ha / 4.0))) @ b
+    return p, q
+
+
+def _march(a: Array, b: Array, held: Array, start: Array) -> Array:
+    """States (n * FINER, 2) from ``start`` (2,); ``held`` (n, 1) is the input from each sample to the next.
+
+    FINER steps make a sample; within one the input is held, so that the steps' own matrices can be
+    multiplied out once and the march goes by samples.
+    """
+    p, q = _rk4(a, b)
+    reach, push = [np.eye(2)], [np.zeros((2, 1))]
+    for _ in range(FINER):
+        reach.append(p @ reach[-1])
+        push.append(p @ push[-1] + q)
+    (p11, p12), (p21, p22) = reach[-1].tolist()
+    q1, q2 = push[-1][:, 0].tolist()
+    x, v = float(start[0]), float(start[1])
+    first, second = [], []
+    for u in held[:, 0].tolist():
+        first.append(x)
+        second.append(v)
+        x, v = p11 * x + p12 * v + q1 * u, p21 * x + p22 * v + q2 * u
+    at_samples = np.column_stack((first, second))
+    out = np.empty((len(held), FINER, 2))
+    for j in range(FINER):
+        out[:, j] = at_samples @ reach[j].T + held @ push[j].T
+    return out.reshape(-1, 2)
+
+
+def _oscillator(frequency: float, ratio: float) -> tuple[Array, Array]:
+    w = 2.0 * math.pi * frequency
+    return np.array([[0.0, 1.0], [-w * w, -2.0 * ratio * w]]), np.array([[0.0], [w * w]])
+
+
+def motion(loads: Array, length: float, effects: Sequence[Spec]) -> Array:
+    """Tip pose (n * FINER, 3): dX, dY, theta on the fine grid."""
+    f = loads.copy()
+    for e in find(effects, 'load_direction'):
+        c, s = math.cos(e['angle']), math.sin(e['angle'])
+        f[:, :2] = f[:, :2] @ np.array([[c, s], [-s, c]])
+    for e in find(effects, 'load_offset'):
+        f[:, 2] = f[:, 2] + e['x'] * f[:, 1] - e['y'] * f[:, 0]
+    stiff_b, stiff_t = EI, GJ
+    f_b, f_t, z_b, z_t = 14.0, 21.0, 0.02, 0.02
+    for e in find(effects, 'bending_stiffness'):
+        stiff_b *= 1.0 + e['scale']
+        if e.get('moves_frequency'):
+            f_b *= math.sqrt(1.0 + e['scale'])
+    for e in find(effects, 'torsional_stiffness'):
+        stiff_t *= 1.0 + e['scale']
+        if e.get('moves_frequency'):
+            f_t *= math.sqrt(1.0 + e['scale'])
+    for e in find(effects, 'damping'):
+        z_b, z_t = e['bending_ratio'], e['torsion_ratio']
+    give_b = length**3 / (3.0 * stiff_b)
+    give_t = length / stiff_t
+    for e in find(effects, 'tip_mass'):
+        # k = m w^2 of the massless spring with the mass that gives 14 Hz.
+        k = 1.0 / give_b
+        m = k / (2.0 * math.pi * f_b) ** 2
+        f_b = math.sqrt(k / (m + e['mass'])) / (2.0 * math.pi)
+    for e in find(effects, 'clamp_bending_compliance'):
+        # Root moment F L turns the root by c F L; the tip moves L times that.
+        give_b = give_b + e['compliance'] * length * length
+    for e in find(effects, 'clamp_torsional_compliance'):
+        give_t = give_t + e['compliance']
+    static = f * np.array([give_b, give_b, give_t])
+    for e in find(effects, 'alien_cubic_spring'):
+        static = static * (1.0 + e['size'] * (static / np.array([1e-3, 1e-3, 1e-2])) ** 2)
+    for e in find(effects, 'alien_quadratic_load'):
+        static[:, 1] += e['size'] * f[:, 1] ** 2
+    for e in find(effects, 'clamp_friction'):
+        levers = (length, length, 1.0)
+        axes = {1: (0, 1), 2: (2,), 3: (0, 1, 2)}[int(e['axis'])]
+        for axis in axes:
+            half = 0.5 * e['width'] * levers[axis]
+            follower = 0.0
+            for i, x in enumerate(static[:, axis].tolist()):
+                if x - follower > half:
+                    follower = x - half
+                elif follower - x > half:
+                    follower = x + half
+                static[i, axis] = follower
+    sag = np.zeros(3)
+    for e in find(effects, 'self_weight'):
+        sag[1] -= e['weight_per_length'] * length**4 / (8.0 * stiff_b)
+    for e in find(effects, 'mount_tilt'):
+        sag[0] += e['x'] * length
+        sag[1] += e['y'] * length
+    pose = np.empty((len(loads) * FINER, 3))
+    creeps = find(effects, 'creep')
+    for axis, (frequency, ratio) in enumerate(((f_b, z_b), (f_b, z_b), (f_t, z_t))):
+        a2, b2 = _oscillator(frequency, ratio)
+        rows = static[:, axis]
+        total = rows.copy()
+        for e in creeps:
+            # What has crept so far drives the oscillator, frozen over a sample.
+            crept, decay = 0.0, math.exp(-1.0 / (RATE * e['time_constant']))
+            lag = np.empty(len(rows))
+            for i, u in enumerate(rows.tolist()):
+                lag[i] = crept
+                crept = u + (crept - u) * decay
+            total = total + e['amplitude'] * lag
+        states = _march(a2, b2, total[:, None], np.zeros(2))
+        pose[:, axis] = states[:, 0] + sag[axis]
+        if axis < 2:
+            for e in find(effects, 'second_bending_mode'):
+                a3, b3 = _oscillator(e['frequency'], e['damping_ratio'])
+                ringing = _march(a3, b3, static[:, axis : axis + 1], np.zeros(2))[:, 0]
+                if int(e['shares']) == 1:
+                    ringing = ringing - states[:, 0]
+                elif int(e['shares']) == 2:
+                    ringing = ringing - np.repeat(static[:, axis], FINER)
+                pose[:, axis] += e['gain'] * ringing
+    for e in find(effects, 'alien_soft_mode'):
+        # A spring that stiffens with speed: not in the catalogue.
+        speed = np.gradient(pose[:, 1], STEP)
+        pose[:, 1] = pose[:, 1] + e['size'] * speed * np.abs(speed)
+    return pose
+
+
+def optics(pose: Array, t: Array, warm: Array, length: float, effects: Sequence[Spec]) -> Array:
+    """Dots (n, 4), m, by intersecting each beam with the plate in space."""
+    n = len(pose)
+    k = sum(e['slope_ratio'] for e in find(effects, 'plane_tilt'))
+    phi, omega, theta = -k * pose[:, 1] / length, k * pose[:, 0] / length, pose[:, 2]
+    cp, sp, co, so, ct, st = np.cos(phi), np.sin(phi), np.cos(omega), np.sin(omega), np.cos(theta), np.sin(theta)
+    # Columns of R = Ry(omega) Rx(phi) Rz(theta): the plate's own X and Y in space.
+    ex = np.stack((co * ct + so * sp * st, cp * st, -so * ct + co * sp * st), axis=1)
+    ey = np.stack((-co * st + so * sp * ct, cp * ct, so * st + co * sp * ct), axis=1)
+    middle = np.column_stack((pose[:, 0], pose[:, 1], np.full(n, length)))
+    dots = np.empty((n, 4))
+    for i in range(2):
+        place = np.array(PLACES[i])
+        beam = np.tile(place, (n, 1))
+        for e in find(effects, 'sensor_position'):
+            if int(e['psd']) == i + 1:
+                place = place + np.array([e['x'], e['y']])
+                if e['aimed']:
+                    beam = beam + np.array([e['x'], e['y']])
+        for e in find(effects, 'laser_pointing_drift'):
+            if int(e['psd']) == i + 1:
+                beam = beam + t[:, None] * np.array([e['rate_x'], e['rate_y']])
+        for e in find(effects, 'refraction'):
+            beam = beam + warm[:, None] * np.array([e['x'], e['y']])
+        # middle + a ex + b ey = (beam, s): three equations for a, b and the height s.
+        system = np.zeros((n, 3, 3))
+        system[:, :, 0], system[:, :, 1] = ex, ey
+        system[:, 2, 2] = -1.0
+        right = np.column_stack((beam, np.zeros(n))) - middle
+        solved = np.linalg.solve(system, right[:, :, None])[:, :, 0]
+        dots[:, 2 * i : 2 * i + 2] = solved[:, :2] - place
+    return dots
+
+
+def _clip_spot(x: Array, radius: float, profile: int) -> tuple[Array, Array]:
+    """Centroid and light left of a spot at x between edges at +-5 mm."""
+    half = 0.005
+    if profile == 2:
+        s = radius / 2.0
+        a, b = (-half - x) / s, (half - x) / s
+        left = norm.cdf(b) - norm.cdf(a)
+        return x + s * (norm.pdf(a) - norm.pdf(b)) / left, left
+    # Strips of an even disc, by trapezoids at the angles where they are equally fine: no closed form here.
+    angle = np.linspace(0.0, np.pi, 100_001)
+    u, weight = -np.cos(angle), np.sin(angle) ** 2
+    step = angle[1]
+    whole = np.concatenate(([0.0], np.cumsum(0.5 * step * (weight[1:] + weight[:-1]))))
+    turn = weight * u
+    first = np.concatenate(([0.0], np.cumsum(0.5 * step * (turn[1:] + turn[:-1]))))
+    hi = np.arccos(-np.clip((half - x) / radius, -1.0, 1.0))
+    lo = np.arccos(-np.clip((-half - x) / radius, -1.0, 1.0))
+    light = np.interp(hi, angle, whole) - np.interp(lo, angle, whole)
+    moment = np.interp(hi, angle, first) - np.interp(lo, angle, first)
+    return x + radius * moment / light, light / whole[-1]
+
+
+def sensors(dots: Array, t: Array, warm: Array, effects: Sequence[Spec]) -> tuple[Array, Array]:
+    """What the PSDs report: dots (n, 4) m and sums (n, 2) V."""
+    m = dots.copy()
+    light = np.full((len(m), 2), 5.0)
+    for i in range(2):
+        cols = (2 * i, 2 * i + 1)
+
+        def mine(name: str, psd: int = i + 1) -> list[Spec]:
+            return [e for e in find(effects, name) if int(e['psd']) == psd]
+
+        for e in mine('spot_clipping'):
+            for c in cols:
+                m[:, c], left = _clip_spot(m[:, c], e['radius'], int(e['profile']))
+                light[:, i] *= left
+        for e in mine('ambient_light'):
+            share = e['level'] / (light[:, i] + e['level'])
+            m[:, cols[0]] += share * (e['x'] - m[:, cols[0]])
+            m[:, cols[1]] += share * (e['y'] - m[:, cols[1]])
+            light[:, i] += e['level']
+        for e in mine('sensor_rotation'):
+            z = (m[:, cols[0]] + 1j * m[:, cols[1]]) * np.exp(-1j * e['angle'])
+            m[:, cols[0]], m[:, cols[1]] = z.real, z.imag
+        for e in mine('sensor_nonlinearity'):
+            r2 = m[:, cols[0]] ** 2 + m[:, cols[1]] ** 2
+            for c in cols:
+                m[:, c] += e['k'] * r2 * m[:, c]
+        for e in mine('axis_crosstalk'):
+            x, y = m[:, cols[0]].copy(), m[:, cols[1]].copy()
+            m[:, cols[0]], m[:, cols[1]] = x + e['xy'] * y, y + e['yx'] * x
+        for e in mine('sensor_gain'):
+            m[:, cols[0]] *= 1.0 + e['x']
+            m[:, cols[1]] *= 1.0 + e['y']
+        for e in mine('thermal_drift'):
+            m[:, cols[0]] += e['x'] * warm
+            m[:, cols[1]] += e['y'] * warm
+    _alien_sensors(m, t, warm, effects)
+    return m, light
+
+
+def _alien_sensors(m: Array, t: Array, warm: Array, effects: Sequence[Spec]) -> None:
+    """What is in no catalogue, each on PSD 1 or 2, in place."""
+    for e in effects:
+        size = e.get('size', 0.0)
+        if e['name'] == 'alien_square_crosstalk':
+            m[:, 0] += size * m[:, 1] ** 2
+        elif e['name'] == 'alien_thermal_square':
+            m[:, 3] += size * warm**2
+        elif e['name'] == 'alien_jump':
+            m[:, 1] += size * (t > 0.55 * t[-1])
+        elif e['name'] == 'alien_gain_drift':
+            m[:, 1] *= 1.0 + size * t
+        elif e['name'] == 'alien_thermal_gain':
+            m[:, 3] *= 1.0 + size * warm
+        elif e['name'] == 'alien_rectifier':
+            m[:, 2] += size * np.abs(m[:, 3])
+        elif e['name'] == 'alien_walk':
+            steps = np.random.default_rng(int(e['seed'])).normal(size=len(t) // FINER + 1)
+            m[:, 0] += size * np.repeat(np.cumsum(steps), FINER)[: len(t)]
+        elif e['name'] == 'alien_backlash':
+            held = m[0, 3]
+            out = np.empty(len(m))
+            for i, v in enumerate(m[:, 3].tolist()):
+                held = min(max(held, v - size), v + size)
+                out[i] = held
+            m[:, 3] = out
+        elif e['name'] == 'alien_beat':
+            m[:, 1] += size * np.sin(2 * np.pi * (0.3 + 0.02 * t) * t)
+
+
+def electronics(m: Array, light: Array, t: Array, effects: Sequence[Spec]) -> Array:
+    """Volts (n, 6) at the samples, before noise."""
+    fine = np.column_stack((m[:, :2] / MM_PER_V, light[:, 0], m[:, 2:] / MM_PER_V, light[:, 1]))
+    for e in find(effects, 'amplifier_lag'):
+        tau = e['time_constant']
+        decay = math.exp(-STEP / tau)
+        # The response to a straight piece of input, solved by hand.
+        ahead = 1.0 - tau / STEP * (1.0 - decay)
+        behind = 1.0 - decay - ahead
+        driven = behind * fine[:-1] + ahead * fine[1:]
+        out = np.empty_like(fine)
+        y = out[0] = fine[0].copy()
+        for i, add in enumerate(driven, 1):
+            y = decay * y + add
+            out[i] = y
+        fine = out
+    volts = fine[::FINER].copy()
+    at = t[::FINER]
+    for e in find(effects, 'channel_skew'):
+        i = 3 * (int(e['psd']) - 1)
+        late = np.clip(at - e['delay'], 0.0, None)
+        volts[:, i : i + 3] = CubicSpline(t, fine[:, i : i + 3])(late)
+    for e in find(effects, 'mains_interference'):
+        sizes, phases = np.array(e['amplitude']), np.array(e['phase'])
+        volts += sizes * np.sin(2.0 * math.pi * e['frequency'] * at[:, None] + phases)
+    return volts
+
+
+def output(volts: Array, effects: Sequence[Spec]) -> Array:
+    """Clipping, coarse steps, the converter's own steps."""
+    v = volts
+    for e in find(effects, 'amplifier_saturation'):
+        cols = [0, 1, 2, 3, 4, 5] if e['sums'] else [0, 1, 3, 4]
+        v = v.copy()
+        v[:, cols] = np.clip(v[:, cols], -e['limit'], e['limit'])
+    for e in find(effects, 'quantisation'):
+        v = e['step'] * np.round(v / e['step'])
+    return np.clip(np.round(v / LSB), -32768, 32767) * LSB
+
+
+def noise(n: int, kind: str, seed: int) -> Array:
+    """(n, 6) V: ``white``, ``heavy`` (Student's t, 4 degrees), ``coloured`` (AR 0.5), ``loud`` (1.5 sigma)."""
+    rng = np.random.default_rng(seed)
+    if kind == 'heavy':
+        return SIGMA * rng.standard_t(4, size=(n, 6)) / math.sqrt(2.0)
+    e = rng.normal(size=(n, 6))
+    if kind == 'loud':
+        return 1.5 * SIGMA * e
+    if kind == 'coloured':
+        out = np.empty_like(e)
+        out[0] = e[0]
+        for i in range(1, n):
+            out[i] = 0.5 * out[i - 1] + math.sqrt(0.75) * e[i]
+        return SIGMA * out
+    return SIGMA * e
+
+
+class Generator:
+    """One recording's design; ``length`` m; ``loads`` (n, 3); ``temperature`` (n,)."""
+
+    def __init__(self, loads: Array, temperature: Array, length: float) -> None:
+        self.loads, self.temperature, self.length = loads, temperature, length
+        self._poses: dict[str, Array] = {}
+
+    def clean(self, effects: Sequence[Spec]) -> Array:
+        """Volts (n, 6) without noise, before clipping and steps."""
+        moving = [e for e in effects if e['name'] in LINK]
+        key = repr(moving)
+        if key not in self._poses:
+            if len(self._poses) > 2:
+                self._poses = {k: v for k, v in self._poses.items() if k == '[]'}
+            self._poses[key] = motion(self.loads, self.length, moving)
+        pose = self._poses[key]
+        t = np.arange(len(pose), dtype=np.float64) * STEP
+        warm = np.repeat(self.temperature - self.temperature[0], FINER)
+        m, light = sensors(optics(pose, t, warm, self.length, effects), t, warm, effects)
+        return electronics(m, light, t, effects)
+
+    def record(self, effects: Sequence[Spec], kind: str, seed: int) -> Array:
+        """Volts (n, 6) as a converter gives them."""
+        clean = self.clean(effects)
+        return output(clean + noise(len(clean), kind, seed), effects)
+
+
+LINK = frozenset(
+    (
+        *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
+        *('clamp_friction', 'creep', 'damping', 'tip_mass', 'second_bending_mode', 'self_weight', 'mount_tilt'),
+        *('load_offset', 'load_direction', 'alien_cubic_spring', 'alien_quadratic_load', 'alien_soft_mode'),
+    )
+)
+"""Effects that change the motion, and with it the slow part of a run."""

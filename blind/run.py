@@ -1,0 +1,133 @@
+"""Run the blind suite: seal the truths, let discover answer, score. ``python -m blind.run --help``.
+
+Truths and thresholds are written and hashed before the first answer; discover is given volts, loads
+and temperatures, nothing else. Each answer is saved as it comes, and a run that was stopped goes on
+where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from blind import score
+from blind.cases import Case, all_cases, designs, scaled, short_cases
+from psd_deflection.config import load_rig, replace_values
+from psd_deflection.discovery.discover import Discovery, discover
+from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.result import result
+from psd_deflection.discovery.signatures import SignatureBank
+
+_BANKS: dict[str, SignatureBank] = {}
+
+
+def truth_of(case: Case) -> list[dict[str, Any]]:
+    """The effects of a case, scaled to their gaps."""
+    return [scaled(case.seed, name, gap, designs(case.design)) for name, gap in case.wanted]
+
+
+def observe(case: Case, truth: Sequence[dict[str, Any]]) -> list[Observation]:
+    """What discover is given."""
+    rig = load_rig()
+    out = []
+    for i, g in enumerate(designs(case.design)):
+        own = replace_values(rig, {'link.length': g.length}) if g.length != rig.link.length else rig
+        volts = g.record(truth, case.noise, case.seed + i)
+        out.append(Observation(f'recording {i + 1}', own, volts, g.loads, g.temperature))
+    return out
+
+
+def answer(case: Case, truth: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], Discovery]:
+    """discover's result.json for a case."""
+    bank = _BANKS.setdefault(case.design, SignatureBank())
+    found = discover(observe(case, truth), load_rig(), seed=0, without=case.without, bank=bank)
+    return result(found), found
+
+
+def _one(job: tuple[dict[str, Any], list[dict[str, Any]], str]) -> str:
+    fields, truth, target = job
+    case = Case(**{**fields, 'wanted': tuple(map(tuple, fields['wanted'])), 'without': tuple(fields['without'])})
+    start = time.perf_counter()
+    got, _ = answer(case, truth)
+    got['seconds'] = time.perf_counter() - start
+    path = Path(target)
+    partial = path.with_suffix('.partial')
+    partial.write_text(json.dumps(got))
+    partial.replace(path)
+    return case.key
+
+
+def seal(cases: Sequence[Case], folder: Path) -> str:
+    """Write truths and thresholds; returns the hash over all of them."""
+    truths = folder / 'sealed'
+    truths.mkdir(parents=True, exist_ok=True)
+    digest = hashlib.sha256(json.dumps(score.THRESHOLDS, sort_keys=True).encode())
+    for case in tqdm(cases, desc='sealing truths', file=sys.stderr):
+        path = truths / f'{case.key}.json'
+        if not path.exists():
+            text = json.dumps({'case': dataclasses.asdict(case), 'truth': truth_of(case)}, sort_keys=True)
+            partial = path.with_suffix('.partial')
+            partial.write_text(text)
+            partial.replace(path)
+        digest.update(path.read_bytes())
+    (folder / 'thresholds.json').write_text(json.dumps(score.THRESHOLDS, indent=1))
+    (folder / 'seal.sha256').write_text(digest.hexdigest() + '\n')
+    return digest.hexdigest()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Seal, run what is missing, score; exit status 1 where a threshold is not met."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--out', default='build/blind', help='folder for truths and answers (default: build/blind)')
+    parser.add_argument('--jobs', type=int, default=1, help='processes at once')
+    parser.add_argument('--short', action='store_true', help='the slice that runs on every change')
+    parser.add_argument('--seeds', type=int, default=4)
+    parser.add_argument('--nulls', type=int, default=300)
+    parser.add_argument('--wrong', type=int, default=102)
+    parser.add_argument('--pairs', type=int, default=60)
+    parser.add_argument('--first', type=int, default=0, help='number of the first seed: fresh cases')
+    parser.add_argument('--only', default='', help='only cases whose name contains this')
+    parser.add_argument('--score', action='store_true', help='only score what is there')
+    args = parser.parse_args(argv)
+    folder = Path(args.out)
+    whole = all_cases(args.seeds, args.nulls, args.wrong, args.pairs, args.first)
+    listed = short_cases() if args.short else list(whole)
+    cases = [c for c in listed if args.only in c.key]
+    if not args.score:
+        print(f'{len(cases)} cases; truths sealed: {seal(cases, folder)}')
+        (folder / 'answers').mkdir(parents=True, exist_ok=True)
+        jobs = []
+        for case in cases:
+            target = folder / 'answers' / f'{case.key}.json'
+            if not target.exists():
+                sealed = json.loads((folder / 'sealed' / f'{case.key}.json').read_text())
+                jobs.append((sealed['case'], sealed['truth'], str(target)))
+        bar = tqdm(total=len(jobs), desc='answers', file=sys.stderr)
+        if args.jobs > 1:
+            with ProcessPoolExecutor(args.jobs) as pool:
+                for _ in pool.map(_one, jobs):
+                    bar.update()
+        else:
+            for job in jobs:
+                _one(job)
+                bar.update()
+        bar.close()
+    rows = score.load(folder, [c.key for c in cases])
+    text, passed = score.summary(rows)
+    print(text)
+    (folder / 'summary.txt').write_text(text + '\n')
+    return 0 if passed else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

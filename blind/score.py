@@ -1,0 +1,210 @@
+"""Scores of the blind suite: against thresholds that were fixed beforehand, with intervals."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta
+
+from blind.cases import SHOWS_ACROSS_LENGTHS
+
+THRESHOLDS: dict[str, float] = {
+    'named_or_equivalent': 0.95,
+    'mean_set_size': 1.7,
+    'named_first_where_told_apart': 0.95,
+    'false_alarm_right_noise': 0.01,
+    'false_alarm_wrong_noise': 0.03,
+    'both_of_a_pair': 0.85,
+    'unknown': 0.90,
+    'heldout_over_floor_median': 1.05,
+    'heldout_over_floor_p95': 1.2,
+    'coverage_low': 0.92,
+    'coverage_high': 0.98,
+    'forward_simulations': 2000,
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A sealed truth and its answer. ``told_apart``: whether the design can, decided beforehand."""
+
+    key: str
+    kind: str
+    gap: float
+    told_apart: bool
+    truth: list[dict[str, Any]]
+    answer: dict[str, Any]
+
+    @property
+    def named(self) -> list[str]:
+        """Names in the answer, in order."""
+        return [e['name'] for e in self.answer['effects']]
+
+    @property
+    def sets(self) -> list[set[str]]:
+        """Each named effect with its equivalents."""
+        return [{e['name'], *e['equivalent']} for e in self.answer['effects']]
+
+
+def load(folder: Path, keys: Sequence[str]) -> list[Row]:
+    """Every case that has an answer."""
+    out = []
+    for key in keys:
+        answer = folder / 'answers' / f'{key}.json'
+        if not answer.exists():
+            continue
+        sealed = json.loads((folder / 'sealed' / f'{key}.json').read_text())
+        case = sealed['case']
+        gap = max((g for _, g in case['wanted']), default=0.0)
+        apart = case['design'] == 'two' or not any(n in SHOWS_ACROSS_LENGTHS for n, _ in case['wanted'])
+        out.append(Row(key, case['kind'], gap, apart, sealed['truth'], json.loads(answer.read_text())))
+    return out
+
+
+def interval(k: int, n: int) -> tuple[float, float]:
+    """Clopper-Pearson, 95 %."""
+    low = float(beta.ppf(0.025, k, n - k + 1)) if k > 0 else 0.0
+    high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
+    return low, high
+
+
+def covered(row: Row) -> list[tuple[str, bool]]:
+    """For each fitted parameter of the effect named rightly: whether truth is in its 95 % interval."""
+    out = []
+    for e in row.answer['effects']:
+        for t in row.truth:
+            if t['name'] != e['name']:
+                continue
+            fitted = e['parameters']
+            # Other choices are another effect; what they fit is not the truth's parameter.
+            if any(k in t and isinstance(v, int) and int(t[k]) != v for k, v in fitted.items()):
+                continue
+            for name, value in fitted.items():
+                if not isinstance(value, dict) or value['sd'] <= 0.0:
+                    continue
+                if name in t:
+                    true = float(t[name])
+                elif name.startswith('amplitude_') and 'amplitude' in t:
+                    true = float(t['amplitude'][CHANNELS.index(name.removeprefix('amplitude_'))])
+                else:
+                    continue
+                out.append((f'{row.key}:{name}', abs(value['value'] - true) <= 1.96 * value['sd']))
+    return out
+
+
+CHANNELS = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
+
+
+class _Sheet:
+    """The lines of a summary, and whether all thresholds hold."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.failures: list[str] = []
+        self.passed = True
+
+    def check(self, good: bool, text: str) -> None:
+        """One line with a threshold."""
+        self.passed = self.passed and good
+        self.lines.append(f'  {"ok  " if good else "MISS"}  {text}')
+
+    def rate(self, name: str, rows: Sequence[Row], hits: Sequence[bool], low: float, high: float, note: bool) -> None:
+        """The share of ``hits``, wanted from ``low`` to ``high``; with ``note``, misses go to the failures."""
+        if note:
+            self.failures += [f'{r.key}: {_said(r)}' for r, h in zip(rows, hits, strict=True) if not h]
+        n, k = len(hits), sum(hits)
+        if n == 0:
+            self.lines.append(f'  --    {name}: no cases')
+            return
+        a, b = interval(k, n)
+        wanted = f'wanted {100 * low:g} to {100 * high:g} %'
+        text = f'{name}: {100 * k / n:.1f} % ({k}/{n}; 95 %: {100 * a:.1f} to {100 * b:.1f}), {wanted}'
+        self.check(low <= k / n <= high, text)
+
+
+def summary(rows: Sequence[Row]) -> tuple[str, bool]:
+    """The report and whether every threshold holds."""
+    t, sheet = THRESHOLDS, _Sheet()
+    single = [r for r in rows if r.kind == 'single' and r.gap >= 3.0]
+    hit = [bool(r.sets) and r.truth[0]['name'] in r.sets[0] for r in single]
+    sheet.rate('truth named first or in its set, gap >= 3 floors', single, hit, t['named_or_equivalent'], 1.0, True)
+    if single:
+        size = float(np.mean([len(r.sets[0]) if r.sets else 1 for r in single]))
+        sheet.check(size <= t['mean_set_size'], f'mean size of that set: {size:.2f}, wanted <= {t["mean_set_size"]}')
+    apart = [r for r in single if r.told_apart]
+    first = [bool(r.named) and r.named[0] == r.truth[0]['name'] for r in apart]
+    name = 'named first where the design tells it apart'
+    sheet.rate(name, apart, first, t['named_first_where_told_apart'], 1.0, True)
+    for kind, name in (('null', 'right'), ('wrong', 'wrong')):
+        of = [r for r in rows if r.kind == kind]
+        alarm = [r.answer['verdict'] != 'nothing_missing' for r in of]
+        sheet.failures += [f'{r.key}: {_said(r)}' for r, a in zip(of, alarm, strict=True) if a]
+        sheet.rate(f'false alarm, {name} noise', of, alarm, 0.0, t[f'false_alarm_{name}_noise'], False)
+    pair = [r for r in rows if r.kind == 'pair']
+    sheet.rate('both of a pair in the answer', pair, [_both(r) for r in pair], t['both_of_a_pair'], 1.0, True)
+    for kind in ('leftout', 'alien'):
+        of = [r for r in rows if r.kind == kind]
+        right = [r.answer['verdict'] == 'unknown_effect' for r in of]
+        sheet.rate(f'{kind} called unknown', of, right, t['unknown'], 1.0, True)
+    known = [r for r in rows if r.kind in ('single', 'pair', 'null', 'wrong')]
+    if known:
+        ratio = np.array([r.answer['gap']['heldout_after'] / r.answer['gap']['floor'] for r in known])
+        middle, top = float(np.median(ratio)), float(np.quantile(ratio, 0.95))
+        good = middle <= t['heldout_over_floor_median'] and top <= t['heldout_over_floor_p95']
+        text = f'held-out gap after, over the floor: median {middle:.3f}, 95th percentile {top:.3f}'
+        sheet.check(good, f'{text}, wanted <= {t["heldout_over_floor_median"]}, {t["heldout_over_floor_p95"]}')
+    cover = [c for r in rows if r.kind == 'single' for c in covered(r)]
+    inside = [c for _, c in cover]
+    sheet.rate('parameter inside its 95 % interval', [], inside, t['coverage_low'], t['coverage_high'], False)
+    if rows:
+        cost = max(r.answer['provenance']['forward_simulations'] for r in rows)
+        wanted = t['forward_simulations']
+        sheet.check(cost <= wanted, f'forward simulations of one search, at most: {cost}, wanted <= {wanted:g}')
+        seconds = np.array([r.answer.get('seconds', 0.0) for r in rows])
+        sheet.lines.append(f'        seconds a case: median {np.median(seconds):.2f}, largest {seconds.max():.2f}')
+    sheet.lines += ['', 'detection (truth in the answer or its sets) by gap:', *_curve(rows)]
+    sheet.lines += ['', 'confusion (truth: first named), gap >= 3 floors:', *_confusion(single)]
+    sheet.lines += ['', f'failures ({len(sheet.failures)}):', *('  ' + f for f in dict.fromkeys(sheet.failures))]
+    outside = [k for k, c in cover if not c]
+    sheet.lines += ['', f'parameters outside their interval ({len(outside)}):', *('  ' + k for k in outside)]
+    return '\n'.join(sheet.lines), sheet.passed
+
+
+def _curve(rows: Sequence[Row]) -> list[str]:
+    lines = []
+    for gap in sorted({r.gap for r in rows if r.kind == 'single'}):
+        of = [r for r in rows if r.kind == 'single' and r.gap == gap]
+        k = sum(any(r.truth[0]['name'] in s for s in r.sets) for r in of)
+        low, high = interval(k, len(of))
+        share = f'{100 * k / len(of):5.1f} % ({k}/{len(of)}; 95 %: {100 * low:.1f} to {100 * high:.1f})'
+        lines.append(f'  {gap:5.1f} floors: {share}')
+    return lines
+
+
+def _confusion(rows: Sequence[Row]) -> list[str]:
+    table: dict[str, Counter[str]] = {}
+    for r in rows:
+        said = r.named[0] if r.named else r.answer['verdict']
+        table.setdefault(r.truth[0]['name'], Counter())[said] += 1
+    return [f'  {name:28s}' + ', '.join(f'{s} {n}' for s, n in table[name].most_common()) for name in sorted(table)]
+
+
+def _both(row: Row) -> bool:
+    wanted = [t['name'] for t in row.truth]
+    a, b = wanted
+    sets = row.sets
+    return any(a in sets[i] and b in sets[j] for i in range(len(sets)) for j in range(len(sets)) if i != j)
+
+
+def _said(row: Row) -> str:
+    truth = ', '.join(t['name'] for t in row.truth) or 'nothing'
+    said = '; '.join('/'.join(sorted(s)) for s in row.sets) or 'no effect'
+    gap = row.answer['gap']
+    before, after = gap['before'] / gap['floor'], gap['after'] / gap['floor']
+    return f'truth {truth}; {row.answer["verdict"]}: {said}; gap {before:.2f} -> {after:.2f}'

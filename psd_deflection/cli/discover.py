@@ -1,0 +1,82 @@
+"""Find where simulation and measurement disagree, name the missing effect, add it, show the gap shrink.
+
+REC is a bag folder, an .mcap or a .csv, with the loads (and temperatures) in it; several may be
+given, or a .yaml list of recordings with what differs in each:
+
+  - recording: short.csv
+    overrides: {link.length: 0.4}
+
+DIR gets model.yaml (the rig with what was found: a --params-file for every command), report.html
+and result.json. Any verdict is a success.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from tqdm import tqdm
+
+from psd_deflection.cli._observations import read_observations
+from psd_deflection.config import load_rig
+from psd_deflection.discovery.discover import discover
+from psd_deflection.discovery.report import report_html
+from psd_deflection.discovery.result import model_yaml, result, sentence
+from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.simulation.catalogue import catalogue
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('recordings', metavar='REC', nargs='+', help='recordings, or .yaml lists of them')
+    parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig as it is known')
+    parser.add_argument('--out', metavar='DIR', required=True, help='folder for model.yaml, report.html, result.json')
+    parser.add_argument('--seed', type=int, default=0, help='seed of the bootstraps; the same gives the same answer')
+    parser.add_argument(
+        '--without', metavar='EFFECT', action='append', default=[], help='leave an effect out of the library'
+    )
+    parser.add_argument('--quiet', action='store_true', help='no progress bar')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, discover, write, and say it in a sentence."""
+    rig = load_rig(args.params_file)
+    for name in args.without:
+        if name not in catalogue():
+            raise ConfigError(f'--without {name}: no effect of that name; there are: {", ".join(catalogue())}')
+    out = Path(args.out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordingError(f'{out}: cannot be made ({error.strerror or error})') from None
+    observations = read_observations(args.recordings, rig)
+    with tqdm(total=None, disable=args.quiet, file=sys.stderr, bar_format='{desc} {elapsed}') as bar:
+
+        def progress(words: str) -> None:
+            bar.set_description_str(words)
+            bar.update()
+
+        found = discover(observations, rig, seed=args.seed, without=args.without, progress=progress)
+        progress('report')
+        page = report_html(found)
+        bar.set_description_str('done')
+    files = {
+        'model.yaml': model_yaml(rig, found.active_effects),
+        'result.json': json.dumps(result(found), indent=1, allow_nan=False) + '\n',
+        'report.html': page,
+    }
+    for name, text in files.items():
+        try:
+            (out / name).write_text(text, encoding='utf-8')
+        except OSError as error:
+            raise RecordingError(f'{out / name}: cannot be written ({error.strerror or error})') from None
+    print(sentence(found))
+    for effect in found.effects:
+        if effect.suggestion is not None:
+            print(f'to tell {effect.active.effect.name} from {", ".join(effect.equivalent)}: {effect.suggestion.text}')
+    for unknown in found.unknown:
+        print(f'unknown: {unknown.signature}')
+    print(f'{found.simulations} forward simulations; see {out / "report.html"}')
+    return 0

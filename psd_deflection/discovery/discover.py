@@ -1,0 +1,336 @@
+"""Compare, localise, name, add, show: :func:`discover` is the whole of it.
+
+The default answer is "nothing missing"; an effect is named only if all of these hold: library-wide
+p <= 0.01, a BIC better by more than 10, a gain on load cases not seen of more than two standard
+errors, and parameters within their bounds. What no effect explains is described as unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from psd_deflection.config import Rig
+from psd_deflection.discovery import proposals as propose
+from psd_deflection.discovery.experiment import Suggestion, suggest
+from psd_deflection.discovery.fit import Fit, refit
+from psd_deflection.discovery.localise import Localisation, localise
+from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.screen import Screen
+from psd_deflection.discovery.search import BIC_ACCEPT, BUDGET, P_ACCEPT, Search, SearchResult
+from psd_deflection.discovery.signatures import SignatureBank, candidates
+from psd_deflection.discovery.validate import HeldOut, heldout_gain, heldout_gap
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.simulation.catalogue import ActiveEffect, effects_of_rig, make_active
+from psd_deflection.simulation.physics import Physics
+
+EQUIVALENT = 21.6
+"""Loss in chi-square below which an alternative of no more parameters counts as equivalent: at
+lambda sin^2(theta/2) = 5.4 one in a hundred would be misnamed, and sin^2(theta) is four times that."""
+EQUIVALENT_BIC = 6.0
+"""An alternative with more parameters must also be this close in BIC: a wider effect always does as well."""
+UNKNOWN_P = 1e-4
+UNKNOWN_SHARE = 0.02
+"""Of what the effects explain; less than this left over is the simulation's own business."""
+UNKNOWN_EXCESS = 60.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NamedEffect:
+    """One effect of the answer. ``sd``: per fitted parameter. ``alternatives``: (name, loss in
+    chi-square, difference of BIC), the closest first; ``equivalent``: those this data cannot exclude.
+    """
+
+    active: ActiveEffect
+    sd: Mapping[str, float]
+    p: float
+    delta_bic: float
+    heldout: HeldOut
+    equivalent: tuple[str, ...]
+    alternatives: tuple[tuple[str, float, float], ...]
+    suggestion: Suggestion | None
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """Structure that no effect explains: ``signature`` in words, ``explains``: its share of the gap's energy."""
+
+    signature: str
+    depends_on: tuple[str, ...]
+    explains: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Discovery:
+    """The answer. Gaps in m (rms of block means over x1 y1 x2 y2)."""
+
+    verdict: str
+    effects: tuple[NamedEffect, ...]
+    unknown: tuple[Unknown, ...]
+    where: Localisation
+    left: Localisation
+    gap_before: float
+    gap_after: float
+    gap_floor: float
+    gap_heldout_before: float
+    gap_heldout_after: float
+    per_channel: Mapping[str, tuple[float, float]]
+    waterfall: tuple[tuple[str, float], ...]
+    simulations: int
+    search: SearchResult
+    fit: Fit
+    workspace: Workspace
+    seed: int
+
+    @property
+    def active_effects(self) -> list[ActiveEffect]:
+        """What to add to the rig file."""
+        return [*self.workspace.base, *(e.active for e in self.effects)]
+
+
+def _proposals(workspace: Workspace) -> dict[str, list[float]]:
+    raw = workspace.raw_residual(workspace.base)
+    observations = workspace.observations
+    noise = observations[0].rig.amplifier.noise
+    sigmas, periods = [n.sigma for n in workspace.noise], [o.period for o in observations]
+    peaks = propose.spectral_peaks(raw, sigmas, periods)
+    return {
+        'spectral': peaks,
+        'line': propose.persistent(peaks, raw, sigmas, periods),
+        'highest': propose.highest_voltages(observations, False, noise),
+        'highest_sums': propose.highest_voltages(observations, True, noise),
+    }
+
+
+def discover(
+    recordings: Sequence[Observation],
+    rig: Rig | None = None,
+    *,
+    seed: int = 0,
+    without: Sequence[str] = (),
+    bank: SignatureBank | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Discovery:
+    """Name what the simulation of ``rig`` lacks to explain ``recordings``.
+
+    Each recording carries its rig with its own overrides; ``rig`` is the common one (that of the
+    first by default), whose effects count as known. ``without``: effects to leave out of the
+    library. ``bank``: signatures of the same design from an earlier call. Raises ConfigError where
+    the rig's effects are malformed.
+    """
+    rig = recordings[0].rig if rig is None else rig
+    rng = np.random.default_rng(seed)
+    base = effects_of_rig(rig)
+    progress('simulating the rig as it is described')
+    workspace = Workspace(recordings, base)
+    bank = SignatureBank() if bank is None else bank
+    bank.nominal(workspace)
+    found = _proposals(workspace)
+    lattice = _lattice(workspace, base, without)
+    if lattice is not None:
+        workspace.base = (*workspace.base, lattice)
+    physics = Physics.of(rig)
+
+    def screen(ws: Workspace) -> Screen:
+        listed = candidates(physics, found, (*without, 'quantisation'))
+        return Screen(ws, [(c, bank.get(c, ws)) for c in listed])
+
+    progress('signatures of every effect')
+    search = Search(workspace, screen, progress)
+    result = search.run()
+    progress('weighing')
+    kept, fit = _accept(search, result, rng)
+    seen = 0.0 if lattice is None else 2.0 * _lattice_gain(workspace, lattice)
+    fit, kept, left = _credible(search, result, fit, kept, seen, rng)
+    if lattice is not None:
+        workspace.base = tuple(base)
+    return _answer(search, result, fit, kept, left, lattice, rng, seed, progress)
+
+
+def _credible(
+    search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut], seen: float, rng: np.random.Generator
+) -> tuple[Fit, list[HeldOut], Localisation]:
+    """Where something unknown remains, an effect that explains less than what remains is a stand-in for it."""
+    ws = search.workspace
+    while True:
+        left = localise(ws, fit.residual, fit.jacobian if fit.free else None, rng)
+        if not fit.effects or not _unknown(left, max(result.null.chi2 - fit.chi2, 0.0) + seen):
+            break
+        weakest = int(np.argmin(result.delta_chi2))
+        if result.delta_chi2[weakest] >= left.excess:
+            break
+        search.trace.append(f'{fit.effects[weakest].label} explains less than what remains unknown')
+        rest = [a for j, a in enumerate(fit.effects) if j != weakest]
+        fit = refit(ws, rest, iterations=6) if rest else result.null
+        heldout = [h for j, h in enumerate(heldout) if j != weakest]
+        for listed in (result.p, result.delta_bic, result.delta_chi2):
+            del listed[weakest]
+    return fit, heldout, left
+
+
+def _lattice(workspace: Workspace, base: Sequence[ActiveEffect], without: Sequence[str]) -> ActiveEffect | None:
+    if 'quantisation' in without or any(a.effect.name == 'quantisation' for a in base):
+        return None
+    steps = [propose.coarse_step(o) for o in workspace.observations]
+    if any(s is None for s in steps):
+        return None
+    return make_active('quantisation', {'step': float(np.median([s for s in steps if s is not None]))}, 'discover')
+
+
+def _accept(search: Search, result: SearchResult, rng: np.random.Generator) -> tuple[list[HeldOut], Fit]:
+    """The joint rule: effects that fail it are taken out, the weakest first, and the rest refitted."""
+    ws, fit = search.workspace, result.fit
+    while True:
+        heldout = []
+        fails: list[tuple[float, int]] = []
+        for i in range(len(fit.effects)):
+            rest = [a for j, a in enumerate(fit.effects) if j != i]
+            without = refit(ws, rest, iterations=4) if rest else result.null
+            gain = heldout_gain(ws, without, fit, rng)
+            heldout.append(gain)
+            columns = fit.columns_of(i)
+            amplitudes = [
+                fit.free[j] in fit.at_bound
+                for j in columns
+                if fit.effects[i].effect.parameter(fit.free[j][1]).kind == 'amplitude'
+            ]
+            unphysical = bool(amplitudes) and all(amplitudes)
+            chi2 = without.chi2 - fit.chi2
+            bic = chi2 - search.penalty * len(columns)
+            if not gain.holds or unphysical or search.library_p(chi2, len(columns)) > P_ACCEPT or bic <= BIC_ACCEPT:
+                fails.append((bic, i))
+        if not fails:
+            break
+        _, worst = min(fails)
+        search.trace.append(f'{fit.effects[worst].label} fails the joint rule')
+        rest = [a for j, a in enumerate(fit.effects) if j != worst]
+        fit = refit(ws, rest, iterations=6) if rest else result.null
+        for listed in (result.p, result.delta_bic, result.delta_chi2):
+            del listed[worst]
+    return heldout, fit
+
+
+def _answer(
+    search: Search,
+    result: SearchResult,
+    fit: Fit,
+    heldout: list[HeldOut],
+    left: Localisation,
+    lattice: ActiveEffect | None,
+    rng: np.random.Generator,
+    seed: int,
+    progress: Callable[[str], None],
+) -> Discovery:
+    ws, null = search.workspace, result.null
+    if lattice is not None:
+        null = refit(ws, ())
+        ws.base = (*ws.base, lattice)
+    covariance = fit.covariance()
+    named: list[NamedEffect] = []
+    progress('alternatives')
+    for i, active in enumerate(fit.effects):
+        # Where the joint rule has taken effects out, what stood beside them is no longer comparable.
+        fits = result.alternatives[i] if fit is result.fit else search.alternatives(fit, i, result.delta_chi2[i])
+        rows, equal = [], []
+        for f in fits:
+            loss = f.chi2 - fit.chi2
+            bic = loss + search.penalty * (f.parameters - fit.parameters)
+            rows.append((f.effects[-1].effect.name, loss, bic))
+            if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < EQUIVALENT_BIC):
+                equal.append(f)
+        names = tuple(dict.fromkeys(f.effects[-1].effect.name for f in equal))
+        sd = {fit.free[j][1]: float(np.sqrt(max(covariance[j, j], 0.0))) for j in fit.columns_of(i)}
+        named.append(
+            NamedEffect(
+                active,
+                sd,
+                result.p[i],
+                result.delta_bic[i],
+                heldout[i],
+                names,
+                tuple(rows),
+                suggest(ws, fit, equal[: 3 if ws.simulations < BUDGET else 1]) if equal else None,
+            )
+        )
+    if lattice is not None:
+        named.append(_named_lattice(ws, lattice))
+        ws.base = ws.base[:-1]
+    progress('where')
+    before = left if fit is null else localise(ws, null.residual, None, rng)
+    floor = ws.floor()
+    # Coarse steps make noise that comes and goes with the signal; what they explain stands against that.
+    explained = max(null.chi2 - fit.chi2, 0.0) + (0.0 if lattice is None else 2.0 * _lattice_gain(ws, lattice))
+    unknown = _unknown(left, explained)
+    verdict = 'unknown_effect' if unknown else 'effects_found' if named else 'nothing_missing'
+    channels = ws.gap_per_channel(null.difference), ws.gap_per_channel(fit.difference)
+    gap_before, gap_after = ws.gap(null.difference), ws.gap(fit.difference)
+    waterfall = [('as described', gap_before)]
+    for i in range(len(fit.effects) - 1):
+        _, difference = ws.residual([*ws.base, *fit.effects[: i + 1]])
+        waterfall.append(('+ ' + fit.effects[i].effect.name, ws.gap(difference)))
+    if fit.effects:
+        waterfall.append(('+ ' + fit.effects[-1].effect.name, gap_after))
+    waterfall.append(('noise alone', floor))
+    return Discovery(
+        verdict,
+        tuple(named),
+        unknown,
+        before,
+        left,
+        gap_before,
+        gap_after,
+        floor,
+        gap_before,
+        heldout_gap(ws, fit),
+        {n: (float(a), float(b)) for n, a, b in zip(('x1', 'y1', 'x2', 'y2'), *channels, strict=True)},
+        tuple(waterfall),
+        ws.simulations,
+        result,
+        fit,
+        ws,
+        seed,
+    )
+
+
+def _lattice_gain(workspace: Workspace, lattice: ActiveEffect) -> float:
+    """Log-likelihood of all readings lying on the lattice: by chance each does with 1 in step/LSB."""
+    lsb = workspace.observations[0].rig.converter.volts_per_count
+    return workspace.size * workspace.fine[0] * float(np.log(max(lattice.values['step'] / lsb, 1.0)))
+
+
+def _named_lattice(workspace: Workspace, lattice: ActiveEffect) -> NamedEffect:
+    """Coarse steps are seen in the values themselves."""
+    lsb = workspace.observations[0].rig.converter.volts_per_count
+    step, gain = lattice.values['step'], _lattice_gain(workspace, lattice)
+    # The lattice's far ends fix the step to a fraction of a count over their distance.
+    span = max(float(np.nanmax(np.abs(o.volts))) for o in workspace.observations)
+    sd = 0.3 * lsb * step / max(span, step)
+    return NamedEffect(lattice, {'step': sd}, 0.0, 2.0 * gain, HeldOut(gain, float(np.sqrt(2.0 * gain))), (), (), None)
+
+
+def _unknown(left: Localisation, explained: float) -> tuple[Unknown, ...]:
+    if left.p > UNKNOWN_P or left.excess < max(UNKNOWN_EXCESS, UNKNOWN_SHARE * explained):
+        return ()
+    strong = [d for d in left.dependences if d.p < 1e-3][:6]
+    channels = list(dict.fromkeys([*(c.channel for c in left.cells if c.p < 0.01), *(d.channel for d in strong)]))
+    names = tuple(dict.fromkeys(d.regressor for d in strong))
+    even = sum(d.gain for d in strong if _even(d.regressor))
+    odd = sum(d.gain for d in strong if not _even(d.regressor))
+    lagging = any('history' in d.regressor for d in strong[:2])
+    words = [f'on {", ".join(channels) or "no single channel"}']
+    if strong:
+        words.append(f'follows {", ".join(names[:3])}')
+        words.append('mostly even' if even > 2.0 * odd else 'mostly odd' if odd > 2.0 * even else 'odd and even parts')
+    if lagging:
+        words.append('hysteretic: it depends on which way the load last changed')
+    if left.cells:
+        c = left.cells[0]
+        words.append(f'strongest at {c.when[0]:.1f} to {c.when[1]:.1f} s, {c.band[0]:g} to {c.band[1]:g} Hz')
+    share = left.excess / max(left.excess + explained, 1e-300)
+    return (Unknown('; '.join(words), names, float(min(max(share, 0.0), 1.0))),)
+
+
+def _even(regressor: str) -> bool:
+    return '^2' in regressor or '|' in regressor or regressor in ('constant', 'dot_x dot_y')

@@ -1,0 +1,132 @@
+"""Full nonlinear refit of a set of effects: Levenberg-Marquardt on the whitened residual, bounded.
+
+Own few lines rather than scipy.optimize.least_squares: every simulation is counted and shared, the
+Jacobian at the optimum is kept for the covariance, the hold-out and the next screening, and steps
+are taken in each parameter's own scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.catalogue import ActiveEffect, EffectParameter
+
+STEP = 0.05
+"""Finite difference, in scales of the parameter."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """``chi2``: squared length of ``residual`` (D,), whitened. ``jacobian`` (D, p), whitened, per unit
+    of each parameter, in the order of ``free``: (index of the effect, parameter).
+    ``difference``: measured minus simulated, fine-block volts. ``at_bound``: parameters stopped there.
+    """
+
+    effects: tuple[ActiveEffect, ...]
+    chi2: float
+    residual: FloatArray
+    difference: list[FloatArray]
+    jacobian: FloatArray
+    free: tuple[tuple[int, str], ...]
+    at_bound: tuple[tuple[int, str], ...]
+
+    @property
+    def parameters(self) -> int:
+        """How many were fitted."""
+        return len(self.free)
+
+    def bic(self, sample_size: float) -> float:
+        """Bayesian information criterion."""
+        return self.chi2 + self.parameters * float(np.log(sample_size))
+
+    def covariance(self) -> FloatArray:
+        """(p, p), of the parameters, from the curvature; unseen directions come out large."""
+        if not self.free:
+            return np.empty((0, 0))
+        lengths = np.maximum(np.linalg.norm(self.jacobian, axis=0), 1e-150)
+        f = (self.jacobian / lengths).T @ (self.jacobian / lengths)
+        return np.asarray(np.linalg.pinv(f, rcond=1e-10, hermitian=True) / np.outer(lengths, lengths))
+
+    def columns_of(self, index: int) -> list[int]:
+        """Columns of the Jacobian that belong to effect ``index``."""
+        return [j for j, (i, _) in enumerate(self.free) if i == index]
+
+
+def _free(effects: Sequence[ActiveEffect]) -> list[tuple[int, EffectParameter]]:
+    return [(i, p) for i, a in enumerate(effects) for p in a.effect.parameters if p.kind != 'choice']
+
+
+def _moved(
+    effects: Sequence[ActiveEffect], free: list[tuple[int, EffectParameter]], x: FloatArray
+) -> list[ActiveEffect]:
+    values = [dict(a.values) for a in effects]
+    for (i, p), v in zip(free, x, strict=True):
+        values[i][p.name] = float(v)
+    return [ActiveEffect(a.effect, v) for a, v in zip(effects, values, strict=True)]
+
+
+def refit(workspace: Workspace, effects: Sequence[ActiveEffect], iterations: int = 8, stop: float = 0.05) -> Fit:
+    """Fit all parameters of ``effects``, from where they stand.
+
+    ``stop``: ends when an iteration gains less than this in chi-square.
+    """
+    free = _free(effects)
+    x = np.array([effects[i].values[p.name] for i, p in free])
+    low = np.array([p.minimum for _, p in free])
+    high = np.array([p.maximum for _, p in free])
+    scale = np.array([p.scale for _, p in free])
+    x = np.clip(x, low, high)
+    base = list(workspace.base)
+
+    def evaluate(v: FloatArray) -> tuple[FloatArray, list[FloatArray], list[FloatArray]]:
+        simulated = workspace.simulate([*base, *_moved(effects, free, v)])
+        difference = [m - s for m, s in zip(workspace.measured, simulated, strict=True)]
+        return workspace.whiten(difference), difference, simulated
+
+    residual, difference, simulated = evaluate(x)
+    chi2 = float(residual @ residual)
+    jacobian = np.empty((len(residual), len(free)))
+    damping = 1e-4
+    for _ in range(iterations if free else 0):
+        for j in range(len(free)):
+            h = STEP * scale[j]
+            if x[j] + h > high[j]:
+                h = -h
+            moved = x.copy()
+            moved[j] += h
+            there = workspace.simulate([*base, *_moved(effects, free, moved)])
+            jacobian[:, j] = workspace.whiten([(a - b) / h for a, b in zip(there, simulated, strict=True)])
+        lengths = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-150)
+        f = (jacobian / lengths).T @ (jacobian / lengths)
+        g = (jacobian.T @ residual) / lengths
+        gained = 0.0
+        for _ in range(5):
+            # Against a bound, a parameter that would leave it stands still.
+            stuck = ((x <= low) & (g < 0.0)) | ((x >= high) & (g > 0.0))
+            go = np.flatnonzero(~stuck)
+            if len(go) == 0:
+                break
+            a = f[np.ix_(go, go)] + damping * np.eye(len(go))
+            step = np.zeros(len(x))
+            step[go] = np.linalg.lstsq(a, g[go], rcond=1e-12)[0] / lengths[go]
+            trial = np.clip(x + step, low, high)
+            if np.array_equal(trial, x):
+                break
+            r, d, s = evaluate(trial)
+            c = float(r @ r)
+            if c < chi2:
+                gained = chi2 - c
+                x, residual, difference, simulated, chi2 = trial, r, d, s, c
+                damping = max(damping * 0.1, 1e-9)
+                break
+            damping = max(damping * 20.0, 1e-4)
+        if gained < stop + 1e-7 * chi2:
+            break
+    bound = tuple((i, p.name) for (i, p), v in zip(free, x, strict=True) if v <= p.minimum or v >= p.maximum)
+    final = tuple(_moved(effects, free, x))
+    return Fit(final, chi2, residual, difference, jacobian, tuple((i, p.name) for i, p in free), bound)

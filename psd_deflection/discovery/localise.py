@@ -1,0 +1,274 @@
+"""Where the simulation and the data part: channel by channel, load case by load case, band by band.
+
+Two families of statistics on a whitened residual. *Cells*: energy per channel, load case and
+frequency band, as standard deviations above what noise has; its null is a parametric bootstrap that
+puts the base model's freedom back in (projection, which is its refit to first order) and takes the
+maximum over all cells. *Dependence*: how much of each channel follows a regressor (loads, their
+rate and history, dot position, temperature, time), which says on what the discrepancy depends, and
+whether oddly or evenly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2 as chi2_law
+
+from psd_deflection.discovery.workspace import Workspace, fine_means
+from psd_deflection.records import CHANNELS, FloatArray, IntArray
+from psd_deflection.simulation.simulator import ForwardModel
+
+BANDS = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, 125.0)
+CLIP = 6.0
+"""Whitened values beyond this count as this: an outlier of heavy-tailed noise is no structure."""
+DRAWS = 39
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One place of the ``where`` list; ``statistic``: standard deviations above noise."""
+
+    channel: str
+    recording: int
+    when: tuple[float, float]
+    band: tuple[float, float]
+    depends_on: tuple[str, ...]
+    statistic: float
+    p: float
+    energy: float
+
+
+@dataclass(frozen=True, slots=True)
+class Dependence:
+    """How much of ``channel`` follows ``regressor``: ``gain`` in chi-square, library-wide ``p``."""
+
+    channel: str
+    regressor: str
+    gain: float
+    p: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Localisation:
+    """Cells, most conspicuous first; dependences likewise. ``excess``:
+    chi-square beyond noise in all significant places; ``p``: that noise alone does this. ``map``
+    (spans, 6, bands): all cells; ``spans``: recording, start and end of each load case, s."""
+
+    cells: tuple[Cell, ...]
+    dependences: tuple[Dependence, ...]
+    excess: float
+    p: float
+    map: FloatArray
+    spans: tuple[tuple[int, float, float], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Layout:
+    recording: int
+    start: int
+    stop: int
+    period: float
+    bins: tuple[IntArray, ...]
+
+
+def _layouts(workspace: Workspace) -> list[_Layout]:
+    out = []
+    for r, (case, o, size) in enumerate(zip(workspace.case, workspace.observations, workspace.fine, strict=True)):
+        period = o.period * size
+        edges = np.concatenate(([0], np.flatnonzero(np.diff(case)) + 1, [len(case)]))
+        for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            if b - a < 8:
+                continue
+            f = np.fft.rfftfreq(b - a, period)
+            bins = tuple(
+                np.flatnonzero((f >= lo) & (f < hi)) for lo, hi in zip(BANDS[:-1], (*BANDS[1:-1], np.inf), strict=True)
+            )
+            out.append(_Layout(r, a, b, period, bins))
+    return out
+
+
+def _energies(parts: list[FloatArray], layouts: list[_Layout]) -> tuple[FloatArray, FloatArray]:
+    """z and excess energy (layout, channel, band)."""
+    z = np.full((len(layouts), 6, len(BANDS) - 1), -9.0)
+    excess = np.zeros_like(z)
+    for i, layout in enumerate(layouts):
+        x = parts[layout.recording][:, layout.start : layout.stop]
+        n = x.shape[1]
+        power = np.abs(np.fft.rfft(x, axis=1)) ** 2 * (2.0 / n)
+        power[:, 0] *= 0.5
+        if n % 2 == 0:
+            power[:, -1] *= 0.5
+        for band, index in enumerate(layout.bins):
+            if len(index) == 0:
+                continue
+            dof = 2.0 * len(index) - float(0 in index) - float(n % 2 == 0 and n // 2 in index)
+            energy = power[:, index].sum(axis=1)
+            # Wilson-Hilferty: chi-square to a normal deviate, good into the tail.
+            z[i, :, band] = (np.cbrt(energy / dof) - (1.0 - 2.0 / (9.0 * dof))) / np.sqrt(2.0 / (9.0 * dof))
+            excess[i, :, band] = energy - dof
+    return z, excess
+
+
+def regressors(workspace: Workspace) -> list[dict[str, list[FloatArray]]]:
+    """Per PSD (two), per name, per recording: what a residual may depend on, on fine blocks (nf,)."""
+    out: list[dict[str, list[FloatArray]]] = [{}, {}]
+    for o, size in zip(workspace.observations, workspace.fine, strict=True):
+        chunk = ForwardModel(o.rig, workspace.base).run(o.loads, o.temperature)
+        dots, loads = fine_means(chunk.dots, size) * 1e3, fine_means(chunk.loads, size)
+        n = dots.shape[1]
+        changes = np.sign(np.diff(chunk.loads, axis=1, prepend=chunk.loads[:, :1]))
+        history = np.empty_like(changes)
+        for row in range(3):
+            last = np.maximum.accumulate(np.where(changes[row] != 0.0, np.arange(changes.shape[1]), 0))
+            history[row] = changes[row][last]
+        history = fine_means(history, size)
+        time = np.arange(n) / n
+        for psd in range(2):
+            x, y = dots[2 * psd], dots[2 * psd + 1]
+            named = {
+                'constant': np.ones(n),
+                'time': time,
+                'time^2': time**2,
+                'load_fx': loads[0],
+                'load_fy': loads[1],
+                'load_tz': loads[2],
+                'load_fx^2': loads[0] ** 2,
+                'load_fy^2': loads[1] ** 2,
+                'load_tz^2': loads[2] ** 2,
+                'dot_x': x,
+                'dot_y': y,
+                'dot_x^2': x * x,
+                'dot_x dot_y': x * y,
+                'dot_y^2': y * y,
+                'dot_x r^2': x * (x * x + y * y),
+                'dot_y r^2': y * (x * x + y * y),
+                '|dot_x|': np.abs(x),
+                '|dot_y|': np.abs(y),
+                'rate of dot_x': np.gradient(x),
+                'rate of dot_y': np.gradient(y),
+                '|rate of dot_x|': np.abs(np.gradient(x)),
+                '|rate of dot_y|': np.abs(np.gradient(y)),
+                'history of load_fx': history[0],
+                'history of load_fy': history[1],
+                'history of load_tz': history[2],
+            }
+            if o.temperature is not None:
+                warmer = fine_means(chunk.warmer[None, :], size)[0]
+                named['temperature'] = warmer
+                named['temperature^2'] = warmer**2
+            else:
+                named['temperature'] = np.zeros(n)
+                named['temperature^2'] = np.zeros(n)
+            for name, values in named.items():
+                out[psd].setdefault(name, []).append(values)
+    return out
+
+
+def dependences(workspace: Workspace, residual: FloatArray, known: FloatArray | None) -> list[Dependence]:
+    """Every channel against every regressor, what ``known`` (D, p) can explain put aside."""
+    table = regressors(workspace)
+    q = None
+    if known is not None and known.shape[1]:
+        q, _ = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))
+    found: list[tuple[str, str, float]] = []
+    for c, channel in enumerate(CHANNELS):
+        names = list(table[c // 3])
+        columns = []
+        for name in names:
+            fine = []
+            for values in table[c // 3][name]:
+                rows = np.zeros((6, len(values)))
+                rows[c] = values
+                fine.append(rows)
+            columns.append(
+                np.concatenate(
+                    [w.whiten(f, v)[c] for f, w, v in zip(fine, workspace.noise, workspace.valid, strict=True)]
+                )
+            )
+        matrix = np.stack(columns, axis=1)
+        e = np.concatenate([part[c] for part in workspace.split(residual)])
+        lengths = np.einsum('ij,ij->j', matrix, matrix)
+        g = matrix.T @ e
+        f = lengths.copy()
+        if q is not None:
+            own = np.stack([np.concatenate([part[c] for part in workspace.split(col)]) for col in q.T])
+            across = matrix.T @ own.T
+            f = f - np.einsum('ij,ij->i', across, across)
+            g = g - across @ (q.T @ residual)
+        for k, name in enumerate(names):
+            if lengths[k] > 0.0 and f[k] > 1e-6 * lengths[k]:
+                found.append((channel, name, float(g[k] ** 2 / f[k])))
+    count = max(1, len(found))
+    out = [
+        Dependence(ch, name, gain, float(-np.expm1(count * np.log1p(-min(float(chi2_law.sf(gain, 1)), 1 - 1e-16)))))
+        for ch, name, gain in found
+    ]
+    out.sort(key=lambda d: -d.gain)
+    return out
+
+
+def localise(
+    workspace: Workspace, residual: FloatArray, known: FloatArray | None, rng: np.random.Generator, limit: int = 12
+) -> Localisation:
+    """Where ``residual`` (D,), whitened, has structure; ``known`` (D, p): columns already fitted."""
+    layouts = _layouts(workspace)
+    z, _ = _energies(workspace.split(np.clip(residual, -CLIP, CLIP)), layouts)
+    raw_z, raw_excess = _energies(workspace.split(residual), layouts)
+    maxima = np.empty(DRAWS)
+    q = None
+    if known is not None and known.shape[1]:
+        q, _ = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))
+    present = (workspace.whiten([np.ones_like(m) for m in workspace.measured]) != 0.0).astype(np.float64)
+    for draw in range(DRAWS):
+        e = rng.standard_normal(len(residual), dtype=np.float32) * present
+        if q is not None:
+            e -= q @ (q.T @ e)
+        maxima[draw] = _energies(workspace.split(e), layouts)[0].max()
+    # Gumbel law of the maximum, by moments: a p below 1/DRAWS without thousands of draws.
+    beta = float(np.std(maxima)) * np.sqrt(6.0) / np.pi
+    mu = float(np.mean(maxima)) - 0.5772 * beta
+
+    def p_of(value: float) -> float:
+        return float(-np.expm1(-np.exp(-max((value - mu) / beta, -5.0))))
+
+    depends = dependences(workspace, residual, known)
+    main: dict[str, list[str]] = {}
+    for d in depends:
+        if d.p < 0.01 and len(main.setdefault(d.channel, [])) < 2:
+            name = _plain(d.regressor)
+            if name not in main[d.channel]:
+                main[d.channel].append(name)
+    order = np.argsort(-z, axis=None)
+    cells = []
+    for flat in order[:limit].tolist():
+        i, c, b = np.unravel_index(flat, z.shape)
+        layout = layouts[int(i)]
+        value = float(z[i, c, b])
+        # The clipped statistic decides; where it is beyond doubt the unclipped one ranks better.
+        shown = float(raw_z[i, c, b]) if p_of(value) < 0.01 else value
+        when = (layout.start * layout.period, layout.stop * layout.period)
+        band = (BANDS[int(b)], min(BANDS[int(b) + 1], 0.5 / layout.period))
+        names = tuple(main.get(CHANNELS[int(c)], [])) if BANDS[int(b)] < 25.0 else ()
+        cells.append(
+            Cell(CHANNELS[int(c)], layout.recording, when, band, names, shown, p_of(value), float(raw_excess[i, c, b]))
+        )
+    cells.sort(key=lambda cell: -cell.statistic)
+    significant = np.array([[p_of(v) < 0.01 for v in row] for row in z.reshape(len(layouts), -1)])
+    total = float(raw_excess.reshape(len(layouts), -1)[significant].sum()) if significant.any() else 0.0
+    total = max(total, depends[0].gain if depends and depends[0].p < 0.01 else 0.0)
+    p = min(1.0, 2.0 * min(p_of(float(z.max())), depends[0].p if depends else 1.0))
+    spans = tuple((x.recording, x.start * x.period, x.stop * x.period) for x in layouts)
+    return Localisation(tuple(cells), tuple(depends), total, p, raw_z, spans)
+
+
+def _plain(regressor: str) -> str:
+    """The contract's word for a regressor: a load, its rate, the dot's position, temperature, time."""
+    for word in ('load_fx', 'load_fy', 'load_tz'):
+        if word in regressor:
+            return word
+    if 'rate' in regressor:
+        return 'rate'
+    if 'dot' in regressor:
+        return 'dot_position'
+    return regressor.split('^')[0]

@@ -1,0 +1,157 @@
+"""The noise: from rest and from where no effect is, never from the residual that is to be explained.
+
+The level comes from the upper half of the residual's spectrum (no link motion there), by the median
+over frequencies, which lines of mains and modes do not move. The colour comes from rest: before the
+first load, and long after the last change. Only where rest shows memory beyond doubt is an
+autoregressive model fitted; otherwise the noise is white, which is sharper.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_toeplitz
+from scipy.signal import detrend
+
+from psd_deflection.discovery.observation import Observation
+from psd_deflection.records import FloatArray
+
+ORDER = 2
+SIGNIFICANT = 5.0
+"""Lag-1 correlation, in its standard errors, from which the noise is taken as coloured."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseModel:
+    """``sigma`` (6,) V rms a sample; ``ar`` (6, p): on fine blocks; ``innovation`` (6,): V rms of a
+    fine block after prediction; ``block_sigma`` (6,): V rms of the mean of one estimate block.
+    """
+
+    sigma: FloatArray
+    ar: FloatArray
+    innovation: FloatArray
+    block_sigma: FloatArray
+    rest_seconds: float
+    coloured: tuple[bool, ...]
+
+    def whiten(self, fine: FloatArray, valid: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> FloatArray:
+        """White, unit-variance innovations (6, nf) of fine-block rows (6, nf); 0 where unknown."""
+        out = fine.copy()
+        good = valid.copy()
+        for j in range(1, self.ar.shape[1] + 1):
+            column = self.ar[:, j - 1 : j]
+            if np.any(column):
+                out[:, j:] -= column * fine[:, :-j]
+                good[j:] &= valid[:-j]
+        out /= self.innovation[:, None]
+        out[:, ~good] = 0.0
+        return out
+
+
+def rest_windows(observation: Observation) -> list[slice]:
+    """Samples at which the link stands still by its known loads."""
+    dynamics = observation.rig.dynamics
+    slow = min(
+        dynamics.bending_damping_ratio * dynamics.bending_frequency,
+        dynamics.torsion_damping_ratio * dynamics.torsion_frequency,
+    )
+    settle = 7.0 / (2.0 * np.pi * max(slow, 1e-3))
+    n, period = len(observation.loads), observation.period
+    changed = np.flatnonzero(np.any(np.diff(observation.loads, axis=0) != 0.0, axis=1)) + 1
+    edges = np.concatenate(([0], changed, [n]))
+    windows = []
+    for i, (a, b) in enumerate(itertools.pairwise(edges)):
+        first = int(a)
+        if i > 0 or np.any(observation.loads[0] != 0.0):
+            first += int(settle / period)
+        if (b - first) * period >= 0.3:
+            windows.append(slice(first, int(b)))
+    return windows
+
+
+def strip_lines(residual: FloatArray, limit: int = 4) -> FloatArray:
+    """``residual`` (n,) without its strongest spectral lines (mains), at most ``limit``."""
+    out = residual - residual.mean()
+    n = len(out)
+    for _ in range(limit):
+        power = np.abs(np.fft.rfft(out * np.hanning(n))) ** 2
+        power[: max(3, n // 500)] = 0.0
+        peak = int(np.argmax(power))
+        if power[peak] < 60.0 * np.median(power[1:]):
+            break
+        spectrum = np.fft.rfft(out)
+        spectrum[max(0, peak - 3) : peak + 4] = 0.0
+        out = np.fft.irfft(spectrum, n)
+    return np.asarray(out, dtype=np.float64)
+
+
+def _ar_density(phi: FloatArray, frequency: FloatArray) -> FloatArray:
+    """Spectral density of an autoregressive process driven by unit variance; ``frequency`` per sample."""
+    lags = np.arange(1, len(phi) + 1)
+    response = np.asarray(1.0 - np.exp(-2j * np.pi * np.outer(frequency, lags)) @ phi, dtype=np.complex128)
+    return 1.0 / (response.real**2 + response.imag**2)
+
+
+def _block_autocovariance(acov: FloatArray, size: int, lags: int) -> FloatArray:
+    """Autocovariance of means of ``size`` samples, from that of the samples."""
+    triangle = size - np.abs(np.arange(-size + 1, size))
+    out = np.empty(lags)
+    for lag in range(lags):
+        index = np.abs(np.arange(-size + 1, size) + lag * size)
+        out[lag] = np.sum(triangle * acov[index]) / size**2
+    return out
+
+
+def estimate_noise(observation: Observation, residual: FloatArray, fine: int, floor: float) -> NoiseModel:
+    """Noise of ``residual`` (n, 6) V, measured minus simulated; NaN where samples are lost.
+
+    ``fine``: samples a fine block. ``floor``: V, no channel is taken as quieter than this.
+    """
+    block = observation.rig.estimator.block_size
+    windows = rest_windows(observation)
+    filled = np.where(np.isfinite(residual), residual, 0.0)
+    n = len(filled)
+    sigma, innovation, block_sigma = np.empty(6), np.empty(6), np.empty(6)
+    ar = np.zeros((6, ORDER))
+    coloured = []
+    present = float(np.mean(np.isfinite(residual[:, 0])))
+    frequency = np.fft.rfftfreq(n, 1.0)
+    upper = frequency > 0.2
+    for c in range(6):
+        power = np.abs(np.fft.rfft(filled[:, c] * np.hanning(n))) ** 2 / (0.375 * n) / max(present, 0.1)
+        level = float(np.median(power[upper])) / np.log(2.0)
+        white = max(np.sqrt(level), floor)
+        rest = [detrend(filled[w, c]) for w in windows if np.all(np.isfinite(residual[w, c]))]
+        rest = [strip_lines(r) for r in rest if len(r) > 100]
+        count = sum(len(r) for r in rest)
+        lags = 4 * max(block, fine) * 3
+        acov = np.zeros(lags)
+        acov[0] = white**2
+        memory = False
+        if count > 400:
+            pooled = np.array(
+                [sum(float(np.dot(r[k:], r[: len(r) - k])) for r in rest) / count for k in range(ORDER + 1)]
+            )
+            memory = pooled[0] > floor**2 and abs(pooled[1]) > SIGNIFICANT / np.sqrt(count) * pooled[0]
+        coloured.append(bool(memory))
+        if memory:
+            phi = solve_toeplitz(pooled[:-1], pooled[1:])
+            shape = (
+                1.0 / np.abs(1.0 - np.exp(-2j * np.pi * np.outer(frequency[upper], np.arange(1, ORDER + 1))) @ phi) ** 2
+            )
+            scale = level / float(np.median(shape))
+            grid = np.arange(4096) / 4096.0
+            density = scale / np.abs(1.0 - np.exp(-2j * np.pi * np.outer(grid, np.arange(1, ORDER + 1))) @ phi) ** 2
+            acov = np.real(np.fft.ifft(density))[:lags]
+        sigma[c] = np.sqrt(acov[0])
+        of_fine = _block_autocovariance(acov, fine, ORDER + 1)
+        if memory:
+            ar[c] = solve_toeplitz(of_fine[:-1], of_fine[1:])
+            innovation[c] = np.sqrt(max(of_fine[0] - float(ar[c] @ of_fine[1:]), 1e-30))
+        else:
+            innovation[c] = np.sqrt(of_fine[0])
+        block_sigma[c] = np.sqrt(_block_autocovariance(acov, block, 1)[0])
+    rest_seconds = sum(w.stop - w.start for w in windows) * observation.period
+    return NoiseModel(sigma, ar, innovation, block_sigma, rest_seconds, tuple(coloured))

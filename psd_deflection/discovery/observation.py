@@ -1,0 +1,83 @@
+"""What discover compares: one recording as arrays on an unbroken sample grid, with its own rig.
+
+The rest of the package knows no files: a reader fills an :class:`Observation`. Lost samples stay
+in their places as NaN, so that the simulation runs on the true time axis and nothing is invented.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from psd_deflection.config import Rig
+from psd_deflection.errors import RecordingError
+from psd_deflection.records import FloatArray, IntArray
+
+QUIET = 0.25
+"""A load that has not changed for this long, s, ends a load case at its next change."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """``volts`` (n, 6) V, NaN where a sample is lost; ``loads`` (n, 3) N, N, N m, held.
+
+    ``temperature`` (n,) degrees Celsius or None; ``reference`` (n, 3) m, m, rad or None (NaN where
+    there is none). ``rig``: the rig with this recording's own overrides. ``digest``: of its source.
+    """
+
+    name: str
+    rig: Rig
+    volts: FloatArray
+    loads: FloatArray
+    temperature: FloatArray | None = None
+    reference: FloatArray | None = None
+    digest: str = ''
+
+    def __post_init__(self) -> None:
+        n = len(self.volts)
+        if n < 4 * self.rig.estimator.block_size:
+            raise RecordingError(f'{self.name}: {n} samples: discover needs at least 4 blocks')
+        if self.volts.shape != (n, 6) or self.loads.shape != (n, 3):
+            raise RecordingError(f'{self.name}: volts {self.volts.shape} and loads {self.loads.shape} do not match')
+        if not np.all(np.isfinite(self.loads)):
+            raise RecordingError(f'{self.name}: a load is not a finite number')
+        if self.temperature is not None and not np.all(np.isfinite(self.temperature)):
+            raise RecordingError(f'{self.name}: a temperature is not a finite number')
+
+    @property
+    def period(self) -> float:
+        """s between samples."""
+        return 1.0 / self.rig.converter.sample_rate_hz
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return len(self.volts) * self.period
+
+    def hashed(self) -> str:
+        """SHA-256 of the numbers themselves, for provenance."""
+        h = hashlib.sha256()
+        for a in (self.volts, self.loads, self.temperature):
+            if a is not None:
+                h.update(np.ascontiguousarray(a, dtype=np.float32).tobytes())
+        return h.hexdigest()
+
+
+def load_cases(loads: FloatArray, period: float) -> IntArray:
+    """The load case of each sample, int (n,), counted from 0.
+
+    A case begins where the load changes after at least ``QUIET`` seconds of rest: each step with
+    its ringing is one, a sweep or ramp is one. Where there is but one, it is cut into four pieces.
+    """
+    n = len(loads)
+    changed = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
+    quiet = max(1, round(QUIET / period))
+    case = np.zeros(n, dtype=np.int64)
+    starts = [int(c) for i, c in enumerate(changed) if i == 0 or c - changed[i - 1] >= quiet]
+    for start in starts:
+        case[start:] += 1
+    if len(starts) < 2:
+        case = np.minimum(np.arange(n) * 4 // n, 3).astype(np.int64)
+    return case

@@ -1,0 +1,127 @@
+"""Where to look for what cannot be reached by a derivative: frequencies, limits, coarse steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from psd_deflection.discovery.observation import Observation
+from psd_deflection.records import FloatArray
+
+PEAK = 40.0
+"""A spectral line counts from this many times the median power around it (one in 1e12 bins by chance)."""
+
+
+def spectral_peaks(
+    residuals: Sequence[FloatArray], sigmas: Sequence[FloatArray], periods: Sequence[float], limit: int = 3
+) -> list[float]:
+    """Frequencies, Hz, of the strongest lines of raw residuals (n, 6) V, strongest first.
+
+    The recording with the strongest line decides; each is refined to where the line's own
+    amplitude is greatest, since a search by derivative needs the phase right over the recording.
+    """
+    best: list[tuple[float, float]] = []
+    for residual, sigma, period in zip(residuals, sigmas, periods, strict=True):
+        n = len(residual)
+        if n < 256:
+            continue
+        scaled = residual / sigma
+        window = np.hanning(n)
+        each = np.abs(np.fft.rfft(scaled * window[:, None], axis=0)) ** 2
+        power = each.sum(axis=1)
+        power[: max(4, int(2.0 * n * period))] = 0.0
+        median = float(np.median(power[power > 0.0]))
+        t = np.arange(n, dtype=np.float64) * period
+        for _ in range(limit):
+            k = int(np.argmax(power))
+            if power[k] < PEAK * median or k < 2:
+                break
+
+            strongest = np.ascontiguousarray(scaled[:, int(np.argmax(each[k]))] * window)
+
+            def loss(f: float, t: FloatArray = t, x: FloatArray = strongest) -> float:
+                angle = 2.0 * np.pi * f * t
+                return -float((np.cos(angle) @ x) ** 2 + (np.sin(angle) @ x) ** 2)
+
+            step = 1.0 / (n * period)
+            found = minimize_scalar(
+                loss, bounds=((k - 1) * step, (k + 1) * step), method='bounded', options={'xatol': 1e-3 * step}
+            )
+            best.append((float(power[k] / median), float(found.x)))
+            power[max(0, k - 12) : k + 13] = 0.0
+    best.sort(reverse=True)
+    out: list[float] = []
+    for _, f in best:
+        if all(abs(f - g) > 0.2 for g in out):
+            out.append(f)
+    return out[:limit]
+
+
+def persistent(
+    peaks: Sequence[float], residuals: Sequence[FloatArray], sigmas: Sequence[FloatArray], periods: Sequence[float]
+) -> list[float]:
+    """Those of ``peaks`` that hum all the time with one phase, as mains do and ringing does not.
+
+    Quarter by quarter of each recording the line's complex amplitude must be of one kind: its sum
+    as long as its parts together, and no quarter without.
+    """
+    out = []
+    for f in peaks:
+        steady = True
+        for residual, sigma, period in zip(residuals, sigmas, periods, strict=True):
+            n = len(residual) // 4
+            t = np.arange(4 * n) * period
+            scaled = residual[: 4 * n] / sigma
+            turned = np.exp(-2j * np.pi * f * t)[:, None] * (scaled - scaled.mean(axis=0))
+            quarters = turned.reshape(4, n, -1).mean(axis=1)
+            strongest = int(np.argmax(np.abs(quarters).sum(axis=0)))
+            q = quarters[:, strongest]
+            size = np.abs(q)
+            steady &= bool(abs(q.sum()) > 0.7 * size.sum() and size.min() > 0.4 * size.mean())
+        if steady:
+            out.append(f)
+    return out
+
+
+def highest_voltages(observations: Sequence[Observation], with_sums: bool, noise: float) -> list[float]:
+    """Limits, V, at which the outputs may have clipped: the largest reading and a little less."""
+    rows = [0, 1, 2, 3, 4, 5] if with_sums else [0, 1, 3, 4]
+    top = max(float(np.nanmax(np.abs(o.volts[:, rows]))) for o in observations)
+    return [v for v in (top - 2.0 * noise, top - 4.0 * noise, top - 12.0 * noise, 0.98 * top) if v > 0.1]
+
+
+def coarse_step(observation: Observation) -> float | None:
+    """The step, V, on whose multiples all readings lie, if it is coarser than the converter's.
+
+    The gaps between neighbouring values that occur are whole multiples of it: the finest common
+    one is refined until all readings are multiples to within the converter's own rounding.
+    """
+    lsb = observation.rig.converter.volts_per_count
+    volts = observation.volts[np.all(np.isfinite(observation.volts), axis=1)]
+    counts = np.rint(volts[:: max(1, len(volts) // 20_000)] / lsb)
+    values = np.unique(counts)
+    gaps = np.diff(values)
+    if len(gaps) < 3 or np.quantile(gaps, 0.5) < 2:
+        return None
+    gap = float(np.median(gaps[gaps <= 1.5 * np.quantile(gaps, 0.25)]))
+    # Refine on the multiples: a longer lever each time, so that rounding of the step averages out.
+    reach = 4.0
+    span = float(np.abs(values).max())
+    while True:
+        near = values[np.abs(values) <= reach * gap + 1.0]
+        k = np.rint(near / gap)
+        if np.any(k != 0):
+            gap = float(np.dot(k, near) / np.dot(k, k))
+        if reach * gap >= span:
+            break
+        reach *= 2.0
+    off = np.abs(values - np.rint(values / gap) * gap)
+    if gap < 1.8 or np.mean(off <= 0.75) < 0.995 or len(values) < 3:
+        return None
+    # Chance: a value lies within 0.75 counts of a multiple with probability 1.5/gap.
+    expected = min(1.0, 2.0 / gap)
+    if expected > 0.9 or len(values) * np.log(1.0 / expected) < 20.0:
+        return None
+    return gap * lsb

@@ -1,0 +1,237 @@
+"""report.html: one page that opens offline and can be read by a person who was not there."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import itertools
+import json
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from psd_deflection.discovery.discover import Discovery, NamedEffect
+from psd_deflection.discovery.localise import BANDS
+from psd_deflection.discovery.result import parameters_of, provenance, sentence
+from psd_deflection.discovery.screen import Score
+from psd_deflection.records import CHANNELS, FloatArray
+
+BEFORE, AFTER, HELD, FLOOR = '#c44e52', '#4c72b0', '#55a868', '#8c8c8c'
+DOTS = ('x1', 'y1', 'x2', 'y2')
+
+STYLE = """
+body{font:16px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:#222}
+h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2.2rem;border-bottom:1px solid #ddd}
+.verdict{font-size:1.25rem;padding:1rem 1.2rem;border-left:6px solid #4c72b0;background:#f3f6fa}
+table{border-collapse:collapse;width:100%;font-size:.9rem}
+th,td{text-align:left;padding:.3rem .6rem;border-bottom:1px solid #e5e5e5;font-variant-numeric:tabular-nums}
+img{max-width:100%}.quiet{color:#666;font-size:.85rem}
+pre{background:#f6f6f6;padding:.8rem;overflow:auto;font-size:.8rem}
+"""
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table; every cell is escaped."""
+    lines = [''.join(f'<td>{html.escape(str(cell))}</td>' for cell in row) for row in rows]
+    head = ''.join(f'<th>{html.escape(h)}</th>' for h in header)
+    return f'<table><tr>{head}</tr>' + ''.join(f'<tr>{line}</tr>' for line in lines) + '</table>'
+
+
+def _image(figure: Figure, words: str) -> str:
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure)
+    figure.savefig(buffer, format='png', dpi=110)
+    code = base64.b64encode(buffer.getvalue()).decode()
+    return f'<img alt="{html.escape(words)}" src="data:image/png;base64,{code}">'
+
+
+def _residual_figure(discovery: Discovery) -> Figure:
+    ws = discovery.workspace
+    before = ws.block_dots(discovery.search.null.difference)
+    after = ws.block_dots(discovery.fit.difference)
+    figure = Figure(figsize=(10, 6.4), layout='constrained')
+    axes = figure.subplots(4, 1, sharex=True)
+    start = 0.0
+    for o, b, a in zip(ws.observations, before, after, strict=True):
+        t = start + (np.arange(b.shape[1]) + 0.5) * o.rig.estimator.block_size * o.period
+        for row, axis in enumerate(axes):
+            axis.plot(t, b[row] * 1e6, color=BEFORE, lw=0.8, label='before' if start == 0.0 else None)
+            axis.plot(t, a[row] * 1e6, color=AFTER, lw=0.8, label='after' if start == 0.0 else None)
+            axis.set_ylabel(f'{DOTS[row]} / µm')
+            axis.grid(alpha=0.25)
+        start += o.duration
+    axes[0].legend(loc='upper right', ncols=2, frameon=False)
+    axes[-1].set_xlabel('time / s (recordings one after another)')
+    figure.suptitle('measured minus simulated dot, block means')
+    return figure
+
+
+def _spectrum(rows: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
+    n = rows.shape[1]
+    window = np.hanning(n)
+    filled = np.where(np.isfinite(rows), rows, 0.0)
+    power = np.abs(np.fft.rfft(filled * window, axis=1)) ** 2 * 2.0 * period / np.sum(window**2)
+    frequency = np.fft.rfftfreq(n, period)
+    # Log-spaced averages: a raw periodogram hides its lines in its own scatter.
+    edges = np.geomspace(frequency[1], frequency[-1], 90)
+    index = np.digitize(frequency[1:], edges)
+    total = power[:, 1:].mean(axis=0)
+    keep = np.unique(index)
+    return (
+        np.array([frequency[1:][index == k].mean() for k in keep]),
+        np.array([total[index == k].mean() for k in keep]),
+    )
+
+
+def _spectrum_figure(discovery: Discovery) -> Figure:
+    ws = discovery.workspace
+    figure = Figure(figsize=(10, 3.2), layout='constrained')
+    axis = figure.subplots()
+    o, size = ws.observations[0], ws.fine[0]
+    rows = [0, 1, 3, 4]
+    for fit, color, name in (
+        (discovery.search.null, BEFORE, 'before'),
+        (discovery.fit, AFTER, 'after'),
+    ):
+        dots = fit.difference[0][rows] * o.rig.amplifier.sensitivity
+        f, p = _spectrum(dots, o.period * size)
+        axis.loglog(f, np.sqrt(p) * 1e6, color=color, lw=1.2, label=name)
+    axis.set_xlabel('frequency / Hz')
+    axis.set_ylabel('µm / √Hz')
+    axis.grid(alpha=0.25, which='both')
+    axis.legend(frameon=False)
+    figure.suptitle(f'spectrum of the residual, mean of x1 y1 x2 y2 ({o.name})')
+    return figure
+
+
+def _waterfall_figure(discovery: Discovery) -> Figure:
+    bars = [(n, 1e6 * v, AFTER) for n, v in discovery.waterfall]
+    bars[0] = (*bars[0][:2], BEFORE)
+    bars[-1] = (*bars[-1][:2], FLOOR)
+    bars.insert(-1, ('on unseen load cases', 1e6 * discovery.gap_heldout_after, HELD))
+    names, values, colors = zip(*bars, strict=True)
+    figure = Figure(figsize=(10, 0.6 + 0.42 * len(bars)), layout='constrained')
+    axis = figure.subplots()
+    # By place, not by name: the same effect may stand there twice, for either PSD.
+    axis.barh(range(len(bars)), values, color=colors)
+    axis.set_yticks(range(len(bars)), names)
+    axis.invert_yaxis()
+    axis.set_xscale('log')
+    axis.set_xlim(0.5 * min(values), 2.5 * max(values))
+    for i, v in enumerate(values):
+        axis.text(v * 1.05, i, f'{v:.3f} µm', va='center', fontsize=9)
+    axis.set_xlabel('gap / µm rms')
+    return figure
+
+
+def _where_figure(discovery: Discovery) -> Figure:
+    shown = np.clip(discovery.where.map, 0.0, 60.0)
+    bands = [f'{a:g}-{b:g}' for a, b in itertools.pairwise(BANDS)]
+    figure = Figure(figsize=(10, 3.4), layout='constrained')
+    axes = figure.subplots(1, 6, sharey=True)
+    top = max(8.0, float(shown.max()))
+    for c, axis in enumerate(axes):
+        picture = axis.imshow(shown[:, c, :], aspect='auto', cmap='magma_r', vmin=0.0, vmax=top)
+        axis.set_title(CHANNELS[c], fontsize=10)
+        axis.set_xticks(range(len(bands)), bands, rotation=90, fontsize=7)
+    spans = discovery.where.spans
+    ticks = range(0, len(spans), max(1, len(spans) // 12))
+    axes[0].set_yticks(ticks, [f'{spans[i][1]:.1f}-{spans[i][2]:.1f} s' for i in ticks], fontsize=7)
+    figure.colorbar(picture, ax=axes, label='σ above noise')
+    figure.suptitle('where: load case (down) by band in Hz (across) by channel, before')
+    return figure
+
+
+def _effect_section(effect: NamedEffect) -> str:
+    e = effect.active.effect
+    out = [
+        f'<h3>{html.escape(effect.active.label)}</h3><p>{html.escape(e.summary)}: <i>{html.escape(e.equation)}</i> '
+        f'(stage {e.stage}; {html.escape(e.source)})</p>'
+    ]
+    rows: list[tuple[object, ...]] = []
+    for name, v in parameters_of(effect).items():
+        if isinstance(v, dict):
+            rows.append((name, f'{v["value"]:.6g}', f'{v["sd"]:.2g}', v['unit']))
+        else:
+            rows.append((name, v, '', ''))
+    out.append(_table(('parameter', 'value', '± sd', 'unit'), rows))
+    out.append(
+        f'<p>Evidence: BIC better by {effect.delta_bic:.1f}; library-wide p {effect.p:.2g}; log-likelihood on unseen '
+        f'load cases {effect.heldout.gain:+.1f} ± {effect.heldout.error:.1f}.</p>'
+    )
+    if effect.alternatives:
+        told = {True: 'cannot be told apart', False: 'worse'}
+        others = [
+            (n, f'{loss:.1f}', f'{bic:.1f}', told[n in effect.equivalent]) for n, loss, bic in effect.alternatives
+        ]
+        out.append(_table(('in its place', 'chi-square lost', 'BIC worse by', ''), others))
+    if effect.suggestion is not None:
+        out.append(f'<p>To decide: {html.escape(effect.suggestion.text)}.</p>')
+    return ''.join(out)
+
+
+def _where_table(discovery: Discovery) -> str:
+    names = [o.name for o in discovery.workspace.observations]
+    rows = [
+        (
+            c.channel,
+            names[c.recording],
+            f'{c.when[0]:.1f}-{c.when[1]:.1f} s',
+            f'{c.band[0]:g}-{c.band[1]:g} Hz',
+            ', '.join(c.depends_on),
+            f'{c.statistic:.1f}',
+            f'{c.p:.2g}',
+        )
+        for c in discovery.where.cells
+        if c.p < 0.05
+    ]
+    if not rows:
+        return '<p>Nowhere beyond noise.</p>'
+    return _table(('channel', 'recording', 'when', 'band', 'depends on', 'σ', 'p'), rows)
+
+
+def report_html(discovery: Discovery) -> str:
+    """The page, pictures inside."""
+    body = ['<h1>What the model lacks</h1>', f'<p class=verdict>{html.escape(sentence(discovery))}</p>']
+    body.append(_image(_waterfall_figure(discovery), 'the gap, step by step'))
+    body.append('<h2>What</h2>')
+    body.append(''.join(_effect_section(e) for e in discovery.effects) or '<p>No effect is named.</p>')
+    if discovery.unknown:
+        body.append('<h2>Unknown</h2>')
+    for u in discovery.unknown:
+        body.append(
+            f'<p>{html.escape(u.signature)}. It is {100 * u.explains:.0f} % of what was to be explained, and is not in '
+            f'model.yaml.</p>'
+        )
+    body.append('<h2>Where</h2>')
+    body.append(_image(_where_figure(discovery), 'where simulation and data part'))
+    body.append(_where_table(discovery))
+    body.append('<h2>Before and after</h2>')
+    body.append(_image(_residual_figure(discovery), 'residual before and after'))
+    body.append(_image(_spectrum_figure(discovery), 'spectrum before and after'))
+    first: dict[str, Score] = {}
+    for score in discovery.search.first_scores:
+        first.setdefault(score.candidate.effect.name, score)
+    rows = [(n, f'{s.gain:.1f}', s.dof, f'{s.p:.2g}') for n, s in list(first.items())[:10]]
+    body.append('<h2>Candidates at first sight</h2>')
+    body.append('<p class=quiet>Gain in chi-square if added alone, to first order.</p>')
+    body.append(_table(('effect', 'gain', 'parameters', 'p'), rows))
+    trace = '; '.join(discovery.search.trace) or 'nothing passed the screen'
+    body.append(f'<h2>Provenance</h2><p class=quiet>Steps: {html.escape(trace)}.</p>')
+    body.append(f'<pre>{html.escape(json.dumps(_plain(provenance(discovery)), indent=1))}</pre>')
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>psd-deflection discover</title>'
+        f'<style>{STYLE}</style></head><body>{"".join(body)}</body></html>'
+    )
+
+
+def _plain(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        return {k: _plain(v) for k, v in tree.items()}
+    if isinstance(tree, list):
+        return [_plain(v) for v in tree]
+    return float(f'{tree:.6g}') if isinstance(tree, float) else tree

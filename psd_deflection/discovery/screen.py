@@ -1,0 +1,124 @@
+"""Score tests: how much of a residual each effect's signature explains, all others put aside.
+
+With whitened signatures M and residual r, g = M'r and F = M'M; what parameters already in the model
+(columns J) can explain is projected out. The gain of a candidate is T = g'F^-1 g over its own
+columns: the drop of chi-square if it were added, to first order; under "nothing missing" it is
+chi-square with as many degrees of freedom as columns.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import chi2
+
+from psd_deflection.discovery.signatures import Candidate, Columns
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.records import FloatArray
+
+SEEN = 1e-6
+"""A column of whose squared length less than this is left after projection counts as explained already."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Score:
+    """``gain``: expected drop of chi-square; ``dof`` columns; ``p``: library-wide, by Sidak."""
+
+    candidate: Candidate
+    gain: float
+    dof: int
+    p: float
+    coefficients: FloatArray
+
+
+def solve_seen(fisher: FloatArray, score: FloatArray, original: FloatArray) -> tuple[float, int, FloatArray]:
+    """Gain, rank and coefficients of F c = g, without directions that cannot be seen.
+
+    ``original`` (k,): squared lengths of the columns before projection.
+    """
+    scale = np.sqrt(np.maximum(original, 1e-300))
+    f = fisher / np.outer(scale, scale)
+    g = score / scale
+    values, vectors = np.linalg.eigh(f)
+    keep = values > SEEN
+    if not np.any(keep):
+        return 0.0, 0, np.zeros_like(score)
+    along = vectors[:, keep].T @ g
+    c = vectors[:, keep] @ (along / values[keep])
+    return float(np.sum(along**2 / values[keep])), int(keep.sum()), c / scale
+
+
+class Screen:
+    """All candidates' signatures, whitened, side by side."""
+
+    def __init__(self, workspace: Workspace, found: Sequence[tuple[Candidate, Columns]]) -> None:
+        self.candidates: list[Candidate] = []
+        self.slices: list[slice] = []
+        parts: list[npt.NDArray[np.float32]] = []
+        at = 0
+        for candidate, columns in found:
+            white = [workspace.whiten(column).astype(np.float32) for column in columns]
+            # What moves a reading by less than a thousandth of sigma over the recording is not there.
+            if max(float(np.dot(w, w)) for w in white) < 1e-6:
+                continue
+            self.candidates.append(candidate)
+            self.slices.append(slice(at, at + len(white)))
+            at += len(white)
+            parts += white
+        self.rows = np.stack(parts) if parts else np.empty((0, len(workspace.data)), dtype=np.float32)
+        self.fisher = (self.rows @ self.rows.T).astype(np.float64)
+        self.lengths = np.maximum(np.diag(self.fisher).copy(), 1e-300)
+
+    def _projected(self, residual: FloatArray, known: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        g = (self.rows @ residual.astype(np.float32)).astype(np.float64)
+        fisher = self.fisher
+        if known is not None and known.shape[1]:
+            q, _ = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))
+            across = (self.rows @ q.astype(np.float32)).astype(np.float64)
+            fisher = fisher - across @ across.T
+            g = g - across @ (q.T @ residual)
+        return g, fisher
+
+    def score(self, residual: FloatArray, known: FloatArray | None = None) -> list[Score]:
+        """Every candidate on ``residual`` (D,), the best first; ``known`` (D, p): columns in the model."""
+        g, fisher = self._projected(residual, known)
+        count = max(1, len(self.candidates))
+        out = []
+        for candidate, s in zip(self.candidates, self.slices, strict=True):
+            gain, dof, c = solve_seen(fisher[s, s], g[s], self.lengths[s])
+            if candidate.one_sided and dof and c[0] < 0.0:
+                gain = 0.0
+            p = -np.expm1(count * np.log1p(-min(float(chi2.sf(gain, max(dof, 1))), 1.0 - 1e-16)))
+            out.append(Score(candidate, gain, dof, float(p), c))
+        out.sort(key=lambda score: -score.gain)
+        return out
+
+    def pairs(self, residual: FloatArray, penalty: float, limit: int) -> list[tuple[Score, Score, float]]:
+        """The ``limit`` best pairs by joint gain less ``penalty`` a column: what no greedy step finds."""
+        g, fisher = self._projected(residual, None)
+        singles = self.score(residual)
+        # Per effect and choices the best shape is enough; thousands of pairs are a matter of milliseconds.
+        best: dict[tuple[object, ...], Score] = {}
+        for score in singles:
+            best.setdefault(score.candidate.variant, score)
+        where = {id(c): s for c, s in zip(self.candidates, self.slices, strict=True)}
+        found = []
+        for a, b in itertools.combinations(best.values(), 2):
+            sa, sb = where[id(a.candidate)], where[id(b.candidate)]
+            index = np.r_[sa, sb]
+            gain, dof, c = solve_seen(fisher[np.ix_(index, index)], g[index], self.lengths[index])
+            na = sa.stop - sa.start
+            if (a.candidate.one_sided and c[0] < 0.0) or (b.candidate.one_sided and c[na] < 0.0):
+                continue
+            found.append((gain - penalty * dof, a, b, gain, c, na))
+        found.sort(key=lambda item: -item[0])
+        out = []
+        for _, a, b, gain, c, na in found[:limit]:
+            first = Score(a.candidate, a.gain, na, 0.0, c[:na])
+            second = Score(b.candidate, b.gain, len(c) - na, 0.0, c[na:])
+            out.append((first, second, gain))
+        return out

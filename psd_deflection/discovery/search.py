@@ -1,0 +1,254 @@
+"""Which effects: greedy add, pairs that no greedy step finds, drop, swap; refitted in full each time.
+
+The order of things: score every candidate on what is left (a matter of milliseconds), refit the
+most promising few, keep the best by BIC if it passes; where something is left after the first, try
+the best pairs of the linear screen as well; in the end drop what no longer earns its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import chi2 as chi2_law
+
+from psd_deflection.discovery.fit import Fit, refit
+from psd_deflection.discovery.screen import Score, Screen
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.simulation.catalogue import ActiveEffect
+
+P_ACCEPT = 0.01
+"""Library-wide p of an effect at most this."""
+BIC_ACCEPT = 10.0
+"""And a BIC this much better."""
+SHARE_ACCEPT = 0.002
+"""And at least this share of what the model as a whole explains: beyond it the simulation itself,
+two exact but different discretisations for example, is not to be trusted to explain."""
+MAX_EFFECTS = 4
+TRIALS = 7
+BUDGET = 600
+"""Forward simulations after which nothing more is added; the alternatives end at twice as many."""
+SWAP_REACH = 0.6
+"""Of what the named effect explains, the share an alternative must explain to be refitted."""
+
+
+@dataclass(slots=True, eq=False)
+class SearchResult:
+    """``fit``: the model chosen. ``null``: the rig file's own. ``p``: library-wide, per effect.
+    ``delta_bic``: what dropping each effect would cost. ``alternatives``: for each effect of ``fit``,
+    refits with another in its place.
+    """
+
+    null: Fit
+    fit: Fit
+    p: list[float]
+    delta_bic: list[float]
+    delta_chi2: list[float]
+    first_scores: list[Score]
+    alternatives: list[list[Fit]]
+    trace: list[str] = field(default_factory=list)
+
+
+def key_of(active: ActiveEffect) -> tuple[object, ...]:
+    """Effect and discrete choices."""
+    return (active.effect.name, *(active.values[p.name] for p in active.effect.parameters if p.kind == 'choice'))
+
+
+def promising(scores: Sequence[Score], penalty: float, share: float, limit: int) -> list[Score]:
+    """The best candidate of each variant, those that gain at least ``share`` of the best gain."""
+    out: list[Score] = []
+    seen: set[tuple[object, ...]] = set()
+    best = max((s.gain for s in scores), default=0.0)
+    for s in sorted(scores, key=lambda s: -(s.gain - penalty * s.dof)):
+        if s.candidate.variant in seen or s.gain < share * best or s.gain <= 0.0:
+            continue
+        seen.add(s.candidate.variant)
+        out.append(s)
+        if len(out) == limit:
+            break
+    return out
+
+
+class Search:
+    """One search over one workspace. ``progress`` is told each step in words."""
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        screen: Callable[[Workspace], Screen],
+        progress: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.workspace = workspace
+        self._make_screen = screen
+        self._progress = progress
+        self.screen = screen(workspace)
+        self.penalty = float(np.log(workspace.effective_size()))
+        self.trace: list[str] = []
+
+    def _say(self, text: str) -> None:
+        self.trace.append(f'{text} [{self.workspace.simulations}]')
+        self._progress(text)
+
+    def _bic(self, fit: Fit) -> float:
+        return fit.chi2 + self.penalty * fit.parameters
+
+    def _best_of(self, starts: Sequence[Sequence[ActiveEffect]], keep: int, iterations: int) -> Fit | None:
+        """Refit each start a little, the best few in full."""
+        fits = [refit(self.workspace, s, iterations=3) for s in starts]
+        fits.sort(key=self._bic)
+        full = [refit(self.workspace, f.effects, iterations=iterations) for f in fits[:keep]]
+        return min(full, key=self._bic, default=None)
+
+    def _passes(self, smaller: Fit, larger: Fit, null: Fit) -> bool:
+        gain = smaller.chi2 - larger.chi2
+        explained = max(null.chi2 - larger.chi2, 0.0)
+        return self._bic(smaller) - self._bic(larger) > BIC_ACCEPT and gain >= SHARE_ACCEPT * explained
+
+    def library_p(self, gain: float, dof: int) -> float:
+        """p of a gain in chi-square, over the whole library (Sidak)."""
+        count = max(1, len(self.screen.candidates))
+        local = float(chi2_law.sf(max(gain, 0.0), max(dof, 1)))
+        return float(-np.expm1(count * np.log1p(-min(local, 1.0 - 1e-16))))
+
+    def renoise(self, fit: Fit) -> Fit:
+        """Noise again, now that most of the discrepancy is explained; where it differs, the fit under it."""
+        before = self.workspace.noise
+        self.workspace.estimate_noise([*self.workspace.base, *fit.effects])
+        now = self.workspace.noise
+        if all(
+            a.coloured == b.coloured and np.allclose(a.innovation, b.innovation, rtol=0.02)
+            for a, b in zip(before, now, strict=True)
+        ):
+            self.workspace.noise = before
+            return fit
+        self.screen = self._make_screen(self.workspace)
+        return refit(self.workspace, fit.effects, iterations=6)
+
+    def run(self) -> SearchResult:
+        """Search; the answer may well be that nothing is missing."""
+        ws = self.workspace
+        null = refit(ws, ())
+        scores = self.screen.score(null.residual)
+        first_scores = scores
+        current = null
+        renoised = False
+        while len(current.effects) < MAX_EFFECTS and ws.simulations < BUDGET:
+            if current.effects:
+                scores = self.screen.score(current.residual, current.jacobian)
+            taken = {key_of(a) for a in current.effects}
+            scores = [s for s in scores if s.candidate.variant not in taken]
+            if not scores or min(s.p for s in scores) > P_ACCEPT:
+                break
+            # From the second on, what is left is smaller and the first guess better.
+            tried = promising(scores, self.penalty, 0.3, TRIALS if not current.effects else 4)
+            starts = [[*current.effects, s.candidate.from_coefficients(s.coefficients)] for s in tried]
+            better = self._best_of(starts, 2, 6) if current.effects else self._best_of(starts, 4, 12)
+            if better is None or not self._passes(current, better, null):
+                break
+            self._say('adding ' + better.effects[-1].label)
+            current = better
+            if not renoised:
+                renoised = True
+                current = self.renoise(current)
+                null = refit(ws, ())
+            if len(current.effects) == 2 and ws.simulations < BUDGET:
+                current = self._try_pairs(null, current)
+        current = self._drop(null, current)
+        if current.effects:
+            current = self.renoise(current)
+            null = refit(ws, ())
+        current, others = self._swap(null, current)
+        p, delta_bic, delta_chi2 = self._weigh(null, current)
+        return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace)
+
+    def _swap(self, null: Fit, current: Fit) -> tuple[Fit, list[list[Fit]]]:
+        """Each effect against what might stand in its place; the better model stays, twice at most."""
+        others: list[list[Fit]] = []
+        for swaps in range(3):
+            others = []
+            _, _, gains = self._weigh(null, current)
+            best = current
+            for i in range(len(current.effects)):
+                fits = self.alternatives(current, i, gains[i])
+                others.append(fits)
+                best = min([best, *fits], key=self._bic)
+            spent = self.workspace.simulations > 1.5 * BUDGET
+            if swaps == 2 or spent or self._bic(best) > self._bic(current) - 2.0:
+                break
+            self._say('swapping to ' + ', '.join(a.label for a in best.effects))
+            current = refit(self.workspace, best.effects, iterations=8)
+            current = self._drop(null, current)
+        return current, others
+
+    def _try_pairs(self, null: Fit, current: Fit) -> Fit:
+        pairs = self.screen.pairs(null.residual, self.penalty, 5)
+        starts = []
+        for a, b, _ in pairs:
+            if {a.candidate.variant, b.candidate.variant} != {key_of(e) for e in current.effects}:
+                starts.append(
+                    [a.candidate.from_coefficients(a.coefficients), b.candidate.from_coefficients(b.coefficients)]
+                )
+        best = self._best_of(starts, 2, 8)
+        if best is not None and self._bic(best) < self._bic(current) - 2.0:
+            self._say('a better pair: ' + ', '.join(a.label for a in best.effects))
+            return best
+        return current
+
+    def _drop(self, null: Fit, current: Fit) -> Fit:
+        while len(current.effects) > 1:
+            smaller = []
+            for i in range(len(current.effects)):
+                rest = [a for j, a in enumerate(current.effects) if j != i]
+                smaller.append(refit(self.workspace, rest, iterations=8))
+            best = min(smaller, key=self._bic)
+            if self._passes(best, current, null):
+                break
+            self._say('dropping to ' + ', '.join(a.label for a in best.effects))
+            current = best
+        return current
+
+    def _weigh(self, null: Fit, current: Fit) -> tuple[list[float], list[float], list[float]]:
+        p, delta_bic, delta_chi2 = [], [], []
+        for i in range(len(current.effects)):
+            rest = [a for j, a in enumerate(current.effects) if j != i]
+            without = refit(self.workspace, rest, iterations=6) if rest else null
+            gain = without.chi2 - current.chi2
+            delta_chi2.append(gain)
+            delta_bic.append(self._bic(without) - self._bic(current))
+            p.append(self.library_p(gain, len(current.columns_of(i))))
+        return p, delta_bic, delta_chi2
+
+    def alternatives(self, current: Fit, index: int, gain: float) -> list[Fit]:
+        """Refits with effect ``index`` swapped for each effect that might do as well, best first.
+
+        ``gain``: what the named effect explains, in chi-square.
+        """
+        if self.workspace.simulations > 2 * BUDGET:
+            return []
+        named = current.effects[index]
+        rest = [a for j, a in enumerate(current.effects) if j != index]
+        without = refit(self.workspace, rest, iterations=4) if rest else refit(self.workspace, ())
+        known = without.jacobian if rest else None
+        scores = self.screen.score(without.residual, known)
+        # Screening is linear: what falls short by little, or by a small share, deserves a full refit.
+        bar = min(SWAP_REACH * gain, gain - 60.0) if gain > 100.0 else 0.5 * gain
+        best: dict[str, Score] = {}
+        for s in scores:
+            name = s.candidate.effect.name
+            if name == named.effect.name or name in {a.effect.name for a in rest} or s.gain < bar:
+                continue
+            if name not in best:
+                best[name] = s
+        # The most likely eight: an exact confounder screens as high as the named effect itself.
+        # Where the search itself was dear, the data are no simple case, and three must do.
+        ranked = sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.workspace.simulations < BUDGET else 2]
+        fits = []
+        for s in ranked:
+            start = [*rest, s.candidate.from_coefficients(s.coefficients)]
+            quick = refit(self.workspace, start, iterations=3)
+            if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain) and self.workspace.simulations < 2 * BUDGET:
+                quick = refit(self.workspace, quick.effects, iterations=8)
+            fits.append(quick)
+        fits.sort(key=lambda f: f.chi2)
+        return fits

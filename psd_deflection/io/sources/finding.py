@@ -1,0 +1,36 @@
+"""Which ports a device may be on: ttyACM0 becomes ttyACM1 when a cable is pulled and put back.
+
+``port`` may be a pattern (``/dev/ttyACM*``); otherwise, beside the port that was named, every USB
+serial port of the machine is a candidate. A device is known again by the serial number that it says
+itself, never by the port's name.
+"""
+
+from __future__ import annotations
+
+import glob
+
+from serial.tools import list_ports
+
+MAX_PORTS = 64
+
+
+def is_pattern(port: str) -> bool:
+    """Whether ``port`` may stand for several."""
+    return glob.has_magic(port)
+
+
+def matching(pattern: str) -> list[str]:
+    """The ports that a pattern stands for now."""
+    return sorted(glob.glob(pattern))[:MAX_PORTS]  # noqa: PTH207 - the pattern is a whole path
+
+
+def candidates(port: str, wanted_serial: str) -> list[str]:
+    """Other ports on which the device may have come back, the likeliest first.
+
+    A port whose USB descriptor has ``wanted_serial`` goes first.
+    """
+    if is_pattern(port):
+        return matching(port)
+    ports = [p for p in list_ports.comports() if p.vid is not None and p.device != port]
+    ports.sort(key=lambda p: (p.serial_number != wanted_serial, p.device))
+    return [p.device for p in ports[:MAX_PORTS]]

@@ -1,0 +1,93 @@
+"""What joins a session to the graph: publishers of encoded messages, subscriptions that are recorded."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+from msg_adapters import DIAGNOSTICS, INPUTS, SAMPLES, TEMPERATURE, TOPIC_TYPES, from_fields
+from psd_deflection.io import cdr
+from psd_deflection.records import TemperatureReading
+from psd_deflection.runner.session import Session
+
+DEPTH = 10
+SAMPLES_DEPTH = 50
+"""A second of raw blocks: a subscriber that stutters misses none."""
+
+MAX_INPUT_BYTES = 4096
+"""Of one message that others publish and we record: the longest of ours has some hundred bytes."""
+
+
+def message_class(type_name: str) -> Any:
+    """The class of ``pkg/msg/Name``."""
+    package, _, name = type_name.split('/')
+    return getattr(importlib.import_module(f'{package}.msg'), name)
+
+
+class PublisherWire:
+    """Publishes encoded messages: a wire of the fan-out. While it is not ``active``, diagnostics alone."""
+
+    def __init__(self, node: Node, topics: Mapping[str, str]) -> None:
+        self.active = False
+        options = QoSOverridingOptions.with_default_policies()
+        self._publishers: dict[str, Publisher] = {}
+        for topic, type_name in topics.items():
+            depth = SAMPLES_DEPTH if topic == SAMPLES else DEPTH
+            qos = QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
+            self._publishers[topic] = node.create_publisher(
+                message_class(type_name), topic, qos, qos_overriding_options=options
+            )
+
+    def names(self, topics: Iterable[str]) -> list[str]:
+        """What they are called on the graph, remapping included."""
+        return [self._publishers[topic].topic_name for topic in topics]
+
+    def put(self, topic: str, type_name: str, cdr: bytes, t_ns: int) -> None:
+        """Publish; the stamp is in the message."""
+        if self.active or topic == DIAGNOSTICS:
+            self._publishers[topic].publish(cdr)
+
+
+class InputRecorder:
+    """Known loads, references and temperatures go into the recording as they come.
+
+    ``session``: the one that records, or None. A message that is longer than any of its type has
+    reason to be is passed over and counted in ``refused``: a stranger must not fill the disk.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.session: Session | None = None
+        self.refused = 0
+        self._clock = node.get_clock()
+        for topic in INPUTS:
+            node.create_subscription(
+                message_class(TOPIC_TYPES[topic]),
+                topic,
+                lambda message, topic=topic: self._received(topic, message),
+                QoSProfile(depth=SAMPLES_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT),
+                raw=True,
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
+
+    def _received(self, topic: str, message: bytes) -> None:
+        if len(message) > MAX_INPUT_BYTES:
+            self.refused += 1
+        elif self.session is not None:
+            self.session.recorder.put(topic, TOPIC_TYPES[topic], bytes(message), self._clock.now().nanoseconds)
+            if topic == TEMPERATURE and self.session.pipeline.needs_temperature:
+                self._correct_for(message, self.session)
+
+    def _correct_for(self, message: bytes, session: Session) -> None:
+        try:
+            reading = from_fields(TEMPERATURE, cdr.decode(TOPIC_TYPES[TEMPERATURE], bytes(message)))
+            if isinstance(reading, TemperatureReading) and math.isfinite(reading.celsius):
+                session.temperature(reading.celsius)
+        except (ValueError, TimeoutError):
+            self.refused += 1

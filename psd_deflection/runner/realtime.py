@@ -1,0 +1,102 @@
+"""What a daemon asks of the system: memory that stays, a reader that comes first, a watchdog that is fed.
+
+None of it is needed to run. What the system grants, and what it refuses and why, is said once in the
+log either way (``docs/deploy``).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import resource
+import socket
+import time
+from collections.abc import Callable
+
+READER_PRIORITY = 50
+"""SCHED_FIFO, for the reader alone: threads inherit the policy, so it asks for itself."""
+
+MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
+
+
+def prefer_reader() -> str:
+    """Give the calling thread SCHED_FIFO 50; what came of it, in words."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(READER_PRIORITY))
+    except (OSError, AttributeError) as error:
+        reason = getattr(error, 'strerror', None) or error
+        return f'reader: ordinary scheduling, SCHED_FIFO {READER_PRIORITY} is refused ({reason}; see docs/deploy)'
+    return f'reader: SCHED_FIFO {READER_PRIORITY}'
+
+
+def lock_memory() -> str:
+    """``mlockall``, so that no page of ours is swapped out; what came of it, in words.
+
+    Pages are locked as they are touched: stacks that were never used cost nothing. Under a finite
+    limit nothing is locked, because memory that is asked for later would be refused, and kill us.
+    """
+    limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+    if limit != resource.RLIM_INFINITY and os.geteuid() != 0:
+        return f'memory: not locked, the limit is {limit} bytes (memlock; see docs/deploy)'
+    try:
+        libc = ctypes.CDLL(None, use_errno=True)
+        if libc.mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT) == 0:
+            return 'memory: locked (mlockall)'
+        reason = os.strerror(ctypes.get_errno())
+    except (OSError, AttributeError) as error:
+        reason = str(error)
+    return f'memory: not locked, mlockall is refused ({reason}; see docs/deploy)'
+
+
+def settle() -> None:
+    """What is there now stays: the collector need not look at it again."""
+    gc.collect()
+    gc.freeze()
+
+
+class Watchdog:
+    """Tells systemd that the daemon is ready and alive (sd_notify, over the socket that it names).
+
+    Without ``NOTIFY_SOCKET`` in the environment it does nothing. ``clock``: monotonic, s.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._address = os.environ.get('NOTIFY_SOCKET', '')
+        if self._address.startswith('@'):
+            self._address = '\0' + self._address[1:]
+        usec = os.environ.get('WATCHDOG_USEC', '')
+        pid = os.environ.get('WATCHDOG_PID', '')
+        meant = not pid or pid == str(os.getpid())
+        # Twice as often as it must be.
+        self._interval = int(usec) / 2e6 if usec.isdecimal() and meant else 0.0
+        self._last = -self._interval
+
+    def _tell(self, text: str) -> None:
+        if not self._address:
+            return
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel:
+                channel.connect(self._address)
+                channel.send(text.encode())
+        except OSError:
+            # Nobody listens: nothing of ours depends on it.
+            self._address = ''
+
+    def ready(self) -> None:
+        """The daemon runs."""
+        self._tell('READY=1')
+
+    def alive(self) -> None:
+        """Call it from the loop that must not hang."""
+        if not self._interval:
+            return
+        now = self._clock()
+        if now - self._last >= self._interval:
+            self._last = now
+            self._tell('WATCHDOG=1')
+
+    def stopping(self) -> None:
+        """The daemon ends."""
+        self._tell('STOPPING=1')

@@ -1,0 +1,46 @@
+"""Light that is not the laser pulls the reading to its own centroid (E_DC, stray light)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from psd_deflection.simulation.catalogue import PSD, Effect, EffectParameter, Reading, State, Values
+from psd_deflection.simulation.chunk import Chunk
+
+
+def _apply(chunk: Chunk, values: Values, state: State) -> None:
+    psd = int(values['psd']) - 1
+    laser, level = chunk.sums[psd], values['level']
+    whole = laser + level
+    for row, center in ((2 * psd, values['x']), (2 * psd + 1, values['y'])):
+        chunk.dots[row] = (laser * chunk.dots[row] + level * center) / whole
+    chunk.sums[psd] = whole
+
+
+def _correct(reading: Reading, values: Values) -> None:
+    psd = int(values['psd']) - 1
+    whole, level = reading.sums[psd].copy(), values['level']
+    laser = np.maximum(whole - level, 1e-3 * whole)
+    for row, center in ((2 * psd, values['x']), (2 * psd + 1, values['y'])):
+        reading.dots[row] = (whole * reading.dots[row] - level * center) / laser
+    reading.sums[psd] = laser
+
+
+EFFECT = Effect(
+    name='ambient_light',
+    stage='psd',
+    summary='background light pulls the reading to its centroid',
+    equation='m -> (S m + level c)/(S + level), S -> S + level',
+    source='Hamamatsu, PSD technical note; thesis E_DC',
+    needs='the sum signal',
+    parameters=(
+        PSD,
+        EffectParameter('level', 'V', 0.0, 100.0, 5e-3, 'its part of the sum signal'),
+        EffectParameter('x', 'm', -0.02, 0.02, 1e-3, 'its centroid', kind='coupled'),
+        EffectParameter('y', 'm', -0.02, 0.02, 1e-3, 'its centroid', kind='coupled'),
+    ),
+    point='dots',
+    apply=_apply,
+    correct=_correct,
+    order=1,
+)

@@ -1,0 +1,49 @@
+"""The amplifier clips before the converter does.
+
+Without the noise on the signal (``chunk.noise`` > 0) the mean of the clipped noisy signal is
+given, so that a comparison is fair where the signal grazes the limit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import ndtr
+
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.catalogue import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.chunk import Chunk
+
+
+def _excess(v: FloatArray, sigma: float) -> FloatArray:
+    """Mean of max(v + noise, 0)."""
+    if sigma <= 0.0:
+        return np.maximum(v, 0.0)
+    z = v / sigma
+    return np.asarray(v * ndtr(z) + sigma * np.exp(-0.5 * np.minimum(z * z, 1e3)) / np.sqrt(2.0 * np.pi))
+
+
+def _apply(chunk: Chunk, values: Values, state: State) -> None:
+    rows = range(6) if values['sums'] else (0, 1, 3, 4)
+    for row in rows:
+        v = chunk.volts[row]
+        chunk.volts[row] = v - _excess(v - values['limit'], chunk.noise) + _excess(-v - values['limit'], chunk.noise)
+
+
+EFFECT = Effect(
+    name='amplifier_saturation',
+    stage='electronics',
+    summary='the output clips',
+    equation='v -> min(max(v, -limit), limit)',
+    source='amplifier datasheets',
+    needs='signals up to the limit',
+    parameters=(
+        EffectParameter('limit', 'V', 0.05, 1e3, 0.01, 'largest output', nominal=1e3, propose='highest'),
+        EffectParameter(
+            'sums', '', 0, 1, 1, '1: the sum signals clip as well', nominal=1, kind='choice', choices=(1, 0)
+        ),
+    ),
+    point='output',
+    apply=_apply,
+    order=3,
+    finite=True,
+)

@@ -1,0 +1,42 @@
+"""The link goes on yielding after each change of load."""
+
+from __future__ import annotations
+
+from psd_deflection.simulation.catalogue import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.modes import Filter, held_lag_coefficients
+
+
+def _apply(chunk: Chunk, values: Values, state: State) -> None:
+    for row in range(3):
+        key = str(row)
+        if key not in state:
+            state[key] = Filter(held_lag_coefficients(values['time_constant'], chunk.physics.period))
+        chunk.static[row] += values['amplitude'] * state[key](chunk.static[row])
+
+
+EFFECT = Effect(
+    name='creep',
+    stage='link',
+    summary='the deflection grows after each load change',
+    equation='q += amplitude (1 - exp(-t/tau)) q after a step to q',
+    source='standard linear solid',
+    needs='a load held for more than a time constant, and its removal',
+    parameters=(
+        EffectParameter('amplitude', '', -0.9, 2.0, 1e-3, 'growth relative to the static deflection'),
+        EffectParameter(
+            'time_constant',
+            's',
+            0.05,
+            1e4,
+            1.0,
+            'how slowly',
+            nominal=5.0,
+            kind='shape',
+            grid=(0.3, 1.0, 3.0, 10.0, 40.0),
+        ),
+    ),
+    point='static',
+    apply=_apply,
+    order=4,
+)

@@ -1,0 +1,50 @@
+"""The modes lose energy faster or slower than the rig file says."""
+
+from __future__ import annotations
+
+import math
+
+from psd_deflection.simulation.catalogue import Effect, EffectParameter, Values
+from psd_deflection.simulation.physics import Physics
+
+
+def _configure(physics: Physics, values: Values) -> None:
+    if not math.isnan(values['bending_ratio']):
+        physics.bending_damping_ratio = values['bending_ratio']
+    if not math.isnan(values['torsion_ratio']):
+        physics.torsion_damping_ratio = values['torsion_ratio']
+
+
+EFFECT = Effect(
+    name='damping',
+    stage='link',
+    summary='damping ratios differ',
+    equation='zeta -> bending_ratio, torsion_ratio',
+    source='contract section 2',
+    needs='a step or a sweep through the modes',
+    parameters=(
+        EffectParameter(
+            'bending_ratio',
+            '',
+            0.0,
+            0.95,
+            1e-3,
+            'damping ratio of dX and dY',
+            nominal=math.nan,
+            of_rig='bending_damping_ratio',
+        ),
+        EffectParameter(
+            'torsion_ratio',
+            '',
+            0.0,
+            0.95,
+            1e-3,
+            'damping ratio of theta',
+            nominal=math.nan,
+            of_rig='torsion_damping_ratio',
+        ),
+    ),
+    order=2,
+    point='configure',
+    configure=_configure,
+)

@@ -1,0 +1,29 @@
+"""The force does not point where the load record says."""
+
+from __future__ import annotations
+
+import math
+
+from psd_deflection.simulation.catalogue import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.chunk import Chunk
+
+
+def _apply(chunk: Chunk, values: Values, state: State) -> None:
+    c, s = math.cos(values['angle']), math.sin(values['angle'])
+    fx, fy = chunk.loads[0].copy(), chunk.loads[1].copy()
+    chunk.loads[0] = c * fx - s * fy
+    chunk.loads[1] = s * fx + c * fy
+
+
+EFFECT = Effect(
+    name='load_direction',
+    stage='load',
+    summary='the force is turned about Z',
+    equation='(Fx, Fy) -> Rz(angle) (Fx, Fy)',
+    source='statics',
+    needs='a force, and a torque to tell it from turned sensors',
+    parameters=(EffectParameter('angle', 'rad', -3.2, 3.2, 1e-3, 'turn of the force about +Z'),),
+    point='load',
+    apply=_apply,
+    order=0,
+)

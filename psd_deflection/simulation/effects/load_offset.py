@@ -1,0 +1,27 @@
+"""The load acts beside the centroid, so that a force also turns the tip."""
+
+from __future__ import annotations
+
+from psd_deflection.simulation.catalogue import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.chunk import Chunk
+
+
+def _apply(chunk: Chunk, values: Values, state: State) -> None:
+    chunk.loads[2] += values['x'] * chunk.loads[1] - values['y'] * chunk.loads[0]
+
+
+EFFECT = Effect(
+    name='load_offset',
+    stage='load',
+    summary='the load acts away from the centroid',
+    equation='Tz += x Fy - y Fx',
+    source='statics',
+    needs='forces along both axes',
+    parameters=(
+        EffectParameter('x', 'm', -1.0, 1.0, 1e-4, 'where it acts'),
+        EffectParameter('y', 'm', -1.0, 1.0, 1e-4, 'where it acts'),
+    ),
+    point='load',
+    apply=_apply,
+    order=1,
+)

@@ -1,0 +1,28 @@
+"""The tip plate leans with the bending slope, so that the beams meet it at an angle (E_Tilt)."""
+
+from __future__ import annotations
+
+from psd_deflection.simulation.catalogue import Effect, EffectParameter, Values
+from psd_deflection.simulation.physics import Physics
+
+
+def _configure(physics: Physics, values: Values) -> None:
+    physics.slope_ratio = values['slope_ratio']
+
+
+EFFECT = Effect(
+    name='plane_tilt',
+    stage='optics',
+    summary='the tip plate tilts with the bending slope',
+    equation='R = Ry(k dX/L) Rx(-k dY/L) Rz(theta)',
+    source='thesis section 2.3, corrected; beam theory',
+    needs='large deflection; an even effect',
+    parameters=(
+        EffectParameter(
+            'slope_ratio', '', 0.0, 20.0, 1.5, 'k of phi = -k dY/L: 3/2 for a force, 2 for a moment', grid=(1.5,)
+        ),
+    ),
+    point='configure',
+    configure=_configure,
+    finite=True,
+)

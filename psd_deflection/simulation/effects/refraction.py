@@ -1,0 +1,28 @@
+"""Air of another temperature bends both beams alike (E_RF)."""
+
+from __future__ import annotations
+
+from psd_deflection.simulation.catalogue import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.chunk import Chunk
+
+
+def _apply(chunk: Chunk, values: Values, state: State) -> None:
+    for i in (0, 2):
+        chunk.beams[i] += values['x'] * chunk.warmer
+        chunk.beams[i + 1] += values['y'] * chunk.warmer
+
+
+EFFECT = Effect(
+    name='refraction',
+    stage='optics',
+    summary='both dots move with temperature',
+    equation='l_i += (x, y) (T - T0)',
+    source='thesis 3.2; Edlen, 3.3 corrected',
+    needs='a change of temperature',
+    parameters=(
+        EffectParameter('x', 'm/K', -1e-3, 1e-3, 1e-7, 'shift of both beams'),
+        EffectParameter('y', 'm/K', -1e-3, 1e-3, 1e-7, 'shift of both beams'),
+    ),
+    point='beam',
+    apply=_apply,
+)

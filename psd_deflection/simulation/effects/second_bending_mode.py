@@ -1,0 +1,62 @@
+"""A further bending mode rings on top of the first."""
+
+from __future__ import annotations
+
+from psd_deflection.simulation.catalogue import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.modes import Filter, mode_coefficients
+
+
+def _apply(chunk: Chunk, values: Values, state: State) -> None:
+    for row in range(2):
+        key = str(row)
+        if key not in state:
+            p = chunk.physics
+            state[key] = Filter(mode_coefficients(values['frequency'], values['damping_ratio'], p.period))
+            state['first' + key] = Filter(mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period))
+        ringing = state[key](chunk.static[row])
+        if values['shares'] == 1:
+            ringing = ringing - state['first' + key](chunk.static[row])
+        elif values['shares'] == 2:
+            ringing = ringing - chunk.static[row]
+        chunk.pose[row] += values['gain'] * ringing
+
+
+EFFECT = Effect(
+    name='second_bending_mode',
+    stage='link',
+    summary='a second bending mode rings',
+    equation="q2'' + 2 zeta w q2' + w^2 q2 = w^2 gain q_static; dX, dY += q2",
+    source='Euler-Bernoulli cantilever: w2/w1 = 6.27',
+    needs='steps',
+    parameters=(
+        EffectParameter('gain', '', -1.0, 1.0, 1e-3, 'its share of the static deflection'),
+        EffectParameter(
+            'frequency',
+            'Hz',
+            5.0,
+            450.0,
+            0.2,
+            'its frequency',
+            nominal=87.7,
+            kind='shape',
+            grid=(87.7,),
+            propose='spectral',
+        ),
+        EffectParameter(
+            'damping_ratio', '', 1e-4, 0.5, 2e-3, 'its damping ratio', nominal=0.02, kind='shape', grid=(0.01,)
+        ),
+        EffectParameter(
+            'shares',
+            '',
+            0,
+            2,
+            1,
+            '0: adds its own static part, 1: takes it from the first mode, 2: rings only',
+            kind='choice',
+            choices=(0, 1, 2),
+        ),
+    ),
+    point='pose',
+    apply=_apply,
+)

@@ -1,0 +1,24 @@
+"""The link sags under its own weight."""
+
+from __future__ import annotations
+
+from psd_deflection.simulation.catalogue import Effect, EffectParameter, Values
+from psd_deflection.simulation.physics import Physics
+
+
+def _configure(physics: Physics, values: Values) -> None:
+    physics.static_offset[1] -= values['weight_per_length'] * physics.length**4 / (8.0 * physics.bending_stiffness)
+
+
+EFFECT = Effect(
+    name='self_weight',
+    stage='link',
+    summary='the link bends under its own weight',
+    equation='dY -= w L^4/(8 EI)',
+    source='beam theory',
+    needs='recordings at two lengths, zeroed at one',
+    parameters=(EffectParameter('weight_per_length', 'N/m', 0.0, 1e3, 1e-2, 'weight of the link per length'),),
+    order=5,
+    point='configure',
+    configure=_configure,
+)

@@ -1,0 +1,37 @@
+"""A PSD reads too large or too small."""
+
+from __future__ import annotations
+
+from psd_deflection.simulation.catalogue import PSD, Effect, EffectParameter, Reading, State, Values
+from psd_deflection.simulation.chunk import Chunk
+
+
+def _apply(chunk: Chunk, values: Values, state: State) -> None:
+    i = 2 * (int(values['psd']) - 1)
+    chunk.dots[i] *= 1.0 + values['x']
+    chunk.dots[i + 1] *= 1.0 + values['y']
+
+
+def _correct(reading: Reading, values: Values) -> None:
+    i = 2 * (int(values['psd']) - 1)
+    reading.dots[i] /= 1.0 + values['x']
+    reading.dots[i + 1] /= 1.0 + values['y']
+
+
+EFFECT = Effect(
+    name='sensor_gain',
+    stage='psd',
+    summary='a reading is scaled',
+    equation='x -> x (1 + x_scale), y likewise',
+    source='PSD and amplifier datasheets',
+    needs='dots that move',
+    parameters=(
+        PSD,
+        EffectParameter('x', '', -0.9, 10.0, 1e-3, 'scale error of x'),
+        EffectParameter('y', '', -0.9, 10.0, 1e-3, 'scale error of y'),
+    ),
+    point='dots',
+    apply=_apply,
+    correct=_correct,
+    order=5,
+)

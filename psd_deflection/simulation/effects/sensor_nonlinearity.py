@@ -1,0 +1,45 @@
+"""A PSD reads more (or less) the farther the dot is from its centre (E_R)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from psd_deflection.simulation.catalogue import PSD, Effect, EffectParameter, Reading, State, Values
+from psd_deflection.simulation.chunk import Chunk
+
+
+def _apply(chunk: Chunk, values: Values, state: State) -> None:
+    i = 2 * (int(values['psd']) - 1)
+    grown = 1.0 + values['k'] * (chunk.dots[i] ** 2 + chunk.dots[i + 1] ** 2)
+    chunk.dots[i] *= grown
+    chunk.dots[i + 1] *= grown
+
+
+def _correct(reading: Reading, values: Values) -> None:
+    i = 2 * (int(values['psd']) - 1)
+    read = np.hypot(reading.dots[i], reading.dots[i + 1])
+    true = read.copy()
+    for _ in range(6):
+        # Newton on true (1 + k true^2) = read; six steps reach rounding anywhere on a sensor.
+        true -= (true * (1.0 + values['k'] * true**2) - read) / np.maximum(1.0 + 3.0 * values['k'] * true**2, 0.1)
+    grown = 1.0 + values['k'] * true**2
+    reading.dots[i] /= grown
+    reading.dots[i + 1] /= grown
+
+
+EFFECT = Effect(
+    name='sensor_nonlinearity',
+    stage='psd',
+    summary='the reading grows with the distance from the centre',
+    equation='x -> x (1 + k r^2), y likewise',
+    source='Hamamatsu S1880 datasheet: position detection error; thesis E_R',
+    needs='dots far from the centre',
+    parameters=(
+        PSD,
+        EffectParameter('k', '1/m^2', -1e4, 1e5, 100.0, 'cubic coefficient'),
+    ),
+    point='dots',
+    apply=_apply,
+    correct=_correct,
+    order=3,
+)

@@ -1,0 +1,43 @@
+"""A PSD's axes are turned in its plane (E_Algn)."""
+
+from __future__ import annotations
+
+import math
+
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.catalogue import PSD, Effect, EffectParameter, Reading, State, Values
+from psd_deflection.simulation.chunk import Chunk
+
+
+def _turn(dots: FloatArray, psd: float, angle: float) -> None:
+    i = 2 * (int(psd) - 1)
+    c, s = math.cos(angle), math.sin(angle)
+    x, y = dots[i].copy(), dots[i + 1].copy()
+    dots[i] = c * x + s * y
+    dots[i + 1] = c * y - s * x
+
+
+def _apply(chunk: Chunk, values: Values, state: State) -> None:
+    _turn(chunk.dots, values['psd'], values['angle'])
+
+
+def _correct(reading: Reading, values: Values) -> None:
+    _turn(reading.dots, values['psd'], -values['angle'])
+
+
+EFFECT = Effect(
+    name='sensor_rotation',
+    stage='psd',
+    summary="a PSD's axes are turned in its plane",
+    equation='m = Rz(-angle) m_true',
+    source='thesis chapter 3: E_Algn',
+    needs='dots that move',
+    parameters=(
+        PSD,
+        EffectParameter('angle', 'rad', -3.2, 3.2, 1e-3, 'turn of the axes about +Z'),
+    ),
+    point='dots',
+    apply=_apply,
+    correct=_correct,
+    order=2,
+)

@@ -1,0 +1,75 @@
+"""Part of the spot leaves the active area, and the centroid of the rest is read (E_LP)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import ndtr
+
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.catalogue import PSD, Effect, EffectParameter, State, Values
+from psd_deflection.simulation.chunk import Chunk
+
+
+def _cut_disc(distance: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
+    """Share of a disc left by an edge at ``distance`` from its centre, and the share's centroid.
+
+    The centroid is the distance it moves away from the edge, m.
+    """
+    u = np.clip(distance / radius, -0.999, 1.0)
+    root = np.sqrt(1.0 - u * u)
+    left = 1.0 - (np.arccos(u) - u * root) / np.pi
+    return left, (2.0 / (3.0 * np.pi)) * radius * root**3 / left
+
+
+def _cut_gauss(position: FloatArray, half: float, radius: float) -> tuple[FloatArray, FloatArray]:
+    """Share of a Gaussian spot between two edges at +-``half``, and the shift of its centroid, m."""
+    sigma = 0.5 * radius
+    a, b = (-half - position) / sigma, (half - position) / sigma
+    left = np.maximum(ndtr(b) - ndtr(a), 1e-9)
+    density = np.exp(-0.5 * a * a) - np.exp(-0.5 * b * b)
+    return left, sigma * density / (np.sqrt(2.0 * np.pi) * left)
+
+
+def _apply(chunk: Chunk, values: Values, state: State) -> None:
+    psd, radius = int(values['psd']) - 1, values['radius']
+    if radius <= 0.0:
+        return
+    for axis in range(2):
+        row, half = 2 * psd + axis, float(chunk.physics.half_area[psd, axis])
+        place = chunk.dots[row].copy()
+        if values['profile'] == 1:
+            for side in (1.0, -1.0):
+                left, moved = _cut_disc(half - side * place, radius)
+                chunk.dots[row] -= side * moved
+                chunk.sums[psd] *= left
+        else:
+            left, moved = _cut_gauss(place, half, radius)
+            chunk.dots[row] += moved
+            chunk.sums[psd] *= left
+
+
+EFFECT = Effect(
+    name='spot_clipping',
+    stage='psd',
+    summary='part of the spot leaves the active area',
+    equation='m = centroid of the spot within the area; the sum falls',
+    source='geometry of a cut disc; thesis E_LP',
+    needs='dots near the edge',
+    parameters=(
+        PSD,
+        EffectParameter(
+            'radius',
+            'm',
+            0.0,
+            0.05,
+            1e-3,
+            'radius of the spot (1/e^2 where the profile is Gaussian)',
+            grid=(1.0e-3, 1.5e-3, 2.0e-3, 2.5e-3, 3.0e-3, 3.5e-3, 4.0e-3, 5.0e-3),
+        ),
+        EffectParameter('profile', '', 1, 2, 1, '1: even disc, 2: Gaussian', nominal=1, kind='choice', choices=(1, 2)),
+    ),
+    point='dots',
+    apply=_apply,
+    order=0,
+    finite=True,
+)

@@ -1,0 +1,37 @@
+"""The reading of one PSD moves with temperature (E_TH)."""
+
+from __future__ import annotations
+
+from psd_deflection.simulation.catalogue import PSD, Effect, EffectParameter, Reading, State, Values
+from psd_deflection.simulation.chunk import Chunk
+
+
+def _apply(chunk: Chunk, values: Values, state: State) -> None:
+    i = 2 * (int(values['psd']) - 1)
+    chunk.dots[i] += values['x'] * chunk.warmer
+    chunk.dots[i + 1] += values['y'] * chunk.warmer
+
+
+def _correct(reading: Reading, values: Values) -> None:
+    i = 2 * (int(values['psd']) - 1)
+    reading.dots[i] -= values['x'] * reading.warmer
+    reading.dots[i + 1] -= values['y'] * reading.warmer
+
+
+EFFECT = Effect(
+    name='thermal_drift',
+    stage='psd',
+    summary='a reading moves with temperature',
+    equation='m += (x, y) (T - T0)',
+    source='PSD datasheets; thesis E_TH',
+    needs='a change of temperature',
+    parameters=(
+        PSD,
+        EffectParameter('x', 'm/K', -1e-3, 1e-3, 1e-7, 'drift of x'),
+        EffectParameter('y', 'm/K', -1e-3, 1e-3, 1e-7, 'drift of y'),
+    ),
+    point='dots',
+    apply=_apply,
+    correct=_correct,
+    order=6,
+)

@@ -1,0 +1,28 @@
+"""A mass at the tip that the rig file knows nothing of lowers the bending frequency."""
+
+from __future__ import annotations
+
+import math
+
+from psd_deflection.simulation.catalogue import Effect, EffectParameter, Values
+from psd_deflection.simulation.physics import Physics
+
+
+def _configure(physics: Physics, values: Values) -> None:
+    omega = 2.0 * math.pi * physics.bending_frequency
+    modal = 1.0 / (physics.force_compliance * omega**2)
+    physics.bending_frequency *= math.sqrt(modal / (modal + values['mass']))
+
+
+EFFECT = Effect(
+    name='tip_mass',
+    stage='link',
+    summary='an added tip mass lowers the bending frequency',
+    equation='m0 = k/w^2, w -> w sqrt(m0/(m0 + mass))',
+    source='Rayleigh',
+    needs='a step or a sweep through the bending mode',
+    parameters=(EffectParameter('mass', 'kg', 0.0, 100.0, 1e-3, 'added mass at the tip'),),
+    order=2,
+    point='configure',
+    configure=_configure,
+)

@@ -1,0 +1,87 @@
+"""Load histories and temperatures in words, as a command line gives them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from psd_deflection.errors import ConfigError
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation import loads
+from psd_deflection.simulation.loads import LoadHistory
+
+HELP = """\
+load histories (a load is FX,FY,TZ in N, N, N m; several --loads follow one another):
+  thesis[:DWELL]                   0, 10, 30, 50 N on the sidebar, 0, the same on the link, 0
+  identification                   24 s that show most effects of the catalogue
+  constant:LOAD:SECONDS
+  steps:LOAD;LOAD;...:DWELL
+  ramp:LOAD;LOAD:SECONDS
+  chirp:LOAD:F0,F1:SECONDS         a sine of this amplitude, from F0 to F1 Hz
+  FILE.csv                         columns t, load_fx, load_fy, load_tz, held between rows
+"""
+
+MAX_SECONDS = 86_400.0
+
+
+def _numbers(text: str, count: int | None, source: str) -> tuple[float, ...]:
+    try:
+        out = tuple(float(v) for v in text.split(','))
+    except ValueError:
+        raise ConfigError(f'{source}: {text!r} is not a list of numbers') from None
+    if not all(math.isfinite(v) for v in out):
+        raise ConfigError(f'{source}: {text!r} holds a number that is not finite')
+    if count is not None and len(out) != count:
+        raise ConfigError(f'{source}: {text!r} must be {count} numbers, is {len(out)}')
+    return out
+
+
+def _load(text: str, source: str) -> tuple[float, float, float]:
+    a, b, c = _numbers(text, 3, source)
+    return (a, b, c)
+
+
+def _seconds(text: str, source: str) -> float:
+    (value,) = _numbers(text, 1, source)
+    if not 0.0 < value <= MAX_SECONDS:
+        raise ConfigError(f'{source}: {value:g} s: must be above 0 and at most {MAX_SECONDS:g}')
+    return value
+
+
+def load_history(words: str, rate: float) -> LoadHistory:
+    """The history that ``words`` describe (see ``HELP``) at ``rate`` Hz.
+
+    Raises ConfigError naming the words and what is wrong, RecordingError for a bad file.
+    """
+    source = f'--loads {words}'
+    if words.endswith('.csv'):
+        return loads.from_csv(words, rate)
+    kind, *rest = words.split(':')
+    if kind == 'thesis' and len(rest) <= 1:
+        return loads.thesis_load_cases(_seconds(rest[0], source) if rest else 4.0, rate)
+    if kind == 'identification' and not rest:
+        return loads.identification(rate)
+    if kind == 'constant' and len(rest) == 2:
+        return loads.constant(_load(rest[0], source), _seconds(rest[1], source), rate)
+    if kind == 'steps' and len(rest) == 2:
+        return loads.steps([_load(part, source) for part in rest[0].split(';')], _seconds(rest[1], source), rate)
+    if kind == 'ramp' and len(rest) == 2:
+        ends = [_load(part, source) for part in rest[0].split(';')]
+        if len(ends) != 2:
+            raise ConfigError(f'{source}: a ramp has two loads, this one has {len(ends)}')
+        return loads.ramp(ends[0], ends[1], _seconds(rest[1], source), rate)
+    if kind == 'chirp' and len(rest) == 3:
+        f0, f1 = _numbers(rest[1], 2, source)
+        if not (0.0 <= f0 < rate / 2.0 and 0.0 <= f1 < rate / 2.0):
+            raise ConfigError(f'{source}: frequencies must be at least 0 and below {rate / 2.0:g} Hz')
+        return loads.chirp(_load(rest[0], source), f0, f1, _seconds(rest[2], source), rate)
+    raise ConfigError(f'{source}: not a load history; psd-deflection simulate --help lists them')
+
+
+def temperature_history(words: str, n: int) -> FloatArray:
+    """``T0[,T1,...]`` in degrees Celsius: straight lines through these, evenly over n samples."""
+    knots = _numbers(words, None, f'--temperature {words}')
+    if len(knots) == 1:
+        return np.full(n, knots[0])
+    return np.asarray(np.interp(np.linspace(0.0, 1.0, n), np.linspace(0.0, 1.0, len(knots)), knots))

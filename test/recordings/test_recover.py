@@ -1,0 +1,222 @@
+"""What a crash leaves is made whole, and judged by a reader that refuses what is not."""
+
+from __future__ import annotations
+
+import fcntl
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.rosbag2 import Reader
+
+from psd_deflection.cli.main import main
+from psd_deflection.config import load_rig
+from psd_deflection.errors import RecordingError
+from psd_deflection.io.bag_writer import BagWriter, McapFile
+from psd_deflection.io.recordings import open_recording
+from psd_deflection.io.recover import recover
+from psd_deflection.records import ParameterChange
+
+from .making import STEP, block, run
+
+HELLO = {'serial': 'A1', 'sample_rate_hz': 1000}
+
+
+def record(folder: Path, **kwargs: float) -> Path:
+    with BagWriter(folder, rig_values=load_rig().values, device_hello=HELLO, **kwargs) as bag:  # type: ignore[arg-type]
+        for r in run(200):
+            bag.write(r)
+    return folder
+
+
+def cut(folder: Path, name: str, keep: int) -> None:
+    """As a crash leaves it."""
+    file = folder / name
+    file.write_bytes(file.read_bytes()[:keep])
+    (folder / 'metadata.yaml').unlink(missing_ok=True)
+
+
+def theirs(folder: Path) -> dict[str, list[tuple[int, bytes]]]:
+    out: dict[str, list[tuple[int, bytes]]] = {}
+    with Reader(folder) as reader:
+        for connection, t_ns, raw in reader.messages():
+            out.setdefault(connection.topic, []).append((t_ns, bytes(raw)))
+        assert reader.message_count == sum(map(len, out.values()))
+    return out
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp('recover') / 'run')
+
+
+@settings(max_examples=25)
+@given(part=st.floats(0.05, 1.0))
+def test_a_bag_cut_anywhere_opens_elsewhere_after_recover(
+    whole: Path, tmp_path_factory: pytest.TempPathFactory, part: float
+) -> None:
+    folder = tmp_path_factory.mktemp('cut') / 'run'
+    folder.mkdir()
+    content = (whole / 'run_0.mcap').read_bytes()
+    (folder / 'run_0.mcap').write_bytes(content)
+    cut(folder, 'run_0.mcap', int(part * len(content)))
+    before = {(m.channel.topic, m.log_time, m.cdr) for m in open_recording(folder).messages()}
+    done = recover(folder)
+    assert done.metadata_written
+    after = open_recording(folder)
+    assert {(m.channel.topic, m.log_time, m.cdr) for m in after.messages()} == before
+    assert after.complete
+    assert not after.warnings
+    assert after.parameters == open_recording(whole).parameters
+    assert after.hello == HELLO
+    got, expected = theirs(folder), theirs(whole)
+    for topic, messages in got.items():
+        assert messages == expected[topic][: len(messages)]
+    assert sum(map(len, got.values())) == len(before)
+    if done.files[0].repaired:
+        assert (folder / 'run_0.mcap.cut').stat().st_size == int(part * len(content))
+
+
+def test_recover_says_what_it_did_and_leaves_alone_what_is_whole(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {p.name: p.read_bytes() for p in whole.iterdir()}
+    assert main(['recover', str(whole)]) == 0
+    assert 'was whole' in capsys.readouterr().out
+    assert {p.name: p.read_bytes() for p in whole.iterdir()} == before
+
+
+def test_metadata_alone_is_made_anew_as_it_was(whole: Path, tmp_path: Path) -> None:
+    folder = record(tmp_path / 'run')
+    expected = yaml.safe_load((folder / 'metadata.yaml').read_text())
+    (folder / 'metadata.yaml').unlink()
+    assert not recover(folder).files[0].repaired
+    assert yaml.safe_load((folder / 'metadata.yaml').read_text()) == expected
+
+
+def test_the_last_of_several_files_is_repaired(tmp_path: Path) -> None:
+    folder = record(tmp_path / 'run', max_s=1.0)
+    names = sorted(p.name for p in folder.glob('*.mcap'))
+    assert names == ['run_0.mcap', 'run_1.mcap', 'run_2.mcap', 'run_3.mcap']
+    expected = theirs(folder)
+    cut(folder, 'run_3.mcap', (folder / 'run_3.mcap').stat().st_size // 2)
+    repaired = [f.repaired for f in recover(folder).files]
+    assert repaired == [False, False, False, True]
+    got = theirs(folder)
+    assert all(got[t] == expected[t][: len(got[t])] for t in got)
+    assert len(got['/psd/samples']) >= 150
+
+
+def test_a_file_that_was_only_begun_is_set_aside(tmp_path: Path) -> None:
+    folder = record(tmp_path / 'run', max_s=2.5)
+    cut(folder, 'run_1.mcap', 3)
+    done = recover(folder)
+    assert [p.name for p in done.set_aside] == ['run_1.mcap.cut']
+    assert len(theirs(folder)['/psd/samples']) == 125
+
+
+def test_a_lone_file_is_repaired(tmp_path: Path) -> None:
+    with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
+        for r in run(100):
+            out.write(r)
+    (tmp_path / 'a.mcap').write_bytes((tmp_path / 'a.mcap').read_bytes()[:-1000])
+    assert recover(tmp_path / 'a.mcap').files[0].repaired
+    assert open_recording(tmp_path / 'a.mcap').complete
+
+
+def test_a_damaged_chunk_costs_itself_and_is_told(tmp_path: Path) -> None:
+    folder = record(tmp_path / 'run')
+    content = bytearray((folder / 'run_0.mcap').read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    (folder / 'run_0.mcap').write_bytes(content)
+    cut(folder, 'run_0.mcap', len(content) - 100)
+    (file,) = recover(folder).files
+    assert any('damaged' in w for w in file.warnings)
+    assert 120 <= len(theirs(folder)['/psd/samples']) < 200
+
+
+def test_what_is_being_recorded_is_refused(tmp_path: Path) -> None:
+    bag = BagWriter(tmp_path / 'run', rig_values={})
+    bag.write(block(0))
+    bag.flush()
+    # The lock of one process does not keep itself out: ask from another.
+    answer = subprocess.run(
+        [sys.executable, '-m', 'psd_deflection', 'recover', str(tmp_path / 'run')], capture_output=True, text=True
+    )
+    assert answer.returncode == 4
+    assert 'is being recorded at this moment' in answer.stderr
+    bag.close()
+
+
+def test_an_earlier_repair_is_not_overwritten(tmp_path: Path) -> None:
+    folder = record(tmp_path / 'run')
+    cut(folder, 'run_0.mcap', 20_000)
+    (folder / 'run_0.mcap.cut').write_text('precious')
+    with pytest.raises(RecordingError, match=r'run_0\.mcap\.cut: is there already'):
+        recover(folder)
+    assert (folder / 'run_0.mcap.cut').read_text() == 'precious'
+    assert (folder / 'run_0.mcap').stat().st_size == 20_000
+
+
+@pytest.mark.parametrize(('content', 'said'), [(b'no mcap at all', 'not an MCAP'), (None, 'no such recording')])
+def test_what_is_no_recording_is_one_line(tmp_path: Path, content: bytes | None, said: str) -> None:
+    path = tmp_path / 'a.mcap'
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(RecordingError, match=said):
+        recover(path)
+
+
+def test_rotation_by_size_and_what_each_file_holds(tmp_path: Path) -> None:
+    rig = load_rig()
+    change = ParameterChange(1, 5, (('sum_min', 1.0),))
+    with BagWriter(tmp_path / 'run', rig_values=rig.values, device_hello=HELLO, max_bytes=100_000) as bag:
+        for i, r in enumerate(run(400)):
+            if i == 20:
+                bag.write(change)
+            bag.write(r)
+    files = sorted((tmp_path / 'run').glob('*.mcap'))
+    assert len(files) >= 3
+    assert all(f.stat().st_size >= 100_000 for f in files[:-1])
+    for file in files:
+        lone = open_recording(file)
+        assert lone.parameters == dict(rig.values)
+        assert lone.hello == HELLO
+        assert lone.changes == [change]
+    together = open_recording(tmp_path / 'run')
+    assert together.changes == [change]
+    assert [b.index for b in together.blocks()] == list(range(400))
+    assert len(theirs(tmp_path / 'run')['/psd/samples']) == 400
+
+
+def test_the_oldest_file_can_go(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'run', rig_values={}, max_s=1.0) as bag:
+        for i in range(200):
+            bag.write(block(i))
+        assert bag.drop_oldest() == tmp_path / 'run' / 'run_0.mcap'
+        assert [p.name for p in bag.ended_files] == ['run_1.mcap', 'run_2.mcap']
+    assert [b.index for b in open_recording(tmp_path / 'run').blocks()] == list(range(50, 200))
+    assert len(theirs(tmp_path / 'run')['/psd/samples']) == 150
+
+
+def test_chunks_are_on_the_disk_within_half_a_second_of_log_time(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'run', rig_values={}, durable=True) as bag:
+        for i in range(100):
+            bag.write(block(i))
+            # What a kill at this moment would leave.
+            (tmp_path / 'left.mcap').write_bytes(bag.path.read_bytes())
+            left = [int(b.t_ns[-1]) for b in open_recording(tmp_path / 'left.mcap').blocks()] if i >= 26 else []
+            if left:
+                assert (100 * 20 * STEP) > int(block(i).t_ns[-1]) - left[-1] <= 520 * STEP
+
+
+def test_the_lock_goes_with_the_writer(tmp_path: Path) -> None:
+    with McapFile(tmp_path / 'a.mcap', rig_values={}) as out, (tmp_path / 'a.mcap').open('rb') as stream:
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        out.close()
+        fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)

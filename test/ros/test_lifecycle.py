@@ -1,0 +1,140 @@
+"""The node's states, its zero from run to run, and its end in every state."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytestmark = pytest.mark.ros
+pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from geometry_msgs.msg import PoseStamped, WrenchStamped  # noqa: E402
+from lifecycle_msgs.msg import State, Transition  # noqa: E402
+from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
+from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from std_srvs.srv import SetBool, Trigger  # noqa: E402
+
+from psd_deflection.errors import DeviceError  # noqa: E402
+from psd_deflection.io.recordings import open_recording  # noqa: E402
+from psd_deflection.io.serial_port import SerialPort  # noqa: E402
+
+END_S = 2.0
+"""How long the node may take to end, by its contract."""
+
+
+def change(peer: Any, transition: int) -> bool:
+    request = ChangeState.Request(transition=Transition(id=transition))
+    return bool(peer.call(ChangeState, '/estimator/change_state', request).success)
+
+
+def state(peer: Any) -> int:
+    return int(peer.call(GetState, '/estimator/get_state', GetState.Request()).current_state.id)
+
+
+def parameters(peer: Any, *names: str) -> list[Any]:
+    answer = peer.call(GetParameters, '/estimator/get_parameters', GetParameters.Request(names=list(names)))
+    return [list(v.double_array_value) for v in answer.values]
+
+
+def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simulated_port: str, tmp_path: Path) -> None:
+    bags = tmp_path / 'bags'
+    daemon = start(
+        '--port', simulated_port, '--ros-args', '-p', 'autostart:=false', '-p', f'bag_dir:={bags}', '-p', 'record:=true'
+    )
+    daemon.said('waiting to be configured')
+    assert state(peer) == State.PRIMARY_STATE_UNCONFIGURED
+    poses = peer.collect(PoseStamped, '/link_tip/deflection')
+    health = peer.collect(DiagnosticArray, '/diagnostics')
+    peer.until(lambda: any(s.message == 'not configured' for m in health for s in m.status), 'STALE')
+    assert peer.call(Trigger, '/estimator/zero', Trigger.Request()).message == 'not zeroed: the node is not configured'
+    assert not peer.call(SetBool, '/estimator/record', SetBool.Request(data=True)).success
+    # The port is not ours yet: somebody else can have it.
+    SerialPort(simulated_port, 921_600).close()
+    assert change(peer, Transition.TRANSITION_CONFIGURE)
+    assert state(peer) == State.PRIMARY_STATE_INACTIVE
+    with pytest.raises(DeviceError, match='another program has the port open'):
+        SerialPort(simulated_port, 921_600)
+    seen = len(health)
+    peer.until(lambda: len(health) > seen + 1, 'diagnostics while inactive')
+    assert not poses
+    assert change(peer, Transition.TRANSITION_ACTIVATE)
+    assert 'publishing on ROS domain' in daemon.said('publishing on ROS domain')
+    peer.until(lambda: len(poses) >= 10, 'estimates')
+    assert change(peer, Transition.TRANSITION_DEACTIVATE)
+    seen = len(health)
+    peer.until(lambda: len(health) > seen + 1, 'diagnostics while inactive')
+    stopped = len(poses)
+    seen = len(health)
+    peer.until(lambda: len(health) > seen, 'more diagnostics')
+    assert len(poses) == stopped
+    assert change(peer, Transition.TRANSITION_CLEANUP)
+    SerialPort(simulated_port, 921_600).close()
+    # What was recorded went on while nothing was published, and is whole.
+    (folder,) = bags.iterdir()
+    recording = open_recording(folder)
+    assert recording.complete
+    assert recording.topics()['/link_tip/deflection'] > stopped + 50
+    # Round again.
+    assert change(peer, Transition.TRANSITION_CONFIGURE)
+    assert change(peer, Transition.TRANSITION_ACTIVATE)
+    peer.until(lambda: len(poses) >= stopped + 10, 'estimates once more')
+    daemon.signal(signal.SIGINT)
+    assert daemon.wait(END_S + 10.0) == 0
+
+
+def test_a_device_that_is_not_there_leaves_the_node_unconfigured(start: Callable[..., Any], peer: Any) -> None:
+    daemon = start('--port', '/dev/nothing_here', '--ros-args', '-p', 'autostart:=false')
+    daemon.said('waiting to be configured')
+    assert not change(peer, Transition.TRANSITION_CONFIGURE)
+    assert daemon.said('no such port')
+    assert state(peer) == State.PRIMARY_STATE_UNCONFIGURED
+    daemon.signal(signal.SIGTERM)
+    assert daemon.wait(END_S + 10.0) == 0
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_waiting_for_a_device(start: Callable[..., Any], device: Any, number: signal.Signals) -> None:
+    device.answer = b''
+    daemon = start('--port', str(device.link))
+    assert device.greeted.wait(60.0)
+    daemon.signal(number)
+    assert daemon.wait(END_S + 10.0) == 0
+    assert not any('Traceback' in line for line in daemon.lines)
+
+
+def test_the_zero_holds_for_the_next_run(
+    start: Callable[..., Any], peer: Any, simulated_port: str, tmp_path: Path
+) -> None:
+    arguments = ('--port', simulated_port, '--ros-args', '-p', f'zero_file:={tmp_path / "zero.json"}')
+    first = start(*arguments)
+    poses = peer.collect(PoseStamped, '/link_tip/deflection')
+    wrenches = peer.collect(WrenchStamped, '/link_tip/wrench')
+    peer.until(lambda: len(poses) >= 30 and len(wrenches) >= 30, 'estimates')
+    put = Parameter('psd_1.zero', value=[0.0002, 0.0001]).to_parameter_msg()
+    answer = peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[put]))
+    assert answer.results[0].successful
+    moved = len(poses)
+    peer.until(lambda: len(poses) > moved + 5, 'estimates after the change')
+    assert abs(poses[-1].pose.position.x) > 5e-5
+    assert peer.call(Trigger, '/estimator/zero', Trigger.Request()).success
+    taken = parameters(peer, 'psd_1.zero', 'psd_2.zero')
+    assert taken[0] != [0.0002, 0.0001]
+    assert taken != [[0.0, 0.0], [0.0, 0.0]]
+    first.signal(signal.SIGINT)
+    assert first.wait(END_S + 10.0) == 0
+    second = start(*arguments)
+    assert 'zero of the last run' in second.said('zero of the last run')
+    second.said('publishing on ROS domain')
+    assert parameters(peer, 'psd_1.zero', 'psd_2.zero') == taken
+    second.signal(signal.SIGINT)
+    assert second.wait(END_S + 10.0) == 0
+    # Switched off, the rig file holds.
+    third = start(*arguments, '-p', 'keep_zero:=false')
+    third.said('publishing on ROS domain')
+    assert parameters(peer, 'psd_1.zero', 'psd_2.zero') == [[0.0, 0.0], [0.0, 0.0]]

@@ -1,0 +1,194 @@
+"""The recorder against a disk that fills, refuses, or is slow."""
+
+from __future__ import annotations
+
+import errno
+import os
+import queue
+import shutil
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rosbags.rosbag2 import Reader
+
+from msg_adapters import to_messages
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.errors import RecordingError
+from psd_deflection.io import cdr
+from psd_deflection.io.recordings import open_recording
+from psd_deflection.records import ParameterChange, SampleBlock
+from psd_deflection.runner import recorder as module
+from psd_deflection.runner.recorder import Recorder
+from test.recordings.making import block
+
+MB = 1_000_000
+
+
+class Disk:
+    """What ``shutil.disk_usage`` says."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.free = 10_000 * MB
+        self.grows = 0
+        self.asked = threading.Semaphore(0)
+        monkeypatch.setattr(shutil, 'disk_usage', self.usage)
+
+    def usage(self, path: Path) -> Any:
+        self.asked.release()
+        return shutil._ntuple_diskusage(100_000 * MB, 0, self.free)
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
+    return Disk(monkeypatch)
+
+
+class Run:
+    def __init__(self, rig: Rig, queue_blocks: int = 1000) -> None:
+        self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.recorder = Recorder(queue_blocks, self.said.put)
+        self.folder = self.recorder.start(rig, None)
+        self.count = 0
+
+    def put(self, blocks: int) -> None:
+        for _ in range(blocks):
+            for topic, kind, t_ns, fields in to_messages(block(self.count)):
+                self.recorder.put(topic, kind, cdr.encode(kind, fields), t_ns)
+            self.count += 1
+
+    def heard(self) -> str:
+        return self.said.get(timeout=10.0)
+
+    def indices(self) -> list[int]:
+        return [b.index for b in open_recording(self.folder).blocks()]
+
+
+def rig_for(tmp_path: Path, **changes: object) -> Rig:
+    return load_rig(None, {'bag_dir': str(tmp_path / 'bags'), **changes})
+
+
+def test_a_disk_that_is_nearly_full_ends_the_recording_whole(tmp_path: Path, disk: Disk) -> None:
+    run = Run(rig_for(tmp_path, disk_reserve=200 * MB))
+    run.put(module.LOOK_EVERY)
+    assert disk.asked.acquire(timeout=10.0)
+    disk.free = 150 * MB
+    run.put(2 * module.LOOK_EVERY)
+    said = run.heard()
+    assert 'the disk has 150 MB left, less than disk_reserve = 200 MB; it is complete up to here' in said
+    assert said.count('\n') == 0
+    assert run.recorder.folder is None
+    assert run.recorder.failure in said
+    with Reader(run.folder) as reader:
+        assert reader.message_count == run.recorder.written
+    # What comes after is passed over; the next recording starts again where there is room.
+    run.put(1)
+    with pytest.raises(RecordingError, match='150 MB left'):
+        run.recorder.start(rig_for(tmp_path, disk_reserve=200 * MB), None)
+    disk.free = 300 * MB
+    second = run.recorder.start(rig_for(tmp_path, disk_reserve=200 * MB), None)
+    assert second != run.folder
+    assert run.recorder.failure == ''
+    run.recorder.stop()
+
+
+def test_the_oldest_file_is_deleted_where_that_was_asked_for(
+    tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def after_deletion(path: Path, *args: object) -> None:
+        disk.free += 100 * MB
+        unlink(path)
+
+    unlink = Path.unlink
+    monkeypatch.setattr(Path, 'unlink', after_deletion)
+    mine = tmp_path / 'bags' / 'other' / 'other_0.mcap'
+    mine.parent.mkdir(parents=True)
+    mine.write_text('not of this recording')
+    rig = rig_for(tmp_path, disk_reserve=200 * MB, disk_full='delete_oldest', bag_max_duration=1.0)
+    run = Run(rig)
+    run.put(module.LOOK_EVERY - 1)
+    disk.free = 150 * MB
+    run.put(1)
+    assert 'deleted, the disk has 150 MB left' in run.heard()
+    assert run.recorder.stop() == run.folder
+    assert run.recorder.files_deleted == 1
+    assert mine.exists()
+    assert run.indices() == list(range(50, module.LOOK_EVERY))
+    with Reader(run.folder) as reader:
+        assert reader.message_count == module.LOOK_EVERY - 50
+
+
+def test_with_nothing_to_delete_it_ends(tmp_path: Path, disk: Disk) -> None:
+    run = Run(rig_for(tmp_path, disk_reserve=200 * MB, disk_full='delete_oldest'))
+    disk.free = 150 * MB
+    run.put(module.LOOK_EVERY)
+    assert 'no older file of this recording' in run.heard()
+
+
+def test_a_disk_that_refuses_ends_the_recording_and_says_the_way_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Run(rig_for(tmp_path))
+
+    def refuse(fd: int) -> None:
+        raise OSError(errno.EIO, 'Input/output error')
+
+    monkeypatch.setattr(os, 'fsync', refuse)
+    run.put(60)
+    said = run.heard()
+    assert 'Input/output error' in said
+    assert f'psd-deflection recover {run.folder}' in said
+    monkeypatch.undo()
+    assert run.recorder.stop() is None
+
+
+def test_a_slow_disk_holds_up_nothing_and_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on, waiting = threading.Event(), threading.Event()
+    fsync = os.fsync
+
+    def slow(fd: int) -> None:
+        waiting.set()
+        go_on.wait(10.0)
+        fsync(fd)
+
+    run = Run(rig_for(tmp_path), queue_blocks=2)
+    monkeypatch.setattr(os, 'fsync', slow)
+    run.put(1)
+    while not waiting.is_set():
+        # The idle flush writes what is there; then the disk stands still.
+        waiting.wait(10.0)
+    run.put(100)
+    limit = 2 * module.MESSAGES_PER_BLOCK
+    assert run.recorder.dropped == 100 - limit
+    run.recorder.put_change(ParameterChange(0, 7, (('sum_min', 1.0),)))
+    go_on.set()
+    run.recorder.stop()
+    recording = open_recording(run.folder)
+    assert run.indices() == list(range(limit + 1))
+    assert [c.block for c in recording.changes] == [7]
+
+
+def test_what_was_written_survives_without_an_end(tmp_path: Path) -> None:
+    """A chunk ends by itself where nothing more comes."""
+    run = Run(rig_for(tmp_path))
+    run.put(3)
+    file = run.folder / f'{run.folder.name}_0.mcap'
+    watch = threading.Event()
+    found: list[SampleBlock] = []
+    for _ in range(500):
+        (tmp_path / 'left.mcap').write_bytes(file.read_bytes())
+        recording = open_recording(tmp_path / 'left.mcap')
+        if recording.topics():
+            found = list(recording.blocks())
+            break
+        watch.wait(0.02)
+    assert [b.index for b in found] == [0, 1, 2]
+    run.recorder.stop()
+
+
+def test_a_recording_stays_in_its_folder(tmp_path: Path) -> None:
+    run = Run(rig_for(tmp_path))
+    assert run.folder.parent == tmp_path / 'bags'
+    assert run.recorder.start(rig_for(tmp_path), None) == run.folder
+    run.recorder.stop()

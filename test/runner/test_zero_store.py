@@ -1,0 +1,78 @@
+"""The kept zero: what is taken back, and what is passed over with a line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.config import Rig, load_rig, replace_values
+from psd_deflection.runner.zero_store import ZeroStore
+
+ZERO = {'psd_1.zero': [1e-4, -2e-4], 'psd_2.zero': [3e-5, 0.0]}
+
+
+@pytest.fixture
+def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    monkeypatch.setenv('XDG_STATE_HOME', str(tmp_path / 'state'))
+    return load_rig()
+
+
+def test_what_was_kept_comes_back_for_the_same_device_alone(rig: Rig) -> None:
+    assert ZeroStore(rig, 'A-1').save(replace_values(rig, ZERO)) == ''
+    back, said = ZeroStore(rig, 'A-1').load(rig)
+    assert 'zero of the last run' in said
+    assert {name: back.values[name] for name in ZERO} == ZERO
+    assert back.psd_1.zero == (1e-4, -2e-4)
+    assert ZeroStore(rig, 'B-2').load(rig) == (rig, '')
+
+
+def test_a_rig_file_that_says_otherwise_now_holds(rig: Rig) -> None:
+    ZeroStore(rig, 'A').save(replace_values(rig, ZERO))
+    edited = load_rig(overrides={'psd_1.zero': [5e-4, 0.0]})
+    back, said = ZeroStore(edited, 'A').load(edited)
+    assert back is edited
+    assert 'the rig file holds' in said
+
+
+@pytest.mark.parametrize('serial', ['../../evil', '/etc/passwd', '..', '', None, 'a' * 500, 'x\x00y', 7])
+def test_no_serial_number_leads_out_of_the_folder(rig: Rig, tmp_path: Path, serial: object) -> None:
+    store = ZeroStore(rig, serial)
+    assert store.path.parent == tmp_path / 'state' / 'psd_deflection'
+    assert len(store.path.name) < 100
+    assert store.save(rig) == ''
+    assert store.path.resolve().is_relative_to(tmp_path / 'state')
+
+
+@pytest.mark.parametrize(
+    'content',
+    [
+        b'',
+        b'[]',
+        b'{"configured": {}, "psd_1.zero": [9, 9], "psd_2.zero": [0, 0]}',
+        b'{"configured": {}, "psd_1.zero": "x", "psd_2.zero": [0, 0]}',
+        b'{"configured": {}}',
+        b'\xff\xfe',
+        b'[' * 5000,
+        b' ' * 20_000,
+        b'{"configured": {}, "psd_1.zero": [NaN, 0], "psd_2.zero": [0, 0]}',
+    ],
+)
+def test_a_bad_file_never_stops_a_run(rig: Rig, content: bytes) -> None:
+    store = ZeroStore(rig, 'A')
+    store.path.parent.mkdir(parents=True)
+    store.path.write_bytes(content)
+    back, said = store.load(rig)
+    assert back is rig
+    assert str(store.path) in said
+    assert 'the rig file holds' in said
+
+
+def test_a_place_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / 'file').write_text('')
+    rig = load_rig(overrides={'zero_file': str(tmp_path / 'file' / 'zero.json')})
+    assert 'cannot be kept' in ZeroStore(rig, 'A').save(rig)
+    named = load_rig(overrides={'zero_file': str(tmp_path / 'zero.json')})
+    assert ZeroStore(named, 'A').save(named) == ''
+    assert json.loads((tmp_path / 'zero.json').read_text())['serial'] == 'A'

@@ -1,0 +1,181 @@
+"""The catalogue: complete, declared, and each effect off when off, on when on, the same in pieces."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from psd_deflection.config import load_rig, rig_from_values
+from psd_deflection.errors import ConfigError
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation import loads
+from psd_deflection.simulation.catalogue import (
+    ActiveEffect,
+    catalogue,
+    effects_of_rig,
+    effects_to_values,
+    make_active,
+)
+from psd_deflection.simulation.correction import Correction
+from psd_deflection.simulation.effects.clamp_friction import play
+from psd_deflection.simulation.physics import Physics
+from psd_deflection.simulation.probes import off_values, typical, variants
+from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
+
+CONTRACT = {
+    *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
+    *('clamp_friction', 'creep', 'damping', 'tip_mass', 'second_bending_mode', 'self_weight', 'mount_tilt'),
+    *('load_offset', 'load_direction', 'plane_tilt', 'laser_pointing_drift', 'refraction', 'sensor_rotation'),
+    *('sensor_position', 'sensor_gain', 'sensor_nonlinearity', 'axis_crosstalk', 'ambient_light', 'thermal_drift'),
+    *('spot_clipping', 'mains_interference', 'amplifier_saturation', 'amplifier_lag', 'channel_skew', 'quantisation'),
+}
+
+RIG = load_rig()
+HISTORY = loads.steps([(0, 0, 0), (5, -50, -29), (60, 10, 20), (20, -25, 10)], 0.3).loads
+WARM = 20.0 + 5.0 * np.linspace(0, 1, len(HISTORY)) ** 2
+
+EVERY = [
+    pytest.param(typical(effect, Physics.of(RIG), choice, 10.0), id=f'{name}-{[int(v) for v in choice.values()]}')
+    for name, effect in catalogue().items()
+    for choice in variants(effect)
+]
+
+
+def volts_of(effects: list[ActiveEffect]) -> FloatArray:
+    chunk = ForwardModel(RIG, effects).run(HISTORY, WARM)
+    model = ForwardModel(RIG, effects)
+    model.run(HISTORY, WARM)
+    model.finish(chunk)
+    return chunk.volts
+
+
+def test_the_catalogue_is_the_contracts() -> None:
+    assert set(catalogue()) == CONTRACT
+
+
+@pytest.mark.parametrize('active', EVERY)
+def test_on_is_on_and_off_is_off(active: ActiveEffect) -> None:
+    nominal = volts_of([])
+    on = volts_of([active])
+    assert np.all(np.isfinite(on))
+    assert np.abs(on - nominal).max() > 1e-5
+    choice = {p.name: active.values[p.name] for p in active.effect.parameters if p.kind == 'choice'}
+    off = volts_of([ActiveEffect(active.effect, off_values(active.effect, Physics.of(RIG), choice))])
+    np.testing.assert_allclose(off, nominal, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize('active', EVERY)
+def test_in_pieces_bit_for_bit(active: ActiveEffect) -> None:
+    rig = rig_from_values(
+        {f'effects.{k}.{n}': v for k, body in effects_to_values([active]).items() for n, v in body.items()}
+    )
+    whole = RigSimulator(rig, 5).step(HISTORY, WARM)
+    pieces = RigSimulator(rig, 5)
+    cuts = [0, 1, 2, 3, 10, 299, 301, 640, len(HISTORY)]
+    got = [pieces.step(HISTORY[a:b], WARM[a:b]).counts for a, b in itertools.pairwise(cuts)]
+    assert np.array_equal(np.concatenate(got), whole.counts)
+
+
+@pytest.mark.parametrize('active', EVERY)
+def test_a_rig_file_carries_it_there_and_back(active: ActiveEffect, tmp_path: Path) -> None:
+    path = tmp_path / 'model.yaml'
+    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': {'effects': effects_to_values([active])}}}))
+    (back,) = effects_of_rig(load_rig(path))
+    assert back.effect is active.effect
+    for key, value in active.values.items():
+        assert back.values[key] == value or (math.isnan(value) and math.isnan(back.values[key]))
+
+
+@pytest.mark.parametrize(
+    ('values', 'said'),
+    [
+        ({'effects.a': 3}, 'effects.a = 3'),
+        ({'effects.a.name': 'sensor_rotatoin', 'effects.a.psd': 1}, 'did you mean sensor_rotation'),
+        ({'effects.a.name': 'sensor_rotation'}, 'psd is missing'),
+        ({'effects.a.name': 'sensor_rotation', 'effects.a.psd': 3}, 'one of 1, 2'),
+        ({'effects.a.name': 'sensor_rotation', 'effects.a.psd': 1, 'effects.a.angle': 'big'}, 'must be a number'),
+        ({'effects.a.name': 'sensor_rotation', 'effects.a.psd': 1, 'effects.a.angle': math.inf}, 'finite'),
+        ({'effects.a.name': 'sensor_rotation', 'effects.a.psd': 1, 'effects.a.angle': 4.0}, 'at most 3.2'),
+        ({'effects.a.name': 'sensor_rotation', 'effects.a.psd': 1, 'effects.a.turn': 4.0}, 'turn'),
+    ],
+)
+def test_a_bad_effect_is_refused_by_name(values: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        effects_of_rig(rig_from_values(values))
+    assert said in str(error.value)
+
+
+def test_play_is_the_sequential_operator() -> None:
+    x = np.cumsum(np.random.default_rng(0).normal(size=500)).repeat(2)
+    y, want = 0.3, []
+    for v in x:
+        y = min(max(y, v - 0.8), v + 0.8)
+        want.append(y)
+    np.testing.assert_array_equal(play(x, 0.8, 0.3), want)
+
+
+CORRECTABLE = [
+    ('sensor_rotation', {'psd': 2, 'angle': 0.02}),
+    ('sensor_gain', {'psd': 1, 'x': 0.02, 'y': -0.01}),
+    ('axis_crosstalk', {'psd': 1, 'xy': 0.01, 'yx': -0.02}),
+    ('sensor_nonlinearity', {'psd': 2, 'k': 2000.0}),
+    ('sensor_position', {'psd': 1, 'x': 1e-3, 'y': -2e-3}),
+    ('sensor_position', {'psd': 2, 'x': 1e-3, 'y': -2e-3, 'aimed': 0}),
+    ('thermal_drift', {'psd': 2, 'x': 2e-6, 'y': 1e-6}),
+    ('refraction', {'x': 2e-6, 'y': 1e-6}),
+    ('laser_pointing_drift', {'psd': 1, 'rate_x': 1e-5, 'rate_y': 2e-5}),
+    ('ambient_light', {'psd': 2, 'level': 0.2, 'x': 2e-3, 'y': -1e-3}),
+    ('plane_tilt', {'slope_ratio': 1.5}),
+]
+
+
+@pytest.mark.parametrize(('name', 'values'), CORRECTABLE)
+def test_the_correction_gives_back_what_the_nominal_rig_shows(name: str, values: dict[str, object]) -> None:
+    rig = rig_from_values({'effects.a.name': name, **{f'effects.a.{k}': v for k, v in values.items()}})
+    seen = ForwardModel(rig).run(HISTORY, WARM)
+    nominal = ForwardModel(RIG).run(HISTORY, WARM)
+    correction = Correction.from_rig(rig)
+    assert correction.active
+    before = np.abs(seen.dots - nominal.dots).max()
+    after = np.abs(correction.apply(seen.dots.T, seen.sums.T, seen.warmer, seen.t).T - nominal.dots).max()
+    assert after < 1e-3 * before
+
+
+def test_all_corrections_together() -> None:
+    values: dict[str, object] = {}
+    for i, (name, parameters) in enumerate(CORRECTABLE):
+        if name == 'sensor_position' and parameters.get('aimed') == 0:
+            continue
+        values[f'effects.e{i}.name'] = name
+        values.update({f'effects.e{i}.{k}': v for k, v in parameters.items()})
+    rig = rig_from_values(values)
+    seen, nominal = ForwardModel(rig).run(HISTORY, WARM), ForwardModel(RIG).run(HISTORY, WARM)
+    after = Correction.from_rig(rig).apply(seen.dots.T, seen.sums.T, seen.warmer, seen.t).T
+    assert np.abs(after - nominal.dots).max() < 1e-7
+    assert np.abs(seen.dots - nominal.dots).max() > 1e-5
+
+
+def test_a_rig_without_effects_corrects_nothing() -> None:
+    assert not Correction.from_rig(RIG).active
+
+
+def test_effect_parameters_are_declared_soundly() -> None:
+    for effect in catalogue().values():
+        names = [p.name for p in effect.parameters]
+        assert len(set(names)) == len(names)
+        assert effect.summary
+        assert effect.equation
+        assert effect.source
+        assert effect.needs
+        for p in effect.parameters:
+            assert p.minimum <= p.maximum
+            assert p.scale > 0
+            assert p.description
+            if p.kind == 'choice':
+                assert p.choices
+    assert make_active('creep', {'amplitude': 0.1}, 'test').values['time_constant'] == 5.0
