@@ -167,6 +167,52 @@ PARAMETERS: tuple[Parameter, ...] = (
         maximum=100.0,
         live=True,
     ),
+    Parameter(
+        'sum_max',
+        'double',
+        7.5,
+        'V',
+        'a sum signal above this means that other light falls on the detector',
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    ),
+    Parameter(
+        'splitter',
+        'bool',
+        False,
+        '',
+        'both detectors share two lasers over a beam splitter (thesis 5.4): one lost halves both sums',
+    ),
+    Parameter(
+        'degraded',
+        'string',
+        'off',
+        '',
+        'with one detector lost: off (no estimate), hold (translation with the last twist), zero (with no twist)',
+        choices=('off', 'hold', 'zero'),
+        live=True,
+    ),
+    Parameter(
+        'twist_sd',
+        'double',
+        0.01,
+        'rad',
+        'standard deviation of the twist where it is not measured (degraded)',
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    ),
+    Parameter(
+        'twist_hold',
+        'double',
+        0.1,
+        's',
+        'time in which a held twist is forgotten: its variance grows to twist_sd^2 (degraded: hold)',
+        above=0.0,
+        maximum=1e6,
+        live=True,
+    ),
     Parameter('solver', 'string', 'exact', '', 'the solver whose answer is /link_tip/deflection'),
     Parameter(
         'solvers',
@@ -394,6 +440,11 @@ class EstimatorConfig:
     block_size: int
     min_samples: int
     sum_min: float
+    sum_max: float
+    splitter: bool
+    degraded: str
+    twist_sd: float
+    twist_hold: float
     solver: str
     solvers: tuple[str, ...]
     wls_weights: str
@@ -581,6 +632,11 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             block_size=v['block_size'],
             min_samples=v['min_samples'],
             sum_min=v['sum_min'],
+            sum_max=v['sum_max'],
+            splitter=v['splitter'],
+            degraded=v['degraded'],
+            twist_sd=v['twist_sd'],
+            twist_hold=v['twist_hold'],
             solver=v['solver'],
             solvers=tuple(v['solvers']),
             wls_weights=v['wls.weights'],

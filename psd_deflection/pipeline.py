@@ -4,23 +4,28 @@ It owns no clock, thread or I/O, so that what it gives depends on the rig, the s
 of calls alone, and ``replay`` can show that bit for bit. Counts -> volts -> blocks -> dots in
 metres -> what the rig file knows to be wrong taken off -> health -> solvers -> estimates and the
 load that the link model needs for them.
+
+What it remembers from block to block (the twist that ``degraded: hold`` holds, how long a detector
+has stood still) is told as a record when a recording starts (:meth:`Pipeline.memory`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from math import expm1
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.averaging import BlockCutter, block_middle_ns, covariance
 from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_variances
+from psd_deflection.calibration.health import OpticsHealth, Verdict
 from psd_deflection.config import Rig, replace_values
 from psd_deflection.mechanics import LinkStatics
 from psd_deflection.records import (
     ENVIRONMENT,
-    FLAG_OVER_RANGE,
     BlockStatus,
     DeflectionEstimate,
     FloatArray,
@@ -34,23 +39,41 @@ from psd_deflection.records import (
 from psd_deflection.simulation.correction import Correction
 from psd_deflection.solvers import solver_from_rig
 from psd_deflection.solvers._interface import SolverStatus
+from psd_deflection.solvers._rig import geometry_from_rig
+from psd_deflection.solvers.one_psd import NAME as ONE_PSD
+from psd_deflection.solvers.one_psd import OnePsd
 
 ZERO_BLOCKS = 25
 """Blocks whose mean is taken as the unloaded dots by :meth:`Pipeline.zero`: half a second."""
 
 START, FIRST_TEMPERATURE, TEMPERATURE = ENVIRONMENT
+HELD, FROZEN = 'state.held_twist', 'state.frozen_blocks'
+"""Names under which :meth:`Pipeline.memory` tells what is remembered."""
 
 Dots = tuple[float, float, float, float]
 
 
 @dataclass(slots=True)
 class PipelineCounters:
-    """What went through: samples, blocks, estimates of the primary solver, and blocks without one."""
+    """What went through: samples, blocks, estimates, and blocks without one.
+
+    ``degraded``: estimates of one detector alone, among ``estimates``. ``findings``: blocks with each.
+    """
 
     samples: int = 0
     blocks: int = 0
     estimates: int = 0
+    degraded: int = 0
     refused: dict[str, int] = field(default_factory=dict)
+    findings: dict[str, int] = field(default_factory=dict)
+
+
+class _Held(NamedTuple):
+    """The last twist that was measured: ns, rad, rad^2."""
+
+    t_ns: int
+    theta: float
+    variance: float
 
 
 class Pipeline:
@@ -70,9 +93,8 @@ class Pipeline:
         self._statics = LinkStatics.from_rig(rig)
         self._recent: list[Dots] = []
         self._environment: dict[str, float] = {}
-        # The converter's last step on either side: beyond it the true value is not known.
-        self._rail = np.float32((2 ** (rig.converter.bits - 1) - 1) * rig.converter.volts_per_count)
-        self._half = tuple(half / 2.0 for psd in rig.psds for half in psd.active_area)
+        self._held: _Held | None = None
+        self._frozen = (0, 0)
         variances = dot_noise_variances(rig)
         self._variances = [tuple(float(v) / n for v in variances) for n in range(1, config.block_size + 1)]
         self._build(rig)
@@ -81,8 +103,9 @@ class Pipeline:
         self.rig = rig
         self._calibration = Calibration.from_rig(rig)
         self._correction = Correction.from_rig(rig)
+        self._optics = OpticsHealth(rig)
+        self._one_psd = OnePsd(geometry_from_rig(rig))
         config = rig.estimator
-        self._sum_min = config.sum_min
         names = [config.solver, *(name for name in config.solvers if name != config.solver)]
         self._solvers = [(name, solver_from_rig(name, rig), name == config.solver) for name in names]
 
@@ -147,8 +170,25 @@ class Pipeline:
             value = values.pop(name, None)
             if isinstance(value, (int, float)):
                 self._environment[name] = float(value)
+        held, frozen = values.pop(HELD, None), values.pop(FROZEN, None)
+        if isinstance(held, list) and len(held) == 3:
+            self._held = _Held(int(held[0]), held[1], held[2])
+        if isinstance(frozen, list) and len(frozen) == 2:
+            self._frozen = (int(frozen[0]), int(frozen[1]))
         if values:
             self._build(replace_values(self.rig, values, 'change'))
+
+    def memory(self) -> ParameterChange | None:
+        """What the next block depends on beside its samples and the rig, or None where that is nothing."""
+        values: list[tuple[str, float | str | tuple[float, ...]]] = list(self._environment.items())
+        if self._held is not None and self.rig.estimator.degraded == 'hold':
+            values.append((HELD, tuple(self._held)))
+        if self._frozen != (0, 0):
+            values.append((FROZEN, self._frozen))
+        last = self.last_spots
+        if not values or last is None:
+            return None
+        return ParameterChange(last.t_ns, last.index + 1, tuple(values))
 
     def temperature(self, celsius: float) -> ParameterChange | None:
         """The ambient temperature from the next block on; None where no correction needs it."""
@@ -157,13 +197,6 @@ class Pipeline:
         index = self.last_spots.index + 1 if self.last_spots is not None else 0
         first = self._environment.get(FIRST_TEMPERATURE, celsius)
         return self._environment_change(index, {FIRST_TEMPERATURE: first, TEMPERATURE: celsius})
-
-    def environment(self) -> ParameterChange | None:
-        """What the estimates depend on now besides the rig: the start of a recording holds it."""
-        if not self._environment:
-            return None
-        index = self.last_spots.index + 1 if self.last_spots is not None else 0
-        return self._environment_change(index, {})
 
     def _environment_change(self, block: int, values: Mapping[str, float]) -> ParameterChange:
         self._environment.update(values)
@@ -188,18 +221,31 @@ class Pipeline:
             samples = self._corrected(block, samples, sums)
         x1, y1, x2, y2 = (samples.sum(axis=0) / present).tolist()
         dots: Dots = (x1, y1, x2, y2)
-        status, reason = self._health(block, dots, sums)
+        still = self._optics.still(volts)
+        self._frozen = (self._frozen[0] + 1 if still[0] else 0, self._frozen[1] + 1 if still[1] else 0)
+        verdict = self._optics.judge(block, dots, sums, self._frozen)
+        status, reason = verdict.status, verdict.reason
         t_ns = block_middle_ns(block, size, self._period_ns)
-        variances = self._variances[present - 1]
+        variances = self._variances_of(verdict, sums, present)
         best: DeflectionEstimate | None = None
+        degraded = False
         if status is BlockStatus.OK:
             best, failure = self._solve(0, t_ns, block.index, dots, variances)
             if best is None:
                 status, reason = BlockStatus.NOT_SOLVED, failure
+            else:
+                self._held = _Held(t_ns, best.theta, best.covariance[8])
+        elif verdict.faulty:
+            best = self._from_the_other(verdict.faulty, t_ns, block.index, dots, variances)
+            degraded = best is not None
+        for finding in verdict.findings:
+            self.counters.findings[finding.split(':')[0]] = self.counters.findings.get(finding.split(':')[0], 0) + 1
         self.last_estimate = best
         if best is not None:
             self.counters.estimates += 1
+            self.counters.degraded += degraded
             yield best
+        if best is not None and not degraded:
             fx, fy, tz = self._statics.tip_load(best.dx, best.dy, best.theta)
             yield TipLoad(t_ns, fx, fy, tz)
             self._recent = [*self._recent[1 - ZERO_BLOCKS :], dots]
@@ -210,11 +256,21 @@ class Pipeline:
         else:
             # A mean taken across an outage must not become a zero.
             self._recent = []
+        if best is None:
             name = status.name.lower()
             self.counters.refused[name] = self.counters.refused.get(name, 0) + 1
         sum1, sum2 = (sums.sum(axis=0) / present).tolist()
         spots = SpotMeans(
-            t_ns, block.index, dots, (sum1, sum2), covariance(samples), present, size - present, status, reason
+            t_ns,
+            block.index,
+            dots,
+            (sum1, sum2),
+            covariance(samples),
+            present,
+            size - present,
+            status,
+            reason,
+            verdict.findings,
         )
         self.last_spots = spots
         yield spots
@@ -234,26 +290,33 @@ class Pipeline:
             '',
         )
 
-    def _health(self, block: SampleBlock, dots: Dots, sums: npt.NDArray[np.float64]) -> tuple[BlockStatus, str]:
-        """Why this block can have no estimate, the cause before its consequences."""
-        present = len(block.seq)
-        low = sums.min(axis=0).tolist()
-        for number, least in enumerate(low, start=1):
-            if least < self._sum_min:
-                return BlockStatus.LASER_LOST, f'laser {number} lost: sum {least:.3f} V, below {self._sum_min:g} V'
-        volts = block.volts
-        if float(np.abs(volts).max()) >= self._rail:
-            column = int(np.abs(volts).max(axis=0).argmax())
-            name = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')[column]
-            return BlockStatus.SATURATED, f'{name} saturated: {float(np.abs(volts[:, column]).max()):.3f} V'
-        if bool((block.flags & FLAG_OVER_RANGE).any()):
-            return BlockStatus.SATURATED, 'the device reports a channel over range'
-        if present < self.rig.estimator.min_samples:
-            return (
-                BlockStatus.TOO_FEW_SAMPLES,
-                f'{present} of {self._cutter.block_size} samples, at least {self.rig.estimator.min_samples} are needed',
-            )
-        for name, dot, half in zip(('x1', 'y1', 'x2', 'y2'), dots, self._half, strict=True):
-            if abs(dot) > half:
-                return BlockStatus.OUTSIDE_ACTIVE_AREA, f'{name} at {dot * 1e3:.3f} mm, outside the active area'
-        return BlockStatus.OK, ''
+    def _variances_of(self, verdict: Verdict, sums: FloatArray, present: int) -> tuple[float, ...]:
+        """Of the dots' means: of the noise, and of what light that is missing or not ours adds."""
+        variances = self._variances[present - 1]
+        if not verdict.findings:
+            return variances
+        first, second = self._optics.background_variance(sums)
+        # The divider's noise goes with the inverse of the light.
+        more = 4.0 if verdict.half_light else 1.0
+        return tuple(more * v + b for v, b in zip(variances, (first, first, second, second), strict=True))
+
+    def _from_the_other(
+        self, faulty: int, t_ns: int, block: int, dots: Dots, variances: tuple[float, ...]
+    ) -> DeflectionEstimate | None:
+        """The translation from the detector that is left, by the rule that ``degraded`` names."""
+        config = self.rig.estimator
+        theta, variance = 0.0, config.twist_sd**2
+        if config.degraded == 'off':
+            return None
+        if config.degraded == 'hold':
+            held = self._held
+            if held is None:
+                return None
+            age = max(t_ns - held.t_ns, 0) / 1e9
+            theta = held.theta
+            variance = held.variance + config.twist_sd**2 * -expm1(-age / config.twist_hold)
+        psd = 2 - faulty
+        x, y = dots[2 * psd], dots[2 * psd + 1]
+        vx, vy = variances[2 * psd], variances[2 * psd + 1]
+        dx, dy, cov = self._one_psd.solve(psd, (x, y), (vx, vy), theta, variance)
+        return DeflectionEstimate(t_ns, block, ONE_PSD, dx, dy, theta, 0.0, 0.0, cov, 0.0, True)

@@ -36,6 +36,7 @@ class BlockStatus(IntEnum):
     SATURATED = 3
     OUTSIDE_ACTIVE_AREA = 4
     NOT_SOLVED = 5
+    FROZEN = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +79,7 @@ class SpotMeans:
     ``t_ns``: middle of the block. ``dots``: (x1, y1, x2, y2), m, from each PSD's centre.
     ``sums``: (sum1, sum2), V. ``covariance`` (4, 4): sample covariance of the dots, m^2 (zeros
     where fewer than two samples are present). ``present`` + ``lost`` = block size. ``reason`` is
-    empty when ``status`` is OK.
+    empty when ``status`` is OK. ``findings``: what is worth telling and stops no estimate.
     """
 
     t_ns: int
@@ -90,6 +91,7 @@ class SpotMeans:
     lost: int
     status: BlockStatus
     reason: str
+    findings: tuple[str, ...] = ()
 
 
 class DeflectionEstimate(NamedTuple):

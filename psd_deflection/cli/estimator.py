@@ -171,8 +171,8 @@ def run_without_ros(overrides: dict[str, object], display: Display, watch: Calla
     watchdog = Watchdog()
     monitor = None
     try:
-        monitor = start_monitor(session, display.say)
         settle()
+        monitor = start_monitor(session, display.say)
         session.start()
         watchdog.ready()
         while not stop.wait(0.1) and session.processing.alive:

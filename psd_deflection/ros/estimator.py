@@ -36,6 +36,10 @@ from psd_deflection.ros.wires import InputRecorder, PublisherWire
 from psd_deflection.runner.health import STALE, HealthReporter
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import Session
+from psd_deflection.solvers.one_psd import NAME as ONE_PSD
+
+if TYPE_CHECKING:
+    from psd_deflection.monitor.server import MonitorServer
 
 if TYPE_CHECKING:
     from psd_deflection.monitor.server import MonitorServer
@@ -139,7 +143,8 @@ class EstimatorNode:
 
     def _wires(self) -> tuple[PublisherWire, InputRecorder]:
         outputs = {topic: kind for topic, kind in TOPIC_TYPES.items() if topic not in INPUTS}
-        outputs.update({solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in self.rig.estimator.solvers})
+        solvers = (*self.rig.estimator.solvers, ONE_PSD)
+        outputs.update({solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in solvers})
         try:
             return PublisherWire(self.node, outputs), InputRecorder(self.node)
         except (InvalidQosOverridesError, ValueError) as error:
@@ -195,8 +200,8 @@ class EstimatorNode:
             self._health = HealthReporter(session)
             session.fanout.wires.insert(0, self._wire)
             self._inputs.session = session
-            self._monitor = start_monitor(session, self._say)
             session.start()
+            self._monitor = start_monitor(session, self._say)
             if self._markers is not None:
                 self._markers.session = session
         except BaseException:

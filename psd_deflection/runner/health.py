@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from psd_deflection.records import BlockStatus, DiagnosticEntry, DiagnosticReport
+from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.runner.session import Session
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
@@ -21,6 +21,7 @@ class _Seen(NamedTuple):
     dropped: int
     blocks: int
     estimates: int
+    degraded: int
 
 
 class HealthReporter:
@@ -35,7 +36,9 @@ class HealthReporter:
         s = self._session
         wire, pipeline = s.acquisition.counters, s.pipeline.counters
         dropped = wire.queue_dropped + s.recorder.dropped
-        now = _Seen(t_ns, wire.samples, wire.lost, wire.bad, dropped, pipeline.blocks, pipeline.estimates)
+        now = _Seen(
+            t_ns, wire.samples, wire.lost, wire.bad, dropped, pipeline.blocks, pipeline.estimates, pipeline.degraded
+        )
         # The first report counts from the start; its rates are those of an unknown time.
         before = self._seen
         self._seen = now
@@ -118,10 +121,20 @@ class HealthReporter:
             level, message = ERROR, spots.reason if spots is not None and spots.reason else 'no blocks'
         elif new.estimates < new.blocks:
             level, message = WARN, f'{new.blocks - new.estimates} of {new.blocks} blocks have no estimate'
+        elif new.degraded and spots is not None:
+            rule = self._session.rig.estimator.degraded
+            twist = 'held' if rule == 'hold' else 'assumed 0'
+            level = WARN
+            message = (
+                f'degraded: {new.degraded} of {new.blocks} blocks from one detector, twist {twist}; {spots.reason}'
+            )
         values = [
             ('rate (estimates/s)', rate),
             ('blocks', str(pipeline.blocks)),
             ('estimates', str(pipeline.estimates)),
+            ('degraded', str(pipeline.degraded)),
+            ('status', spots.status.name if spots is not None else 'none yet'),
+            *((f'found: {finding}', str(count)) for finding, count in sorted(pipeline.findings.items())),
             *((f'refused: {cause}', str(count)) for cause, count in sorted(pipeline.refused.items())),
         ]
         if latency is not None:
@@ -136,10 +149,15 @@ class HealthReporter:
             return DiagnosticEntry(name, STALE, 'no block yet', ())
         total = spots.sums[psd - 1]
         x, y = spots.dots[2 * psd - 2], spots.dots[2 * psd - 1]
-        lost = total < self._session.rig.estimator.sum_min
-        mine = lost or (
-            spots.status in (BlockStatus.SATURATED, BlockStatus.OUTSIDE_ACTIVE_AREA) and f'{psd} ' in spots.reason
-        )
+        # Reasons and findings name the detector they are about.
+        names = (f'laser {psd} ', f'x{psd} ', f'y{psd} ', f'sum{psd} ', f'psd_{psd} ')
+        fault = spots.reason if spots.reason.startswith(names) else ''
+        found = [f for f in spots.findings if f.startswith((f'psd_{psd}', 'one of the two lasers'))]
+        level, message = OK, 'dot seen'
+        if found:
+            level, message = WARN, '; '.join(found)
+        if fault or total < self._session.rig.estimator.sum_min * 0.5:
+            level, message = ERROR, fault or 'laser lost'
         values = (
             ('sum (V)', f'{total:.4f}'),
             ('x (mm)', f'{x * 1e3:.4f}'),
@@ -147,9 +165,7 @@ class HealthReporter:
             ('x, std in the block (um)', f'{spots.covariance[2 * psd - 2, 2 * psd - 2] ** 0.5 * 1e6:.2f}'),
             ('y, std in the block (um)', f'{spots.covariance[2 * psd - 1, 2 * psd - 1] ** 0.5 * 1e6:.2f}'),
         )
-        return DiagnosticEntry(
-            name, ERROR if mine else OK, (spots.reason or 'laser lost') if mine else 'dot seen', values
-        )
+        return DiagnosticEntry(name, level, message, values)
 
     def _recording(self) -> DiagnosticEntry:
         recorder = self._session.recorder

@@ -49,26 +49,25 @@ class Spokesman:
         self._interval = interval_s
         self._last_line = -interval_s
         self._now = ''
-        self._why = ''
+        self._text = ''
         self._blocks = 0
         self._changes = 0
 
-    def block(self, cause: str, reason: str, now: float) -> None:
-        """One block: ``cause`` '' where it has an estimate; ``reason`` in words; ``now`` monotonic, s."""
+    def block(self, cause: str, text: str, now: float) -> None:
+        """One block: ``cause`` '' where all is well; ``text`` what to say; ``now`` monotonic, s."""
         if cause != self._now:
             self._changes += 1
-            self._now, self._why = cause, reason
+            self._now, self._text = cause, text
         self._blocks += bool(cause)
         if not self._changes or now - self._last_line < self._interval:
             return
-        # A change and back within the second is news as well.
-        text = f'no estimate: {self._why}' if cause else 'estimates are back'
+        line = self._text if cause else 'estimates are back'
         if self._changes > 1 or (not cause and self._blocks):
             noun = 'block' if self._blocks == 1 else 'blocks'
-            text += f' ({self._blocks} {noun} without one since the last line)'
+            line += f' ({self._blocks} {noun} affected since the last line)'
         self._last_line = now
         self._blocks = self._changes = 0
-        self._say(text)
+        self._say(line)
 
 
 class Processing:
@@ -173,9 +172,15 @@ class Processing:
 
     def _tell_refusals(self) -> None:
         spots = self.pipeline.last_spots
-        if spots is not None:
-            cause = spots.status.name if spots.reason else ''
-            self._spokesman.block(cause, spots.reason, time.monotonic())
+        if spots is None:
+            return
+        estimate = self.pipeline.last_estimate
+        cause = spots.status.name if spots.reason else ''
+        text = f'no estimate: {spots.reason}'
+        if cause and estimate is not None:
+            cause += ' degraded'
+            text = f'degraded, translation from one detector alone: {spots.reason}'
+        self._spokesman.block(cause, text, time.monotonic())
 
 
 __all__ = ['Ended', 'Latency', 'Processing']

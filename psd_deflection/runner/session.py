@@ -131,10 +131,12 @@ class Session:
         def change() -> Path | None:
             if not wanted:
                 return self.recorder.stop()
+            running = self.recorder.folder
             folder = self.recorder.start(self.rig, hello)
-            held = self.pipeline.environment()
-            if held is not None:
-                self.recorder.put_change(held)
+            # What the next block depends on besides itself: without it no replay would be the same.
+            memory = self.pipeline.memory()
+            if memory is not None and folder != running:
+                self.recorder.put_change(memory)
             return folder
 
         return self.processing.request(change)

@@ -85,15 +85,15 @@ def test_lines_about_estimates_come_once_a_second_with_counts() -> None:
     # Fifty blocks a second, every other one without an estimate, for ten seconds.
     for i in range(500):
         lost = i % 2 == 1
-        spokesman.block('LASER_LOST' if lost else '', 'laser 1 lost' if lost else '', 10.0 + 0.02 * i)
+        spokesman.block('LASER_LOST' if lost else '', 'no estimate: laser 1 lost' if lost else '', 10.0 + 0.02 * i)
     assert 9 <= len(said) <= 11
     assert said[0] == 'no estimate: laser 1 lost'
-    assert '25 blocks without one' in said[1] or '26 blocks without one' in said[1]
+    assert '25 blocks affected' in said[1] or '26 blocks affected' in said[1]
     # And nothing while nothing changes.
     before = len(said)
     for i in range(500):
         spokesman.block('', '', 30.0 + 0.02 * i)
     assert len(said) <= before + 1
-    spokesman.block('SATURATED', 'x1 saturated', 50.0)
+    spokesman.block('SATURATED', 'no estimate: x1 saturated', 50.0)
     spokesman.block('', '', 52.0)
     assert said[-2:] == ['no estimate: x1 saturated', 'estimates are back']

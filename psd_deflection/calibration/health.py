@@ -1,0 +1,163 @@
+"""What a block's samples say about lasers and detectors, before anyone computes with them.
+
+A fault is a reason not to believe one detector (``faulty``); a finding is news that does not stop
+the estimate (``findings``). Everything comes from the block's own samples and the rig, but for one
+count: how many blocks in a row a detector has stood still, which the pipeline keeps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from psd_deflection.config import Rig
+from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, FloatArray, SampleBlock
+
+FROZEN_BLOCKS = 5
+"""Blocks in a row without the last bit of x, y or sum moving: noise does not do that."""
+
+NOISY = 5.0
+"""Times the noise of the rig file."""
+
+HALF_LIGHT = (0.35, 0.65)
+"""Share of ``sum_nominal`` on both detectors when one of the splitter's two lasers is out."""
+
+_NAMES = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
+_THIRD_DIFFERENCE = 20.0
+"""Variance of the third difference of white noise of variance 1: 1 + 9 + 9 + 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """``faulty``: the one detector (1 or 2) that is to blame, 0 where it is neither alone.
+
+    ``half_light``: the splitter works with one of its two lasers.
+    """
+
+    status: BlockStatus
+    reason: str
+    faulty: int
+    findings: tuple[str, ...] = ()
+    half_light: bool = False
+
+
+class OpticsHealth:
+    """Judges blocks by the rig's limits."""
+
+    def __init__(self, rig: Rig) -> None:
+        config = rig.estimator
+        self._size = config.block_size
+        self._min_samples = config.min_samples
+        self._splitter = config.splitter
+        self._nominal = rig.amplifier.sum_nominal
+        # Half the light is no lost laser where two lasers share both detectors.
+        self._sum_min = config.sum_min * (0.5 if self._splitter else 1.0)
+        self._sum_max = config.sum_max
+        step = rig.converter.volts_per_count
+        # The converter's last step on either side: beyond it the true value is not known.
+        self._rail = np.float32((2 ** (rig.converter.bits - 1) - 1) * step)
+        self._half = tuple(half / 2.0 for psd in rig.psds for half in psd.active_area)
+        self._radius = tuple(psd.spot_radius for psd in rig.psds for _ in range(2))
+        # Where the noise is below a step, standing still is what a good detector does.
+        self._moves = rig.amplifier.noise > step
+        self._noise = NOISY * (rig.amplifier.noise**2 + step**2 / 12.0) ** 0.5
+
+    def still(self, volts: npt.NDArray[np.float32]) -> tuple[bool, bool]:
+        """Whether x, y and sum of PSD 1, of PSD 2 are the same to the last bit throughout."""
+        if not self._moves or len(volts) < max(self._min_samples, 2):
+            return (False, False)
+        same = (volts == volts[0]).all(axis=0)
+        return (bool(same[:3].all()), bool(same[3:].all()))
+
+    def judge(self, block: SampleBlock, dots: tuple[float, ...], sums: FloatArray, frozen: tuple[int, int]) -> Verdict:
+        """The block's verdict, the cause before its consequences. ``frozen``: blocks in a row that each stood still."""
+        faults: dict[int, tuple[BlockStatus, str]] = {}
+
+        def fault(psd: int, status: BlockStatus, reason: str) -> None:
+            faults.setdefault(psd, (status, reason))
+
+        volts = block.volts
+        present = len(block.seq)
+        low = sums.min(axis=0).tolist()
+        for psd, least in enumerate(low, start=1):
+            if least < self._sum_min:
+                fault(psd, BlockStatus.LASER_LOST, f'laser {psd} lost: sum {least:.3f} V, below {self._sum_min:g} V')
+        extremes = np.abs(volts).max(axis=0)
+        if float(extremes.max()) >= self._rail:
+            for column, name in enumerate(_NAMES):
+                if extremes[column] >= self._rail:
+                    reason = f'{name} saturated: {float(extremes[column]):.3f} V'
+                    fault(1 + column // 3, BlockStatus.SATURATED, reason)
+        elif bool((block.flags & FLAG_OVER_RANGE).any()) and not faults:
+            return Verdict(BlockStatus.SATURATED, 'the device reports a channel over range', 0)
+        for psd, blocks in enumerate(frozen, start=1):
+            if blocks >= FROZEN_BLOCKS:
+                fault(psd, BlockStatus.FROZEN, f'psd_{psd} stands still: no bit has moved for {blocks} blocks')
+        if present < self._min_samples and not faults:
+            reason = f'{present} of {self._size} samples, at least {self._min_samples} are needed'
+            return Verdict(BlockStatus.TOO_FEW_SAMPLES, reason, 0)
+        for column, (name, dot, half) in enumerate(zip(('x1', 'y1', 'x2', 'y2'), dots, self._half, strict=True)):
+            if abs(dot) > half:
+                reason = f'{name} at {dot * 1e3:.3f} mm, outside the active area'
+                fault(1 + column // 2, BlockStatus.OUTSIDE_ACTIVE_AREA, reason)
+        half_light = self._half_light(low) if self._splitter else False
+        findings = self._findings(block, dots, sums, set(faults), half_light)
+        if not faults:
+            return Verdict(BlockStatus.OK, '', 0, findings, half_light)
+        # The worst cause first: what is lost explains what is saturated or outside.
+        psd = min(faults, key=lambda p: (_ORDER.index(faults[p][0]), p))
+        status, reason = faults[psd]
+        lone = len(faults) == 1 and present >= self._min_samples
+        return Verdict(status, reason, psd if lone else 0, findings, half_light)
+
+    def _half_light(self, low: list[float]) -> bool:
+        return all(HALF_LIGHT[0] * self._nominal < s < HALF_LIGHT[1] * self._nominal for s in low)
+
+    def _findings(
+        self, block: SampleBlock, dots: tuple[float, ...], sums: FloatArray, faulty: set[int], half_light: bool
+    ) -> tuple[str, ...]:
+        out = []
+        if half_light:
+            out.append('one of the two lasers is out: half the light on both detectors')
+        high = sums.max(axis=0)
+        for psd in (1, 2):
+            if psd in faulty:
+                continue
+            if high[psd - 1] > self._sum_max:
+                out.append(f'psd_{psd} sees other light: sum {high[psd - 1]:.3f} V, above {self._sum_max:g} V')
+            for column in (2 * psd - 2, 2 * psd - 1):
+                if abs(dots[column]) + self._radius[column] > self._half[column]:
+                    out.append(f'psd_{psd}: the spot is clipped at the edge')
+                    break
+        if len(block.seq) == self._size >= 10:
+            # Third differences: the link's own motion leaves next to nothing in them.
+            rough = np.diff(block.volts, n=3, axis=0)
+            level = np.sqrt(np.einsum('ij,ij->j', rough, rough) / (len(rough) * _THIRD_DIFFERENCE))
+            for psd in (1, 2):
+                worst = float(level[3 * psd - 3 : 3 * psd].max())
+                if psd not in faulty and worst > self._noise:
+                    out.append(f'psd_{psd} is noisy: {worst * 1e3:.1f} mV a sample')
+        return tuple(out)
+
+    def background_variance(self, sums: FloatArray) -> tuple[float, float]:
+        """Variance (m^2) that other light may have added to a dot of each PSD, 0 where there is none.
+
+        A background of share b pulls a reading by b (x_b - x); where its centre x_b is, nobody knows:
+        evenly spread over the active area it has a variance of (b L/2)^2 / 3.
+        """
+        out = []
+        for psd in (0, 1):
+            total = float(sums[:, psd].mean())
+            share = max(total - self._nominal, 0.0) / total if total > self._sum_max else 0.0
+            out.append((share * max(self._half[2 * psd : 2 * psd + 2])) ** 2 / 3.0)
+        return (out[0], out[1])
+
+
+_ORDER = (
+    BlockStatus.LASER_LOST,
+    BlockStatus.SATURATED,
+    BlockStatus.FROZEN,
+    BlockStatus.OUTSIDE_ACTIVE_AREA,
+)
