@@ -353,7 +353,9 @@ PARAMETERS: tuple[Parameter, ...] = (
         "when the reserve is reached: stop, or delete the oldest file of this recording (never another's)",
         choices=('stop', 'delete_oldest'),
     ),
-    # The live page.
+    # What is shown.
+    Parameter('markers', 'bool', False, '', 'publish link, plate, beams and dots for RViz (/link_tip/markers)'),
+    Parameter('markers_magnify', 'double', 10.0, '', 'how much larger they show displacements', above=0.0, maximum=1e4),
     Parameter('monitor', 'bool', False, '', 'serve the live page'),
     Parameter('monitor_address', 'string', '127.0.0.1', '', 'address it is served on; 0.0.0.0 shows it to the network'),
     Parameter(
@@ -482,12 +484,14 @@ class AcquisitionConfig:
 
 @dataclass(frozen=True, slots=True)
 class MonitorConfig:
-    """The live page: whether, where, and whether its buttons work."""
+    """The live page: whether, where, and whether its buttons work; markers for RViz, and how much magnified."""
 
     enabled: bool
     address: str
     port: int
     control: bool
+    markers: bool
+    markers_magnify: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -671,6 +675,8 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             address=v['monitor_address'],
             port=v['monitor_port'],
             control=v['monitor_control'],
+            markers=v['markers'],
+            markers_magnify=v['markers_magnify'],
         ),
         values=MappingProxyType(got),
         effects=MappingProxyType(effects),
