@@ -1,8 +1,8 @@
 """Which port has what on it: asks politely in every language we read, and listens.
 
-Nothing is started, stopped or set (but an Arduino starts anew whenever its port is opened): only questions
-are asked that each of these devices answers from
-where it stands. A port that another program has open is left alone.
+Nothing is started, stopped or set: only questions are asked that each of these devices answers from
+where it stands (an Arduino starts anew all the same, whenever its port is opened). A port that another
+program has open is left alone.
 """
 
 from __future__ import annotations
