@@ -194,6 +194,15 @@ PARAMETERS: tuple[Parameter, ...] = (
         live=True,
     ),
     Parameter(
+        'frozen',
+        'string',
+        'report',
+        '',
+        'a detector of which no bit moves: report it in /diagnostics, or refuse its blocks as well',
+        choices=('report', 'refuse'),
+        live=True,
+    ),
+    Parameter(
         'twist_sd',
         'double',
         0.01,
@@ -344,7 +353,9 @@ PARAMETERS: tuple[Parameter, ...] = (
         "when the reserve is reached: stop, or delete the oldest file of this recording (never another's)",
         choices=('stop', 'delete_oldest'),
     ),
-    # The live page.
+    # What is shown.
+    Parameter('markers', 'bool', False, '', 'publish link, plate, beams and dots for RViz (/link_tip/markers)'),
+    Parameter('markers_magnify', 'double', 10.0, '', 'how much larger they show displacements', above=0.0, maximum=1e4),
     Parameter('monitor', 'bool', False, '', 'serve the live page'),
     Parameter('monitor_address', 'string', '127.0.0.1', '', 'address it is served on; 0.0.0.0 shows it to the network'),
     Parameter(
@@ -441,6 +452,7 @@ class EstimatorConfig:
     sum_max: float
     splitter: bool
     degraded: str
+    frozen: str
     twist_sd: float
     twist_hold: float
     solver: str
@@ -472,12 +484,14 @@ class AcquisitionConfig:
 
 @dataclass(frozen=True, slots=True)
 class MonitorConfig:
-    """The live page: whether, where, and whether its buttons work."""
+    """The live page: whether, where, and whether its buttons work; markers for RViz, and how much magnified."""
 
     enabled: bool
     address: str
     port: int
     control: bool
+    markers: bool
+    markers_magnify: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -631,6 +645,7 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             sum_max=v['sum_max'],
             splitter=v['splitter'],
             degraded=v['degraded'],
+            frozen=v['frozen'],
             twist_sd=v['twist_sd'],
             twist_hold=v['twist_hold'],
             solver=v['solver'],
@@ -660,6 +675,8 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             address=v['monitor_address'],
             port=v['monitor_port'],
             control=v['monitor_control'],
+            markers=v['markers'],
+            markers_magnify=v['markers_magnify'],
         ),
         values=MappingProxyType(got),
         effects=MappingProxyType(effects),

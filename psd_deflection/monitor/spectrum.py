@@ -20,13 +20,15 @@ SECONDS = 4.0
 
 
 class Spectrum:
-    """Remembers the last four seconds; one thread at a time."""
+    """Remembers the last ``seconds`` (None: all there were); one thread at a time."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, seconds: float | None = SECONDS) -> None:
         self.rate_hz = rig.converter.sample_rate_hz
         self._calibration = Calibration.from_rig(rig)
-        blocks = max(2, round(max(SECONDS * self.rate_hz, 2.0 * SEGMENT) / rig.estimator.block_size))
-        self._blocks: deque[SampleBlock] = deque(maxlen=blocks)
+        samples = None if seconds is None else max(seconds * self.rate_hz, 2.0 * SEGMENT)
+        self._blocks: deque[SampleBlock] = deque(
+            maxlen=None if samples is None else max(2, round(samples / rig.estimator.block_size))
+        )
         self._window = np.hanning(SEGMENT + 1)[:-1]
 
     def add(self, block: SampleBlock) -> None:

@@ -41,6 +41,10 @@ from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 if TYPE_CHECKING:
     from psd_deflection.monitor.server import MonitorServer
 
+if TYPE_CHECKING:
+    from psd_deflection.monitor.server import MonitorServer
+    from psd_deflection.ros.markers import RigMarkers
+
 NODE_NAME = 'estimator'
 
 SPIN_S = 0.1
@@ -132,6 +136,7 @@ class EstimatorNode:
             self.node.create_service(SetBool, '~/record', self._record)
             self._wire, self._inputs = self._wires()
             self.node.create_timer(1.0, self._report)
+            self._markers = self._make_markers()
         except BaseException:
             self.node.destroy_node()
             raise
@@ -144,6 +149,14 @@ class EstimatorNode:
             return PublisherWire(self.node, outputs), InputRecorder(self.node)
         except (InvalidQosOverridesError, ValueError) as error:
             raise ConfigError(f'ROS parameters: qos_overrides: {error}') from None
+
+    def _make_markers(self) -> RigMarkers | None:
+        if not self.rig.monitor.markers:
+            return None
+        # Only here: whoever shows nothing does without visualization_msgs.
+        from psd_deflection.ros.markers import RigMarkers
+
+        return RigMarkers(self.node, self.rig)
 
     def transition(self, action: Callable[[], None]) -> TransitionCallbackReturn:
         """Run one transition; what goes wrong outside is said, kept in ``error``, and leaves the state as it was."""
@@ -189,6 +202,8 @@ class EstimatorNode:
             self._inputs.session = session
             session.start()
             self._monitor = start_monitor(session, self._say)
+            if self._markers is not None:
+                self._markers.session = session
         except BaseException:
             self.cleanup()
             raise
@@ -212,6 +227,8 @@ class EstimatorNode:
         self._inputs.session = None
         self._live.session = None
         self._health = None
+        if self._markers is not None:
+            self._markers.session = None
         monitor, self._monitor = self._monitor, None
         if monitor is not None:
             monitor.close()

@@ -277,7 +277,7 @@ def test_a_pattern_without_a_port_is_named(tmp_path: Path) -> None:
 def test_a_silent_device_is_woken(device: Any, run: Run, short_wait: ModuleType, sample: Any) -> None:
     assert device.greeted.wait(10.0)
     device.greeted.clear()
-    run.heard('no frame for 0.2 s')
+    run.heard('no sample for 0.2 s')
     assert device.greeted.wait(10.0)
     device.send(b'\x01rubbish without an end\x00' * 3)
     device.send_frames(*[sample(s) for s in range(20)])

@@ -1,0 +1,267 @@
+"""Draw a recording: deflection and twist with their uncertainty, dots, sums, spectrum, what was lost.
+
+REC (a bag folder, an .mcap or a .csv) runs through the same pipeline as in `replay`, with its own
+parameters or those of --params-file. The kind of picture is the ending of --out: .png, .svg, .pdf,
+or .html, one page without anything from elsewhere.
+
+  psd-deflection plot bags/lost_samples
+  psd-deflection plot run.csv --params-file my_rig.yaml --out run.html
+"""
+
+from __future__ import annotations
+
+import argparse
+import html
+import io
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from psd_deflection import __version__
+from psd_deflection.cli._report import save_figure
+from psd_deflection.cli.replay import replayed, rig_of
+from psd_deflection.config import Rig
+from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.io.recordings import open_recording
+from psd_deflection.monitor.spectrum import Spectrum
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import DeflectionEstimate, FloatArray, Record, SampleBlock, SpotMeans
+
+KINDS = ('.png', '.svg', '.pdf', '.html')
+SPECTRUM_S = 600.0
+"""The spectrum is of the last ten minutes: it does not get better after that, only slower."""
+
+COLORS = {'dx': '#0b6bcb', 'dy': '#c2570c', 'theta': '#0f7b4f', 'lost': '#c62828', 'quiet': '#5a6875'}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
+    parser.add_argument('--params-file', metavar='RIG.yaml', help='use this rig instead of the recorded parameters')
+    parser.add_argument('--out', metavar='OUT', help='.png, .svg, .pdf or .html (default: REC.png, here)')
+
+
+@dataclass
+class Drawn:
+    """What is drawn, a row a block: s, m, m, rad, V; NaN where a block has no estimate."""
+
+    spots: list[SpotMeans] = field(default_factory=list)
+    estimates: dict[int, DeflectionEstimate] = field(default_factory=dict)
+
+    def add(self, record: Record) -> None:
+        """Take what is drawn of a record."""
+        if isinstance(record, SpotMeans):
+            self.spots.append(record)
+        elif isinstance(record, DeflectionEstimate) and record.primary:
+            self.estimates[record.block] = record
+
+    def table(self) -> dict[str, FloatArray]:
+        """Arrays (n,): t from the first block, pose, standard deviations, dots, sums, samples lost."""
+        start = self.spots[0].t_ns
+        nothing = (np.nan,) * 6
+        rows: list[tuple[float, ...]] = []
+        index = self.spots[0].index - 1
+        for s in self.spots:
+            if s.index != index + 1 and rows:
+                # Blocks that are gone altogether break the line, from the first to the last of them.
+                step = ((s.t_ns - start) / 1e9 - rows[-1][0]) / (s.index - index)
+                before = rows[-1][0]
+                for k in (1, s.index - index - 1):
+                    rows.append((before + k * step, *nothing, *(np.nan,) * 7))
+            index = s.index
+            e = self.estimates.get(s.index)
+            pose = (
+                nothing if e is None else (e.dx, e.dy, e.theta, *(max(e.covariance[i], 0.0) ** 0.5 for i in (0, 4, 8)))
+            )
+            rows.append(((s.t_ns - start) / 1e9, *pose, *s.dots, *s.sums, float(s.lost)))
+        names = ('t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta', 'x1', 'y1', 'x2', 'y2', 'sum1', 'sum2', 'lost')
+        columns = np.array(rows, np.float64).T
+        return dict(zip(names, columns, strict=True))
+
+    def gone(self, block_size: int) -> int:
+        """Samples that are missing, those of whole blocks included."""
+        steps = np.diff([s.index for s in self.spots]) - 1
+        return sum(s.lost for s in self.spots) + int(steps.sum()) * block_size
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, replay, draw."""
+    out = Path(args.out) if args.out is not None else Path(Path(args.recording.rstrip('/')).stem + '.png')
+    if out.suffix.lower() not in KINDS:
+        raise ConfigError(f'--out {out}: the name must end in {", ".join(KINDS)}')
+    rig = rig_of(open_recording(args.recording), args.params_file)
+    recording = open_recording(args.recording, block_size=rig.estimator.block_size)
+    drawn, spectrum = Drawn(), Spectrum(rig, SPECTRUM_S)
+    bar = tqdm(recording.blocks(), unit=' blocks', delay=1.0, leave=False, disable=None, ncols=80)
+    for records in replayed(recording, Pipeline(rig), bar):
+        for record in records:
+            drawn.add(record)
+            if isinstance(record, SampleBlock):
+                spectrum.add(record)
+    if not drawn.spots:
+        raise RecordingError(f'{args.recording}: has no samples to draw')
+    summary = summarise(drawn, rig)
+    figure = draw(drawn, spectrum, rig, Path(args.recording).name)
+    if out.suffix.lower() == '.html':
+        write_html(figure, out, str(args.recording), summary)
+    else:
+        save_figure(figure, out)
+    for name, value in summary:
+        print(f'{name:<24} {value}')
+    print(f'written to {out}')
+    return 0
+
+
+def summarise(drawn: Drawn, rig: Rig) -> list[tuple[str, str]]:
+    """Name and value, for the terminal and the page."""
+    table = drawn.table()
+    lost, size = drawn.gone(rig.estimator.block_size), rig.estimator.block_size
+    present = sum(s.present for s in drawn.spots)
+    rows = [
+        ('duration', f'{table["t"][-1] + size / rig.converter.sample_rate_hz:.3f} s'),
+        ('samples', f'{present} present, {lost} lost ({100.0 * lost / (present + lost):.3g} %)'),
+        ('estimates', f'{len(drawn.estimates)} of {len(drawn.spots)} blocks ({rig.estimator.solver})'),
+    ]
+    causes = Counter(s.status.name.lower().replace('_', ' ') for s in drawn.spots if s.reason)
+    rows += [(f'without: {cause}', f'{n} blocks') for cause, n in sorted(causes.items())]
+    for name, label, scale, unit in _POSE:
+        values = table[name][np.isfinite(table[name])] * scale
+        if len(values):
+            sd = float(np.nanmedian(table[f'sd_{name}'])) * scale
+            rows.append((label, f'{values.min():+.2f} … {values.max():+.2f} {unit}, sd {sd:.2f} {unit}'))
+    return rows
+
+
+_MDEG = 180e3 / np.pi
+_POSE = (('dx', 'ΔX', 1e6, 'µm'), ('dy', 'ΔY', 1e6, 'µm'), ('theta', 'θ', _MDEG, 'mdeg'))
+
+
+def draw(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any:
+    """The figure: four traces on the left, both detectors and the spectrum on the right."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    table = drawn.table()
+    t = table['t']
+    # Paths of an hour's blocks are pictures, not paths, else an .svg of them chokes its reader.
+    raster = len(t) > 20_000
+    with mpl.rc_context({'font.size': 9, 'axes.grid': True, 'grid.alpha': 0.3, 'axes.axisbelow': True}):
+        figure = Figure(figsize=(13, 8), layout='constrained')
+        figure.suptitle(
+            f'{name} · {len(drawn.estimates)} estimates, {drawn.gone(rig.estimator.block_size)} samples lost'
+        )
+        grid = figure.add_gridspec(4, 4, height_ratios=(3, 3, 3, 1.6))
+        left = [figure.add_subplot(grid[0, :2])]
+        left += [figure.add_subplot(grid[i, :2], sharex=left[0]) for i in (1, 2, 3)]
+        for axes, (key, label, scale, unit) in zip(left, _POSE, strict=False):
+            value, sd = table[key] * scale, table[f'sd_{key}'] * scale
+            axes.fill_between(
+                t, value - 2 * sd, value + 2 * sd, color=COLORS[key], alpha=0.3, linewidth=0, rasterized=raster
+            )
+            axes.plot(t, value, color=COLORS[key], linewidth=0.8, rasterized=raster)
+            typical = f', band ±2 sd, sd {np.nanmedian(sd):.2f} {unit}' if np.isfinite(sd).any() else ''
+            axes.set_ylabel(f'{label} ({unit})')
+            axes.set_title(f'{label}{typical}', loc='left', fontsize=9)
+            _mark_losses(axes, table)
+        if left[0].get_legend_handles_labels()[0]:
+            left[0].legend(loc='upper right', fontsize=8)
+        for key, color in (('sum1', COLORS['dx']), ('sum2', COLORS['dy'])):
+            left[3].plot(t, table[key], color=color, linewidth=0.9, label=key, rasterized=raster)
+        left[3].axhline(rig.estimator.sum_min, color=COLORS['quiet'], linestyle=':', linewidth=1)
+        left[3].set(
+            xlabel='t (s)',
+            ylabel='sum (V)',
+            ylim=(0.0, 1.2 * max(rig.amplifier.sum_nominal, np.nanmax(table['sum1']), np.nanmax(table['sum2']))),
+        )
+        left[3].legend(loc='center right', fontsize=8, ncols=2)
+        for number in (1, 2):
+            _detector(figure.add_subplot(grid[:2, 1 + number]), table, rig, number, raster)
+        _spectrum(figure.add_subplot(grid[2:, 2:]), spectrum, rig)
+    return figure
+
+
+def _mark_losses(axes: Any, table: dict[str, FloatArray]) -> None:
+    """Red ticks where samples are missing, grey where there is no estimate."""
+    t, none, lost = table['t'], ~np.isfinite(table['dx']), ~(table['lost'] == 0)
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], none, [False])).astype(int)))
+    half = float(np.median(np.diff(t))) / 2.0 if len(t) > 1 else 0.0
+    for i, (first, end) in enumerate(edges.reshape(-1, 2)):
+        axes.axvspan(
+            t[first] - half,
+            t[end - 1] + half,
+            color=COLORS['quiet'],
+            alpha=0.18,
+            lw=0,
+            label='' if i else 'no estimate',
+        )
+    if lost.any():
+        where = axes.get_xaxis_transform()
+        axes.plot(
+            t[lost], np.ones(int(lost.sum())), '|', color=COLORS['lost'], ms=9, transform=where, label='lost samples'
+        )
+
+
+def _detector(axes: Any, table: dict[str, FloatArray], rig: Rig, number: int, raster: bool) -> None:
+    from matplotlib.patches import Rectangle
+
+    width, height = (1e3 * side for side in rig.psds[number - 1].active_area)
+    axes.add_patch(Rectangle((-width / 2, -height / 2), width, height, fill=False, color=COLORS['quiet']))
+    x, y = table[f'x{number}'] * 1e3, table[f'y{number}'] * 1e3
+    seen = np.isfinite(table['dx'])
+    axes.plot(x[seen], y[seen], '.', ms=2.5, color=COLORS['lost'], alpha=0.5, rasterized=raster)
+    axes.set(
+        aspect='equal',
+        xlim=(-0.54 * width, 0.54 * width),
+        ylim=(-0.54 * height, 0.54 * height),
+        xlabel=f'x{number} (mm)',
+        ylabel=f'y{number} (mm)',
+    )
+    axes.set_title(f'PSD {number}, active area', loc='left', fontsize=9)
+
+
+def _spectrum(axes: Any, spectrum: Spectrum, rig: Rig) -> None:
+    density = spectrum.density()
+    axes.set_title('spectrum of the dots', loc='left', fontsize=9)
+    axes.set(xlabel='f (Hz)', ylabel='µm/√Hz', xscale='log', yscale='log')
+    if density is None:
+        axes.text(0.5, 0.5, 'no stretch without a loss is long enough', transform=axes.transAxes, ha='center')
+        return
+    for channel, color, values in zip(
+        ('x1', 'y1', 'x2', 'y2'), ('#0b6bcb', '#5aa2e6', '#c2570c', '#e8a15f'), density, strict=True
+    ):
+        if (values > 0.0).any():
+            axes.plot(spectrum.frequencies, values * 1e6, color=color, linewidth=0.9, label=channel)
+    for hertz, label in ((rig.dynamics.bending_frequency, 'bending'), (rig.dynamics.torsion_frequency, 'torsion')):
+        axes.axvline(hertz, color=COLORS['quiet'], linestyle=':', linewidth=1)
+        axes.text(hertz, 0.02, f' {label}', rotation=90, transform=axes.get_xaxis_transform(), fontsize=8, va='bottom')
+    axes.legend(loc='upper right', fontsize=8, ncols=2)
+
+
+PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title><style>
+body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 1200px; margin: 2rem auto; padding: 0 1rem; color: #17212b; }}
+svg {{ width: 100%; height: auto; }}
+td, th {{ text-align: left; padding: .1rem 1.5rem .1rem 0; }} th {{ font-weight: 600; }}
+</style></head><body><h1>{title}</h1><table>{rows}</table>{picture}
+<p>psd_deflection {version}; <code>psd-deflection plot {title}</code></p></body></html>
+"""
+
+
+def write_html(figure: Any, path: Path, title: str, summary: list[tuple[str, str]]) -> None:
+    """One page with the figure in it. Raises ConfigError where it cannot be written."""
+    stream = io.StringIO()
+    figure.savefig(stream, format='svg', metadata={'Date': None})
+    picture = stream.getvalue()
+    rows = ''.join(f'<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>' for k, v in summary)
+    page = PAGE.format(
+        title=html.escape(title), rows=rows, picture=picture[picture.index('<svg') :], version=__version__
+    )
+    try:
+        path.write_text(page, encoding='utf-8')
+    except OSError as error:
+        raise ConfigError(f'--out {path}: cannot be written ({error.strerror})') from None

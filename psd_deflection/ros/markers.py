@@ -1,0 +1,160 @@
+"""What RViz shows: link, plate, detectors, beams and dots, and the transforms where tf2 is there.
+
+Only made where the parameter ``markers`` is on. What does not move (beams, lasers, link at rest) is
+latched, so that an RViz started later sees it. Micrometres cannot be seen beside half a metre:
+displacements are drawn ``markers_magnify`` times as large; the transforms are not.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from geometry_msgs.msg import Point, Quaternion, TransformStamped
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from visualization_msgs.msg import Marker, MarkerArray
+
+from msg_adapters.orientation import quaternion
+from psd_deflection.config import Rig
+from psd_deflection.records import DeflectionEstimate, SpotMeans
+from psd_deflection.runner.session import Session
+
+MOVING = '/link_tip/markers'
+AT_REST = '/link_tip/markers_at_rest'
+PERIOD_S = 0.1
+
+BASE, REST, TIP = 'link_base', 'link_tip_rest', 'link_tip'
+_METAL, _PLATE, _SENSOR, _LASER = (
+    (0.6, 0.65, 0.7, 0.9),
+    (0.2, 0.3, 0.4, 0.6),
+    (0.1, 0.1, 0.12, 1.0),
+    (1.0, 0.2, 0.15, 1.0),
+)
+_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+Vector = tuple[float, float, float]
+
+
+def _marker(
+    number: int, name: str, kind: int, color: Sequence[float], scale: Vector, at: Vector = (0.0, 0.0, 0.0)
+) -> Any:
+    marker = Marker(ns=name, id=number, type=kind, action=Marker.ADD)
+    marker.header.frame_id = BASE
+    marker.pose.position = Point(x=at[0], y=at[1], z=at[2])
+    marker.scale.x, marker.scale.y, marker.scale.z = scale
+    marker.color.r, marker.color.g, marker.color.b, marker.color.a = color
+    return marker
+
+
+def at_rest(rig: Rig) -> Any:
+    """The MarkerArray of what does not move: the unloaded link, both lasers, both beams."""
+    length, radius = rig.link.length, rig.link.outer_radius
+    link = _marker(
+        0,
+        'link_at_rest',
+        Marker.CYLINDER,
+        (*_METAL[:3], 0.25),
+        (2 * radius, 2 * radius, length),
+        (0.0, 0.0, length / 2),
+    )
+    out = [link]
+    for i, psd in enumerate(rig.psds, 1):
+        x, y = psd.center[0] + psd.zero[0], psd.center[1] + psd.zero[1]
+        out.append(_marker(i, 'laser', Marker.CYLINDER, _SENSOR, (0.016, 0.016, 0.04), (x, y, -0.02)))
+        beam = _marker(i, 'beam', Marker.LINE_LIST, (*_LASER[:3], 0.7), (0.0015, 0.0, 0.0))
+        beam.points = [Point(x=x, y=y, z=0.0), Point(x=x, y=y, z=length + psd.height)]
+        out.append(beam)
+    return MarkerArray(markers=out)
+
+
+def moving(rig: Rig, estimate: DeflectionEstimate | None, spots: SpotMeans, magnify: float) -> Any:
+    """The MarkerArray of bent link, plate, detectors and dots; the pose is that of ``estimate``, else at rest."""
+    length = rig.link.length
+    dx, dy, theta = (magnify * v for v in estimate[3:6]) if estimate is not None else (0.0, 0.0, 0.0)
+    c, s = math.cos(theta), math.sin(theta)
+
+    def placed(x: float, y: float, z: float) -> Vector:
+        return dx + c * x - s * y, dy + s * x + c * y, length + z
+
+    turn = Quaternion(z=math.sin(theta / 2), w=math.cos(theta / 2))
+    link = _marker(0, 'link', Marker.LINE_STRIP, _METAL, (2 * rig.link.outer_radius, 0.0, 0.0))
+    for k in range(21):
+        u = k / 20.0
+        # A cantilever under a force at its tip.
+        bend = u * u * (3.0 - u) / 2.0
+        link.points.append(Point(x=dx * bend, y=dy * bend, z=length * u))
+    xs = [0.0, *(p.center[0] for p in rig.psds)]
+    ys = [0.0, *(p.center[1] for p in rig.psds)]
+    side = 0.03
+    size = (max(xs) - min(xs) + side, max(ys) - min(ys) + side, 0.004)
+    middle = placed((max(xs) + min(xs)) / 2, (max(ys) + min(ys)) / 2, 0.003)
+    plate = _marker(0, 'plate', Marker.CUBE, _PLATE, size, middle)
+    plate.pose.orientation = turn
+    out = [link, plate]
+    for i, psd in enumerate(rig.psds):
+        (cx, cy), (width, height), (zx, zy) = psd.center, psd.active_area, psd.zero
+        sensor = _marker(i + 1, 'psd', Marker.CUBE, _SENSOR, (width, height, 0.002), placed(cx, cy, psd.height))
+        sensor.pose.orientation = turn
+        mx, my = spots.dots[2 * i], spots.dots[2 * i + 1]
+        radius = 2.0 * psd.spot_radius
+        where = placed(cx + zx + magnify * (mx - zx), cy + zy + magnify * (my - zy), psd.height - 0.002)
+        dot = _marker(i + 1, 'dot', Marker.SPHERE, _LASER, (2 * radius, 2 * radius, 2 * radius), where)
+        if spots.sums[i] < rig.estimator.sum_min or not (math.isfinite(mx) and math.isfinite(my)):
+            dot.action = Marker.DELETE
+        out += [sensor, dot]
+    for marker in out:
+        marker.header.stamp.sec, marker.header.stamp.nanosec = divmod(spots.t_ns, 1_000_000_000)
+    return MarkerArray(markers=out)
+
+
+def transform(parent: str, child: str, t_ns: int, at: Vector, rotation: dict[str, float]) -> Any:
+    """One TransformStamped."""
+    out = TransformStamped(child_frame_id=child)
+    out.header.frame_id = parent
+    out.header.stamp.sec, out.header.stamp.nanosec = divmod(t_ns, 1_000_000_000)
+    out.transform.translation.x, out.transform.translation.y, out.transform.translation.z = at
+    out.transform.rotation = Quaternion(**rotation)
+    return out
+
+
+class RigMarkers:
+    """Publishes ten times a second what ``session`` last knew; nothing while it is None."""
+
+    def __init__(self, node: Node, rig: Rig) -> None:
+        self.session: Session | None = None
+        self._magnify = rig.monitor.markers_magnify
+        self._seen = 0
+        self._at_rest = node.create_publisher(MarkerArray, AT_REST, _LATCHED)
+        self._moving = node.create_publisher(MarkerArray, MOVING, 10)
+        self._at_rest.publish(at_rest(rig))
+        self._tf: Any = None
+        # tf2_msgs comes with a ROS installation, not with the wheels.
+        if importlib.util.find_spec('tf2_msgs') is not None:
+            from tf2_msgs.msg import TFMessage
+
+            self._tf_message = TFMessage
+            self._tf = node.create_publisher(TFMessage, '/tf', 10)
+            self._tf_static = node.create_publisher(TFMessage, '/tf_static', _LATCHED)
+            now = node.get_clock().now().nanoseconds
+            upright = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
+            self._tf_static.publish(
+                TFMessage(transforms=[transform(BASE, REST, now, (0.0, 0.0, rig.link.length), upright)])
+            )
+        node.create_timer(PERIOD_S, self._publish)
+
+    def _publish(self) -> None:
+        session = self.session
+        if session is None:
+            return
+        estimate, spots = session.pipeline.last_estimate, session.pipeline.last_spots
+        if spots is None or spots.t_ns == self._seen:
+            return
+        self._seen = spots.t_ns
+        self._moving.publish(moving(session.rig, estimate, spots, self._magnify))
+        if self._tf is not None and estimate is not None:
+            rotation = quaternion(estimate.theta, estimate.phi, estimate.omega)
+            at = (estimate.dx, estimate.dy, 0.0)
+            self._tf.publish(self._tf_message(transforms=[transform(REST, TIP, estimate.t_ns, at, rotation)]))

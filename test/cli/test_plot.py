@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.cli.main import main
+
+BAGS = Path(__file__).parent.parent.parent / 'bags'
+
+
+@pytest.mark.parametrize(('ending', 'magic'), [('.png', b'\x89PNG'), ('.svg', b'<?xml'), ('.html', b'<!doctype html>')])
+def test_a_recording_is_drawn(tmp_path: Path, ending: str, magic: bytes, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / f'picture{ending}'
+    assert main(['plot', str(BAGS / 'lost_samples'), '--out', str(out)]) == 0
+    assert out.read_bytes().startswith(magic)
+    printed = capsys.readouterr().out
+    # 4000 were taken (bags/make.py), 176 of them are missing.
+    assert '3824 present, 176 lost (4.4 %)' in printed
+    assert '192 of 193 blocks' in printed
+    assert 'too few samples' in printed
+
+
+def test_the_page_is_whole(tmp_path: Path) -> None:
+    out = tmp_path / 'page.html'
+    assert main(['plot', str(BAGS / 'laser_off'), '--out', str(out)]) == 0
+    page = out.read_text()
+    assert page.count('<svg') == 1
+    assert not re.search(r'(src|href)="(?!#)', re.sub(r'xlink:href="#', 'xlink:href="#', page))
+    assert 'laser lost' in page
+    assert '52 blocks' in page
+
+
+def test_losses_and_missing_estimates_are_marked() -> None:
+    from psd_deflection.cli.plot import Drawn
+    from psd_deflection.cli.replay import replayed, rig_of
+    from psd_deflection.io.recordings import open_recording
+    from psd_deflection.pipeline import Pipeline
+
+    recording = open_recording(BAGS / 'lost_samples')
+    drawn = Drawn()
+    for records in replayed(recording, Pipeline(rig_of(recording, None)), recording.blocks()):
+        for record in records:
+            drawn.add(record)
+    table = drawn.table()
+    t, dx = table['t'], table['dx']
+    assert (t[1:] > t[:-1]).all()
+    # Blocks 100 to 106 are gone: the line is broken there, at their own times.
+    gone = t[(dx != dx) & (table['lost'] != table['lost'])]
+    assert gone.tolist() == pytest.approx([100 * 0.02, 106 * 0.02], abs=1e-3)
+    # Block 50 has too few samples.
+    assert t[(dx != dx) & (table['lost'] > 0)].tolist() == pytest.approx([50 * 0.02], abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'status', 'told'),
+    [
+        (['no_such'], 4, 'no such recording'),
+        ([str(BAGS / 'clean'), '--out', 'x.bmp'], 3, 'the name must end in'),
+        ([str(BAGS / 'clean'), '--out', '/no/such/folder/x.html'], 3, 'cannot be written'),
+        ([str(BAGS / 'clean'), '--out', '/no/such/folder/x.png'], 3, 'cannot be written'),
+    ],
+)
+def test_what_cannot_be_drawn_is_one_line(
+    arguments: list[str], status: int, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(['plot', *arguments]) == status
+    err = capsys.readouterr().err
+    assert told in err
+    assert err.strip().count('\n') == 0

@@ -1,0 +1,81 @@
+"""What RViz is given: latched geometry at rest, and what moves with the estimate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.ros
+pytest.importorskip('rclpy')
+
+from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
+from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
+
+from psd_deflection.config import load_rig  # noqa: E402
+from psd_deflection.records import BlockStatus, DeflectionEstimate, SpotMeans  # noqa: E402
+from psd_deflection.ros.markers import at_rest, moving  # noqa: E402
+
+RIG = load_rig()
+
+
+def spots(dots: tuple[float, float, float, float], sums: tuple[float, float] = (5.0, 5.0)) -> SpotMeans:
+    return SpotMeans(5_000_000_007, 0, dots, sums, np.zeros((4, 4)), 20, 0, BlockStatus.OK, '')
+
+
+def by_name(array: Any) -> dict[tuple[str, int], Any]:
+    return {(m.ns, m.id): m for m in array.markers}
+
+
+def test_at_rest_the_beams_meet_the_detectors() -> None:
+    rest, now = by_name(at_rest(RIG)), by_name(moving(RIG, None, spots((0.0, 0.0, 0.0, 0.0)), 10.0))
+    for number, psd in enumerate(RIG.psds, 1):
+        start, end = rest['beam', number].points
+        assert (start.x, start.y, start.z) == (*psd.center, 0.0)
+        assert (end.x, end.y, end.z) == (*psd.center, RIG.link.length)
+        place = now['psd', number].pose.position
+        assert (place.x, place.y, place.z) == (*psd.center, RIG.link.length)
+        dot = now['dot', number].pose.position
+        assert (dot.x, dot.y) == psd.center
+    stamp = now['plate', 0].header.stamp
+    assert (stamp.sec, stamp.nanosec) == (5, 7)
+
+
+def test_the_plate_goes_with_the_estimate_and_the_dot_stays_on_its_beam() -> None:
+    dx, dy, theta = 1e-4, -2e-4, 1e-3
+    estimate = DeflectionEstimate(0, 0, 'exact', dx, dy, theta, 0.0, 0.0, (0.0,) * 9, 0.0, True)
+    c, s = math.cos(theta), math.sin(theta)
+    dots = []
+    for cx, cy in (psd.center for psd in RIG.psds):
+        x, y = cx - dx, cy - dy
+        # c + m = Rz(-theta)(l - d)
+        dots += [c * x + s * y - cx, -s * x + c * y - cy]
+    now = by_name(moving(RIG, estimate, spots((dots[0], dots[1], dots[2], dots[3])), 1.0))
+    for number, psd in enumerate(RIG.psds, 1):
+        dot = now['dot', number].pose.position
+        assert (dot.x, dot.y) == pytest.approx(psd.center, abs=1e-12)
+    tip = now['link', 0].points[-1]
+    assert (tip.x, tip.y, tip.z) == pytest.approx((dx, dy, RIG.link.length))
+    assert now['psd', 1].pose.orientation.z == pytest.approx(math.sin(theta / 2))
+    far = by_name(moving(RIG, estimate, spots((0.0, 0.0, 0.0, 0.0)), 10.0))
+    assert far['link', 0].points[-1].y == pytest.approx(10.0 * dy)
+
+
+def test_a_lost_dot_is_taken_away() -> None:
+    now = by_name(moving(RIG, None, spots((0.0, 0.0, math.nan, 0.0), (0.1, 5.0)), 10.0))
+    assert now['dot', 1].action == Marker.DELETE
+    assert now['dot', 2].action == Marker.DELETE
+
+
+def test_a_late_rviz_sees_both(start: Callable[..., Any], peer: Any) -> None:
+    start('--ros-args', '-p', 'markers:=true')
+    moves = peer.collect(MarkerArray, '/link_tip/markers')
+    peer.until(lambda: len(moves) >= 5, 'moving markers')
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    rest = peer.collect(MarkerArray, '/link_tip/markers_at_rest', latched)
+    peer.until(lambda: len(rest) >= 1, 'the latched markers')
+    assert {m.ns for m in rest[0].markers} == {'link_at_rest', 'laser', 'beam'}
+    assert {m.ns for m in moves[-1].markers} == {'link', 'plate', 'psd', 'dot'}

@@ -1,0 +1,79 @@
+"""The layouts of Foxglove, PlotJuggler and RViz name what there is: topics and fields of a recording."""
+
+from __future__ import annotations
+
+import json
+import re
+import xml.etree.ElementTree
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from msg_adapters import DIAGNOSTICS
+from psd_deflection.io import cdr
+from psd_deflection.io.recordings import open_recording
+
+ROOT = Path(__file__).parent.parent
+CONFIG = ROOT / 'config'
+
+
+@pytest.fixture(scope='module')
+def recorded() -> dict[str, Any]:
+    """One message of each topic of a recording, decoded."""
+    found: dict[str, Any] = {}
+    for message in open_recording(ROOT / 'bags' / 'clean').messages():
+        if message.channel.topic not in found:
+            found[message.channel.topic] = cdr.decode(message.channel.type, message.cdr)
+    return found
+
+
+def field_of(fields: Any, path: str) -> float:
+    for name in re.findall(r'\w+', path):
+        fields = fields[int(name)] if name.isdigit() else fields[name]
+    assert isinstance(fields, float)
+    return fields
+
+
+def test_foxglove(recorded: dict[str, Any]) -> None:
+    layout = json.loads((CONFIG / 'foxglove_layout.json').read_text())
+    panels = layout['configById']
+    paths = [p['value'] for panel in panels.values() for p in panel.get('paths', [])]
+    assert len(paths) > 10
+    for path in paths:
+        topic, _, field = path.partition('.')
+        assert topic in recorded, path
+        field_of(recorded[topic], field)
+    topics = [p[key] for p in panels.values() for key in ('topicPath', 'topicToRender') if key in p]
+    assert set(topics) <= {*recorded, DIAGNOSTICS}
+
+    def leaves(node: Any) -> list[str]:
+        return [node] if isinstance(node, str) else [*leaves(node['first']), *leaves(node['second'])]
+
+    assert sorted(leaves(layout['layout'])) == sorted(panels)
+
+
+def test_plotjuggler(recorded: dict[str, Any]) -> None:
+    root = xml.etree.ElementTree.parse(CONFIG / 'plotjuggler_layout.xml').getroot()
+    made = {snippet.get('name') for snippet in root.iter('snippet')}
+    names = [str(c.get('name')) for c in root.iter('curve')]
+    sources = [str(s.text) for s in root.iter('linked_source')]
+    assert len(names) > 10
+    for name in [*(n for n in names if n not in made), *sources]:
+        (topic,) = [t for t in recorded if name.startswith(t + '/')]
+        field_of(recorded[topic], name.removeprefix(topic))
+    for splitter in root.iter('DockSplitter'):
+        assert int(str(splitter.get('count'))) == len(splitter) == len(str(splitter.get('sizes')).split(';'))
+
+
+def test_rviz() -> None:
+    # Read as text: the node's room imports rclpy, which need not be here.
+    source = (ROOT / 'psd_deflection' / 'ros' / 'markers.py').read_text()
+    there = dict(re.findall(r"^(MOVING|AT_REST) = '(\S+)'", source, re.M))
+    tree = yaml.safe_load((CONFIG / 'link_tip.rviz').read_text())
+    displays = [d for d in tree['Visualization Manager']['Displays'] if d['Class'].endswith('MarkerArray')]
+    assert {d['Topic']['Value'] for d in displays} == set(there.values())
+    latched = [d['Topic']['Value'] for d in displays if d['Topic']['Durability Policy'] == 'Transient Local']
+    assert latched == [there['AT_REST']]
+    assert tree['Visualization Manager']['Global Options']['Fixed Frame'] == 'link_base'
