@@ -19,14 +19,9 @@ COMMANDS: dict[str, str] = {
     'monitor': 'serve a live page: of the rig, or of a recording that plays',
     'replay': 'run a recording through the same pipeline',
     'simulate': 'simulate the rig: as a recording, or as a device on a pseudo-terminal',
-<<<<<<< HEAD
     'discover': 'name what the simulation lacks to explain a recording, and add it',
     'devices': 'list serial ports, say what answers on each, suggest the parameters',
     'plot': 'draw a recording: PNG, SVG, PDF or HTML',
-=======
-    'devices': 'list serial ports, say what answers on each, suggest the parameters',
-    'discover': 'name what the simulation lacks to explain a recording, and add it',
->>>>>>> devices
     'info': 'say what is in a recording',
     'convert': 'write the samples of a recording as a CSV, an .mcap or a bag',
     'recover': 'make a recording whole that a crash left without its end',
