@@ -4,6 +4,8 @@
 # make bench    what it costs, as ratios to peers measured in the same run (a few minutes)
 # make golden   make the recordings in bags/ anew
 # make colcon   build with colcon in a virtual environment of its own and look at what it installed
+# make docs     the documentation as a web site, in build/site
+# make shots    the pictures of the live page in docs/figures anew (needs Chromium)
 # make clean    remove what the above made
 PYTHON ?= python3
 VENV ?= .venv
@@ -13,7 +15,7 @@ PORT ?=
 ARGS ?=
 BIN := $(VENV)/bin
 
-.PHONY: help run test lint types contracts unit bench golden colcon clean
+.PHONY: help run test lint types contracts unit bench golden docs shots colcon clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -55,6 +57,14 @@ bench: $(VENV)/.installed
 
 golden: $(VENV)/.installed
 	$(BIN)/python bags/make.py
+
+docs: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[docs]'
+	$(BIN)/python -m mkdocs build --strict --quiet --site-dir build/site
+	@echo 'open build/site/index.html'
+
+shots: $(VENV)/.installed
+	$(BIN)/python docs/shots.py
 
 # colcon from PyPI wants an older setuptools than ours: a virtual environment of its own.
 colcon:
