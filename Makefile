@@ -2,6 +2,7 @@
 #               (make run PORT=/dev/ttyACM0 ARGS='--params-file my_rig.yaml' for a real one)
 # make test     set-up, then lint, types, import contracts and every test
 # make bench    what it costs, as ratios to peers measured in the same run (a few minutes)
+# make firmware build the example firmware, run it in qemu, join it to the daemon (installs what it needs with apt-get)
 # make golden   make the recordings in bags/ anew
 # make colcon   build with colcon in a virtual environment of its own and look at what it installed
 # make docs     the documentation as a web site, in build/site
@@ -15,7 +16,7 @@ PORT ?=
 ARGS ?=
 BIN := $(VENV)/bin
 
-.PHONY: help run test lint types contracts unit bench golden docs shots colcon clean
+.PHONY: help run test lint types contracts unit bench firmware golden docs shots colcon clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -54,6 +55,13 @@ run: $(VENV)/.installed
 bench: $(VENV)/.installed
 	$(BIN)/python bench/live.py
 	$(BIN)/python bench/solvers.py
+
+SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
+
+firmware: $(VENV)/.installed
+	(command -v arm-none-eabi-gcc && command -v qemu-system-arm) || ($(SUDO) apt-get update -qq && $(SUDO) apt-get install -y -qq --no-install-recommends gcc-arm-none-eabi qemu-system-arm)
+	$(MAKE) -C docs/firmware OUT=$(CURDIR)/build/firmware
+	$(BIN)/python docs/firmware/check.py build/firmware/psd_synthetic.elf
 
 golden: $(VENV)/.installed
 	$(BIN)/python bags/make.py

@@ -194,6 +194,15 @@ PARAMETERS: tuple[Parameter, ...] = (
         live=True,
     ),
     Parameter(
+        'frozen',
+        'string',
+        'report',
+        '',
+        'a detector of which no bit moves: report it in /diagnostics, or refuse its blocks as well',
+        choices=('report', 'refuse'),
+        live=True,
+    ),
+    Parameter(
         'twist_sd',
         'double',
         0.01,
@@ -443,6 +452,7 @@ class EstimatorConfig:
     sum_max: float
     splitter: bool
     degraded: str
+    frozen: str
     twist_sd: float
     twist_hold: float
     solver: str
@@ -635,6 +645,7 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             sum_max=v['sum_max'],
             splitter=v['splitter'],
             degraded=v['degraded'],
+            frozen=v['frozen'],
             twist_sd=v['twist_sd'],
             twist_hold=v['twist_hold'],
             solver=v['solver'],

@@ -267,13 +267,13 @@ def test_from_simulate_to_model(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 def test_a_bag_and_a_csv_of_one_run_give_one_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ['--loads', 'thesis:1', '--effect', 'creep,amplitude=0.02,time_constant=1', '--temperature', '20,22']
-    for name in ('run.csv', 'run', 'run.mcap'):
+    answers = []
+    for name in ('run.csv', 'run'):
         assert main(['simulate', '--out', str(tmp_path / name), *words]) == 0
         assert main(['discover', str(tmp_path / name), '--out', str(tmp_path / ('of_' + name)), '--quiet']) == 0
-    answers = [json.loads((tmp_path / ('of_' + n) / 'result.json').read_text()) for n in ('run.csv', 'run', 'run.mcap')]
-    assert [a['effects'][0]['name'] for a in answers] == ['creep'] * 3
-    assert answers[1]['effects'] == answers[2]['effects']
-    first, second = (a['effects'][0]['parameters']['amplitude']['value'] for a in answers[:2])
+        answers.append(json.loads((tmp_path / ('of_' + name) / 'result.json').read_text()))
+    assert [a['effects'][0]['name'] for a in answers] == ['creep'] * 2
+    first, second = (a['effects'][0]['parameters']['amplitude']['value'] for a in answers)
     assert first == pytest.approx(second, rel=1e-3)
     capsys.readouterr()
 

@@ -196,10 +196,13 @@ def test_what_is_remembered_says_only_what_matters() -> None:
 # ---- findings
 
 
-def test_a_detector_that_stands_still_is_refused_after_a_tenth_of_a_second() -> None:
+def test_a_detector_that_stands_still_is_reported_and_refused_where_it_shall_be() -> None:
     counts = moving(12)
     counts[2 * SIZE : 10 * SIZE, 0:3] = counts[2 * SIZE, 0:3]
-    records = records_of(Pipeline(load_rig()), counts)
+    quiet = Pipeline(load_rig())
+    assert {s.status for s in spots(records_of(quiet, counts[: 8 * SIZE]))} == {BlockStatus.OK}
+    assert quiet.counters.findings['psd_1 stands still'] == 2
+    records = records_of(Pipeline(load_rig(overrides={'frozen': 'refuse'})), counts)
     statuses = [s.status for s in spots(records)]
     assert statuses == [BlockStatus.OK] * 6 + [BlockStatus.FROZEN] * 4 + [BlockStatus.OK] * 2
     assert 'psd_1 stands still: no bit has moved for 5 blocks' in [s.reason for s in spots(records)]

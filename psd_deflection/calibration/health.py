@@ -43,6 +43,11 @@ class Verdict:
     half_light: bool = False
 
 
+def _long(frozen: tuple[int, int]) -> list[tuple[int, int]]:
+    """(PSD, blocks) of those that have stood still for too long."""
+    return [(psd, blocks) for psd, blocks in enumerate(frozen, start=1) if blocks >= FROZEN_BLOCKS]
+
+
 class OpticsHealth:
     """Judges blocks by the rig's limits."""
 
@@ -55,6 +60,7 @@ class OpticsHealth:
         # Half the light is no lost laser where two lasers share both detectors.
         self._sum_min = config.sum_min * (0.5 if self._splitter else 1.0)
         self._sum_max = config.sum_max
+        self._refuse_frozen = config.frozen == 'refuse'
         step = rig.converter.volts_per_count
         # The converter's last step on either side: beyond it the true value is not known.
         self._rail = np.float32((2 ** (rig.converter.bits - 1) - 1) * step)
@@ -92,9 +98,10 @@ class OpticsHealth:
                     fault(1 + column // 3, BlockStatus.SATURATED, reason)
         elif bool((block.flags & FLAG_OVER_RANGE).any()) and not faults:
             return Verdict(BlockStatus.SATURATED, 'the device reports a channel over range', 0)
-        for psd, blocks in enumerate(frozen, start=1):
-            if blocks >= FROZEN_BLOCKS:
-                fault(psd, BlockStatus.FROZEN, f'psd_{psd} stands still: no bit has moved for {blocks} blocks')
+        still = {p: f'psd_{p} stands still: no bit has moved for {n} blocks' for p, n in _long(frozen)}
+        if self._refuse_frozen:
+            for psd, reason in still.items():
+                fault(psd, BlockStatus.FROZEN, reason)
         if present < self._min_samples and not faults:
             reason = f'{present} of {self._size} samples, at least {self._min_samples} are needed'
             return Verdict(BlockStatus.TOO_FEW_SAMPLES, reason, 0)
@@ -104,6 +111,7 @@ class OpticsHealth:
                 fault(1 + column // 2, BlockStatus.OUTSIDE_ACTIVE_AREA, reason)
         half_light = self._half_light(low) if self._splitter else False
         findings = self._findings(block, dots, sums, set(faults), half_light)
+        findings += tuple(reason for psd, reason in still.items() if psd not in faults)
         if not faults:
             return Verdict(BlockStatus.OK, '', 0, findings, half_light)
         # The worst cause first: what is lost explains what is saturated or outside.

@@ -27,6 +27,9 @@ from psd_deflection.discovery.result import model_yaml, result, sentence
 from psd_deflection.errors import ConfigError, RecordingError
 from psd_deflection.simulation.catalogue import catalogue
 
+STEPS = 8
+"""Steps that the progress bar counts: described, signatures, adding, weighing, alternatives, where, report, done."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
@@ -52,16 +55,19 @@ def run(args: argparse.Namespace) -> int:
     except OSError as error:
         raise RecordingError(f'{out}: cannot be made ({error.strerror or error})') from None
     observations = read_observations(args.recordings, rig)
-    with tqdm(total=None, disable=args.quiet, file=sys.stderr, bar_format='{desc} {elapsed}') as bar:
+    # Reading took most of what can be foreseen; a search has as many steps as it has effects to weigh.
+    with tqdm(total=STEPS, disable=args.quiet, file=sys.stderr, bar_format='{l_bar}{bar}| {elapsed}') as bar:
 
         def progress(words: str) -> None:
             bar.set_description_str(words)
-            bar.update()
+            if bar.n < STEPS - 1:
+                bar.update()
 
         found = discover(observations, rig, seed=args.seed, without=args.without, progress=progress)
         progress('report')
         page = report_html(found)
         bar.set_description_str('done')
+        bar.update(STEPS - bar.n)
     files = {
         'model.yaml': model_yaml(rig, found.active_effects),
         'result.json': json.dumps(result(found), indent=1, allow_nan=False) + '\n',

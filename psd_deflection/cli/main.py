@@ -20,6 +20,7 @@ COMMANDS: dict[str, str] = {
     'replay': 'run a recording through the same pipeline',
     'simulate': 'simulate the rig: as a recording, or as a device on a pseudo-terminal',
     'discover': 'name what the simulation lacks to explain a recording, and add it',
+    'devices': 'list serial ports, say what answers on each, suggest the parameters',
     'plot': 'draw a recording: PNG, SVG, PDF or HTML',
     'info': 'say what is in a recording',
     'convert': 'write the samples of a recording as a CSV, an .mcap or a bag',

@@ -186,11 +186,10 @@ def discover_in(plant: Plant) -> PlantDiscovery:
             tried = [(name, now - value) for value, name, _, _ in trials]
         value, name, model, residuals = trials[0]
         unseen = fitter.heldout(model)
-        level = fitter.rms(held)
-        weight = fitter.count / len(everything) / level**2
+        # Each case at its own level: one that goes badly wrong shall not speak for the others.
         gains = np.array(
             [
-                float(np.sum(weight * (np.mean(a**2, axis=1) - np.mean(b**2, axis=1))))
+                float(np.sum(fitter.count * np.log(np.mean(a**2, axis=1) / np.mean(b**2, axis=1))) / len(everything))
                 for a, b in zip(held, unseen, strict=True)
             ]
         )

@@ -27,7 +27,7 @@ SHARE_ACCEPT = 0.002
 two exact but different discretisations for example, is not to be trusted to explain."""
 MAX_EFFECTS = 4
 TRIALS = 7
-BUDGET = 600
+BUDGET = 500
 """Forward simulations after which nothing more is added; the alternatives end at twice as many."""
 SWAP_REACH = 0.6
 """Of what the named effect explains, the share an alternative must explain to be refitted."""

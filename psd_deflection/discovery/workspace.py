@@ -18,6 +18,8 @@ from psd_deflection.simulation.catalogue import ActiveEffect, sort_effects
 from psd_deflection.simulation.simulator import ForwardModel
 
 FINE_SECONDS = 0.004
+MAX_FINE = 60_000
+"""Fine blocks of all recordings together, about; long ones get longer blocks, so that memory stays bounded."""
 DOT_ROWS = (0, 1, 3, 4)
 
 
@@ -41,11 +43,12 @@ class Workspace:
         self.noise: list[NoiseModel] = []
         self._noise_sigma: list[float] = []
         next_case = 0
+        longest = sum(o.duration for o in self.observations) / MAX_FINE
         for o in self.observations:
             block = o.rig.estimator.block_size
-            wanted = max(1, round(FINE_SECONDS / o.period))
+            wanted = max(1, round(max(FINE_SECONDS, longest) / o.period))
             # A fine block divides an estimate block, so that blocks are means of whole fine ones.
-            size = max(d for d in range(1, wanted + 1) if block % d == 0)
+            size = max(d for d in range(1, min(wanted, block) + 1) if block % d == 0)
             means = fine_means(o.volts.T, size)
             good = np.all(np.isfinite(means), axis=0)
             means[:, ~good] = 0.0

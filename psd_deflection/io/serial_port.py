@@ -17,6 +17,8 @@ import serial
 from psd_deflection.errors import DeviceError
 
 READ_SIZE = 4096
+MAX_EMPTY_READS = 1000
+"""Reads in a row without a byte, though there was one to read, after which a port counts as gone."""
 
 
 class PortClosedError(DeviceError):
@@ -38,6 +40,7 @@ class SerialPort:
         except (OSError, ValueError) as error:
             raise DeviceError(f'{name}: cannot be opened at {baud} baud ({error})') from None
         self._fd = self._serial.fileno()
+        self._empty_reads = 0
         if hasattr(self._serial, 'set_low_latency_mode'):
             # Only some drivers have a latency timer to shorten.
             with contextlib.suppress(OSError, ValueError, NotImplementedError):
@@ -55,9 +58,19 @@ class SerialPort:
             return b''
         except OSError as error:
             raise PortClosedError(f'{self.name}: the device is gone ({error.strerror})') from None
-        if not received:
+        if received:
+            self._empty_reads = 0
+        elif self._is_gone():
             raise PortClosedError(f'{self.name}: the device is gone')
         return received
+
+    def _is_gone(self) -> bool:
+        """A read that was promised bytes has none: hung up, or another program took them."""
+        self._empty_reads += 1
+        poll = select.poll()
+        poll.register(self._fd, select.POLLIN)
+        hung_up = any(mask & (select.POLLHUP | select.POLLERR | select.POLLNVAL) for _, mask in poll.poll(0))
+        return hung_up or self._empty_reads > MAX_EMPTY_READS
 
     def fileno(self) -> int:
         """The descriptor, for ``select``."""
@@ -85,7 +98,7 @@ class SerialPort:
 def _why(error: serial.SerialException, name: str) -> str:
     number = error.errno if error.errno is not None else getattr(error.__context__, 'errno', None)
     if number == errno.ENOENT or not Path(name).exists():
-        return 'no such port; `python -m serial.tools.list_ports` lists those that are there'
+        return 'no such port; `psd-deflection devices` lists those that are there'
     if number in (errno.EAGAIN, errno.EBUSY) or 'exclusively lock' in str(error):
         return 'another program has the port open; close it (on Linux: `fuser NAME` names it)'.replace('NAME', name)
     if number in (errno.EACCES, errno.EPERM):

@@ -45,7 +45,7 @@ from psd_deflection.runner.realtime import prefer_reader
 from psd_deflection.timing import ClockMap, ClockState
 
 SILENCE_S = 2.0
-"""A device that sends no frame for this long is reported."""
+"""A device that sends no sample for this long is reported, and asked for samples once more."""
 
 RETRY_S = 0.2
 READ_TIMEOUT_S = 0.1
@@ -273,7 +273,7 @@ class Acquisition:
 
     def _silent(self, size: int) -> None:
         self.counters.silences += 1
-        what = 'bytes but no frame (is the baud rate right?)' if size else 'no frame'
+        what = 'bytes but no sample (is the baud rate right?)' if size else 'no sample'
         self._say(f'{self._name}: {what} for {SILENCE_S:g} s; still listening')
         # It may have been stopped, by itself or by another program.
         self.source.wake()
@@ -325,7 +325,7 @@ class Acquisition:
         self._say(f'{self._name}: the device is back')
 
     def _take(self, events: list[Event], now: int) -> bool:
-        """Sort the frames of one read; True where one of them was a frame of ours."""
+        """Sort the frames of one read; True where one of them was a sample."""
         counters = self.counters
         good = False
         if self._regressed:
@@ -356,9 +356,7 @@ class Acquisition:
                 reason = str(frame.reason)
                 counters.bad_frames[reason] = counters.bad_frames.get(reason, 0) + 1
                 self._bad_since_sample += frame.reason != BadReason.UNKNOWN_TYPE
-                good = good or frame.reason == BadReason.UNKNOWN_TYPE
             else:
-                good = True
                 self._other(frame, now)
         return good
 

@@ -155,7 +155,7 @@ def short_wait(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_a_missing_port_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DeviceError, match=r'nowhere: no such port; .*list_ports'):
+    with pytest.raises(DeviceError, match=r'nowhere: no such port; .*psd-deflection devices'):
         Acquisition(load_rig(overrides={'port': str(tmp_path / 'nowhere')}), print).open()
 
 
@@ -277,7 +277,7 @@ def test_a_pattern_without_a_port_is_named(tmp_path: Path) -> None:
 def test_a_silent_device_is_woken(device: Any, run: Run, short_wait: ModuleType, sample: Any) -> None:
     assert device.greeted.wait(10.0)
     device.greeted.clear()
-    run.heard('no frame for 0.2 s')
+    run.heard('no sample for 0.2 s')
     assert device.greeted.wait(10.0)
     device.send(b'\x01rubbish without an end\x00' * 3)
     device.send_frames(*[sample(s) for s in range(20)])

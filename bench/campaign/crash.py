@@ -1,0 +1,112 @@
+"""``make crash``: kill -9 at random instants while recording; what is left opens, and lacks less than a second.
+
+The daemon runs without ROS, forked from this process so that each round takes a moment only, and
+reads a simulated rig in real time. A round: record, kill, read what is left with our reader,
+``recover``, read it with ``rosbags``.
+
+  python -m bench.campaign.crash --times 200
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from rosbags.rosbag2 import Reader
+
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.io.recordings import open_recording
+from psd_deflection.io.recover import recover
+from psd_deflection.runner.session import Session
+
+ALLOWED_S = 1.0
+
+
+def daemon(rig: Rig) -> None:
+    """The child: records until it is killed."""
+    session = Session(rig, lambda text: None)
+    session.start()
+    signal.pause()
+
+
+def left_by_a_kill(rig: Rig, bags: Path, after_s: float) -> tuple[Path, int]:
+    """The folder that a daemon leaves that is killed ``after_s`` after its first chunk, and when, ns."""
+    child = os.fork()
+    if child == 0:
+        try:
+            daemon(rig)
+        finally:
+            os._exit(1)
+    deadline = time.monotonic() + 20.0
+    while not any(p.stat().st_size > 20_000 for p in bags.glob('*/*.mcap')):
+        if time.monotonic() > deadline:
+            os.kill(child, signal.SIGKILL)
+            raise SystemExit('the daemon records nothing')
+        time.sleep(0.005)
+    time.sleep(after_s)
+    os.kill(child, signal.SIGKILL)
+    killed_ns = time.time_ns()
+    os.waitpid(child, 0)
+    (folder,) = bags.iterdir()
+    return folder, killed_ns
+
+
+def judge(folder: Path, killed_ns: int) -> float:
+    """Seconds between the last sample that is left and the kill; AssertionError where a reader disagrees."""
+    before = [int(b.t_ns[-1]) for b in open_recording(folder).blocks()]
+    recover(folder)
+    after = [int(b.t_ns[-1]) for b in open_recording(folder).blocks()]
+    assert after == before, 'recover changed what is in it'
+    with Reader(folder) as reader:
+        theirs = sum(1 for c, _, _ in reader.messages() if c.topic == '/psd/samples')
+        assert theirs == len(before), f'rosbags has {theirs} blocks, our reader {len(before)}'
+    return (killed_ns - before[-1]) / 1e9
+
+
+def main() -> int:
+    """Run the rounds; exit status 0 where each one lost less than a second."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
+    parser.add_argument('--times', type=int, default=200)
+    parser.add_argument('--seed', type=int, default=1)
+    args = parser.parse_args()
+    chance = random.Random(args.seed)
+    with tempfile.TemporaryDirectory() as name:
+        bags = Path(name) / 'bags'
+        rig_process = subprocess.Popen(
+            [sys.executable, '-m', 'psd_deflection', 'simulate', '--serve'],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        assert rig_process.stdout is not None
+        port = rig_process.stdout.readline().removeprefix('port: ').strip()
+        rotating = {'bag_max_duration': 0.7}
+        lost = []
+        try:
+            for number in range(args.times):
+                more = rotating if number % 4 == 3 else {}
+                rig = load_rig(None, {'port': port, 'record': True, 'bag_dir': str(bags), 'keep_zero': False, **more})
+                folder, killed_ns = left_by_a_kill(rig, bags, chance.uniform(0.0, 1.5))
+                lost.append(judge(folder, killed_ns))
+                shutil.rmtree(bags)
+        finally:
+            rig_process.send_signal(signal.SIGINT)
+            rig_process.wait(5.0)
+    worst = max(lost)
+    print(
+        f'{len(lost)} kills: all opened, all recovered, all read by rosbags; '
+        f'lost {min(lost):.3f} to {worst:.3f} s, mean {sum(lost) / len(lost):.3f} s (allowed {ALLOWED_S:g} s)'
+    )
+    return 0 if worst <= ALLOWED_S else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,348 @@
+"""The faults: what each does to the line, when it is over, and which counter must have seen it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import serial
+from cobs import cobs
+
+from bench.campaign.line import Line, hello_of
+from psd_deflection.protocol.frames import encode
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """``act(line, pid)`` returns when the fault is over. ``seen``: diagnostics of which one must have risen.
+
+    ``samples_flow``: False where what must come back is the estimate, not the sample. ``back``: the
+    port was away, so the time to recover counts against the second that is allowed.
+    """
+
+    name: str
+    act: Callable[[Line, int], None]
+    seen: tuple[str, ...]
+    estimates: bool = False
+    back: bool = False
+
+
+BAD = ('bad frames',)
+AWAY = ('disconnects',)
+
+
+def pause(seconds: float) -> None:
+    time.sleep(seconds)
+
+
+def _wire(line: Line, wire: Callable[[int, bytes], bytes | None], seconds: float) -> None:
+    with line.lock:
+        line.wire = wire
+    pause(seconds)
+    with line.lock:
+        line.wire = None
+
+
+def _once(change: Callable[[Line, bytes], bytes], seconds: float = 0.03) -> Callable[[Line, int], None]:
+    """Change one frame."""
+
+    def act(line: Line, pid: int) -> None:
+        done: list[int] = []
+
+        def wire(identity: int, frame: bytes) -> bytes | None:
+            if done:
+                return None
+            done.append(identity)
+            return change(line, frame)
+
+        _wire(line, wire, seconds)
+
+    return act
+
+
+def _merged(line: Line, frame: bytes) -> bytes:
+    # The next frame is this one's tail: it is taken as well.
+    line.taken_by_fault.add(line.sent)
+    return frame[:-1]
+
+
+def _flip(line: Line, frame: bytes) -> bytes:
+    out = bytearray(frame)
+    # Any bit but those of the closing zero; one that makes a new zero is welcome too.
+    bit = line.random.randrange(8 * (len(out) - 1))
+    out[bit // 8] ^= 1 << bit % 8
+    return bytes(out)
+
+
+def _body(line: Line, payload: bytes) -> bytes:
+    sealed: bytes = cobs.encode(payload + zlib.crc32(payload).to_bytes(4, 'little')) + b'\x00'
+    return sealed
+
+
+def _replug(line: Line, pid: int) -> None:
+    line.unplug()
+    pause(0.1)
+    line.plug(line.name)
+
+
+def _replug_elsewhere(line: Line, pid: int) -> None:
+    line.unplug()
+    pause(0.1)
+    line.plug('port_b' if line.name == 'port' else 'port')
+
+
+def _replug_beside_another(line: Line, pid: int) -> None:
+    old = line.name
+    line.unplug()
+    other = Line(line.folder, old)
+    other.serial = 'SOMEBODY-ELSE'
+    pause(0.3)
+    line.plug('port_c' if old != 'port_c' else 'port')
+    line.greeted.wait(5.0)
+    other.close()
+
+
+def _replug_late(line: Line, pid: int) -> None:
+    line.unplug()
+    pause(1.5)
+    line.plug(line.name)
+
+
+def _replug_restarted(line: Line, pid: int) -> None:
+    line.unplug()
+    line.restart()
+    pause(0.1)
+    line.plug(line.name)
+
+
+def _held_by_another(line: Line, pid: int) -> None:
+    line.unplug()
+    line.plug(line.name)
+    try:
+        holder = serial.Serial(line.device_name, 921600, exclusive=True)
+    except serial.SerialException:
+        # The node was quicker: then nobody else can have it, which is the point.
+        return
+    pause(0.4)
+    holder.close()
+
+
+def _stolen_bytes(line: Line, pid: int) -> None:
+    descriptor = os.open(line.device_name, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    first = line.next_identity()
+    deadline = time.monotonic() + 0.1
+    while time.monotonic() < deadline:
+        try:
+            os.read(descriptor, 64)
+        except BlockingIOError:
+            pause(0.001)
+    os.close(descriptor)
+    with line.lock:
+        # Which of them it took only it knows: all that were sent meanwhile, and what was on its way.
+        line.taken_by_fault.update(range(max(first - 40, 0), line.sent + 1))
+
+
+def _wrong_baud(line: Line, pid: int) -> None:
+    _wire(line, lambda identity, frame: bytes(line.random.getrandbits(8) or 1 for _ in frame), 0.3)
+    line.inject(b'\x00')
+
+
+def _flips(line: Line, pid: int) -> None:
+    _wire(line, lambda identity, frame: _flip(line, frame) if line.random.random() < 0.1 else None, 0.2)
+
+
+def _garbage(line: Line, pid: int) -> None:
+    line.inject(b'\x00' + bytes(line.random.getrandbits(8) for _ in range(64)) + b'\x00')
+    pause(0.03)
+
+
+def _endless(line: Line, pid: int) -> None:
+    line.inject(b'\x55' * 2000 + b'\x00')
+    pause(0.03)
+
+
+def _zeros(line: Line, pid: int) -> None:
+    line.inject(b'\x00' * 200)
+    _garbage(line, pid)
+
+
+def _duplicate(line: Line, frame: bytes) -> bytes:
+    return frame * 2
+
+
+def _duplicates(line: Line, pid: int) -> None:
+    kept: list[bytes] = []
+
+    def wire(identity: int, frame: bytes) -> bytes | None:
+        kept.append(frame)
+        return None
+
+    _wire(line, wire, 0.03)
+    line.inject(b''.join(kept[-30:]))
+    pause(0.02)
+
+
+def _swapped(line: Line, pid: int) -> None:
+    waiting: list[bytes] = []
+    done: list[bool] = []
+
+    def wire(identity: int, frame: bytes) -> bytes | None:
+        if done:
+            return None
+        if not waiting:
+            waiting.append(frame)
+            return b''
+        done.append(True)
+        with line.lock:
+            line.taken_by_fault.discard(identity)
+        return None
+
+    with line.lock:
+        line.wire = wire
+    pause(0.02)
+    with line.lock:
+        line.wire = None
+    line.inject(waiting[0] if waiting else b'')
+    pause(0.01)
+
+
+def _jump(samples: int, seconds: float = 0.05) -> Callable[[Line, int], None]:
+    def act(line: Line, pid: int) -> None:
+        line.jump(samples, samples * 1000)
+        pause(seconds)
+
+    return act
+
+
+def _clock(us: int) -> Callable[[Line, int], None]:
+    def act(line: Line, pid: int) -> None:
+        line.jump(0, us)
+        pause(0.05)
+
+    return act
+
+
+def _restart(seq: int = 0) -> Callable[[Line, int], None]:
+    def act(line: Line, pid: int) -> None:
+        line.restart(seq, 0)
+        line.inject(encode(hello_of()))
+        pause(0.08)
+
+    return act
+
+
+def _overrun(line: Line, pid: int) -> None:
+    with line.lock:
+        line.mute = True
+    pause(0.03)
+    with line.lock:
+        line.mute, line.flags = False, 2
+
+
+def _stall(seconds: float) -> Callable[[Line, int], None]:
+    def act(line: Line, pid: int) -> None:
+        with line.lock:
+            line.hold = True
+        pause(seconds)
+        with line.lock:
+            line.hold = False
+
+    return act
+
+
+def _silent(line: Line, pid: int) -> None:
+    with line.lock:
+        line.mute = True
+    pause(2.4)
+    with line.lock:
+        line.mute = False
+
+
+def _stopped(line: Line, pid: int) -> None:
+    with line.lock:
+        line.mute = line.obedient = True
+    deadline = time.monotonic() + 8.0
+    while line.mute and time.monotonic() < deadline:
+        pause(0.01)
+
+
+def _frozen_node(line: Line, pid: int) -> None:
+    os.kill(pid, signal.SIGSTOP)
+    pause(0.3)
+    os.kill(pid, signal.SIGCONT)
+
+
+def _optics(channels: dict[int, int], seconds: float = 0.15) -> Callable[[Line, int], None]:
+    def act(line: Line, pid: int) -> None:
+        with line.lock:
+            line.optics = channels
+        pause(seconds)
+        with line.lock:
+            line.optics = {}
+
+    return act
+
+
+def _frozen_psd(line: Line, pid: int) -> None:
+    # PSD 2 stands still, but for the identity that it carries: keep that constant by its slow digit.
+    with line.lock:
+        line.freeze = True
+    pause(0.25)
+    with line.lock:
+        line.freeze = False
+
+
+def _frame(payload: bytes) -> Callable[[Line, int], None]:
+    def act(line: Line, pid: int) -> None:
+        line.inject(_body(line, payload))
+        pause(0.03)
+
+    return act
+
+
+FAULTS: tuple[Fault, ...] = (
+    Fault('unplugged, back under its name', _replug, AWAY, back=True),
+    Fault('unplugged, back under another name', _replug_elsewhere, AWAY, back=True),
+    Fault('unplugged, another device on its port, back elsewhere', _replug_beside_another, AWAY, back=True),
+    Fault('unplugged for 1.5 s', _replug_late, AWAY, back=True),
+    Fault('unplugged and restarted', _replug_restarted, AWAY, back=True),
+    Fault('back while another program has the port', _held_by_another, AWAY, back=True),
+    Fault('another program reads from the port', _stolen_bytes, ('lost', 'bad frames')),
+    Fault('wrong baud rate for 0.3 s', _wrong_baud, BAD),
+    Fault('64 bytes of garbage', _garbage, BAD),
+    Fault('2000 bytes without an end', _endless, BAD),
+    Fault('zeros and garbage', _zeros, BAD),
+    Fault('frame truncated', _once(lambda line, f: f[: line.random.randrange(2, len(f) - 1)] + b'\x00'), BAD),
+    Fault('frame without its closing zero', _once(_merged), BAD),
+    Fault('frame split by a zero', _once(lambda line, f: f[:9] + b'\x00' + f[9:]), BAD),
+    Fault('one bit flipped', _once(_flip), BAD),
+    Fault('a tenth of the frames flipped for 0.2 s', _flips, BAD),
+    Fault('frame duplicated', _once(_duplicate), ('repeated',)),
+    Fault('30 frames duplicated', _duplicates, ('repeated',)),
+    Fault('frame late, out of order', _swapped, ('repeated', 'lost')),
+    Fault('frame lost without a trace', _once(lambda line, f: b''), ('lost',)),
+    Fault('numbers jump by 7', _jump(7), ('lost',)),
+    Fault('numbers jump by 100,000', _jump(100_000), ('lost',)),
+    Fault('device restarts', _restart(), ('device restarts',)),
+    Fault('device restarts 50 before 2^32', _restart(2**32 - 50), ('device restarts',)),
+    Fault('device clock jumps ahead 10 s', _clock(10_000_000), ('device clock jumps',)),
+    Fault('device clock jumps back 10 s', _clock(-10_000_000), ('device clock jumps', 'device restarts')),
+    Fault('device overrun of 30 samples', _overrun, ('lost: dropped by the device',)),
+    Fault('port stalled for 0.3 s', _stall(0.3), ()),
+    Fault('port stalled for 1 s', _stall(1.0), ()),
+    Fault('device silent for 2.4 s', _silent, ('silences',)),
+    Fault('device stopped until it is woken', _stopped, ('silences',)),
+    Fault('node stopped for 0.3 s (SIGSTOP)', _frozen_node, ()),
+    Fault('unknown frame type', _frame(b'\x7fhello'), BAD),
+    Fault('sample of a wrong length, right CRC', _frame(b'\x01' + b'\x00' * 11), BAD),
+    Fault('HELLO that is no JSON', _frame(b'\x10\x01{not json'), BAD),
+    Fault('HELLO of another rate', lambda line, pid: line.inject(encode(hello_of(rate=500.0))), ()),
+    Fault('laser 1 off', _optics({2: 3}), ('refused: laser_lost',), estimates=True),
+    Fault('laser 2 off', _optics({5: -2}), ('refused: laser_lost',), estimates=True),
+    Fault('y1 saturated', _optics({1: 32767}), ('refused: saturated',), estimates=True),
+    Fault('psd_2 stands still', _frozen_psd, ('refused: frozen',), estimates=True),
+)

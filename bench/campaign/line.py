@@ -1,0 +1,215 @@
+"""A device on a pseudo-terminal with every fault a line can have, and a ledger of what it did to which sample.
+
+Every sample carries its own number (its identity) in the counts of x1 and x2, so that a recording
+tells which samples arrived, whatever numbers and clocks the device made up meanwhile.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import select
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from psd_deflection.io.simulated_device import PseudoTerminal
+from psd_deflection.protocol.frames import (
+    FrameDecoder,
+    HelloFrame,
+    HelloRequestFrame,
+    PingFrame,
+    PongFrame,
+    SampleFrame,
+    StartFrame,
+    StatusFrame,
+    encode,
+)
+from psd_deflection.records import CHANNELS
+
+RATE = 1000
+SERIAL = 'CAMPAIGN-1'
+VOLTS_PER_COUNT = 10.0 / 32768
+DIGIT = 4096
+"""Identities are written in two digits to this base: (id // base) in x2, (id % base) in x1."""
+
+Wire = Callable[[int, bytes], bytes | None]
+"""What becomes of a sample's frame on the line; None where it arrives as it is."""
+
+
+def hello_of(serial: str = SERIAL, rate: float = 1000.0) -> HelloFrame:
+    """What the device says of itself."""
+    info: dict[str, object] = {
+        'serial': serial,
+        'firmware': 'campaign',
+        'sample_rate_hz': rate,
+        'channels': list(CHANNELS),
+        'volts_per_count': VOLTS_PER_COUNT,
+    }
+    return HelloFrame(1, info)
+
+
+def identities(volts: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
+    """(n,) identities of samples in volts (n, 6)."""
+    counts = np.rint(volts[:, [0, 3]] / VOLTS_PER_COUNT).astype(np.int64) + DIGIT // 2
+    out: npt.NDArray[np.int64] = counts[:, 0] + counts[:, 1] * DIGIT
+    return out
+
+
+class Line:
+    """The device and its cable. Faults change its attributes; ``lock`` keeps them apart from the sending."""
+
+    def __init__(self, folder: Path, name: str = 'port') -> None:
+        self.lock = threading.RLock()
+        self.folder = folder
+        self.random = random.Random(1)
+        self.taken_by_fault: set[int] = set()
+        self.sent = 0
+        self.wire: Wire | None = None
+        self.mute = False
+        self.hold = False
+        self.obedient = False
+        self.optics: dict[int, int] = {}
+        self.freeze = False
+        self.flags = 0
+        self.greeted = threading.Event()
+        self.serial = SERIAL
+        self._seq = 0
+        self._clock_us = 0
+        self._listening = False
+        self._pending = bytearray()
+        self._second = 0
+        self._stop = threading.Event()
+        self._terminal: PseudoTerminal | None = None
+        self._decoder = FrameDecoder()
+        self._start = time.monotonic()
+        self.plug(name)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    # ---- what faults do
+
+    def plug(self, name: str = 'port') -> None:
+        """Put the cable in, under ``name``."""
+        with self.lock:
+            self.greeted.clear()
+            self._listening = False
+            self._pending.clear()
+            self._decoder = FrameDecoder()
+            self.name = name
+            self._terminal = PseudoTerminal(self.folder / name)
+
+    def unplug(self) -> None:
+        """Pull it; what was on its way is read first."""
+        with self.lock:
+            self._listening = False
+        time.sleep(0.03)
+        with self.lock:
+            if self._terminal is not None:
+                self._terminal.close()
+            self._terminal = None
+
+    @property
+    def device_name(self) -> str:
+        """The host's side of the cable."""
+        return self._terminal.name if self._terminal is not None else ''
+
+    def restart(self, seq: int = 0, clock_us: int = 0) -> None:
+        """The device starts anew."""
+        with self.lock:
+            self._seq, self._clock_us = seq, clock_us
+
+    def jump(self, samples: int = 0, clock_us: int = 0) -> None:
+        """Numbers or clock jump ahead (or back)."""
+        with self.lock:
+            self._seq += samples
+            self._clock_us += clock_us
+
+    def inject(self, garbage: bytes) -> None:
+        """Bytes between two frames."""
+        with self.lock:
+            self._pending += garbage
+
+    def next_identity(self) -> int:
+        """Of the next sample to be taken."""
+        with self.lock:
+            return self.sent
+
+    def close(self) -> None:
+        """End."""
+        self._stop.set()
+        self._thread.join()
+        if self._terminal is not None:
+            self._terminal.close()
+
+    # ---- the device itself
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            with self.lock:
+                self._serve()
+            time.sleep(0.002)
+
+    def _serve(self) -> None:
+        due = int((time.monotonic() - self._start) * RATE) - self.sent
+        for _ in range(due):
+            self._sample()
+        terminal = self._terminal
+        if terminal is None:
+            return
+        poll = select.poll()
+        poll.register(terminal.master, select.POLLIN)
+        mask = poll.poll(0)
+        if mask and mask[0][1] & select.POLLHUP:
+            self._listening = False
+            self._pending.clear()
+            return
+        with contextlib.suppress(BlockingIOError, OSError):
+            if mask:
+                self._receive(os.read(terminal.master, 4096))
+        with contextlib.suppress(BlockingIOError, OSError):
+            if self._pending and not self.hold:
+                del self._pending[: os.write(terminal.master, self._pending)]
+
+    def _receive(self, received: bytes) -> None:
+        for frame in self._decoder.feed(b'\x00' + received if not self._listening else received):
+            if isinstance(frame, HelloRequestFrame):
+                self._pending += encode(hello_of(self.serial))
+                self._listening = True
+                self.greeted.set()
+            elif isinstance(frame, PingFrame):
+                self._pending += encode(PongFrame(frame.cookie, self._clock_us))
+            elif isinstance(frame, StartFrame) and self.obedient:
+                self.mute = self.obedient = False
+
+    def _sample(self) -> None:
+        identity = self.sent
+        self.sent += 1
+        seq, t_us = self._seq, self._clock_us
+        self._seq += 1
+        self._clock_us += 1_000_000 // RATE
+        if not self._listening or self.mute:
+            self.taken_by_fault.add(identity)
+            return
+        high, low = divmod(identity, DIGIT)
+        shake = 0 if self.freeze else self.random.randrange(-6, 7)
+        counts = [low - DIGIT // 2, shake, 16384 + shake, high - DIGIT // 2, -shake, 16384 - shake]
+        for channel, value in self.optics.items():
+            counts[channel] = value
+        if self.freeze:
+            counts[3:] = [high - DIGIT // 2, 0, 16384]
+        flags, self.flags = self.flags, 0
+        frame = encode(SampleFrame(flags, seq % 2**32, max(t_us, 0), tuple(counts)))  # type: ignore[arg-type]
+        changed = self.wire(identity, frame) if self.wire is not None else None
+        if changed is not None:
+            self.taken_by_fault.add(identity)
+            frame = changed
+        self._pending += frame
+        if self.sent // RATE != self._second:
+            self._second = self.sent // RATE
+            self._pending += encode(hello_of(self.serial)) + encode(StatusFrame(0, 2150))

@@ -1,0 +1,66 @@
+"""List the serial ports, ask what is on each, and print the parameter lines for it.
+
+Without a name, every port that the system lists; with names, only those (a pseudo-terminal is in no list).
+Ports that another program has open are named and left alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+
+from psd_deflection.io.port_survey import Port, survey
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('ports', nargs='*', metavar='PORT', help='only these, e.g. /dev/ttyACM0 or /dev/pts/3')
+    parser.add_argument('--json', action='store_true', help='for programs: one JSON list')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the survey; the exit status is 0 whatever was found."""
+    ports = survey(args.ports)
+    if args.json:
+        print(json.dumps({'ports': [asdict(p) for p in ports], 'suggested': suggestions(ports)}, indent=2))
+        return 0
+    if not ports:
+        print('no serial ports; is the device plugged in? (a pseudo-terminal has to be named)')
+        return 0
+    for port in ports:
+        about = f' ({port.description})' if port.description and port.description != 'n/a' else ''
+        print(f'{port.port}{about}\n  {port.answer}')
+    for suggested in suggestions(ports):
+        print('\n' + parameter_lines(suggested))
+    return 0
+
+
+def suggestions(ports: list[Port]) -> list[dict[str, object]]:
+    """One parameter set a device; two Thorlabs aligners are one device."""
+    aligners = [p for p in ports if p.source == 'thorlabs']
+    out: list[dict[str, object]] = [p.suggested for p in ports if p.source and p.source != 'thorlabs']
+    out += [
+        {
+            'source': 'thorlabs',
+            'port': f'{one.suggested["port"]},{two.suggested["port"]}',
+            'converter.sample_rate_hz': 200.0,
+            'block_size': 10,
+            'min_samples': 5,
+        }
+        for one, two in zip(aligners[::2], aligners[1::2], strict=False)
+    ]
+    return out
+
+
+def parameter_lines(values: dict[str, object]) -> str:
+    """A ROS 2 parameter file of these values, to be put beside those of the rig."""
+    lines = ['/**:', '  ros__parameters:']
+    section = ''
+    for name, value in values.items():
+        head, _, tail = name.rpartition('.')
+        if head and head != section:
+            lines.append(f'    {head}:')
+        section = head
+        lines.append(f'    {"  " if head else ""}{tail}: {json.dumps(value)}')
+    return '\n'.join(lines)
