@@ -9,6 +9,8 @@
 # make firmware build the example firmware, run it in qemu, join it to the daemon (installs what it needs with apt-get)
 # make golden   make the recordings in bags/ anew
 # make colcon   build with colcon in a virtual environment of its own and look at what it installed
+# make docs     the documentation as a web site, in build/site
+# make shots    the pictures of the live page in docs/figures anew (needs Chromium)
 # make clean    remove what the above made
 PYTHON ?= python3
 VENV ?= .venv
@@ -18,7 +20,7 @@ PORT ?=
 ARGS ?=
 BIN := $(VENV)/bin
 
-.PHONY: help run test lint types contracts unit bench faults crash fuzz soak firmware golden colcon clean
+.PHONY: help run test lint types contracts unit bench faults crash fuzz soak firmware golden docs shots blind blind-slice demo-discover colcon clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -87,6 +89,14 @@ firmware: $(VENV)/.installed
 
 golden: $(VENV)/.installed
 	$(BIN)/python bags/make.py
+
+docs: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[docs]'
+	$(BIN)/python -m mkdocs build --strict --quiet --site-dir build/site
+	@echo 'open build/site/index.html'
+
+shots: $(VENV)/.installed
+	$(BIN)/python docs/shots.py
 
 # colcon from PyPI wants an older setuptools than ours: a virtual environment of its own.
 colcon:
