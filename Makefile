@@ -11,6 +11,8 @@
 # make colcon   build with colcon in a virtual environment of its own and look at what it installed
 # make docs     the documentation as a web site, in build/site
 # make shots    the pictures of the live page in docs/figures anew (needs Chromium)
+# make blind    hide effects with a second generator and see whether discover names them (hours; JOBS=2)
+# make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
 # make clean    remove what the above made
 PYTHON ?= python3
 VENV ?= .venv
@@ -20,7 +22,7 @@ PORT ?=
 ARGS ?=
 BIN := $(VENV)/bin
 
-.PHONY: help run test lint types contracts unit bench faults crash fuzz soak firmware golden docs shots blind blind-slice demo-discover colcon clean
+.PHONY: help run test lint types contracts unit bench faults crash fuzz soak firmware golden docs shots blind demo-discover colcon clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -97,6 +99,18 @@ docs: $(VENV)/.installed
 
 shots: $(VENV)/.installed
 	$(BIN)/python docs/shots.py
+
+# Truth hidden by a second generator: fresh seeds, both cores with JOBS=2; a run that was stopped goes on.
+JOBS ?= 1
+blind: $(VENV)/.installed
+	$(BIN)/python -m blind.run --jobs $(JOBS) $(BLIND)
+
+demo-discover: $(VENV)/.installed
+	rm -rf build/demo && mkdir -p build/demo
+	$(BIN)/psd-deflection simulate --loads identification --effect sensor_rotation,psd=2,angle=0.01 --seed 5 --out build/demo/rig
+	$(BIN)/psd-deflection discover build/demo/rig --params-file config/thesis_rig.yaml --out build/demo/found
+	$(BIN)/psd-deflection replay build/demo/rig --params-file build/demo/found/model.yaml --out build/demo/corrected.csv
+	@echo 'the report: build/demo/found/report.html'
 
 # colcon from PyPI wants an older setuptools than ours: a virtual environment of its own.
 colcon:
