@@ -49,7 +49,7 @@ PATIENCE_S = 10.0
 def expected(number: int) -> tuple[int, ...]:
     """What synthetic.c makes of a sample's number."""
     ramp = number % 2000 - 1000
-    return (ramp, -ramp, 16384, number % 256, 0, 16384)
+    return (ramp, -ramp, 16384 + number % 7, number % 256, number % 5, 16384 - number % 11)
 
 
 def dialogue(port: str) -> tuple[int, float]:

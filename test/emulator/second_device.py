@@ -131,7 +131,9 @@ class Emulator:
                 self.overruns += 1
                 self.dropping = True
             elif self.streaming:
-                counts = (number % 2000, -100, 16384, 50, 25, 16384)
+                # A real converter is never still.
+                still = number * 7919 % 13 - 6
+                counts = (number % 2000, still - 100, 16384 + still, 50 - still, 25 + still, 16384 - still)
                 seq = (self.first_seq + number) % 2**32
                 body = struct.pack('<BIQ6h', 2 if self.dropping else 0, seq, number * 1_000_000 // RATE_HZ, *counts)
                 self.dropping = False

@@ -1,0 +1,44 @@
+"""``source:`` without a port starts the rig behind the simulated device of that name, as a process."""
+
+from __future__ import annotations
+
+import pytest
+
+from psd_deflection.config import load_rig
+from psd_deflection.errors import ConfigError, DeviceError
+from psd_deflection.runner.session import Session
+
+SLOW: dict[str, object] = {'converter.sample_rate_hz': 100.0, 'block_size': 5, 'min_samples': 2}
+
+
+@pytest.mark.parametrize(
+    ('source', 'overrides', 'described'),
+    [
+        ('dataq', {}, 'DATAQ DI-2108'),
+        ('lines', {}, 'text lines'),
+        ('thorlabs', SLOW, 'Thorlabs KPA101 and KPA101'),
+    ],
+)
+def test_estimates_come_of_every_device(source: str, overrides: dict[str, object], described: str) -> None:
+    said: list[str] = []
+    session = Session(load_rig(overrides={'source': source, **overrides}), said.append)
+    try:
+        session.start()
+        while session.pipeline.counters.estimates < 4 and session.acquisition.counters.samples < 20_000:
+            session.processing.request(lambda: None)
+    finally:
+        session.close()
+    assert session.failed is None
+    assert session.pipeline.counters.estimates >= 4
+    assert any(described in s for s in said)
+    assert session.acquisition.counters.bad == 0
+
+
+def test_a_rate_that_the_pair_cannot_do_ends_before_it_begins() -> None:
+    with pytest.raises(DeviceError, match=r'converter\.sample_rate_hz = 1000 is out of reach'):
+        Session(load_rig(overrides={'source': 'thorlabs'}), lambda _: None)
+
+
+def test_what_cannot_be_simulated_needs_a_port() -> None:
+    with pytest.raises(ConfigError, match='name the recording'):
+        Session(load_rig(overrides={'source': 'replay'}), lambda _: None)
