@@ -2,9 +2,17 @@
 #               (make run PORT=/dev/ttyACM0 ARGS='--params-file my_rig.yaml' for a real one)
 # make test     set-up, then lint, types, import contracts and every test
 # make bench    what it costs, as ratios to peers measured in the same run (a few minutes)
+# make faults   a campaign of faults against the real node, each FAULT_TIMES=20 times (about 20 minutes)
+# make crash    kill -9 at 200 random instants while recording (about 8 minutes)
+# make fuzz     coverage-guided fuzzing of all that reads strangers' bytes, FUZZ_SECONDS=600 each; 10^7 damaged frames
+# make soak     SOAK_MINUTES=30 in real time, SOAK_HOURS=24 of simulated time
 # make firmware build the example firmware, run it in qemu, join it to the daemon (installs what it needs with apt-get)
 # make golden   make the recordings in bags/ anew
 # make colcon   build with colcon in a virtual environment of its own and look at what it installed
+# make docs     the documentation as a web site, in build/site
+# make shots    the pictures of the live page in docs/figures anew (needs Chromium)
+# make blind    hide effects with a second generator and see whether discover names them (hours; JOBS=2)
+# make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
 # make clean    remove what the above made
 PYTHON ?= python3
 VENV ?= .venv
@@ -14,7 +22,7 @@ PORT ?=
 ARGS ?=
 BIN := $(VENV)/bin
 
-.PHONY: help run test lint types contracts unit bench firmware golden colcon clean
+.PHONY: help run test lint types contracts unit bench faults crash fuzz soak firmware golden docs shots blind demo-discover colcon clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -54,6 +62,26 @@ bench: $(VENV)/.installed
 	$(BIN)/python bench/live.py
 	$(BIN)/python bench/solvers.py
 
+FAULT_TIMES ?= 20
+faults: $(VENV)/.installed
+	$(BIN)/python -m bench.campaign.faults --times $(FAULT_TIMES)
+
+CRASH_TIMES ?= 200
+crash: $(VENV)/.installed
+	$(BIN)/python -m bench.campaign.crash --times $(CRASH_TIMES)
+
+FUZZ_SECONDS ?= 600
+FUZZ_FRAMES ?= 10000000
+fuzz: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check atheris
+	$(BIN)/python -m bench.campaign.fuzz corrupted $(FUZZ_FRAMES)
+	for target in frames bag csv parameters; do $(BIN)/python -m bench.campaign.fuzz $$target -max_total_time=$(FUZZ_SECONDS) || exit 1; done
+
+SOAK_MINUTES ?= 30
+SOAK_HOURS ?= 24
+soak: $(VENV)/.installed
+	$(BIN)/python -m bench.campaign.soak --minutes $(SOAK_MINUTES) --hours $(SOAK_HOURS)
+
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 
 firmware: $(VENV)/.installed
@@ -63,6 +91,26 @@ firmware: $(VENV)/.installed
 
 golden: $(VENV)/.installed
 	$(BIN)/python bags/make.py
+
+docs: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[docs]'
+	$(BIN)/python -m mkdocs build --strict --quiet --site-dir build/site
+	@echo 'open build/site/index.html'
+
+shots: $(VENV)/.installed
+	$(BIN)/python docs/shots.py
+
+# Truth hidden by a second generator: fresh seeds, both cores with JOBS=2; a run that was stopped goes on.
+JOBS ?= 1
+blind: $(VENV)/.installed
+	$(BIN)/python -m blind.run --jobs $(JOBS) $(BLIND)
+
+demo-discover: $(VENV)/.installed
+	rm -rf build/demo && mkdir -p build/demo
+	$(BIN)/psd-deflection simulate --loads identification --effect sensor_rotation,psd=2,angle=0.01 --seed 5 --out build/demo/rig
+	$(BIN)/psd-deflection discover build/demo/rig --params-file config/thesis_rig.yaml --out build/demo/found
+	$(BIN)/psd-deflection replay build/demo/rig --params-file build/demo/found/model.yaml --out build/demo/corrected.csv
+	@echo 'the report: build/demo/found/report.html'
 
 # colcon from PyPI wants an older setuptools than ours: a virtual environment of its own.
 colcon:

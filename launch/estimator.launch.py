@@ -21,6 +21,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument('record', default_value='false', description='record from the start'),
             DeclareLaunchArgument('bag_dir', default_value='recordings', description='where recordings go'),
             DeclareLaunchArgument('monitor', default_value='false', description='serve the live page'),
+            DeclareLaunchArgument('markers', default_value='false', description='publish markers for RViz'),
             Node(
                 package='psd_deflection',
                 executable='estimator',
@@ -32,6 +33,7 @@ def generate_launch_description() -> LaunchDescription:
                         'port': ParameterValue(LaunchConfiguration('port'), value_type=str),
                         'record': ParameterValue(LaunchConfiguration('record'), value_type=bool),
                         'monitor': ParameterValue(LaunchConfiguration('monitor'), value_type=bool),
+                        'markers': ParameterValue(LaunchConfiguration('markers'), value_type=bool),
                         'bag_dir': ParameterValue(LaunchConfiguration('bag_dir'), value_type=str),
                     },
                 ],

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from psd_deflection import __version__
 from psd_deflection.errors import PsdDeflectionError
@@ -29,6 +29,7 @@ COMMANDS: dict[str, str] = {
     'design': 'size the link and place the sensors (appendix B, condition numbers)',
     'compare-methods': 'how far each method is off, and where the figures of Table 5.1 come from',
     'params': 'list every parameter with unit, bounds and default',
+    'completion': 'print what makes your shell complete these commands',
 }
 """Command name to one-line summary; the module is ``psd_deflection.cli.NAME`` (``-`` as ``_``)."""
 
@@ -39,9 +40,8 @@ Each command explains itself:     psd-deflection COMMAND --help
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status (``psd_deflection.errors`` lists them)."""
-    argv = list(sys.argv[1:] if argv is None else argv)
+def make_parser(chosen: Collection[str]) -> argparse.ArgumentParser:
+    """The whole command line; the arguments of the commands ``chosen`` only, since the others' modules stay unread."""
     parser = argparse.ArgumentParser(
         prog='psd-deflection',
         description='Tip deflection and twist of a flexible link from two position sensing detectors.',
@@ -50,16 +50,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument('--version', action='version', version=f'psd-deflection {__version__}')
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
-    chosen = next((a for a in argv if not a.startswith('-')), None)
     for name, summary in COMMANDS.items():
         sub = commands.add_parser(
             name, help=summary, description=summary, formatter_class=argparse.RawDescriptionHelpFormatter
         )
-        if name == chosen:
+        if name in chosen:
             module = importlib.import_module('psd_deflection.cli.' + name.replace('-', '_'))
             sub.description = module.__doc__
             module.add_arguments(sub)
             sub.set_defaults(run=module.run)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status (``psd_deflection.errors`` lists them)."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    parser = make_parser([a for a in argv if not a.startswith('-')][:1])
     # `ros2 run` and `ros2 launch` add arguments of their own: they are for rclpy, not for argparse.
     own, ros_arguments = _split_ros_arguments(argv)
     args = parser.parse_args(own)

@@ -6,6 +6,7 @@ With --params-file the values of that file are shown and checked.
 from __future__ import annotations
 
 import argparse
+import json
 
 from psd_deflection.config import PARAMETERS, load_rig
 
@@ -13,11 +14,15 @@ from psd_deflection.config import PARAMETERS, load_rig
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('--params-file', metavar='RIG.yaml', help='a ROS 2 parameter file')
+    parser.add_argument('--json', action='store_true', help='for programs: one JSON object, name to value')
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the table."""
     rig = load_rig(args.params_file)
+    if args.json:
+        print(json.dumps(dict(rig.values), indent=2))
+        return 0
     for p in PARAMETERS:
         bounds = p.bound_text() or (', '.join(p.choices) if p.choices else '')
         unit = f' {p.unit}' if p.unit else ''

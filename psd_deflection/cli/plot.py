@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import html
 import io
+import json
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -43,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
     parser.add_argument('--params-file', metavar='RIG.yaml', help='use this rig instead of the recorded parameters')
     parser.add_argument('--out', metavar='OUT', help='.png, .svg, .pdf or .html (default: REC.png, here)')
+    parser.add_argument('--json', action='store_true', help='print the summary as JSON')
 
 
 @dataclass
@@ -110,6 +112,9 @@ def run(args: argparse.Namespace) -> int:
         write_html(figure, out, str(args.recording), summary)
     else:
         save_figure(figure, out)
+    if args.json:
+        print(json.dumps({**dict(summary), 'out': str(out)}, ensure_ascii=False))
+        return 0
     for name, value in summary:
         print(f'{name:<24} {value}')
     print(f'written to {out}')

@@ -7,7 +7,7 @@ the best pairs of the linear screen as well; in the end drop what no longer earn
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -53,6 +53,11 @@ class SearchResult:
 def key_of(active: ActiveEffect) -> tuple[object, ...]:
     """Effect and discrete choices."""
     return (active.effect.name, *(active.values[p.name] for p in active.effect.parameters if p.kind == 'choice'))
+
+
+def slot(effect: str, values: Mapping[str, float]) -> tuple[object, ...]:
+    """What there is one of: an effect, for each PSD. Two readings of one effect at once explain nothing."""
+    return (effect, values.get('psd'))
 
 
 def promising(scores: Sequence[Score], penalty: float, share: float, limit: int) -> list[Score]:
@@ -136,8 +141,8 @@ class Search:
         while len(current.effects) < MAX_EFFECTS and ws.simulations < BUDGET:
             if current.effects:
                 scores = self.screen.score(current.residual, current.jacobian)
-            taken = {key_of(a) for a in current.effects}
-            scores = [s for s in scores if s.candidate.variant not in taken]
+            taken = {slot(a.effect.name, a.values) for a in current.effects}
+            scores = [s for s in scores if slot(s.candidate.effect.name, s.candidate.start) not in taken]
             if not scores or min(s.p for s in scores) > P_ACCEPT:
                 break
             # From the second on, what is left is smaller and the first guess better.
@@ -185,7 +190,8 @@ class Search:
         pairs = self.screen.pairs(null.residual, self.penalty, 5)
         starts = []
         for a, b, _ in pairs:
-            if {a.candidate.variant, b.candidate.variant} != {key_of(e) for e in current.effects}:
+            same = slot(a.candidate.effect.name, a.candidate.start) == slot(b.candidate.effect.name, b.candidate.start)
+            if not same and {a.candidate.variant, b.candidate.variant} != {key_of(e) for e in current.effects}:
                 starts.append(
                     [a.candidate.from_coefficients(a.coefficients), b.candidate.from_coefficients(b.coefficients)]
                 )

@@ -170,7 +170,7 @@ class Acquisition:
         self._regressed = self.source.clock in (Clock.DEVICE, Clock.COUNTED)
         # Monotonic time is mapped to ROS time by one constant: a step of the wall clock while
         # running must not tear the stamps apart.
-        self._to_ros_ns = time.time_ns() - time.monotonic_ns()
+        self.to_ros_ns = time.time_ns() - time.monotonic_ns()
         self._sequence = SequenceExtender(self._block_size)
         self._last_t_ns = 0
         self._first_number = 0
@@ -231,7 +231,7 @@ class Acquisition:
 
         Stamps do not follow it: they would tear apart. The next start takes it over.
         """
-        return time.time_ns() - time.monotonic_ns() - self._to_ros_ns
+        return time.time_ns() - time.monotonic_ns() - self.to_ros_ns
 
     def _run(self) -> None:
         if self._rig.acquisition.realtime:
@@ -253,7 +253,7 @@ class Acquisition:
                     events, now, size = self.source.read(READ_TIMEOUT_S)
                     if size:
                         self.counters.bytes += size
-                        if self._take(events, now):
+                        if self.feed(events, now):
                             silent_since = now / 1e9
                     elif self._seq:
                         self._hand_over(now)
@@ -324,8 +324,11 @@ class Acquisition:
             self._restarted()
         self._say(f'{self._name}: the device is back')
 
-    def _take(self, events: list[Event], now: int) -> bool:
-        """Sort the frames of one read; True where one of them was a sample."""
+    def feed(self, events: list[Event], now: int) -> bool:
+        """Sort the frames of one read at ``now`` (CLOCK_MONOTONIC, ns); True where one was a sample.
+
+        The reader thread calls it; without one, whoever has a clock of his own may (a test, a simulation).
+        """
         counters = self.counters
         good = False
         if self._regressed:
@@ -451,4 +454,4 @@ class Acquisition:
         if self.source.clock is Clock.RECORDED:
             return t
         host = self._clock.to_host_ns(t) if self._regressed else t
-        return host + (self._to_ros_ns - self._latency_ns)
+        return host + (self.to_ros_ns - self._latency_ns)

@@ -97,7 +97,8 @@ function greet(found) {
   buttons();
 }
 
-const blank = new Array(KEEP.length).fill(null);
+// Breaks the traces where blocks are gone altogether, and is marked as lost.
+const blank = KEEP.map((name) => (name === 'lost' ? 1 : null));
 const row = new Array(KEEP.length).fill(null);
 
 function takeRow(values) {

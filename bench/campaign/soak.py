@@ -1,0 +1,236 @@
+"""``make soak``: the daemon for long, in real time and in simulated time.
+
+Real time: the node with recording and a subscriber, reading a device whose clock runs 30 ppm fast
+over a line that is polled every millisecond, as USB is. Simulated time: reader, clock and pipeline
+as fast as they go, over a wrap of the sample numbers. Both are judged by samples lost, by the growth
+of memory after warm-up, and by the stamps against the simulated truth after three minutes.
+
+  python -m bench.campaign.soak --minutes 30 --hours 24
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+from bench.campaign.line import hello_of
+from psd_deflection.config import load_rig
+from psd_deflection.io.recordings import open_recording
+from psd_deflection.io.simulated_device import PseudoTerminal
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.protocol.frames import (
+    FrameDecoder,
+    HelloRequestFrame,
+    PingFrame,
+    PongFrame,
+    SampleFrame,
+    StatusFrame,
+    encode,
+)
+from psd_deflection.runner.acquisition import Acquisition, Chunk
+
+SKEW = 30e-6
+MS = 1_000_000
+SETTLED_S = 180
+ALLOWED_STD_NS = 50_000
+ALLOWED_GROWTH = 2_000_000
+PAGE = os.sysconf('SC_PAGE_SIZE')
+
+
+def resident(pid: int) -> int:
+    """Resident memory of a process, bytes."""
+    return int(Path(f'/proc/{pid}/statm').read_text().split()[1]) * PAGE
+
+
+class PolledDevice:
+    """1 kHz by a clock that runs ``SKEW`` fast, over a line that takes its bytes each full millisecond."""
+
+    def __init__(self, folder: Path) -> None:
+        self.port = PseudoTerminal(folder / 'port')
+        self.start_ns = time.monotonic_ns()
+        self.taken = 0
+        self.listening_from = -1
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def true_ns(self, number: int) -> int:
+        """Host time (CLOCK_MONOTONIC) at which a sample was taken."""
+        return self.start_ns + round(number * MS / (1.0 + SKEW))
+
+    def _run(self) -> None:
+        decoder, pending, chance = FrameDecoder(), b'', random.Random(2)
+        decoder.feed(b'\x00')
+        while not self._stop.is_set():
+            now = time.monotonic_ns()
+            time.sleep((MS - now % MS) / 1e9)
+            now = time.monotonic_ns()
+            try:
+                for frame in decoder.feed(os.read(self.port.master, 4096)):
+                    if isinstance(frame, HelloRequestFrame):
+                        pending += encode(hello_of('SOAK'))
+                        self.listening_from = self.taken
+                    elif isinstance(frame, PingFrame):
+                        device_us = int((now - self.start_ns) * (1.0 + SKEW) / 1000)
+                        pending += encode(PongFrame(frame.cookie, device_us))
+            except (BlockingIOError, OSError):
+                pass
+            while self.true_ns(self.taken) < now - now % MS:
+                shake = chance.randrange(-6, 7)
+                counts = (shake, -shake, 16384, shake, shake, 16384 - shake)
+                pending += encode(SampleFrame(0, self.taken % 2**32, self.taken * 1000, counts))
+                self.taken += 1
+                if self.taken % 1000 == 0:
+                    pending += encode(hello_of('SOAK')) + encode(StatusFrame(0, 2150))
+            if self.listening_from < 0:
+                pending = b''
+                continue
+            with contextlib.suppress(BlockingIOError, OSError):
+                pending = pending[os.write(self.port.master, pending) :]
+
+    def close(self) -> None:
+        """End."""
+        self._stop.set()
+        self._thread.join()
+        self.port.close()
+
+
+def judged(name: str, lost: int, growth: int, errors: np.ndarray[tuple[int], np.dtype[np.float64]]) -> bool:
+    """Print the verdict of one part."""
+    std = float(errors.std()) if len(errors) else float('nan')
+    mean = float(errors.mean()) if len(errors) else float('nan')
+    good = lost == 0 and growth < ALLOWED_GROWTH and (not len(errors) or std <= ALLOWED_STD_NS)
+    print(
+        f'{name}: {lost} samples lost, memory {growth / 1e6:+.2f} MB after warm-up (allowed 2), '
+        f'stamps after {SETTLED_S} s: {mean / 1e3:+.1f} us on average, std {std / 1e3:.1f} us (allowed 50)'
+        + ('' if good else '  <-- NOT AS IT MUST BE')
+    )
+    return good
+
+
+def real_time(minutes: float) -> bool:
+    """The node in real time."""
+    import rclpy
+    from geometry_msgs.msg import PoseStamped
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        os.environ.setdefault('ROS_DOMAIN_ID', '78')
+        os.environ['XDG_STATE_HOME'] = os.environ['ROS_LOG_DIR'] = name
+        device = PolledDevice(folder)
+        arguments = ['--port', f'{folder}/port', '--record', str(folder / 'bags')]
+        node = subprocess.Popen(
+            [sys.executable, '-m', 'psd_deflection', 'estimator', *arguments],
+            stderr=(folder / 'said').open('w'),
+            start_new_session=True,
+        )
+        rclpy.init()
+        witness = rclpy.create_node('soak')
+        poses = [0]
+
+        def received(pose: PoseStamped) -> None:
+            poses[0] += 1
+
+        witness.create_subscription(PoseStamped, '/link_tip/deflection', received, 50)
+        memory: list[tuple[float, int]] = []
+        began = time.monotonic()
+        warm_up = min(60.0, 20.0 * minutes)
+        try:
+            while (passed := time.monotonic() - began) < minutes * 60.0 and node.poll() is None:
+                rclpy.spin_once(witness, timeout_sec=0.5)
+                if passed > warm_up and (not memory or passed - memory[-1][0] > 5.0):
+                    memory.append((passed, resident(node.pid)))
+        finally:
+            node.send_signal(signal.SIGINT)
+            node.wait(10.0)
+            device.close()
+        rclpy.shutdown()
+        (bag,) = (folder / 'bags').iterdir()
+        seq, t_ns = [], []
+        for block in open_recording(bag).blocks():
+            seq.append(block.seq)
+            t_ns.append(block.t_ns)
+        numbers, stamps = np.concatenate(seq), np.concatenate(t_ns)
+        lost = int(numbers[-1] - numbers[0]) + 1 - len(numbers)
+        # Recorded times are ROS times; the offset to CLOCK_MONOTONIC is one constant of the run.
+        offset = time.time_ns() - time.monotonic_ns()
+        truth = np.array([device.true_ns(int(n)) for n in numbers]) + offset
+        settled = stamps - stamps[0] > SETTLED_S * 10**9
+        growth = memory[-1][1] - memory[0][1] if memory else 0
+        print(f'{minutes:g} minutes: {len(numbers)} samples recorded, {poses[0]} poses received by a subscriber')
+        return judged('real time', lost, growth, (stamps - truth)[settled].astype(np.float64))
+
+
+def simulated_time(hours: float) -> bool:
+    """Reader, clock and pipeline as fast as they go."""
+    rig = load_rig(None, {'port': 'simulated', 'realtime': False, 'queue_blocks': 100_000})
+    acquisition = Acquisition(rig, lambda text: print(f'  said: {text}'))
+    pipeline = Pipeline(rig)
+    chance = random.Random(3)
+    pool = []
+    for _ in range(997):
+        shake = [chance.randrange(-13, 14) for _ in range(6)]
+        pool.append((shake[0], shake[1], 16384 + shake[2], shake[3], shake[4], 16384 + shake[5]))
+    samples = int(hours * 3600) * 1000
+    # The numbers wrap half way; blocks are cut at multiples of 20, and 2^32 is none.
+    first = (2**32 - samples // 2) // 20 * 20
+    rng = np.random.default_rng(4)
+    errors: list[int] = []
+    memory: list[int] = []
+    blocks = present = 0
+    began = time.perf_counter()
+    for start in range(0, samples, 20):
+        numbers = range(start, start + 20)
+        true_last = round((start + 19) * MS / (1.0 + SKEW))
+        arrival = -(-true_last // MS) * MS + 200_000 + int(rng.exponential(50_000))
+        frames = [SampleFrame(0, (first + n) % 2**32, (first + n) * 1000, pool[n % 997]) for n in numbers]
+        acquisition.feed(frames, arrival)  # type: ignore[arg-type]
+        while not acquisition.queue.empty():
+            item = acquisition.queue.get()
+            if isinstance(item, Chunk):
+                blocks += 1
+                present += len(item.raw.seq)
+                for _ in pipeline.process(item.raw):
+                    pass
+                if start > SETTLED_S * 1000:
+                    stamp = int(item.raw.t_ns[-1]) - acquisition.to_ros_ns
+                    errors.append(stamp - true_last)
+        if len(errors) > 100_000:
+            del errors[: len(errors) - 50_000]
+        if start % (20 * 30_000) == 0:
+            memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+    seconds = time.perf_counter() - began
+    print(
+        f'{hours:g} h of simulated time in {seconds:.0f} s ({hours * 3600 / seconds:.0f} times real time): {present} '
+        f'samples, {blocks} blocks, {pipeline.counters.estimates} estimates, numbers wrapped past 2^32'
+    )
+    growth = memory[-1] - memory[min(2, len(memory) - 1)]
+    return judged('simulated time', samples - present, growth, np.array(errors, np.float64))
+
+
+def main() -> int:
+    """Run both parts; exit status 0 where all is as it must be."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
+    parser.add_argument('--minutes', type=float, default=30.0)
+    parser.add_argument('--hours', type=float, default=24.0)
+    args = parser.parse_args()
+    good = [real_time(args.minutes)] if args.minutes else []
+    if args.hours:
+        good.append(simulated_time(args.hours))
+    return 0 if all(good) else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

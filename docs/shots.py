@@ -1,0 +1,70 @@
+"""Makes the pictures of the live page in docs/figures: ``make shots``; needs Chromium and its driver.
+
+The page plays the simulated rig for half a minute, so that every load case has gone by.
+"""
+
+from __future__ import annotations
+
+import base64
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from selenium import webdriver
+from selenium.webdriver.chrome.service import Service
+
+FIGURES = Path(__file__).resolve().parent / 'figures'
+SECONDS = 27.0
+SHOTS = (('monitor', 1440, 900, 1.0, 'light', False),)
+PHONE = ('monitor_phone', 390, 844, 2.0, 'light', True)
+
+
+def take(url: str, name: str, width: int, height: int, ratio: float, scheme: str, mobile: bool, seconds: float) -> None:
+    """One picture."""
+    options = webdriver.ChromeOptions()
+    options.binary_location = shutil.which('chromium') or shutil.which('google-chrome') or ''
+    for flag in ('--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--disable-background-networking'):
+        options.add_argument(flag)
+    options.add_argument(f'--user-data-dir={tempfile.mkdtemp()}')
+    driver = webdriver.Chrome(options=options, service=Service(shutil.which('chromedriver') or ''))
+    try:
+        driver.execute_cdp_cmd(
+            'Emulation.setDeviceMetricsOverride',
+            {'width': width, 'height': height, 'deviceScaleFactor': ratio, 'mobile': mobile},
+        )
+        driver.execute_cdp_cmd(
+            'Emulation.setEmulatedMedia', {'features': [{'name': 'prefers-color-scheme', 'value': scheme}]}
+        )
+        driver.get(url)
+        driver.execute_script("document.documentElement.style.scrollbarWidth = 'none'")
+        time.sleep(seconds)
+        shot = driver.execute_cdp_cmd('Page.captureScreenshot', {})
+        (FIGURES / f'{name}.png').write_bytes(base64.b64decode(shot['data']))
+    finally:
+        driver.quit()
+
+
+def main() -> int:
+    """Start the rig, take all pictures."""
+    program = subprocess.Popen(
+        [sys.executable, '-m', 'psd_deflection', 'monitor', '--http-port', '0', '--control'],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert program.stderr is not None
+        url = next(line.split()[1] for line in program.stderr if line.startswith('monitor: '))
+        for i, shot in enumerate((*SHOTS, PHONE)):
+            take(url, *shot, SECONDS if i == 0 else 4.0)
+    finally:
+        program.send_signal(signal.SIGINT)
+        program.wait()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,126 @@
+"""The campaigns of ``bench/campaign``, a few rounds of each: they must be able to run, and to fail."""
+
+from __future__ import annotations
+
+import configparser
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.campaign import soak
+from bench.campaign.crash import judge, left_by_a_kill
+from bench.campaign.faults import Row, report
+from bench.campaign.fuzz import TARGETS, corrupted
+from bench.campaign.kinds import FAULTS
+from bench.campaign.line import DIGIT, VOLTS_PER_COUNT, Line, identities
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.runner.acquisition import Acquisition
+
+ROOT = Path(__file__).resolve().parents[2]
+FOUND = sorted((ROOT / 'test' / 'data' / 'fuzz').glob('*'))
+
+
+@pytest.fixture
+def line(tmp_path: Path) -> Iterator[Line]:
+    one = Line(tmp_path)
+    yield one
+    one.close()
+
+
+@pytest.fixture
+def recording_rig(line: Line, tmp_path: Path) -> Rig:
+    return load_rig(
+        None,
+        {
+            'port': str(tmp_path / 'port'),
+            'record': True,
+            'bag_dir': str(tmp_path / 'bags'),
+            'keep_zero': False,
+            'realtime': False,
+        },
+    )
+
+
+@pytest.mark.filterwarnings('ignore:This process .* is multi-threaded:DeprecationWarning')
+@pytest.mark.parametrize('after_s', [0.05, 0.4])
+def test_a_kill_costs_less_than_a_second(recording_rig: Rig, tmp_path: Path, after_s: float) -> None:
+    folder, killed_ns = left_by_a_kill(recording_rig, tmp_path / 'bags', after_s)
+    assert 0.0 < judge(folder, killed_ns) < 1.0
+
+
+def test_a_sample_is_known_again_by_its_volts() -> None:
+    numbers = np.array([0, 1, 4095, 4096, 123_456, 2**24 - 1])
+    counts = np.zeros((len(numbers), 6))
+    counts[:, 0], counts[:, 3] = numbers % DIGIT - DIGIT // 2, numbers // DIGIT - DIGIT // 2
+    np.testing.assert_array_equal(identities((counts * VOLTS_PER_COUNT).astype(np.float32)), numbers)
+
+
+def test_the_line_keeps_its_ledger(line: Line, recording_rig: Rig) -> None:
+    acquisition = Acquisition(recording_rig, lambda text: None)
+    acquisition.open()
+    acquisition.start()
+    seen: set[int] = set()
+    line.inject(b'\x00rubbish\x00')
+    first = line.next_identity()
+    FAULTS[[f.name for f in FAULTS].index('frame truncated')].act(line, 0)
+    while max(seen, default=0) < first + 100:
+        item = acquisition.queue.get(timeout=10.0)
+        raw = getattr(item, 'raw', None)
+        if raw is not None:
+            seen.update(identities(raw.readings.astype(np.float32) * np.float32(VOLTS_PER_COUNT)).tolist())
+    acquisition.stop()
+    expected = set(range(min(seen), max(seen) + 1)) - line.taken_by_fault
+    assert expected <= seen
+    assert len(line.taken_by_fault & set(range(first, first + 100))) == 1
+
+
+def test_there_are_enough_kinds_and_a_bad_row_fails_the_campaign(capsys: pytest.CaptureFixture[str]) -> None:
+    assert len(FAULTS) >= 25
+    assert len({f.name for f in FAULTS}) == len(FAULTS)
+    good = Row(FAULTS[0], injected=2, detected=2, recovered=2, times=[0.2, 0.3])
+    between = {'between the faults': (0, 0)}
+    assert report([good], {FAULTS[0].name: (0, 7), **between})
+    assert not report([good], {FAULTS[0].name: (1, 7), **between})
+    assert not report([good], {FAULTS[0].name: (0, 7), 'between the faults': (3, 0)})
+    slow = Row(FAULTS[0], injected=1, detected=1, recovered=1, times=[1.2])
+    assert not report([slow], {FAULTS[0].name: (0, 0), **between})
+    unseen = Row(FAULTS[0], injected=1, detected=0, recovered=1, times=[0.2])
+    assert not report([unseen], {FAULTS[0].name: (0, 0), **between})
+    assert 'NOT AS IT MUST BE' in capsys.readouterr().out
+
+
+def test_simulated_minutes_lose_nothing_and_keep_time(capsys: pytest.CaptureFixture[str]) -> None:
+    assert soak.simulated_time(200 / 3600)
+    assert 'wrapped past 2^32' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('name', TARGETS)
+def test_fuzz_targets_take_what_is_good_and_what_was_found_bad(name: str) -> None:
+    target, seeds = TARGETS[name]()
+    chance = random.Random(5)
+    for seed in [*seeds, b'', *(p.read_bytes() for p in FOUND if p.name.startswith(name))]:
+        target(seed)
+        for _ in range(5):
+            spoiled = bytearray(seed or b'\x00')
+            spoiled[chance.randrange(len(spoiled))] ^= 1 << chance.randrange(8)
+            target(bytes(spoiled))
+
+
+def test_damaged_frames_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert corrupted(20_000) == 0
+    assert ' 0 accepted with a wrong content' in capsys.readouterr().out
+
+
+def test_the_unit_file_asks_for_what_the_daemon_uses() -> None:
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.optionxform = str  # type: ignore[assignment, method-assign]
+    unit.read(ROOT / 'docs' / 'deploy' / 'psd-deflection.service')
+    service = unit['Service']
+    assert service['Type'] == 'notify'
+    assert int(service['WatchdogSec']) > 5
+    assert service['LimitRTPRIO'] == '50'
+    assert service['LimitMEMLOCK'] == 'infinity'
+    assert 'psd-deflection estimator' in service['ExecStart']

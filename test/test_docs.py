@@ -1,0 +1,242 @@
+"""The documents do what they say: every command is run or at least understood, every link leads somewhere.
+
+A command is not run where it needs hardware, ROS, a network or minutes (``NEEDS``), or where
+``<!-- not run: why -->`` stands before its block; a command of ours is then still given to the
+argument parser, so that no option is named that does not exist.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from psd_deflection import errors
+from psd_deflection.cli.main import COMMANDS, main, make_parser
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
+BLOCK = re.compile(r'(?P<mark><!-- not run: [^>]+-->\s*)?^```(?P<kind>\w*)\n(?P<text>.*?)^```', re.M | re.S)
+
+NEEDS = (
+    (
+        r'^(ros2|rviz2|colcon|ssh|curl|sudo|apt|pip|git|make|python3? -m venv|source|cd|export|udevadm|systemctl)\b',
+        'a system',
+    ),
+    (r'psd-deflection (estimator|monitor)\b', 'no end'),
+    (r'--serve\b', 'no end'),
+    (r'/dev/tty|--port\b', 'a device'),
+    (r'psd-deflection (discover|compare-methods|calibrate|camera|devices?|recover)\b', 'minutes, or files of a rig'),
+)
+
+
+class Command(NamedTuple):
+    page: str
+    line: str
+    run: bool
+
+
+def commands() -> Iterator[Command]:
+    for page in PAGES:
+        for block in BLOCK.finditer(page.read_text()):
+            if block['kind'] not in ('sh', 'bash', 'console', ''):
+                continue
+            text = block['text'].replace('\\\n', ' ')
+            for raw in text.splitlines():
+                line = re.sub(r'^\$ ', '', raw.strip())
+                # A comment, and what a console answers.
+                if not line or line.startswith('#') or (block['kind'] in ('console', '') and raw[0] != '$'):
+                    continue
+                needs = any(re.search(pattern, line) for pattern, _ in NEEDS)
+                yield Command(str(page.relative_to(ROOT)), line, not needs and block['mark'] is None)
+
+
+ALL = list(commands())
+OURS = [c for c in ALL if c.line.startswith('psd-deflection ')]
+
+
+def words(line: str) -> list[str]:
+    """The arguments of one of our commands, with what a reader would put in for a placeholder."""
+    line = re.split(r'\s#\s|\s>\s|\s\|\s', line + ' ')[0]
+    line = re.sub(r'recordings/psd_\w+|\bREC(ORDING)?\b', 'bags/clean', line).replace(
+        'my_rig.yaml', 'config/thesis_rig.yaml'
+    )
+    return shlex.split(line)[1:]
+
+
+@pytest.fixture(scope='module')
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what a checkout has, where commands may write."""
+    folder = tmp_path_factory.mktemp('checkout')
+    for name in ('bags', 'config', 'docs'):
+        (folder / name).symlink_to(ROOT / name)
+    return folder
+
+
+def test_there_are_commands() -> None:
+    assert len([c for c in OURS if c.run]) >= 12
+    others = {c.line for c in ALL if c.run} - {c.line for c in OURS}
+    assert not others, f'neither ours nor known to need something: {others}'
+
+
+@pytest.mark.parametrize('command', OURS, ids=lambda c: f'{c.page}: {c.line}'[:90])
+def test_a_command_is_understood(command: Command) -> None:
+    argv = words(command.line)
+    if argv[0] == 'COMMAND':
+        return
+    assert argv[0] in COMMANDS
+    arguments = argv[: argv.index('--ros-args')] if '--ros-args' in argv else argv
+    if '--help' not in arguments:
+        make_parser([argv[0]]).parse_args(arguments)
+
+
+@pytest.mark.parametrize(
+    'line', sorted({' '.join(words(c.line)) for c in OURS if c.run}), ids=lambda line: str(line)[:80]
+)
+def test_a_command_runs(
+    line: str, checkout: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(checkout)
+    argv = shlex.split(line)
+    if '--help' in argv:
+        with pytest.raises(SystemExit):
+            main(argv)
+        return
+    if '--out' in argv:
+        # A page may write the same name as another one.
+        out = Path(argv[argv.index('--out') + 1])
+        if out.exists():
+            argv[argv.index('--out') + 1] = f'again_{abs(hash(line))}{out.suffix}'
+    # A recording of another machine may differ in its last bits: that is what 1 says.
+    assert main(argv) in ((0, 1) if '--compare' in argv else (0,)), capsys.readouterr().err
+
+
+def anchors(page: Path) -> set[str]:
+    headings = re.findall(r'^#+ (.+)$', page.read_text(), re.M)
+    return {re.sub(r'[^\w\- ]', '', h.lower()).strip().replace(' ', '-') for h in headings}
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda p: p.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    text = re.sub(r'```.*?```', '', page.read_text(), flags=re.S)
+    for target in re.findall(r'\]\(([^)\s]+)(?: "[^"]*")?\)', text):
+        if target.startswith(('http://', 'https://', 'mailto:')):
+            continue
+        name, _, anchor = target.partition('#')
+        path = (page.parent / name).resolve() if name else page
+        assert path.exists(), f'{page.name}: {target}'
+        if anchor and path.suffix == '.md':
+            assert anchor in anchors(path), f'{page.name}: {target}'
+
+
+def test_no_page_loads_anything_from_elsewhere() -> None:
+    for page in PAGES:
+        assert not re.search(r'!\[[^\]]*\]\(https?:', page.read_text()), page
+
+
+PYTHON = [
+    (page, number, block['text'])
+    for page in PAGES
+    for number, block in enumerate(BLOCK.finditer(page.read_text()))
+    if block['kind'] == 'python' and block['mark'] is None
+]
+
+
+@pytest.mark.parametrize(('page', 'number', 'text'), PYTHON, ids=lambda v: getattr(v, 'name', None))
+def test_python_blocks_run(
+    page: Path, number: int, text: str, checkout: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(checkout)
+    script = tmp_path / f'block_{number}.py'
+    script.write_text(text)
+    runpy.run_path(str(script))
+
+
+def test_the_notebook_runs(checkout: Path, tmp_path: Path) -> None:
+    if importlib.util.find_spec('pandas') is None:
+        pytest.skip('the notebook needs pandas: pip install .[test]')
+    cells = json.loads((ROOT / 'docs' / 'recording.ipynb').read_text())['cells']
+    sources = [''.join(cell['source']) for cell in cells if cell['cell_type'] == 'code']
+    assert len(sources) >= 4
+    script = tmp_path / 'notebook.py'
+    # As a notebook does: all in one namespace.
+    script.write_text(
+        "import matplotlib\nmatplotlib.use('Agg')\n" + '\n\n'.join(sources) + '\nassert len(samples) == 4000\n'
+    )
+    done = subprocess.run(
+        [sys.executable, str(script)],
+        cwd=checkout,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={'PYTHONPATH': str(ROOT), 'PATH': '', 'MPLCONFIGDIR': str(tmp_path)},
+    )
+    assert done.returncode == 0, done.stderr
+    assert 'sd at rest: 0.18 µm, 0.20 µm, 0.15 mdeg' in done.stdout
+
+
+@pytest.fixture(scope='module')
+def hooks() -> Any:
+    spec = importlib.util.spec_from_file_location('docs_hooks', ROOT / 'docs' / 'hooks.py')
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_error_message_is_on_the_troubleshooting_page(hooks: Any) -> None:
+    page = hooks.on_page_markdown((ROOT / 'docs' / 'troubleshooting.md').read_text())
+    found = list(hooks.messages())
+    assert len(found) > 150
+    for _, text, module in found:
+        assert hooks._cell(text) in page, (module, text)
+    for name, status in hooks.STATUS.items():
+        assert f'Exit status {status}: {name}' in page or not any(kind == name for kind, _, _ in found)
+    # Found by the collector: every place in the source where one of ours is raised with a text.
+    raised = 0
+    for path in (ROOT / 'psd_deflection').rglob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and isinstance(node.exc.func, ast.Name):
+                raised += node.exc.func.id in hooks.STATUS
+    assert len(found) > 0.8 * raised
+
+
+def test_exit_statuses_are_documented(hooks: Any) -> None:
+    page = (ROOT / 'docs' / 'commands.md').read_text()
+    rows = {int(n) for n in re.findall(r'^\| (\d+) \|', page, re.M)}
+    assert rows == {0, 1, 2, *hooks.STATUS.values()}
+    kinds = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, errors.PsdDeflectionError)]
+    assert {k.exit_status for k in kinds} - rows == {errors.PsdDeflectionError.exit_status}
+
+
+def test_every_command_and_parameter_is_on_its_page(hooks: Any) -> None:
+    page = hooks.on_page_markdown((ROOT / 'docs' / 'commands.md').read_text())
+    assert '<!--' not in page
+    for name in COMMANDS:
+        assert f'usage: psd-deflection {name}' in page
+    assert '| `monitor_control` | `False` |' in page
+
+
+@pytest.mark.parametrize('shell', ['bash', 'zsh'])
+def test_completion_knows_commands_and_options(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['completion', shell]) == 0
+    script = capsys.readouterr().out
+    for word in (*COMMANDS, '--params-file', '--no-ros', '--control'):
+        assert word in script
+
+
+def test_the_navigation_has_every_page() -> None:
+    nav = (ROOT / 'mkdocs.yml').read_text().partition('\nnav:')[2].partition('not_in_nav')
+    listed = set(re.findall(r'(\S+\.md)$', nav[0], re.M)) | set(re.findall(r'^  /(\S+\.md)$', nav[2], re.M))
+    assert {p.name for p in (ROOT / 'docs').glob('*.md')} <= listed
