@@ -94,7 +94,9 @@ def test_it_reads_the_rig_with_its_losses(served: Any, run: Any, unloaded: Any, 
     running = run(load_rig(overrides={'source': 'lines', 'port': str(port.link)}))
     chunks = running.take(400)
     numbers = [int(s) for c in chunks for s in c.raw.seq]
-    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    # A busy machine may make the device drop lines; the numbers then say so.
+    assert all(b > a for a, b in itertools.pairwise(numbers))
+    assert running.acquisition.counters.lost >= numbers[-1] - numbers[0] + 1 - len(numbers)
     np.testing.assert_allclose(volts(chunks).mean(axis=0), [0, 0, 5, 0, 0, 5], atol=1e-3)
     times = np.concatenate([c.raw.t_ns for c in chunks])
     assert (np.diff(times) > 0).all()
