@@ -191,6 +191,8 @@ def main() -> int:
                 print(f'round {number + 1} of {args.times}', file=sys.stderr, flush=True)
             end = line.next_identity()
             witness.spin_until(lambda: witness.newest > end + 100, 10.0)
+            counters = witness.next_report()
+            print({k: v for k, v in counters.items() if 'drop' in k or 'lost' in k or k == 'disconnects'})
         finally:
             node.send_signal(signal.SIGINT)
             node.wait(10.0)

@@ -175,7 +175,8 @@ class CsvRecording(Recording):
         steps = np.diff(np.array(times, dtype=np.int64)).astype(np.float64)
         median = float(np.median(steps))
         near = steps[(steps > 0.5 * median) & (steps < 1.5 * median)]
-        return float(near.mean())
+        # Between steps of very different length the median may be near to none of them.
+        return float(near.mean()) if len(near) else float(steps.min())
 
     def blocks(self) -> Iterator[SampleBlock]:
         """The samples, cut into blocks at seq // block_size; the first sample has seq 0.

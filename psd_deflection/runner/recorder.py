@@ -20,7 +20,9 @@ from psd_deflection.errors import RecordingError
 from psd_deflection.io.bag_writer import BagWriter
 from psd_deflection.records import ParameterChange
 
-MESSAGES_PER_BLOCK = 10
+MESSAGES_PER_BLOCK = 100
+"""The recorder's queue holds this many messages for each block of ``queue_blocks``. A block makes about
+ten, so that a disk may stand still ten times as long as the pipeline may: 50 s by default, in 25 MB."""
 JOIN_S = 1.0
 IDLE_S = 0.5
 LOOK_EVERY = 250
