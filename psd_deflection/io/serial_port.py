@@ -10,6 +10,7 @@ import contextlib
 import errno
 import os
 import select
+import termios
 from pathlib import Path
 
 import serial
@@ -78,7 +79,8 @@ class SerialPort:
 
     def discard_input(self) -> None:
         """Forget what has come and was not read: it is older than it would look."""
-        with contextlib.suppress(OSError, serial.SerialException):
+        # A terminal that is gone refuses with termios' own error, which is no OSError.
+        with contextlib.suppress(OSError, termios.error, serial.SerialException):
             self._serial.reset_input_buffer()
 
     def write(self, frame: bytes) -> None:

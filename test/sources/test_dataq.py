@@ -130,6 +130,19 @@ def test_an_unplugged_one_is_configured_anew(served: Any, run: Any, unloaded: An
     assert running.acquisition.counters.disconnects == 1
 
 
+def test_one_that_falls_silent_is_configured_anew(served: Any, run: Any, unloaded: Any) -> None:
+    device = SimulatedDataq(load_rig(), unloaded)
+    running = run(load_rig(overrides={'source': 'dataq', 'port': str(served(device).link)}))
+    running.take(40)
+    # As a device that lost its supply and has forgotten everything, though its port stays.
+    device._obey('stop', 0)
+    running.heard('no scans come; waiting for it to come back')
+    running.heard('the device is back')
+    before = running.acquisition.counters.samples
+    while running.acquisition.counters.samples < before + 40:
+        running.take(20)
+
+
 @pytest.mark.parametrize(
     ('model', 'said'),
     [('1100', '4 analog inputs and no counter'), ('718B', "model '718B'; known are 1100")],

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import ConfigError, DeviceError
+from psd_deflection.io.serial_port import PortClosedError
 from psd_deflection.io.simulated_thorlabs import SharedRig, SimulatedAligner
 from psd_deflection.io.sources._registry import make_source
 from psd_deflection.protocol.apt import (
@@ -174,3 +175,14 @@ def test_an_answer_that_does_not_come_is_counted(pair: Any) -> None:
     reading = source.read(0.1)
     source.close()
     assert reading.events == [BadFrame('no answer in time', 0)]
+
+
+def test_a_port_that_goes_away_while_it_is_asked_is_a_port_that_is_gone(pair: Any) -> None:
+    first, _, rig = pair()
+    source = make_source(rig)
+    source.open(2.0)
+    source.start()
+    first.unplug()
+    with pytest.raises(PortClosedError):
+        source.read(0.1)
+    source.close()

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, DeviceError
-from psd_deflection.io.serial_port import SerialPort
+from psd_deflection.io.serial_port import PortClosedError, SerialPort
 from psd_deflection.io.sources._interface import Clock, Event, Reading, Sample, Source
 from psd_deflection.protocol.dataq import (
     ANALOG,
@@ -200,6 +200,10 @@ class Dataq(Source):
         hello = self.open(REPLY_S)
         self.start()
         return hello
+
+    def wake(self) -> None:
+        """Silence means that it was stopped or has forgotten its scan list: it is to be configured anew."""
+        raise PortClosedError(f'{self.name}: no scans come')
 
     def close(self) -> None:
         """Stop the device and give the port back."""

@@ -5,7 +5,7 @@ once in slots of ``converter.sample_rate_hz``, which has to be a rate that they 
 measured at the start, and a rate out of reach is refused with the one that is not). A slot in which
 no answer came, or for which the host was late, is a lost sample, and counted. A sample's time is
 half-way between asking and the answer, on the host's clock; the two devices are read within one
-answer time of each other, not at one instant.
+answer time of each other, not at one instant. A sample whose time falls out of its slot is none.
 """
 
 from __future__ import annotations
@@ -170,7 +170,12 @@ class ThorlabsPair(Source):
         self._slot = slot
         events: list[Event] = []
         first, second, t_ns, size = self._ask(events)
-        if first is not None and second is not None:
+        if first is None or second is None:
+            pass
+        elif (t_ns - origin) // self._period_ns != slot:
+            # Between question and answer the next slot began: this is no sample of the one it was asked for.
+            events.append(BadFrame('answered too late for its slot', size))
+        else:
             sign = self._x_sign
             values = (sign * first.x, first.y, first.total, sign * second.x, second.y, second.total)
             events.append(Sample(0, slot % 2**32, t_ns, values))
