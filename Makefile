@@ -20,6 +20,8 @@ VENV ?= .venv
 WITH ?=
 PORT ?=
 ARGS ?=
+# Further words for pytest, e.g. PYTEST='-m "not browser"'.
+PYTEST ?=
 BIN := $(VENV)/bin
 
 .PHONY: help run test lint types contracts unit bench faults crash fuzz soak firmware golden docs shots blind demo-discover colcon clean
@@ -53,7 +55,7 @@ contracts: $(VENV)/.installed
 	$(BIN)/lint-imports --no-cache
 
 unit: $(VENV)/.installed
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PYTEST)
 
 run: $(VENV)/.installed
 	$(BIN)/psd-deflection estimator --monitor --record recordings $(if $(PORT),--port $(PORT)) $(ARGS)

@@ -135,6 +135,10 @@ def lost_samples(rows: list[Row], line: Line, recording: Path, start: int, end: 
         out[row.fault.name] = (0 if row.fault.estimates else len(numbers - taken - present), len(taken))
     rest = set(range(start, end)) - accounted - line.taken_by_fault - present
     out['between the faults'] = (len(rest), 0)
+    for first in sorted(i for i in rest if i - 1 not in rest):
+        last = next(i for i in range(first, end + 1) if i + 1 not in rest)
+        before = max(((b, row.fault.name) for row in rows for _, b in row.windows if b <= first), default=(0, 'start'))
+        print(f'missing: {first} to {last}, {first - before[0]} samples after "{before[1]}" was over', file=sys.stderr)
     return out
 
 

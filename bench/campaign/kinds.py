@@ -344,5 +344,5 @@ FAULTS: tuple[Fault, ...] = (
     Fault('laser 1 off', _optics({2: 3}), ('refused: laser_lost',), estimates=True),
     Fault('laser 2 off', _optics({5: -2}), ('refused: laser_lost',), estimates=True),
     Fault('y1 saturated', _optics({1: 32767}), ('refused: saturated',), estimates=True),
-    Fault('psd_2 stands still', _frozen_psd, ('refused: frozen',), estimates=True),
+    Fault('psd_2 stands still', _frozen_psd, ('refused: frozen', 'found: psd_2 stands still'), estimates=True),
 )

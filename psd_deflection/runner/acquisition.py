@@ -51,6 +51,9 @@ RETRY_S = 0.2
 READ_TIMEOUT_S = 0.1
 READY_S = 10.0
 
+TORN_US = 50_000
+"""Device time that disagrees with the sample numbers by more: the clock jumped, or the device paused."""
+
 BY_DEVICE = 'dropped by the device'
 DAMAGED = 'damaged on the wire'
 AWAY = 'while the port was away'
@@ -176,6 +179,7 @@ class Acquisition:
         self._first_number = 0
         self._period_us = 1e6 / rig.converter.sample_rate_hz
         self._observed: tuple[int, int] | None = None
+        self._previous = (-1, 0)
         self._bad_since_sample = 0
         self._was_away = False
         self._refusal = ''
@@ -346,7 +350,11 @@ class Acquisition:
                     continue
                 if flags & FLAG_DEVICE_DROPPED:
                     counters.device_dropped += 1
-                if self._seq and number // self._block_size != self._seq[0] // self._block_size:
+                if self._regressed and self._torn(number, t):
+                    # What came before the clock jumped is stamped by the map that held then.
+                    self._hand_over(now)
+                    self._observe(seq, t, now)
+                elif self._seq and number // self._block_size != self._seq[0] // self._block_size:
                     self._hand_over(now)
                 self._seq.append(number)
                 self._t.append(t)
@@ -369,17 +377,31 @@ class Acquisition:
         if newest is None:
             return
         _, seq, t_us, _ = newest
-        passed = None
         if self._observed is not None:
             last_seq, last_t = self._observed
             if (last_seq - seq) % WRAP < NEARBY and t_us <= last_t:
                 # Repeated: it says nothing.
                 return
             passed = (seq - last_seq) % WRAP * self._period_us
+            if abs(t_us - last_t - passed) > TORN_US:
+                # The clock may have jumped within this read: that is seen sample by sample.
+                return
+        self._observe(seq, t_us, now)
+
+    def _observe(self, seq: int, t_us: int, now: int) -> None:
+        passed = None
+        if self._observed is not None:
+            passed = (seq - self._observed[0]) % WRAP * self._period_us
         self._observed = (seq, t_us)
         if self._clock.observe(t_us, now, passed):
             self.counters.clock_jumps += 1
             self._say(f"{self._name}: the device's clock jumped; times are laid anew")
+
+    def _torn(self, number: int, t_us: int) -> bool:
+        """Whether device time does not agree with the numbers since the sample before."""
+        last_number, last_t = self._previous
+        self._previous = (number, t_us)
+        return last_number >= 0 and abs(t_us - last_t - (number - last_number) * self._period_us) > TORN_US
 
     def _unusual(self, number: int, step: Step, missing: int, flags: int) -> bool:
         """Count a sample that does not simply follow; False where it is to be passed over."""

@@ -298,10 +298,14 @@ def test_pings_are_answered_and_a_device_that_knows_none_is_left_in_peace(
     assert run.acquisition.counters.pongs == 0
 
 
-def test_a_clock_jump_of_the_device_is_told_and_time_goes_on(device: Any, run: Run, sample: Any) -> None:
-    device.send_frames(*[sample(s) for s in range(40)])
+@pytest.mark.parametrize(('at', 'jump_us'), [(40, 10**9), (47, 10**9), (40, -(10**7)), (53, -(10**7))])
+def test_a_clock_jump_of_the_device_is_told_and_time_goes_on(
+    device: Any, run: Run, sample: Any, at: int, jump_us: int
+) -> None:
+    clock = [10**8 + s * 1000 + (jump_us if s >= at else 0) for s in range(80)]
+    device.send_frames(*[sample(s, t_us=clock[s]) for s in range(40)])
     before = take(run.acquisition, 40)
-    device.send_frames(*[sample(s, t_us=s * 1000 + 10**9) for s in range(40, 80)])
+    device.send_frames(*[sample(s, t_us=clock[s]) for s in range(40, 80)])
     run.heard("the device's clock jumped")
     items = before + take(run.acquisition, 40)
     t = [int(t) for i in items if isinstance(i, Chunk) for t in i.raw.t_ns]
