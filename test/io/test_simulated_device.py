@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
+import os
+import select
+import threading
+import tty
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from psd_deflection.config import load_rig
-from psd_deflection.io.simulated_device import SimulatedDevice
+from psd_deflection.io import simulated_device as module
+from psd_deflection.io.simulated_device import PseudoTerminal, SimulatedDevice, serve
 from psd_deflection.protocol.frames import (
     Frame,
     FrameDecoder,
@@ -104,3 +112,31 @@ def test_losses_and_a_dark_laser_are_where_they_were_asked_for() -> None:
     low = [f.seq for f in got if f.counts[5] < 1000]
     assert low == list(range(10, 20))
     assert all(f.counts[2] > 1000 for f in got)
+
+
+def test_a_process_that_wakes_late_catches_up_and_drops_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Half a second passes at each look at the clock: 500 samples, four times what the device may hold back.
+    clock = itertools.count(0, 250 * MS)
+    monkeypatch.setattr(module, 'time', SimpleNamespace(monotonic_ns=lambda: next(clock), sleep=lambda _: None))
+    port = PseudoTerminal()
+    host = os.open(port.name, os.O_RDWR | os.O_NOCTTY)
+    tty.setraw(host)
+    received = bytearray()
+    ended = threading.Event()
+
+    def read() -> None:
+        while not ended.is_set() or select.select((host,), (), (), 0.1)[0]:
+            if select.select((host,), (), (), 0.1)[0]:
+                received.extend(os.read(host, 65_536))
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    d = device()
+    serve(d, port, lambda: d.taken > 1000)
+    ended.set()
+    reader.join()
+    os.close(host)
+    port.close()
+    got = frames(bytes(received))
+    assert [f.seq for f in got if isinstance(f, SampleFrame)] == list(range(d.taken))
+    assert {f.overruns for f in got if isinstance(f, StatusFrame)} == {0}
