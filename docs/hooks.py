@@ -17,7 +17,7 @@ from typing import Any
 
 from psd_deflection import errors
 from psd_deflection.cli.main import COMMANDS, main, make_parser
-from psd_deflection.config import PARAMETERS
+from psd_deflection.parameters import PARAMETERS
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ('psd_deflection', 'msg_adapters')

@@ -16,8 +16,9 @@ from typing import cast
 
 import yaml
 
-from psd_deflection.config import MAX_FILE_BYTES, Parameter, check_value
+from psd_deflection.config import MAX_FILE_BYTES
 from psd_deflection.errors import ConfigError
+from psd_deflection.parameters import Parameter, check_value
 
 
 @dataclass(frozen=True, slots=True)

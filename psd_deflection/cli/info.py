@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from msg_adapters import SAMPLES
-from psd_deflection.config import BY_NAME
 from psd_deflection.io.recording import Recording
 from psd_deflection.io.recordings import open_recording
+from psd_deflection.parameters import BY_NAME
 
 _EPOCH_FROM_NS = 10**18
 """September 2001; smaller times count from a zero of their own."""

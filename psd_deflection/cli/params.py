@@ -8,7 +8,8 @@ from __future__ import annotations
 import argparse
 import json
 
-from psd_deflection.config import PARAMETERS, load_rig
+from psd_deflection.config import load_rig
+from psd_deflection.parameters import PARAMETERS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

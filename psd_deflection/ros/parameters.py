@@ -1,4 +1,4 @@
-"""The parameters of ``config.PARAMETERS`` as ROS parameters, with types, ranges and units.
+"""The parameters of ``parameters.PARAMETERS`` as ROS parameters, with types, ranges and units.
 
 What is given on the command line, in a launch file or in a parameter file reaches the node as
 overrides. They are checked by the same code as everywhere else, so that ``0`` for a length is
@@ -13,9 +13,9 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from psd_deflection import config
-from psd_deflection.config import PARAMETERS, Rig, check_value, rig_from_values
+from psd_deflection.config import Rig, rig_from_values
 from psd_deflection.errors import ConfigError
+from psd_deflection.parameters import BY_NAME, PARAMETERS, Parameter, check_value
 from psd_deflection.runner.session import Session
 
 ROS_OWN = ('use_sim_time', 'start_type_description_service')
@@ -43,7 +43,7 @@ def rig_of_node(node: Node, extra: Mapping[str, object]) -> Rig:
     return rig
 
 
-def _descriptor(parameter: config.Parameter) -> ParameterDescriptor:
+def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         name=parameter.name,
@@ -88,7 +88,7 @@ class LiveParameters:
             return SetParametersResult(successful=True)
         values: dict[str, float | str | tuple[float, ...]] = {}
         for parameter in changed:
-            declared = config.BY_NAME.get(parameter.name)
+            declared = BY_NAME.get(parameter.name)
             if declared is None:
                 continue
             value = parameter.value

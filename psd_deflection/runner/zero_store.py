@@ -15,8 +15,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.config import BY_NAME, Rig, check_value, replace_values
+from psd_deflection.config import Rig, replace_values
 from psd_deflection.errors import ConfigError
+from psd_deflection.parameters import BY_NAME, check_value
 
 ZEROS = ('psd_1.zero', 'psd_2.zero')
 MAX_BYTES = 10_000
