@@ -221,8 +221,8 @@ class Pipeline:
             samples = self._corrected(block, samples, sums)
         x1, y1, x2, y2 = (samples.sum(axis=0) / present).tolist()
         dots: Dots = (x1, y1, x2, y2)
-        still = self._optics.still(volts)
-        self._frozen = (self._frozen[0] + 1 if still[0] else 0, self._frozen[1] + 1 if still[1] else 0)
+        if self._optics.refuses_frozen:
+            self._count_still(volts)
         verdict = self._optics.judge(block, dots, sums, self._frozen)
         status, reason = verdict.status, verdict.reason
         t_ns = block_middle_ns(block, size, self._period_ns)
@@ -238,8 +238,6 @@ class Pipeline:
         elif verdict.faulty:
             best = self._from_the_other(verdict.faulty, t_ns, block.index, dots, variances)
             degraded = best is not None
-        for finding in verdict.findings:
-            self.counters.findings[finding.split(':')[0]] = self.counters.findings.get(finding.split(':')[0], 0) + 1
         self.last_estimate = best
         if best is not None:
             self.counters.estimates += 1
@@ -259,6 +257,13 @@ class Pipeline:
         if best is None:
             name = status.name.lower()
             self.counters.refused[name] = self.counters.refused.get(name, 0) + 1
+        # What follows, no estimate waits for.
+        if not self._optics.refuses_frozen:
+            self._count_still(volts)
+        findings = verdict.findings + self._optics.late_findings(block, verdict, self._frozen)
+        for finding in findings:
+            name = finding.split(':')[0]
+            self.counters.findings[name] = self.counters.findings.get(name, 0) + 1
         sum1, sum2 = (sums.sum(axis=0) / present).tolist()
         spots = SpotMeans(
             t_ns,
@@ -270,11 +275,15 @@ class Pipeline:
             size - present,
             status,
             reason,
-            verdict.findings,
+            findings,
         )
         self.last_spots = spots
         yield spots
         yield block
+
+    def _count_still(self, volts: npt.NDArray[np.float32]) -> None:
+        first, second = self._optics.still(volts)
+        self._frozen = (self._frozen[0] + 1 if first else 0, self._frozen[1] + 1 if second else 0)
 
     def _solve(
         self, number: int, t_ns: int, block: int, dots: Dots, variances: tuple[float, ...]

@@ -33,7 +33,7 @@ _THIRD_DIFFERENCE = 20.0
 class Verdict:
     """``faulty``: the one detector (1 or 2) that is to blame, 0 where it is neither alone.
 
-    ``half_light``: the splitter works with one of its two lasers.
+    ``faults``: all that are. ``half_light``: the splitter works with one of its two lasers.
     """
 
     status: BlockStatus
@@ -41,11 +41,16 @@ class Verdict:
     faulty: int
     findings: tuple[str, ...] = ()
     half_light: bool = False
+    faults: frozenset[int] = frozenset()
 
 
-def _long(frozen: tuple[int, int]) -> list[tuple[int, int]]:
-    """(PSD, blocks) of those that have stood still for too long."""
-    return [(psd, blocks) for psd, blocks in enumerate(frozen, start=1) if blocks >= FROZEN_BLOCKS]
+def _long(frozen: tuple[int, int]) -> list[tuple[int, str]]:
+    """(PSD, what to say) of those that have stood still for too long."""
+    return [
+        (psd, f'psd_{psd} stands still: no bit has moved for {blocks} blocks')
+        for psd, blocks in enumerate(frozen, start=1)
+        if blocks >= FROZEN_BLOCKS
+    ]
 
 
 class OpticsHealth:
@@ -60,7 +65,7 @@ class OpticsHealth:
         # Half the light is no lost laser where two lasers share both detectors.
         self._sum_min = config.sum_min * (0.5 if self._splitter else 1.0)
         self._sum_max = config.sum_max
-        self._refuse_frozen = config.frozen == 'refuse'
+        self.refuses_frozen = config.frozen == 'refuse'
         step = rig.converter.volts_per_count
         # The converter's last step on either side: beyond it the true value is not known.
         self._rail = np.float32((2 ** (rig.converter.bits - 1) - 1) * step)
@@ -98,9 +103,8 @@ class OpticsHealth:
                     fault(1 + column // 3, BlockStatus.SATURATED, reason)
         elif bool((block.flags & FLAG_OVER_RANGE).any()) and not faults:
             return Verdict(BlockStatus.SATURATED, 'the device reports a channel over range', 0)
-        still = {p: f'psd_{p} stands still: no bit has moved for {n} blocks' for p, n in _long(frozen)}
-        if self._refuse_frozen:
-            for psd, reason in still.items():
+        if self.refuses_frozen:
+            for psd, reason in _long(frozen):
                 fault(psd, BlockStatus.FROZEN, reason)
         if present < self._min_samples and not faults:
             reason = f'{present} of {self._size} samples, at least {self._min_samples} are needed'
@@ -110,21 +114,20 @@ class OpticsHealth:
                 reason = f'{name} at {dot * 1e3:.3f} mm, outside the active area'
                 fault(1 + column // 2, BlockStatus.OUTSIDE_ACTIVE_AREA, reason)
         half_light = self._half_light(low) if self._splitter else False
-        findings = self._findings(block, dots, sums, set(faults), half_light)
-        findings += tuple(reason for psd, reason in still.items() if psd not in faults)
+        findings = self._findings(dots, sums, set(faults), half_light)
         if not faults:
             return Verdict(BlockStatus.OK, '', 0, findings, half_light)
         # The worst cause first: what is lost explains what is saturated or outside.
         psd = min(faults, key=lambda p: (_ORDER.index(faults[p][0]), p))
         status, reason = faults[psd]
         lone = len(faults) == 1 and present >= self._min_samples
-        return Verdict(status, reason, psd if lone else 0, findings, half_light)
+        return Verdict(status, reason, psd if lone else 0, findings, half_light, frozenset(faults))
 
     def _half_light(self, low: list[float]) -> bool:
         return all(HALF_LIGHT[0] * self._nominal < s < HALF_LIGHT[1] * self._nominal for s in low)
 
     def _findings(
-        self, block: SampleBlock, dots: tuple[float, ...], sums: FloatArray, faulty: set[int], half_light: bool
+        self, dots: tuple[float, ...], sums: FloatArray, faulty: set[int], half_light: bool
     ) -> tuple[str, ...]:
         out = []
         if half_light:
@@ -139,6 +142,12 @@ class OpticsHealth:
                 if abs(dots[column]) + self._radius[column] > self._half[column]:
                     out.append(f'psd_{psd}: the spot is clipped at the edge')
                     break
+        return tuple(out)
+
+    def late_findings(self, block: SampleBlock, verdict: Verdict, frozen: tuple[int, int]) -> tuple[str, ...]:
+        """Findings that no estimate waits for: a noisy detector, one that stands still."""
+        faulty = verdict.faults
+        out = []
         if len(block.seq) == self._size >= 10:
             # Third differences: the link's own motion leaves next to nothing in them.
             rough = np.diff(block.volts, n=3, axis=0)
@@ -147,6 +156,8 @@ class OpticsHealth:
                 worst = float(level[3 * psd - 3 : 3 * psd].max())
                 if psd not in faulty and worst > self._noise:
                     out.append(f'psd_{psd} is noisy: {worst * 1e3:.1f} mV a sample')
+        if not self.refuses_frozen:
+            out += [reason for psd, reason in _long(frozen) if psd not in faulty]
         return tuple(out)
 
     def background_variance(self, sums: FloatArray) -> tuple[float, float]:
