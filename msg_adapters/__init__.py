@@ -7,7 +7,7 @@ names of the ROS message definitions, so that nothing here needs ROS.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 from msg_adapters import (
@@ -81,6 +81,26 @@ def solver_topic(solver: str) -> str:
 
 def to_messages(record: Record) -> tuple[Message, ...]:
     """Every message that a record is published and recorded as; none where there is nothing to say."""
+    return tuple(messages(record))
+
+
+def messages(record: Record) -> Iterator[Message]:
+    """:func:`to_messages`, each made only when it is asked for: the first waits for no other."""
+    if not isinstance(record, DeflectionEstimate):
+        yield from _messages(record)
+        return
+    t_ns = record.t_ns
+    fields = pose_stamped.from_estimate(record)
+    if record.primary:
+        # The one that a controller waits for goes first.
+        yield Message(DEFLECTION, pose_stamped.TYPE, t_ns, fields)
+    yield Message(solver_topic(record.solver), pose_stamped.TYPE, t_ns, fields)
+    if record.primary:
+        with_covariance = pose_with_covariance_stamped.from_estimate(record)
+        yield Message(DEFLECTION_WITH_COVARIANCE, pose_with_covariance_stamped.TYPE, t_ns, with_covariance)
+
+
+def _messages(record: Record) -> tuple[Message, ...]:
     if isinstance(record, SampleBlock):
         return tuple(
             Message(SAMPLES, point_cloud2.TYPE, int(part.t_ns[0]), point_cloud2.from_block(part))
@@ -89,18 +109,6 @@ def to_messages(record: Record) -> tuple[Message, ...]:
     if isinstance(record, ParameterChange):
         return ()
     t_ns = record.t_ns
-    if isinstance(record, DeflectionEstimate):
-        fields = pose_stamped.from_estimate(record)
-        own = Message(solver_topic(record.solver), pose_stamped.TYPE, t_ns, fields)
-        if not record.primary:
-            return (own,)
-        with_covariance = pose_with_covariance_stamped.from_estimate(record)
-        # The one that a controller waits for goes first.
-        return (
-            Message(DEFLECTION, pose_stamped.TYPE, t_ns, fields),
-            own,
-            Message(DEFLECTION_WITH_COVARIANCE, pose_with_covariance_stamped.TYPE, t_ns, with_covariance),
-        )
     if isinstance(record, SpotMeans):
         if record.status not in _MEASURED or not all(map(math.isfinite, record.dots)):
             return ()

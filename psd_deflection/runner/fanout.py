@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from msg_adapters import to_messages
+from msg_adapters import messages
 from psd_deflection.io import cdr
 from psd_deflection.records import ParameterChange, Record
 
@@ -36,8 +36,12 @@ class Fanout:
             for change_wire in self.change_wires:
                 change_wire.put_change(record)
             return
-        for topic, type_name, t_ns, fields in to_messages(record):
-            encoded = cdr.encode(type_name, fields)
+        last: object = None
+        encoded = b''
+        for topic, type_name, t_ns, fields in messages(record):
+            # The same message on two topics is encoded once.
+            if fields is not last:
+                last, encoded = fields, cdr.encode(type_name, fields)
             for wire in self.wires:
                 wire.put(topic, type_name, encoded, t_ns)
 
