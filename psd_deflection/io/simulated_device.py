@@ -238,15 +238,15 @@ def serve(device: LineDevice, port: PseudoTerminal, stopped: Callable[[], bool])
             if mask & select.POLLIN:
                 pending += device.receive(os.read(port.master, 4096), now)
             until = now + min(device.due_in_ns(now), 0)
-            while until < now:
+            caught_up = False
+            while not caught_up:
                 # A device is never late; this process may be, on a busy machine. What fell due
                 # meanwhile is sent piece by piece: only a host that does not read makes it drop.
                 until = min(until + CATCH_UP_NS, now)
+                caught_up = until == now
                 pending += device.take(until, room=OUTPUT_LIMIT - len(pending))
                 if pending:
                     pending = pending[os.write(port.master, pending) :]
-            if pending:
-                pending = pending[os.write(port.master, pending) :]
         except BlockingIOError:
             pass
         except OSError:
