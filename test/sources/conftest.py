@@ -132,6 +132,9 @@ class WiredPort:
     def fileno(self) -> int:
         return self._number
 
+    def give_up(self) -> None:
+        """It never waits long."""
+
     def close(self) -> None:
         """Nothing is held."""
 

@@ -212,6 +212,12 @@ class Dataq(Source):
         """Silence means that it was stopped or has forgotten its scan list: it is to be configured anew."""
         raise PortClosedError(f'{self.name}: no scans come')
 
+    def give_up(self) -> None:
+        """Wait for the device no longer."""
+        port = self._port
+        if port is not None:
+            port.give_up()
+
     def close(self) -> None:
         """Stop the device and give the port back."""
         if self._port is not None:
