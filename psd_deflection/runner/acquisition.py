@@ -240,6 +240,11 @@ class Acquisition:
                 return
         self.source.close()
 
+    @property
+    def away(self) -> bool:
+        """Whether the device is waited for."""
+        return not self._connected
+
     def clock_state(self) -> ClockState:
         """How the device's clock stands to the host's."""
         return self._clock.state()
