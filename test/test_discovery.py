@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from psd_deflection.cli._observations import recorded_rig
 from psd_deflection.cli.main import main
 from psd_deflection.config import Rig, load_rig, replace_values
 from psd_deflection.discovery import proposals
@@ -22,7 +23,8 @@ from psd_deflection.discovery.screen import solve_seen
 from psd_deflection.discovery.signatures import SignatureBank
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.errors import RecordingError
-from psd_deflection.records import FloatArray
+from psd_deflection.io.recordings import open_recording
+from psd_deflection.records import FloatArray, ParameterChange
 from psd_deflection.simulation import loads
 from psd_deflection.simulation.catalogue import effects_of_rig, make_active
 from psd_deflection.simulation.simulator import RigSimulator
@@ -299,6 +301,24 @@ def test_from_simulate_to_model(tmp_path: Path, capsys: pytest.CaptureFixture[st
         main(['discover', str(recorded), '--params-file', str(out / 'model.yaml'), '--out', str(out), '--quiet']) == 0
     )
     assert 'Nothing is missing' in capsys.readouterr().out
+
+
+def test_a_bag_tells_its_own_rig_but_not_what_was_hidden(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    short = tmp_path / 'short.yaml'
+    short.write_text(model_yaml(replace_values(RIG, {'link.length': 0.4}), ()))
+    words = ['--params-file', str(short), '--loads', 'thesis:1', '--effect', 'sensor_rotation,psd=1,angle=0.003']
+    assert main(['simulate', '--out', str(tmp_path / 'run'), *words]) == 0
+    assert main(['discover', str(tmp_path / 'run'), '--out', str(tmp_path / 'found'), '--quiet']) == 0
+    assert 'sensor_rotation (psd 1) is missing' in capsys.readouterr().out
+    assert load_rig(tmp_path / 'found' / 'model.yaml').link.length == 0.4
+
+
+def test_a_zero_taken_while_it_ran_is_part_of_the_rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert main(['simulate', '--out', str(tmp_path / 'run'), '--loads', 'thesis:0.5']) == 0
+    recording = open_recording(tmp_path / 'run')
+    later = ParameterChange(0, 3, (('psd_2.zero', (1e-4, -2e-4)), ('environment.temperature', 22.0)))
+    monkeypatch.setattr(recording, 'changes', [later])
+    assert recorded_rig(recording).zeros.tolist() == [[0.0, 0.0], [1e-4, -2e-4]]
 
 
 def test_a_bag_and_a_csv_of_one_run_give_one_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
