@@ -80,6 +80,17 @@ class EffectParameter:
 
 PSD = EffectParameter('psd', '', 1, 2, 1, 'which PSD', nominal=1, kind='choice', choices=(1, 2), required=True)
 """The parameter of every effect that belongs to one detector."""
+MOVES_FREQUENCY = EffectParameter(
+    'moves_frequency',
+    '',
+    0,
+    1,
+    1,
+    '1: the mode moves with it, by sqrt(1 + scale); 0: the frequency was measured',
+    kind='choice',
+    choices=(0, 1),
+)
+"""The parameter of every effect on a stiffness."""
 
 
 @dataclass(slots=True, eq=False)
