@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.cli._observations import recorded_rig
+import psd_deflection
 from psd_deflection.cli.main import main
 from psd_deflection.config import Rig, load_rig, replace_values
 from psd_deflection.discovery import proposals
@@ -23,6 +23,7 @@ from psd_deflection.discovery.screen import solve_seen
 from psd_deflection.discovery.signatures import SignatureBank
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.errors import RecordingError
+from psd_deflection.io.observations import recorded_rig
 from psd_deflection.io.recordings import open_recording
 from psd_deflection.records import FloatArray, ParameterChange
 from psd_deflection.simulation import loads
@@ -311,6 +312,9 @@ def test_a_bag_tells_its_own_rig_but_not_what_was_hidden(tmp_path: Path, capsys:
     assert main(['discover', str(tmp_path / 'run'), '--out', str(tmp_path / 'found'), '--quiet']) == 0
     assert 'sensor_rotation (psd 1) is missing' in capsys.readouterr().out
     assert load_rig(tmp_path / 'found' / 'model.yaml').link.length == 0.4
+    # The front door says the same; and the model it left, nothing missing.
+    found = psd_deflection.discover([tmp_path / 'run'], tmp_path / 'found' / 'model.yaml')
+    assert found.verdict == 'nothing_missing'
 
 
 def test_a_zero_taken_while_it_ran_is_part_of_the_rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,12 +19,12 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from psd_deflection.cli._observations import read_observations
 from psd_deflection.config import load_rig
 from psd_deflection.discovery.discover import discover
 from psd_deflection.discovery.report import report_html
 from psd_deflection.discovery.result import model_yaml, result, sentence
 from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.io.observations import read_observations
 from psd_deflection.simulation.catalogue import catalogue
 
 STEPS = 8

@@ -118,7 +118,7 @@ def _digest(path: Path) -> str:
     return digest.hexdigest()
 
 
-def read_observations(paths: Sequence[str], rig: Rig | None = None) -> list[Observation]:
+def read_observations(paths: Sequence[str | Path], rig: Rig | None = None) -> list[Observation]:
     """All of ``paths``: recordings, or ``.yaml`` lists of them with what differs in each::
 
         - recording: short.csv
