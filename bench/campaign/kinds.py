@@ -132,6 +132,7 @@ def _held_by_another(line: Line, pid: int) -> None:
 
 
 def _stolen_bytes(line: Line, pid: int) -> None:
+    line.wait_until_read()
     descriptor = os.open(line.device_name, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
     first = line.next_identity()
     deadline = time.monotonic() + 0.1

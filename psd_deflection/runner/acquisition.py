@@ -50,6 +50,8 @@ SILENCE_S = 2.0
 RETRY_S = 0.2
 READ_TIMEOUT_S = 0.1
 READY_S = 10.0
+GIVE_UP_TIMES = 10
+"""How often, a read's time apart, a reader is asked to give up waiting for its device."""
 
 TORN_US = 50_000
 """Device time that disagrees with the sample numbers by more: the clock jumped, or the device paused."""
@@ -220,10 +222,22 @@ class Acquisition:
         self._ready.wait(READY_S)
 
     def stop(self) -> None:
-        """Stop the reader and close the port; an Ended item is the last on the queue."""
+        """Stop the reader and close the port; an Ended item is the last on the queue.
+
+        A reader that waits for its device is told to give up; one that does not come back is left behind.
+        """
         self._stop.set()
         if self._thread.ident is not None:
-            self._thread.join()
+            self._thread.join(2.0 * READ_TIMEOUT_S)
+            for _ in range(GIVE_UP_TIMES):
+                if not self._thread.is_alive():
+                    break
+                self.source.give_up()
+                self._thread.join(READ_TIMEOUT_S)
+            else:
+                self._say(f'{self._name}: the source hangs; it is not waited for')
+                self.queue.put(Ended())
+                return
         self.source.close()
 
     def clock_state(self) -> ClockState:
@@ -249,8 +263,8 @@ class Acquisition:
             while not self._stop.is_set():
                 self.beat = time.monotonic()
                 if not self._connected:
-                    self._stop.wait(RETRY_S)
-                    self._reopen()
+                    if not self._stop.wait(RETRY_S):
+                        self._reopen()
                     silent_since = time.monotonic()
                     continue
                 try:
@@ -296,6 +310,9 @@ class Acquisition:
         self._sent = {cookie: sent}
 
     def _disconnected(self, error: PortClosedError) -> None:
+        if self._stop.is_set():
+            # Given up by us.
+            return
         self.counters.disconnects += 1
         self._hand_over(time.monotonic_ns())
         self.source.close()
@@ -313,6 +330,8 @@ class Acquisition:
                 self.hello = hello
         except DeviceError as error:
             self.source.close()
+            if self._stop.is_set():
+                return
             self.counters.refused_reopenings += 1
             refusal = str(error)
             # Why it is not taken back is news once; that there is no port yet is none.

@@ -153,6 +153,12 @@ class ContractFrames(Source):
         if self._port is not None:
             self._port.write(_WAKE)
 
+    def give_up(self) -> None:
+        """Wait for the device no longer."""
+        port = self._port
+        if port is not None:
+            port.give_up()
+
     def close(self) -> None:
         """Give the port back."""
         if self._port is not None:
