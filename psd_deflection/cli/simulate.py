@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
 from psd_deflection.cli import serve
 from psd_deflection.config import EFFECTS_PREFIX, Rig, load_rig, replace_values
@@ -26,6 +27,7 @@ from psd_deflection.records import (
     RawChunk,
     Record,
     ReferencePose,
+    SampleBlock,
     TemperatureReading,
 )
 from psd_deflection.simulation.catalogue import effects_of_rig
@@ -106,9 +108,12 @@ def write_recording(
         sink = McapFile(out, rig_values=values)
     else:
         sink = BagWriter(out, rig_values=values)
-    with contextlib.closing(sink):
+    bar = tqdm(total=len(loads), unit=' samples', delay=1.0, leave=False, disable=None, ncols=80)
+    with contextlib.closing(sink), bar:
         for record in records(rig, loads, temperature, seed, reference, 0 if is_csv else BAG_START_NS):
             sink.put(record)
+            if isinstance(record, SampleBlock):
+                bar.update(len(record.seq))
     return len(loads)
 
 
