@@ -83,12 +83,12 @@ def look(browser: webdriver.Chrome, folder: str) -> tuple[float, float, float]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--times', type=int, default=3)
+    parser.add_argument('--times', type=int, default=1)
     args = parser.parse_args()
     if not shutil.which('chromedriver'):
         raise SystemExit('Chromium and its driver are needed: apt install chromium chromium-driver')
     # What make sets up is not part of it.
-    subprocess.run(['make', '--silent', '.venv/.installed'], cwd=ROOT, check=True)
+    subprocess.run(['make', '--silent', 'setup'], cwd=ROOT, check=True)
     with tempfile.TemporaryDirectory() as folder:
         browser = open_browser(f'{folder}/profile')
         try:
