@@ -71,6 +71,7 @@ BENCH_SOLVERS ?=
 bench: $(VENV)/.installed
 	$(BIN)/python bench/live.py $(BENCH_LIVE)
 	$(BIN)/python bench/solvers.py $(BENCH_SOLVERS)
+	$(BIN)/python bench/accuracy.py
 
 FAULT_TIMES ?= 20
 FAULTS ?=
