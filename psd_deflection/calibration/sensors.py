@@ -17,8 +17,6 @@ from math import erf, pi, sqrt
 from typing import ClassVar
 
 import numpy as np
-from scipy.special import erf as erf_many
-from scipy.special import erfinv
 
 from psd_deflection.config import PsdConfig
 from psd_deflection.errors import ConfigError
@@ -149,6 +147,15 @@ class Quadrant(Sensor):
 
     _REACH = 1.5
 
+    def __init__(self, active_area: tuple[float, float], spot_radius: float) -> None:
+        """See :class:`Sensor`."""
+        super().__init__(active_area, spot_radius)
+        # Not with the module: it would make every start a fifth of a second later, and few have this sensor.
+        from scipy.special import erf as erf_many
+        from scipy.special import erfinv
+
+        self._erf, self._erfinv = erf_many, erfinv
+
     def ratios(self, currents: FloatArray) -> FloatArray:
         """See :class:`Sensor`."""
         i1, i2, i3, i4 = np.asarray(currents, dtype=np.float64).T
@@ -165,11 +172,11 @@ class Quadrant(Sensor):
     def from_ratios(self, ratios: FloatArray) -> FloatArray:
         """Places (n, 2), m, of ratios (n, 2): w/sqrt(2) erfinv; held at 1.5 w beyond it."""
         limit = erf(sqrt(2.0) * self._REACH)
-        return np.asarray(self.spot_radius / sqrt(2.0) * erfinv(np.clip(ratios, -limit, limit)))
+        return np.asarray(self.spot_radius / sqrt(2.0) * self._erfinv(np.clip(ratios, -limit, limit)))
 
     def to_ratios(self, place: FloatArray) -> FloatArray:
         """erf(sqrt(2) x/w), (n, 2)."""
-        return np.asarray(erf_many(sqrt(2.0) / self.spot_radius * np.asarray(place)))
+        return np.asarray(self._erf(sqrt(2.0) / self.spot_radius * np.asarray(place)))
 
     def from_linear(self, place: FloatArray) -> FloatArray:
         """At the centre dX/dx = sqrt(8/pi)/w: a ratio is ``place`` times that."""

@@ -59,7 +59,8 @@ def run(args: argparse.Namespace) -> int:
     observations = read_observations(args.recordings, given)
     rig = observations[0].rig if given is None else given
     # Reading took most of what can be foreseen; a search has as many steps as it has effects to weigh.
-    with tqdm(total=STEPS, disable=args.quiet, file=sys.stderr, bar_format='{l_bar}{bar}| {elapsed}') as bar:
+    hidden = True if args.quiet else None
+    with tqdm(total=STEPS, disable=hidden, file=sys.stderr, bar_format='{l_bar}{bar}| {elapsed}') as bar:
 
         def progress(words: str) -> None:
             bar.set_description_str(words)

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
 from psd_deflection.cli import serve
 from psd_deflection.config import EFFECTS_PREFIX, Rig, load_rig, replace_values
@@ -27,6 +28,7 @@ from psd_deflection.records import (
     RawChunk,
     Record,
     ReferencePose,
+    SampleBlock,
     TemperatureReading,
 )
 from psd_deflection.simulation.catalogue import effects_of_rig
@@ -111,9 +113,17 @@ def write_recording(
         sink = McapFile(out, rig_values=values)
     else:
         sink = BagWriter(out, rig_values=values)
+<<<<<<< HEAD
     with contextlib.closing(sink):
         for record in records(rig, known, loads, temperature, seed, reference, 0 if is_csv else BAG_START_NS):
+=======
+    bar = tqdm(total=len(loads), unit=' samples', delay=1.0, leave=False, disable=None, ncols=80)
+    with contextlib.closing(sink), bar:
+        for record in records(rig, loads, temperature, seed, reference, 0 if is_csv else BAG_START_NS):
+>>>>>>> face
             sink.put(record)
+            if isinstance(record, SampleBlock):
+                bar.update(len(record.seq))
     return len(loads)
 
 
