@@ -113,14 +113,9 @@ def write_recording(
         sink = McapFile(out, rig_values=values)
     else:
         sink = BagWriter(out, rig_values=values)
-<<<<<<< HEAD
-    with contextlib.closing(sink):
-        for record in records(rig, known, loads, temperature, seed, reference, 0 if is_csv else BAG_START_NS):
-=======
     bar = tqdm(total=len(loads), unit=' samples', delay=1.0, leave=False, disable=None, ncols=80)
     with contextlib.closing(sink), bar:
-        for record in records(rig, loads, temperature, seed, reference, 0 if is_csv else BAG_START_NS):
->>>>>>> face
+        for record in records(rig, known, loads, temperature, seed, reference, 0 if is_csv else BAG_START_NS):
             sink.put(record)
             if isinstance(record, SampleBlock):
                 bar.update(len(record.seq))
