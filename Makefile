@@ -1,3 +1,4 @@
+# make setup    a virtual environment in .venv with all that is needed
 # make run      set-up, then the daemon on the simulated rig, recorded below recordings/
 #               (make run PORT=/dev/ttyACM0 ARGS='--params-file my_rig.yaml' for a real one)
 # make test     set-up, then lint, types, import contracts and every test
@@ -10,8 +11,10 @@
 # make golden   make the recordings in bags/ anew
 # make colcon   build with colcon in a virtual environment of its own and look at what it installed
 # make docs     the documentation as a web site, in build/site
+# make wheel    sdist and wheel in dist/, tried in an environment of its own
+# make doc-commands  every command of README and docs that the tests do not run, run
 # make shots    the pictures of the live page in docs/figures anew (needs Chromium)
-# make blind    hide effects with a second generator and see whether discover names them (hours; JOBS=2)
+# make blind    hide effects with a second generator and see whether discover names them (an hour or two on two cores; JOBS=1 for one)
 # make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
 # make clean    remove what the above made
 PYTHON ?= python3
@@ -24,7 +27,7 @@ ARGS ?=
 PYTEST ?=
 BIN := $(VENV)/bin
 
-.PHONY: help run test lint types contracts unit bench faults crash fuzz soak firmware golden docs shots blind demo-discover colcon clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware golden docs shots blind demo-discover colcon wheel doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -41,6 +44,8 @@ $(VENV)/.requirements: setup.cfg
 $(VENV)/.installed: $(VENV)/.requirements setup.py setup.cfg $(SOURCES)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall .
 	touch $@
+
+setup: $(VENV)/.installed
 
 test: lint types contracts unit
 
@@ -60,13 +65,18 @@ unit: $(VENV)/.installed
 run: $(VENV)/.installed
 	$(BIN)/psd-deflection estimator --monitor --record recordings $(if $(PORT),--port $(PORT)) $(ARGS)
 
+# Arguments, e.g. BENCH_LIVE='--seconds 5 --minutes 1' for a first look.
+BENCH_LIVE ?=
+BENCH_SOLVERS ?=
 bench: $(VENV)/.installed
-	$(BIN)/python bench/live.py
-	$(BIN)/python bench/solvers.py
+	$(BIN)/python bench/live.py $(BENCH_LIVE)
+	$(BIN)/python bench/solvers.py $(BENCH_SOLVERS)
+	$(BIN)/python bench/accuracy.py
 
 FAULT_TIMES ?= 20
+FAULTS ?=
 faults: $(VENV)/.installed
-	$(BIN)/python -m bench.campaign.faults --times $(FAULT_TIMES)
+	$(BIN)/python -m bench.campaign.faults --times $(FAULT_TIMES) $(FAULTS)
 
 CRASH_TIMES ?= 200
 crash: $(VENV)/.installed
@@ -99,18 +109,33 @@ docs: $(VENV)/.installed
 	$(BIN)/python -m mkdocs build --strict --quiet --site-dir build/site
 	@echo 'open build/site/index.html'
 
+SHOT_SECONDS ?= 27
 shots: $(VENV)/.installed
-	$(BIN)/python docs/shots.py
+	$(BIN)/python docs/shots.py --seconds $(SHOT_SECONDS)
+
+# Each command of README and docs that the tests do not run themselves; ONLY='monitor' for those with that word.
+doc-commands: $(VENV)/.installed
+	$(BIN)/python docs/run_commands.py $(ONLY)
+
+# In an environment of its own, without ROS: the wheel made from the sdist, as `pip install dist/*.whl` has it.
+wheel: $(VENV)/.installed
+	rm -rf dist build/wheel && mkdir -p build/wheel
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check build
+	$(BIN)/python -m build --outdir dist . > build/wheel/log
+	$(PYTHON) -m venv build/wheel/use && build/wheel/use/bin/pip install --quiet --disable-pip-version-check dist/*.whl
+	cd build/wheel && use/bin/psd-deflection --help && use/bin/psd-deflection info ../../bags/clean
+	build/wheel/use/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/*.tar.gz
+	cd build/wheel && use/bin/psd-deflection --version && use/lib/psd_deflection/replay --help > log
 
 # Truth hidden by a second generator: fresh seeds, both cores with JOBS=2; a run that was stopped goes on.
-JOBS ?= 1
+JOBS ?= $(shell nproc)
 blind: $(VENV)/.installed
 	$(BIN)/python -m blind.run --jobs $(JOBS) $(BLIND)
 
 demo-discover: $(VENV)/.installed
 	rm -rf build/demo && mkdir -p build/demo
 	$(BIN)/psd-deflection simulate --loads identification --effect sensor_rotation,psd=2,angle=0.01 --seed 5 --out build/demo/rig
-	$(BIN)/psd-deflection discover build/demo/rig --params-file config/thesis_rig.yaml --out build/demo/found
+	$(BIN)/psd-deflection discover build/demo/rig --out build/demo/found
 	$(BIN)/psd-deflection replay build/demo/rig --params-file build/demo/found/model.yaml --out build/demo/corrected.csv
 	@echo 'the report: build/demo/found/report.html'
 

@@ -4,6 +4,7 @@ Every figure stands beside a peer's from the same run, as a ratio: machines diff
 
 - Latency: last byte of a block written to the port -> callback in another process, beside a bare
   publisher of the same message -> the same callback, both in the same subscriber at the same time.
+- The same with the live page served and looked at, in turns with the node alone.
 - CPU: the node with recording, as a share of one core.
 - Replay of ten minutes beside bare iteration of the same file with ``mcap``.
 """
@@ -11,6 +12,7 @@ Every figure stands beside a peer's from the same run, as a ratio: machines diff
 from __future__ import annotations
 
 import argparse
+import asyncio
 import json
 import os
 import subprocess
@@ -18,12 +20,14 @@ import sys
 import tempfile
 import threading
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 ROOT = Path(__file__).resolve().parent.parent
+SETTLE_S = 5.0
 
 
 def percentiles(values: list[float]) -> tuple[float, float]:
@@ -78,6 +82,7 @@ def bare_publisher() -> None:
     publisher = node.create_publisher(PoseStamped, '/bare', 10)
     message = PoseStamped()
     message.header.frame_id = 'link_tip_rest'
+    print('ready', flush=True)
     stop = until_stdin_closes()
     rows: list[tuple[int, int]] = []
     count = 0
@@ -88,6 +93,24 @@ def bare_publisher() -> None:
         publisher.publish(message)
         rows.append((count, now))
     json.dump(rows, sys.stdout)
+
+
+def looker(url: str) -> None:
+    """Child process: takes what the live page sends, as a browser does; prints how many messages came."""
+    import aiohttp
+
+    stop = until_stdin_closes()
+
+    async def look() -> int:
+        count = 0
+        async with aiohttp.ClientSession() as session, session.ws_connect(f'{url}ws') as socket:
+            print('ready', flush=True)
+            while not stop.is_set():
+                await socket.receive()
+                count += 1
+        return count
+
+    print(asyncio.run(look()))
 
 
 class Device:
@@ -121,9 +144,9 @@ class Device:
                 self.written.append(time.monotonic_ns())
 
 
-def child(role: str) -> subprocess.Popen[str]:
+def child(role: str, url: str = '') -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, str(Path(__file__)), '--role', role],
+        [sys.executable, str(Path(__file__)), '--role', role, '--url', url],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -137,47 +160,84 @@ def cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
 
-def live(seconds: float) -> None:
+@dataclass(slots=True)
+class Latencies:
+    """What was measured of one kind of node, ms, and its share of a core while it ran."""
+
+    ours: list[float] = field(default_factory=list)
+    bare: list[float] = field(default_factory=list)
+    shares: list[float] = field(default_factory=list)
+
+    def ratios(self) -> tuple[float, float]:
+        """Median and 99th percentile over those of the bare publisher."""
+        (m, p), (m0, p0) = percentiles(self.ours), percentiles(self.bare)
+        return m / m0, p / p0
+
+
+def measure(seconds: float, page: bool, into: Latencies) -> None:
+    """One node, recording; ``page``: it serves the live page too, and a browser's worth of it is fetched."""
     device = Device()
     device.thread.start()
     with tempfile.TemporaryDirectory() as folder:
-        node = subprocess.Popen(
-            [sys.executable, '-m', 'psd_deflection', 'estimator', '--port', device.port.name, '--record', folder],
-            cwd=ROOT,
-            stderr=subprocess.DEVNULL,
-        )
-        ear, bare = child('subscriber'), child('bare')
-        assert ear.stdout is not None
-        assert ear.stdin is not None
-        assert bare.stdin is not None
-        ear.stdout.readline()
-        time.sleep(5.0)
+        command = [sys.executable, '-m', 'psd_deflection', 'estimator', '--port', device.port.name, '--record', folder]
+        command += ['--monitor', '--ros-args', '-p', 'monitor_port:=0'] if page else []
+        node = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+        assert node.stderr is not None
+        url = next(line.split()[1] for line in node.stderr if line.startswith('monitor: ')) if page else ''
+        # What it goes on saying is read and left.
+        threading.Thread(target=node.stderr.read, daemon=True).start()
+        children = [child('subscriber'), child('bare'), *([child('looker', url)] if page else [])]
+        ear, bare = children[:2]
+        for one in children:
+            assert one.stdout is not None
+            one.stdout.readline()
+        time.sleep(SETTLE_S)
         used, began = cpu_seconds(node.pid), time.monotonic()
         time.sleep(seconds)
-        share = (cpu_seconds(node.pid) - used) / (time.monotonic() - began)
+        into.shares.append((cpu_seconds(node.pid) - used) / (time.monotonic() - began))
         published, _ = bare.communicate()
         heard, _ = ear.communicate()
+        if page:
+            received, _ = children[2].communicate()
+            if int(received) < seconds * 20:
+                raise SystemExit(f'the page sent {received} messages in {seconds:g} s')
         node.terminate()
         node.wait(10.0)
     device.stop.set()
     device.thread.join()
-    rows = json.loads(heard)
+    since = int(began * 1e9)
     sent = dict(json.loads(published))
-    since = int((began + 0.0) * 1e9)
-    bare_ms = [(t - sent[s]) / 1e6 for topic, s, t in rows if topic == '/bare' and s in sent and t > since]
     written = np.array(device.written)
-    ours_ms = []
-    for topic, _, t in rows:
-        if topic == '/link_tip/deflection' and t > since:
+    for topic, s, t in json.loads(heard):
+        if t <= since:
+            continue
+        if topic == '/bare' and s in sent:
+            into.bare.append((t - sent[s]) / 1e6)
+        elif topic == '/link_tip/deflection':
             last = written[: int(np.searchsorted(written, t))]
-            ours_ms.append((t - int(last[-1])) / 1e6)
-    (m, p), (m0, p0) = percentiles(ours_ms), percentiles(bare_ms)
-    print(f'latency, last byte -> callback in another process, {len(ours_ms)} messages (ms)')
-    print(f'  {"":28}{"median":>10}{"p99":>10}')
-    print(f'  {"psd_deflection":28}{m:10.3f}{p:10.3f}')
-    print(f'  {"bare publish -> callback":28}{m0:10.3f}{p0:10.3f}   ({len(bare_ms)} messages)')
-    print(f'  {"ratio (bound 2, 3)":28}{m / m0:10.2f}{p / p0:10.2f}')
-    print(f'CPU of the node with recording: {100 * share:.1f} % of a core (bound 15 %)')
+            into.ours.append((t - int(last[-1])) / 1e6)
+
+
+def live(seconds: float, rounds: int) -> None:
+    """The node alone and the node with the live page, in turns, each beside a bare publisher."""
+    alone, with_page = Latencies(), Latencies()
+    for _ in range(rounds):
+        measure(seconds / rounds, False, alone)
+        measure(seconds / rounds, True, with_page)
+    print('latency, last byte -> callback in another process (ms)')
+    print(f'  {"":36}{"median":>10}{"p99":>10}{"messages":>10}')
+    for what, found in (('psd_deflection', alone), ('psd_deflection, live page looked at', with_page)):
+        for name, values in ((what, found.ours), ('  bare publish -> callback', found.bare)):
+            m, p = percentiles(values)
+            print(f'  {name:36}{m:10.3f}{p:10.3f}{len(values):10d}')
+        m, p = found.ratios()
+        print(f'  {"  ratio (bound 2, 3)":36}{m:10.2f}{p:10.2f}')
+    (m, p), (m0, p0) = with_page.ratios(), alone.ratios()
+    print(f'  {"the live page, ratio of the ratios":36}{m / m0:10.2f}{p / p0:10.2f}')
+    share, page_share = (100 * float(np.mean(found.shares)) for found in (alone, with_page))
+    print(
+        f'CPU of the node with recording: {share:.1f} % of a core (bound 15 %), with the live page {page_share:.1f} %'
+    )
 
 
 def make_recording(folder: Path, minutes: float) -> tuple[Path, int]:
@@ -238,16 +298,20 @@ def replay(minutes: float) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--seconds', type=float, default=30.0, help='of the live measurement')
+    parser.add_argument('--seconds', type=float, default=30.0, help='of the live measurement of each kind of node')
     parser.add_argument('--minutes', type=float, default=10.0, help='of the recording that is replayed')
-    parser.add_argument('--role', choices=('subscriber', 'bare'), help=argparse.SUPPRESS)
+    parser.add_argument('--rounds', type=int, default=2, help='in which it is done, so that a busy moment meets both')
+    parser.add_argument('--role', choices=('subscriber', 'bare', 'looker'), help=argparse.SUPPRESS)
+    parser.add_argument('--url', help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.role == 'subscriber':
         subscriber()
     elif args.role == 'bare':
         bare_publisher()
+    elif args.role == 'looker':
+        looker(args.url)
     else:
-        live(args.seconds)
+        live(args.seconds, args.rounds)
         replay(args.minutes)
     return 0
 

@@ -1,10 +1,11 @@
 """Makes the pictures of the live page in docs/figures: ``make shots``; needs Chromium and its driver.
 
-The page plays the simulated rig for half a minute, so that every load case has gone by.
+The page shows the simulated rig for half a minute, so that every load case has gone by.
 """
 
 from __future__ import annotations
 
+import argparse
 import base64
 import shutil
 import signal
@@ -18,7 +19,6 @@ from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 
 FIGURES = Path(__file__).resolve().parent / 'figures'
-SECONDS = 27.0
 SHOTS = (('monitor', 1440, 900, 1.0, 'light', False),)
 PHONE = ('monitor_phone', 390, 844, 2.0, 'light', True)
 
@@ -50,6 +50,9 @@ def take(url: str, name: str, width: int, height: int, ratio: float, scheme: str
 
 def main() -> int:
     """Start the rig, take all pictures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--seconds', type=float, default=27.0, help='before the first picture')
+    seconds = parser.parse_args().seconds
     program = subprocess.Popen(
         [sys.executable, '-m', 'psd_deflection', 'monitor', '--http-port', '0', '--control'],
         stderr=subprocess.PIPE,
@@ -59,7 +62,7 @@ def main() -> int:
         assert program.stderr is not None
         url = next(line.split()[1] for line in program.stderr if line.startswith('monitor: '))
         for i, shot in enumerate((*SHOTS, PHONE)):
-            take(url, *shot, SECONDS if i == 0 else 4.0)
+            take(url, *shot, seconds if i == 0 else 4.0)
     finally:
         program.send_signal(signal.SIGINT)
         program.wait()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from psd_deflection.cli.serve import served_loads
 from psd_deflection.config import load_rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.records import FloatArray
@@ -89,6 +90,15 @@ def test_cyclic_loads_go_round() -> None:
     cycle = loads.CyclicLoads(history)
     got = np.concatenate([cycle.take(5), cycle.take(4), cycle.take(12)])
     np.testing.assert_array_equal(got, np.concatenate([history.loads] * 3))
+
+
+def test_the_served_rig_is_loaded_a_second_after_power_up() -> None:
+    served = served_loads(1000.0)
+    got, cycle = served.take(5000 + 36_000), loads.thesis_load_cases().loads
+    assert not got[:1000].any()
+    np.testing.assert_array_equal(got[1000:5000], np.tile(loads.sidebar(10.0), (4000, 1)))
+    # Then as ever: the whole cycle, unloaded case and all.
+    np.testing.assert_array_equal(got[-3000:], cycle[5000:8000])
 
 
 def test_load_file_is_held_between_rows(tmp_path: Path) -> None:

@@ -17,8 +17,6 @@ from math import erf, pi, sqrt
 from typing import ClassVar
 
 import numpy as np
-from scipy.special import erf as erf_many
-from scipy.special import erfinv
 
 from psd_deflection.config import PsdConfig
 from psd_deflection.errors import ConfigError
@@ -73,7 +71,25 @@ class Sensor(abc.ABC):
         return self.half
 
 
-class Duolateral(Sensor):
+class _EdgeElectrodes(Sensor):
+    """Two pairs of electrodes along the edges; ``share``: the part of the photocurrent through one half of a pair."""
+
+    electrodes: ClassVar[tuple[str, str, str, str]] = ('x1', 'x2', 'y1', 'y2')
+    share: ClassVar[float]
+
+    def ratios(self, currents: FloatArray) -> FloatArray:
+        """See :class:`Sensor`."""
+        x1, x2, y1, y2 = np.asarray(currents, dtype=np.float64).T
+        return _over(np.column_stack((x1 - x2, y1 - y2)), np.column_stack((x1 + x2, y1 + y2)))
+
+    def currents(self, place: FloatArray, total: FloatArray | float) -> FloatArray:
+        """See :class:`Sensor`."""
+        x, y = self.to_ratios(place).T
+        part = self.share * np.broadcast_to(total, x.shape)
+        return np.column_stack((part * (1.0 + x), part * (1.0 - x), part * (1.0 + y), part * (1.0 - y)))
+
+
+class Duolateral(_EdgeElectrodes):
     """Two resistive sheets: x between two electrodes in front, y between two behind.
 
     x = (Lx/2)(I_x1 - I_x2)/(I_x1 + I_x2), electrode 1 on the positive side (2.3, 2.4; Hamamatsu's and
@@ -81,40 +97,18 @@ class Duolateral(Sensor):
     """
 
     name: ClassVar[str] = 'duolateral'
-    electrodes: ClassVar[tuple[str, str, str, str]] = ('x1', 'x2', 'y1', 'y2')
-
-    def ratios(self, currents: FloatArray) -> FloatArray:
-        """See :class:`Sensor`."""
-        x1, x2, y1, y2 = np.asarray(currents, dtype=np.float64).T
-        return _over(np.column_stack((x1 - x2, y1 - y2)), np.column_stack((x1 + x2, y1 + y2)))
-
-    def currents(self, place: FloatArray, total: FloatArray | float) -> FloatArray:
-        """See :class:`Sensor`."""
-        x, y = self.to_ratios(place).T
-        half = np.broadcast_to(total, x.shape) / 2.0
-        return np.column_stack((half * (1.0 + x), half * (1.0 - x), half * (1.0 + y), half * (1.0 - y)))
+    share: ClassVar[float] = 0.5
 
     def sum_signal(self, currents: FloatArray) -> FloatArray:
         """The photocurrent (n,), A: it passes both pairs, and is counted once."""
         return super().sum_signal(currents) / 2.0
 
 
-class Tetralateral(Sensor):
+class Tetralateral(_EdgeElectrodes):
     """One sheet with an electrode along each edge: both axes share the photocurrent (2.3, 2.4)."""
 
     name: ClassVar[str] = 'tetralateral'
-    electrodes: ClassVar[tuple[str, str, str, str]] = ('x1', 'x2', 'y1', 'y2')
-
-    def ratios(self, currents: FloatArray) -> FloatArray:
-        """See :class:`Sensor`."""
-        x1, x2, y1, y2 = np.asarray(currents, dtype=np.float64).T
-        return _over(np.column_stack((x1 - x2, y1 - y2)), np.column_stack((x1 + x2, y1 + y2)))
-
-    def currents(self, place: FloatArray, total: FloatArray | float) -> FloatArray:
-        """See :class:`Sensor`."""
-        x, y = self.to_ratios(place).T
-        part = np.broadcast_to(total, x.shape) / 4.0
-        return np.column_stack((part * (1.0 + x), part * (1.0 - x), part * (1.0 + y), part * (1.0 - y)))
+    share: ClassVar[float] = 0.25
 
 
 class Pincushion(Sensor):
@@ -153,6 +147,15 @@ class Quadrant(Sensor):
 
     _REACH = 1.5
 
+    def __init__(self, active_area: tuple[float, float], spot_radius: float) -> None:
+        """See :class:`Sensor`."""
+        super().__init__(active_area, spot_radius)
+        # Not with the module: it would make every start a fifth of a second later, and few have this sensor.
+        from scipy.special import erf as erf_many
+        from scipy.special import erfinv
+
+        self._erf, self._erfinv = erf_many, erfinv
+
     def ratios(self, currents: FloatArray) -> FloatArray:
         """See :class:`Sensor`."""
         i1, i2, i3, i4 = np.asarray(currents, dtype=np.float64).T
@@ -169,11 +172,11 @@ class Quadrant(Sensor):
     def from_ratios(self, ratios: FloatArray) -> FloatArray:
         """Places (n, 2), m, of ratios (n, 2): w/sqrt(2) erfinv; held at 1.5 w beyond it."""
         limit = erf(sqrt(2.0) * self._REACH)
-        return np.asarray(self.spot_radius / sqrt(2.0) * erfinv(np.clip(ratios, -limit, limit)))
+        return np.asarray(self.spot_radius / sqrt(2.0) * self._erfinv(np.clip(ratios, -limit, limit)))
 
     def to_ratios(self, place: FloatArray) -> FloatArray:
         """erf(sqrt(2) x/w), (n, 2)."""
-        return np.asarray(erf_many(sqrt(2.0) / self.spot_radius * np.asarray(place)))
+        return np.asarray(self._erf(sqrt(2.0) / self.spot_radius * np.asarray(place)))
 
     def from_linear(self, place: FloatArray) -> FloatArray:
         """At the centre dX/dx = sqrt(8/pi)/w: a ratio is ``place`` times that."""

@@ -13,6 +13,7 @@ import itertools
 from collections.abc import Iterable
 from pathlib import Path
 
+from psd_deflection.cli._progress import progress_of
 from psd_deflection.config import EFFECTS_PREFIX, load_rig
 from psd_deflection.io.bag_writer import BagWriter, McapFile
 from psd_deflection.io.csv_writer import CsvSampleSink
@@ -40,14 +41,13 @@ def convert(recording: Recording, out: Path, parameters: dict[str, object]) -> i
     """Write ``recording`` to ``out``; returns the number of samples. Raises RecordingError."""
     changes, loads = recording.changes, recording.loads()
     references, temperatures = recording.references(), recording.temperatures()
-    records: Iterable[Convertible] = heapq.merge(
-        changes, loads, references, temperatures, recording.blocks(), key=_time
-    )
+    blocks = progress_of(recording.blocks())
+    records: Iterable[Convertible] = heapq.merge(changes, loads, references, temperatures, blocks, key=_time)
     sink: CsvSampleSink | McapFile | BagWriter
     if out.suffix.lower() == '.csv':
         sink = CsvSampleSink(out, loads=bool(loads), references=bool(references), temperatures=bool(temperatures))
         # A row takes what is waiting, and a block's last row what came during the block.
-        records = itertools.chain(loads, references, temperatures, recording.blocks())
+        records = itertools.chain(loads, references, temperatures, blocks)
     elif out.suffix.lower() == '.mcap':
         sink = McapFile(out, rig_values=parameters, device_hello=recording.hello)
     else:

@@ -12,13 +12,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from msg_adapters import SAMPLES
+from msg_adapters import DEFLECTION, LOAD, SAMPLES
+from psd_deflection.cli._progress import progress_of
 from psd_deflection.io.recording import Recording
 from psd_deflection.io.recordings import open_recording
 from psd_deflection.parameters import BY_NAME
 
 _EPOCH_FROM_NS = 10**18
 """September 2001; smaller times count from a zero of their own."""
+
+_BREAK = 0.5
+"""Where time and sample numbers disagree by this share the device was stopped or started anew between two blocks."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,16 +36,39 @@ def changed_parameters(parameters: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in parameters.items() if k not in BY_NAME or BY_NAME[k].default != v}
 
 
-def survey(recording: Recording) -> dict[str, Any]:
+def lacks(recording: Recording, topics: Mapping[str, int]) -> list[str]:
+    """What is not in it and some command would need, each with the way out."""
+    found = []
+    if not topics.get(SAMPLES):
+        found.append(f'no samples ({SAMPLES}): nothing can be computed from it')
+    if not recording.parameters:
+        found.append('no parameters: the nominal rig is taken where --params-file gives no other')
+    if recording.hello is None:
+        found.append('no word of the device itself')
+    if not topics.get(DEFLECTION):
+        found.append(f'no estimates ({DEFLECTION}): `psd-deflection replay` makes them')
+    if not topics.get(LOAD):
+        found.append(f'no known loads ({LOAD}): `psd-deflection discover` needs them')
+    return found
+
+
+def survey(recording: Recording, quiet: bool = True) -> dict[str, Any]:
     """What ``info --json`` prints: times in s and ns, counts, metadata; reads the whole recording."""
     topics = recording.topics()
     blocks = samples = flagged = 0
     first = last = (0, 0)
+    counted, lasted = 0, 0
     if topics.get(SAMPLES):
-        for block in recording.blocks():
+        expected_ns = 1e9 / recording.sample_rate_hz if recording.sample_rate_hz > 0.0 else 0.0
+        for block in progress_of(recording.blocks(), topics[SAMPLES], quiet=quiet):
+            begin, end = ((int(block.seq[i]), int(block.t_ns[i])) for i in (0, -1))
             if blocks == 0:
-                first = (int(block.seq[0]), int(block.t_ns[0]))
-            last = (int(block.seq[-1]), int(block.t_ns[-1]))
+                first = last = begin
+            # From the end of the block before, so that a pause of the device counts neither as samples nor as time.
+            for n, dt in ((begin[0] - last[0], begin[1] - last[1]), (end[0] - begin[0], end[1] - begin[1])):
+                if abs(dt - n * expected_ns) <= _BREAK * n * expected_ns:
+                    counted, lasted = counted + n, lasted + dt
+            last = end
             blocks += 1
             samples += len(block.seq)
             flagged += int((block.flags != 0).sum())
@@ -57,13 +84,14 @@ def survey(recording: Recording) -> dict[str, Any]:
         'samples': samples,
         'lost': last[0] - first[0] + 1 - samples if samples else 0,
         'flagged': flagged,
-        'sample_rate_hz': recording.sample_rate_hz if samples > 1 else 0.0,
+        'sample_rate_hz': counted * 1e9 / lasted if lasted else 0.0,
         'blocks': blocks,
         'block_size': recording.block_size,
         'topics': topics,
         'parameters': dict(recording.parameters),
         'changed_parameters': changed_parameters(recording.parameters),
         'changes': [{'t_ns': c.t_ns, 'block': c.block, 'values': dict(c.values)} for c in recording.changes],
+        'lacks': lacks(recording, topics),
         'complete': recording.complete,
         'warnings': list(recording.warnings),
     }
@@ -71,7 +99,7 @@ def survey(recording: Recording) -> dict[str, Any]:
 
 def run(args: argparse.Namespace) -> int:
     """Print the survey."""
-    found = survey(open_recording(Path(args.recording)))
+    found = survey(open_recording(Path(args.recording)), quiet=args.json)
     if args.json:
         print(json.dumps(found, indent=2))
         return 0
@@ -89,27 +117,29 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     if found['version']:
         out.append(row('recorded by', f'psd_deflection {found["version"]}'))
     if found['device_hello'] is not None:
-        out.append(row('device', ', '.join(f'{k} {v}' for k, v in found['device_hello'].items())))
-    start = found['start_ns']
-    if start >= _EPOCH_FROM_NS:
-        when = datetime.fromtimestamp(start // 1_000_000_000, UTC).strftime('%Y-%m-%d %H:%M:%S')
-        out.append(row('start', f'{when}.{start % 1_000_000_000:09d} UTC'))
-    else:
-        out.append(row('start', f'{start * 1e-9:.9f} s'))
-    out.append(row('duration', f'{found["duration_s"]:.3f} s'))
-    samples, lost = found['samples'], found['lost']
+        hello = {k: ' '.join(map(str, v)) if isinstance(v, list) else v for k, v in found['device_hello'].items()}
+        out.append(row('device', ', '.join(f'{k} {v}' for k, v in hello.items())))
+    start, samples, lost = found['start_ns'], found['samples'], found['lost']
     share = 100.0 * lost / (samples + lost) if samples else 0.0
-    out.append(row('samples', f'{samples} present, {lost} lost ({share:.3g} %), {found["flagged"]} flagged'))
-    out.append(row('rate', f'{found["sample_rate_hz"]:.6g} samples/s'))
-    out.append(row('blocks', f'{found["blocks"]} of up to {found["block_size"]} samples'))
+    if not samples:
+        out.append(row('samples', 'none'))
+    else:
+        if start >= _EPOCH_FROM_NS:
+            when = datetime.fromtimestamp(start // 1_000_000_000, UTC).strftime('%Y-%m-%d %H:%M:%S')
+            out.append(row('start', f'{when}.{start % 1_000_000_000:09d} UTC'))
+        else:
+            out.append(row('start', f'{start * 1e-9:.9f} s'))
+        out.append(row('duration', f'{found["duration_s"]:.3f} s'))
+        out.append(row('samples', f'{samples} present, {lost} lost ({share:.3g} %), {found["flagged"]} flagged'))
+        out.append(row('rate', f'{found["sample_rate_hz"]:.6g} samples/s'))
+        out.append(row('blocks', f'{found["blocks"]} of up to {found["block_size"]} samples'))
+    out += [row('lacks' if i == 0 else '', text) for i, text in enumerate(found['lacks'])]
     out.append('  topics')
     width = max((len(t) for t in found['topics']), default=0)
     out += [f'    {topic:<{width}}  {count}' for topic, count in sorted(found['topics'].items())]
-    if not found['parameters']:
-        out.append('  no parameters in it')
-    elif not found['changed_parameters']:
+    if found['parameters'] and not found['changed_parameters']:
         out.append('  all parameters at their defaults')
-    else:
+    elif found['parameters']:
         out.append('  parameters that are not at their defaults')
         out += [f'    {k} = {v}' for k, v in sorted(found['changed_parameters'].items())]
     out += [

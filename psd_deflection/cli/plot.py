@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from psd_deflection import __version__
+from psd_deflection.cli._progress import progress_of
 from psd_deflection.cli._report import save_figure
 from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.config import Rig
@@ -98,8 +98,7 @@ def run(args: argparse.Namespace) -> int:
     rig = rig_of(open_recording(args.recording), args.params_file)
     recording = open_recording(args.recording, block_size=rig.estimator.block_size)
     drawn, spectrum = Drawn(), Spectrum(rig, SPECTRUM_S)
-    bar = tqdm(recording.blocks(), unit=' blocks', delay=1.0, leave=False, disable=None, ncols=80)
-    for records in replayed(recording, Pipeline(rig), bar):
+    for records in replayed(recording, Pipeline(rig), progress_of(recording.blocks(), quiet=args.json)):
         for record in records:
             drawn.add(record)
             if isinstance(record, SampleBlock):

@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
+from psd_deflection.cli._progress import progress_of
 from psd_deflection.config import Rig, load_rig, rig_from_values
 from psd_deflection.io.comparison import Comparison
 from psd_deflection.io.recording import Recording
@@ -116,9 +116,7 @@ def run(args: argparse.Namespace) -> int:
         )
     totals = Totals()
     began = time.perf_counter()
-    bar = tqdm(
-        recording.blocks(), unit=' blocks', delay=1.0, leave=False, disable=None if not args.json else True, ncols=80
-    )
+    bar = progress_of(recording.blocks(), quiet=args.json)
     try:
         for records in replayed(recording, pipeline, bar):
             for record in records:

@@ -25,6 +25,10 @@ from psd_deflection.simulation.loads import CyclicLoads, thesis_load_cases
 DEVICES = SIMULATED
 """What can be simulated, named as the sources that read it."""
 
+DWELL_S = 4.0
+FIRST_LOAD_S = 1.0
+"""Unloaded after power-up, s: long enough for a zero, short enough that whoever looks on sees it move at once."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what --serve takes besides the rig."""
@@ -51,7 +55,7 @@ def run_device(args: argparse.Namespace) -> int:
     rig = _attached_rig(stop) if args.attached else load_rig(args.params_file)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    loads = CyclicLoads(thesis_load_cases(rate=rig.converter.sample_rate_hz))
+    loads = served_loads(rig.converter.sample_rate_hz)
     name = args.device or rig.acquisition.source
     if name not in DEVICES:
         raise ConfigError(f'source = {name!r}: cannot be simulated; --device takes one of {", ".join(DEVICES)}')
@@ -72,6 +76,11 @@ def run_device(args: argparse.Namespace) -> int:
         for port in ports:
             port.close()
     return 0
+
+
+def served_loads(rate: float) -> CyclicLoads:
+    """The thesis's load cases over and over, of which the first, unloaded, has almost gone by at power-up."""
+    return CyclicLoads(thesis_load_cases(DWELL_S, rate), start=round((DWELL_S - FIRST_LOAD_S) * rate))
 
 
 def make_devices(

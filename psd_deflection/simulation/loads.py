@@ -163,13 +163,13 @@ def from_csv(path: str | Path, rate: float = 1000.0) -> LoadHistory:
 
 
 class CyclicLoads:
-    """A history over and over, for a device that never ends."""
+    """A history over and over, for a device that never ends; the first time from sample ``start`` on."""
 
-    def __init__(self, history: LoadHistory) -> None:
+    def __init__(self, history: LoadHistory, start: int = 0) -> None:
         if len(history) == 0:
             raise ValueError('a cyclic history needs at least one sample')
         self._loads = history.loads
-        self._next = 0
+        self._next = start % len(history)
 
     def take(self, n: int) -> FloatArray:
         """The next n samples, (n, 3)."""

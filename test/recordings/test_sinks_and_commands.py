@@ -17,8 +17,9 @@ from psd_deflection.io.bag_writer import BagWriter, McapFile
 from psd_deflection.io.csv_writer import CsvEstimateSink
 from psd_deflection.io.recordings import open_recording
 from psd_deflection.io.sinks import open_sink
+from psd_deflection.records import SampleBlock
 
-from .making import run
+from .making import T0, block, run
 
 HELLO = {'serial': 'A1', 'sample_rate_hz': 1000}
 
@@ -73,7 +74,33 @@ def test_info_reads_a_cut_file_and_says_so(bag: Path, capsys: pytest.CaptureFixt
 def test_info_of_what_has_no_samples(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     BagWriter(tmp_path / 'empty', rig_values={}).close()
     assert main(['info', str(tmp_path / 'empty')]) == 0
-    assert '0 present' in capsys.readouterr().out
+    text = capsys.readouterr().out
+    for part in (
+        'samples      none',
+        'no samples (/psd/samples)',
+        'no parameters',
+        'no word of the device',
+        'no known loads',
+    ):
+        assert part in text
+    assert main(['info', str(tmp_path / 'empty'), '--json']) == 0
+    assert len(json.loads(capsys.readouterr().out)['lacks']) == 5
+
+
+def test_info_takes_the_rate_over_the_whole_and_a_pause_for_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # The clock's map settles in the first second, and the device was off for two seconds on the way.
+    with BagWriter(tmp_path / 'run', rig_values={'block_size': 20}) as bag:
+        for i in range(200):
+            whole = block(i, t0=T0 + (2_000_000_000 if i >= 100 else 0))
+            late = np.clip(1_000_000 - whole.seq * 1000, 0, None)
+            bag.put(SampleBlock(i, whole.seq, whole.t_ns - late, whole.volts, whole.flags))
+    assert main(['info', str(tmp_path / 'run'), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert open_recording(tmp_path / 'run').sample_rate_hz == pytest.approx(999.0, rel=1e-4)
+    assert found['sample_rate_hz'] == pytest.approx(1000.0, rel=3e-4)
+    assert found['lost'] == 0
 
 
 def test_an_unreadable_recording_is_status_4_and_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,82 @@
+"""``make bench``: the error of the estimates against the simulated truth, beside the least that any method can have.
+
+The Cramér–Rao bound comes from the dots' own equation (m = R(-theta)(l - d) - c, differentiated by differences) and
+from the noise that the rig file states: amplifier noise and one converter step, in the mean of a block.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+import numpy as np
+
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import DeflectionEstimate, FloatArray, RawChunk
+from psd_deflection.simulation.loads import constant, direct, sidebar
+from psd_deflection.simulation.simulator import RigSimulator
+
+SETTLED_S = 10.0
+"""After the load is on, at which the modes have rung down to nothing."""
+
+CASES = {'unloaded': (0.0, 0.0, 0.0)}
+CASES |= {f'{f:g} N on the sidebar': sidebar(f) for f in (10.0, 30.0, 50.0)}
+CASES |= {f'{f:g} N on the link': direct(f) for f in (10.0, 30.0, 50.0)}
+
+
+def dots(rig: Rig, pose: FloatArray) -> FloatArray:
+    """x1 y1 x2 y2 (4,), m, of a flat plate."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    turned = np.array([[c, s], [-s, c]])
+    return np.concatenate([turned @ (np.array(psd.center) - pose[:2]) - psd.center for psd in rig.psds])
+
+
+def bound(rig: Rig, pose: FloatArray) -> FloatArray:
+    """Least standard deviations of dX, dY (m) and theta (rad) of one block's mean."""
+    steps = (1e-7, 1e-7, 1e-6)
+    columns = [(dots(rig, pose + h) - dots(rig, pose - h)) / (2 * h.sum()) for h in np.diag(steps)]
+    jacobian = np.stack(columns, axis=1)
+    variance = (rig.amplifier.noise**2 + rig.converter.volts_per_count**2 / 12) / rig.estimator.block_size
+    information = jacobian.T @ jacobian / (variance * rig.amplifier.sensitivity**2)
+    return np.asarray(np.sqrt(np.linalg.inv(information).diagonal()))
+
+
+def errors(rig: Rig, load: tuple[float, float, float], blocks: int) -> tuple[FloatArray, FloatArray]:
+    """Error of each estimate (n, 3) and the mean true pose (3,)."""
+    rate, size = rig.converter.sample_rate_hz, rig.estimator.block_size
+    skipped = round(SETTLED_S * rate / size) * size
+    simulated = RigSimulator(rig, seed=1).step(constant(load, (skipped + blocks * size) / rate, rate).loads)
+    counts, pose = simulated.counts[skipped:], simulated.pose[skipped:]
+    seq = np.arange(len(counts))
+    t_ns = np.rint(seq * 1e9 / rate).astype(np.int64)
+    pipeline = Pipeline(rig)
+    chunk = RawChunk(seq, t_ns, counts, np.zeros(len(seq), np.uint8), rig.converter.volts_per_count)
+    records = [*pipeline.process(chunk), *pipeline.flush()]
+    found = np.array([(r.dx, r.dy, r.theta) for r in records if isinstance(r, DeflectionEstimate) and r.primary])
+    truth = pose.reshape(-1, size, 3).mean(axis=1)
+    return found - truth[: len(found)], truth.mean(axis=0)
+
+
+def main() -> int:
+    """Print rms errors and their ratios to the bound."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--blocks', type=int, default=5000, help='blocks of each load case')
+    blocks = parser.parse_args().blocks
+    rig = load_rig()
+    print(f'rms error against the simulated truth, {blocks} blocks a load case; in brackets over the Cramér–Rao bound')
+    unit = np.array([1e6, 1e6, np.degrees(1e3)])
+    worst = 0.0
+    for name, load in CASES.items():
+        error, pose = errors(rig, load, blocks)
+        rms = np.sqrt((error**2).mean(axis=0))
+        ratio = rms / bound(rig, pose)
+        worst = max(worst, float(ratio.max()))
+        cells = zip(('dX', 'dY', 'theta'), rms * unit, ratio, ('um', 'um', 'mdeg'), strict=True)
+        print(f'  {name:20}' + ''.join(f'  {n} {v:.3f} {u} ({r:.2f})' for n, v, r, u in cells))
+    print(f'  largest ratio {worst:.2f} (bound 1.1)')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,481 @@
+"""Runs the commands of README and docs as a reader would: ``make doc-commands``.
+
+What ends in a moment is run by test/test_docs.py; what CI runs anyway is looked up in .ci/run. The rest is run
+here, block by block, in a copy of the checkout: a daemon or a page is started on the simulated device, seen to
+work by what it says, and ended by Ctrl-C; a campaign runs in its shortest form; what ``ros2 topic`` and
+``ros2 service`` would do is done with rclpy, since ros2cli has no wheel. What is left is in :data:`NOT_RUN`, each
+with its reason, and is printed; an entry that the documents no longer have is an error.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import importlib
+import json
+import os
+import pty
+import re
+import select
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
+FENCE = re.compile(r'^```(?P<kind>\w*)\n(?P<text>.*?)^```', re.M | re.S)
+INLINE = re.compile(r'`((?:make|psd-deflection|python) [^`\n]+)`')
+PROGRAMS = ('psd-deflection', 'make', 'ros2', 'pip', 'python', 'python3')
+WAIT_S = 120.0
+CUT = 'recordings/cut'
+"""A recording that a crash left without its end."""
+
+NOT_RUN = (
+    (r'^ssh ', 'needs another machine'),
+    (r'^rviz2 |^ros2 run plotjuggler ', 'a program of ROS from apt; test_layouts.py checks what it would open'),
+    (r'^ros2 security |ROS_SECURITY_|--enclave ', 'needs ros2cli, and a Fast DDS built with security'),
+    (r'/opt/psd_deflection|^useradd |^install -|^udevadm |^systemctl |^journalctl ', 'changes the system, as root'),
+    (r'^python -m blind\.(thesis|arm|run) ?', 'minutes to hours; `make blind` is run in its shortest form'),
+)
+"""What is not run: pattern, reason."""
+
+CI_RUNS = (
+    (r'^make test$', '.ci/run', 'make test '),
+    (r'^make (lint|types|contracts|unit)$', 'Makefile', 'test: lint types contracts unit'),
+    (r'^make docs$', '.ci/run', 'make docs '),
+    (r'^make colcon$', '.ci/run', 'make colcon '),
+    (r'^make doc-commands$', '.ci/run', 'make doc-commands '),
+    (r'^make wheel$|^pip install dist/\*\.whl', '.ci/run', 'make wheel '),
+    (
+        r"^pip install '\.\[ros,monitor\]'$",
+        'Makefile',
+        "pip install --quiet --disable-pip-version-check '.[ros,monitor,",
+    ),
+    (r'^python bench/solvers\.py$', 'Makefile', 'python bench/solvers.py'),
+)
+"""What CI runs without us: pattern, file, and the text in it that does."""
+
+SHORTEST = {
+    'bench': 'BENCH_LIVE="--rounds 1 --seconds 2 --minutes 0.2" BENCH_SOLVERS="--blocks 10000"',
+    'faults': 'FAULT_TIMES=1 FAULTS="--only zero"',
+    'crash': 'CRASH_TIMES=1',
+    'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=10000',
+    'soak': 'SOAK_MINUTES=0.05 SOAK_HOURS=0.05',
+    'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
+    'shots': 'SHOT_SECONDS=2',
+}
+"""Variables with which a ``make`` target is over in seconds."""
+
+VERDICTS = {
+    'faults': r'between the faults +\d',
+    'crash': r'\d+ kills: ',
+    'soak': r'real time: \d+ samples lost',
+    'blind': r'failures \(\d+\)',
+}
+"""What a campaign says at its end: cut short, on a busy machine, it may come to another verdict than in full."""
+
+TOOLS = {
+    r'^make firmware': ('arm-none-eabi-gcc', 'qemu-system-arm'),
+    r'^make shots|first_look': ('chromium', 'chromedriver'),
+    r'^curl ': ('curl',),
+}
+"""Programs without which a command is passed over, and said to be."""
+
+QUICK = re.compile(
+    r'^psd-deflection (info|replay|convert|plot|budget|design|params|completion|compare-methods)\b'
+    r'|^psd-deflection simulate .*--(out|help)\b'
+)
+LIVE = re.compile(r'^psd-deflection (estimator|monitor)\b|--serve\b|^make run\b|^ros2 run psd_deflection estimator\b')
+
+
+class Command(NamedTuple):
+    """One command of the documents."""
+
+    page: str
+    block: int
+    line: str
+
+
+def commands() -> Iterator[Command]:
+    """All of them: every line of a block that is a command, and in running text those that have arguments."""
+    number = 0
+    for page in PAGES:
+        name, text = str(page.relative_to(ROOT)), page.read_text(encoding='utf-8')
+        for fence in FENCE.finditer(text):
+            number += 1
+            for line in _lines(fence['kind'], fence['text']):
+                yield Command(name, number, line)
+        for inline in INLINE.finditer(FENCE.sub('', text)):
+            number += 1
+            line = inline[1].strip()
+            # A command of ours without arguments is a name that is spoken of.
+            if re.fullmatch(r'psd-deflection [a-z-]+', line) is None:
+                yield Command(name, number, line)
+
+
+def _lines(kind: str, text: str) -> Iterator[str]:
+    if kind not in ('', 'sh', 'bash', 'console'):
+        return
+    lines = [raw.rstrip() for raw in text.replace('\\\n', ' ').splitlines() if raw.strip()]
+    if kind in ('', 'console'):
+        prompted = [raw[2:] for raw in lines if raw.startswith('$ ')]
+        whole = lines if lines and lines[0].split()[0] in PROGRAMS else []
+        lines = prompted or whole
+    for raw in lines:
+        line = re.split(r'\s+#\s|^#', raw + ' ')[0].strip()
+        if line:
+            yield line
+
+
+def filled(line: str, recording: str = 'bags/clean') -> str:
+    """``line`` with what a reader would put in for its placeholders; ``recording``: for one that was made at home."""
+    line = re.sub(r'\bREC(ORDING)?\b', 'bags/clean', re.sub(r'recordings/psd_(\.\.\.|\w+)', recording, line))
+    line = line.replace('OUT.csv', 'out.csv').replace('--out OUT', '--out out').replace('METHOD', 'wls')
+    return re.sub(r'\b(my|other)_rig\.yaml', 'config/thesis_rig.yaml', line)
+
+
+def reason_not_run(line: str) -> str:
+    """Why ``line`` is not run; '' where it is."""
+    return next((reason for pattern, reason in NOT_RUN if re.search(pattern, line)), '')
+
+
+def run_by_ci(line: str) -> tuple[str, str] | None:
+    """File, and the text in it that runs ``line``."""
+    return next(((file, text) for pattern, file, text in CI_RUNS if re.search(pattern, line)), None)
+
+
+def is_quick(line: str) -> bool:
+    """Whether the tests run it within themselves."""
+    return QUICK.search(line) is not None and '--serve' not in line
+
+
+def blocks_to_run() -> list[list[Command]]:
+    """What is run here, in the documents' order; blocks that are quick throughout are left to the tests."""
+    blocks: dict[int, list[Command]] = {}
+    seen: set[str] = set()
+    for command in commands():
+        blocks.setdefault(command.block, []).append(command)
+    out = []
+    for block in blocks.values():
+        if all(is_quick(c.line) or reason_not_run(c.line) or run_by_ci(c.line) for c in block):
+            continue
+        left = [c for c in block if not reason_not_run(c.line) and run_by_ci(c.line) is None and c.line not in seen]
+        # The lines below it may need what a simulation writes, and nothing else that is quick.
+        left = [c for c in left if not is_quick(c.line) or ' simulate ' in c.line]
+        seen.update(c.line for c in left)
+        if left:
+            out.append(left)
+    return out
+
+
+def stale() -> list[str]:
+    """Entries of the tables that no command of the documents needs any more."""
+    lines = [c.line for c in commands()]
+    patterns = [p for p, *_ in (*NOT_RUN, *CI_RUNS)] + [f'^make {name}\\b' for name in SHORTEST] + list(TOOLS)
+    return [p for p in patterns if not any(re.search(p, line) for line in lines)]
+
+
+class Terminal:
+    """A program with a terminal before it, as a person has one."""
+
+    def __init__(self, line: str, folder: Path) -> None:
+        self._fd, theirs = pty.openpty()
+        self.process = subprocess.Popen(
+            ['bash', '-c', f'exec {line}'],
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=theirs,
+            stderr=theirs,
+            start_new_session=True,
+        )
+        os.close(theirs)
+        self.text = ''
+
+    def until(self, pattern: str) -> re.Match[str]:
+        """The first match in what it says."""
+        end = time.monotonic() + WAIT_S
+        while (match := re.search(pattern, self.text)) is None:
+            if not self._read(end):
+                raise RuntimeError(f'{pattern!r} was not said')
+        return match
+
+    def _read(self, end: float) -> bool:
+        ready, _, _ = select.select((self._fd,), (), (), max(0.0, end - time.monotonic()))
+        try:
+            new = os.read(self._fd, 65536) if ready else b''
+        except OSError:
+            new = b''
+        self.text += new.decode(errors='replace')
+        return bool(new)
+
+    def end(self) -> int:
+        """Ctrl-C, all it says, and its exit status."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGINT)
+        return self.finish()
+
+    def finish(self) -> int:
+        """Wait until it is over."""
+        end = time.monotonic() + WAIT_S
+        while self._read(end):
+            pass
+        try:
+            status = self.process.wait(max(1.0, end - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            os.killpg(self.process.pid, signal.SIGKILL)
+            raise RuntimeError('did not end') from None
+        finally:
+            with contextlib.suppress(OSError):
+                os.close(self._fd)
+        return status
+
+
+class Reader:
+    """Someone who reads the documents and types what they say, in ``folder``."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._device: Terminal | None = None
+        self._background: list[Terminal] = []
+        self._served = ''
+
+    def block(self, lines: list[str], ran: Callable[[str, float, str], None]) -> None:
+        """Type the lines of a block one after the other; ``ran`` is told seconds and, where it failed, why."""
+        try:
+            for line in lines:
+                began = time.monotonic()
+                failed = ''
+                try:
+                    self.type(filled(line, CUT))
+                except (RuntimeError, OSError, subprocess.SubprocessError) as error:
+                    failed = str(error)
+                ran(line, time.monotonic() - began, failed)
+        finally:
+            for program in self._background:
+                program.end()
+            self._background.clear()
+
+    def type(self, line: str) -> None:
+        """One command; raises RuntimeError where it does not do what it should."""
+        line = line.replace('/dev/ttyACM0', 'ttyACM0').replace('/dev/pts/3', self._served)
+        if 'ttyACM0' in line and self._device is None:
+            self._device = Terminal('psd-deflection simulate --serve --link ttyACM0', self._folder)
+            self._device.until('port: ')
+        if line.startswith('ros2 launch '):
+            check_launch(line)
+        elif line.startswith(('ros2 topic ', 'ros2 service ')):
+            self._node()
+            self._to_the_end(f'python {shlex.quote(str(Path(__file__)))} --ask {shlex.quote(line)}')
+        elif line.startswith('curl '):
+            self._press(line)
+        elif LIVE.search(line):
+            self._live(line)
+        elif line.startswith('make '):
+            target = line.split()[1]
+            self._to_the_end(f'{line} {SHORTEST.get(target, "")}', VERDICTS.get(target, ''))
+        else:
+            self._to_the_end(line)
+
+    def _to_the_end(self, line: str, verdict: str = '') -> None:
+        program = Terminal(line, self._folder)
+        status = program.finish()
+        judged = verdict != '' and re.search(verdict, program.text) and 'Traceback' not in program.text
+        if status != 0 and not judged:
+            raise RuntimeError(f'exit status {status}\n{program.text[-2000:]}')
+
+    def _live(self, line: str) -> None:
+        # What `ros2 run` does: it looks the executable up and becomes it.
+        line = re.sub(r'^ros2 run psd_deflection ', f'{os.environ["VIRTUAL_ENV"]}/lib/psd_deflection/', line)
+        program = Terminal(line, self._folder)
+        try:
+            if '--serve' in line:
+                self._served = program.until(r'port: (\S+)\s')[1]
+                self._background.append(program)
+                return
+            if ' monitor' in line or '--monitor' in line or line == 'make run':
+                with urllib.request.urlopen(program.until(r'monitor: (http://[^\s#]+)')[1], timeout=WAIT_S) as answer:
+                    if b'psd_deflection monitor' not in answer.read():
+                        raise RuntimeError('the address that it prints has another page')
+            if not re.search(r' monitor bags/', line):
+                program.until(r'θ +[-+]\d+\.\d\d ± \d')
+            status = program.end()
+        except RuntimeError as error:
+            program.end()
+            raise RuntimeError(f'{error}\n{program.text[-2000:]}') from None
+        # make itself is ended by Ctrl-C too.
+        if (status != 0 and not line.startswith('make')) or 'Traceback' in program.text:
+            raise RuntimeError(f'exit status {status} after Ctrl-C\n{program.text[-2000:]}')
+        if ('--record' in line or line == 'make run') and 'replay it:' not in program.text:
+            raise RuntimeError(f'no recording was made\n{program.text[-2000:]}')
+
+    def _node(self) -> None:
+        if not self._background:
+            self._background.append(Terminal('psd-deflection estimator', self._folder))
+            self._background[-1].until(r'θ +[-+]\d')
+
+    def _press(self, line: str) -> None:
+        if not self._background:
+            self._background.append(Terminal('psd-deflection monitor --control', self._folder))
+            self._background[-1].until(r'θ +[-+]\d')
+        url = self._background[-1].until(r'monitor: (http://[^\s#]+)/')[1]
+        line = line.replace('http://127.0.0.1:8790', url)
+        done = subprocess.run(
+            ['bash', '-c', f'{line} --silent'], capture_output=True, text=True, check=True, timeout=WAIT_S
+        )
+        if json.loads(done.stdout)['ok'] is not True:
+            raise RuntimeError(done.stdout)
+
+    def close(self) -> None:
+        """Pull the plug."""
+        if self._device is not None:
+            self._device.end()
+
+
+def check_launch(line: str) -> None:
+    """That ``ros2 launch`` would find package, file and arguments."""
+    _, _, package, file, *arguments = shlex.split(line)
+    prefix = Path(os.environ['VIRTUAL_ENV'])
+    installed = prefix / 'share' / package / 'launch' / file
+    if not (prefix / 'share/ament_index/resource_index/packages' / package).exists() or not installed.exists():
+        raise RuntimeError(f'{package}/{file} is not installed')
+    declared = set(re.findall(r"DeclareLaunchArgument\(\s*'(\w+)'", installed.read_text(encoding='utf-8')))
+    unknown = {a.partition(':=')[0] for a in arguments} - declared
+    if unknown:
+        raise RuntimeError(f'{file} has no argument {", ".join(unknown)}')
+
+
+def ask(line: str) -> None:
+    """What ``ros2 topic echo --once`` and ``ros2 service call`` do, with rclpy."""
+    import rclpy
+    import yaml
+
+    def type_of(name: str) -> Any:
+        package, kind, message = name.split('/')
+        return getattr(importlib.import_module(f'{package}.{kind}'), message)
+
+    _, what, verb, name, *rest = shlex.split(line)
+    rclpy.init()
+    node = rclpy.create_node('reader_of_the_documents')
+    end = time.monotonic() + WAIT_S
+    answers: list[Any] = []
+    if (what, verb) == ('topic', 'echo'):
+        while not (types := dict(node.get_topic_names_and_types()).get(name)):
+            rclpy.spin_once(node, timeout_sec=0.1)
+            if time.monotonic() > end:
+                raise SystemExit(f'no topic {name}')
+        node.create_subscription(type_of(types[0]), name, answers.append, 10)
+        while not answers and time.monotonic() < end:
+            rclpy.spin_once(node, timeout_sec=0.1)
+    elif (what, verb) == ('service', 'call'):
+        kind = type_of(rest[0])
+        client = node.create_client(kind, name)
+        if not client.wait_for_service(WAIT_S):
+            raise SystemExit(f'no service {name}')
+        request = kind.Request(**(yaml.safe_load(rest[1]) if len(rest) > 1 else {}))
+        # Before the first block there is nothing to be zeroed.
+        while not (answers and answers[-1].success) and time.monotonic() < end:
+            future = client.call_async(request)
+            rclpy.spin_until_future_complete(node, future, timeout_sec=10.0)
+            answers = [future.result()] if future.done() else []
+        answers = [a for a in answers if a.success]
+    else:
+        raise SystemExit(f'not known: {line}')
+    print(answers[-1] if answers else 'no answer')
+    node.destroy_node()
+    rclpy.shutdown()
+    if not answers:
+        raise SystemExit(1)
+
+
+@contextlib.contextmanager
+def a_domain_of_our_own() -> Iterator[str]:
+    """A ROS_DOMAIN_ID held by a lock, the one that the tests use."""
+    for candidate in range(99, 19, -1):
+        with (Path(tempfile.gettempdir()) / f'psd_deflection_test_domain_{candidate}').open('w') as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            yield str(candidate)
+            return
+    raise SystemExit('no ROS domain is free')
+
+
+def copy_checkout(target: Path) -> None:
+    """What git knows or would take, with its times, so that make finds nothing to be done anew."""
+    names = subprocess.run(
+        ['git', 'ls-files', '-z', '--cached', '--others', '--exclude-standard'],
+        cwd=ROOT,
+        capture_output=True,
+        check=True,
+    ).stdout.decode()
+    for name in names.split('\0'):
+        if name and (ROOT / name).is_file():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, target / name)
+    whole = (ROOT / 'bags/clean/clean_0.mcap').read_bytes()
+    (target / CUT).mkdir(parents=True)
+    (target / CUT / 'cut_0.mcap').write_bytes(whole[: len(whole) * 6 // 10])
+
+
+def main() -> int:
+    """Run them all, or those that hold the words given; the exit status is 1 where one failed."""
+    if sys.argv[1:2] == ['--ask']:
+        ask(sys.argv[2])
+        return 0
+    only = ' '.join(sys.argv[1:])
+    environment = Path(sys.prefix)
+    failures = 0
+    with tempfile.TemporaryDirectory() as temporary, a_domain_of_our_own() as domain:
+        folder = Path(temporary) / 'checkout'
+        copy_checkout(folder)
+        os.environ.update(
+            PATH=f'{environment / "bin"}:{os.environ["PATH"]}',
+            VIRTUAL_ENV=str(environment),
+            VENV=str(environment),
+            MAKEFLAGS=f'VENV={environment}',
+            ROS_DOMAIN_ID=domain,
+            ROS_LOG_DIR=f'{temporary}/log',
+            XDG_STATE_HOME=f'{temporary}/state',
+        )
+        reader = Reader(folder)
+
+        def ran(line: str, seconds: float, failed: str) -> None:
+            nonlocal failures
+            failures += bool(failed)
+            print(f'{"FAILED" if failed else "ok":6} {seconds:5.1f} s  {line}', flush=True)
+            if failed:
+                print(failed, flush=True)
+
+        try:
+            for block in blocks_to_run():
+                lines = [c.line for c in block if only in c.line]
+                for line in [*lines]:
+                    missing = [
+                        t for p, tools in TOOLS.items() if re.search(p, line) for t in tools if not shutil.which(t)
+                    ]
+                    if missing:
+                        lines.remove(line)
+                        print(f'passed over, for want of {", ".join(missing)}: {line}')
+                reader.block(lines, ran)
+        finally:
+            reader.close()
+    for pattern, reason in NOT_RUN:
+        left = sorted({c.line for c in commands() if re.search(pattern, c.line)})
+        print(f'not run ({reason}):', *left, sep='\n  ')
+    for pattern in stale():
+        failures += 1
+        print(f'FAILED: nothing in the documents is like {pattern} any more')
+    return 1 if failures else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
