@@ -50,7 +50,7 @@ SILENCE_S = 2.0
 RETRY_S = 0.2
 READ_TIMEOUT_S = 0.1
 READY_S = 10.0
-GIVE_UP_TIMES = 10
+GIVE_UP_TIMES = 5
 """How often, a read's time apart, a reader is asked to give up waiting for its device."""
 
 TORN_US = 50_000
