@@ -161,7 +161,7 @@ def run(args: argparse.Namespace) -> int:
         from psd_deflection.ros import estimator
 
         status = estimator.run(args.ros_arguments, overrides, display.say, watch)
-    for folder in recorded:
+    for folder in (f for f in recorded if f.is_dir()):
         display.say(f'recorded {folder}\n  replay it:  psd-deflection replay {folder} --compare')
     return status
 
