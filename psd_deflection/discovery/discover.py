@@ -236,7 +236,8 @@ def _answer(
     progress('alternatives')
     for i, active in enumerate(fit.effects):
         # Where the joint rule has taken effects out, what stood beside them is no longer comparable.
-        fits = result.alternatives[i] if fit is result.fit else search.alternatives(result.null, fit, i, result.delta_chi2[i])
+        as_found = fit is result.fit
+        fits = result.alternatives[i] if as_found else search.alternatives(result.null, fit, i, result.delta_chi2[i])
         rows, equal = [], []
         for f in fits:
             loss = f.chi2 - fit.chi2
