@@ -109,7 +109,7 @@ docs: $(VENV)/.installed
 	$(BIN)/python -m mkdocs build --strict --quiet --site-dir build/site
 	@echo 'open build/site/index.html'
 
-SHOT_SECONDS ?= 27
+SHOT_SECONDS ?= 40
 shots: $(VENV)/.installed
 	$(BIN)/python docs/shots.py --seconds $(SHOT_SECONDS)
 
