@@ -14,7 +14,7 @@
 # make wheel    sdist and wheel in dist/, tried in an environment of its own
 # make doc-commands  every command of README and docs that the tests do not run, run
 # make shots    the pictures of the live page in docs/figures anew (needs Chromium)
-# make blind    hide effects with a second generator and see whether discover names them (hours; JOBS=2)
+# make blind    hide effects with a second generator and see whether discover names them (an hour or two on two cores; JOBS=1 for one)
 # make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
 # make clean    remove what the above made
 PYTHON ?= python3
@@ -128,14 +128,14 @@ wheel: $(VENV)/.installed
 	cd build/wheel && use/bin/psd-deflection --version && use/lib/psd_deflection/replay --help > log
 
 # Truth hidden by a second generator: fresh seeds, both cores with JOBS=2; a run that was stopped goes on.
-JOBS ?= 1
+JOBS ?= $(shell nproc)
 blind: $(VENV)/.installed
 	$(BIN)/python -m blind.run --jobs $(JOBS) $(BLIND)
 
 demo-discover: $(VENV)/.installed
 	rm -rf build/demo && mkdir -p build/demo
 	$(BIN)/psd-deflection simulate --loads identification --effect sensor_rotation,psd=2,angle=0.01 --seed 5 --out build/demo/rig
-	$(BIN)/psd-deflection discover build/demo/rig --params-file config/thesis_rig.yaml --out build/demo/found
+	$(BIN)/psd-deflection discover build/demo/rig --out build/demo/found
 	$(BIN)/psd-deflection replay build/demo/rig --params-file build/demo/found/model.yaml --out build/demo/corrected.csv
 	@echo 'the report: build/demo/found/report.html'
 

@@ -148,10 +148,16 @@ def summary(rows: Sequence[Row]) -> tuple[str, bool]:
         sheet.rate(f'false alarm, {name} noise', of, alarm, 0.0, t[f'false_alarm_{name}_noise'], False)
     pair = [r for r in rows if r.kind == 'pair']
     sheet.rate('both of a pair in the answer', pair, [_both(r) for r in pair], t['both_of_a_pair'], 1.0, True)
-    for kind in ('leftout', 'alien'):
-        of = [r for r in rows if r.kind == kind]
+    for kinds in (('leftout',), ('alien',), ('leftout', 'alien')):
+        of = [r for r in rows if r.kind in kinds]
         right = [r.answer['verdict'] == 'unknown_effect' for r in of]
-        sheet.rate(f'{kind} called unknown', of, right, t['unknown'], 1.0, True)
+        sheet.rate(f'{" or ".join(kinds)} called unknown', of, right, t['unknown'], 1.0, len(kinds) == 1)
+    listed = [r for r in rows if r.kind in ('single', 'pair') and r.gap >= 3.0]
+    wrongly = [r for r in listed if r.answer['verdict'] == 'unknown_effect']
+    sheet.lines.append(
+        f'        truth in the library, gap >= 3 floors, and yet something called unknown: {len(wrongly)}/{len(listed)}'
+    )
+    sheet.lines += [f'          {r.key}: {_said(r)}' for r in wrongly]
     known = [r for r in rows if r.kind in ('single', 'pair', 'null', 'wrong')]
     if known:
         ratio = np.array([r.answer['gap']['heldout_after'] / r.answer['gap']['floor'] for r in known])

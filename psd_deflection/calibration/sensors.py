@@ -71,7 +71,25 @@ class Sensor(abc.ABC):
         return self.half
 
 
-class Duolateral(Sensor):
+class _EdgeElectrodes(Sensor):
+    """Two pairs of electrodes along the edges; ``share``: the part of the photocurrent through one half of a pair."""
+
+    electrodes: ClassVar[tuple[str, str, str, str]] = ('x1', 'x2', 'y1', 'y2')
+    share: ClassVar[float]
+
+    def ratios(self, currents: FloatArray) -> FloatArray:
+        """See :class:`Sensor`."""
+        x1, x2, y1, y2 = np.asarray(currents, dtype=np.float64).T
+        return _over(np.column_stack((x1 - x2, y1 - y2)), np.column_stack((x1 + x2, y1 + y2)))
+
+    def currents(self, place: FloatArray, total: FloatArray | float) -> FloatArray:
+        """See :class:`Sensor`."""
+        x, y = self.to_ratios(place).T
+        part = self.share * np.broadcast_to(total, x.shape)
+        return np.column_stack((part * (1.0 + x), part * (1.0 - x), part * (1.0 + y), part * (1.0 - y)))
+
+
+class Duolateral(_EdgeElectrodes):
     """Two resistive sheets: x between two electrodes in front, y between two behind.
 
     x = (Lx/2)(I_x1 - I_x2)/(I_x1 + I_x2), electrode 1 on the positive side (2.3, 2.4; Hamamatsu's and
@@ -79,40 +97,18 @@ class Duolateral(Sensor):
     """
 
     name: ClassVar[str] = 'duolateral'
-    electrodes: ClassVar[tuple[str, str, str, str]] = ('x1', 'x2', 'y1', 'y2')
-
-    def ratios(self, currents: FloatArray) -> FloatArray:
-        """See :class:`Sensor`."""
-        x1, x2, y1, y2 = np.asarray(currents, dtype=np.float64).T
-        return _over(np.column_stack((x1 - x2, y1 - y2)), np.column_stack((x1 + x2, y1 + y2)))
-
-    def currents(self, place: FloatArray, total: FloatArray | float) -> FloatArray:
-        """See :class:`Sensor`."""
-        x, y = self.to_ratios(place).T
-        half = np.broadcast_to(total, x.shape) / 2.0
-        return np.column_stack((half * (1.0 + x), half * (1.0 - x), half * (1.0 + y), half * (1.0 - y)))
+    share: ClassVar[float] = 0.5
 
     def sum_signal(self, currents: FloatArray) -> FloatArray:
         """The photocurrent (n,), A: it passes both pairs, and is counted once."""
         return super().sum_signal(currents) / 2.0
 
 
-class Tetralateral(Sensor):
+class Tetralateral(_EdgeElectrodes):
     """One sheet with an electrode along each edge: both axes share the photocurrent (2.3, 2.4)."""
 
     name: ClassVar[str] = 'tetralateral'
-    electrodes: ClassVar[tuple[str, str, str, str]] = ('x1', 'x2', 'y1', 'y2')
-
-    def ratios(self, currents: FloatArray) -> FloatArray:
-        """See :class:`Sensor`."""
-        x1, x2, y1, y2 = np.asarray(currents, dtype=np.float64).T
-        return _over(np.column_stack((x1 - x2, y1 - y2)), np.column_stack((x1 + x2, y1 + y2)))
-
-    def currents(self, place: FloatArray, total: FloatArray | float) -> FloatArray:
-        """See :class:`Sensor`."""
-        x, y = self.to_ratios(place).T
-        part = np.broadcast_to(total, x.shape) / 4.0
-        return np.column_stack((part * (1.0 + x), part * (1.0 - x), part * (1.0 + y), part * (1.0 - y)))
+    share: ClassVar[float] = 0.25
 
 
 class Pincushion(Sensor):

@@ -19,12 +19,12 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from psd_deflection.cli._observations import read_observations
 from psd_deflection.config import load_rig
 from psd_deflection.discovery.discover import discover
 from psd_deflection.discovery.report import report_html
 from psd_deflection.discovery.result import model_yaml, result, sentence
 from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.io.observations import read_observations
 from psd_deflection.simulation.catalogue import catalogue
 
 STEPS = 8
@@ -34,7 +34,9 @@ STEPS = 8
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('recordings', metavar='REC', nargs='+', help='recordings, or .yaml lists of them')
-    parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig as it is known')
+    parser.add_argument(
+        '--params-file', metavar='RIG.yaml', help='the rig as it is known (default: the parameters in the recording)'
+    )
     parser.add_argument('--out', metavar='DIR', required=True, help='folder for model.yaml, report.html, result.json')
     parser.add_argument('--seed', type=int, default=0, help='seed of the bootstraps; the same gives the same answer')
     parser.add_argument(
@@ -45,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, discover, write, and say it in a sentence."""
-    rig = load_rig(args.params_file)
+    given = None if args.params_file is None else load_rig(args.params_file)
     for name in args.without:
         if name not in catalogue():
             raise ConfigError(f'--without {name}: no effect of that name; there are: {", ".join(catalogue())}')
@@ -54,7 +56,8 @@ def run(args: argparse.Namespace) -> int:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RecordingError(f'{out}: cannot be made ({error.strerror or error})') from None
-    observations = read_observations(args.recordings, rig)
+    observations = read_observations(args.recordings, given)
+    rig = observations[0].rig if given is None else given
     # Reading took most of what can be foreseen; a search has as many steps as it has effects to weigh.
     hidden = True if args.quiet else None
     with tqdm(total=STEPS, disable=hidden, file=sys.stderr, bar_format='{l_bar}{bar}| {elapsed}') as bar:

@@ -1,7 +1,8 @@
 """Simulate the rig: as a recording (--out), or as a device on a pseudo-terminal (--serve).
 
-The rig file says what the rig is and which effects are on; --effect adds one more. A recording
-holds the samples, the loads, the temperature where one is given, and with --reference the true pose.
+The rig file says what the rig is and which effects are known of; --effect adds one that nobody knows
+of: neither the estimates nor the parameters in the recording tell of it. A recording holds the
+samples, the loads, the temperature where one is given, and with --reference the true pose.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ BAG_START_NS = 1_000_000_000
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.epilog = HELP
-    parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig and its effects')
+    parser.add_argument('--params-file', metavar='RIG.yaml', help='the rig and its known effects')
     parser.add_argument('--seed', type=int, default=0, help='seed of the noise')
     group = parser.add_argument_group('as a recording (--out)')
     group.add_argument('--out', metavar='OUT', help='X.csv, X.mcap or a bag folder')
@@ -55,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='NAME,KEY=VALUE,...',
         action='append',
         default=[],
-        help='switch an effect on, for example sensor_rotation,psd=2,angle=0.01; repeatable',
+        help='hide an effect in it, for example sensor_rotation,psd=2,angle=0.01; repeatable',
     )
     group.add_argument('--reference', action='store_true', help='record the true pose as an independent measurement')
     serve.add_arguments(parser)
@@ -67,13 +68,14 @@ def run(args: argparse.Namespace) -> int:
         return serve.run_device(args)
     if args.out is None:
         raise ConfigError('simulate: --out OUT or --serve is needed')
-    rig = with_effects(load_rig(args.params_file), args.effect)
+    known = load_rig(args.params_file)
+    rig = with_effects(known, args.effect)
     rate = rig.converter.sample_rate_hz
     parts = [load_history(words, rate) for words in args.loads or ['thesis']]
     history = parts[0].then(*parts[1:])
     temperature = None if args.temperature is None else temperature_history(args.temperature, len(history))
     out = Path(args.out)
-    count = write_recording(out, rig, history.loads, temperature, args.seed, args.reference)
+    count = write_recording(out, rig, known, history.loads, temperature, args.seed, args.reference)
     names = ', '.join(a.label for a in effects_of_rig(rig)) or 'none'
     print(f'{out}: {count} samples, {count / rate:.1f} s; effects: {names}')
     return 0
@@ -96,12 +98,15 @@ def with_effects(rig: Rig, words: Sequence[str]) -> Rig:
 
 
 def write_recording(
-    out: Path, rig: Rig, loads: FloatArray, temperature: FloatArray | None, seed: int, reference: bool
+    out: Path, rig: Rig, known: Rig, loads: FloatArray, temperature: FloatArray | None, seed: int, reference: bool
 ) -> int:
-    """Simulate and write; returns the number of samples. Raises RecordingError, ConfigError."""
+    """Simulate ``rig`` and write what a daemon with the parameters ``known`` would; returns the number of samples.
+
+    Raises RecordingError, ConfigError.
+    """
     is_csv = out.suffix.lower() == '.csv'
     sink: Sink
-    values = {**rig.values, **{EFFECTS_PREFIX + k: e for k, e in rig.effects.items()}}
+    values = {**known.values, **{EFFECTS_PREFIX + k: e for k, e in known.effects.items()}}
     if is_csv:
         sink = CsvSampleSink(out, loads=True, references=reference, temperatures=temperature is not None)
     elif out.suffix.lower() == '.mcap':
@@ -110,7 +115,7 @@ def write_recording(
         sink = BagWriter(out, rig_values=values)
     bar = tqdm(total=len(loads), unit=' samples', delay=1.0, leave=False, disable=None, ncols=80)
     with contextlib.closing(sink), bar:
-        for record in records(rig, loads, temperature, seed, reference, 0 if is_csv else BAG_START_NS):
+        for record in records(rig, known, loads, temperature, seed, reference, 0 if is_csv else BAG_START_NS):
             sink.put(record)
             if isinstance(record, SampleBlock):
                 bar.update(len(record.seq))
@@ -118,10 +123,10 @@ def write_recording(
 
 
 def records(
-    rig: Rig, loads: FloatArray, temperature: FloatArray | None, seed: int, reference: bool, start_ns: int
+    rig: Rig, known: Rig, loads: FloatArray, temperature: FloatArray | None, seed: int, reference: bool, start_ns: int
 ) -> Iterator[Record]:
     """What the rig would have recorded, and the estimates that the daemon would have made of it."""
-    simulator, pipeline = RigSimulator(rig, seed), Pipeline(rig)
+    simulator, pipeline = RigSimulator(rig, seed), Pipeline(known)
     period = 1e9 / rig.converter.sample_rate_hz
     # A temperature takes effect with the block that follows it: then block by block.
     size = max(1, round(CHUNK_SECONDS * rig.converter.sample_rate_hz))

@@ -14,6 +14,7 @@ import numpy as np
 
 from psd_deflection.config import Rig
 from psd_deflection.discovery import proposals as propose
+from psd_deflection.discovery.coincidence import Coincidence, coincidences
 from psd_deflection.discovery.experiment import Suggestion, suggest
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.localise import Localisation, localise
@@ -55,11 +56,14 @@ class NamedEffect:
 
 @dataclass(frozen=True, slots=True)
 class Unknown:
-    """Structure that no effect explains: ``signature`` in words, ``explains``: its share of the gap's energy."""
+    """What no effect explains, or only several tied to each other: ``signature`` in words, ``explains``:
+    its share of the gap's energy. ``remains``: whether it is still there with all effects added.
+    """
 
     signature: str
     depends_on: tuple[str, ...]
     explains: float
+    remains: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,10 +177,12 @@ def _credible(
 def _lattice(workspace: Workspace, base: Sequence[ActiveEffect], without: Sequence[str]) -> ActiveEffect | None:
     if 'quantisation' in without or any(a.effect.name == 'quantisation' for a in base):
         return None
-    steps = [propose.coarse_step(o) for o in workspace.observations]
-    if any(s is None for s in steps):
+    found = [propose.coarse_step(o) for o in workspace.observations]
+    steps = [s for s in found if s is not None]
+    if len(steps) < len(found):
         return None
-    return make_active('quantisation', {'step': float(np.median([s for s in steps if s is not None]))}, 'discover')
+    # The recording with the longest lever knows it best.
+    return make_active('quantisation', {'step': min(steps, key=lambda s: s[1])[0]}, 'discover')
 
 
 def _accept(search: Search, result: SearchResult, rng: np.random.Generator) -> tuple[list[HeldOut], Fit]:
@@ -262,7 +268,7 @@ def _answer(
     floor = ws.floor()
     # Coarse steps make noise that comes and goes with the signal; what they explain stands against that.
     explained = max(null.chi2 - fit.chi2, 0.0) + (0.0 if lattice is None else 2.0 * _lattice_gain(ws, lattice))
-    unknown = _unknown(left, explained)
+    unknown = _unknown(left, explained) or _tied(coincidences(fit, ws.physics), fit, result, before)
     verdict = 'unknown_effect' if unknown else 'effects_found' if named else 'nothing_missing'
     channels = ws.gap_per_channel(null.difference), ws.gap_per_channel(fit.difference)
     gap_before, gap_after = ws.gap(null.difference), ws.gap(fit.difference)
@@ -302,11 +308,8 @@ def _lattice_gain(workspace: Workspace, lattice: ActiveEffect) -> float:
 
 def _named_lattice(workspace: Workspace, lattice: ActiveEffect) -> NamedEffect:
     """Coarse steps are seen in the values themselves."""
-    lsb = workspace.observations[0].rig.converter.volts_per_count
-    step, gain = lattice.values['step'], _lattice_gain(workspace, lattice)
-    # The lattice's far ends fix the step to a fraction of a count over their distance.
-    span = max(float(np.nanmax(np.abs(o.volts))) for o in workspace.observations)
-    sd = 0.3 * lsb * step / max(span, step)
+    gain = _lattice_gain(workspace, lattice)
+    sd = min(s[1] for o in workspace.observations if (s := propose.coarse_step(o)) is not None)
     return NamedEffect(lattice, {'step': sd}, 0.0, 2.0 * gain, HeldOut(gain, float(np.sqrt(2.0 * gain))), (), (), None)
 
 
@@ -330,6 +333,22 @@ def _unknown(left: Localisation, explained: float) -> tuple[Unknown, ...]:
         words.append(f'strongest at {c.when[0]:.1f} to {c.when[1]:.1f} s, {c.band[0]:g} to {c.band[1]:g} Hz')
     share = left.excess / max(left.excess + explained, 1e-300)
     return (Unknown('; '.join(words), names, float(min(max(share, 0.0), 1.0))),)
+
+
+def _tied(ties: Sequence[Coincidence], fit: Fit, result: SearchResult, before: Localisation) -> tuple[Unknown, ...]:
+    """What effects that agree in size beyond chance do together is put down to one cause, not named here."""
+    if not ties:
+        return ()
+    tie = ties[0]
+    (i, first), (j, second) = tie.first, tie.second
+    (a, b), unit = tie.sizes, f' {tie.unit}' if tie.unit else ''
+    words = (
+        f'{fit.effects[i].label} and {fit.effects[j].label} agree in size ({first} {a:.4g}, {second} {b:.4g}{unit}) as '
+        f'independent effects hardly would (odds {tie.odds:.0f} to 1): one cause that is not in the catalogue'
+    )
+    names = tuple(dict.fromkeys(d.regressor for d in before.dependences[:6] if d.p < 1e-3))
+    share = (result.delta_chi2[i] + result.delta_chi2[j]) / max(result.null.chi2 - fit.chi2, 1e-300)
+    return (Unknown(words, names, float(min(max(share, 0.0), 1.0)), remains=False),)
 
 
 def _even(regressor: str) -> bool:

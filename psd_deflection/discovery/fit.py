@@ -77,8 +77,8 @@ def refit(workspace: Workspace, effects: Sequence[ActiveEffect], iterations: int
     """
     free = _free(effects)
     x = np.array([effects[i].values[p.name] for i, p in free])
-    low = np.array([p.minimum for _, p in free])
-    high = np.array([p.maximum for _, p in free])
+    bounds = [p.bounds(workspace.physics, effects[i].values) for i, p in free]
+    low, high = np.array([b[0] for b in bounds]), np.array([b[1] for b in bounds])
     scale = np.array([p.scale for _, p in free])
     x = np.clip(x, low, high)
     base = list(workspace.base)
@@ -127,6 +127,6 @@ def refit(workspace: Workspace, effects: Sequence[ActiveEffect], iterations: int
             damping = max(damping * 20.0, 1e-4)
         if gained < stop + 1e-7 * chi2:
             break
-    bound = tuple((i, p.name) for (i, p), v in zip(free, x, strict=True) if v <= p.minimum or v >= p.maximum)
+    bound = tuple((i, p.name) for (i, p), v, (a, b) in zip(free, x, bounds, strict=True) if v <= a or v >= b)
     final = tuple(_moved(effects, free, x))
     return Fit(final, chi2, residual, difference, jacobian, tuple((i, p.name) for i, p in free), bound)

@@ -92,8 +92,8 @@ def highest_voltages(observations: Sequence[Observation], with_sums: bool, noise
     return [v for v in (top - 2.0 * noise, top - 4.0 * noise, top - 12.0 * noise, 0.98 * top) if v > 0.1]
 
 
-def coarse_step(observation: Observation) -> float | None:
-    """The step, V, on whose multiples all readings lie, if it is coarser than the converter's.
+def coarse_step(observation: Observation) -> tuple[float, float] | None:
+    """The step on whose multiples all readings lie, if it is coarser than the converter's, and its sd; V.
 
     The gaps between neighbouring values that occur are whole multiples of it: the finest common
     one is refined until all readings are multiples to within the converter's own rounding.
@@ -124,4 +124,6 @@ def coarse_step(observation: Observation) -> float | None:
     expected = min(1.0, 2.0 / gap)
     if expected > 0.9 or len(values) * np.log(1.0 / expected) < 20.0:
         return None
-    return gap * lsb
+    # Least squares through the origin, each value rounded to whole counts (sd of a uniform law).
+    k = np.rint(values / gap)
+    return gap * lsb, float(lsb / np.sqrt(12.0 * np.dot(k, k)))

@@ -203,9 +203,9 @@ def report_html(discovery: Discovery) -> str:
     if discovery.unknown:
         body.append('<h2>Unknown</h2>')
     for u in discovery.unknown:
+        where = 'is not in model.yaml' if u.remains else 'the effects stand in for it in model.yaml'
         body.append(
-            f'<p>{html.escape(u.signature)}. It is {100 * u.explains:.0f} % of what was to be explained, and is not in '
-            f'model.yaml.</p>'
+            f'<p>{html.escape(u.signature)}. It is {100 * u.explains:.0f} % of what was to be explained; {where}.</p>'
         )
     body.append('<h2>Where</h2>')
     body.append(_image(_where_figure(discovery), 'where simulation and data part'))

@@ -143,6 +143,11 @@ def sentence(discovery: Discovery) -> str:
             f'{named} {is_are} missing from the model; adding {"it" if len(parts) == 1 else "them"} '
             f'closes the gap from {before:.3f} to {after:.3f} µm (noise alone: {floor:.3f} µm).'
         )
+    if not any(u.remains for u in discovery.unknown):
+        return (
+            f'{named} close the gap from {before:.3f} to {after:.3f} µm (noise alone: {floor:.3f} µm), but their sizes '
+            f'are tied: one effect that is not in the catalogue is likelier.'
+        )
     lead = (
         f'{named} explains part, but an unknown effect remains' if named else 'An effect that is not in the catalogue'
     )

@@ -13,9 +13,6 @@ from psd_deflection.simulation.catalogue import ActiveEffect, Effect, catalogue
 from psd_deflection.simulation.physics import Physics
 from psd_deflection.simulation.probes import off_values, variants
 
-HIGHER = 1.6
-"""A second mode is looked for from this many times the first mode's frequency."""
-
 Columns = list[list[FloatArray]]
 """Per column, per recording: fine-block volts (6, nf)."""
 
@@ -98,9 +95,9 @@ def candidates(
                 if p.kind == 'shape':
                     grid = list(proposals.get(p.propose, ())) if p.propose else list(p.grid)
                     if p.propose == 'spectral':
-                        # A further mode stands well above the first; beside it, it would only mimic the first.
-                        grid = [v for v in grid if v > HIGHER * physics.bending_frequency] + list(p.grid)
-                    shapes.append([(p.name, v) for v in grid if p.minimum <= v <= p.maximum])
+                        grid += p.grid
+                    low, high = p.bounds(physics, off)
+                    shapes.append([(p.name, v) for v in grid if low <= v <= high])
                 elif p.kind == 'amplitude' and effect.finite:
                     key = 'highest_sums' if p.propose == 'highest' and choice.get('sums') else p.propose
                     grid = list(proposals.get(key, ())) if p.propose else list(p.grid)

@@ -15,6 +15,7 @@ from psd_deflection.discovery.noise import NoiseModel, estimate_noise
 from psd_deflection.discovery.observation import Observation, load_cases
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.simulation.catalogue import ActiveEffect, sort_effects
+from psd_deflection.simulation.physics import Physics
 from psd_deflection.simulation.simulator import ForwardModel
 
 FINE_SECONDS = 0.004
@@ -34,6 +35,7 @@ class Workspace:
 
     def __init__(self, observations: Sequence[Observation], base: Sequence[ActiveEffect] = ()) -> None:
         self.observations = tuple(observations)
+        self.physics = Physics.of(observations[0].rig)
         self.simulations = 0
         self.base = tuple(base)
         self.fine: list[int] = []

@@ -48,6 +48,7 @@ class EffectParameter:
     likewise, and ``grid`` says where to look (``spectral``: at peaks of the residual's spectrum;
     ``line``: at those that hum steadily;
     ``highest``: at the largest voltage seen); a ``choice`` takes the values of ``choices``.
+    ``within``: narrower bounds that the rig sets, given the effect's values.
     """
 
     name: str
@@ -63,14 +64,33 @@ class EffectParameter:
     propose: Literal['', 'spectral', 'line', 'highest', 'lattice'] = ''
     of_rig: str = ''
     required: bool = False
+    within: Callable[[Physics, Values], tuple[float, float]] | None = None
 
     def off(self, physics: Physics) -> float:
         """The nominal value on this rig."""
         return float(getattr(physics, self.of_rig)) if self.of_rig else self.nominal
 
+    def bounds(self, physics: Physics, values: Values) -> tuple[float, float]:
+        """Least and greatest value that is physical on this rig."""
+        if self.within is None:
+            return self.minimum, self.maximum
+        low, high = self.within(physics, values)
+        return max(low, self.minimum), min(high, self.maximum)
+
 
 PSD = EffectParameter('psd', '', 1, 2, 1, 'which PSD', nominal=1, kind='choice', choices=(1, 2), required=True)
 """The parameter of every effect that belongs to one detector."""
+MOVES_FREQUENCY = EffectParameter(
+    'moves_frequency',
+    '',
+    0,
+    1,
+    1,
+    '1: the mode moves with it, by sqrt(1 + scale); 0: the frequency was measured',
+    kind='choice',
+    choices=(0, 1),
+)
+"""The parameter of every effect on a stiffness."""
 
 
 @dataclass(slots=True, eq=False)

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from psd_deflection.simulation.catalogue import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.physics import Physics
+
+
+def _on_the_detector(axis: int) -> Callable[[Physics, Values], tuple[float, float]]:
+    # Light that is measured falls on the active area; so does its centroid.
+    def within(physics: Physics, values: Values) -> tuple[float, float]:
+        half = float(physics.half_area[int(values['psd']) - 1, axis])
+        return -half, half
+
+    return within
 
 
 def _apply(chunk: Chunk, values: Values, state: State) -> None:
@@ -36,8 +48,8 @@ EFFECT = Effect(
     parameters=(
         PSD,
         EffectParameter('level', 'V', 0.0, 100.0, 5e-3, 'its part of the sum signal'),
-        EffectParameter('x', 'm', -0.02, 0.02, 1e-3, 'its centroid', kind='coupled'),
-        EffectParameter('y', 'm', -0.02, 0.02, 1e-3, 'its centroid', kind='coupled'),
+        EffectParameter('x', 'm', -0.5, 0.5, 1e-3, 'its centroid', kind='coupled', within=_on_the_detector(0)),
+        EffectParameter('y', 'm', -0.5, 0.5, 1e-3, 'its centroid', kind='coupled', within=_on_the_detector(1)),
     ),
     point='dots',
     apply=_apply,

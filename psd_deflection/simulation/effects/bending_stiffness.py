@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.catalogue import Effect, EffectParameter, Values
+from psd_deflection.simulation.catalogue import MOVES_FREQUENCY, Effect, EffectParameter, Values
 from psd_deflection.simulation.physics import Physics
 
 
@@ -21,16 +21,7 @@ EFFECT = Effect(
     needs='a known force',
     parameters=(
         EffectParameter('scale', '', -0.9, 10.0, 1e-3, 'relative change of EI'),
-        EffectParameter(
-            'moves_frequency',
-            '',
-            0,
-            1,
-            1,
-            '1: the mode moves with it, by sqrt(1 + scale); 0: the frequency was measured',
-            kind='choice',
-            choices=(0, 1),
-        ),
+        MOVES_FREQUENCY,
     ),
     order=0,
     point='configure',

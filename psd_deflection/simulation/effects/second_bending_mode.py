@@ -5,6 +5,14 @@ from __future__ import annotations
 from psd_deflection.simulation.catalogue import Effect, EffectParameter, State, Values
 from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.modes import Filter, mode_coefficients
+from psd_deflection.simulation.physics import Physics
+
+HIGHER = 1.6
+"""Times the first mode's frequency, at least: beside the first, a second one would only mimic it."""
+
+
+def _above_the_first(physics: Physics, values: Values) -> tuple[float, float]:
+    return HIGHER * physics.bending_frequency, float('inf')
 
 
 def _apply(chunk: Chunk, values: Values, state: State) -> None:
@@ -42,6 +50,7 @@ EFFECT = Effect(
             kind='shape',
             grid=(87.7,),
             propose='spectral',
+            within=_above_the_first,
         ),
         EffectParameter(
             'damping_ratio', '', 1e-4, 0.5, 2e-3, 'its damping ratio', nominal=0.02, kind='shape', grid=(0.01,)

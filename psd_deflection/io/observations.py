@@ -3,28 +3,50 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from psd_deflection.config import Rig, replace_values
+from psd_deflection.config import Rig, replace_values, rig_from_values
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.io.recording import Recording
 from psd_deflection.io.recordings import open_recording
-from psd_deflection.records import CHANNELS, FloatArray, IntArray
+from psd_deflection.records import CHANNELS, ENVIRONMENT, FloatArray, IntArray
 
 MAX_SAMPLES = 20_000_000
 
 
-def read_observation(path: str | Path, rig: Rig) -> Observation:
-    """One recording; raises RecordingError where it has no loads or cannot be read.
+def recorded_rig(recording: Recording) -> Rig:
+    """The rig that the recording itself tells of; the thesis rig where it tells of none.
+
+    What was changed while it ran (a zero taken) is what the rig was all along, only known better.
+    """
+    rig = rig_from_values(recording.parameters, f'{recording.path} (recorded parameters)')
+    for change in recording.changes:
+        values = {name: value for name, value in change.values if name not in ENVIRONMENT}
+        if values:
+            rig = replace_values(rig, values, f'{recording.path} (changed at block {change.block})')
+    return rig
+
+
+def read_observation(
+    path: str | Path, rig: Rig | None = None, overrides: Mapping[str, object] | None = None, source: str = 'overrides'
+) -> Observation:
+    """One recording, with the rig that it tells of where none is given, and ``overrides`` on it.
+
+    Raises RecordingError where it has no loads or cannot be read, ConfigError for a bad override.
 
     The sample at t sees the loads applied before t: a load counts from the first sample at or
     after its own time.
     """
     path = Path(path)
+    if rig is None:
+        rig = recorded_rig(open_recording(path))
+    if overrides:
+        rig = replace_values(rig, overrides, source)
     recording = open_recording(path, block_size=rig.estimator.block_size)
     samples = recording.samples
     rate = recording.sample_rate_hz
@@ -96,7 +118,7 @@ def _digest(path: Path) -> str:
     return digest.hexdigest()
 
 
-def read_observations(paths: Sequence[str], rig: Rig) -> list[Observation]:
+def read_observations(paths: Sequence[str | Path], rig: Rig | None = None) -> list[Observation]:
     """All of ``paths``: recordings, or ``.yaml`` lists of them with what differs in each::
 
         - recording: short.csv
@@ -111,8 +133,7 @@ def read_observations(paths: Sequence[str], rig: Rig) -> list[Observation]:
             out.append(read_observation(path, rig))
             continue
         for i, (name, overrides) in enumerate(_listed(path)):
-            own = replace_values(rig, overrides, f'{path}: entry {i + 1}') if overrides else rig
-            out.append(read_observation(path.parent / name, own))
+            out.append(read_observation(path.parent / name, rig, overrides, f'{path}: entry {i + 1}'))
     return out
 
 
