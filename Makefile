@@ -107,7 +107,7 @@ golden: $(VENV)/.installed
 docs: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[docs]'
 	$(BIN)/python -m mkdocs build --strict --quiet --site-dir build/site
-	@echo 'open build/site/index.html'
+	@echo 'open build/site/index.html (its search needs a server: python -m http.server --directory build/site)'
 
 SHOT_SECONDS ?= 40
 shots: $(VENV)/.installed
