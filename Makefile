@@ -107,9 +107,9 @@ golden: $(VENV)/.installed
 docs: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[docs]'
 	$(BIN)/python -m mkdocs build --strict --quiet --site-dir build/site
-	@echo 'open build/site/index.html'
+	@echo 'open build/site/index.html (its search needs a server: python -m http.server --directory build/site)'
 
-SHOT_SECONDS ?= 27
+SHOT_SECONDS ?= 40
 shots: $(VENV)/.installed
 	$(BIN)/python docs/shots.py --seconds $(SHOT_SECONDS)
 

@@ -76,7 +76,7 @@ def _cell(text: str) -> str:
 def command_help() -> str:
     """What each command says of itself."""
     out = []
-    os.environ['COLUMNS'] = '100'
+    os.environ['COLUMNS'] = '90'
     make_parser(())
     for name in COMMANDS:
         stream = io.StringIO()

@@ -33,6 +33,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 FENCE = re.compile(r'^```(?P<kind>\w*)\n(?P<text>.*?)^```', re.M | re.S)
 INLINE = re.compile(r'`((?:make|psd-deflection|python) [^`\n]+)`')
+INDENTED = re.compile(r'^ {4}(?:psd-deflection|make|python|ros2|pip) .+\n(?: {4,}.+\n)*', re.M)
 PROGRAMS = ('psd-deflection', 'make', 'ros2', 'pip', 'python', 'python3')
 WAIT_S = 120.0
 CUT = 'recordings/cut'
@@ -113,7 +114,12 @@ def commands() -> Iterator[Command]:
             number += 1
             for line in _lines(fence['kind'], fence['text']):
                 yield Command(name, number, line)
-        for inline in INLINE.finditer(FENCE.sub('', text)):
+        rest = FENCE.sub('', text)
+        for indented in INDENTED.finditer(rest):
+            number += 1
+            for line in _lines('sh', indented[0]):
+                yield Command(name, number, line.strip())
+        for inline in INLINE.finditer(rest):
             number += 1
             line = inline[1].strip()
             # A command of ours without arguments is a name that is spoken of.

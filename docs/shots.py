@@ -1,12 +1,13 @@
 """Makes the pictures of the live page in docs/figures: ``make shots``; needs Chromium and its driver.
 
-The page shows the simulated rig for half a minute, so that every load case has gone by.
+The page shows the simulated rig until every load case has gone by, and 50 N hang on the sidebar.
 """
 
 from __future__ import annotations
 
 import argparse
 import base64
+import re
 import shutil
 import signal
 import subprocess
@@ -23,7 +24,19 @@ SHOTS = (('monitor', 1440, 900, 1.0, 'light', False),)
 PHONE = ('monitor_phone', 390, 844, 2.0, 'light', True)
 
 
-def take(url: str, name: str, width: int, height: int, ratio: float, scheme: str, mobile: bool, seconds: float) -> None:
+def wait_for_load(driver: webdriver.Chrome) -> None:
+    """Until 50 N hang still on the sidebar, which they do every 36 s."""
+    still = 0
+    until = time.monotonic() + 45.0
+    while still < 5 and time.monotonic() < until:
+        theta = driver.execute_script('return document.getElementById("theta").textContent').replace('\u2212', '-')
+        still = still + 1 if re.fullmatch(r'-9[34]\d\.\d+', theta) else 0
+        time.sleep(0.2)
+
+
+def take(
+    url: str, name: str, width: int, height: int, ratio: float, scheme: str, mobile: bool, seconds: float, loaded: bool
+) -> None:
     """One picture."""
     options = webdriver.ChromeOptions()
     options.binary_location = shutil.which('chromium') or shutil.which('google-chrome') or ''
@@ -42,6 +55,8 @@ def take(url: str, name: str, width: int, height: int, ratio: float, scheme: str
         driver.get(url)
         driver.execute_script("document.documentElement.style.scrollbarWidth = 'none'")
         time.sleep(seconds)
+        if loaded:
+            wait_for_load(driver)
         shot = driver.execute_cdp_cmd('Page.captureScreenshot', {})
         (FIGURES / f'{name}.png').write_bytes(base64.b64decode(shot['data']))
     finally:
@@ -51,7 +66,7 @@ def take(url: str, name: str, width: int, height: int, ratio: float, scheme: str
 def main() -> int:
     """Start the rig, take all pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--seconds', type=float, default=27.0, help='before the first picture')
+    parser.add_argument('--seconds', type=float, default=40.0, help='before the first picture')
     seconds = parser.parse_args().seconds
     program = subprocess.Popen(
         [sys.executable, '-m', 'psd_deflection', 'monitor', '--http-port', '0', '--control'],
@@ -62,7 +77,7 @@ def main() -> int:
         assert program.stderr is not None
         url = next(line.split()[1] for line in program.stderr if line.startswith('monitor: '))
         for i, shot in enumerate((*SHOTS, PHONE)):
-            take(url, *shot, seconds if i == 0 else 4.0)
+            take(url, *shot, seconds if i == 0 else 4.0, i == 0)
     finally:
         program.send_signal(signal.SIGINT)
         program.wait()

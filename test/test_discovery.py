@@ -30,6 +30,7 @@ from psd_deflection.simulation import loads
 from psd_deflection.simulation.catalogue import effects_of_rig, make_active
 from psd_deflection.simulation.simulator import RigSimulator
 
+SCHEMA = Path(__file__).parent.parent.parent / 'shared' / 'checks' / 'result.schema.json'
 RIG = load_rig()
 HISTORY = loads.identification()
 WARM = 21.0 + 2.0 * np.sin(np.linspace(0.0, 5.0, len(HISTORY)))
@@ -88,7 +89,10 @@ def test_the_model_closes_the_gap_on_new_data(rotated: Discovery, tmp_path: Path
 
 
 def check_schema(tree: dict[str, Any]) -> None:
-    """The contract's own conditions on result.json."""
+    """The contract's own conditions on result.json; those of its schema too, where one lies beside the checkout."""
+    if SCHEMA.exists():
+        jsonschema = pytest.importorskip('jsonschema')
+        jsonschema.validate(tree, json.loads(SCHEMA.read_text()))
     assert set(tree) >= {'verdict', 'where', 'effects', 'unknown', 'gap'}
     assert tree['verdict'] in ('effects_found', 'nothing_missing', 'unknown_effect')
     for w in tree['where']:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
-from msg_adapters import DIAGNOSTICS
+from msg_adapters import DIAGNOSTICS, TOPIC_TYPES
 from psd_deflection.io import cdr
 from psd_deflection.io.recordings import open_recording
 
@@ -45,6 +45,10 @@ def test_foxglove(recorded: dict[str, Any]) -> None:
         topic, _, field = path.partition('.')
         assert topic in recorded, path
         field_of(recorded[topic], field)
+    stamped = [p for panel in panels.values() for p in panel.get('paths', []) if p['timestampMethod'] == 'headerStamp']
+    assert all('stamp' in recorded[p['value'].partition('.')[0]]['header'] for p in stamped)
+    # A bag that was simulated has no diagnostics; one that was recorded has.
+    assert DIAGNOSTICS in TOPIC_TYPES
     topics = [p[key] for p in panels.values() for key in ('topicPath', 'topicToRender') if key in p]
     assert set(topics) <= {*recorded, DIAGNOSTICS}
 
@@ -76,4 +80,8 @@ def test_rviz() -> None:
     assert {d['Topic']['Value'] for d in displays} == set(there.values())
     latched = [d['Topic']['Value'] for d in displays if d['Topic']['Durability Policy'] == 'Transient Local']
     assert latched == [there['AT_REST']]
-    assert tree['Visualization Manager']['Global Options']['Fixed Frame'] == 'link_base'
+    (base,) = re.findall(r"^BASE, REST, TIP = '(\w+)'", source, re.M)
+    assert tree['Visualization Manager']['Global Options']['Fixed Frame'] == base
+    # All that the node publishes is reliable; asked of a best-effort publisher, that would be no connection at all.
+    assert {d['Topic']['Reliability Policy'] for d in displays} == {'Reliable'}
+    assert '_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE' in source

@@ -135,7 +135,9 @@ def read_inputs(path: str | Path | None = None, settings: Mapping[str, object] |
             if found is None:
                 near = difflib.get_close_matches(str(name), INPUT_BY_NAME, n=1)
                 hint = f'; did you mean {near[0]}?' if near else ''
-                raise ConfigError(f'{source}: {name} = {value!r}: no input of that name{hint} (--list-inputs has all)')
+                raise ConfigError(
+                    f'{source}: {name} = {value!r}: no such input{hint} (`psd-deflection budget --explain` has all)'
+                )
             values[str(name)] = cast(float, check_value(found.parameter, value, source))
     return values
 

@@ -2,6 +2,9 @@
 
 OUT ending in .csv becomes a CSV recording, in .mcap a lone MCAP file, anything else a bag folder.
 Volts come through bit for bit. Estimates are not carried over: psd-deflection replay makes them.
+
+  psd-deflection convert bags/clean --out clean.csv
+  psd-deflection convert run.csv --out run --params-file my_rig.yaml
 """
 
 from __future__ import annotations

@@ -2,6 +2,9 @@
 
 Without a name, every port that the system lists; with names, only those (a pseudo-terminal is in no list).
 Ports that another program has open are named and left alone.
+
+  psd-deflection devices
+  psd-deflection devices /dev/ttyACM0 --json
 """
 
 from __future__ import annotations

@@ -8,6 +8,9 @@ given, or a .yaml list of recordings with what differs in each:
 
 DIR gets model.yaml (the rig with what was found: a --params-file for every command), report.html
 and result.json. Any verdict is a success.
+
+  psd-deflection discover recordings/psd_20260101_120000 --params-file my_rig.yaml --out found
+  psd-deflection discover long.csv short.csv --params-file my_rig.yaml --out found --json
 """
 
 from __future__ import annotations
@@ -43,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--without', metavar='EFFECT', action='append', default=[], help='leave an effect out of the library'
     )
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
+    parser.add_argument('--json', action='store_true', help='print what result.json holds')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -59,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     observations = read_observations(args.recordings, given)
     rig = observations[0].rig if given is None else given
     # Reading took most of what can be foreseen; a search has as many steps as it has effects to weigh.
-    hidden = True if args.quiet else None
+    hidden = True if args.quiet or args.json else None
     with tqdm(total=STEPS, disable=hidden, file=sys.stderr, bar_format='{l_bar}{bar}| {elapsed}') as bar:
 
         def progress(words: str) -> None:
@@ -72,9 +76,10 @@ def run(args: argparse.Namespace) -> int:
         page = report_html(found)
         bar.set_description_str('done')
         bar.update(STEPS - bar.n)
+    in_json = json.dumps(result(found), indent=1, allow_nan=False)
     files = {
         'model.yaml': model_yaml(rig, found.active_effects),
-        'result.json': json.dumps(result(found), indent=1, allow_nan=False) + '\n',
+        'result.json': in_json + '\n',
         'report.html': page,
     }
     for name, text in files.items():
@@ -82,6 +87,9 @@ def run(args: argparse.Namespace) -> int:
             (out / name).write_text(text, encoding='utf-8')
         except OSError as error:
             raise RecordingError(f'{out / name}: cannot be written ({error.strerror or error})') from None
+    if args.json:
+        print(in_json)
+        return 0
     print(sentence(found))
     for effect in found.effects:
         if effect.suggestion is not None:

@@ -1,6 +1,9 @@
 """Say what is in a recording: how long, how many samples, what is lost, which topics, whose rig.
 
 The whole of it is read, so damage anywhere in it is found. Takes a bag folder, an .mcap or a .csv.
+
+  psd-deflection info bags/clean
+  psd-deflection info recordings/psd_20260101_120000 --json
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ Each command is a module of this package with ``SUMMARY``, ``add_arguments(parse
 from __future__ import annotations
 
 import argparse
+import difflib
 import importlib
 import sys
 from collections.abc import Collection, Sequence
@@ -32,6 +33,9 @@ COMMANDS: dict[str, str] = {
     'completion': 'print what makes your shell complete these commands',
 }
 """Command name to one-line summary; the module is ``psd_deflection.cli.NAME`` (``-`` as ``_``)."""
+
+USAGE = 2
+"""Exit status of a command line that was not understood; argparse has the same."""
 
 EPILOG = """\
 A first look, without hardware:   psd-deflection estimator
@@ -76,7 +80,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: list[str]) -> int:
-    parser = make_parser([a for a in argv if not a.startswith('-')][:1])
+    chosen = [a for a in argv if not a.startswith('-')][:1]
+    if chosen and chosen[0] not in COMMANDS:
+        close = difflib.get_close_matches(chosen[0], COMMANDS, 1)
+        hint = f'did you mean {close[0]}?' if close else '`psd-deflection --help` lists them'
+        print(f'psd-deflection: no command {chosen[0]!r}; {hint}', file=sys.stderr)
+        return USAGE
+    parser = make_parser(chosen)
     # `ros2 run` and `ros2 launch` add arguments of their own: they are for rclpy, not for argparse.
     own, ros_arguments = _split_ros_arguments(argv)
     args = parser.parse_args(own)

@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
     parser.add_argument('--params-file', metavar='RIG.yaml', help='use this rig instead of the recorded parameters')
     parser.add_argument('--out', metavar='OUT', help='.png, .svg, .pdf or .html (default: REC.png, here)')
-    parser.add_argument('--json', action='store_true', help='print the summary as JSON')
+    parser.add_argument('--json', action='store_true', help='for programs: the summary as one JSON object, in SI units')
 
 
 @dataclass
@@ -112,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         save_figure(figure, out)
     if args.json:
-        print(json.dumps({**dict(summary), 'out': str(out)}, ensure_ascii=False))
+        print(json.dumps({**figures(drawn, rig), 'out': str(out)}))
         return 0
     for name, value in summary:
         print(f'{name:<24} {value}')
@@ -120,23 +120,41 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def figures(drawn: Drawn, rig: Rig) -> dict[str, Any]:
+    """What ``--json`` prints: counts, s, m and rad."""
+    table = drawn.table()
+    causes = Counter(s.status.name.lower() for s in drawn.spots if s.reason)
+    out: dict[str, Any] = {
+        'duration_s': float(table['t'][-1]) + rig.estimator.block_size / rig.converter.sample_rate_hz,
+        'samples': sum(s.present for s in drawn.spots),
+        'lost': drawn.gone(rig.estimator.block_size),
+        'blocks': len(drawn.spots),
+        'estimates': len(drawn.estimates),
+        'solver': rig.estimator.solver,
+        'without_estimate': dict(sorted(causes.items())),
+    }
+    for name, *_ in _POSE:
+        values = table[name][np.isfinite(table[name])]
+        if len(values):
+            sd = float(np.nanmedian(table[f'sd_{name}']))
+            out[name] = {'min': float(values.min()), 'max': float(values.max()), 'sd': sd}
+    return out
+
+
 def summarise(drawn: Drawn, rig: Rig) -> list[tuple[str, str]]:
     """Name and value, for the terminal and the page."""
-    table = drawn.table()
-    lost, size = drawn.gone(rig.estimator.block_size), rig.estimator.block_size
-    present = sum(s.present for s in drawn.spots)
+    f = figures(drawn, rig)
+    present, lost = f['samples'], f['lost']
     rows = [
-        ('duration', f'{table["t"][-1] + size / rig.converter.sample_rate_hz:.3f} s'),
+        ('duration', f'{f["duration_s"]:.3f} s'),
         ('samples', f'{present} present, {lost} lost ({100.0 * lost / (present + lost):.3g} %)'),
-        ('estimates', f'{len(drawn.estimates)} of {len(drawn.spots)} blocks ({rig.estimator.solver})'),
+        ('estimates', f'{f["estimates"]} of {f["blocks"]} blocks ({f["solver"]})'),
     ]
-    causes = Counter(s.status.name.lower().replace('_', ' ') for s in drawn.spots if s.reason)
-    rows += [(f'without: {cause}', f'{n} blocks') for cause, n in sorted(causes.items())]
+    rows += [(f'without: {cause.replace("_", " ")}', f'{n} blocks') for cause, n in f['without_estimate'].items()]
     for name, label, scale, unit in _POSE:
-        values = table[name][np.isfinite(table[name])] * scale
-        if len(values):
-            sd = float(np.nanmedian(table[f'sd_{name}'])) * scale
-            rows.append((label, f'{values.min():+.2f} … {values.max():+.2f} {unit}, sd {sd:.2f} {unit}'))
+        if name in f:
+            low, high, sd = (f[name][k] * scale for k in ('min', 'max', 'sd'))
+            rows.append((label, f'{low:+.2f} … {high:+.2f} {unit}, sd {sd:.2f} {unit}'))
     return rows
 
 

@@ -3,6 +3,10 @@
 The rig file says what the rig is and which effects are known of; --effect adds one that nobody knows
 of: neither the estimates nor the parameters in the recording tell of it. A recording holds the
 samples, the loads, the temperature where one is given, and with --reference the true pose.
+
+  psd-deflection simulate --out run --loads thesis --temperature 20,24
+  psd-deflection simulate --out odd.csv --loads identification --effect sensor_rotation,psd=2,angle=0.01
+  psd-deflection simulate --serve --link rig_port
 """
 
 from __future__ import annotations
@@ -67,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     if args.serve or args.attached:
         return serve.run_device(args)
     if args.out is None:
-        raise ConfigError('simulate: --out OUT or --serve is needed')
+        raise ConfigError('--out OUT (a recording) or --serve (a device) is needed')
     known = load_rig(args.params_file)
     rig = with_effects(known, args.effect)
     rate = rig.converter.sample_rate_hz

@@ -75,7 +75,7 @@ def test_the_method_follows_the_rigs_solver(tmp_path: Path, capsys: pytest.Captu
     ('arguments', 'said'),
     [
         (['--set', 'nothing'], 'NAME=VALUE'),
-        (['--set', 'nothing=1'], 'no input of that name'),
+        (['--set', 'nothing=1'], 'no such input'),
         (['--monte-carlo', '1'], '--monte-carlo'),
         (['--monte-carlo', '1000', '--seed', '-1'], '--seed'),
         (['--load', 'nan', '0', '0'], 'must be finite'),

@@ -34,6 +34,18 @@ def test_the_command_line_without_a_command_names_them(capsys: pytest.CaptureFix
     assert all(name in text for name in COMMANDS)
 
 
+@pytest.mark.parametrize(('typed', 'hint'), [('inf', 'did you mean info?'), ('frobnicate', '--help` lists them')])
+def test_a_command_that_is_none_is_one_line_with_the_way_out(
+    typed: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([typed]) == 2
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert err.count('\n') == 1
+    assert typed in err
+    assert hint in err
+
+
 def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
     status = main(list(argv))
     err = capsys.readouterr().err.strip()

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -51,6 +52,16 @@ def test_losses_and_missing_estimates_are_marked() -> None:
     assert gone.tolist() == pytest.approx([100 * 0.02, 106 * 0.02], abs=1e-3)
     # Block 50 has too few samples.
     assert t[(dx != dx) & (table['lost'] > 0)].tolist() == pytest.approx([50 * 0.02], abs=1e-3)
+
+
+def test_json_is_in_si_units(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['plot', str(BAGS / 'laser_off'), '--out', str(tmp_path / 'a.svg'), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found['blocks'], found['estimates'], found['without_estimate']) == (200, 148, {'laser_lost': 52})
+    assert found['duration_s'] == pytest.approx(4.0)
+    assert found['dx']['sd'] == pytest.approx(0.18e-6, abs=0.01e-6)
+    assert found['dy']['min'] < -2e-3 < found['dy']['max']
+    assert Path(found['out']).exists()
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,17 @@
 
 const AXIS = 62;
 
-function clock(seconds, withDate) {
+function clock(seconds) {
   // Times of a CSV may count from its own zero.
   if (seconds < 1e9) return `${Math.round(seconds * 100) / 100} s`;
   const d = new Date(seconds * 1000);
   return d.toLocaleTimeString([], { hour12: false });
+}
+
+// A label that the edge would cut is left out.
+function whole(u, t) {
+  const room = u.bbox.width / (window.devicePixelRatio || 1) - u.valToPos(t, 'x');
+  return room < 20 ? '' : clock(t);
 }
 
 function number(value) {
@@ -37,7 +43,7 @@ function options(color, element, series, extra) {
     series: [{}, ...series],
     ...extra,
     axes: [
-      { ...axis, size: 26, space: 90, values: (u, ticks) => ticks.map((t) => clock(t)), ...(extra.x || {}) },
+      { ...axis, size: 26, space: 90, values: (u, ticks) => ticks.map((t) => whole(u, t)), ...(extra.x || {}) },
       { ...axis, size: AXIS, space: 28, values: (u, ticks) => ticks.map(number), ...(extra.y || {}) },
     ],
   };
