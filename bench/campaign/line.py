@@ -42,7 +42,7 @@ DIGIT = 4096
 """Identities are written in two digits to this base: (id // base) in x2, (id % base) in x1."""
 
 LOOK_S = 0.005
-QUIET_LOOKS = 6
+QUIET_LOOKS = 5
 READ_LIMIT_S = 5.0
 
 Wire = Callable[[int, bytes], bytes | None]
@@ -116,19 +116,28 @@ class Line:
         empties is no loss of the daemon's, however late the daemon was."""
         with self.lock:
             self._listening = False
-        self.wait_until_read(QUIET_LOOKS)
+        self.wait_until_read()
         with self.lock:
             if self._terminal is not None:
                 self._terminal.close()
             self._terminal = None
 
-    def wait_until_read(self, looks: int = 1) -> None:
-        """Wait until nothing sent is unread at ``looks`` looks in a row (a byte may be between two buffers)."""
-        deadline, quiet = time.monotonic() + READ_LIMIT_S, 0
-        while quiet < looks and time.monotonic() < deadline:
+    def wait_until_read(self) -> int:
+        """Wait until nothing sent is unread at several looks in a row; samples before the returned one are read.
+
+        At one look bytes may be between two of the kernel's buffers, unseen: only what was sent before
+        the first of the looks is sure to be read by the last.
+        """
+        deadline, quiet, sure = time.monotonic() + READ_LIMIT_S, 0, 0
+        while quiet < QUIET_LOOKS and time.monotonic() < deadline:
             with self.lock:
-                quiet = 0 if self._pending or self._unread() else quiet + 1
+                if self._pending or self._unread():
+                    quiet = 0
+                else:
+                    sure = self.sent if quiet == 0 else sure
+                    quiet += 1
             time.sleep(LOOK_S)
+        return sure
 
     def _unread(self) -> int:
         """Bytes that wait for the host to read them."""

@@ -121,7 +121,10 @@ def live_line(session: Session, rate: float) -> str:
     tail = f'lost {counters.lost + dropped}, bad frames {counters.bad}'
     if session.recorder.folder is not None:
         tail += '  ● rec'
-    if estimate is not None:
+    if rate == 0.0:
+        # An old estimate beside a device that sends nothing would look like a new one.
+        body = 'no samples: the device is away' if session.acquisition.away else 'no samples come'
+    elif estimate is not None:
         sd = [math.sqrt(estimate.covariance[i]) for i in (0, 4, 8)]
         mdeg = 1e3 * 180.0 / math.pi
         body = (

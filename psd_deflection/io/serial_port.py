@@ -119,6 +119,6 @@ def _why(error: serial.SerialException, name: str) -> str:
         return 'another program has the port open; close it (on Linux: `fuser NAME` names it)'.replace('NAME', name)
     if number in (errno.EACCES, errno.EPERM):
         return 'no permission; join the group that owns it (`sudo usermod -aG dialout $USER`, then log in anew)'
-    if number in (errno.ENOTTY, errno.EINVAL) or 'configure port' in str(error):
+    if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or 'configure port' in str(error):
         return 'not a serial port'
     return f'cannot be opened ({error})'

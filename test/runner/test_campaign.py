@@ -121,6 +121,30 @@ def test_there_are_enough_kinds_and_a_bad_row_fails_the_campaign(capsys: pytest.
     assert 'NOT AS IT MUST BE' in capsys.readouterr().out
 
 
+def test_many_frames_at_once_are_the_frames_one_by_one() -> None:
+    rng = np.random.default_rng(6)
+    seq, t_us = rng.integers(0, 2**33, 300), rng.integers(0, 2**53, 300)
+    counts = rng.integers(-32768, 32768, (300, 6))
+    # Zeros are what COBS is about.
+    seq[:100] %= 300
+    t_us[50:150] = 0
+    counts[rng.random((300, 6)) < 0.3] = 0
+    expected = b''.join(
+        encode(SampleFrame(0, s % 2**32, t, tuple(c)))
+        for s, t, c in zip(seq.tolist(), t_us.tolist(), counts.tolist(), strict=True)
+    )
+    assert soak.sample_frames(seq, t_us, counts) == expected
+
+
+def test_a_spread_is_numpy_s() -> None:
+    values = [10**15 + n * n for n in range(50)]
+    spread = soak.Spread()
+    for value in values:
+        spread.add(value)
+    assert spread.std == pytest.approx(float(np.std([n * n for n in range(50)])), rel=1e-12)
+    assert spread.mean == pytest.approx(float(np.mean(values)))
+
+
 def test_simulated_minutes_lose_nothing_and_keep_time(capsys: pytest.CaptureFixture[str]) -> None:
     assert soak.simulated_time(200 / 3600)
     assert 'wrapped past 2^32' in capsys.readouterr().out

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 from typing import Any
 
 import pytest
 
-from psd_deflection.cli.estimator import Display, run_without_ros
+from psd_deflection.cli.estimator import Display, live_line, run_without_ros
 from psd_deflection.runner.session import Session
 from psd_deflection.runner.signals import Signals, StopRequestedError
 
@@ -41,6 +42,9 @@ def test_a_signal_ends_the_waiting_for_one_that_is_away(device: Any, sample: Any
         elif session.acquisition.counters.disconnects == 0 and not away:
             away.append(True)
             device.unplug()
+            while not session.acquisition.away:
+                time.sleep(0.001)
+            shown.append(live_line(session, 0.0))
             device.answer = b''
             device.plug()
             threading.Thread(target=end, daemon=True).start()
@@ -51,9 +55,11 @@ def test_a_signal_ends_the_waiting_for_one_that_is_away(device: Any, sample: Any
 
     sent: list[int] = []
     away: list[bool] = []
+    shown: list[str] = []
     values: dict[str, object] = {'port': str(device.link), 'keep_zero': False, 'realtime': False}
     assert run_without_ros(values, Display(), look) == 0
     assert away
+    assert 'no samples: the device is away' in shown[0]
 
 
 def test_what_runs_is_not_torn() -> None:

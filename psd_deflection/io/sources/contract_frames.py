@@ -51,7 +51,9 @@ class ContractFrames(Source):
             return self._open(self._given, timeout)
         ports = matching(self._given)
         if not ports:
-            raise DeviceError(f'{self._given}: no port of such a name is there')
+            raise DeviceError(
+                f'{self._given}: no port of such a name is there; `psd-deflection devices` lists those that are'
+            )
         refusals = []
         for name in ports:
             try:
