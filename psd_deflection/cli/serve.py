@@ -113,6 +113,9 @@ def serve_all(devices: Sequence[LineDevice], ports: Sequence[PseudoTerminal], st
 
 def _attached_rig(stop: threading.Event) -> Rig:
     line = sys.stdin.buffer.readline()
+    if not line:
+        # The daemon that started us early has gone before it came to us.
+        raise SystemExit(0)
     try:
         values = json.loads(line)
     except ValueError:
