@@ -68,10 +68,11 @@ CI_RUNS = (
 """What CI runs without us: pattern, file, and the text in it that does."""
 
 SHORTEST = {
-    'bench': 'BENCH_LIVE="--rounds 1 --seconds 2 --minutes 0.2" BENCH_SOLVERS="--blocks 10000"',
+    'bench': 'BENCH_LIVE="--rounds 1 --seconds 2 --settle 3 --minutes 0.1" BENCH_SOLVERS="--blocks 1000" '
+    'BENCH_ACCURACY="--blocks 100"',
     'faults': 'FAULT_TIMES=1 FAULTS="--only zero"',
     'crash': 'CRASH_TIMES=1',
-    'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=10000',
+    'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=1000',
     'soak': 'SOAK_MINUTES=0.05 SOAK_HOURS=0.05',
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
     'shots': 'SHOT_SECONDS=2',
