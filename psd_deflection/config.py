@@ -303,8 +303,10 @@ def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[
         text = path.read_text(encoding='utf-8')
     except FileNotFoundError:
         raise ConfigError(f'{path}: no such parameter file') from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f'{path}: cannot be read as a parameter file ({error})') from None
+    except OSError as error:
+        raise ConfigError(f'{path}: cannot be read as a parameter file ({error.strerror or error})') from None
+    except UnicodeDecodeError:
+        raise ConfigError(f'{path}: cannot be read as a parameter file (it is no text)') from None
     try:
         tree = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, ValueError) as error:

@@ -43,13 +43,10 @@ class Parameter:
 
     def bound_text(self) -> str:
         """The bounds in words, for an error message or ``--help``."""
-        parts = []
-        if self.above is not None:
-            parts.append(f'above {self.above:g}')
-        if self.minimum is not None:
-            parts.append(f'at least {self.minimum:g}')
-        if self.maximum is not None:
-            parts.append(f'at most {self.maximum:g}')
+        words = (('above', self.above), ('at least', self.minimum), ('at most', self.maximum))
+        # Whole numbers as they are typed: nobody writes 1e+06 bytes.
+        form = '.0f' if self.kind == 'integer' else 'g'
+        parts = [f'{word} {bound:{form}}' for word, bound in words if bound is not None]
         return ' and '.join(parts)
 
 

@@ -64,3 +64,19 @@ def test_a_number_that_yaml_takes_for_text_is_a_number_as_in_ros(tmp_path: Path)
     path = tmp_path / 'mine.yaml'
     path.write_text('/**:\n  ros__parameters:\n    link:\n      youngs_modulus: 70e9\n')
     assert load_rig(path).link.youngs_modulus == 70e9
+
+
+def test_whole_bounds_are_written_whole() -> None:
+    with pytest.raises(ConfigError, match='must be at least 1000000 and at most 1000000000000'):
+        load_rig(overrides={'disk_reserve': 0})
+
+
+@pytest.mark.parametrize(('content', 'why'), [(None, r'Is a directory'), (b'\xd0\xff', 'it is no text')])
+def test_what_is_no_text_is_no_parameter_file(tmp_path: Path, content: bytes | None, why: str) -> None:
+    path = tmp_path / 'rig.yaml'
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content)
+    with pytest.raises(ConfigError, match=rf'rig\.yaml: cannot be read as a parameter file \({why}\)$'):
+        load_rig(path)

@@ -132,8 +132,8 @@ def _held_by_another(line: Line, pid: int) -> None:
 
 
 def _stolen_bytes(line: Line, pid: int) -> None:
+    first = line.wait_until_read()
     descriptor = os.open(line.device_name, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
-    first = line.next_identity()
     deadline = time.monotonic() + 0.1
     while time.monotonic() < deadline:
         try:
@@ -143,7 +143,7 @@ def _stolen_bytes(line: Line, pid: int) -> None:
     os.close(descriptor)
     with line.lock:
         # Which of them it took only it knows: all that were sent meanwhile, and what was on its way.
-        line.taken_by_fault.update(range(max(first - 40, 0), line.sent + 1))
+        line.taken_by_fault.update(range(first, line.sent + 1))
 
 
 def _wrong_baud(line: Line, pid: int) -> None:

@@ -7,9 +7,12 @@ tells which samples arrived, whatever numbers and clocks the device made up mean
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import random
 import select
+import sys
+import termios
 import threading
 import time
 from collections.abc import Callable
@@ -37,6 +40,10 @@ SERIAL = 'CAMPAIGN-1'
 VOLTS_PER_COUNT = 10.0 / 32768
 DIGIT = 4096
 """Identities are written in two digits to this base: (id // base) in x2, (id % base) in x1."""
+
+LOOK_S = 0.005
+QUIET_LOOKS = 5
+READ_LIMIT_S = 5.0
 
 Wire = Callable[[int, bytes], bytes | None]
 """What becomes of a sample's frame on the line; None where it arrives as it is."""
@@ -105,14 +112,43 @@ class Line:
             self._terminal = PseudoTerminal(self.folder / name)
 
     def unplug(self) -> None:
-        """Pull it; what was on its way is read first."""
+        """Pull it once the host has read what was on its way: a kernel's buffer that a pulled cable
+        empties is no loss of the daemon's, however late the daemon was."""
         with self.lock:
             self._listening = False
-        time.sleep(0.03)
+        self.wait_until_read()
         with self.lock:
             if self._terminal is not None:
                 self._terminal.close()
             self._terminal = None
+
+    def wait_until_read(self) -> int:
+        """Wait until nothing sent is unread at several looks in a row; samples before the returned one are read.
+
+        At one look bytes may be between two of the kernel's buffers, unseen: only what was sent before
+        the first of the looks is sure to be read by the last.
+        """
+        deadline, quiet, sure = time.monotonic() + READ_LIMIT_S, 0, 0
+        while quiet < QUIET_LOOKS and time.monotonic() < deadline:
+            with self.lock:
+                if self._pending or self._unread():
+                    quiet = 0
+                else:
+                    sure = self.sent if quiet == 0 else sure
+                    quiet += 1
+            time.sleep(LOOK_S)
+        return sure
+
+    def _unread(self) -> int:
+        """Bytes that wait for the host to read them."""
+        if self._terminal is None:
+            return 0
+        descriptor = os.open(self._terminal.name, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
+        try:
+            answer = fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4))
+        finally:
+            os.close(descriptor)
+        return int.from_bytes(answer, sys.byteorder)
 
     @property
     def device_name(self) -> str:

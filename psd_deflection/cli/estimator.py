@@ -18,22 +18,23 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import math
-import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from psd_deflection.config import read_parameter_file, rig_from_values
+from psd_deflection.config import Rig, read_parameter_file, rig_from_values
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor.start import start_monitor
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import SIMULATED, Session
+from psd_deflection.runner.signals import Signals, StopRequestedError
 from psd_deflection.runner.simulated_rig import started_early
 
 REFRESH_S = 0.25
 PLAIN_REFRESH_S = 5.0
+LOOK_S = 0.1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -127,7 +128,10 @@ def live_line(session: Session, rate: float) -> str:
     tail = f'lost {counters.lost + dropped}, bad frames {counters.bad}'
     if session.recorder.folder is not None:
         tail += '  ● rec'
-    if estimate is not None:
+    if rate == 0.0:
+        # An old estimate beside a device that sends nothing would look like a new one.
+        body = 'no samples: the device is away' if session.acquisition.away else 'no samples come'
+    elif estimate is not None:
         sd = [math.sqrt(estimate.covariance[i]) for i in (0, 4, 8)]
         mdeg = 1e3 * 180.0 / math.pi
         body = (
@@ -177,10 +181,17 @@ def _run(
 
 def run_without_ros(overrides: dict[str, object], display: Display, watch: Callable[[Session], None]) -> int:
     """Run a session, and its live page where the parameters say so, until SIGINT or SIGTERM."""
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    session = Session(rig_from_values(overrides, 'command line'), display.say)
+    signals = Signals()
+    try:
+        return _run_until(signals, rig_from_values(overrides, 'command line'), display, watch)
+    except StopRequestedError:
+        return 0
+    finally:
+        signals.restore()
+
+
+def _run_until(signals: Signals, rig: Rig, display: Display, watch: Callable[[Session], None]) -> int:
+    session = signals.interruptible(lambda: Session(rig, display.say))
     watchdog = Watchdog()
     monitor = None
     try:
@@ -188,7 +199,8 @@ def run_without_ros(overrides: dict[str, object], display: Display, watch: Calla
         monitor = start_monitor(session, display.say)
         session.start()
         watchdog.ready()
-        while not stop.wait(0.1) and session.processing.alive:
+        while not signals.stop and session.processing.alive:
+            time.sleep(LOOK_S)
             if session.responsive():
                 watchdog.alive()
             watch(session)

@@ -44,6 +44,10 @@ Each command explains itself:     psd-deflection COMMAND --help
 """
 
 
+INTERRUPTED = 130
+"""What a shell gives a program that Ctrl-C ended."""
+
+
 def make_parser(chosen: Collection[str]) -> argparse.ArgumentParser:
     """The whole command line; the arguments of the commands ``chosen`` only, since the others' modules stay unread."""
     parser = argparse.ArgumentParser(
@@ -67,8 +71,15 @@ def make_parser(chosen: Collection[str]) -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status (``psd_deflection.errors`` lists them)."""
-    argv = list(sys.argv[1:] if argv is None else argv)
+    """Run one command; returns the exit status (``psd_deflection.errors`` lists them; 130: Ctrl-C)."""
+    try:
+        return _run(list(sys.argv[1:] if argv is None else argv))
+    except KeyboardInterrupt:
+        print('psd-deflection: interrupted', file=sys.stderr)
+        return INTERRUPTED
+
+
+def _run(argv: list[str]) -> int:
     chosen = [a for a in argv if not a.startswith('-')][:1]
     if chosen and chosen[0] not in COMMANDS:
         close = difflib.get_close_matches(chosen[0], COMMANDS, 1)

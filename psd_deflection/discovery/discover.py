@@ -191,9 +191,7 @@ def _accept(search: Search, result: SearchResult, rng: np.random.Generator) -> t
     while True:
         heldout = []
         fails: list[tuple[float, int]] = []
-        for i in range(len(fit.effects)):
-            rest = [a for j, a in enumerate(fit.effects) if j != i]
-            without = refit(ws, rest, iterations=4) if rest else result.null
+        for i, without in enumerate(search.without_each(fit, result.null)):
             gain = heldout_gain(ws, without, fit, rng)
             heldout.append(gain)
             columns = fit.columns_of(i)
@@ -238,7 +236,8 @@ def _answer(
     progress('alternatives')
     for i, active in enumerate(fit.effects):
         # Where the joint rule has taken effects out, what stood beside them is no longer comparable.
-        fits = result.alternatives[i] if fit is result.fit else search.alternatives(fit, i, result.delta_chi2[i])
+        as_found = fit is result.fit
+        fits = result.alternatives[i] if as_found else search.alternatives(result.null, fit, i, result.delta_chi2[i])
         rows, equal = [], []
         for f in fits:
             loss = f.chi2 - fit.chi2

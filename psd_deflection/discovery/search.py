@@ -90,6 +90,19 @@ class Search:
         self.screen = screen(workspace)
         self.penalty = float(np.log(workspace.effective_size()))
         self.trace: list[str] = []
+        self._without: dict[int, tuple[Fit, list[Fit]]] = {}
+
+    def without_each(self, fit: Fit, null: Fit) -> list[Fit]:
+        """``fit`` refitted without each of its effects in turn; ``null``: the fit of no effect."""
+        kept = self._without.get(id(fit))
+        if kept is None:
+            fits = []
+            for i in range(len(fit.effects)):
+                rest = [a for j, a in enumerate(fit.effects) if j != i]
+                fits.append(refit(self.workspace, rest, iterations=6) if rest else null)
+            # With the fit itself, so that no other takes its identity.
+            kept = self._without[id(fit)] = (fit, fits)
+        return kept[1]
 
     def _say(self, text: str) -> None:
         self.trace.append(f'{text} [{self.workspace.simulations}]')
@@ -127,6 +140,7 @@ class Search:
         ):
             self.workspace.noise = before
             return fit
+        self._without.clear()
         self.screen = self._make_screen(self.workspace)
         return refit(self.workspace, fit.effects, iterations=6)
 
@@ -175,7 +189,7 @@ class Search:
             _, _, gains = self._weigh(null, current)
             best = current
             for i in range(len(current.effects)):
-                fits = self.alternatives(current, i, gains[i])
+                fits = self.alternatives(null, current, i, gains[i])
                 others.append(fits)
                 best = min([best, *fits], key=self._bic)
             spent = self.workspace.simulations > 1.5 * BUDGET
@@ -203,11 +217,7 @@ class Search:
 
     def _drop(self, null: Fit, current: Fit) -> Fit:
         while len(current.effects) > 1:
-            smaller = []
-            for i in range(len(current.effects)):
-                rest = [a for j, a in enumerate(current.effects) if j != i]
-                smaller.append(refit(self.workspace, rest, iterations=8))
-            best = min(smaller, key=self._bic)
+            best = min(self.without_each(current, null), key=self._bic)
             if self._passes(best, current, null):
                 break
             self._say('dropping to ' + ', '.join(a.label for a in best.effects))
@@ -216,25 +226,23 @@ class Search:
 
     def _weigh(self, null: Fit, current: Fit) -> tuple[list[float], list[float], list[float]]:
         p, delta_bic, delta_chi2 = [], [], []
-        for i in range(len(current.effects)):
-            rest = [a for j, a in enumerate(current.effects) if j != i]
-            without = refit(self.workspace, rest, iterations=6) if rest else null
+        for i, without in enumerate(self.without_each(current, null)):
             gain = without.chi2 - current.chi2
             delta_chi2.append(gain)
             delta_bic.append(self._bic(without) - self._bic(current))
             p.append(self.library_p(gain, len(current.columns_of(i))))
         return p, delta_bic, delta_chi2
 
-    def alternatives(self, current: Fit, index: int, gain: float) -> list[Fit]:
+    def alternatives(self, null: Fit, current: Fit, index: int, gain: float) -> list[Fit]:
         """Refits with effect ``index`` swapped for each effect that might do as well, best first.
 
-        ``gain``: what the named effect explains, in chi-square.
+        ``gain``: what the named effect explains, in chi-square; ``null``: the fit of no effect.
         """
         if self.workspace.simulations > 2 * BUDGET:
             return []
         named = current.effects[index]
         rest = [a for j, a in enumerate(current.effects) if j != index]
-        without = refit(self.workspace, rest, iterations=4) if rest else refit(self.workspace, ())
+        without = self.without_each(current, null)[index]
         known = without.jacobian if rest else None
         scores = self.screen.score(without.residual, known)
         # Screening is linear: what falls short by little, or by a small share, deserves a full refit.

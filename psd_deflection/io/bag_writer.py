@@ -12,11 +12,14 @@ import contextlib
 import fcntl
 import json
 import os
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
 
+from mcap.data_stream import RecordBuilder
+from mcap.records import ChunkIndex
 from mcap.writer import CompressionType, Writer
 
 from msg_adapters import to_messages
@@ -46,6 +49,9 @@ META_CHANGE = 'psd_deflection.change.'
 """Names of the MCAP metadata records; every value in the last three is JSON."""
 
 
+_CHUNK_INDICES = '_Writer__chunk_indices'
+"""Where mcap's writer keeps them; it has no public place for them."""
+
 CUSTOM = {'psd_deflection_version': __version__}
 
 
@@ -58,6 +64,35 @@ def _json_values(values: Mapping[str, object]) -> dict[str, str]:
         raise TypeError(f'{type(value).__name__} {value!r} has no JSON')
 
     return {key: json.dumps(value, default=plain) for key, value in values.items()}
+
+
+class _IndexSpool:
+    """The chunk indexes of a recording until its end, in a file without a name beside it.
+
+    The writer keeps them in a list: a kilobyte a chunk, a third of a gigabyte a day.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - open as long as the recording
+
+    def append(self, index: ChunkIndex) -> None:
+        """Put one behind the others."""
+        record = RecordBuilder()
+        index.write(record)
+        self._file.write(record.end())
+
+    def __iter__(self) -> Iterator[_IndexSpool]:
+        yield self
+
+    def write(self, summary: RecordBuilder) -> None:
+        """All of them, as they stand in the summary."""
+        self._file.seek(0)
+        while part := self._file.read(1 << 20):
+            summary.write(part)
+
+    def close(self) -> None:
+        """It is gone."""
+        self._file.close()
 
 
 class McapFile:
@@ -90,6 +125,7 @@ class McapFile:
         self._chunk_last = 0
         self.changes: list[ParameterChange] = []
         self._stream: BinaryIO | None = None
+        self._spool: _IndexSpool | None = None
         parameters = _json_values(rig_values)
         hello = None if device_hello is None else _json_values(device_hello)
         try:
@@ -102,6 +138,7 @@ class McapFile:
             fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._writer = Writer(self._stream, compression=CompressionType.ZSTD, enable_crcs=True)
         with self._guard():
+            self._spool = vars(self._writer)[_CHUNK_INDICES] = _IndexSpool(path.parent)
             self._writer.start(profile='ros2', library=f'psd_deflection {__version__}')
             self._writer.add_metadata(META_SOFTWARE, {'version': __version__})
             self._writer.add_metadata(META_PARAMETERS, parameters)
@@ -144,9 +181,10 @@ class McapFile:
 
     def _abandon(self) -> None:
         stream, self._stream = self._stream, None
-        if stream is not None:
-            with contextlib.suppress(OSError):
-                stream.close()
+        for one in (stream, self._spool):
+            if one is not None:
+                with contextlib.suppress(OSError):
+                    one.close()
 
     def write_hello(self, device_hello: Mapping[str, object]) -> None:
         """Note the device's hello when it comes after the start of the recording; the last one counts."""
@@ -220,6 +258,8 @@ class McapFile:
                 self._stream.flush()
                 os.fsync(self._stream.fileno())
             self._stream.close()
+            if self._spool is not None:
+                self._spool.close()
         self._stream = None
 
     # A recorder is a sink like any other.

@@ -29,11 +29,16 @@ class PortClosedError(DeviceError):
     """
 
 
+SLICE_S = 0.1
+"""A read waits no longer at a time, so that whoever gives the port up is heard."""
+
+
 class SerialPort:
     """An open port. ``name`` as given; raises DeviceError naming it where it cannot be had."""
 
     def __init__(self, name: str, baud: int, rtscts: bool = False) -> None:
         self.name = name
+        self._given_up = False
         try:
             self._serial = serial.Serial(name, baud, timeout=0, write_timeout=1.0, exclusive=True, rtscts=rtscts)
         except serial.SerialException as error:
@@ -49,9 +54,14 @@ class SerialPort:
         self.discard_input()
 
     def read(self, timeout: float) -> bytes:
-        """What has come, at most 4096 bytes; empty after ``timeout`` s. PortClosedError if it is gone."""
+        """What has come, at most 4096 bytes; empty after ``timeout`` s, or 0.1 s where that is less.
+
+        PortClosedError if it is gone, or given up.
+        """
+        if self._given_up:
+            raise PortClosedError(f'{self.name}: given up')
         try:
-            ready, _, _ = select.select((self._fd,), (), (), timeout)
+            ready, _, _ = select.select((self._fd,), (), (), min(timeout, SLICE_S))
             if not ready:
                 return b''
             received = os.read(self._fd, READ_SIZE)
@@ -72,6 +82,10 @@ class SerialPort:
         poll.register(self._fd, select.POLLIN)
         hung_up = any(mask & (select.POLLHUP | select.POLLERR | select.POLLNVAL) for _, mask in poll.poll(0))
         return hung_up or self._empty_reads > MAX_EMPTY_READS
+
+    def give_up(self) -> None:
+        """Whoever waits for this port waits no longer; any thread may say so."""
+        self._given_up = True
 
     def fileno(self) -> int:
         """The descriptor, for ``select``."""
@@ -105,6 +119,6 @@ def _why(error: serial.SerialException, name: str) -> str:
         return 'another program has the port open; close it (on Linux: `fuser NAME` names it)'.replace('NAME', name)
     if number in (errno.EACCES, errno.EPERM):
         return 'no permission; join the group that owns it (`sudo usermod -aG dialout $USER`, then log in anew)'
-    if number in (errno.ENOTTY, errno.EINVAL) or 'configure port' in str(error):
+    if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or 'configure port' in str(error):
         return 'not a serial port'
     return f'cannot be opened ({error})'

@@ -12,8 +12,6 @@ nothing of lifecycles meets an ordinary node.
 from __future__ import annotations
 
 import os
-import signal
-import types
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -36,10 +34,8 @@ from psd_deflection.ros.wires import InputRecorder, PublisherWire
 from psd_deflection.runner.health import STALE, HealthReporter
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import Session
+from psd_deflection.runner.signals import Signals, StopRequestedError
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
-
-if TYPE_CHECKING:
-    from psd_deflection.monitor.server import MonitorServer
 
 if TYPE_CHECKING:
     from psd_deflection.monitor.server import MonitorServer
@@ -49,40 +45,6 @@ NODE_NAME = 'estimator'
 
 SPIN_S = 0.1
 """How long a signal may wait to be seen."""
-
-
-class _StopRequestedError(BaseException):
-    """SIGINT or SIGTERM came while the main thread waits for a device. Like KeyboardInterrupt, no Exception."""
-
-
-class Signals:
-    """SIGINT and SIGTERM: ``stop`` is set at once; inside :meth:`interruptible` they end the waiting too."""
-
-    def __init__(self) -> None:
-        self.stop = False
-        self._raise = False
-        self._previous = {s: signal.signal(s, self._received) for s in (signal.SIGINT, signal.SIGTERM)}
-
-    def _received(self, number: int, frame: types.FrameType | None) -> None:
-        self.stop = True
-        if self._raise:
-            self._raise = False
-            raise _StopRequestedError
-
-    def interruptible(self, action: Callable[[], Session]) -> Session:
-        """``action()``; a signal before or during it ends it."""
-        self._raise = True
-        try:
-            if self.stop:
-                raise _StopRequestedError
-            return action()
-        finally:
-            self._raise = False
-
-    def restore(self) -> None:
-        """Give the signals back to who had them."""
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
 
 
 class _ManagedNode(LifecycleNode):  # type: ignore[misc]
@@ -326,7 +288,7 @@ def run(
                         watchdog.alive()
                     if while_running is not None and session is not None:
                         while_running(session)
-            except _StopRequestedError:
+            except StopRequestedError:
                 pass
             finally:
                 watchdog.stopping()

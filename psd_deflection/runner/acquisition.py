@@ -15,7 +15,7 @@ import random
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -31,7 +31,6 @@ from psd_deflection.io.sources._interface import (
 )
 from psd_deflection.io.sources._registry import make_source
 from psd_deflection.protocol.frames import (
-    PROTOCOL_VERSION,
     BadFrame,
     BadReason,
     HelloFrame,
@@ -40,7 +39,8 @@ from psd_deflection.protocol.frames import (
     StatusFrame,
 )
 from psd_deflection.protocol.sequence import NEARBY, WRAP, SequenceExtender, Step
-from psd_deflection.records import CHANNELS, FLAG_DEVICE_DROPPED, IntArray, RawChunk
+from psd_deflection.records import FLAG_DEVICE_DROPPED, IntArray, RawChunk
+from psd_deflection.runner.arrivals import AWAY, BY_DEVICE, DAMAGED, UNSEEN, AcquisitionCounters, check_hello
 from psd_deflection.runner.realtime import prefer_reader
 from psd_deflection.timing import ClockMap, ClockState
 
@@ -50,15 +50,11 @@ SILENCE_S = 2.0
 RETRY_S = 0.2
 READ_TIMEOUT_S = 0.1
 READY_S = 10.0
+GIVE_UP_TIMES = 5
+"""How often, a read's time apart, a reader is asked to give up waiting for its device."""
 
 TORN_US = 50_000
 """Device time that disagrees with the sample numbers by more: the clock jumped, or the device paused."""
-
-BY_DEVICE = 'dropped by the device'
-DAMAGED = 'damaged on the wire'
-AWAY = 'while the port was away'
-UNSEEN = 'on the wire, without a trace'
-"""Why samples are missing."""
 
 PING_S = (0.1, 0.4)
 """Bounds of the random time between two pings: their phase to the samples must not repeat."""
@@ -86,71 +82,6 @@ class Ended:
 
 
 Item = Chunk | Restarted | Ended
-
-
-@dataclass(slots=True)
-class AcquisitionCounters:
-    """What came off the wire. Written by the reader alone; anyone may read."""
-
-    bytes: int = 0
-    samples: int = 0
-    lost: int = 0
-    lost_by: dict[str, int] = field(default_factory=dict)
-    repeated: int = 0
-    queue_dropped: int = 0
-    device_dropped: int = 0
-    device_overruns: int = 0
-    restarts: int = 0
-    disconnects: int = 0
-    silences: int = 0
-    refused_reopenings: int = 0
-    clock_jumps: int = 0
-    pings: int = 0
-    pongs: int = 0
-    bad_frames: dict[str, int] = field(default_factory=dict)
-    temperature: float | None = None
-
-    @property
-    def bad(self) -> int:
-        """Frames that were none, of every reason."""
-        return sum(self.bad_frames.values())
-
-    def count_lost(self, missing: int, cause: str) -> None:
-        """``missing`` samples will not come."""
-        self.lost += missing
-        self.lost_by[cause] = self.lost_by.get(cause, 0) + missing
-
-
-def check_hello(frame: HelloFrame, rig: Rig, port: str) -> float | None:
-    """Volts per count of a device that fits the rig, None where it gives volts; DeviceError naming what does not."""
-    if frame.version != PROTOCOL_VERSION:
-        raise DeviceError(
-            f'{port}: the device speaks protocol version {frame.version}, this is version {PROTOCOL_VERSION}; '
-            'update its firmware or psd_deflection'
-        )
-    info = frame.info
-    channels = info.get('channels')
-    if channels != list(CHANNELS):
-        raise DeviceError(f'{port}: HELLO has channels {channels!r}, needed are {list(CHANNELS)!r}')
-    rate = info.get('sample_rate_hz')
-    wanted = rig.converter.sample_rate_hz
-    if isinstance(rate, bool) or not isinstance(rate, (int, float)) or abs(rate - wanted) > 1e-3 * wanted:
-        raise DeviceError(
-            f'{port}: HELLO has sample_rate_hz {rate!r}, the rig file says {wanted:g}; '
-            'set converter.sample_rate_hz to what the device does'
-        )
-    volts = info.get('volts_per_count')
-    if volts is None and 'volts_per_count' in info:
-        return None
-    if isinstance(volts, bool) or not isinstance(volts, (int, float)) or not 0.0 < volts < 1.0:
-        raise DeviceError(f'{port}: HELLO has volts_per_count {volts!r}, needed is a number between 0 and 1 V')
-    expected = rig.converter.volts_per_count
-    if abs(volts - expected) > 1e-3 * expected:
-        raise DeviceError(
-            f'{port}: HELLO has volts_per_count {volts!r}, the rig file gives {expected:g} '
-            '(converter.full_scale and converter.bits); make them agree'
-        )
-    return float(volts)
 
 
 class Acquisition:
@@ -220,11 +151,28 @@ class Acquisition:
         self._ready.wait(READY_S)
 
     def stop(self) -> None:
-        """Stop the reader and close the port; an Ended item is the last on the queue."""
+        """Stop the reader and close the port; an Ended item is the last on the queue.
+
+        A reader that waits for its device is told to give up; one that does not come back is left behind.
+        """
         self._stop.set()
         if self._thread.ident is not None:
-            self._thread.join()
+            self._thread.join(2.0 * READ_TIMEOUT_S)
+            for _ in range(GIVE_UP_TIMES):
+                if not self._thread.is_alive():
+                    break
+                self.source.give_up()
+                self._thread.join(READ_TIMEOUT_S)
+            else:
+                self._say(f'{self._name}: the source hangs; it is not waited for')
+                self.queue.put(Ended())
+                return
         self.source.close()
+
+    @property
+    def away(self) -> bool:
+        """Whether the device is waited for."""
+        return not self._connected
 
     def clock_state(self) -> ClockState:
         """How the device's clock stands to the host's."""
@@ -249,8 +197,8 @@ class Acquisition:
             while not self._stop.is_set():
                 self.beat = time.monotonic()
                 if not self._connected:
-                    self._stop.wait(RETRY_S)
-                    self._reopen()
+                    if not self._stop.wait(RETRY_S):
+                        self._reopen()
                     silent_since = time.monotonic()
                     continue
                 try:
@@ -296,6 +244,9 @@ class Acquisition:
         self._sent = {cookie: sent}
 
     def _disconnected(self, error: PortClosedError) -> None:
+        if self._stop.is_set():
+            # Given up by us.
+            return
         self.counters.disconnects += 1
         self._hand_over(time.monotonic_ns())
         self.source.close()
@@ -313,6 +264,8 @@ class Acquisition:
                 self.hello = hello
         except DeviceError as error:
             self.source.close()
+            if self._stop.is_set():
+                return
             self.counters.refused_reopenings += 1
             refusal = str(error)
             # Why it is not taken back is news once; that there is no port yet is none.

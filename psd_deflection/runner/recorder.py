@@ -28,6 +28,8 @@ IDLE_S = 0.5
 LOOK_EVERY = 250
 """Messages between two looks at the room on the disk: half a second's worth."""
 
+ELSEWHERE = 'make room, or record elsewhere (--record FOLDER, bag_dir)'
+
 Message = tuple[str, str, bytes, int]
 Item = Message | ParameterChange | None
 
@@ -87,15 +89,18 @@ class Recorder:
         folder = new_folder(Path(config.bag_dir).expanduser())
         missing = _missing_room(_nearest(folder), config.disk_reserve)
         if missing:
-            raise RecordingError(f'{folder}: {missing}')
-        bag = BagWriter(
-            folder,
-            rig_values={**rig.values, **effects},
-            device_hello=hello,
-            max_bytes=config.bag_max_bytes,
-            max_s=config.bag_max_duration,
-            durable=True,
-        )
+            raise RecordingError(f'{folder}: {missing}; {ELSEWHERE}')
+        try:
+            bag = BagWriter(
+                folder,
+                rig_values={**rig.values, **effects},
+                device_hello=hello,
+                max_bytes=config.bag_max_bytes,
+                max_s=config.bag_max_duration,
+                durable=True,
+            )
+        except RecordingError as error:
+            raise RecordingError(f'{error}; {ELSEWHERE}') from None
         self.failure = ''
         self._queue = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, args=(bag, self._queue, config), name='recorder', daemon=True)

@@ -130,6 +130,15 @@ def test_params_lists_each_with_unit_and_bounds(capsys: pytest.CaptureFixture[st
     assert 'above 0 and at most 1000' in out
 
 
+def test_ctrl_c_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(args: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr('psd_deflection.cli.params.run', interrupted)
+    assert main(['params']) == 130
+    assert capsys.readouterr().err == 'psd-deflection: interrupted\n'
+
+
 def test_a_closed_pipe_is_no_error() -> None:
     done = subprocess.run(
         f'"{sys.executable}" -m psd_deflection params | head -1',

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import errno
+import gc
 import io
 import json
 from pathlib import Path
@@ -11,8 +12,9 @@ from typing import Any
 
 import pytest
 import yaml
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Chunk
+from mcap.records import Chunk, ChunkIndex
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
 
@@ -113,6 +115,24 @@ def test_chunks_are_zstd_with_crc_and_span_less_than_a_second(tmp_path: Path) ->
                 assert r.uncompressed_crc != 0
                 assert 0 <= r.message_end_time - r.message_start_time < 1_000_000_000
     assert chunks >= 4
+
+
+def test_the_index_of_a_long_recording_is_whole_and_does_not_wait_in_memory(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    with McapFile(path, rig_values={}) as out:
+        for number in range(300):
+            out.write(block(number))
+            out.flush()
+        assert not [o for o in gc.get_objects() if isinstance(o, ChunkIndex)]
+    with path.open('rb') as f:
+        summary = make_reader(f, validate_crcs=True).get_summary()
+        assert summary is not None
+        assert len(summary.chunk_indexes) == 300
+        for index in (summary.chunk_indexes[0], summary.chunk_indexes[-1]):
+            f.seek(index.chunk_start_offset)
+            assert f.read(1)[0] == Opcode.CHUNK
+            assert sorted(index.message_index_offsets) == [1]
+    assert [p.name for p in tmp_path.iterdir()] == ['a.mcap']
 
 
 def test_a_late_message_does_not_stretch_a_chunk(tmp_path: Path) -> None:

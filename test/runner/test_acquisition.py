@@ -164,6 +164,8 @@ def test_a_file_is_not_a_serial_port(tmp_path: Path) -> None:
     path.write_text('x')
     with pytest.raises(DeviceError, match=r'file\.txt: not a serial port'):
         Acquisition(load_rig(overrides={'port': str(path)}), print).open()
+    with pytest.raises(DeviceError, match=r'[^:]*: not a serial port$'):
+        Acquisition(load_rig(overrides={'port': str(tmp_path)}), print).open()
 
 
 def test_a_port_in_use_is_named(run: Run, rig: Rig) -> None:
@@ -270,7 +272,7 @@ def test_a_wanted_serial_number_is_held_against_the_first_device_too(device: Any
 
 
 def test_a_pattern_without_a_port_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DeviceError, match=r'tty\*: no port of such a name'):
+    with pytest.raises(DeviceError, match=r'tty\*: no port of such a name .*psd-deflection devices'):
         Acquisition(load_rig(overrides={'port': str(tmp_path / 'tty*')}), print).open()
 
 

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import configparser
+import contextlib
 import random
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import serial
 
-from bench.campaign import soak
+from bench.campaign import fuzz, soak
 from bench.campaign.crash import judge, left_by_a_kill
 from bench.campaign.faults import Row, report
-from bench.campaign.fuzz import TARGETS, corrupted
+from bench.campaign.fuzz import TARGETS, corrupted, within_a_second
 from bench.campaign.kinds import FAULTS
 from bench.campaign.line import DIGIT, VOLTS_PER_COUNT, Line, identities
 from psd_deflection.config import Rig, load_rig
+from psd_deflection.protocol.frames import FrameDecoder, HelloRequestFrame, SampleFrame, encode
 from psd_deflection.runner.acquisition import Acquisition
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -77,6 +81,31 @@ def test_the_line_keeps_its_ledger(line: Line, recording_rig: Rig) -> None:
     assert len(line.taken_by_fault & set(range(first, first + 100))) == 1
 
 
+def test_a_cable_is_pulled_only_when_the_host_has_read(line: Line) -> None:
+    """However late it reads: what a cable takes with it would look like a loss of the daemon's."""
+    seen: set[int] = set()
+    decoder, unread = FrameDecoder(), threading.Event()
+    with serial.Serial(line.device_name, timeout=0, exclusive=True) as host:
+        host.write(encode(HelloRequestFrame()))
+        assert line.greeted.wait(10.0)
+        pulled = threading.Thread(target=line.unplug)
+        first = line.next_identity()
+        while line.next_identity() < first + 80:
+            unread.wait(0.005)
+        pulled.start()
+        first = line.next_identity()
+        while line.next_identity() < first + 80:
+            unread.wait(0.005)
+            assert pulled.is_alive(), 'pulled while 80 samples waited to be read'
+        with contextlib.suppress(serial.SerialException):
+            while True:
+                for frame in decoder.feed(host.read(4096)):
+                    if isinstance(frame, SampleFrame):
+                        seen.add(frame.seq)
+        pulled.join()
+    assert set(range(min(seen), line.next_identity())) - line.taken_by_fault <= seen
+
+
 def test_there_are_enough_kinds_and_a_bad_row_fails_the_campaign(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(FAULTS) >= 25
     assert len({f.name for f in FAULTS}) == len(FAULTS)
@@ -90,6 +119,30 @@ def test_there_are_enough_kinds_and_a_bad_row_fails_the_campaign(capsys: pytest.
     unseen = Row(FAULTS[0], injected=1, detected=0, recovered=1, times=[0.2])
     assert not report([unseen], {FAULTS[0].name: (0, 0), **between})
     assert 'NOT AS IT MUST BE' in capsys.readouterr().out
+
+
+def test_many_frames_at_once_are_the_frames_one_by_one() -> None:
+    rng = np.random.default_rng(6)
+    seq, t_us = rng.integers(0, 2**33, 300), rng.integers(0, 2**53, 300)
+    counts = rng.integers(-32768, 32768, (300, 6))
+    # Zeros are what COBS is about.
+    seq[:100] %= 300
+    t_us[50:150] = 0
+    counts[rng.random((300, 6)) < 0.3] = 0
+    expected = b''.join(
+        encode(SampleFrame(0, s % 2**32, t, tuple(c)))
+        for s, t, c in zip(seq.tolist(), t_us.tolist(), counts.tolist(), strict=True)
+    )
+    assert soak.sample_frames(seq, t_us, counts) == expected
+
+
+def test_a_spread_is_numpy_s() -> None:
+    values = [10**15 + n * n for n in range(50)]
+    spread = soak.Spread()
+    for value in values:
+        spread.add(value)
+    assert spread.std == pytest.approx(float(np.std([n * n for n in range(50)])), rel=1e-12)
+    assert spread.mean == pytest.approx(float(np.mean(values)))
 
 
 def test_simulated_minutes_lose_nothing_and_keep_time(capsys: pytest.CaptureFixture[str]) -> None:
@@ -107,6 +160,13 @@ def test_fuzz_targets_take_what_is_good_and_what_was_found_bad(name: str) -> Non
             spoiled = bytearray(seed or b'\x00')
             spoiled[chance.randrange(len(spoiled))] ^= 1 << chance.randrange(8)
             target(bytes(spoiled))
+
+
+def test_a_hang_is_an_error_by_the_time_it_works(monkeypatch: pytest.MonkeyPatch) -> None:
+    within_a_second(lambda content: None, b'')
+    monkeypatch.setattr(fuzz, 'HANG_S', -1.0)
+    with pytest.raises(AssertionError, match='for one input'):
+        within_a_second(lambda content: None, b'')
 
 
 def test_damaged_frames_are_refused(capsys: pytest.CaptureFixture[str]) -> None:

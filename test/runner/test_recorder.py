@@ -84,13 +84,19 @@ def test_a_disk_that_is_nearly_full_ends_the_recording_whole(tmp_path: Path, dis
         assert reader.message_count == run.recorder.written
     # What comes after is passed over; the next recording starts again where there is room.
     run.put(1)
-    with pytest.raises(RecordingError, match='150 MB left'):
+    with pytest.raises(RecordingError, match=r'150 MB left, .*; make room, or record elsewhere'):
         run.recorder.start(rig_for(tmp_path, disk_reserve=200 * MB), None)
     disk.free = 300 * MB
     second = run.recorder.start(rig_for(tmp_path, disk_reserve=200 * MB), None)
     assert second != run.folder
     assert run.recorder.failure == ''
     run.recorder.stop()
+
+
+def test_a_folder_that_cannot_be_made_says_the_way_out(tmp_path: Path) -> None:
+    (tmp_path / 'bags').write_text('a file')
+    with pytest.raises(RecordingError, match=r'cannot be made \(Not a directory\); .*record elsewhere'):
+        Recorder(10, print).start(rig_for(tmp_path), None)
 
 
 def test_the_oldest_file_is_deleted_where_that_was_asked_for(

@@ -1,19 +1,29 @@
-"""Simulated devices on pseudo-terminals, served by threads, pulled out and plugged in by the test."""
+"""Simulated devices on lines, pulled out and plugged in by the test.
+
+``served``: on a pseudo-terminal, in real time. ``wired``: on a line of our own, in a time of our own
+that passes only while somebody waits, so that a device is never late and waits for its reader: for
+sources that measure how quick the device is, whatever else the machine does.
+"""
 
 from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from psd_deflection.config import Rig
+from psd_deflection.errors import DeviceError
+from psd_deflection.io.serial_port import PortClosedError
 from psd_deflection.io.simulated_device import LineDevice, PseudoTerminal, serve
+from psd_deflection.io.sources import dataq, thorlabs
 from psd_deflection.records import FloatArray
+from psd_deflection.runner import acquisition
 from psd_deflection.runner.acquisition import Acquisition, Chunk
 
 
@@ -43,6 +53,90 @@ class Served:
             self._thread.join()
             self._terminal.close()
             self._thread = None
+
+
+class OwnClock:
+    """Stands for the module ``time``; nanoseconds that pass while somebody waits."""
+
+    def __init__(self) -> None:
+        self.now = 10**12
+
+    def monotonic_ns(self) -> int:
+        return self.now
+
+    def monotonic(self) -> float:
+        return self.now / 1e9
+
+    def time_ns(self) -> int:
+        return self.now + 10**18
+
+    def sleep(self, seconds: float) -> None:
+        self.now += round(seconds * 1e9)
+
+
+class Wired:
+    """A device on a line that has no kernel in it; ``link`` is the port's name."""
+
+    def __init__(self, link: str, clock: OwnClock) -> None:
+        self.link = link
+        self._clock = clock
+        self._waiting = b''
+        self._powered = 0
+        self.device: LineDevice | None = None
+
+    def plug(self, device: LineDevice) -> None:
+        self._waiting, self._powered = b'', self._clock.now
+        self.device = device
+
+    def unplug(self) -> None:
+        self.device = None
+
+    def _there(self) -> LineDevice:
+        if self.device is None:
+            raise PortClosedError(f'{self.link}: the device is gone')
+        return self.device
+
+    def due_in_ns(self) -> int:
+        """Until it has something to be read; 0 where it has, or is gone."""
+        gone = self.device is None or self._waiting
+        return 0 if gone else max(self._there().due_in_ns(self._clock.now - self._powered), 0)
+
+    def read(self, timeout: float) -> bytes:
+        deadline = self._clock.now + round(timeout * 1e9)
+        while True:
+            self._waiting += self._there().take(self._clock.now - self._powered)
+            if self._waiting or self._clock.now >= deadline:
+                received, self._waiting = self._waiting, b''
+                return received
+            self._clock.now = min(self._clock.now + max(self.due_in_ns(), 1000), deadline)
+
+    def write(self, frame: bytes) -> None:
+        device = self._there()
+        self._waiting += device.receive(frame, self._clock.now - self._powered)
+
+    def discard(self) -> None:
+        self._there().take(self._clock.now - self._powered)
+        self._waiting = b''
+
+
+class WiredPort:
+    """Stands for ``SerialPort``."""
+
+    def __init__(self, lines: list[Wired], name: str) -> None:
+        self._number = next(i for i, line in enumerate(lines) if line.link == name)
+        self._line = lines[self._number]
+        if self._line.device is None:
+            raise DeviceError(f'{name}: no such port')
+        self.read, self.write, self.discard_input = self._line.read, self._line.write, self._line.discard
+
+    def fileno(self) -> int:
+        return self._number
+
+    def give_up(self) -> None:
+        """It never waits long."""
+
+    def close(self) -> None:
+        """Nothing is held."""
 
 
 class Run:
@@ -88,6 +182,32 @@ def served(tmp_path: Path) -> Iterator[Callable[[LineDevice], Served]]:
     yield make
     for one in made:
         one.unplug()
+
+
+@pytest.fixture
+def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[[LineDevice], Wired]:
+    clock = OwnClock()
+    made: list[Wired] = []
+
+    def make(device: LineDevice) -> Wired:
+        one = Wired(f'port_{len(made)}', clock)
+        one.plug(device)
+        made.append(one)
+        return one
+
+    def port(name: str, baud: int, rtscts: bool = False) -> WiredPort:
+        return WiredPort(made, name)
+
+    def select(ports: Sequence[int], _: object, __: object, timeout: float) -> None:
+        waits = [made[number].due_in_ns() for number in ports]
+        clock.now += min(max(min(waits), 1000), round(timeout * 1e9))
+
+    for module in (thorlabs, dataq):
+        monkeypatch.setattr(module, 'time', clock)
+        monkeypatch.setattr(module, 'SerialPort', port)
+    monkeypatch.setattr(thorlabs, 'select', SimpleNamespace(select=select))
+    monkeypatch.setattr(acquisition, 'time', clock)
+    return make
 
 
 @pytest.fixture

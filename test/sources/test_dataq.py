@@ -1,4 +1,4 @@
-"""DATAQ converters: replies and scans written by hand, and the simulated device on a pseudo-terminal."""
+"""DATAQ converters: replies and scans written by hand, and the simulated device on a line of our own."""
 
 from __future__ import annotations
 
@@ -101,9 +101,9 @@ def test_a_rate_that_the_model_cannot_do_has_no_setting() -> None:
 
 @pytest.mark.parametrize('per_channel', [False, True])
 def test_it_reads_the_rig_at_the_rate_of_the_rig(
-    served: Any, run: Any, unloaded: Any, volts: Any, per_channel: bool
+    wired: Any, run: Any, unloaded: Any, volts: Any, per_channel: bool
 ) -> None:
-    port = served(SimulatedDataq(load_rig(), unloaded, per_channel=per_channel))
+    port = wired(SimulatedDataq(load_rig(), unloaded, per_channel=per_channel))
     running = run(load_rig(overrides={'source': 'dataq', 'port': str(port.link)}))
     hello = running.acquisition.hello.info
     assert hello['firmware'].startswith('DATAQ DI-2108')
@@ -116,8 +116,38 @@ def test_it_reads_the_rig_at_the_rate_of_the_rig(
     assert 'lost whole scans are not' in running.acquisition.source.describe()['sample numbers']
 
 
-def test_an_unplugged_one_is_configured_anew(served: Any, run: Any, unloaded: Any) -> None:
-    port = served(SimulatedDataq(load_rig(), unloaded))
+class Held(SimulatedDataq):
+    """The host is held up behind the 200th scan, in so many trials."""
+
+    trials = 0
+
+    def due_in_ns(self, since_power_up_ns: int) -> int:
+        due = super().due_in_ns(since_power_up_ns)
+        if self._scanning and self._sent == 200 and due > 0 and self.trials:
+            self.trials -= 1
+            return due + 200_000_000
+        return due
+
+
+@pytest.mark.parametrize('trials', [0, 1, 3])
+def test_a_busy_host_measures_again(wired: Any, unloaded: Any, trials: int) -> None:
+    device = Held(load_rig(), unloaded)
+    device.trials = trials
+    source = make_source(load_rig(overrides={'source': 'dataq', 'port': str(wired(device).link)}))
+    source.open(2.0)
+    assert device.trials == 0
+    assert float(source.describe()['scan rate at start (1/s)']) == pytest.approx(1000.0, rel=0.1)
+
+
+def test_another_rate_than_was_set_is_refused(wired: Any, unloaded: Any) -> None:
+    port = wired(SimulatedDataq(load_rig(), unloaded, skew_ppm=-3e5))
+    source = make_source(load_rig(overrides={'source': 'dataq', 'port': str(port.link)}))
+    with pytest.raises(DeviceError, match=r'does 7\d\d\.\d scans/s where 1000\.0 were set'):
+        source.open(2.0)
+
+
+def test_an_unplugged_one_is_configured_anew(wired: Any, run: Any, unloaded: Any) -> None:
+    port = wired(SimulatedDataq(load_rig(), unloaded))
     running = run(load_rig(overrides={'source': 'dataq', 'port': str(port.link)}))
     running.take(40)
     port.unplug()
@@ -130,9 +160,9 @@ def test_an_unplugged_one_is_configured_anew(served: Any, run: Any, unloaded: An
     assert running.acquisition.counters.disconnects == 1
 
 
-def test_one_that_falls_silent_is_configured_anew(served: Any, run: Any, unloaded: Any) -> None:
+def test_one_that_falls_silent_is_configured_anew(wired: Any, run: Any, unloaded: Any) -> None:
     device = SimulatedDataq(load_rig(), unloaded)
-    running = run(load_rig(overrides={'source': 'dataq', 'port': str(served(device).link)}))
+    running = run(load_rig(overrides={'source': 'dataq', 'port': str(wired(device).link)}))
     running.take(40)
     # As a device that lost its supply and has forgotten everything, though its port stays.
     device._obey('stop', 0)
@@ -147,16 +177,16 @@ def test_one_that_falls_silent_is_configured_anew(served: Any, run: Any, unloade
     ('model', 'said'),
     [('1100', '4 analog inputs and no counter'), ('718B', "model '718B'; known are 1100")],
 )
-def test_a_model_that_will_not_do_is_named(served: Any, unloaded: Any, model: str, said: str) -> None:
-    port = served(SimulatedDataq(load_rig(), unloaded, model=model))
+def test_a_model_that_will_not_do_is_named(wired: Any, unloaded: Any, model: str, said: str) -> None:
+    port = wired(SimulatedDataq(load_rig(), unloaded, model=model))
     source = make_source(load_rig(overrides={'source': 'dataq', 'port': str(port.link)}))
     with pytest.raises(DeviceError, match=said):
         source.open(2.0)
 
 
-def test_a_rate_out_of_reach_is_named(served: Any, unloaded: Any) -> None:
+def test_a_rate_out_of_reach_is_named(wired: Any, unloaded: Any) -> None:
     rig = load_rig(overrides={'converter.sample_rate_hz': 500.0})
-    port = served(SimulatedDataq(rig, unloaded, model='1110'))
+    port = wired(SimulatedDataq(rig, unloaded, model='1110'))
     source = make_source(
         load_rig(overrides={'source': 'dataq', 'port': str(port.link), 'converter.sample_rate_hz': 500.0})
     )

@@ -34,6 +34,11 @@ def test_the_parameters_of_a_page_are_parameters(page: str, tmp_path: Path) -> N
     assert load_rig(path).acquisition.source == page.removesuffix('.md')
 
 
+@pytest.mark.parametrize('page', ['dataq.md', 'thorlabs.md', 'lines.md'])
+def test_a_page_says_that_it_was_not_tried_on_hardware(page: str) -> None:
+    assert 'Not tried on hardware' in (PAGES / page).read_text()
+
+
 def test_the_example_lines_are_lines() -> None:
     (example,) = blocks('lines.md', '')[:1]
     items = [parse(line.encode()) for line in example.splitlines()]

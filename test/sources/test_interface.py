@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import queue
+import threading
 import time
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint, EntryPoints
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from psd_deflection.config import Rig, load_rig
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, DeviceError
+from psd_deflection.io.simulated_device import PseudoTerminal
 from psd_deflection.io.sources import _registry
 from psd_deflection.io.sources._interface import Clock, PortClosedError, Reading, Sample, Source, SourceEndedError
 from psd_deflection.io.sources._registry import make_source, source_names
@@ -162,3 +166,61 @@ def test_a_source_names_its_own_reasons_for_what_is_no_sample() -> None:
     acquisition = acquisition_of([[BadFrame('five fields', 9), BadFrame('five fields', 9)]])
     run(acquisition)
     assert acquisition.counters.bad_frames == {'five fields': 2}
+
+
+@pytest.mark.parametrize('gives_up', [True, False])
+def test_a_run_that_ends_waits_for_no_source(monkeypatch: pytest.MonkeyPatch, gives_up: bool) -> None:
+    """One that waits for its device is told to give up; one that hangs is left behind."""
+    monkeypatch.setattr('psd_deflection.runner.acquisition.GIVE_UP_TIMES', 20 if gives_up else 1)
+    waiting, over = threading.Event(), threading.Event()
+
+    class Patient(Scripted):
+        def reopen(self) -> HelloFrame | None:
+            waiting.set()
+            over.wait()
+            raise DeviceError('scripted: given up')
+
+        def give_up(self) -> None:
+            if gives_up:
+                over.set()
+
+    said: list[str] = []
+    acquisition = Acquisition(load_rig(overrides={'source': 'scripted'}), said.append)
+    acquisition.source = source = Patient(load_rig())
+    source.script = [PortClosedError('scripted: gone')]
+    acquisition.open()
+    acquisition.start()
+    assert waiting.wait(10.0)
+    acquisition.stop()
+    assert isinstance(acquisition.queue.get(timeout=10.0), Ended)
+    hangs = ['scripted: the source hangs; it is not waited for']
+    assert said[said.index('scripted: gone; waiting for it to come back') + 1 :] == ([] if gives_up else hangs)
+    over.set()
+
+
+@pytest.mark.parametrize('name', ['serial', 'lines', 'dataq', 'thorlabs'])
+def test_each_of_ours_gives_up_waiting(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However long it would wait for a device that says nothing."""
+    for waits in ('text_lines.BOOT_S', 'dataq.STOP_S'):
+        monkeypatch.setattr(f'psd_deflection.io.sources.{waits}', 1e6)
+    ports = [PseudoTerminal(tmp_path / f'port_{i}') for i in range(2)]
+    port = ','.join(p.name for p in ports) if name == 'thorlabs' else ports[0].name
+    source = make_source(load_rig(overrides={'source': name, 'port': port}))
+    outcome: queue.SimpleQueue[Exception] = queue.SimpleQueue()
+
+    def wait() -> None:
+        try:
+            source.open(1e6)
+        except DeviceError as error:
+            outcome.put(error)
+
+    thread = threading.Thread(target=wait, daemon=True)
+    thread.start()
+    for _ in range(200):
+        source.give_up()
+        thread.join(0.05)
+        if not thread.is_alive():
+            break
+    assert 'given up' in str(outcome.get(timeout=10.0))
+    for one in ports:
+        one.close()

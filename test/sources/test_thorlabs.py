@@ -1,4 +1,4 @@
-"""Thorlabs aligners: messages written by hand, and the simulated pair on pseudo-terminals."""
+"""Thorlabs aligners: messages written by hand, and the simulated pair on lines of our own."""
 
 from __future__ import annotations
 
@@ -105,10 +105,10 @@ SLOW: dict[str, object] = {
 
 
 @pytest.fixture
-def pair(served: Any, unloaded: Any) -> Callable[..., tuple[Any, Any, Rig]]:
+def pair(wired: Any, unloaded: Any) -> Callable[..., tuple[Any, Any, Rig]]:
     def make(**options: object) -> tuple[Any, Any, Rig]:
         shared = SharedRig(load_rig(overrides=SLOW), unloaded, 0)
-        ports = [served(SimulatedAligner(shared, psd, answer_ns=500_000)) for psd in (1, 2)]
+        ports = [wired(SimulatedAligner(shared, psd, answer_ns=500_000)) for psd in (1, 2)]
         rig = load_rig(overrides={**SLOW, 'port': ','.join(str(p.link) for p in ports), **options})
         return ports[0], ports[1], rig
 
@@ -157,10 +157,10 @@ def test_one_that_is_pulled_out_is_lost_time_not_lost_order(pair: Any, run: Any,
     assert counters.restarts == 0
 
 
-def test_a_port_where_nothing_answers_is_named(served: Any, unloaded: Any) -> None:
+def test_a_port_where_nothing_answers_is_named(wired: Any, unloaded: Any) -> None:
     shared = SharedRig(load_rig(), unloaded, 0)
-    good = served(SimulatedAligner(shared, 1))
-    mute = served(SimulatedAligner(shared, 2, answer_ns=10**12))
+    good = wired(SimulatedAligner(shared, 1))
+    mute = wired(SimulatedAligner(shared, 2, answer_ns=10**12))
     rig = load_rig(overrides={**SLOW, 'port': f'{good.link},{mute.link}'})
     with pytest.raises(DeviceError, match=r'port_1: nothing in 0\.3 s; is it a KPA101'):
         make_source(rig).open(0.3)

@@ -8,7 +8,7 @@ say what its numbers and times are worth.
 One source's life: made from the rig; ``open`` (the device is heard out and made ready), ``start``
 (samples flow), ``read`` again and again, ``close``. When ``read`` says that the device is gone, the
 reader closes it and calls ``reopen`` four times a second until it succeeds. ``open``, ``start``,
-``read``, ``ping`` and ``reopen`` are called by one thread at a time; ``describe`` by any.
+``read``, ``ping`` and ``reopen`` are called by one thread at a time; ``describe`` and ``give_up`` by any.
 """
 
 from __future__ import annotations
@@ -126,6 +126,10 @@ class Source(abc.ABC):
 
     def wake(self) -> None:  # noqa: B027 - most devices cannot be asked
         """The device has been silent for long: ask it for samples once more. Raises PortClosedError."""
+
+    def give_up(self) -> None:  # noqa: B027 - a source that never waits long has nothing to do
+        """Called again and again, by another thread, while the run ends: let ``open``, ``reopen`` or ``read``
+        that waits for a device come back, with DeviceError. One that does not is left behind."""
 
     @abc.abstractmethod
     def describe(self) -> Mapping[str, str]:

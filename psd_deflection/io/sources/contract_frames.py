@@ -51,7 +51,9 @@ class ContractFrames(Source):
             return self._open(self._given, timeout)
         ports = matching(self._given)
         if not ports:
-            raise DeviceError(f'{self._given}: no port of such a name is there')
+            raise DeviceError(
+                f'{self._given}: no port of such a name is there; `psd-deflection devices` lists those that are'
+            )
         refusals = []
         for name in ports:
             try:
@@ -152,6 +154,12 @@ class ContractFrames(Source):
         """Ask for a HELLO and for samples once more."""
         if self._port is not None:
             self._port.write(_WAKE)
+
+    def give_up(self) -> None:
+        """Wait for the device no longer."""
+        port = self._port
+        if port is not None:
+            port.give_up()
 
     def close(self) -> None:
         """Give the port back."""

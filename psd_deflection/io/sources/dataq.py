@@ -35,8 +35,9 @@ REPLY_S = 0.5
 STOP_S = 2.5
 """``stop`` and ``encode`` hold some models up for a second."""
 
-TRIAL_SCANS = 250
-"""Scans over which the rate is measured before the first sample is given."""
+TRIAL_SCANS = (250, 250, 500, 1000)
+"""Scans over which the rate is measured before the first sample is given; the next where the one before
+does not agree with what was set: a busy host may have been late to read."""
 
 TRIAL_TOLERANCE = 0.1
 RAILS = (-32768, 32767)
@@ -91,17 +92,7 @@ class Dataq(Source):
         self._must('ps 0', REPLY_S)
         for line in scan_list(range(ANALOG)):
             self._must(line, REPLY_S)
-        self._set_rate(model, per_channel=False)
-        self._measured = self._trial()
-        if abs(self._measured * (ANALOG + 1) / self._rate.hz - 1.0) < TRIAL_TOLERANCE:
-            # It took the number as conversions a second, not as scans.
-            self._set_rate(model, per_channel=True)
-            self._measured = self._trial()
-        if abs(self._measured / self._rate.hz - 1.0) > TRIAL_TOLERANCE:
-            raise DeviceError(
-                f'{self.name}: does {self._measured:.1f} scans/s where {self._rate.hz:.1f} were set; '
-                'is the counter input free, and does the host keep up?'
-            )
+        self._settle_rate(model)
         return HelloFrame(
             PROTOCOL_VERSION,
             {
@@ -112,6 +103,22 @@ class Dataq(Source):
                 'volts_per_count': VOLTS_PER_COUNT,
                 'sample_numbers': 'counted by the host',
             },
+        )
+
+    def _settle_rate(self, model: Model) -> None:
+        """Set the rate, and see that it is done; some devices take the number as conversions a second."""
+        per_channel = False
+        self._set_rate(model, per_channel)
+        for scans in TRIAL_SCANS:
+            self._measured = self._trial(scans)
+            if abs(self._measured / self._rate.hz - 1.0) <= TRIAL_TOLERANCE:
+                return
+            if not per_channel and abs(self._measured * (ANALOG + 1) / self._rate.hz - 1.0) < TRIAL_TOLERANCE:
+                per_channel = True
+                self._set_rate(model, per_channel)
+        raise DeviceError(
+            f'{self.name}: does {self._measured:.1f} scans/s where {self._rate.hz:.1f} were set; '
+            'is the counter input free, and does the host keep up?'
         )
 
     def _set_rate(self, model: Model, per_channel: bool) -> None:
@@ -126,16 +133,16 @@ class Dataq(Source):
             self._must(f'dec {rate.dec}', REPLY_S)
         self._must(f'srate {rate.srate}', REPLY_S)
 
-    def _trial(self) -> float:
-        """Scans a second as they come, by arrival over ``TRIAL_SCANS``; the device is stopped again."""
+    def _trial(self, scans: int) -> float:
+        """Scans a second as they come, by arrival over so many; the device is stopped again."""
         port = self._opened()
         port.discard_input()
         port.write(command('reset 1') + command('start'))
         received = 0
         first = last = 0
-        deadline = time.monotonic_ns() + round((5.0 * (ANALOG + 1) * TRIAL_SCANS / self._rate.hz + 1.0) * 1e9)
+        deadline = time.monotonic_ns() + round((5.0 * (ANALOG + 1) * scans / self._rate.hz + 1.0) * 1e9)
         counted_from = 0
-        while received - counted_from < TRIAL_SCANS * STRIDE and time.monotonic_ns() < deadline:
+        while received - counted_from < scans * STRIDE and time.monotonic_ns() < deadline:
             piece = port.read(0.1)
             if not piece:
                 continue
@@ -204,6 +211,12 @@ class Dataq(Source):
     def wake(self) -> None:
         """Silence means that it was stopped or has forgotten its scan list: it is to be configured anew."""
         raise PortClosedError(f'{self.name}: no scans come')
+
+    def give_up(self) -> None:
+        """Wait for the device no longer."""
+        port = self._port
+        if port is not None:
+            port.give_up()
 
     def close(self) -> None:
         """Stop the device and give the port back."""

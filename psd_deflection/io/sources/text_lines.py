@@ -112,6 +112,12 @@ class TextLines(Source):
         over = max(counts) == 32767 or min(counts) == -32768
         return Sample(FLAG_OVER_RANGE if over else 0, line.seq, self._time.extend(line), counts)
 
+    def give_up(self) -> None:
+        """Wait for the device no longer."""
+        port = self._port
+        if port is not None:
+            port.give_up()
+
     def close(self) -> None:
         """Give the port back."""
         if self._port is not None:

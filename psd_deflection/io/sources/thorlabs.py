@@ -184,6 +184,11 @@ class ThorlabsPair(Source):
             self._taken += 1
         return Reading(events, time.monotonic_ns(), max(size, 1))
 
+    def give_up(self) -> None:
+        """Wait for the devices no longer."""
+        for port in tuple(self._ports):
+            port.give_up()
+
     def close(self) -> None:
         """Give both ports back."""
         for port in self._ports:

@@ -1,0 +1,73 @@
+"""SIGINT and SIGTERM without ROS: they end the waiting for a device at once, and nothing else at once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from typing import Any
+
+import pytest
+
+from psd_deflection.cli.estimator import Display, live_line, run_without_ros
+from psd_deflection.runner.session import Session
+from psd_deflection.runner.signals import Signals, StopRequestedError
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_waiting_for_a_silent_device(
+    device: Any, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    device.answer = b''
+    monkeypatch.setattr('psd_deflection.runner.acquisition.SILENCE_S', 60.0)
+    before = signal.getsignal(number)
+
+    def end() -> None:
+        device.greeted.wait(30.0)
+        os.kill(os.getpid(), number)
+
+    threading.Thread(target=end, daemon=True).start()
+    assert run_without_ros({'port': str(device.link)}, Display(), lambda session: None) == 0
+    assert signal.getsignal(number) is before
+
+
+def test_a_signal_ends_the_waiting_for_one_that_is_away(device: Any, sample: Any) -> None:
+    """The port is back and nothing answers: the daemon hears it out, and stops when it is told."""
+
+    def look(session: Session) -> None:
+        if session.acquisition.counters.samples < 20:
+            device.send_frames(*[sample(s) for s in range(len(sent), len(sent) + 20)])
+            sent.extend(range(20))
+        elif session.acquisition.counters.disconnects == 0 and not away:
+            away.append(True)
+            device.unplug()
+            while not session.acquisition.away:
+                time.sleep(0.001)
+            shown.append(live_line(session, 0.0))
+            device.answer = b''
+            device.plug()
+            threading.Thread(target=end, daemon=True).start()
+
+    def end() -> None:
+        device.greeted.wait(30.0)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    sent: list[int] = []
+    away: list[bool] = []
+    shown: list[str] = []
+    values: dict[str, object] = {'port': str(device.link), 'keep_zero': False, 'realtime': False}
+    assert run_without_ros(values, Display(), look) == 0
+    assert away
+    assert 'no samples: the device is away' in shown[0]
+
+
+def test_what_runs_is_not_torn() -> None:
+    signals = Signals()
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert signals.stop
+        with pytest.raises(StopRequestedError):
+            signals.interruptible(lambda: None)
+    finally:
+        signals.restore()
