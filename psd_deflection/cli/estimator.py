@@ -24,6 +24,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from psd_deflection.cli._program import program
 from psd_deflection.config import Rig, read_parameter_file, rig_from_values
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor.start import start_monitor
@@ -160,7 +161,7 @@ def run(args: argparse.Namespace) -> int:
     with started_early(simulates(overrides, args.ros_arguments)):
         status = _run(args, overrides, display, watch)
     for folder in recorded:
-        display.say(f'recorded {folder}\n  replay it:  psd-deflection replay {folder} --compare')
+        display.say(f'recorded {folder}\n  replay it:  {program()} replay {folder} --compare')
     return status
 
 

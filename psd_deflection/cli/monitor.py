@@ -21,6 +21,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+from psd_deflection.cli._program import program
 from psd_deflection.cli.estimator import Display, run_without_ros, simulates
 from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.config import read_parameter_file, replace_values, rig_from_values
@@ -93,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     with started_early(simulates({**values, **overrides})):
         status = run_without_ros({**values, **overrides}, display, watch)
     for folder in recorded:
-        display.say(f'recorded {folder}\n  replay it:  psd-deflection replay {folder} --compare')
+        display.say(f'recorded {folder}\n  replay it:  {program()} replay {folder} --compare')
     return status
 
 
