@@ -441,6 +441,8 @@ def main() -> int:
     if sys.argv[1:2] == ['--ask']:
         ask(sys.argv[2])
         return 0
+    # A shell that runs us in the background has it ignored, and so would all that we start.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     only = ' '.join(sys.argv[1:])
     environment = Path(sys.prefix)
     failures = 0
