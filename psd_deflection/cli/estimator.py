@@ -161,8 +161,7 @@ def run(args: argparse.Namespace) -> int:
     with started_early(simulates(overrides, args.ros_arguments)):
         status = _run(args, overrides, display, watch)
     for folder in (f for f in recorded if f.is_dir()):
-        display.say(f'recorded {folder}
-  replay it:  {program()} replay {folder} --compare')
+        display.say(f'recorded {folder}\n  replay it:  {program()} replay {folder} --compare')
     return status
 
 
