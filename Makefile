@@ -68,10 +68,11 @@ run: $(VENV)/.installed
 # Arguments, e.g. BENCH_LIVE='--seconds 5 --minutes 1' for a first look.
 BENCH_LIVE ?=
 BENCH_SOLVERS ?=
+BENCH_ACCURACY ?=
 bench: $(VENV)/.installed
 	$(BIN)/python bench/live.py $(BENCH_LIVE)
 	$(BIN)/python bench/solvers.py $(BENCH_SOLVERS)
-	$(BIN)/python bench/accuracy.py
+	$(BIN)/python bench/accuracy.py $(BENCH_ACCURACY)
 
 FAULT_TIMES ?= 20
 FAULTS ?=

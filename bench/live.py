@@ -27,7 +27,6 @@ import numpy as np
 import numpy.typing as npt
 
 ROOT = Path(__file__).resolve().parent.parent
-SETTLE_S = 5.0
 
 
 def percentiles(values: list[float]) -> tuple[float, float]:
@@ -174,7 +173,7 @@ class Latencies:
         return m / m0, p / p0
 
 
-def measure(seconds: float, page: bool, into: Latencies) -> None:
+def measure(seconds: float, settle: float, page: bool, into: Latencies) -> None:
     """One node, recording; ``page``: it serves the live page too, and a browser's worth of it is fetched."""
     device = Device()
     device.thread.start()
@@ -191,7 +190,7 @@ def measure(seconds: float, page: bool, into: Latencies) -> None:
         for one in children:
             assert one.stdout is not None
             one.stdout.readline()
-        time.sleep(SETTLE_S)
+        time.sleep(settle)
         used, began = cpu_seconds(node.pid), time.monotonic()
         time.sleep(seconds)
         into.shares.append((cpu_seconds(node.pid) - used) / (time.monotonic() - began))
@@ -218,12 +217,12 @@ def measure(seconds: float, page: bool, into: Latencies) -> None:
             into.ours.append((t - int(last[-1])) / 1e6)
 
 
-def live(seconds: float, rounds: int) -> None:
+def live(seconds: float, settle: float, rounds: int) -> None:
     """The node alone and the node with the live page, in turns, each beside a bare publisher."""
     alone, with_page = Latencies(), Latencies()
     for _ in range(rounds):
-        measure(seconds / rounds, False, alone)
-        measure(seconds / rounds, True, with_page)
+        measure(seconds / rounds, settle, False, alone)
+        measure(seconds / rounds, settle, True, with_page)
     print('latency, last byte -> callback in another process (ms)')
     print(f'  {"":36}{"median":>10}{"p99":>10}{"messages":>10}')
     for what, found in (('psd_deflection', alone), ('psd_deflection, live page looked at', with_page)):
@@ -300,6 +299,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--seconds', type=float, default=30.0, help='of the live measurement of each kind of node')
     parser.add_argument('--minutes', type=float, default=10.0, help='of the recording that is replayed')
+    parser.add_argument('--settle', type=float, default=5.0, help='seconds before each measurement')
     parser.add_argument('--rounds', type=int, default=2, help='in which it is done, so that a busy moment meets both')
     parser.add_argument('--role', choices=('subscriber', 'bare', 'looker'), help=argparse.SUPPRESS)
     parser.add_argument('--url', help=argparse.SUPPRESS)
@@ -311,7 +311,7 @@ def main() -> int:
     elif args.role == 'looker':
         looker(args.url)
     else:
-        live(args.seconds, args.rounds)
+        live(args.seconds, args.settle, args.rounds)
         replay(args.minutes)
     return 0
 

@@ -77,7 +77,7 @@ def main() -> int:
         assert program.stderr is not None
         url = next(line.split()[1] for line in program.stderr if line.startswith('monitor: '))
         for i, shot in enumerate((*SHOTS, PHONE)):
-            take(url, *shot, seconds if i == 0 else 4.0, i == 0)
+            take(url, *shot, seconds if i == 0 else 4.0, i == 0 and seconds > 10.0)
     finally:
         program.send_signal(signal.SIGINT)
         program.wait()

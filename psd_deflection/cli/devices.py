@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from dataclasses import asdict
 
 from psd_deflection.io.port_survey import Port, survey
@@ -24,7 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the survey; the exit status is 0 whatever was found."""
+    told = sys.stderr.isatty() and not args.json
+    if told:
+        print('asking; a port that stays silent takes some seconds ...', end='', file=sys.stderr, flush=True)
     ports = survey(args.ports)
+    if told:
+        print('\r\x1b[K', end='', file=sys.stderr, flush=True)
     if args.json:
         print(json.dumps({'ports': [asdict(p) for p in ports], 'suggested': suggestions(ports)}, indent=2))
         return 0

@@ -22,15 +22,17 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from psd_deflection.cli._program import program
 from psd_deflection.config import Rig, read_parameter_file, rig_from_values
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor.start import start_monitor
 from psd_deflection.runner.realtime import Watchdog, settle
-from psd_deflection.runner.session import Session
+from psd_deflection.runner.session import SIMULATED, Session
 from psd_deflection.runner.signals import Signals, StopRequestedError
+from psd_deflection.runner.simulated_rig import started_early
 
 REFRESH_S = 0.25
 PLAIN_REFRESH_S = 5.0
@@ -74,6 +76,12 @@ def overrides_of(args: argparse.Namespace) -> dict[str, object]:
     # Refuse them here, where the file's name is known.
     rig_from_values(values, args.params_file or 'command line')
     return values
+
+
+def simulates(overrides: Mapping[str, object], ros_arguments: Sequence[str] = ()) -> bool:
+    """Whether a simulated rig will be started, as far as can be told before ROS has read its arguments."""
+    told_to_ros = any(a == '--params-file' or a.startswith(('port:=', 'source:=')) for a in ros_arguments)
+    return not told_to_ros and not overrides.get('port') and overrides.get('source', 'serial') in SIMULATED
 
 
 class Display:
@@ -150,20 +158,26 @@ def run(args: argparse.Namespace) -> int:
             display.say(f'recording to {folder}')
         display.update(session)
 
-    if args.no_ros:
-        status = run_without_ros(overrides, display, watch)
-    else:
-        if importlib.util.find_spec('rclpy') is None:
-            raise ConfigError(
-                "rclpy is not installed: source your ROS 2, or `pip install 'psd_deflection[ros]'`, "
-                'or run with --no-ros to acquire and record without it'
-            )
-        from psd_deflection.ros import estimator
-
-        status = estimator.run(args.ros_arguments, overrides, display.say, watch)
+    with started_early(simulates(overrides, args.ros_arguments)):
+        status = _run(args, overrides, display, watch)
     for folder in (f for f in recorded if f.is_dir()):
-        display.say(f'recorded {folder}\n  replay it:  psd-deflection replay {folder} --compare')
+        display.say(f'recorded {folder}\n  replay it:  {program()} replay {folder} --compare')
     return status
+
+
+def _run(
+    args: argparse.Namespace, overrides: dict[str, object], display: Display, watch: Callable[[Session], None]
+) -> int:
+    if args.no_ros:
+        return run_without_ros(overrides, display, watch)
+    if importlib.util.find_spec('rclpy') is None:
+        raise ConfigError(
+            "rclpy is not installed: source your ROS 2, or `pip install 'psd_deflection[ros]'`, "
+            'or run with --no-ros to acquire and record without it'
+        )
+    from psd_deflection.ros import estimator
+
+    return estimator.run(args.ros_arguments, overrides, display.say, watch)
 
 
 def run_without_ros(overrides: dict[str, object], display: Display, watch: Callable[[Session], None]) -> int:

@@ -21,7 +21,8 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-from psd_deflection.cli.estimator import Display, run_without_ros
+from psd_deflection.cli._program import program
+from psd_deflection.cli.estimator import Display, run_without_ros, simulates
 from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.config import read_parameter_file, replace_values, rig_from_values
 from psd_deflection.errors import ConfigError
@@ -32,6 +33,7 @@ from psd_deflection.monitor.start import need_server
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import Record
 from psd_deflection.runner.session import Session
+from psd_deflection.runner.simulated_rig import started_early
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -89,9 +91,10 @@ def run(args: argparse.Namespace) -> int:
             recorded.append(folder)
         display.update(session)
 
-    status = run_without_ros({**values, **overrides}, display, watch)
+    with started_early(simulates({**values, **overrides})):
+        status = run_without_ros({**values, **overrides}, display, watch)
     for folder in recorded:
-        display.say(f'recorded {folder}\n  replay it:  psd-deflection replay {folder} --compare')
+        display.say(f'recorded {folder}\n  replay it:  {program()} replay {folder} --compare')
     return status
 
 

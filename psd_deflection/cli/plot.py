@@ -49,8 +49,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass
 class Drawn:
-    """What is drawn, a row a block: s, m, m, rad, V; NaN where a block has no estimate."""
+    """What is drawn, a row a block: s, m, m, rad, V; NaN where a block has no estimate.
 
+    ``numbers``: of the first and the last sample.
+    """
+
+    numbers: tuple[int, int] | None = None
     spots: list[SpotMeans] = field(default_factory=list)
     estimates: dict[int, DeflectionEstimate] = field(default_factory=dict)
 
@@ -60,6 +64,9 @@ class Drawn:
             self.spots.append(record)
         elif isinstance(record, DeflectionEstimate) and record.primary:
             self.estimates[record.block] = record
+        elif isinstance(record, SampleBlock):
+            first, last = int(record.seq[0]), int(record.seq[-1])
+            self.numbers = (first if self.numbers is None else self.numbers[0], last)
 
     def table(self) -> dict[str, FloatArray]:
         """Arrays (n,): t from the first block, pose, standard deviations, dots, sums, samples lost."""
@@ -84,10 +91,11 @@ class Drawn:
         columns = np.array(rows, np.float64).T
         return dict(zip(names, columns, strict=True))
 
-    def gone(self, block_size: int) -> int:
-        """Samples that are missing, those of whole blocks included."""
-        steps = np.diff([s.index for s in self.spots]) - 1
-        return sum(s.lost for s in self.spots) + int(steps.sum()) * block_size
+    def gone(self) -> int:
+        """Samples that are missing between the first and the last one."""
+        if self.numbers is None:
+            return 0
+        return self.numbers[1] - self.numbers[0] + 1 - sum(s.present for s in self.spots)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -127,7 +135,7 @@ def figures(drawn: Drawn, rig: Rig) -> dict[str, Any]:
     out: dict[str, Any] = {
         'duration_s': float(table['t'][-1]) + rig.estimator.block_size / rig.converter.sample_rate_hz,
         'samples': sum(s.present for s in drawn.spots),
-        'lost': drawn.gone(rig.estimator.block_size),
+        'lost': drawn.gone(),
         'blocks': len(drawn.spots),
         'estimates': len(drawn.estimates),
         'solver': rig.estimator.solver,
@@ -173,9 +181,7 @@ def draw(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any:
     raster = len(t) > 20_000
     with mpl.rc_context({'font.size': 9, 'axes.grid': True, 'grid.alpha': 0.3, 'axes.axisbelow': True}):
         figure = Figure(figsize=(13, 8), layout='constrained')
-        figure.suptitle(
-            f'{name} · {len(drawn.estimates)} estimates, {drawn.gone(rig.estimator.block_size)} samples lost'
-        )
+        figure.suptitle(f'{name} · {len(drawn.estimates)} estimates, {drawn.gone()} samples lost')
         grid = figure.add_gridspec(4, 4, height_ratios=(3, 3, 3, 1.6))
         left = [figure.add_subplot(grid[0, :2])]
         left += [figure.add_subplot(grid[i, :2], sharex=left[0]) for i in (1, 2, 3)]

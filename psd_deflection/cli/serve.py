@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 
+from psd_deflection.cli._program import program
 from psd_deflection.config import Rig, load_rig, rig_from_values
 from psd_deflection.errors import ConfigError
 from psd_deflection.io.simulated_dataq import SimulatedDataq
@@ -68,7 +69,7 @@ def run_device(args: argparse.Namespace) -> int:
         if not args.attached:
             source = '' if name == 'serial' else f' --source {name}'
             print(
-                f'a simulated rig answers there; try:  psd-deflection estimator --port {names}{source}\nCtrl-C ends it',
+                f'a simulated rig answers there; try:  {program()} estimator --port {names}{source}\nCtrl-C ends it',
                 file=sys.stderr,
             )
         serve_all(devices, ports, stop.is_set)
@@ -113,6 +114,9 @@ def serve_all(devices: Sequence[LineDevice], ports: Sequence[PseudoTerminal], st
 
 def _attached_rig(stop: threading.Event) -> Rig:
     line = sys.stdin.buffer.readline()
+    if not line:
+        # The daemon that started us early has gone before it came to us.
+        raise SystemExit(0)
     try:
         values = json.loads(line)
     except ValueError:

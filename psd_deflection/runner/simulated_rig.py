@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import select
 import subprocess
 import sys
+from collections.abc import Iterator
 
 from psd_deflection.config import Rig
 from psd_deflection.errors import DeviceError
@@ -14,18 +16,42 @@ START_S = 20.0
 PORT_LINE = 'port: '
 
 
+_waiting: list[subprocess.Popen[bytes]] = []
+
+
+@contextlib.contextmanager
+def started_early(wanted: bool) -> Iterator[None]:
+    """Start the process of the next rig now, where one is ``wanted``; ends it where none took it.
+
+    It imports while its daemon does, and waits for its parameters: whoever types the command sees the dots sooner.
+    """
+    if wanted:
+        _waiting.append(_start())
+    try:
+        yield
+    finally:
+        while _waiting:
+            process = _waiting.pop()
+            process.kill()
+            process.communicate()
+
+
+def _start() -> subprocess.Popen[bytes]:
+    # A session of its own: Ctrl-C in the terminal is for the daemon, which ends the rig itself.
+    return subprocess.Popen(
+        [sys.executable, '-m', 'psd_deflection', 'simulate', '--serve', '--attached'],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    )
+
+
 class SimulatedRigProcess:
     """The process behind ``port``; it ends when this one closes its standard input, or dies."""
 
     def __init__(self, rig: Rig) -> None:
         effects = {f'effects.{name}': value for name, value in rig.effects.items()}
-        # A session of its own: Ctrl-C in the terminal is for the daemon, which ends the rig itself.
-        self._process = subprocess.Popen(
-            [sys.executable, '-m', 'psd_deflection', 'simulate', '--serve', '--attached'],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            start_new_session=True,
-        )
+        self._process = _waiting.pop() if _waiting else _start()
         if self._process.stdin is None or self._process.stdout is None:
             raise DeviceError('the simulated rig has no pipes')
         self._process.stdin.write(json.dumps({**rig.values, **effects}).encode() + b'\n')

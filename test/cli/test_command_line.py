@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from psd_deflection.cli._program import program
 from psd_deflection.cli.main import COMMANDS, main
 
 ROOT = Path(__file__).parent.parent.parent
@@ -150,3 +151,19 @@ def test_a_closed_pipe_is_no_error() -> None:
     )
     assert done.returncode == 0
     assert 'Traceback' not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ('found', 'called', 'told'),
+    [
+        ('/usr/bin/psd-deflection', '.venv/bin/psd-deflection', 'psd-deflection'),
+        (None, '.venv/bin/psd-deflection', '.venv/bin/psd-deflection'),
+        (None, '/somewhere/__main__.py', f'{sys.executable} -m psd_deflection'),
+    ],
+)
+def test_what_it_suggests_can_be_typed(
+    found: str | None, called: str, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr('shutil.which', lambda name: found)
+    monkeypatch.setattr(sys, 'argv', [called, 'estimator'])
+    assert program() == told

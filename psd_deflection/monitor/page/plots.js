@@ -1,6 +1,7 @@
 // The traces, drawn by uPlot (vendor/uPlot.LICENSE).
 
 const AXIS = 62;
+const SOONER = [5, 10, 30];
 
 function clock(seconds) {
   // Times of a CSV may count from its own zero.
@@ -154,9 +155,12 @@ export class Plots {
 
   traces(rows, span) {
     const newest = rows.last('t');
+    // What has just begun, and a recording that is short, fill the plot sooner.
+    const held = newest - rows.last('t', rows.end - rows.start - 1);
+    const shown = SOONER.find((s) => s < span && held < s) ?? span;
     this.state.to = newest;
-    this.state.from = newest - span;
-    const first = Math.max(rows.from(newest - span) - 1, rows.start);
+    this.state.from = newest - shown;
+    const first = Math.max(rows.from(newest - shown) - 1, rows.start);
     const [t, lost] = rows.slices(['t', 'lost'], first);
     this.state.losses = t.filter((_, i) => lost[i] > 0);
     const of = (...names) => [t, ...rows.slices(names, first)];

@@ -1,0 +1,17 @@
+"""How to call this program from where the user stands, for the commands that it suggests."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+NAME = 'psd-deflection'
+
+
+def program() -> str:
+    """``psd-deflection`` where the shell finds it; else how it was called, as by ``make run`` from ``.venv/bin``."""
+    if shutil.which(NAME) is not None:
+        return NAME
+    called = Path(sys.argv[0])
+    return str(called) if called.name == NAME else f'{sys.executable} -m psd_deflection'

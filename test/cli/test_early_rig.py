@@ -1,0 +1,55 @@
+"""The simulated rig's process, started before its daemon is ready for it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.cli.estimator import simulates
+from psd_deflection.config import load_rig
+from psd_deflection.runner import simulated_rig
+from psd_deflection.runner.simulated_rig import SimulatedRigProcess, started_early
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+@pytest.mark.parametrize(
+    ('overrides', 'ros_arguments', 'wanted'),
+    [
+        ({}, (), True),
+        ({'source': 'dataq'}, ('--ros-args', '-p', 'record:=true'), True),
+        ({'port': '/dev/ttyACM0'}, (), False),
+        ({'source': 'replay'}, (), False),
+        ({}, ('--ros-args', '-p', 'port:=/dev/ttyACM0'), False),
+        ({}, ('--ros-args', '--params-file', 'rig.yaml'), False),
+    ],
+)
+def test_it_is_started_where_no_port_is_known(
+    overrides: dict[str, object], ros_arguments: tuple[str, ...], wanted: bool
+) -> None:
+    assert simulates(overrides, ros_arguments) is wanted
+
+
+def test_the_first_that_needs_one_takes_it_and_no_one_leaves_it_behind() -> None:
+    with started_early(True):
+        (process,) = simulated_rig._waiting
+        rig = SimulatedRigProcess(load_rig())
+        assert rig.port.startswith('/dev/')
+        assert simulated_rig._waiting == []
+        assert process.poll() is None
+        rig.close()
+        assert process.poll() is not None
+    with started_early(True):
+        (unused,) = simulated_rig._waiting
+    assert unused.poll() is not None
+    with started_early(False):
+        assert simulated_rig._waiting == []
+
+
+def test_it_ends_without_a_word_when_its_daemon_is_gone_before() -> None:
+    command = [sys.executable, '-m', 'psd_deflection', 'simulate', '--serve', '--attached']
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
