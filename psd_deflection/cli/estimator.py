@@ -16,6 +16,7 @@ While it runs:
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.util
 import math
 import sys
@@ -96,8 +97,7 @@ class Display:
     def say(self, text: str) -> None:
         """A message of its own line, above the live one."""
         with self._lock:
-            self._clear()
-            print(text, file=sys.stderr, flush=True)
+            self._put(text + '\n', shown=False)
 
     def update(self, session: Session) -> None:
         """Show where things stand, when it is time to."""
@@ -110,14 +110,14 @@ class Display:
         self._last, self._samples = now, samples
         text = live_line(session, rate)
         with self._lock:
-            self._clear()
-            print(text, end='' if self._live else '\n', file=sys.stderr, flush=True)
-            self._shown = self._live
+            self._put(text + ('' if self._live else '\n'), shown=self._live)
 
-    def _clear(self) -> None:
-        if self._shown:
-            print('\r\x1b[K', end='', file=sys.stderr)
-            self._shown = False
+    def _put(self, text: str, shown: bool) -> None:
+        clear = '\r\x1b[K' if self._shown else ''
+        self._shown = shown
+        # The terminal may be gone, and whoever speaks here reads or records: that goes on unheard.
+        with contextlib.suppress(OSError, ValueError):
+            print(clear + text, end='', file=sys.stderr, flush=True)
 
 
 def live_line(session: Session, rate: float) -> str:
@@ -160,7 +160,7 @@ def run(args: argparse.Namespace) -> int:
 
     with started_early(simulates(overrides, args.ros_arguments)):
         status = _run(args, overrides, display, watch)
-    for folder in recorded:
+    for folder in (f for f in recorded if f.is_dir()):
         display.say(f'recorded {folder}\n  replay it:  {program()} replay {folder} --compare')
     return status
 

@@ -69,7 +69,7 @@ def _json_values(values: Mapping[str, object]) -> dict[str, str]:
 class _IndexSpool:
     """The chunk indexes of a recording until its end, in a file without a name beside it.
 
-    The writer keeps them in a list: a kilobyte a chunk, a third of a gigabyte a day.
+    The writer keeps them in a list: a kilobyte a chunk, 180 MB a day.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -190,7 +190,11 @@ class Acquisition:
             self._say(prefer_reader())
         # Locking the memory takes its time: only what comes after it is as old as it looks.
         if self._connected:
-            self.source.start()
+            try:
+                self.source.start()
+            except DeviceError as error:
+                # Pulled out since it was heard out.
+                self._disconnected(error)
         self._ready.set()
         silent_since = time.monotonic()
         try:
@@ -243,7 +247,7 @@ class Acquisition:
         self._unanswered += 1
         self._sent = {cookie: sent}
 
-    def _disconnected(self, error: PortClosedError) -> None:
+    def _disconnected(self, error: DeviceError) -> None:
         if self._stop.is_set():
             # Given up by us.
             return

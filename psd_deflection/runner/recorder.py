@@ -8,6 +8,7 @@ chunk ends after half a second of log time, or of nothing to write.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import shutil
 import threading
@@ -26,7 +27,7 @@ ten, so that a disk may stand still ten times as long as the pipeline may: 50 s 
 JOIN_S = 1.0
 IDLE_S = 0.5
 LOOK_EVERY = 250
-"""Messages between two looks at the room on the disk: half a second's worth."""
+"""Messages between two looks at the file and the room on its disk: half a second's worth."""
 
 ELSEWHERE = 'make room, or record elsewhere (--record FOLDER, bag_dir)'
 
@@ -47,6 +48,10 @@ def new_folder(parent: Path, now: float | None = None) -> Path:
 
 class _FullError(Exception):
     """The disk has less room than the reserve."""
+
+
+class _GoneError(Exception):
+    """Somebody deleted or moved the file: what is written into it from now on, nobody finds."""
 
 
 class Recorder:
@@ -146,6 +151,10 @@ class Recorder:
                 self._ended(bag, f'{bag.folder}: {error}; it is complete up to here')
             else:
                 bag.close()
+        except _GoneError as error:
+            with contextlib.suppress(RecordingError):
+                bag.close()
+            self._ended(bag, str(error))
         except RecordingError as error:
             self._ended(bag, f'{error}; `psd-deflection recover {bag.folder}` makes it whole')
 
@@ -177,6 +186,8 @@ class Recorder:
             since_look += 1
             if since_look >= LOOK_EVERY:
                 since_look = 0
+                if not bag.path.exists():
+                    raise _GoneError(f'{bag.path}: was deleted or moved while it was recorded; start another recording')
                 self._make_room(bag, config)
 
     def _make_room(self, bag: BagWriter, config: AcquisitionConfig) -> None:

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: a wish to end, not an interruption, but for the waiting for a device.
+"""SIGINT, SIGTERM, SIGHUP: a wish to end, not an interruption, but for the waiting for a device.
 
 A signal that raised wherever it comes would tear the last blocks off a recording. So it is noted,
 and whoever runs looks; only while a device is waited for does it end the waiting at once.
@@ -19,15 +19,19 @@ class StopRequestedError(BaseException):
 
 
 class Signals:
-    """SIGINT and SIGTERM from now on: ``stop`` is set at once; inside :meth:`interruptible` they end the waiting too.
+    """The signals from now on: ``stop`` is set at once; inside :meth:`interruptible` they end the waiting too.
 
-    For the main thread alone.
+    SIGHUP, a terminal that is closed or an ssh that breaks off, is one of them unless it was to be
+    passed over (``nohup``): the recording gets its end. For the main thread alone.
     """
 
     def __init__(self) -> None:
         self.stop = False
         self._raise = False
-        self._previous = {s: signal.signal(s, self._received) for s in (signal.SIGINT, signal.SIGTERM)}
+        heard = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            heard.append(signal.SIGHUP)
+        self._previous = {s: signal.signal(s, self._received) for s in heard}
 
     def _received(self, number: int, frame: types.FrameType | None) -> None:
         self.stop = True

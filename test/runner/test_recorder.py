@@ -93,6 +93,26 @@ def test_a_disk_that_is_nearly_full_ends_the_recording_whole(tmp_path: Path, dis
     run.recorder.stop()
 
 
+@pytest.mark.parametrize('how', ['deleted', 'moved'])
+def test_a_recording_that_is_taken_away_ends_with_one_line(tmp_path: Path, how: str) -> None:
+    run = Run(rig_for(tmp_path))
+    run.put(1)
+    if how == 'deleted':
+        shutil.rmtree(run.folder)
+    else:
+        run.folder.rename(tmp_path / 'elsewhere')
+    run.put(module.LOOK_EVERY)
+    said = run.heard()
+    assert '_0.mcap: was deleted or moved while it was recorded; start another recording' in said
+    assert run.recorder.failure in said
+    assert run.recorder.folder is None
+    if how == 'moved':
+        assert [b.index for b in open_recording(tmp_path / 'elsewhere').blocks()][:1] == [0]
+    # The next one starts in a folder of its own.
+    assert run.recorder.start(rig_for(tmp_path), None).is_dir()
+    run.recorder.stop()
+
+
 def test_a_folder_that_cannot_be_made_says_the_way_out(tmp_path: Path) -> None:
     (tmp_path / 'bags').write_text('a file')
     with pytest.raises(RecordingError, match=r'cannot be made \(Not a directory\); .*record elsewhere'):

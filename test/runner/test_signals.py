@@ -1,7 +1,9 @@
-"""SIGINT and SIGTERM without ROS: they end the waiting for a device at once, and nothing else at once."""
+"""SIGINT, SIGTERM and SIGHUP without ROS: they end the waiting for a device at once, and nothing else at once."""
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import signal
 import threading
@@ -15,7 +17,7 @@ from psd_deflection.runner.session import Session
 from psd_deflection.runner.signals import Signals, StopRequestedError
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_waiting_for_a_silent_device(
     device: Any, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
@@ -71,3 +73,30 @@ def test_what_runs_is_not_torn() -> None:
             signals.interruptible(lambda: None)
     finally:
         signals.restore()
+
+
+def test_a_hang_up_that_is_to_be_passed_over_is() -> None:
+    """``nohup``."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        signals = Signals()
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert not signals.stop
+        signals.restore()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_terminal_that_is_gone_holds_up_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Gone(io.StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(errno.EIO, 'Input/output error')
+
+    display = Display()
+    monkeypatch.setattr('sys.stderr', Gone())
+    display.say('unheard')
+    heard = io.StringIO()
+    monkeypatch.setattr('sys.stderr', heard)
+    display.say('heard')
+    assert heard.getvalue() == 'heard\n'

@@ -168,6 +168,19 @@ def test_a_source_names_its_own_reasons_for_what_is_no_sample() -> None:
     assert acquisition.counters.bad_frames == {'five fields': 2}
 
 
+def test_a_device_that_goes_away_before_it_starts_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    acquisition = acquisition_of([[Sample(0, i, i * 1000, VOLTS) for i in range(20)]])
+    starts = [DeviceError('scripted: did not confirm')]
+
+    def start(self: Scripted) -> None:
+        if starts:
+            raise starts.pop()
+
+    monkeypatch.setattr(Scripted, 'start', start)
+    assert [int(s) for c in chunks(run(acquisition)) for s in c.raw.seq] == list(range(20))
+    assert acquisition.counters.disconnects == 1
+
+
 @pytest.mark.parametrize('gives_up', [True, False])
 def test_a_run_that_ends_waits_for_no_source(monkeypatch: pytest.MonkeyPatch, gives_up: bool) -> None:
     """One that waits for its device is told to give up; one that hangs is left behind."""

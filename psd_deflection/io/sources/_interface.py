@@ -93,7 +93,7 @@ class Source(abc.ABC):
 
     @abc.abstractmethod
     def start(self) -> None:
-        """Let samples flow from now on; what came before is forgotten."""
+        """Let samples flow from now on; what came before is forgotten. Raises DeviceError where it is gone."""
 
     @abc.abstractmethod
     def read(self, timeout: float) -> Reading:
