@@ -106,3 +106,9 @@ def on_page_markdown(markdown: str, **kwargs: Any) -> str:
         if mark in markdown:
             markdown = markdown.replace(mark, fill())
     return markdown
+
+
+def on_page_content(html: str, **kwargs: Any) -> str:
+    """mkdocs calls it for each page: docstrings name other things as Sphinx wants them, which is not drawn here."""
+    html = re.sub(r':(?:class|meth|func|mod|data|attr):(?=<code>)', '', html)
+    return re.sub(r'<code>~[\w.]*\.(\w+)</code>', r'<code>\1</code>', html)

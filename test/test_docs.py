@@ -203,6 +203,11 @@ def test_every_command_and_parameter_is_on_its_page(hooks: Any) -> None:
     assert '| `monitor_control` | `False` |' in page
 
 
+def test_what_docstrings_say_for_sphinx_is_not_shown(hooks: Any) -> None:
+    html = '<p>Raises :class:<code>~psd_deflection.errors.ConfigError</code>; see :meth:<code>Pipeline.zero</code>.</p>'
+    assert hooks.on_page_content(html) == '<p>Raises <code>ConfigError</code>; see <code>Pipeline.zero</code>.</p>'
+
+
 @pytest.mark.parametrize('shell', ['bash', 'zsh'])
 def test_completion_knows_commands_and_options(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['completion', shell]) == 0

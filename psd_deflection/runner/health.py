@@ -95,7 +95,7 @@ class HealthReporter:
         clock, wire = acquisition.clock_state(), acquisition.counters
         stepped = acquisition.system_clock_step_ns()
         values = [
-            ('skew (ppm)', f'{clock.skew_ppm:.2f}'),
+            ('skew (ppm)', f'{clock.skew_ppm:z.2f}'),
             ('offset (ns)', str(clock.offset_ns)),
             ('residual (us)', f'{clock.residual_ns / 1e3:.1f}'),
             ('seconds in the fit', str(clock.points)),
@@ -107,7 +107,7 @@ class HealthReporter:
         ]
         if clock.round_trip_ns is not None:
             values.append(('least round trip (us)', f'{clock.round_trip_ns / 1e3:.0f}'))
-        level, message = OK, f'skew {clock.skew_ppm:.1f} ppm'
+        level, message = OK, f'skew {clock.skew_ppm:z.1f} ppm'
         if abs(stepped) > CLOCK_STEP_NS:
             level = WARN
             message = f'the system clock was set by {stepped / 1e9:+.3f} s; stamps go on as before until the next start'
