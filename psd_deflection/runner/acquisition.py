@@ -24,7 +24,6 @@ from psd_deflection.errors import DeviceError
 from psd_deflection.io.sources._interface import (
     Clock,
     Event,
-    PortClosedError,
     Sample,
     Source,
     SourceEndedError,
@@ -120,6 +119,7 @@ class Acquisition:
         self._unanswered = 0
         self._volts_per_count: float | None = rig.converter.volts_per_count
         self._connected = False
+        self.failed: BaseException | None = None
         self.beat = time.monotonic()
         self._stop = threading.Event()
         self._ready = threading.Event()
@@ -218,11 +218,14 @@ class Acquisition:
                         self._silent(size)
                     if now / 1e9 >= self._next_ping:
                         self._ping(now)
-                except PortClosedError as error:
+                except DeviceError as error:
                     self._disconnected(error)
                 except SourceEndedError as end:
                     self._say(f'{self._name}: {end}')
                     break
+        except BaseException as error:
+            self.failed = error
+            raise
         finally:
             self._hand_over(time.monotonic_ns())
             self.queue.put(Ended())

@@ -157,6 +157,11 @@ class Recorder:
             self._ended(bag, str(error))
         except RecordingError as error:
             self._ended(bag, f'{error}; `psd-deflection recover {bag.folder}` makes it whole')
+        except Exception as error:
+            # Whatever it was: a recorder that is dead and says nothing would be worse.
+            with contextlib.suppress(Exception):
+                bag.close()
+            self._ended(bag, f'{bag.folder}: {type(error).__name__}: {error}')
 
     def _ended(self, bag: BagWriter, why: str) -> None:
         if self._bag is bag:

@@ -99,8 +99,8 @@ class Session:
 
     @property
     def failed(self) -> BaseException | None:
-        """What ended the pipeline thread, if something did."""
-        return self.processing.failed
+        """What ended the pipeline or the reader thread, if something did."""
+        return self.processing.failed or self.acquisition.failed
 
     def responsive(self) -> bool:
         """Whether reader and pipeline came round lately; a device that is away does not hold them up."""

@@ -210,7 +210,7 @@ def test_it_ends_within_two_seconds_and_leaves_a_whole_recording(
     assert daemon.wait(30.0) == 0
     assert time.monotonic() - began < 2.0
     (folder,) = tmp_path.glob('psd_*')
-    assert f'psd-deflection replay {folder} --compare' in daemon.lines[-1]
+    assert f' replay {folder} --compare' in daemon.lines[-1]
     with Reader(folder) as bag:
         assert bag.message_count > 100
     assert not any('Traceback' in line for line in daemon.lines)

@@ -18,6 +18,7 @@ from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.io import cdr
 from psd_deflection.io.recordings import open_recording
+from psd_deflection.io.recover import recover
 from psd_deflection.records import ParameterChange, SampleBlock
 from psd_deflection.runner import recorder as module
 from psd_deflection.runner.recorder import Recorder
@@ -111,6 +112,21 @@ def test_a_recording_that_is_taken_away_ends_with_one_line(tmp_path: Path, how: 
     # The next one starts in a folder of its own.
     assert run.recorder.start(rig_for(tmp_path), None).is_dir()
     run.recorder.stop()
+
+
+def test_no_error_ends_a_recording_in_silence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise KeyError('no such type')
+
+    run = Run(rig_for(tmp_path))
+    run.put(3)
+    monkeypatch.setattr('psd_deflection.io.bag_writer.BagWriter.write_encoded', fails)
+    run.put(1)
+    assert "KeyError: 'no such type'" in run.heard()
+    assert run.recorder.folder is None
+    assert run.recorder.failure
+    # It is closed, so that whoever repairs it is not told that it is still being made.
+    recover(run.folder)
 
 
 def test_a_folder_that_cannot_be_made_says_the_way_out(tmp_path: Path) -> None:

@@ -162,6 +162,20 @@ def test_a_device_without_numbers_that_comes_back_starts_a_new_block() -> None:
     assert source.calls == ['open', 'start', 'close', 'open', 'start', 'close']
 
 
+def test_a_source_whose_device_fails_is_waited_for_as_one_that_is_gone() -> None:
+    acquisition = acquisition_of([DeviceError('scripted: says nothing we know'), [Sample(0, 0, 0, VOLTS)]])
+    assert len(chunks(run(acquisition))) == 1
+    assert acquisition.counters.disconnects == 1
+    assert acquisition.failed is None
+
+
+@pytest.mark.filterwarnings('ignore::pytest.PytestUnhandledThreadExceptionWarning')
+def test_a_source_that_breaks_ends_the_run_as_an_error() -> None:
+    acquisition = acquisition_of([[Sample(0, 0, 0, VOLTS)], ZeroDivisionError('in a plug-in')])
+    assert len(chunks(run(acquisition))) == 1
+    assert isinstance(acquisition.failed, ZeroDivisionError)
+
+
 def test_a_source_names_its_own_reasons_for_what_is_no_sample() -> None:
     acquisition = acquisition_of([[BadFrame('five fields', 9), BadFrame('five fields', 9)]])
     run(acquisition)
