@@ -64,10 +64,14 @@ def subscriber() -> None:
 
     listen('/link_tip/deflection')
     listen('/bare')
-    print('ready', flush=True)
     stop = until_stdin_closes()
+    ready = False
     while not stop.is_set():
         rclpy.spin_once(node, timeout_sec=0.1)
+        # Until then the two have not found each other: nothing can be measured.
+        if not ready and len({topic for topic, *_ in rows}) == 2:
+            ready = True
+            print('ready', flush=True)
     json.dump(rows, sys.stdout)
 
 
