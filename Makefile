@@ -6,7 +6,7 @@
 # make faults   a campaign of faults against the real node, each FAULT_TIMES=20 times (about 20 minutes)
 # make crash    kill -9 at 200 random instants while recording (about 8 minutes)
 # make fuzz     coverage-guided fuzzing of all that reads strangers' bytes, FUZZ_SECONDS=600 each; 10^7 damaged frames
-# make soak     SOAK_MINUTES=30 in real time, SOAK_HOURS=24 of simulated time
+# make soak     SOAK_MINUTES=30 in real time, then SOAK_HOURS=24 of simulated time (a quarter of an hour on an idle core)
 # make firmware build the example firmware, run it in qemu, join it to the daemon (installs what it needs with apt-get)
 # make golden   make the recordings in bags/ anew
 # make colcon   build with colcon in a virtual environment of its own and look at what it installed
