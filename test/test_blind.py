@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from blind import generator, run, score
+from blind.arm import Arm
 from blind.cases import Case, all_cases, designs, gap_of, scaled, short_cases
 from psd_deflection.config import load_rig
 from psd_deflection.discovery.adapter import Model, PlantEffect, discover_in
@@ -129,3 +130,21 @@ def test_the_adapter_names_what_another_plant_lacks() -> None:
 
 def test_the_adapter_adds_nothing_to_a_plant_that_lacks_nothing() -> None:
     assert discover_in(Spring(0.0)).steps == ()
+
+
+def test_what_was_found_missing_closes_the_gap_on_measured_data() -> None:
+    # The search itself takes minutes (python -m blind.arm); what it ended with is in docs/discover.md.
+    arm = Arm()
+    every = range(len(arm.cases))
+
+    def rms(model: Model) -> FloatArray:
+        apart = [m - s for m, s in zip(arm.measured(), arm.simulate(model, every), strict=True)]
+        return np.asarray(np.sqrt(np.mean(np.concatenate(apart, axis=1) ** 2, axis=1)))
+
+    nominal = rms({})
+    damped = rms({'tip_damping': {'damping': 9.196}})
+    both = rms({'tip_damping': {'damping': 9.196}, 'coulomb_friction': {'torque': 1.472}})
+    np.testing.assert_allclose(nominal, [0.350, 0.01263], rtol=0.01)
+    assert damped[1] < 0.45 * nominal[1]
+    assert both[0] < 0.5 * nominal[0]
+    assert both[1] < 0.4 * nominal[1]
