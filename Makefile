@@ -114,9 +114,9 @@ SHOT_SECONDS ?= 40
 shots: $(VENV)/.installed
 	$(BIN)/python docs/shots.py --seconds $(SHOT_SECONDS)
 
-# Each command of README and docs that the tests do not run themselves; ONLY='monitor' for those with that word.
+# Each command of README and docs that the tests do not run themselves; ONLY='monitor' for those with that word, or on a page with it.
 doc-commands: $(VENV)/.installed
-	$(BIN)/python docs/run_commands.py $(ONLY)
+	$(BIN)/python -m docs.run_commands $(ONLY)
 
 # In an environment of its own, without ROS: the wheel made from the sdist, as `pip install dist/*.whl` has it.
 wheel: $(VENV)/.installed

@@ -14,9 +14,7 @@ import fcntl
 import importlib
 import json
 import os
-import pty
 import re
-import select
 import shlex
 import shutil
 import signal
@@ -29,23 +27,22 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from docs import machine
+from docs.terminal import WAIT_S, Terminal
+
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 FENCE = re.compile(r'^```(?P<kind>\w*)\n(?P<text>.*?)^```', re.M | re.S)
 INLINE = re.compile(r'`((?:make|psd-deflection|python) [^`\n]+)`')
 INDENTED = re.compile(r'^ {4}(?:psd-deflection|make|python|ros2|pip) .+\n(?: {4,}.+\n)*', re.M)
 PROGRAMS = ('psd-deflection', 'make', 'ros2', 'pip', 'python', 'python3')
-WAIT_S = 400.0
 CUT = 'recordings/cut'
 """A recording that a crash left without its end."""
 
 NOT_RUN = (
-    (r'^ssh ', 'needs another machine'),
     (r'^rviz2 |^ros2 run plotjuggler ', 'a program of ROS from apt; test_layouts.py checks what it would open'),
     (r'^rerun ', 'a viewer of 170 MB that is no dependency; tried by hand'),
     (r'^ros2 security |ROS_SECURITY_|--enclave ', 'needs ros2cli, and a Fast DDS built with security'),
-    (r'/opt/psd_deflection|^useradd |^install -|^udevadm |^systemctl |^journalctl ', 'changes the system, as root'),
-    (r'^python -m blind\.(arm|run)\b', 'minutes to half an hour; test_blind.py runs the short of it'),
 )
 """What is not run: pattern, reason."""
 
@@ -79,6 +76,9 @@ SHORTEST = {
 }
 """Variables with which a ``make`` target is over in seconds."""
 
+SHORTER = {r'^python -m blind\.run\b': '--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation'}
+"""Arguments that, put behind those of a command, have it over in seconds."""
+
 VERDICTS = {
     'faults': r'between the faults +\d',
     'crash': r'\d+ kills: ',
@@ -93,6 +93,9 @@ TOOLS = {
     r'^curl ': ('curl',),
 }
 """Programs without which a command is passed over, and said to be."""
+
+ON_A_MACHINE = re.compile(r'/opt/psd_deflection|^(useradd|install|udevadm|systemctl|journalctl|ssh) ')
+"""What is typed on a machine made for it (docs/machine.py): as root, or from one machine to another."""
 
 QUICK = re.compile(
     r'^psd-deflection (info|replay|convert|plot|budget|design|params|completion|compare-methods)\b'
@@ -186,66 +189,19 @@ def blocks_to_run() -> list[list[Command]]:
     return out
 
 
+def what_is_missing(line: str) -> str:
+    """What ``line`` needs, and this machine has not."""
+    if ON_A_MACHINE.search(line):
+        return machine.missing()
+    return ', '.join(t for p, tools in TOOLS.items() if re.search(p, line) for t in tools if not shutil.which(t))
+
+
 def stale() -> list[str]:
     """Entries of the tables that no command of the documents needs any more."""
     lines = [c.line for c in commands()]
-    patterns = [p for p, *_ in (*NOT_RUN, *CI_RUNS)] + [f'^make {name}\\b' for name in SHORTEST] + list(TOOLS)
+    patterns = [p for p, *_ in (*NOT_RUN, *CI_RUNS)] + [f'^make {name}\\b' for name in SHORTEST]
+    patterns += [*TOOLS, *SHORTER, ON_A_MACHINE.pattern]
     return [p for p in patterns if not any(re.search(p, line) for line in lines)]
-
-
-class Terminal:
-    """A program with a terminal before it, as a person has one."""
-
-    def __init__(self, line: str, folder: Path) -> None:
-        self._fd, theirs = pty.openpty()
-        self.process = subprocess.Popen(
-            ['bash', '-c', f'exec {line}'],
-            cwd=folder,
-            stdin=subprocess.DEVNULL,
-            stdout=theirs,
-            stderr=theirs,
-            start_new_session=True,
-        )
-        os.close(theirs)
-        self.text = ''
-
-    def until(self, pattern: str) -> re.Match[str]:
-        """The first match in what it says."""
-        end = time.monotonic() + WAIT_S
-        while (match := re.search(pattern, self.text)) is None:
-            if not self._read(end):
-                raise RuntimeError(f'{pattern!r} was not said')
-        return match
-
-    def _read(self, end: float) -> bool:
-        ready, _, _ = select.select((self._fd,), (), (), max(0.0, end - time.monotonic()))
-        try:
-            new = os.read(self._fd, 65536) if ready else b''
-        except OSError:
-            new = b''
-        self.text += new.decode(errors='replace')
-        return bool(new)
-
-    def end(self) -> int:
-        """Ctrl-C, all it says, and its exit status."""
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self.process.pid, signal.SIGINT)
-        return self.finish()
-
-    def finish(self) -> int:
-        """Wait until it is over."""
-        end = time.monotonic() + WAIT_S
-        while self._read(end):
-            pass
-        try:
-            status = self.process.wait(max(1.0, end - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            os.killpg(self.process.pid, signal.SIGKILL)
-            raise RuntimeError('did not end') from None
-        finally:
-            with contextlib.suppress(OSError):
-                os.close(self._fd)
-        return status
 
 
 class Reader:
@@ -255,6 +211,7 @@ class Reader:
         self._folder = folder
         self._device: Terminal | None = None
         self._background: list[Terminal] = []
+        self._machine: machine.Machine | None = None
         self._served = ''
 
     def block(self, lines: list[str], ran: Callable[[str, float, str], None]) -> None:
@@ -279,11 +236,13 @@ class Reader:
         if 'ttyACM0' in line and self._device is None:
             self._device = Terminal('psd-deflection simulate --serve --link ttyACM0', self._folder)
             self._device.until('port: ')
-        if line.startswith('ros2 launch '):
+        if ON_A_MACHINE.search(line):
+            self._on_a_machine(line)
+        elif line.startswith('ros2 launch '):
             check_launch(line)
         elif line.startswith(('ros2 topic ', 'ros2 service ')):
             self._node()
-            self._to_the_end(f'python {shlex.quote(str(Path(__file__)))} --ask {shlex.quote(line)}')
+            self._to_the_end(f'python -m docs.run_commands --ask {shlex.quote(line)}')
         elif line.startswith('curl '):
             self._press(line)
         elif LIVE.search(line):
@@ -292,7 +251,23 @@ class Reader:
             target = line.split()[1]
             self._to_the_end(f'{line} {SHORTEST.get(target, "")}', VERDICTS.get(target, ''))
         else:
-            self._to_the_end(line)
+            more = next((arguments for pattern, arguments in SHORTER.items() if re.search(pattern, line)), '')
+            self._to_the_end(f'{line} {more}', VERDICTS['blind'] if more else '')
+
+    def _on_a_machine(self, line: str) -> None:
+        if self._machine is None:
+            self._machine = machine.Machine(self._folder, Path(os.environ['VIRTUAL_ENV']))
+        if line.startswith('ssh '):
+            self._machine.tunnel(line)
+        elif line.startswith('journalctl -f'):
+            journal = Terminal(self._machine.typed(line), self._folder)
+            try:
+                journal.until(r'θ +[-+]\d+\.\d\d ± \d')
+            finally:
+                journal.end()
+            machine.check_service(self._machine)
+        else:
+            self._machine.run(line)
 
     def _to_the_end(self, line: str, verdict: str = '') -> None:
         program = Terminal(line, self._folder)
@@ -344,9 +319,11 @@ class Reader:
             raise RuntimeError(done.stdout)
 
     def close(self) -> None:
-        """Pull the plug."""
+        """Pull the plugs."""
         if self._device is not None:
             self._device.end()
+        if self._machine is not None:
+            self._machine.close()
 
 
 def check_launch(line: str) -> None:
@@ -437,7 +414,7 @@ def copy_checkout(target: Path) -> None:
 
 
 def main() -> int:
-    """Run them all, or those that hold the words given; the exit status is 1 where one failed."""
+    """Run them all, or those that hold the words given, as ``PAGE: LINE``; the exit status is 1 where one failed."""
     if sys.argv[1:2] == ['--ask']:
         ask(sys.argv[2])
         return 0
@@ -469,14 +446,11 @@ def main() -> int:
 
         try:
             for block in blocks_to_run():
-                lines = [c.line for c in block if only in c.line]
+                lines = [c.line for c in block if only in f'{c.page}: {c.line}']
                 for line in [*lines]:
-                    missing = [
-                        t for p, tools in TOOLS.items() if re.search(p, line) for t in tools if not shutil.which(t)
-                    ]
-                    if missing:
+                    if missing := what_is_missing(line):
                         lines.remove(line)
-                        print(f'passed over, for want of {", ".join(missing)}: {line}')
+                        print(f'passed over, for want of {missing}: {line}')
                 reader.block(lines, ran)
         finally:
             reader.close()

@@ -1,0 +1,182 @@
+"""A machine on which the documents' lines for root can be typed: a copy of this one, thrown away afterwards.
+
+This machine's root lies under an overlay in memory, and ``systemd-nspawn`` boots it with a systemd, a udev and a
+journal of its own; the network is this machine's, so that pip finds what it found outside. What is installed,
+enabled or added there is gone when the last process is. It needs root, and writes below /sys as udev does: only where
+the environment has ``MACHINE=1``, which ``.ci/run`` sets on machines that are CI's own.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+from docs.terminal import WAIT_S, Terminal
+
+NEEDED = ('systemd-nspawn', 'unshare', 'nsenter', 'udevadm', 'ip', 'ssh', 'sshd')
+KEPT = re.compile(r'^PIP_|_proxy$|CERT|CA_BUNDLE', re.I)
+"""Environment variables that lead to the package index."""
+
+BOOT = """set -e
+mount -t tmpfs tmpfs {here}
+mkdir {here}/new {here}/work {here}/root
+mount -t overlay overlay -o lowerdir=/,upperdir={here}/new,workdir={here}/work {here}/root
+rm -f {here}/root/etc/machine-id {here}/root/etc/resolv.conf
+cp /etc/resolv.conf {here}/root/etc/resolv.conf
+exec systemd-nspawn --quiet --register=no {unit} --console=pipe --link-journal=no --resolv-conf=off \
+--capability=CAP_SYS_RESOURCE,CAP_SYS_NICE --bind={checkout}:/root/checkout --bind-ro={environment} \
+--directory={here}/root --machine=psd-deflection-docs --boot systemd.unit=basic.target systemd.firstboot=off
+"""
+
+SSH_CONFIG = """Host rig
+ProxyCommand nsenter --net=/run/netns/rig /usr/sbin/sshd -i
+StrictHostKeyChecking accept-new
+LogLevel ERROR
+"""
+
+
+def missing() -> str:
+    """What keeps such a machine from being made here; '' where nothing does."""
+    if os.environ.get('MACHINE') != '1' or os.getuid() != 0:
+        return 'root and MACHINE=1'
+    return ', '.join(name for name in NEEDED if shutil.which(name) is None)
+
+
+class Machine:
+    """It runs from here to :meth:`close`; ``checkout`` is its folder ``/root/checkout``."""
+
+    def __init__(self, checkout: Path, environment: Path) -> None:
+        self._folder = Path(tempfile.mkdtemp(prefix='psd_deflection_machine_'))
+        boot = BOOT.format(
+            here=self._folder,
+            checkout=checkout,
+            environment=environment,
+            unit='' if Path('/run/systemd/system').exists() else '--keep-unit',
+        )
+        self._log = (self._folder.parent / f'{self._folder.name}.log').open('w+b')
+        self._nspawn = subprocess.Popen(
+            ['unshare', '--mount', '--propagation', 'private', 'bash', '-c', boot],
+            env={**os.environ, 'SYSTEMD_NSPAWN_API_VFS_WRITABLE': 'yes'},
+            stdin=subprocess.DEVNULL,
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        kept = [f'{name}={value}' for name, value in os.environ.items() if KEPT.search(name)]
+        self._inside = ['env', '-i', 'HOME=/root', 'USER=root', 'TERM=dumb', *kept]
+        self._inside += ['PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin']
+        self._environment = environment
+        self._init = 0
+        try:
+            self._wait_until_up()
+        except RuntimeError:
+            self.close()
+            raise
+
+    def _wait_until_up(self) -> None:
+        end = time.monotonic() + WAIT_S
+        while time.monotonic() < end and self._nspawn.poll() is None:
+            children = Path(f'/proc/{self._nspawn.pid}/task/{self._nspawn.pid}/children').read_text().split()
+            for child in children:
+                if Path(f'/proc/{child}/comm').read_text().strip() == 'systemd':
+                    self._init = int(child)
+                    # "degraded" is up as well: some unit of the machine that was copied did not like it here.
+                    done = subprocess.run(
+                        ['bash', '-c', self.typed('systemctl is-system-running --wait || true')],
+                        capture_output=True,
+                        text=True,
+                        timeout=WAIT_S,
+                    )
+                    if done.stdout.strip() in ('running', 'degraded'):
+                        return
+            time.sleep(0.2)
+        self._log.seek(0)
+        raise RuntimeError(f'the machine did not start\n{self._log.read().decode(errors="replace")}')
+
+    def typed(self, line: str, network: str = '') -> str:
+        """The line of this machine's shell that runs ``line`` there; ``network``: one that :meth:`rig` made."""
+        inside = f'ip netns exec {network} bash -c {shlex.quote(line)}' if network else line
+        words = ['nsenter', f'--target={self._init}', '--mount', '--pid', '--uts', '--ipc', *self._inside]
+        return shlex.join([*words, 'bash', '-c', f'cd /root/checkout && {inside}'])
+
+    def run(self, line: str) -> str:
+        """What ``line`` prints there; RuntimeError where it fails."""
+        program = Terminal(self.typed(line), self._folder.parent)
+        if (status := program.finish()) != 0:
+            raise RuntimeError(f'exit status {status}\n{program.text[-2000:]}')
+        return program.text
+
+    def tunnel(self, line: str) -> None:
+        """``line`` is an ssh tunnel from a second network there, the reader's, to the monitor on one called rig."""
+        self.run('mkdir -p /run/sshd && ip netns add rig && ip netns add reader')
+        self.run('ip -n rig link set lo up && ip -n reader link set lo up')
+        self.run(
+            'mkdir -m 700 -p ~/.ssh && cd ~/.ssh && ssh-keygen -q -t ed25519 -N "" -f id_ed25519 '
+            f'&& cp id_ed25519.pub authorized_keys && printf %s {shlex.quote(SSH_CONFIG)} > config'
+        )
+        monitor = Terminal(self.typed(f'{self._environment}/bin/psd-deflection monitor', 'rig'), self._folder.parent)
+        try:
+            monitor.until(r'monitor: http://127.0.0.1:8790/')
+            ssh = Terminal(self.typed(line, 'reader'), self._folder.parent, stdin=subprocess.PIPE)
+            try:
+                page = self.run(
+                    'ip netns exec reader curl --silent --show-error --retry 30 --retry-connrefused --retry-delay 1 '
+                    'http://127.0.0.1:8790/'
+                )
+            finally:
+                if ssh.process.stdin is not None:
+                    ssh.process.stdin.close()
+                ssh.end()
+        finally:
+            monitor.end()
+        if 'psd_deflection monitor' not in page:
+            raise RuntimeError(f'another page came through the tunnel\n{page[:500]}')
+
+    def close(self) -> None:
+        """Pull the plug."""
+        for process in (self._init, self._nspawn.pid):
+            if process and self._nspawn.poll() is None:
+                os.kill(process, signal.SIGKILL)
+        self._nspawn.wait()
+        Path(self._log.name).unlink()
+        self._log.close()
+        self._folder.rmdir()
+
+
+def check_service(machine: Machine) -> None:
+    """That the unit, once it runs, is what docs/deploy says: started anew when it hangs or dies, whole when ended."""
+
+    def measuring() -> str:
+        """Its process, once that has said an estimate; '' until then."""
+        pid = machine.run('systemctl show --property MainPID --value psd-deflection').strip()
+        return pid if 'θ ' in machine.run(f'journalctl --no-pager --quiet _PID={pid}') else ''
+
+    for blow in ('SIGSTOP', 'SIGKILL'):
+        before = measuring()
+        machine.run(f'systemctl kill --kill-whom=main --signal={blow} psd-deflection')
+        end = time.monotonic() + WAIT_S
+        while measuring() in ('', before):
+            if time.monotonic() > end:
+                raise RuntimeError(f'after {blow} it was not started anew')
+            time.sleep(0.5)
+    if complaint := machine.run('journalctl --no-pager --quiet --unit systemd-udevd --grep psd-deflection || true'):
+        raise RuntimeError(f'udev on the rules\n{complaint}')
+    if 'Watchdog timeout' not in machine.run('journalctl --no-pager --unit psd-deflection'):
+        raise RuntimeError('it was not the watchdog that ended it')
+    machine.run('systemctl stop psd-deflection')
+    # The first two were cut off by the signals.
+    recordings = machine.run('ls -d /var/lib/psd_deflection/recordings/*').split()
+    program = '/opt/psd_deflection/bin/psd-deflection'
+    for recording in recordings[:-1]:
+        machine.run(f'{program} recover {recording}')
+    for recording in recordings:
+        machine.run(f'{program} replay {recording} --compare')
+    if len(recordings) != 3:
+        raise RuntimeError(f'three recordings were wanted, not {recordings}')

@@ -1,0 +1,70 @@
+"""A program with a terminal before it, for what runs the documents' commands."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import re
+import select
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+WAIT_S = 400.0
+
+
+class Terminal:
+    """A program with a terminal before it, as a person has one."""
+
+    def __init__(self, line: str, folder: Path, stdin: int = subprocess.DEVNULL) -> None:
+        self._fd, theirs = pty.openpty()
+        self.process = subprocess.Popen(
+            ['bash', '-c', f'exec {line}'],
+            cwd=folder,
+            stdin=stdin,
+            stdout=theirs,
+            stderr=theirs,
+            start_new_session=True,
+        )
+        os.close(theirs)
+        self.text = ''
+
+    def until(self, pattern: str) -> re.Match[str]:
+        """The first match in what it says."""
+        end = time.monotonic() + WAIT_S
+        while (match := re.search(pattern, self.text)) is None:
+            if not self._read(end):
+                raise RuntimeError(f'{pattern!r} was not said')
+        return match
+
+    def _read(self, end: float) -> bool:
+        ready, _, _ = select.select((self._fd,), (), (), max(0.0, end - time.monotonic()))
+        try:
+            new = os.read(self._fd, 65536) if ready else b''
+        except OSError:
+            new = b''
+        self.text += new.decode(errors='replace')
+        return bool(new)
+
+    def end(self) -> int:
+        """Ctrl-C, all it says, and its exit status."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGINT)
+        return self.finish()
+
+    def finish(self) -> int:
+        """Wait until it is over."""
+        end = time.monotonic() + WAIT_S
+        while self._read(end):
+            pass
+        try:
+            status = self.process.wait(max(1.0, end - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            os.killpg(self.process.pid, signal.SIGKILL)
+            raise RuntimeError('did not end') from None
+        finally:
+            with contextlib.suppress(OSError):
+                os.close(self._fd)
+        return status
