@@ -98,11 +98,6 @@ class Arm:
         late = of('input_delay', 'delay', 0.0) * RATE
         read, zero = 1.0 + of('tip_gain', 'scale', 0.0), of('tip_offset', 'offset', 0.0)
 
-        def slope(x: FloatArray, torque: FloatArray) -> FloatArray:
-            hub = torque - b1 * x[2] - friction * np.tanh(x[2] / CREEP_RATE)
-            spring = ks * x[1] + b2 * x[3]
-            return np.stack((x[2], x[3], (hub + spring) / j1, -(1.0 / j1 + 1.0 / j2) * spring - hub / j1))
-
         x = self._start[list(cases)].T.copy()
         x[1] -= zero
         current = np.clip(self._current[list(cases)], -limit, limit)
@@ -112,13 +107,33 @@ class Arm:
         part = np.clip(at - low, 0.0, 1.0)
         torque = kt * ((1.0 - part) * current[:, low] + part * current[:, np.minimum(low + 1, n - 1)])
         out = np.empty((len(cases), 2, n))
-        h = 1.0 / (RATE * SUBSTEPS)
+        # Rates of change of the two angles and their speeds: rates @ x + push * (torque - friction).
+        both, h = 1.0 / j1 + 1.0 / j2, 1.0 / (RATE * SUBSTEPS)
+        rates = np.array(
+            [
+                [0.0, 0.0, 1.0, 0.0],
+                [0.0, 0.0, 0.0, 1.0],
+                [0.0, ks / j1, -b1 / j1, b2 / j1],
+                [0.0, -both * ks, b1 / j1, -both * b2],
+            ]
+        )
+        push = np.array([0.0, 0.0, 1.0 / j1, -1.0 / j1])
+        step = np.eye(4) + h * rates + 0.5 * h * h * rates @ rates
+        early, late_half = 0.5 * h * h * rates @ push[:, None], h * push[:, None]
+        # Without friction the substeps of a sample are one linear map.
+        whole = np.linalg.matrix_power(step, SUBSTEPS)
+        held = sum(np.linalg.matrix_power(step, k) for k in range(SUBSTEPS)) @ (early + late_half)
         for i in range(n):
             out[:, 0, i] = x[0]
             out[:, 1, i] = x[1] * read + zero
+            if friction == 0.0:
+                x = whole @ x + held * torque[:, i]
+                continue
             for _ in range(SUBSTEPS):
-                middle = x + 0.5 * h * slope(x, torque[:, i])
-                x = x + h * slope(middle, torque[:, i])
+                force = torque[:, i] - friction * np.tanh(x[2] / CREEP_RATE)
+                middle = x[2] + 0.5 * h * (rates[2] @ x + push[2] * force)
+                x = step @ x + early * force
+                x += late_half * (torque[:, i] - friction * np.tanh(middle / CREEP_RATE))
         return [np.clip(rows, -10.0, 10.0) for rows in out]
 
 

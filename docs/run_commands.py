@@ -2,16 +2,16 @@
 
 What ends in a moment is run by test/test_docs.py; what CI runs anyway is looked up in .ci/run. The rest is run
 here, block by block, in a copy of the checkout: a daemon or a page is started on the simulated device, seen to
-work by what it says, and ended by Ctrl-C; a campaign runs in its shortest form; what ``ros2 topic`` and
-``ros2 service`` would do is done with rclpy, since ros2cli has no wheel. What is left is in :data:`NOT_RUN`, each
-with its reason, and is printed; an entry that the documents no longer have is an error.
+work by what it says, and ended by Ctrl-C; a campaign runs in its shortest form; what ``ros2`` would do is done with
+rclpy (docs/ros2.py); what is typed as root, or from one machine to another, is typed on a machine made for it
+(docs/machine.py). What is left is in :data:`NOT_RUN`, each with its reason, and is printed; an entry that the
+documents no longer have is an error.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
-import importlib
 import json
 import os
 import re
@@ -25,22 +25,23 @@ import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from docs import machine
+from docs import machine, ros2
 from docs.terminal import WAIT_S, Terminal
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 FENCE = re.compile(r'^```(?P<kind>\w*)\n(?P<text>.*?)^```', re.M | re.S)
-INLINE = re.compile(r'`((?:make|psd-deflection|python) [^`\n]+)`')
+INLINE = re.compile(r'`((?:make|psd-deflection|python|python3|pip|apt|sudo|colcon|ros2) [^`\n]+)`')
+SPOKEN_OF = re.compile(r'(psd-deflection [a-z-]+|ros2 [a-z]+( [a-z]+)?)$')
+"""Names of commands that take arguments: no reader types them as they stand."""
 INDENTED = re.compile(r'^ {4}(?:psd-deflection|make|python|ros2|pip) .+\n(?: {4,}.+\n)*', re.M)
 PROGRAMS = ('psd-deflection', 'make', 'ros2', 'pip', 'python', 'python3')
 CUT = 'recordings/cut'
 """A recording that a crash left without its end."""
 
 NOT_RUN = (
-    (r'^rviz2 |^ros2 run plotjuggler ', 'a program of ROS from apt; test_layouts.py checks what it would open'),
     (r'^rerun ', 'a viewer of 170 MB that is no dependency; tried by hand'),
     (r'^ros2 security |ROS_SECURITY_|--enclave ', 'needs ros2cli, and a Fast DDS built with security'),
 )
@@ -51,6 +52,12 @@ CI_RUNS = (
     (r'^make (lint|types|contracts|unit)$', 'Makefile', 'test: lint types contracts unit'),
     (r'^make docs$', '.ci/run', 'make docs '),
     (r'^make colcon$', '.ci/run', 'make colcon '),
+    (r'^colcon build$', 'Makefile', 'bin/colcon --log-base log build '),
+    (
+        r"^pip install 'psd_deflection\[(ros|monitor)\]'$",
+        'Makefile',
+        "pip install --quiet --disable-pip-version-check 'psd_deflection[",
+    ),
     (r'^make doc-commands$', '.ci/run', 'make doc-commands '),
     (r'^make wheel$|^pip install dist/\*\.whl', '.ci/run', 'make wheel '),
     (
@@ -94,7 +101,7 @@ TOOLS = {
 }
 """Programs without which a command is passed over, and said to be."""
 
-ON_A_MACHINE = re.compile(r'/opt/psd_deflection|^(useradd|install|udevadm|systemctl|journalctl|ssh) ')
+ON_A_MACHINE = re.compile(r'/opt/psd_deflection|^(apt|install|journalctl|ssh|sudo|systemctl|udevadm|useradd) ')
 """What is typed on a machine made for it (docs/machine.py): as root, or from one machine to another."""
 
 QUICK = re.compile(
@@ -129,8 +136,7 @@ def commands() -> Iterator[Command]:
         for inline in INLINE.finditer(rest):
             number += 1
             line = inline[1].strip()
-            # A command of ours without arguments is a name that is spoken of.
-            if re.fullmatch(r'psd-deflection [a-z-]+', line) is None:
+            if SPOKEN_OF.match(line) is None:
                 yield Command(name, number, line)
 
 
@@ -192,7 +198,7 @@ def blocks_to_run() -> list[list[Command]]:
 def what_is_missing(line: str) -> str:
     """What ``line`` needs, and this machine has not."""
     if ON_A_MACHINE.search(line):
-        return machine.missing()
+        return '' if machine.wanted() else 'root and MACHINE=1'
     return ', '.join(t for p, tools in TOOLS.items() if re.search(p, line) for t in tools if not shutil.which(t))
 
 
@@ -239,10 +245,10 @@ class Reader:
         if ON_A_MACHINE.search(line):
             self._on_a_machine(line)
         elif line.startswith('ros2 launch '):
-            check_launch(line)
-        elif line.startswith(('ros2 topic ', 'ros2 service ')):
+            ros2.check_launch(line)
+        elif line.startswith(('ros2 topic ', 'ros2 service ', 'ros2 lifecycle ')):
             self._node()
-            self._to_the_end(f'python -m docs.run_commands --ask {shlex.quote(line)}')
+            self._to_the_end(f'python -m docs.ros2 {shlex.quote(line)}')
         elif line.startswith('curl '):
             self._press(line)
         elif LIVE.search(line):
@@ -326,62 +332,6 @@ class Reader:
             self._machine.close()
 
 
-def check_launch(line: str) -> None:
-    """That ``ros2 launch`` would find package, file and arguments."""
-    _, _, package, file, *arguments = shlex.split(line)
-    prefix = Path(os.environ['VIRTUAL_ENV'])
-    installed = prefix / 'share' / package / 'launch' / file
-    if not (prefix / 'share/ament_index/resource_index/packages' / package).exists() or not installed.exists():
-        raise RuntimeError(f'{package}/{file} is not installed')
-    declared = set(re.findall(r"DeclareLaunchArgument\(\s*'(\w+)'", installed.read_text(encoding='utf-8')))
-    unknown = {a.partition(':=')[0] for a in arguments} - declared
-    if unknown:
-        raise RuntimeError(f'{file} has no argument {", ".join(unknown)}')
-
-
-def ask(line: str) -> None:
-    """What ``ros2 topic echo --once`` and ``ros2 service call`` do, with rclpy."""
-    import rclpy
-    import yaml
-
-    def type_of(name: str) -> Any:
-        package, kind, message = name.split('/')
-        return getattr(importlib.import_module(f'{package}.{kind}'), message)
-
-    _, what, verb, name, *rest = shlex.split(line)
-    rclpy.init()
-    node = rclpy.create_node('reader_of_the_documents')
-    end = time.monotonic() + WAIT_S
-    answers: list[Any] = []
-    if (what, verb) == ('topic', 'echo'):
-        while not (types := dict(node.get_topic_names_and_types()).get(name)):
-            rclpy.spin_once(node, timeout_sec=0.1)
-            if time.monotonic() > end:
-                raise SystemExit(f'no topic {name}')
-        node.create_subscription(type_of(types[0]), name, answers.append, 10)
-        while not answers and time.monotonic() < end:
-            rclpy.spin_once(node, timeout_sec=0.1)
-    elif (what, verb) == ('service', 'call'):
-        kind = type_of(rest[0])
-        client = node.create_client(kind, name)
-        if not client.wait_for_service(WAIT_S):
-            raise SystemExit(f'no service {name}')
-        request = kind.Request(**(yaml.safe_load(rest[1]) if len(rest) > 1 else {}))
-        # Before the first block there is nothing to be zeroed.
-        while not (answers and answers[-1].success) and time.monotonic() < end:
-            future = client.call_async(request)
-            rclpy.spin_until_future_complete(node, future, timeout_sec=10.0)
-            answers = [future.result()] if future.done() else []
-        answers = [a for a in answers if a.success]
-    else:
-        raise SystemExit(f'not known: {line}')
-    print(answers[-1] if answers else 'no answer')
-    node.destroy_node()
-    rclpy.shutdown()
-    if not answers:
-        raise SystemExit(1)
-
-
 @contextlib.contextmanager
 def a_domain_of_our_own() -> Iterator[str]:
     """A ROS_DOMAIN_ID held by a lock, the one that the tests use."""
@@ -415,9 +365,6 @@ def copy_checkout(target: Path) -> None:
 
 def main() -> int:
     """Run them all, or those that hold the words given, as ``PAGE: LINE``; the exit status is 1 where one failed."""
-    if sys.argv[1:2] == ['--ask']:
-        ask(sys.argv[2])
-        return 0
     # A shell that runs us in the background has it ignored, and so would all that we start.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     only = ' '.join(sys.argv[1:])

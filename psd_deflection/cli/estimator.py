@@ -36,6 +36,7 @@ from psd_deflection.runner.simulated_rig import started_early
 
 REFRESH_S = 0.25
 PLAIN_REFRESH_S = 5.0
+PLAIN_REFRESH_LATER_S = 60.0
 LOOK_S = 0.1
 
 
@@ -85,10 +86,11 @@ def simulates(overrides: Mapping[str, object], ros_arguments: Sequence[str] = ()
 
 
 class Display:
-    """One live line on a terminal; a line every few seconds elsewhere. Its methods may be called by any thread."""
+    """One live line on a terminal; lines elsewhere, soon one a minute. Its methods may be called by any thread."""
 
     def __init__(self) -> None:
         self._live = sys.stderr.isatty()
+        self._wait = REFRESH_S if self._live else PLAIN_REFRESH_S
         self._lock = threading.Lock()
         self._last = 0.0
         self._shown = False
@@ -103,8 +105,11 @@ class Display:
         """Show where things stand, when it is time to."""
         now = time.monotonic()
         passed = now - self._last
-        if passed < (REFRESH_S if self._live else PLAIN_REFRESH_S):
+        if passed < self._wait:
             return
+        if self._last and not self._live:
+            # A journal is read for what changed; each change says so itself.
+            self._wait = min(2.0 * self._wait, PLAIN_REFRESH_LATER_S)
         samples = session.acquisition.counters.samples
         rate = (samples - self._samples) / passed if self._last else math.nan
         self._last, self._samples = now, samples

@@ -7,7 +7,8 @@ import io
 import os
 import signal
 import threading
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -98,3 +99,16 @@ def test_a_terminal_that_is_gone_holds_up_nobody(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr('sys.stderr', heard)
     display.say('heard')
     assert heard.getvalue() == 'heard\n'
+
+
+def test_a_journal_gets_a_line_a_minute_in_the_long_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    heard, now = io.StringIO(), [100.0]
+    monkeypatch.setattr('sys.stderr', heard)
+    monkeypatch.setattr('psd_deflection.cli.estimator.time', SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr('psd_deflection.cli.estimator.live_line', lambda session, rate: f'{now[0] - 100.0:.0f} s')
+    display = Display()
+    session = cast(Session, SimpleNamespace(acquisition=SimpleNamespace(counters=SimpleNamespace(samples=0))))
+    while now[0] < 400.0:
+        display.update(session)
+        now[0] += 0.5
+    assert heard.getvalue().splitlines() == [f'{s} s' for s in (0, 5, 15, 35, 75, 135, 195, 255)]
