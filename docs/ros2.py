@@ -7,27 +7,87 @@ from __future__ import annotations
 
 import importlib
 import os
-import re
+import runpy
 import shlex
 import sys
 import time
 from pathlib import Path
+from types import ModuleType
 from typing import Any
+from unittest import mock
+
+import yaml
 
 from docs.terminal import WAIT_S
 
 
-def check_launch(line: str) -> None:
-    """That ``ros2 launch`` would find package, file and arguments."""
+class Said:
+    """Whatever a launch file makes: what it is called, and with what."""
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        self.given = given
+        self.named = named
+
+
+KINDS = {
+    'launch': ('LaunchDescription',),
+    'launch.actions': ('DeclareLaunchArgument',),
+    'launch.substitutions': ('LaunchConfiguration',),
+    'launch_ros.actions': ('Node',),
+    'launch_ros.parameter_descriptions': ('ParameterValue',),
+    'launch_ros.substitutions': ('FindPackageShare',),
+}
+"""What our launch file uses of launch and launch_ros."""
+
+
+def launched(line: str, scratch: Path) -> str:
+    """The line that starts the node which ``ros2 launch`` would start; RuntimeError where that would not work.
+
+    The launch file is run with stand-ins for what it imports; its parameters go to a file in ``scratch``, as
+    launch_ros hands them over.
+    """
     _, _, package, file, *arguments = shlex.split(line)
     prefix = Path(os.environ['VIRTUAL_ENV'])
-    installed = prefix / 'share' / package / 'launch' / file
-    if not (prefix / 'share/ament_index/resource_index/packages' / package).exists() or not installed.exists():
-        raise RuntimeError(f'{package}/{file} is not installed')
-    declared = set(re.findall(r"DeclareLaunchArgument\(\s*'(\w+)'", installed.read_text(encoding='utf-8')))
-    unknown = {a.partition(':=')[0] for a in arguments} - declared
-    if unknown:
+    if not (prefix / 'share/ament_index/resource_index/packages' / package).exists():
+        raise RuntimeError(f'no package {package}')
+    given = dict(argument.split(':=', 1) for argument in arguments)
+
+    def text(value: Any) -> str:
+        if isinstance(value, (list, tuple)):
+            return ''.join(map(text, value))
+        match type(value).__name__:
+            case 'FindPackageShare':
+                return str(prefix / 'share' / value.given[0])
+            case 'LaunchConfiguration':
+                return given[value.given[0]] if value.given[0] in given else text(defaults[value.given[0]])
+            case _:
+                return str(value)
+
+    modules = {name: ModuleType(name) for name in KINDS}
+    for name, kinds in KINDS.items():
+        for kind in kinds:
+            setattr(modules[name], kind, type(kind, (Said,), {}))
+    with mock.patch.dict(sys.modules, {**modules, 'launch_ros': ModuleType('launch_ros')}):
+        said = runpy.run_path(str(prefix / 'share' / package / 'launch' / file))['generate_launch_description']()
+    actions = said.given[0]
+    declared = [a for a in actions if type(a).__name__ == 'DeclareLaunchArgument']
+    defaults = {a.given[0]: a.named['default_value'] for a in declared}
+    if unknown := set(given) - set(defaults):
         raise RuntimeError(f'{file} has no argument {", ".join(unknown)}')
+    (node,) = [a for a in actions if type(a).__name__ == 'Node']
+    words = [prefix / 'lib' / node.named['package'] / node.named['executable'], '--ros-args']
+    words += ['-r', f'__node:={node.named["name"]}']
+    for number, parameters in enumerate(node.named['parameters']):
+        path = Path(text(parameters)) if isinstance(parameters, Said) else scratch / f'launch_params_{number}.yaml'
+        if not isinstance(parameters, Said):
+            # With value_type str the text is the value; the others are read as YAML.
+            values = {
+                key: text(v.given[0]) if v.named['value_type'] is str else yaml.safe_load(text(v.given[0]))
+                for key, v in parameters.items()
+            }
+            path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}), encoding='utf-8')
+        words += ['--params-file', path]
+    return shlex.join(map(str, words))
 
 
 class Asker:
@@ -84,8 +144,6 @@ def _type_of(name: str) -> Any:
 
 def main() -> None:
     """Do the line that is the first argument, and print the answer."""
-    import yaml
-
     _, what, verb, name, *rest = shlex.split(sys.argv[1])
     asker = Asker()
     if (what, verb) == ('topic', 'echo'):

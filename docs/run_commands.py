@@ -245,7 +245,7 @@ class Reader:
         if ON_A_MACHINE.search(line):
             self._on_a_machine(line)
         elif line.startswith('ros2 launch '):
-            ros2.check_launch(line)
+            self._live(ros2.launched(line, self._folder), record='record:=true' in line, page='monitor:=true' in line)
         elif line.startswith(('ros2 topic ', 'ros2 service ', 'ros2 lifecycle ')):
             self._node()
             self._to_the_end(f'python -m docs.ros2 {shlex.quote(line)}')
@@ -282,16 +282,18 @@ class Reader:
         if status != 0 and not judged:
             raise RuntimeError(f'exit status {status}\n{program.text[-2000:]}')
 
-    def _live(self, line: str) -> None:
+    def _live(self, line: str, record: bool = False, page: bool = False) -> None:
         # What `ros2 run` does: it looks the executable up and becomes it.
         line = re.sub(r'^ros2 run psd_deflection ', f'{os.environ["VIRTUAL_ENV"]}/lib/psd_deflection/', line)
+        record = record or '--record' in line or line == 'make run'
+        page = page or ' monitor' in line or '--monitor' in line or line == 'make run'
         program = Terminal(line, self._folder)
         try:
             if '--serve' in line:
                 self._served = program.until(r'port: (\S+)\s')[1]
                 self._background.append(program)
                 return
-            if ' monitor' in line or '--monitor' in line or line == 'make run':
+            if page:
                 with urllib.request.urlopen(program.until(r'monitor: (http://[^\s#]+)')[1], timeout=WAIT_S) as answer:
                     if b'psd_deflection monitor' not in answer.read():
                         raise RuntimeError('the address that it prints has another page')
@@ -304,7 +306,7 @@ class Reader:
         # make itself is ended by Ctrl-C too.
         if (status != 0 and not line.startswith('make')) or 'Traceback' in program.text:
             raise RuntimeError(f'exit status {status} after Ctrl-C\n{program.text[-2000:]}')
-        if ('--record' in line or line == 'make run') and 'replay it:' not in program.text:
+        if record and 'replay it:' not in program.text:
             raise RuntimeError(f'no recording was made\n{program.text[-2000:]}')
 
     def _node(self) -> None:
