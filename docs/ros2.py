@@ -6,11 +6,11 @@
 from __future__ import annotations
 
 import importlib
-import os
 import runpy
 import shlex
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -28,10 +28,14 @@ class Said:
         self.given = given
         self.named = named
 
+    def perform(self, context: Callable[[Any], str]) -> str:
+        """Its text; our context is what finds it."""
+        return context(self)
+
 
 KINDS = {
-    'launch': ('LaunchDescription',),
-    'launch.actions': ('DeclareLaunchArgument',),
+    'launch': ('LaunchContext', 'LaunchDescription'),
+    'launch.actions': ('DeclareLaunchArgument', 'OpaqueFunction'),
     'launch.substitutions': ('LaunchConfiguration',),
     'launch_ros.actions': ('Node',),
     'launch_ros.parameter_descriptions': ('ParameterValue',),
@@ -40,14 +44,13 @@ KINDS = {
 """What our launch file uses of launch and launch_ros."""
 
 
-def launched(line: str, scratch: Path) -> str:
-    """The line that starts the node which ``ros2 launch`` would start; RuntimeError where that would not work.
+def launched(line: str, prefix: Path, scratch: Path) -> list[str]:
+    """The words of the command that ``ros2 launch`` would start; RuntimeError where it would not.
 
-    The launch file is run with stand-ins for what it imports; its parameters go to a file in ``scratch``, as
-    launch_ros hands them over.
+    ``prefix`` is where the package is installed. The launch file is run with stand-ins for what it imports; its
+    parameters go to a file in ``scratch``, as launch_ros hands them over.
     """
     _, _, package, file, *arguments = shlex.split(line)
-    prefix = Path(os.environ['VIRTUAL_ENV'])
     if not (prefix / 'share/ament_index/resource_index/packages' / package).exists():
         raise RuntimeError(f'no package {package}')
     given = dict(argument.split(':=', 1) for argument in arguments)
@@ -69,25 +72,24 @@ def launched(line: str, scratch: Path) -> str:
             setattr(modules[name], kind, type(kind, (Said,), {}))
     with mock.patch.dict(sys.modules, {**modules, 'launch_ros': ModuleType('launch_ros')}):
         said = runpy.run_path(str(prefix / 'share' / package / 'launch' / file))['generate_launch_description']()
-    actions = said.given[0]
-    declared = [a for a in actions if type(a).__name__ == 'DeclareLaunchArgument']
-    defaults = {a.given[0]: a.named['default_value'] for a in declared}
+    actions = {kind: [a for a in said.given[0] if type(a).__name__ == kind] for kind in KINDS['launch.actions']}
+    defaults = {a.given[0]: a.named['default_value'] for a in actions['DeclareLaunchArgument']}
     if unknown := set(given) - set(defaults):
         raise RuntimeError(f'{file} has no argument {", ".join(unknown)}')
-    (node,) = [a for a in actions if type(a).__name__ == 'Node']
-    words = [prefix / 'lib' / node.named['package'] / node.named['executable'], '--ros-args']
-    words += ['-r', f'__node:={node.named["name"]}']
+    (opaque,) = actions['OpaqueFunction']
+    (node,) = opaque.named['function'](text)
+    words = [str(prefix / 'lib' / node.named['package'] / node.named['executable']), '--ros-args']
+    words += [*map(text, node.named['ros_arguments']), '-r', f'__node:={node.named["name"]}']
     for number, parameters in enumerate(node.named['parameters']):
-        path = Path(text(parameters)) if isinstance(parameters, Said) else scratch / f'launch_params_{number}.yaml'
-        if not isinstance(parameters, Said):
-            # With value_type str the text is the value; the others are read as YAML.
-            values = {
-                key: text(v.given[0]) if v.named['value_type'] is str else yaml.safe_load(text(v.given[0]))
-                for key, v in parameters.items()
-            }
-            path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}), encoding='utf-8')
-        words += ['--params-file', path]
-    return shlex.join(map(str, words))
+        # With value_type str the text is the value; the others are read as YAML.
+        values = {
+            key: text(value.given[0]) if value.named['value_type'] is str else yaml.safe_load(text(value.given[0]))
+            for key, value in parameters.items()
+        }
+        path = scratch / f'launch_params_{number}.yaml'
+        path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}), encoding='utf-8')
+        words += ['--params-file', str(path)]
+    return words
 
 
 class Asker:

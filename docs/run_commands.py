@@ -245,7 +245,8 @@ class Reader:
         if ON_A_MACHINE.search(line):
             self._on_a_machine(line)
         elif line.startswith('ros2 launch '):
-            self._live(ros2.launched(line, self._folder), record='record:=true' in line, page='monitor:=true' in line)
+            words = ros2.launched(line, Path(os.environ['VIRTUAL_ENV']), self._folder)
+            self._live(shlex.join(words), record='record:=true' in line, page='monitor:=true' in line)
         elif line.startswith(('ros2 topic ', 'ros2 service ', 'ros2 lifecycle ')):
             self._node()
             self._to_the_end(f'python -m docs.ros2 {shlex.quote(line)}')

@@ -28,6 +28,8 @@ MAX_KEYS = 10_000
 
 EFFECTS_PREFIX = 'effects.'
 """Keys below it describe simulated effects; ``psd_deflection.simulation`` checks them."""
+ROS_OWN = ('use_sim_time', 'start_type_description_service')
+QOS_OVERRIDES_PREFIX = 'qos_overrides.'
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,14 +196,17 @@ class Rig:
 def rig_from_values(values: Mapping[str, object], source: str = 'parameters') -> Rig:
     """Make a :class:`Rig` from flat values; what is missing takes its default.
 
-    Raises ConfigError for an unknown key (with the nearest known one), a wrong type, a value out
-    of bounds, or values that contradict each other.
+    Parameters that every ROS node has are passed over: ``ros2 param dump`` writes them too. Raises ConfigError for
+    an unknown key (with the nearest known one), a wrong type, a value out of bounds, or values that contradict each
+    other.
     """
     effects: dict[str, Any] = {}
     got: dict[str, Value] = {p.name: p.default for p in PARAMETERS}
     for key, value in values.items():
         if key.startswith(EFFECTS_PREFIX):
             effects[key[len(EFFECTS_PREFIX) :]] = value
+            continue
+        if key in ROS_OWN or key.startswith(QOS_OVERRIDES_PREFIX):
             continue
         parameter = BY_NAME.get(key)
         if parameter is None:

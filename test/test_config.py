@@ -41,6 +41,15 @@ def test_a_bad_value_is_refused_by_name(key: str, value: object, said: str) -> N
     assert said in message
 
 
+def test_a_dump_of_a_node_is_a_parameter_file() -> None:
+    of_every_node = {
+        'use_sim_time': False,
+        'start_type_description_service': True,
+        'qos_overrides./diagnostics.publisher.depth': 10,
+    }
+    assert rig_from_values({**load_rig().values, **of_every_node}) == load_rig()
+
+
 @pytest.mark.parametrize(
     ('text', 'said'),
     [

@@ -112,6 +112,9 @@ class Display:
             self._wait = min(2.0 * self._wait, PLAIN_REFRESH_LATER_S)
         samples = session.acquisition.counters.samples
         rate = (samples - self._samples) / passed if self._last else math.nan
+        if samples < self._samples:
+            # Another session, which counts from nought.
+            rate = math.nan
         self._last, self._samples = now, samples
         text = live_line(session, rate)
         with self._lock:
@@ -160,7 +163,6 @@ def run(args: argparse.Namespace) -> int:
         folder = session.recorder.folder
         if folder is not None and folder not in recorded:
             recorded.append(folder)
-            display.say(f'recording to {folder}')
         display.update(session)
 
     with started_early(simulates(overrides, args.ros_arguments)):

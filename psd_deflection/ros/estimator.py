@@ -62,13 +62,15 @@ class _ManagedNode(LifecycleNode):  # type: ignore[misc]
         return self.owner.transition(self.owner.deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self.owner.transition(self.owner.cleanup)
+        return self.owner.transition(self.owner.release)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self.owner.transition(self.owner.cleanup)
+        return self.owner.transition(self.owner.finish)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self.owner.transition(self.owner.cleanup)
+        # What went wrong stays in `error`: whoever starts the node says it.
+        self.owner.cleanup()
+        return TransitionCallbackReturn.SUCCESS
 
 
 class EstimatorNode:
@@ -77,6 +79,7 @@ class EstimatorNode:
     def __init__(self, overrides: Mapping[str, object], say: Callable[[str], None] | None, signals: Signals) -> None:
         self.session: Session | None = None
         self.error: Exception | None = None
+        self.finished = False
         self._signals = signals
         self._starting = False
         self._health: HealthReporter | None = None
@@ -89,6 +92,9 @@ class EstimatorNode:
             )
         except ParameterException as error:
             raise ConfigError(f'ROS parameters: {error}') from None
+        except RuntimeError as error:
+            # What DDS refuses: security that it was built without, or an enclave that may not.
+            raise ConfigError('ROS: ' + ' '.join(str(error).split())) from None
         self.node.owner = self
         try:
             self._say = say or self.node.get_logger().info
@@ -183,6 +189,17 @@ class EstimatorNode:
         self._wire.active = False
         self._say('not publishing; reading and recording go on')
 
+    def release(self) -> None:
+        """End the session, and say so."""
+        self.cleanup()
+        self._say('not configured: the port is free')
+
+    def finish(self) -> None:
+        """End for good: a node that was shut down cannot be configured any more."""
+        self.cleanup()
+        self.finished = True
+        self._say('shut down by change_state')
+
     def cleanup(self) -> None:
         """End the session: the port is free."""
         self._wire.active = False
@@ -232,7 +249,6 @@ class EstimatorNode:
         response.success = True
         verb = 'recording to' if request.data else 'recording ended:'
         response.message = f'{verb} {folder}' if folder is not None else 'no recording was made'
-        self._say(response.message)
         return response
 
     def _report(self) -> None:
@@ -278,7 +294,7 @@ def run(
                 settle()
                 estimator.start()
                 watchdog.ready()
-                while not signals.stop:
+                while not (signals.stop or estimator.finished):
                     executor.spin_once(timeout_sec=SPIN_S)
                     session = estimator.session
                     if session is not None and not session.processing.alive:

@@ -18,8 +18,6 @@ from psd_deflection.errors import ConfigError
 from psd_deflection.parameters import BY_NAME, PARAMETERS, Parameter, check_value
 from psd_deflection.runner.session import Session
 
-ROS_OWN = ('use_sim_time', 'start_type_description_service')
-QOS_PREFIX = 'qos_overrides.'
 SOURCE = 'ROS parameters'
 
 
@@ -31,8 +29,6 @@ def rig_of_node(node: Node, extra: Mapping[str, object]) -> Rig:
     """
     given: dict[str, object] = {}
     for name, parameter in node.get_parameters_by_prefix('').items():
-        if name in ROS_OWN or name.startswith(QOS_PREFIX):
-            continue
         value = parameter.value
         given[name] = list(value) if not isinstance(value, (str, bool, int, float)) and value is not None else value
     rig = rig_from_values({**given, **extra}, SOURCE)

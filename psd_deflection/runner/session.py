@@ -139,7 +139,10 @@ class Session:
                 self.recorder.put_change(memory)
             return folder
 
-        return self.processing.request(change)
+        folder = self.processing.request(change)
+        if folder is not None:
+            self._tell(f'recording to {folder}' if wanted else f'recording ended: {folder}')
+        return folder
 
     def temperature(self, celsius: float) -> None:
         """The ambient temperature, for the corrections that need it; from the next block on.

@@ -126,7 +126,7 @@ def test_zero_and_record(start: Callable[..., Any], peer: Any, tmp_path: Path, s
     rig.write_text(
         f'estimator:\n  ros__parameters:\n    bag_dir: {tmp_path / "bags"}\n    psd_1:\n      zero: [0.0002, 0.0001]\n'
     )
-    start('--params-file', str(rig), '--port', simulated_port)
+    daemon = start('--params-file', str(rig), '--port', simulated_port)
     poses = peer.collect(PoseStamped, '/link_tip/deflection')
     peer.until(lambda: len(poses) >= 30, 'estimates')
     # The file's zero is wrong by tenths of a millimetre, and so is the deflection.
@@ -147,6 +147,7 @@ def test_zero_and_record(start: Callable[..., Any], peer: Any, tmp_path: Path, s
     assert ended.success
     assert ended.message == f'recording ended: {folder}'
     assert peer.call(SetBool, '/estimator/record', SetBool.Request(data=False)).message == 'no recording was made'
+    assert [line for line in daemon.lines if 'recording' in line] == [begun.message, ended.message]
     # An independent reader finds in the bag what was received.
     store = get_typestore(Stores.ROS2_JAZZY)
     received = {stamp(p): p.pose.position.x for p in poses}

@@ -20,9 +20,10 @@ from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 
-from psd_deflection.errors import DeviceError  # noqa: E402
+from psd_deflection.errors import ConfigError, DeviceError  # noqa: E402
 from psd_deflection.io.recordings import open_recording  # noqa: E402
 from psd_deflection.io.serial_port import SerialPort  # noqa: E402
+from psd_deflection.ros import estimator  # noqa: E402
 
 END_S = 2.0
 """How long the node may take to end, by its contract."""
@@ -138,3 +139,30 @@ def test_the_zero_holds_for_the_next_run(
     third = start(*arguments, '-p', 'keep_zero:=false')
     third.said('publishing on ROS domain')
     assert parameters(peer, 'psd_1.zero', 'psd_2.zero') == [[0.0, 0.0], [0.0, 0.0]]
+
+
+def test_a_shutdown_ends_the_daemon(start: Callable[..., Any], peer: Any, simulated_port: str) -> None:
+    daemon = start('--port', simulated_port)
+    daemon.said('publishing on ROS domain')
+    assert change(peer, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert daemon.said('shut down by change_state')
+    assert daemon.wait(END_S + 10.0) == 0
+    SerialPort(simulated_port, 921_600).close()
+
+
+def test_an_unforeseen_error_at_the_start_is_not_swallowed(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(rig: Any, tell: Any) -> Any:
+        raise ZeroDivisionError('of our own making')
+
+    monkeypatch.setattr(estimator, 'Session', broken)
+    with pytest.raises(ZeroDivisionError, match='of our own making'):
+        estimator.run(['--ros-args'], {}, lambda text: None)
+
+
+def test_what_dds_refuses_is_one_line(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*args: Any, **options: Any) -> Any:
+        raise RuntimeError('error creating node: no security libraries\nPlease compile')
+
+    monkeypatch.setattr(estimator, '_ManagedNode', refused)
+    with pytest.raises(ConfigError, match=r'^ROS: error creating node: no security libraries Please compile$'):
+        estimator.run(['--ros-args'], {}, lambda text: None)

@@ -101,6 +101,24 @@ def test_a_terminal_that_is_gone_holds_up_nobody(monkeypatch: pytest.MonkeyPatch
     assert heard.getvalue() == 'heard\n'
 
 
+def test_a_session_made_anew_counts_from_nought(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, counters = [100.0], SimpleNamespace(samples=0)
+    rates: list[float] = []
+
+    def line(session: Session, rate: float) -> str:
+        rates.append(rate)
+        return ''
+
+    monkeypatch.setattr('psd_deflection.cli.estimator.time', SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr('psd_deflection.cli.estimator.live_line', line)
+    display = Display()
+    session = cast(Session, SimpleNamespace(acquisition=SimpleNamespace(counters=counters)))
+    for counters.samples in (0, 50_000, 10, 10_010):
+        display.update(session)
+        now[0] += 100.0
+    assert [rate if rate == rate else None for rate in rates] == [None, 500.0, None, 100.0]
+
+
 def test_a_journal_gets_a_line_a_minute_in_the_long_run(monkeypatch: pytest.MonkeyPatch) -> None:
     heard, now = io.StringIO(), [100.0]
     monkeypatch.setattr('sys.stderr', heard)
