@@ -13,6 +13,7 @@
 # make docs     the documentation as a web site, in build/site
 # make wheel    sdist and wheel in dist/, tried in an environment of its own
 # make doc-commands  every command of README and docs that the tests do not run, run
+# make rerun    recordings converted for the Rerun viewer (170 MB, in an environment of its own) and looked at in it
 # make shots    the pictures of the live page in docs/figures anew (needs Chromium)
 # make blind    hide effects with a second generator and see whether discover names them (an hour or two on two cores; JOBS=1 for one)
 # make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
@@ -27,7 +28,7 @@ ARGS ?=
 PYTEST ?=
 BIN := $(VENV)/bin
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware golden docs shots blind demo-discover colcon wheel doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware golden docs shots blind demo-discover colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -128,6 +129,13 @@ wheel: $(VENV)/.installed
 	build/wheel/use/bin/pip install --quiet --disable-pip-version-check 'psd_deflection[monitor]' 'psd_deflection[ros]'
 	build/wheel/use/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/*.tar.gz
 	cd build/wheel && use/bin/psd-deflection --version && use/lib/psd_deflection/replay --help > log
+
+# An environment of its own below build/, which is kept. The picture, where Xvfb is: build/rerun/shot.png.
+RERUN ?=
+rerun:
+	test -x build/rerun/use/bin/rerun || ($(PYTHON) -m venv build/rerun/use && build/rerun/use/bin/pip install --quiet --disable-pip-version-check '.[rerun]')
+	build/rerun/use/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall .
+	build/rerun/use/bin/python docs/check_rerun.py bags/clean bags/laser_off bags/lost_samples --out build/rerun $(RERUN)
 
 # Truth hidden by a second generator: fresh seeds, both cores with JOBS=2; a run that was stopped goes on.
 JOBS ?= $(shell nproc)

@@ -2,8 +2,11 @@
 
 OUT ending in .csv becomes a CSV recording, in .mcap a lone MCAP file, anything else a bag folder.
 Volts come through bit for bit. Estimates are not carried over: psd-deflection replay makes them.
+OUT ending in .rrd becomes a recording for the Rerun viewer (pip install rerun-sdk), for people to look at:
+the estimates that replay makes, dots, loads and losses, and how they are shown. It is not read again.
 
   psd-deflection convert bags/clean --out clean.csv
+  psd-deflection convert bags/lost_samples --out lost_samples.rrd
   psd-deflection convert run.csv --out run --params-file my_rig.yaml
 """
 
@@ -17,11 +20,14 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from psd_deflection.cli._progress import progress_of
+from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.config import EFFECTS_PREFIX, load_rig
 from psd_deflection.io.bag_writer import BagWriter, McapFile
 from psd_deflection.io.csv_writer import CsvSampleSink
 from psd_deflection.io.recording import Recording
 from psd_deflection.io.recordings import open_recording
+from psd_deflection.io.rerun_writer import RerunFile
+from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import AppliedLoad, ParameterChange, ReferencePose, SampleBlock, TemperatureReading
 
 Convertible = SampleBlock | ParameterChange | AppliedLoad | ReferencePose | TemperatureReading
@@ -30,9 +36,13 @@ Convertible = SampleBlock | ParameterChange | AppliedLoad | ReferencePose | Temp
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
-    parser.add_argument('--out', metavar='OUT', required=True, help='what to make: X.csv, X.mcap or a bag folder')
     parser.add_argument(
-        '--params-file', metavar='RIG.yaml', help="the rig to note in a bag; otherwise the recording's own"
+        '--out', metavar='OUT', required=True, help='what to make: X.csv, X.mcap, X.rrd or a bag folder'
+    )
+    parser.add_argument(
+        '--params-file',
+        metavar='RIG.yaml',
+        help="the rig to note in a bag or to use for an .rrd; otherwise the recording's own",
     )
 
 
@@ -66,12 +76,33 @@ def convert(recording: Recording, out: Path, parameters: dict[str, object]) -> i
 def run(args: argparse.Namespace) -> int:
     """Convert and say what was written."""
     recording = open_recording(Path(args.recording))
+    if Path(args.out).suffix.lower() == '.rrd':
+        return _to_rerun(recording, Path(args.out), args.params_file)
     parameters: dict[str, object] = dict(recording.parameters)
     if args.params_file is not None:
         rig = load_rig(args.params_file)
         parameters = {**rig.values, **{EFFECTS_PREFIX + k: e for k, e in rig.effects.items()}}
     samples = convert(recording, Path(args.out), parameters)
     print(f'{args.out}: {samples} samples')
+    _warn(recording)
+    return 0
+
+
+def _to_rerun(recording: Recording, out: Path, params_file: str | None) -> int:
+    rig = rig_of(recording, params_file)
+    recording = open_recording(recording.path, block_size=rig.estimator.block_size)
+    pipeline = Pipeline(rig)
+    with contextlib.closing(RerunFile(out, rig, recording.path.stem)) as sink:
+        for records in replayed(recording, pipeline, progress_of(recording.blocks())):
+            for record in records:
+                sink.put(record)
+    print(
+        f'{out}: {pipeline.counters.estimates} estimates of {pipeline.counters.blocks} blocks; look at it: rerun {out}'
+    )
+    _warn(recording)
+    return 0
+
+
+def _warn(recording: Recording) -> None:
     for warning in recording.warnings:
         print(f'warning: {warning}')
-    return 0

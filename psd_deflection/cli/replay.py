@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--params-file', metavar='RIG.yaml', help='use this rig instead of the parameters in the recording'
     )
-    parser.add_argument('--out', metavar='OUT', help='write the estimates: OUT.csv, OUT.mcap, or a bag folder')
+    parser.add_argument('--out', metavar='OUT', help='write the estimates: OUT.csv, OUT.mcap, OUT.rrd, or a bag folder')
     parser.add_argument(
         '--compare', action='store_true', help='compare with the recorded estimates; exit 1 where a bit differs'
     )

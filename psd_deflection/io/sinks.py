@@ -6,8 +6,10 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Protocol
 
+from psd_deflection.config import rig_from_values
 from psd_deflection.io.bag_writer import BagWriter, McapFile
 from psd_deflection.io.csv_writer import CsvEstimateSink
+from psd_deflection.io.rerun_writer import RerunFile
 from psd_deflection.records import Record
 
 
@@ -28,11 +30,13 @@ def open_sink(
     solvers: Collection[str],
     device_hello: Mapping[str, object] | None = None,
 ) -> Sink:
-    """The sink for ``path``: ``.csv`` for estimates, ``.mcap`` for a lone file, else a bag folder."""
+    """The sink for ``path``: ``.csv`` (estimates), ``.rrd`` (for Rerun), ``.mcap`` (a lone file), else a bag folder."""
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == '.csv':
         return CsvEstimateSink(path, solvers)
+    if suffix == '.rrd':
+        return RerunFile(path, rig_from_values(rig_values, str(path)))
     if suffix == '.mcap':
         return McapFile(path, rig_values=rig_values, device_hello=device_hello)
     return BagWriter(path, rig_values=rig_values, device_hello=device_hello)

@@ -1,0 +1,162 @@
+"""Recordings for Rerun, without Rerun: what is written row by row, and what is told where it is missing.
+
+``make rerun`` reads the files with Rerun's own reader and looks at its picture.
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from pathlib import Path
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+
+import psd_deflection
+from psd_deflection.cli.main import main
+from psd_deflection.cli.replay import replayed, rig_of
+from psd_deflection.io import rerun_writer
+from psd_deflection.io.rerun_writer import POSE, RerunFile, Row
+from psd_deflection.pipeline import Pipeline
+
+BAGS = Path(__file__).parent.parent.parent / 'bags'
+FIND = 'psd_deflection.io.rerun_writer.importlib.util.find_spec'
+
+
+@pytest.fixture
+def no_rerun(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FIND, lambda name: None)
+
+
+@pytest.fixture
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
+    """What takes every call, in rerun's place, be rerun installed or not."""
+    rerun = MagicMock()
+    monkeypatch.setattr(FIND, lambda name: object())
+    monkeypatch.setitem(sys.modules, 'rerun', rerun)
+    monkeypatch.setitem(sys.modules, 'rerun.blueprint', rerun.blueprint)
+    return rerun
+
+
+def rows_of(name: str, out: Path) -> dict[str, list[tuple[int, Row]]]:
+    recording = psd_deflection.open(BAGS / name)
+    rig = rig_of(recording, None)
+    sink = RerunFile(out, rig)
+    for records in replayed(recording, Pipeline(rig), recording.blocks()):
+        for record in records:
+            sink.put(record)
+    return sink._rows
+
+
+@pytest.mark.usefixtures('no_rerun')
+@pytest.mark.parametrize('command', ['convert', 'replay'])
+@pytest.mark.parametrize('name', ['a.rrd', 'a.RRD'])
+def test_without_rerun_the_way_out_is_told(
+    command: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / name
+    assert main([command, str(BAGS / 'clean'), '--out', str(out)]) == 3
+    err = capsys.readouterr().err
+    assert 'pip install rerun-sdk' in err
+    assert "pip install 'psd_deflection[rerun]'" in err
+    assert err.strip().count('\n') == 0
+    assert not out.exists()
+
+
+@pytest.mark.usefixtures('stand_in')
+def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / 'a.rrd').write_text('mine')
+    assert main(['convert', str(BAGS / 'clean'), '--out', str(tmp_path / 'a.rrd')]) == 4
+    assert 'exists already' in capsys.readouterr().err
+    assert (tmp_path / 'a.rrd').read_text() == 'mine'
+    assert main(['convert', str(BAGS / 'clean'), '--out', str(tmp_path / 'no' / 'a.rrd')]) == 4
+    assert 'cannot be made' in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures('no_rerun')
+def test_help_names_the_ending(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(['convert', '--help'])
+    assert 'X.rrd' in capsys.readouterr().out
+
+
+def test_a_disk_that_refuses_is_one_line(
+    stand_in: MagicMock, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stand_in.RecordingStream.return_value.flush.side_effect = RuntimeError('File-writer thread shut down')
+    assert main(['convert', str(BAGS / 'clean'), '--out', str(tmp_path / 'a.rrd')]) == 4
+    assert 'a.rrd: cannot be written (File-writer thread shut down)' in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures('stand_in')
+@pytest.mark.parametrize('name', ['clean', 'lost_samples', 'laser_off'])
+def test_every_estimate_and_no_other_is_written(name: str, tmp_path: Path) -> None:
+    rows = rows_of(name, tmp_path / 'a.rrd')
+    recorded = psd_deflection.open(BAGS / name).estimates()['/link_tip/deflection_with_covariance']
+    assert recorded.covariance is not None
+    for i, (entity, _, _, scale, _) in enumerate(POSE):
+        written = [(t, row) for t, row in rows[f'tip/{entity}'] if row is not None]
+        assert [t for t, _ in written] == recorded.t_ns.tolist()
+        # Another machine's last bits may differ.
+        assert np.allclose([row[0] for _, row in written], recorded.pose[:, i] * scale, rtol=1e-9, atol=1e-9)
+        sd = 2.0 * np.sqrt(recorded.covariance[:, i, i]) * scale
+        low, high = np.array([row for _, row in rows[f'tip/{entity}/band'] if row is not None]).T
+        assert np.allclose(high - low, 2.0 * sd)
+    for path, of_entity in rows.items():
+        times = [t for t, _ in of_entity]
+        assert all(a < b for a, b in itertools.pairwise(times)), path
+
+
+@pytest.mark.usefixtures('stand_in')
+def test_a_loss_breaks_every_line(tmp_path: Path) -> None:
+    rows = rows_of('lost_samples', tmp_path / 'a.rrd')
+    start = rows['lost'][0][0]
+    breaks = [(t - start) / 2e7 for t, row in rows['tip/dx'] if row is None]
+    # bags/make.py: block 50 has too few samples, blocks 100 to 106 are gone.
+    assert breaks == pytest.approx([50.0, 100.0], abs=0.01)
+    assert [(t - start) / 2e7 for t, row in rows['psd_1/plane/dot'] if row is None] == pytest.approx([100.0], abs=0.01)
+    # The plate is said once, and again after each break.
+    assert [row is None for _, row in rows['rig/tip/plate']] == [False, True, False, True, False]
+    lost = {round((t - start) / 2e7): row for t, row in rows['lost']}
+    assert (lost[100], lost[106]) == ((20,), (20,))
+    assert 101 not in lost
+
+
+@pytest.mark.usefixtures('stand_in')
+def test_a_dot_without_light_is_taken_away(tmp_path: Path) -> None:
+    rows = rows_of('laser_off', tmp_path / 'a.rrd')
+    dark = [n for n in (1, 2) if any(row is None for _, row in rows[f'psd_{n}/plane/dot'])]
+    assert len(dark) == 1
+    (number,) = dark
+    times = {t for t, row in rows[f'sums/psd_{number}'] if row is not None and row[0] < 2.5}
+    assert len(times) > 10
+    assert not times & {t for t, row in rows[f'psd_{number}/plane/dot'] if row is not None}
+
+
+def test_rows_are_written_in_batches(
+    stand_in: MagicMock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(rerun_writer, '_BATCH', 50)
+    assert main(['convert', str(BAGS / 'clean'), '--out', str(tmp_path / 'a.rrd')]) == 0
+    assert 'a.rrd: 200 estimates of 200 blocks' in capsys.readouterr().out
+    sent = [call.args[0] for call in stand_in.send_columns.call_args_list]
+    assert sent.count('tip/theta') == 4
+    assert sent.count('rig/tip/plate') == 1
+
+
+def test_times_of_a_csv_are_since_its_start(stand_in: MagicMock, tmp_path: Path) -> None:
+    assert main(['convert', str(BAGS / 'clean'), '--out', str(tmp_path / 'a.csv')]) == 0
+    text = (tmp_path / 'a.csv').read_text().splitlines()
+    cut = [line.partition('.')[2] for line in text[1:500]]
+    (tmp_path / 'b.csv').write_text('\n'.join([text[0], *('1.' + line for line in cut)]) + '\n')
+    assert main(['convert', str(tmp_path / 'b.csv'), '--out', str(tmp_path / 'b.rrd')]) == 0
+    kinds = {kind for call in stand_in.TimeColumn.call_args_list for kind in call.kwargs}
+    assert kinds == {'duration'}
+
+
+def test_it_ends_once(stand_in: MagicMock, tmp_path: Path) -> None:
+    sink = RerunFile(tmp_path / 'a.rrd', rig_of(psd_deflection.open(BAGS / 'clean'), None))
+    sink.close()
+    sink.close()
+    stand_in.RecordingStream.return_value.disconnect.assert_called_once_with()
