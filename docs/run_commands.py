@@ -42,7 +42,6 @@ CUT = 'recordings/cut'
 """A recording that a crash left without its end."""
 
 NOT_RUN = (
-    (r'^rerun ', 'a viewer of 170 MB that is no dependency; tried by hand'),
     (r'^ros2 security |ROS_SECURITY_|--enclave ', 'needs ros2cli, and a Fast DDS built with security'),
 )
 """What is not run: pattern, reason."""
@@ -60,6 +59,9 @@ CI_RUNS = (
     ),
     (r'^make doc-commands$', '.ci/run', 'make doc-commands '),
     (r'^make wheel$|^pip install dist/\*\.whl', '.ci/run', 'make wheel '),
+    (r'^make rerun$', '.ci/run', 'make rerun '),
+    (r"^pip install '\.\[rerun\]'$", 'Makefile', "'.[rerun]'"),
+    (r'^psd-deflection convert .*\.rrd$|^rerun ', 'Makefile', 'python docs/check_rerun.py bags/'),
     (
         r"^pip install '\.\[ros,monitor\]'$",
         'Makefile',
@@ -173,7 +175,7 @@ def run_by_ci(line: str) -> tuple[str, str] | None:
 
 def is_quick(line: str) -> bool:
     """Whether the tests run it within themselves."""
-    return QUICK.search(line) is not None and '--serve' not in line
+    return QUICK.search(line) is not None and '--serve' not in line and run_by_ci(line) is None
 
 
 def blocks_to_run() -> list[list[Command]]:
