@@ -4,8 +4,7 @@ What ends in a moment is run by test/test_docs.py; what CI runs anyway is looked
 here, block by block, in a copy of the checkout: a daemon or a page is started on the simulated device, seen to
 work by what it says, and ended by Ctrl-C; a campaign runs in its shortest form; what ``ros2`` would do is done with
 rclpy (docs/ros2.py); what is typed as root, or from one machine to another, is typed on a machine made for it
-(docs/machine.py). What is left is in :data:`NOT_RUN`, each with its reason, and is printed; an entry that the
-documents no longer have is an error.
+(docs/machine.py). Nothing is left out; an entry of the tables below that the documents no longer have is an error.
 """
 
 from __future__ import annotations
@@ -40,11 +39,6 @@ INDENTED = re.compile(r'^ {4}(?:psd-deflection|make|python|ros2|pip) .+\n(?: {4,
 PROGRAMS = ('psd-deflection', 'make', 'ros2', 'pip', 'python', 'python3')
 CUT = 'recordings/cut'
 """A recording that a crash left without its end."""
-
-NOT_RUN = (
-    (r'^ros2 security |ROS_SECURITY_|--enclave ', 'needs ros2cli, and a Fast DDS built with security'),
-)
-"""What is not run: pattern, reason."""
 
 CI_RUNS = (
     (r'^make test$', '.ci/run', 'make test '),
@@ -163,11 +157,6 @@ def filled(line: str, recording: str = 'bags/clean') -> str:
     return re.sub(r'\b(my|other)_rig\.yaml', 'config/thesis_rig.yaml', line)
 
 
-def reason_not_run(line: str) -> str:
-    """Why ``line`` is not run; '' where it is."""
-    return next((reason for pattern, reason in NOT_RUN if re.search(pattern, line)), '')
-
-
 def run_by_ci(line: str) -> tuple[str, str] | None:
     """File, and the text in it that runs ``line``."""
     return next(((file, text) for pattern, file, text in CI_RUNS if re.search(pattern, line)), None)
@@ -186,9 +175,9 @@ def blocks_to_run() -> list[list[Command]]:
         blocks.setdefault(command.block, []).append(command)
     out = []
     for block in blocks.values():
-        if all(is_quick(c.line) or reason_not_run(c.line) or run_by_ci(c.line) for c in block):
+        if all(is_quick(c.line) or run_by_ci(c.line) for c in block):
             continue
-        left = [c for c in block if not reason_not_run(c.line) and run_by_ci(c.line) is None and c.line not in seen]
+        left = [c for c in block if run_by_ci(c.line) is None and c.line not in seen]
         # The lines below it may need what a simulation writes, and nothing else that is quick.
         left = [c for c in left if not is_quick(c.line) or ' simulate ' in c.line]
         seen.update(c.line for c in left)
@@ -207,7 +196,7 @@ def what_is_missing(line: str) -> str:
 def stale() -> list[str]:
     """Entries of the tables that no command of the documents needs any more."""
     lines = [c.line for c in commands()]
-    patterns = [p for p, *_ in (*NOT_RUN, *CI_RUNS)] + [f'^make {name}\\b' for name in SHORTEST]
+    patterns = [p for p, *_ in CI_RUNS] + [f'^make {name}\\b' for name in SHORTEST]
     patterns += [*TOOLS, *SHORTER, ON_A_MACHINE.pattern]
     return [p for p in patterns if not any(re.search(p, line) for line in lines)]
 
@@ -406,9 +395,6 @@ def main() -> int:
                 reader.block(lines, ran)
         finally:
             reader.close()
-    for pattern, reason in NOT_RUN:
-        left = sorted({c.line for c in commands() if re.search(pattern, c.line)})
-        print(f'not run ({reason}):', *left, sep='\n  ')
     for pattern in stale():
         failures += 1
         print(f'FAILED: nothing in the documents is like {pattern} any more')

@@ -1,4 +1,4 @@
-"""The layouts of Foxglove, PlotJuggler and RViz name what there is: topics and fields of a recording."""
+"""The layouts of Foxglove, PlotJuggler and RViz and the SROS 2 policy name what there is."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
-from msg_adapters import DIAGNOSTICS, TOPIC_TYPES
+from msg_adapters import DIAGNOSTICS, INPUTS, TOPIC_TYPES
 from psd_deflection.io import cdr
 from psd_deflection.io.recordings import open_recording
 
@@ -85,3 +85,22 @@ def test_rviz() -> None:
     # All that the node publishes is reliable; asked of a best-effort publisher, that would be no connection at all.
     assert {d['Topic']['Reliability Policy'] for d in displays} == {'Reliable'}
     assert '_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE' in source
+
+
+def test_the_sros2_policy() -> None:
+    root = xml.etree.ElementTree.parse(CONFIG / 'sros2_policy.xml').getroot()
+    enclaves = {str(e.get('path')): e for e in root.iter('enclave')}
+    assert sorted(enclaves) == ['/psd/estimator', '/psd/operator', '/psd/viewer']
+    of_every_node = {'/rosout', '/parameter_events'}
+    topics = {t.text for t in root.iter('topic')} - of_every_node - {'*', '/link_tip/*'}
+    assert topics <= set(TOPIC_TYPES)
+    assert topics >= set(INPUTS)
+    source = (ROOT / 'psd_deflection' / 'ros' / 'estimator.py').read_text()
+    served = {f'/estimator/{name}' for name in re.findall(r"create_service\(\w+, '~/(\w+)'", source)}
+    requested = {
+        path: {s.text for g in e.iter('services') if 'request' in g.attrib for s in g} for path, e in enclaves.items()
+    }
+    assert requested == {'/psd/estimator': set(), '/psd/operator': served, '/psd/viewer': set()}
+    for path in ('/psd/operator', '/psd/viewer'):
+        published = {t.text for g in enclaves[path].iter('topics') if 'publish' in g.attrib for t in g}
+        assert published == of_every_node
