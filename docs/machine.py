@@ -101,7 +101,7 @@ class Machine:
         raise RuntimeError(f'the machine did not start\n{self._log.read().decode(errors="replace")}')
 
     def typed(self, line: str, network: str = '') -> str:
-        """The line of this machine's shell that runs ``line`` there; ``network``: one that :meth:`rig` made."""
+        """The line of this machine's shell that runs ``line`` there; ``network``: one that :meth:`tunnel` makes."""
         inside = f'ip netns exec {network} bash -c {shlex.quote(line)}' if network else line
         words = ['nsenter', f'--target={self._init}', '--mount', '--pid', '--uts', '--ipc', *self._inside]
         return shlex.join([*words, 'bash', '-c', f'cd /root/checkout && {inside}'])
@@ -120,7 +120,7 @@ class Machine:
         self.run('mkdir -p /run/sshd && ip netns add rig && ip netns add reader')
         self.run('ip -n rig link set lo up && ip -n reader link set lo up')
         self.run(
-            'mkdir -m 700 -p ~/.ssh && cd ~/.ssh && ssh-keygen -q -t ed25519 -N "" -f id_ed25519 '
+            'mkdir -m 700 -p ~/.ssh && cd ~/.ssh && rm -f id_ed25519 && ssh-keygen -q -t ed25519 -N "" -f id_ed25519 '
             f'&& cp id_ed25519.pub authorized_keys && printf %s {shlex.quote(SSH_CONFIG)} > config'
         )
         monitor = Terminal(self.typed(f'{self._environment}/bin/psd-deflection monitor', 'rig'), self._folder.parent)
