@@ -58,6 +58,9 @@ TORN_US = 50_000
 PING_S = (0.1, 0.4)
 """Bounds of the random time between two pings: their phase to the samples must not repeat."""
 
+GATHER_S = 0.004
+"""Longest that the reader lets samples gather: to wake costs more than a sample does."""
+
 UNANSWERED = 20
 """A device that has left so many pings unanswered in a row does not know them: it is asked no more."""
 
@@ -211,6 +214,7 @@ class Acquisition:
                         self.counters.bytes += size
                         if self.feed(events, now):
                             silent_since = now / 1e9
+                            self._gather()
                     elif self._seq:
                         self._hand_over(now)
                     if now / 1e9 - silent_since > SILENCE_S:
@@ -229,6 +233,20 @@ class Acquisition:
         finally:
             self._hand_over(time.monotonic_ns())
             self.queue.put(Ended())
+
+    def _gather(self) -> None:
+        """Let samples come before the next read; the last ones of a block are waited for one by one.
+
+        The clock map lives on the samples that are read as they come, and the estimate waits for the last.
+        """
+        if not self._regressed:
+            # The time of the read is the time of the sample.
+            return
+        to_come = -(self._previous[0] + 1) % self._block_size or self._block_size
+        period_s = self._period_us / 1e6
+        rest = min(GATHER_S, (to_come - 2) * period_s)
+        if rest >= 2 * period_s:
+            time.sleep(rest)
 
     def _silent(self, size: int) -> None:
         self.counters.silences += 1

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import itertools
 import queue
+import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import DeviceError
+from psd_deflection.io.sources._interface import Clock, Event, Reading, Sample, Source, SourceEndedError
 from psd_deflection.protocol.frames import HelloFrame, encode
 from psd_deflection.runner import acquisition as module
 from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Item, Restarted
@@ -315,3 +317,54 @@ def test_a_clock_jump_of_the_device_is_told_and_time_goes_on(
     assert t[-1] - t[0] < 10**9
     assert run.acquisition.counters.clock_jumps == 1
     assert numbers(items) == list(range(80))
+
+
+class Clockwork(Source):
+    """1000 samples a second by a clock of its own, which goes on when the reader waits or rests."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.name, self.clock = 'clockwork', clock
+        self.passed_s = 0.0
+        self.given = 0
+        self.reads: list[int] = []
+        self.rests: list[float] = []
+
+    def sleep(self, rest: float) -> None:
+        self.passed_s += rest
+        self.rests.append(rest)
+
+    def open(self, timeout: float) -> HelloFrame:
+        return HelloFrame(1, HELLO_INFO)
+
+    def start(self) -> None: ...
+
+    def read(self, timeout: float) -> Reading:
+        if self.given >= 40:
+            raise SourceEndedError('forty are enough')
+        self.passed_s = max(self.passed_s, 1e-3 * (self.given + 1))
+        there = round(self.passed_s * 1e3)
+        events: list[Event] = [Sample(0, n, n * 1000, (0, 0, 16384, 0, 0, 16384)) for n in range(self.given, there)]
+        self.reads.append(there - self.given)
+        self.given = there
+        return Reading(events, round(self.passed_s * 1e9), len(events))
+
+    def close(self) -> None: ...
+
+    def describe(self) -> dict[str, str]:
+        return {}
+
+
+@pytest.mark.parametrize('clock', [Clock.DEVICE, Clock.HOST])
+def test_samples_gather_except_the_last_of_a_block(rig: Rig, monkeypatch: pytest.MonkeyPatch, clock: Clock) -> None:
+    source = Clockwork(clock)
+    monkeypatch.setattr(module, 'make_source', lambda rig: source)
+    monkeypatch.setattr(module, 'time', SimpleNamespace(**{**vars(time), 'sleep': source.sleep}))
+    run = Run(rig)
+    assert numbers(take(run.acquisition, 40)) == list(range(40))
+    run.acquisition.stop()
+    if clock is Clock.HOST:
+        # Whose samples are as old as their reading.
+        assert source.reads == [1] * 40
+        return
+    assert source.reads == [1, 4, 4, 4, 4, 1, 1, 1, 4, 4, 4, 4, 2, 1, 1]
+    assert max(source.rests) == module.GATHER_S
