@@ -60,6 +60,12 @@ def _short(type_name: str) -> str:
     return type_name.replace('/msg/', '/')
 
 
+def members(type_name: str) -> list[tuple[str, str]]:
+    """(type, name) of each field of ``pkg/Name`` or ``pkg/msg/Name``; none where it is no message of ours."""
+    lines = _PARTS.get(_short(type_name), '').splitlines()
+    return [(line.split()[0], line.split()[1]) for line in lines if '=' not in line]
+
+
 def definition(type_name: str) -> str:
     """The definition of ``pkg/msg/Name`` followed by all that it is made of. Raises KeyError."""
     seen: list[str] = []
