@@ -76,7 +76,7 @@ class Machine:
         self._init = 0
         try:
             self._wait_until_up()
-        except RuntimeError:
+        except BaseException:
             self.close()
             raise
 

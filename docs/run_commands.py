@@ -209,6 +209,7 @@ class Reader:
         self._device: Terminal | None = None
         self._background: list[Terminal] = []
         self._machine: machine.Machine | None = None
+        self._no_machine = False
         self._served = ''
 
     def block(self, lines: list[str], ran: Callable[[str, float, str], None]) -> None:
@@ -253,8 +254,13 @@ class Reader:
             self._to_the_end(f'{line} {more}', VERDICTS['blind'] if more else '')
 
     def _on_a_machine(self, line: str) -> None:
+        if self._no_machine:
+            raise RuntimeError('there is no machine to type it on')
         if self._machine is None:
+            # Tried once: what keeps it from starting keeps on.
+            self._no_machine = True
             self._machine = machine.Machine(self._folder, Path(os.environ['VIRTUAL_ENV']))
+            self._no_machine = False
         if line.startswith('ssh '):
             self._machine.tunnel(line)
         elif line.startswith('journalctl -f'):
