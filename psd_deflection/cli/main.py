@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import importlib
+import os
 import sys
 from collections.abc import Collection, Sequence
 
@@ -36,6 +37,9 @@ COMMANDS: dict[str, str] = {
 
 USAGE = 2
 """Exit status of a command line that was not understood; argparse has the same."""
+
+ROS_OPTIONS = ('-p', '--param', '-r', '--remap')
+"""What ROS 2 takes behind --ros-args and people type without it."""
 
 EPILOG = """\
 A first look, without hardware:   psd-deflection estimator
@@ -66,7 +70,7 @@ def make_parser(chosen: Collection[str]) -> argparse.ArgumentParser:
             module = importlib.import_module('psd_deflection.cli.' + name.replace('-', '_'))
             sub.description = module.__doc__
             module.add_arguments(sub)
-            sub.set_defaults(run=module.run)
+            sub.set_defaults(run=module.run, refuse=sub.error)
     return parser
 
 
@@ -89,7 +93,10 @@ def _run(argv: list[str]) -> int:
     parser = make_parser(chosen)
     # `ros2 run` and `ros2 launch` add arguments of their own: they are for rclpy, not for argparse.
     own, ros_arguments = _split_ros_arguments(argv)
-    args = parser.parse_args(own)
+    args, unknown = parser.parse_known_args(own)
+    if unknown:
+        # The parser of the whole program would answer with its own usage, which names none of the command's options.
+        args.refuse(f'unrecognized arguments: {" ".join(unknown)}{_ros_hint(unknown)}')
     args.ros_arguments = ros_arguments
     try:
         return int(args.run(args))
@@ -100,6 +107,11 @@ def _run(argv: list[str]) -> int:
         # `psd-deflection ... | head` is not an error; keep the interpreter's own flush quiet too.
         sys.stderr.close()
         return 0
+
+
+def _ros_hint(unknown: Sequence[str]) -> str:
+    meant = any(a in ROS_OPTIONS or ':=' in a for a in unknown)
+    return '; ROS arguments go behind --ros-args' if meant else ''
 
 
 def _split_ros_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:

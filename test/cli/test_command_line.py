@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 from pathlib import Path
@@ -45,6 +46,41 @@ def test_a_command_that_is_none_is_one_line_with_the_way_out(
     assert err.count('\n') == 1
     assert typed in err
     assert hint in err
+
+
+@pytest.mark.parametrize(
+    ('argv', 'hinted'),
+    [
+        (['estimator', '-p', 'port:=/dev/ttyACM0'], True),
+        (['estimator', '-r', 'deflection:=tip'], True),
+        (['estimator', 'port:=/dev/ttyACM0'], True),
+        (['monitor', '--remap', 'a:=b'], True),
+        (['estimator', '--prot', '/dev/ttyACM0'], False),
+    ],
+)
+def test_arguments_that_are_none_are_refused_by_the_command(
+    argv: list[str], hinted: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as done:
+        main(argv)
+    assert done.value.code == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f'usage: psd-deflection {argv[0]} ')
+    assert f'\npsd-deflection {argv[0]}: error: unrecognized arguments: {argv[1]}' in err
+    assert ('; ROS arguments go behind --ros-args' in err) == hinted
+
+
+def test_ros_arguments_go_through_untouched(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[list[str]] = []
+
+    def run(args: argparse.Namespace) -> int:
+        taken.append(args.ros_arguments)
+        return 0
+
+    monkeypatch.setattr('psd_deflection.cli.estimator.run', run)
+    ros = ['--ros-args', '-p', 'port:=/dev/ttyACM0', '--remap', 'a:=b', '--no-such-option']
+    assert main(['estimator', *ros]) == 0
+    assert taken == [ros]
 
 
 def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
