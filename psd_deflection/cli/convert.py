@@ -66,7 +66,7 @@ def convert(recording: Recording, out: Path, parameters: dict[str, object]) -> i
     else:
         sink = BagWriter(out, rig_values=parameters, device_hello=recording.hello)
     samples = 0
-    with contextlib.closing(sink):
+    with contextlib.closing(sink), blocks:
         for record in records:
             sink.put(record)
             samples += len(record.seq) if isinstance(record, SampleBlock) else 0
@@ -92,8 +92,8 @@ def _to_rerun(recording: Recording, out: Path, params_file: str | None) -> int:
     rig = rig_of(recording, params_file)
     recording = open_recording(recording.path, block_size=rig.estimator.block_size)
     pipeline = Pipeline(rig)
-    with contextlib.closing(RerunFile(out, rig, recording.path.stem)) as sink:
-        for records in replayed(recording, pipeline, progress_of(recording.blocks())):
+    with contextlib.closing(RerunFile(out, rig, recording.path.stem)) as sink, progress_of(recording.blocks()) as bar:
+        for records in replayed(recording, pipeline, bar):
             for record in records:
                 sink.put(record)
     print(

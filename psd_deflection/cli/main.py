@@ -98,8 +98,19 @@ def _run(argv: list[str]) -> int:
         # The parser of the whole program would answer with its own usage, which names none of the command's options.
         args.refuse(f'unrecognized arguments: {" ".join(unknown)}{_ros_hint(unknown)}')
     args.ros_arguments = ros_arguments
+    out: str | None = getattr(args, 'out', None)
+    # What was there before is another run's, and this one has not written into it.
+    fresh = out is not None and not os.path.lexists(out)
     try:
         return int(args.run(args))
+    except KeyboardInterrupt:
+        if out is None or not fresh or not os.path.lexists(out):
+            raise
+        print(
+            f'psd-deflection {args.command}: interrupted; {out} holds only what came before',
+            file=sys.stderr,
+        )
+        return INTERRUPTED
     except PsdDeflectionError as error:
         print(f'psd-deflection {args.command}: {error}', file=sys.stderr)
         return error.exit_status
