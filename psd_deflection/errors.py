@@ -8,11 +8,12 @@ status    meaning
 ========  =======================================================================
 0         done (``replay --compare``: no bit differs)
 1         done, and the answer is "differs" (``replay --compare``)
-2         the command line was not understood (argparse)
+2         the command line was not understood (argparse), or ``UsageError``
 3         ``ConfigError``: parameter file or parameter value
 4         ``RecordingError``: a recording cannot be read or written
 5         ``DeviceError``: port missing, in use, silent, or of another protocol
 6         ``SolverError``: the geometry cannot be solved
+130       Ctrl-C before it was done
 ========  =======================================================================
 """
 
@@ -23,6 +24,15 @@ class PsdDeflectionError(Exception):
     """Base of every error that is the outside world's, not ours."""
 
     exit_status = 70
+
+
+class UsageError(PsdDeflectionError):
+    """Options of a command that do not go together, or one is missing; each by itself argparse has understood.
+
+    Example: ``--out OUT (a recording) or --serve (a device) is needed``.
+    """
+
+    exit_status = 2
 
 
 class ConfigError(PsdDeflectionError):

@@ -21,7 +21,7 @@ import pytest
 from docs import run_commands
 from docs.run_commands import FENCE, PAGES, ROOT, Command
 from psd_deflection import errors
-from psd_deflection.cli.main import COMMANDS, main, make_parser
+from psd_deflection.cli.main import COMMANDS, INTERRUPTED, main, make_parser
 
 ALL = list(run_commands.commands())
 OURS = [c for c in ALL if c.line.startswith('psd-deflection ')]
@@ -188,7 +188,7 @@ def test_every_error_message_is_on_the_troubleshooting_page(hooks: Any) -> None:
 def test_exit_statuses_are_documented(hooks: Any) -> None:
     page = (ROOT / 'docs' / 'commands.md').read_text()
     rows = {int(n) for n in re.findall(r'^\| (\d+) \|', page, re.M)}
-    assert rows == {0, 1, 2, *hooks.STATUS.values()}
+    assert rows == {0, 1, 2, INTERRUPTED, *hooks.STATUS.values()}
     kinds = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, errors.PsdDeflectionError)]
     assert {k.exit_status for k in kinds} - rows == {errors.PsdDeflectionError.exit_status}
 

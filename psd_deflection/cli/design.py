@@ -19,7 +19,7 @@ import numpy as np
 
 from psd_deflection.cli._report import columns, save_figure
 from psd_deflection.config import Rig, load_rig
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, UsageError
 from psd_deflection.mechanics import LinkStatics, placement, scaling
 from psd_deflection.mechanics.section import TubeSection
 from psd_deflection.records import FloatArray
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the tables or the study."""
     if args.params_file is None:
         if args.out is not None:
-            raise ConfigError('--out draws the placement of a rig: give --params-file RIG.yaml')
+            raise UsageError('--out draws the placement of a rig: give --params-file RIG.yaml')
         print(appendix_b())
         return 0
     rig = load_rig(args.params_file)

@@ -1,7 +1,8 @@
 """List the serial ports, ask what is on each, and print the parameter lines for it.
 
 Without a name, every port that the system lists; with names, only those (a pseudo-terminal is in no list).
-Ports that another program has open are named and left alone.
+Ports that another program has open are named and left alone. Exit status 5: a port that you named is missing, in use
+or cannot be opened.
 
   psd-deflection devices
   psd-deflection devices /dev/ttyACM0 --json
@@ -14,6 +15,7 @@ import json
 import sys
 from dataclasses import asdict
 
+from psd_deflection.errors import DeviceError
 from psd_deflection.io.port_survey import Port, survey
 
 
@@ -24,16 +26,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the survey; the exit status is 0 whatever was found."""
+    """Print the survey; the exit status is 0 whatever was found, unless a port that was named could not be asked."""
     told = sys.stderr.isatty() and not args.json
     if told:
         print('asking; a port that stays silent takes some seconds ...', end='', file=sys.stderr, flush=True)
     ports = survey(args.ports)
     if told:
         print('\r\x1b[K', end='', file=sys.stderr, flush=True)
+    status = DeviceError.exit_status if args.ports and not all(p.asked for p in ports) else 0
     if args.json:
         print(json.dumps({'ports': [asdict(p) for p in ports], 'suggested': suggestions(ports)}, indent=2))
-        return 0
+        return status
     if not ports:
         print('no serial ports; is the device plugged in? (a pseudo-terminal has to be named)')
         return 0
@@ -42,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
         print(f'{port.port}{about}\n  {port.answer}')
     for suggested in suggestions(ports):
         print('\n' + parameter_lines(suggested))
-    return 0
+    return status
 
 
 def suggestions(ports: list[Port]) -> list[dict[str, object]]:

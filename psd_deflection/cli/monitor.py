@@ -25,7 +25,7 @@ from psd_deflection.cli._program import program
 from psd_deflection.cli.estimator import Display, run_without_ros, simulates
 from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.config import read_parameter_file, replace_values, rig_from_values
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import UsageError
 from psd_deflection.io.recordings import open_recording
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.monitor.source import ReplaySource
@@ -74,8 +74,17 @@ def overrides_of(args: argparse.Namespace) -> dict[str, object]:
     return values
 
 
+def _check(args: argparse.Namespace) -> None:
+    if not math.isfinite(args.speed) or args.speed <= 0.0:
+        raise UsageError(f'--speed {args.speed:g}: must be above 0')
+    for name in ('port', 'baud', 'record'):
+        if args.recording is not None and getattr(args, name) is not None:
+            raise UsageError(f'--{name} is for a rig; {args.recording} is played')
+
+
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
+    _check(args)
     overrides = overrides_of(args)
     need_server()
     if args.recording is not None:
@@ -101,11 +110,6 @@ def run(args: argparse.Namespace) -> int:
 def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     from psd_deflection.monitor.server import MonitorServer
 
-    if not math.isfinite(args.speed) or args.speed <= 0.0:
-        raise ConfigError(f'--speed {args.speed:g}: must be above 0')
-    for name in ('port', 'baud', 'record'):
-        if getattr(args, name) is not None:
-            raise ConfigError(f'--{name} is for a rig; {args.recording} is played')
     rig = replace_values(rig_of(open_recording(args.recording), args.params_file), overrides, 'command line')
 
     def open_steps() -> tuple[Pipeline, Iterator[list[Record]]]:

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from psd_deflection.cli import serve
 from psd_deflection.config import EFFECTS_PREFIX, Rig, load_rig, replace_values
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, UsageError
 from psd_deflection.io.bag_writer import BagWriter, McapFile
 from psd_deflection.io.csv_writer import CsvSampleSink
 from psd_deflection.io.sinks import Sink
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     if args.serve or args.attached:
         return serve.run_device(args)
     if args.out is None:
-        raise ConfigError('--out OUT (a recording) or --serve (a device) is needed')
+        raise UsageError('--out OUT (a recording) or --serve (a device) is needed')
     known = load_rig(args.params_file)
     rig = with_effects(known, args.effect)
     rate = rig.converter.sample_rate_hz

@@ -39,6 +39,7 @@ class Port:
     """A port. ``source``: the name for ``source:``, '' where nothing that we know answers.
 
     ``answer``: what answered, or why nothing could. ``suggested``: parameters for it.
+    ``asked``: False where the port is missing, in use or cannot be opened.
     """
 
     port: str
@@ -47,6 +48,7 @@ class Port:
     source: str = ''
     answer: str = 'nothing that we know answers'
     suggested: dict[str, Any] = field(default_factory=dict)
+    asked: bool = True
 
 
 class _Ear:
@@ -156,6 +158,7 @@ def identify(port: Port) -> Port:
             _ask(port, FRAMES_BAUD)
     except DeviceError as error:
         port.answer = str(error).removeprefix(f'{port.port}: ')
+        port.asked = False
     return port
 
 

@@ -151,6 +151,19 @@ def test_a_rig_that_cannot_be_solved(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert 'coincide' in err
 
 
+@pytest.mark.parametrize(
+    ('argv', 'told'),
+    [(['simulate'], '--out OUT (a recording) or --serve'), (['design', '--out', 'a.png'], 'give --params-file')],
+    ids=['simulate', 'design'],
+)
+def test_options_that_do_not_go_together_are_usage(
+    argv: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, err = refused(capsys, *argv)
+    assert status == 2
+    assert told in err
+
+
 def test_output_that_is_there_already_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / 'out.csv'
     out.write_text('mine')

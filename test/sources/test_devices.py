@@ -61,11 +61,17 @@ def test_each_is_known_by_its_answer(
     assert read_parameter_file(path)['port'] == pair['port']
 
 
-def test_a_port_in_use_or_missing_is_named_and_left_alone(served: Any, unloaded: Any, tmp_path: Path) -> None:
+def test_a_port_in_use_or_missing_is_named_and_left_alone(
+    served: Any, unloaded: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     name = str(served(SimulatedDevice(load_rig(), unloaded)).link)
     mine = SerialPort(name, 921_600)
     busy, missing = survey([name, str(tmp_path / 'none')])
+    assert main(['devices', name]) == 5
     mine.close()
+    assert main(['devices', name]) == 0
+    assert main(['devices', '--json', name, str(tmp_path / 'none')]) == 5
+    assert 'no such port' in capsys.readouterr().out
     assert 'another program has the port open' in busy.answer
     assert 'no such port' in missing.answer
     assert busy.source == missing.source == ''
