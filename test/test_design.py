@@ -55,7 +55,6 @@ def test_the_drawing_is_written(tmp_path: Path, name: str, capsys: pytest.Captur
         (['--params-file', RIG, '--sigma', '0'], '--sigma'),
         (['--params-file', RIG, '--radius', '-1'], '--radius'),
         (['--params-file', RIG, '--out', 'plan.txt'], '.png, .svg or .pdf'),
-        (['--out', 'plan.png'], '--params-file'),
         (['--params-file', RIG, '--out', 'no/such/folder/plan.png'], 'cannot be written'),
     ],
 )
