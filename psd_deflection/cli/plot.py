@@ -256,7 +256,9 @@ def _spectrum(axes: Any, spectrum: Spectrum, rig: Rig) -> None:
     axes.set_title('spectrum of the dots', loc='left', fontsize=9)
     axes.set(xlabel='f (Hz)', ylabel='µm/√Hz', xscale='log', yscale='log')
     if density is None:
-        axes.text(0.5, 0.5, 'no stretch without a loss is long enough', transform=axes.transAxes, ha='center')
+        axes.text(
+            0.5, 0.5, 'no stretch with light and without a loss is long enough', transform=axes.transAxes, ha='center'
+        )
         return
     for channel, color, values in zip(
         ('x1', 'y1', 'x2', 'y2'), ('#0b6bcb', '#5aa2e6', '#c2570c', '#e8a15f'), density, strict=True
