@@ -100,7 +100,8 @@ class Drawn:
 
 def run(args: argparse.Namespace) -> int:
     """Read, replay, draw."""
-    out = Path(args.out) if args.out is not None else Path(Path(args.recording.rstrip('/')).stem + '.png')
+    name = Path(args.recording).resolve().name
+    out = Path(args.out) if args.out is not None else default_out(args.recording)
     if out.suffix.lower() not in KINDS:
         raise ConfigError(f'--out {out}: the name must end in {", ".join(KINDS)}')
     rig = rig_of(open_recording(args.recording), args.params_file)
@@ -114,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
     if not drawn.spots:
         raise RecordingError(f'{args.recording}: has no samples to draw')
     summary = summarise(drawn, rig)
-    figure = draw(drawn, spectrum, rig, Path(args.recording).name)
+    figure = draw(drawn, spectrum, rig, name)
     if out.suffix.lower() == '.html':
         write_html(figure, out, str(args.recording), summary)
     else:
@@ -126,6 +127,13 @@ def run(args: argparse.Namespace) -> int:
         print(f'{name:<24} {value}')
     print(f'written to {out}')
     return 0
+
+
+def default_out(recording: str) -> Path:
+    """A .png here, named like the recording; a folder's name may have dots in it."""
+    path = Path(recording).resolve()
+    is_file = path.suffix.lower() in ('.mcap', '.csv') and not path.is_dir()
+    return Path(f'{path.stem if is_file else path.name}.png')
 
 
 def figures(drawn: Drawn, rig: Rig) -> dict[str, Any]:

@@ -2,11 +2,13 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
 
 from psd_deflection.cli.main import main
+from psd_deflection.cli.plot import default_out
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
 
@@ -64,6 +66,24 @@ def test_json_is_in_si_units(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert found['dx']['sd'] == pytest.approx(0.18e-6, abs=0.01e-6)
     assert found['dy']['min'] < -2e-3 < found['dy']['max']
     assert Path(found['out']).exists()
+
+
+def test_the_picture_is_named_like_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = tmp_path / 'run_0.5N'
+    shutil.copytree(BAGS / 'clean', bag)
+    monkeypatch.chdir(bag)
+    assert main(['plot', '.']) == 0
+    assert 'written to run_0.5N.png' in capsys.readouterr().out
+    assert (bag / 'run_0.5N.png').exists()
+    for recording, name in (
+        ('../run_0.8N', 'run_0.8N.png'),
+        ('../run_0.5N/', 'run_0.5N.png'),
+        ('clean_0.mcap', 'clean_0.png'),
+        ('a/run_0.5N.CSV', 'run_0.5N.png'),
+    ):
+        assert default_out(recording) == Path(name)
 
 
 @pytest.mark.parametrize(
