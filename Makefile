@@ -38,6 +38,7 @@ SOURCES := $(shell find psd_deflection msg_adapters config launch resource -type
 $(VENV)/.requirements: setup.cfg
 	$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info[:2] <= (3, 12) else f"Python 3.11 or 3.12 is needed, this is {sys.version.split()[0]}: make PYTHON=python3.12")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@echo 'setting up $(VENV), once: a minute or two, 0.9 GB'
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[ros,monitor,test]' $(if $(WITH),'$(WITH)')
 	touch $@
 

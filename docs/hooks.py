@@ -104,7 +104,9 @@ def on_page_markdown(markdown: str, **kwargs: Any) -> str:
     for name, fill in FILLED.items():
         mark = f'<!-- {name} -->'
         if mark in markdown:
-            markdown = markdown.replace(mark, fill())
+            # In the place of the line below it too, which is for those who read the file itself.
+            before, _, after = markdown.partition(f'{mark}\n')
+            markdown = f'{before}{fill()}\n{after.partition(chr(10))[2]}'
     return markdown
 
 

@@ -19,6 +19,7 @@ import argparse
 import contextlib
 import importlib.util
 import math
+import shlex
 import sys
 import threading
 import time
@@ -168,7 +169,7 @@ def run(args: argparse.Namespace) -> int:
     with started_early(simulates(overrides, args.ros_arguments)):
         status = _run(args, overrides, display, watch)
     for folder in (f for f in recorded if f.is_dir()):
-        display.say(f'recorded {folder}\n  replay it:  {program()} replay {folder} --compare')
+        display.say(f'recorded {folder}\n  replay it:  {program()} replay {shlex.quote(str(folder))} --compare')
     return status
 
 

@@ -43,15 +43,15 @@ def lacks(recording: Recording, topics: Mapping[str, int]) -> list[str]:
     """What is not in it and some command would need, each with the way out."""
     found = []
     if not topics.get(SAMPLES):
-        found.append(f'no samples ({SAMPLES}): nothing can be computed from it')
+        found.append(f'samples ({SAMPLES}): nothing can be computed from it')
     if not recording.parameters:
-        found.append('no parameters: the nominal rig is taken where --params-file gives no other')
+        found.append('parameters: the nominal rig is taken where --params-file gives no other')
     if recording.hello is None:
-        found.append('no word of the device itself')
+        found.append('what the device says of itself')
     if not topics.get(DEFLECTION):
-        found.append(f'no estimates ({DEFLECTION}): `psd-deflection replay` makes them')
+        found.append(f'estimates ({DEFLECTION}): `psd-deflection replay` makes them')
     if not topics.get(LOAD):
-        found.append(f'no known loads ({LOAD}): `psd-deflection discover` needs them')
+        found.append(f'known loads ({LOAD}): `psd-deflection discover` needs them')
     return found
 
 

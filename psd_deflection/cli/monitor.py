@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import shlex
 import signal
 import threading
 from collections.abc import Iterator
@@ -94,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     with started_early(simulates({**values, **overrides})):
         status = run_without_ros({**values, **overrides}, display, watch)
     for folder in recorded:
-        display.say(f'recorded {folder}\n  replay it:  {program()} replay {folder} --compare')
+        display.say(f'recorded {folder}\n  replay it:  {program()} replay {shlex.quote(str(folder))} --compare')
     return status
 
 

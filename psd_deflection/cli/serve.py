@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import json
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -68,8 +69,9 @@ def run_device(args: argparse.Namespace) -> int:
         print(f'{PORT_LINE}{names}', flush=True)
         if not args.attached:
             source = '' if name == 'serial' else f' --source {name}'
+            reached = shlex.quote(','.join(map(str, links))) if args.link else names
             print(
-                f'a simulated rig answers there; try:  {program()} estimator --port {names}{source}\nCtrl-C ends it',
+                f'a simulated rig answers there; try:  {program()} estimator --port {reached}{source}\nCtrl-C ends it',
                 file=sys.stderr,
             )
         serve_all(devices, ports, stop.is_set)

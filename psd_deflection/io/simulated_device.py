@@ -20,6 +20,7 @@ import numpy as np
 
 from psd_deflection import __version__
 from psd_deflection.config import Rig
+from psd_deflection.errors import ConfigError
 from psd_deflection.protocol.frames import (
     PROTOCOL_VERSION,
     FrameDecoder,
@@ -176,7 +177,10 @@ class SimulatedDevice:
 
 
 class PseudoTerminal:
-    """The device's side of a port that pyserial can open: ``name`` is the host's side."""
+    """The device's side of a port that pyserial can open: ``name`` is the host's side.
+
+    ``link``: a symbolic link to it, which replaces an older link and nothing else; ConfigError where it cannot be made.
+    """
 
     def __init__(self, link: str | Path | None = None) -> None:
         self.master, slave = os.openpty()
@@ -187,14 +191,20 @@ class PseudoTerminal:
         os.set_blocking(self.master, False)
         self._link = Path(link) if link is not None else None
         if self._link is not None:
-            self._link.unlink(missing_ok=True)
-            self._link.symlink_to(self.name)
+            try:
+                if self._link.is_symlink():
+                    self._link.unlink()
+                self._link.symlink_to(self.name)
+            except OSError as error:
+                os.close(self.master)
+                raise ConfigError(f'{self._link}: no link can be made there ({error.strerror})') from None
 
     def close(self) -> None:
         """Take the port away, as a pulled cable does."""
         os.close(self.master)
-        if self._link is not None:
-            self._link.unlink(missing_ok=True)
+        # It may be another's by now.
+        if self._link is not None and self._link.is_symlink() and str(self._link.readlink()) == self.name:
+            self._link.unlink()
 
 
 class LineDevice(Protocol):

@@ -236,7 +236,8 @@ class MonitorServer:
         if len(self._browsers) >= BROWSERS:
             return web.Response(status=503, text=f'{BROWSERS} browsers look on already')
         # Who does not read for this long is gone.
-        browser = web.WebSocketResponse(heartbeat=10.0, max_msg_size=1024)
+        # Not compressed: aiohttp compresses what is long in a task of its own, which outlives a browser that has left.
+        browser = web.WebSocketResponse(heartbeat=10.0, max_msg_size=1024, compress=False)
         await browser.prepare(request)
         event = asyncio.Event()
         self._browsers[browser] = event

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import socket
+from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.config import load_rig
+from psd_deflection.errors import ConfigError
 from psd_deflection.io import simulated_device as module
 from psd_deflection.io.simulated_device import PseudoTerminal, SimulatedDevice, serve
 from psd_deflection.protocol.frames import (
@@ -128,3 +130,18 @@ def test_a_process_that_wakes_late_catches_up_and_drops_nothing(monkeypatch: pyt
     got = frames(received)
     assert [f.seq for f in got if isinstance(f, SampleFrame)] == list(range(d.taken))
     assert {f.overruns for f in got if isinstance(f, StatusFrame)} == {0}
+
+
+def test_a_link_replaces_a_link_and_nothing_else(tmp_path: Path) -> None:
+    mine = tmp_path / 'my_rig.yaml'
+    mine.write_text('precious')
+    for place in (mine, tmp_path, tmp_path / 'nothing' / 'port'):
+        with pytest.raises(ConfigError, match=r'no link can be made there \((File exists|No such file or directory)\)'):
+            PseudoTerminal(place)
+    assert mine.read_text() == 'precious'
+    first = PseudoTerminal(tmp_path / 'port')
+    second = PseudoTerminal(tmp_path / 'port')
+    first.close()
+    assert str((tmp_path / 'port').readlink()) == second.name
+    second.close()
+    assert not (tmp_path / 'port').is_symlink()

@@ -77,10 +77,10 @@ def test_info_of_what_has_no_samples(tmp_path: Path, capsys: pytest.CaptureFixtu
     text = capsys.readouterr().out
     for part in (
         'samples      none',
-        'no samples (/psd/samples)',
-        'no parameters',
-        'no word of the device',
-        'no known loads',
+        'lacks        samples (/psd/samples)',
+        ' parameters: the nominal',
+        'what the device says of itself',
+        ' known loads',
     ):
         assert part in text
     assert main(['info', str(tmp_path / 'empty'), '--json']) == 0
