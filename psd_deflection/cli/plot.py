@@ -30,7 +30,7 @@ from psd_deflection.errors import ConfigError, RecordingError
 from psd_deflection.io.recordings import open_recording
 from psd_deflection.monitor.spectrum import Spectrum
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.records import DeflectionEstimate, FloatArray, Record, SampleBlock, SpotMeans
+from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, Record, SampleBlock, SpotMeans
 
 KINDS = ('.png', '.svg', '.pdf', '.html')
 SPECTRUM_S = 600.0
@@ -51,10 +51,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 class Drawn:
     """What is drawn, a row a block: s, m, m, rad, V; NaN where a block has no estimate.
 
-    ``numbers``: of the first and the last sample.
+    ``numbers``: of the first and the last sample. ``first``, ``last``: the blocks at the ends, which a
+    start or a stop amid a block leaves unfinished.
     """
 
     numbers: tuple[int, int] | None = None
+    first: SampleBlock | None = None
+    last: SampleBlock | None = None
     spots: list[SpotMeans] = field(default_factory=list)
     estimates: dict[int, DeflectionEstimate] = field(default_factory=dict)
 
@@ -67,9 +70,11 @@ class Drawn:
         elif isinstance(record, SampleBlock):
             first, last = int(record.seq[0]), int(record.seq[-1])
             self.numbers = (first if self.numbers is None else self.numbers[0], last)
+            self.first = self.first or record
+            self.last = record
 
     def table(self) -> dict[str, FloatArray]:
-        """Arrays (n,): t from the first block, pose, standard deviations, dots, sums, samples lost."""
+        """Arrays (n,): t from the first block, pose, standard deviations, dots, sums, samples lost, 1 if unfinished."""
         start = self.spots[0].t_ns
         nothing = (np.nan,) * 6
         rows: list[tuple[float, ...]] = []
@@ -80,16 +85,27 @@ class Drawn:
                 step = ((s.t_ns - start) / 1e9 - rows[-1][0]) / (s.index - index)
                 before = rows[-1][0]
                 for k in (1, s.index - index - 1):
-                    rows.append((before + k * step, *nothing, *(np.nan,) * 7))
+                    rows.append((before + k * step, *nothing, *(np.nan,) * 7, 0.0))
             index = s.index
             e = self.estimates.get(s.index)
             pose = (
                 nothing if e is None else (e.dx, e.dy, e.theta, *(max(e.covariance[i], 0.0) ** 0.5 for i in (0, 4, 8)))
             )
-            rows.append(((s.t_ns - start) / 1e9, *pose, *s.dots, *s.sums, float(s.lost)))
-        names = ('t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta', 'x1', 'y1', 'x2', 'y2', 'sum1', 'sum2', 'lost')
+            lost = self._lost(s)
+            unfinished = s.status is BlockStatus.TOO_FEW_SAMPLES and lost == 0
+            rows.append(((s.t_ns - start) / 1e9, *pose, *s.dots, *s.sums, float(lost), float(unfinished)))
+        pose_names, dot_names = ('dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta'), ('x1', 'y1', 'x2', 'y2')
+        names = ('t', *pose_names, *dot_names, 'sum1', 'sum2', 'lost', 'unfinished')
         columns = np.array(rows, np.float64).T
         return dict(zip(names, columns, strict=True))
+
+    def _lost(self, spots: SpotMeans) -> int:
+        """Samples lost of a block: of one at an end those between its own first and last, as in ``gone``."""
+        lost = spots.lost
+        for block in (self.first, self.last):
+            if block is not None and block.index == spots.index:
+                lost = min(lost, int(block.seq[-1] - block.seq[0]) + 1 - len(block.seq))
+        return lost
 
     def gone(self) -> int:
         """Samples that are missing between the first and the last one."""
@@ -100,7 +116,8 @@ class Drawn:
 
 def run(args: argparse.Namespace) -> int:
     """Read, replay, draw."""
-    out = Path(args.out) if args.out is not None else Path(Path(args.recording.rstrip('/')).stem + '.png')
+    name = Path(args.recording).resolve().name
+    out = Path(args.out) if args.out is not None else default_out(args.recording)
     if out.suffix.lower() not in KINDS:
         raise ConfigError(f'--out {out}: the name must end in {", ".join(KINDS)}')
     rig = rig_of(open_recording(args.recording), args.params_file)
@@ -114,7 +131,7 @@ def run(args: argparse.Namespace) -> int:
     if not drawn.spots:
         raise RecordingError(f'{args.recording}: has no samples to draw')
     summary = summarise(drawn, rig)
-    figure = draw(drawn, spectrum, rig, Path(args.recording).name)
+    figure = draw(drawn, spectrum, rig, name)
     if out.suffix.lower() == '.html':
         write_html(figure, out, str(args.recording), summary)
     else:
@@ -126,6 +143,13 @@ def run(args: argparse.Namespace) -> int:
         print(f'{name:<24} {value}')
     print(f'written to {out}')
     return 0
+
+
+def default_out(recording: str) -> Path:
+    """A .png here, named like the recording; a folder's name may have dots in it."""
+    path = Path(recording).resolve()
+    is_file = path.suffix.lower() in ('.mcap', '.csv') and not path.is_dir()
+    return Path(f'{path.stem if is_file else path.name}.png')
 
 
 def figures(drawn: Drawn, rig: Rig) -> dict[str, Any]:
@@ -158,7 +182,10 @@ def summarise(drawn: Drawn, rig: Rig) -> list[tuple[str, str]]:
         ('samples', f'{present} present, {lost} lost ({100.0 * lost / (present + lost):.3g} %)'),
         ('estimates', f'{f["estimates"]} of {f["blocks"]} blocks ({f["solver"]})'),
     ]
-    rows += [(f'without: {cause.replace("_", " ")}', f'{n} blocks') for cause, n in f['without_estimate'].items()]
+    rows += [
+        (f'without: {cause.replace("_", " ")}', f'{n} block' if n == 1 else f'{n} blocks')
+        for cause, n in f['without_estimate'].items()
+    ]
     for name, label, scale, unit in _POSE:
         if name in f:
             low, high, sd = (f[name][k] * scale for k in ('min', 'max', 'sd'))
@@ -214,7 +241,7 @@ def draw(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any:
 
 def _mark_losses(axes: Any, table: dict[str, FloatArray]) -> None:
     """Red ticks where samples are missing, grey where there is no estimate."""
-    t, none, lost = table['t'], ~np.isfinite(table['dx']), ~(table['lost'] == 0)
+    t, none, lost = table['t'], ~np.isfinite(table['dx']) & (table['unfinished'] == 0), ~(table['lost'] == 0)
     edges = np.flatnonzero(np.diff(np.concatenate(([False], none, [False])).astype(int)))
     half = float(np.median(np.diff(t))) / 2.0 if len(t) > 1 else 0.0
     for i, (first, end) in enumerate(edges.reshape(-1, 2)):
@@ -256,7 +283,9 @@ def _spectrum(axes: Any, spectrum: Spectrum, rig: Rig) -> None:
     axes.set_title('spectrum of the dots', loc='left', fontsize=9)
     axes.set(xlabel='f (Hz)', ylabel='µm/√Hz', xscale='log', yscale='log')
     if density is None:
-        axes.text(0.5, 0.5, 'no stretch without a loss is long enough', transform=axes.transAxes, ha='center')
+        axes.text(
+            0.5, 0.5, 'no stretch with light and without a loss is long enough', transform=axes.transAxes, ha='center'
+        )
         return
     for channel, color, values in zip(
         ('x1', 'y1', 'x2', 'y2'), ('#0b6bcb', '#5aa2e6', '#c2570c', '#e8a15f'), density, strict=True

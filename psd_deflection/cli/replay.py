@@ -174,7 +174,7 @@ def _print_summary(args: argparse.Namespace, rig: Rig, pipeline: Pipeline, total
         f'{counters.estimates} estimates ({rig.estimator.solver})'
     )
     for cause, count in sorted(counters.refused.items()):
-        print(f'  no estimate: {count} blocks, {cause.replace("_", " ")}')
+        print(f'  no estimate: {count} {"block" if count == 1 else "blocks"}, {cause.replace("_", " ")}')
     if len(poses):
         low, high = poses.min(axis=0), poses.max(axis=0)
         print(

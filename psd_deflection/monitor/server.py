@@ -30,7 +30,7 @@ from psd_deflection.errors import ConfigError
 from psd_deflection.monitor import access
 from psd_deflection.monitor.feed import COLUMNS, BlockResult, Feed, row_json
 from psd_deflection.monitor.source import RefusedError, Source
-from psd_deflection.monitor.spectrum import Spectrum
+from psd_deflection.monitor.spectrum import Spectrum, density_json
 from psd_deflection.records import BlockStatus, DiagnosticReport
 
 PAGE = Path(__file__).parent / 'page'
@@ -178,7 +178,7 @@ class MonitorServer:
             now = time.monotonic()
             if self._browsers and now >= due:
                 due = now + SPECTRUM_S
-                self._density = (self._density[0] + 1, self._spectrum_json())
+                self._density = (self._density[0] + 1, density_json(self._spectrum.density()))
                 new = True
             if new:
                 self._wake()
@@ -198,12 +198,6 @@ class MonitorServer:
     def _wake(self) -> None:
         for event in self._browsers.values():
             event.set()
-
-    def _spectrum_json(self) -> str:
-        density = self._spectrum.density()
-        if density is None:
-            return 'null'
-        return '[' + ','.join('[' + ','.join(f'{v:.3g}' for v in channel) + ']' for channel in density.tolist()) + ']'
 
     def _health_json(self, report: DiagnosticReport) -> str:
         entries = [

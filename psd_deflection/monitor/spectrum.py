@@ -2,7 +2,8 @@
 
 Welch's method (P. D. Welch, IEEE Trans. Audio Electroacoust. 15, 1967): Hann windows, half
 overlapping, linear trend left in but for the mean. A segment holds only samples that follow each
-other: a lost sample ends one, and nothing is filled in.
+other: a lost sample ends one, and nothing is filled in. Nor does one hold a sample without light: its
+place, 0 mm, is no dot's.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ class Spectrum:
         self._blocks: deque[SampleBlock] = deque(
             maxlen=None if samples is None else max(2, round(samples / rig.estimator.block_size))
         )
+        # As the optics' health has it: half the light is no lost laser where two share both detectors.
+        self._sum_min = rig.estimator.sum_min * (0.5 if rig.estimator.splitter else 1.0)
         self._window = np.hanning(SEGMENT + 1)[:-1]
 
     def add(self, block: SampleBlock) -> None:
@@ -43,22 +46,39 @@ class Spectrum:
         return np.arange(1, SEGMENT // 2 + 1, dtype=np.float64) * (self.rate_hz / SEGMENT)
 
     def density(self) -> FloatArray | None:
-        """(4, k) of x1 y1 x2 y2, m/sqrt(Hz), one-sided; None while no stretch without a loss is long enough."""
+        """(4, k) of x1 y1 x2 y2, m/sqrt(Hz), one-sided; NaN for a PSD, None for both, without a long enough stretch.
+
+        Such a stretch has no loss and, on that PSD, light throughout.
+        """
         if not self._blocks:
             return None
         seq = np.concatenate([b.seq for b in self._blocks])
-        dots = self._calibration.dots(np.concatenate([b.volts for b in self._blocks])).astype(np.float64)
+        volts = np.concatenate([b.volts for b in self._blocks])
+        dots = self._calibration.dots(volts).astype(np.float64)
+        for psd in (0, 1):
+            dots[~(volts[:, 3 * psd + 2] >= self._sum_min), 2 * psd : 2 * psd + 2] = np.nan
         total = np.zeros((SEGMENT // 2 + 1, 4))
-        count = 0
+        count = np.zeros(4)
         for run in np.split(dots, np.flatnonzero(np.diff(seq) != 1) + 1):
             for start in range(0, len(run) - SEGMENT + 1, SEGMENT // 2):
                 part = run[start : start + SEGMENT]
-                if not np.isfinite(part).all():
+                seen = np.repeat(np.isfinite(part).all(axis=0).reshape(2, 2).all(axis=1), 2)
+                if not seen.any():
                     continue
+                part = part[:, seen]
                 transform = np.fft.rfft((part - part.mean(axis=0)) * self._window[:, None], axis=0)
-                total += np.abs(transform) ** 2
-                count += 1
-        if count == 0:
+                total[:, seen] += np.abs(transform) ** 2
+                count += seen
+        if not count.any():
             return None
+        count[count == 0] = np.nan
         power = 2.0 * total / (count * self.rate_hz * float((self._window**2).sum()))
         return np.asarray(np.sqrt(power[1:]).T, np.float64)
+
+
+def density_json(density: FloatArray | None) -> str:
+    """:meth:`Spectrum.density` as the page reads it, NaN as null."""
+    if density is None:
+        return 'null'
+    rows = (','.join(f'{v:.3g}' if v == v else 'null' for v in channel) for channel in density.tolist())
+    return '[' + ','.join(f'[{row}]' for row in rows) + ']'

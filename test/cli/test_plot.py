@@ -1,12 +1,16 @@
 from __future__ import annotations
 
+import itertools
 import json
 import re
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from psd_deflection.cli.main import main
+from psd_deflection.cli.plot import default_out
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
 
@@ -56,6 +60,51 @@ def test_losses_and_missing_estimates_are_marked() -> None:
     assert t[(dx != dx) & (table['lost'] > 0)].tolist() == pytest.approx([50 * 0.02], abs=1e-3)
 
 
+def test_blocks_cut_by_start_and_stop_have_lost_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from matplotlib.figure import Figure
+
+    from psd_deflection.cli.plot import Drawn, _mark_losses
+    from psd_deflection.cli.replay import replayed, rig_of
+    from psd_deflection.io.recordings import open_recording
+    from psd_deflection.pipeline import Pipeline
+    from psd_deflection.records import SampleBlock
+
+    recording = open_recording(BAGS / 'clean')
+
+    def drawn_of(numbers: list[int]) -> tuple[list[float], list[bool], int, list[str]]:
+        blocks = []
+        for b in itertools.islice(recording.blocks(), 4):
+            kept = np.isin(b.seq, numbers)
+            blocks.append(SampleBlock(b.index, b.seq[kept], b.t_ns[kept], b.volts[kept], b.flags[kept]))
+        drawn = Drawn()
+        for records in replayed(recording, Pipeline(rig_of(recording, None)), blocks):
+            for record in records:
+                drawn.add(record)
+        table = drawn.table()
+        axes = Figure().add_subplot()
+        _mark_losses(axes, table)
+        estimated = [x == x for x in table['dx'].tolist()]
+        return table['lost'].tolist(), estimated, drawn.gone(), axes.get_legend_handles_labels()[1]
+
+    # Three samples of the first block, two whole ones, five of the last.
+    lost, estimated, gone, marks = drawn_of([*range(17, 65)])
+    assert lost == [0.0, 0.0, 0.0, 0.0]
+    assert estimated == [False, True, True, False]
+    assert (gone, marks) == (0, [])
+    # A gap inside the last block is one, and so is a block without an estimate for it.
+    lost, _, gone, marks = drawn_of([*range(17, 62), 64])
+    assert lost == [0.0, 0.0, 0.0, 2.0]
+    assert (gone, marks) == (2, ['no estimate', 'lost samples'])
+    whole = tmp_path / 'whole.csv'
+    assert main(['convert', str(BAGS / 'clean'), '--out', str(whole)]) == 0
+    whole.write_text('\n'.join([*whole.read_text().splitlines()[:66], '']))
+    capsys.readouterr()
+    assert main(['plot', str(whole), '--out', str(tmp_path / 'a.svg')]) == 0
+    assert re.search(r'too few samples +1 block$', capsys.readouterr().out, re.MULTILINE)
+    assert main(['replay', str(whole)]) == 0
+    assert 'no estimate: 1 block, too few samples' in capsys.readouterr().out
+
+
 def test_json_is_in_si_units(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['plot', str(BAGS / 'laser_off'), '--out', str(tmp_path / 'a.svg'), '--json']) == 0
     found = json.loads(capsys.readouterr().out)
@@ -64,6 +113,24 @@ def test_json_is_in_si_units(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert found['dx']['sd'] == pytest.approx(0.18e-6, abs=0.01e-6)
     assert found['dy']['min'] < -2e-3 < found['dy']['max']
     assert Path(found['out']).exists()
+
+
+def test_the_picture_is_named_like_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = tmp_path / 'run_0.5N'
+    shutil.copytree(BAGS / 'clean', bag)
+    monkeypatch.chdir(bag)
+    assert main(['plot', '.']) == 0
+    assert 'written to run_0.5N.png' in capsys.readouterr().out
+    assert (bag / 'run_0.5N.png').exists()
+    for recording, name in (
+        ('../run_0.8N', 'run_0.8N.png'),
+        ('../run_0.5N/', 'run_0.5N.png'),
+        ('clean_0.mcap', 'clean_0.png'),
+        ('a/run_0.5N.CSV', 'run_0.5N.png'),
+    ):
+        assert default_out(recording) == Path(name)
 
 
 @pytest.mark.parametrize(

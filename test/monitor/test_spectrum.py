@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from psd_deflection.config import load_rig
-from psd_deflection.monitor.spectrum import SEGMENT, Spectrum
+from psd_deflection.monitor.spectrum import SEGMENT, Spectrum, density_json
 from psd_deflection.records import SampleBlock
 
 RIG = load_rig()
@@ -74,4 +76,35 @@ def test_it_keeps_four_seconds_and_starts_anew_when_numbers_go_back() -> None:
     assert density is not None
     assert density[0].max() == 0.0
     spectrum.add(blocks(noisy)[0])
+    assert spectrum.density() is None
+
+
+def test_samples_without_light_are_no_dots() -> None:
+    rng = np.random.default_rng(4)
+    lit, dark = blocks(rng.normal(1.0, 2e-3, 4000)), blocks(np.zeros(4000))
+    for block in dark:
+        block.volts[:, 2] = 0.01
+    spectrum = Spectrum(RIG)
+    # The dot stands at 0.5 mm; counted as one at 0 mm, the dark part in the middle would be a step.
+    for block in [*lit[:80], *dark[80:120], *lit[120:]]:
+        spectrum.add(block)
+    density = spectrum.density()
+    assert density is not None
+    assert np.sqrt((density[0] ** 2).mean()) == pytest.approx(2e-3 * 0.5e-3 / np.sqrt(500.0), rel=0.1)
+    # PSD 1 dark, or its sum not a number, all along: nothing of it, and PSD 2 is told all the same.
+    for sum1 in (0.01, np.nan):
+        spectrum = Spectrum(RIG)
+        for block in blocks(rng.normal(0.0, 2e-3, 4000)):
+            block.volts[:, 2] = sum1
+            spectrum.add(block)
+        density = spectrum.density()
+        assert density is not None
+        assert np.isnan(density[:2]).all()
+        assert (density[2:] == 0.0).all()
+        # NaN is no JSON: a browser would refuse the whole message.
+        assert json.loads(density_json(density)) == [[None] * (SEGMENT // 2)] * 2 + [[0.0] * (SEGMENT // 2)] * 2
+    spectrum = Spectrum(RIG)
+    for block in dark:
+        block.volts[:, 5] = 0.01
+        spectrum.add(block)
     assert spectrum.density() is None
