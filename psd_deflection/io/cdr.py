@@ -2,8 +2,8 @@
 
 The node publishes and the recorder writes the very same bytes (XCDR1, little-endian, header
 ``00 01 00 00``), so a message is encoded once. The library's encoder walks the definition anew for
-each message; those that are a header and numbers, seven of the eight of a block, are packed in one
-go here, to the same bytes: that is a third of what the pipeline thread does.
+each message, which was the dearest part of a block; messages that are a header and numbers, seven
+of a block's eight, are packed in one go here, to the same bytes.
 """
 
 from __future__ import annotations
