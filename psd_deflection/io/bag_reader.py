@@ -152,7 +152,9 @@ class BagRecording(Recording):
                 waiting = block
         if waiting is None:
             cut = '' if self.complete else ' before the cut'
-            raise RecordingError(f'{self.path}: holds no samples{cut} (topic {SAMPLES})')
+            raise RecordingError(
+                f'{self.path}: holds no samples{cut} (topic {SAMPLES}); `psd-deflection info` lists what it holds'
+            )
         yield waiting
 
     def _samples_in_order(self) -> Iterator[tuple[IntArray, IntArray, npt.NDArray[np.float32], npt.NDArray[np.uint8]]]:

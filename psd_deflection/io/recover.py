@@ -241,8 +241,10 @@ def _recover_file(path: Path) -> RecoveredFile:
             except DamagedError as error:
                 source.warnings.append(f'{path}: {error}; it is left out')
         copy.finish()
-    finally:
+    except BaseException:
         copy.abandon()
+        partial.unlink(missing_ok=True)
+        raise
     count = FileCount(path.name, copy.start, copy.end, copy.messages)
     if cut:
         aside = path.with_name(path.name + '.cut')
@@ -280,7 +282,10 @@ def recover(path: str | Path) -> Recovered:
         if not path.is_file():
             raise RecordingError(f'{path}: no such recording')
         _refuse_if_written(path)
-        return Recovered([_recover_file(path)], False, [])
+        file = _recover_file(path)
+        if path.stat().st_size <= len(MAGIC):
+            raise RecordingError(f'{path}: has no more than its first bytes; there is nothing to recover')
+        return Recovered([file], False, [])
     except OSError as error:
         raise RecordingError(f'{path}: cannot be repaired ({error.strerror or error})') from None
 
