@@ -41,9 +41,6 @@ COMMANDS: dict[str, str] = {
 }
 """Command name to one-line summary; the module is ``psd_deflection.cli.NAME`` (``-`` as ``_``)."""
 
-USAGE = 2
-"""Exit status of a command line that was not understood; argparse has the same."""
-
 ROS_OPTIONS = ('-p', '--param', '-r', '--remap')
 """What ROS 2 takes behind --ros-args and people type without it."""
 
@@ -132,8 +129,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if error.errno not in _REFUSED_OUTPUT or error.filename is not None:
             raise
         _discard_output()
-        print(f'psd-deflection: the standard output cannot be written ({error.strerror})', file=sys.stderr)
-        return RecordingError.exit_status
+        refused = RecordingError(f'the standard output cannot be written ({error.strerror})')
+        print(f'psd-deflection: {refused}', file=sys.stderr)
+        return refused.exit_status
     return status
 
 
@@ -146,21 +144,19 @@ def _discard_output() -> None:
 
 
 def _run(argv: list[str]) -> int:
-    chosen = [a for a in argv if not a.startswith('-')][:1]
-    if chosen and chosen[0] not in COMMANDS:
-        close = difflib.get_close_matches(chosen[0], COMMANDS, 1)
-        hint = f'did you mean {close[0]}?' if close else '`psd-deflection --help` lists them'
-        print(f'psd-deflection: no command {chosen[0]!r}; {hint}', file=sys.stderr)
-        return USAGE
-    parser = make_parser(chosen)
+    chosen = [a for a in argv if a and not a.startswith('-')][:1]
     # `ros2 run` and `ros2 launch` add arguments of their own: they are for rclpy, not for argparse.
     own, ros_arguments = _split_ros_arguments(argv)
     try:
         _refuse_empty(own)
-        args, unknown = parser.parse_known_args(own)
+        if chosen and chosen[0] not in COMMANDS:
+            close = difflib.get_close_matches(chosen[0], COMMANDS, 1)
+            hint = f'did you mean {close[0]}?' if close else '`psd-deflection --help` lists them'
+            raise UsageError(f'no command {chosen.pop()!r}; {hint}')
+        args, unknown = make_parser(chosen).parse_known_args(own)
     except UsageError as error:
-        print(f'psd-deflection {" ".join(chosen)}: {error}', file=sys.stderr)
-        return USAGE
+        print(f'{" ".join(["psd-deflection", *chosen])}: {error}', file=sys.stderr)
+        return error.exit_status
     if unknown:
         # The parser of the whole program would answer with its own usage, which names none of the command's options.
         args.refuse(f'unrecognized arguments: {" ".join(unknown)}{_ros_hint(unknown)}')
