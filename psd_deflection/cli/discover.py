@@ -97,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
         'report.html': page,
     }
     for name, text in files.items():
-        save(text.encode(), out / name)
+        save(text.encode(errors='replace'), out / name)
     if args.json:
         print(in_json)
         return 0

@@ -14,9 +14,10 @@ import importlib
 import itertools
 import os
 import shutil
+import signal
 import sys
 import textwrap
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from psd_deflection import __version__
@@ -165,7 +166,8 @@ def _run(argv: list[str]) -> int:
     # What was there before is another run's, and this one has not written into it.
     fresh = out is not None and not os.path.lexists(out)
     try:
-        return int(args.run(args))
+        with _ended_like_ctrl_c() if fresh else contextlib.nullcontext():
+            return int(args.run(args))
     except KeyboardInterrupt:
         aside = set_aside(Path(out)) if out is not None and fresh else ''
         if not aside:
@@ -176,6 +178,22 @@ def _run(argv: list[str]) -> int:
         aside = set_aside(Path(out)) if out is not None and fresh else ''
         print(f'psd-deflection {args.command}: {error}{aside}', file=sys.stderr)
         return error.exit_status
+
+
+@contextlib.contextmanager
+def _ended_like_ctrl_c() -> Iterator[None]:
+    """What a `timeout` or a closed terminal ends leaves no output either that looks whole."""
+    before = {}
+    # Only the main thread may say so.
+    with contextlib.suppress(ValueError):
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is signal.SIG_DFL:
+                before[number] = signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def set_aside(out: Path) -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import html
 import io
+import os
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -120,7 +121,10 @@ class Drawn:
 
 def run(args: argparse.Namespace) -> int:
     """Read, replay, draw."""
-    name = Path(args.recording).resolve().name
+    # A name that is no text is shown as far as it is one.
+    name, title = (
+        os.fsencode(n).decode(errors='replace') for n in (Path(args.recording).resolve().name, args.recording)
+    )
     out = Path(args.out) if args.out is not None else default_out(args.recording)
     need_folder(out)
     rig = rig_of(open_recording(args.recording), args.params_file)
@@ -137,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
     with told('drawing', quiet=args.json):
         figure = draw(drawn, spectrum, rig, name)
         if out.suffix.lower() == '.html':
-            write_html(figure, out, str(args.recording), summary)
+            write_html(figure, out, title, summary)
         else:
             save_figure(figure, out, dpi=150)
     if args.json:

@@ -14,7 +14,7 @@ import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 import yaml
@@ -23,6 +23,7 @@ from mcap.writer import CompressionType, Writer
 from psd_deflection import __version__
 from psd_deflection.errors import RecordingError
 from psd_deflection.io.bag_metadata import DEFAULT_QOS, FileCount, Qos, TopicCount, bag_information, write_metadata
+from psd_deflection.io.bag_reader import read_information
 from psd_deflection.io.bag_writer import CHUNK_NS, CUSTOM
 from psd_deflection.io.mcap_source import (
     CHANNEL,
@@ -290,6 +291,17 @@ def recover(path: str | Path) -> Recovered:
         raise RecordingError(f'{path}: cannot be repaired ({error.strerror or error})') from None
 
 
+def _describes(metadata: Path, files: list[RecoveredFile]) -> bool:
+    """Whether ``metadata.yaml`` can be read and names the files that are there; what rosbag2 compressed is its own."""
+    try:
+        information = read_information(metadata)
+    except RecordingError:
+        return False
+    named = information.get('relative_file_paths')
+    names = {PurePath(str(n)).name for n in named} if isinstance(named, list) else set()
+    return bool(information.get('compression_mode')) or names == {f.path.name for f in files}
+
+
 def _recover_folder(folder: Path) -> Recovered:
     paths = sorted(folder.glob('*.mcap'), key=_number)
     if not paths:
@@ -307,7 +319,9 @@ def _recover_folder(folder: Path) -> Recovered:
         files.append(_recover_file(file))
     metadata = folder / 'metadata.yaml'
     if metadata.is_file() and not set_aside and not any(f.repaired for f in files):
-        return Recovered(files, False, set_aside)
+        if _describes(metadata, files):
+            return Recovered(files, False, set_aside)
+        metadata.replace(metadata.with_name(metadata.name + '.cut'))
     topics: dict[str, TopicCount] = {}
     for file_ in files:
         for t in file_.topics:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +132,18 @@ def test_an_output_that_was_not_finished_does_not_pretend_to_be_whole(
         assert not (folder / name).exists()
 
 
+@pytest.fixture
+def signals() -> Iterator[None]:
+    """Handlers as in a program that has just begun: commands that go on until Ctrl-C leave theirs behind."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)}
+    before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures('signals')
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize(
     ('argv', 'sink'),
     [
@@ -140,13 +154,20 @@ def test_an_output_that_was_not_finished_does_not_pretend_to_be_whole(
     ids=lambda v: v[0] if isinstance(v, list) else '',
 )
 def test_ctrl_c_leaves_no_output_that_looks_whole(
-    argv: list[str], sink: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    argv: list[str],
+    sink: str,
+    number: signal.Signals,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def interrupted(self: object, record: object) -> None:
-        raise KeyboardInterrupt
+        signal.raise_signal(number)
 
     monkeypatch.setattr(sink, interrupted)
+    before = signal.getsignal(number)
     assert main([*argv, '--out', 'out.csv']) == 130
+    assert signal.getsignal(number) is before
     told = f'psd-deflection {argv[0]}: interrupted; out.csv.partial holds what came before\n'
     assert capsys.readouterr().err == told
     assert [p.name for p in folder.iterdir()] == ['out.csv.partial']
@@ -233,6 +254,13 @@ def test_no_letter_is_missing_so_much_that_it_fails() -> None:
     done = program(f'PROGRAM replay {CLEAN}', PYTHONIOENCODING='ascii')
     assert (done.returncode, done.stderr) == (0, '')
     assert '4000 samples' in done.stdout
+
+
+def test_a_name_that_is_no_text_is_drawn_as_far_as_it_is(folder: Path) -> None:
+    name = os.fsdecode(b'n\xff.mcap')
+    (folder / name).write_bytes(Path(CLEAN, 'clean_0.mcap').read_bytes())
+    assert main(['plot', name, '--out', 'a.html']) == 0
+    assert 'n\ufffd.mcap' in (folder / 'a.html').read_text(encoding='utf-8')
 
 
 def strict(text: str) -> Any:
