@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 
+from psd_deflection.cli._progress import told
 from psd_deflection.io.recover import recover
 
 
@@ -25,7 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Repair and say what was done."""
     for path in args.recording:
-        done = recover(path)
+        with told(f'reading {path}, and writing anew what is cut'):
+            done = recover(path)
         for file in done.files:
             for warning in file.warnings:
                 print(f'warning: {warning}', file=sys.stderr)
