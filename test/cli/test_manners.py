@@ -296,6 +296,9 @@ def odd_recording(folder: Path) -> Path:
         ['replay', CLEAN, '--compare'],
         ['plot', CLEAN, '--out', 'a.svg'],
         ['plot', 'dark.csv', '--out', 'a.svg'],
+        ['convert', CLEAN, '--out', 'a.csv'],
+        ['recover', 'cut.mcap'],
+        ['simulate', *SHORT, '--out', 'a'],
         ['params'],
         ['budget', '--load', '0', '0', '0', '--monte-carlo', '100'],
         ['devices'],
@@ -306,6 +309,7 @@ def test_json_is_all_that_is_on_stdout(argv: list[str], folder: Path, capsys: py
     odd_recording(folder)
     rows = [f'{i / 1000:.3f},0,0,0,0,0,0' for i in range(100)]
     (folder / 'dark.csv').write_text('\n'.join(['t,x1,y1,sum1,x2,y2,sum2', *rows]) + '\n')
+    (folder / 'cut.mcap').write_bytes(Path(CLEAN, 'clean_0.mcap').read_bytes()[:100_000])
     # A recording of another machine may differ in its last bits.
     assert main([*argv, '--json']) in ((0, 1) if '--compare' in argv else (0,))
     out, err = capsys.readouterr()
@@ -317,4 +321,10 @@ def test_json_is_all_that_is_on_stdout(argv: list[str], folder: Path, capsys: py
         assert compared['same'] == (not compared['different'])
     elif argv[0] == 'replay':
         assert found['compared'] is None
-    assert (err == '') == ('--compare' not in argv)
+    elif argv[0] == 'recover':
+        (recording,) = found['recordings']
+        (file,) = recording['files']
+        assert file['repaired']
+        assert file['messages'] > 500
+    # A verdict and a warning are for whoever reads the log.
+    assert (err == '') == ('--compare' not in argv and argv[0] != 'recover')
