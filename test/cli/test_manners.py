@@ -109,6 +109,19 @@ def test_any_other_dot_is_part_of_a_folder_s_name(name: str, folder: Path) -> No
     assert (folder / f'sim_{name}' / 'metadata.yaml').is_file()
 
 
+@pytest.mark.parametrize(
+    'argv',
+    [
+        ['simulate', '--out', 'a.csv', *SHORT, '--temperature', '-5,-2.5e1'],
+        ['budget', '--json', '--load', '-1e0', '-5e1', '-.5'],
+        ['design', '--params-file', RIG, '--box', '-1.2e-1', '-.1', '1e-1', '1e-1'],
+    ],
+    ids=lambda argv: argv[0],
+)
+def test_a_negative_number_is_a_value_however_it_is_written(argv: list[str]) -> None:
+    assert main(argv) == 0
+
+
 def bad_from_row(folder: Path, row: int) -> Path:
     """A CSV that can be read up to ``row``."""
     path = folder / 'bad.csv'
