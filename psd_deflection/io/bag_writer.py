@@ -319,11 +319,6 @@ class BagWriter:
         """True once nothing more can be written, be it after ``close`` or after an error."""
         return self._file.closed
 
-    @property
-    def ended_files(self) -> list[Path]:
-        """The files that are whole already, oldest first."""
-        return [self.folder / count.path for count, _ in self._ended]
-
     def _begin(self) -> McapFile:
         file = McapFile(
             self.folder / f'{self._name}_{self._number}.mcap',
