@@ -33,7 +33,7 @@ from psd_deflection.ros.parameters import LiveParameters, rig_of_node
 from psd_deflection.ros.wires import InputRecorder, PublisherWire
 from psd_deflection.runner.health import STALE, HealthReporter
 from psd_deflection.runner.realtime import Watchdog, settle
-from psd_deflection.runner.session import Session
+from psd_deflection.runner.session import Session, zero_text
 from psd_deflection.runner.signals import Signals, StopRequestedError
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 
@@ -230,10 +230,7 @@ class EstimatorNode:
             return response
         rig = self.session.rig
         self._live.show(rig)
-        (x1, y1), (x2, y2) = (psd.zero for psd in rig.psds)
-        text = f'unloaded dots (mm): psd_1 ({x1 * 1e3:.4f}, {y1 * 1e3:.4f}), psd_2 ({x2 * 1e3:.4f}, {y2 * 1e3:.4f})'
-        self._say(text)
-        response.success, response.message = True, text
+        response.success, response.message = True, zero_text(rig)
         return response
 
     def _record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:

@@ -54,8 +54,8 @@ class HealthReporter:
                 self._acquisition(new, rate(new.samples)),
                 self._clock(),
                 self._estimates(new, rate(new.estimates)),
-                self._laser(1),
-                self._laser(2),
+                self._laser(1, new),
+                self._laser(2, new),
                 self._recording(),
             ),
         )
@@ -142,11 +142,14 @@ class HealthReporter:
             values.append(('latency, worst of a second (ms)', f'{latency.worst * 1e3:.3f}'))
         return DiagnosticEntry('psd_deflection: estimates', level, message, tuple(values))
 
-    def _laser(self, psd: int) -> DiagnosticEntry:
+    def _laser(self, psd: int, new: _Seen) -> DiagnosticEntry:
         name = f'psd_deflection: psd_{psd}'
         spots = self._session.pipeline.last_spots
         if spots is None:
             return DiagnosticEntry(name, STALE, 'no block yet', ())
+        if new.samples == 0:
+            # What was seen last says nothing about now.
+            return DiagnosticEntry(name, STALE, 'no samples', ())
         total = spots.sums[psd - 1]
         x, y = spots.dots[2 * psd - 2], spots.dots[2 * psd - 1]
         # Reasons and findings name the detector they are about.

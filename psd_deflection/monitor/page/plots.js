@@ -99,11 +99,12 @@ export class Plots {
     this.frequencies = Array.from({ length: bins }, (_, i) => f0 * (i + 1));
     this.plots = {
       shift: new uPlot(options(color, elements.shift, [line(color('--dx')), edge, edge, line(color('--dy')), edge, edge], {
-        bands: [{ series: [2, 3], fill: fade('--dx') }, { series: [5, 6], fill: fade('--dy') }],
+        // uPlot fills from the upper edge down.
+        bands: [{ series: [3, 2], fill: fade('--dx') }, { series: [6, 5], fill: fade('--dy') }],
         scales: { x: time, y: { range: calm(1) } }, hooks,
       }), this.empty(7), elements.shift),
       theta: new uPlot(options(color, elements.theta, [line(color('--theta')), edge, edge], {
-        bands: [{ series: [2, 3], fill: fade('--theta') }],
+        bands: [{ series: [3, 2], fill: fade('--theta') }],
         scales: { x: time, y: { range: calm(0.5) } }, hooks,
       }), this.empty(4), elements.theta),
       sums: new uPlot(options(color, elements.sums, [line(color('--dx')), line(color('--dy'))], {
