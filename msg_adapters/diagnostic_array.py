@@ -20,7 +20,7 @@ def from_report(report: DiagnosticReport) -> Fields:
                 'level': entry.level,
                 'name': entry.name,
                 'message': entry.message,
-                'hardware_id': '',
+                'hardware_id': report.hardware_id,
                 'values': [{'key': key, 'value': value} for key, value in entry.values],
             }
             for entry in report.entries
@@ -41,4 +41,5 @@ def to_report(fields: Mapping[str, Any]) -> DiagnosticReport:
             )
             for s in fields['status']
         ),
+        next((str(s['hardware_id']) for s in fields['status']), ''),
     )

@@ -12,10 +12,12 @@ nothing of lifecycles meets an ordinary node.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import rclpy
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -30,7 +32,7 @@ from psd_deflection.io import cdr
 from psd_deflection.monitor.start import start_monitor
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.parameters import LiveParameters, rig_of_node
-from psd_deflection.ros.wires import InputRecorder, PublisherWire
+from psd_deflection.ros.wires import InputRecorder, PublisherWire, say_on_rosout
 from psd_deflection.runner.health import STALE, HealthReporter
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import Session, zero_text
@@ -92,18 +94,24 @@ class EstimatorNode:
             )
         except ParameterException as error:
             raise ConfigError(f'ROS parameters: {error}') from None
+        except ValueError:
+            raise ConfigError(
+                'ROS parameters: one of them is an empty list, of which ROS cannot tell the type; '
+                'leave it out for its default'
+            ) from None
         except RuntimeError as error:
             # What DDS refuses: security that it was built without, or an enclave that may not.
             raise ConfigError('ROS: ' + ' '.join(str(error).split())) from None
         self.node.owner = self
         try:
-            self._say = say or self.node.get_logger().info
+            self._say = say_on_rosout(self.node, say) if say is not None else self.node.get_logger().info
             self.rig = rig_of_node(self.node, {})
             self._live = LiveParameters(self.node)
             self.node.create_service(Trigger, '~/zero', self._zero)
             self.node.create_service(SetBool, '~/record', self._record)
             self._wire, self._inputs = self._wires()
-            self.node.create_timer(1.0, self._report)
+            # Neither a simulated clock that stands still nor a system clock that is set keeps health from being told.
+            self.node.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
             self._markers = self._make_markers()
         except BaseException:
             self.node.destroy_node()
@@ -115,7 +123,7 @@ class EstimatorNode:
         outputs.update({solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in solvers})
         try:
             return PublisherWire(self.node, outputs), InputRecorder(self.node)
-        except (InvalidQosOverridesError, ValueError) as error:
+        except (InvalidQosOverridesError, ValueError, RuntimeError) as error:
             raise ConfigError(f'ROS parameters: qos_overrides: {error}') from None
 
     def _make_markers(self) -> RigMarkers | None:
@@ -149,8 +157,10 @@ class EstimatorNode:
 
     def start(self) -> None:
         """Configure and activate, where ``autostart`` says so. Raises what stands in the way."""
+        if self.node.get_parameter('use_sim_time').value:
+            self._say('use_sim_time is true: what is measured is stamped by the system clock all the same')
         if not self.rig.values['autostart']:
-            self._say('waiting to be configured: ros2 lifecycle set /estimator configure')
+            self._say(f'waiting to be configured: ros2 lifecycle set {self.node.get_fully_qualified_name()} configure')
             return
         self._starting = True
         for trigger in (self.node.trigger_configure, self.node.trigger_activate):
@@ -222,7 +232,7 @@ class EstimatorNode:
             return response
         try:
             change = self.session.zero()
-        except TimeoutError as error:
+        except (PsdDeflectionError, TimeoutError) as error:
             response.message = f'not zeroed: {error}'
             return response
         if change is None:
@@ -249,13 +259,23 @@ class EstimatorNode:
         return response
 
     def _report(self) -> None:
-        now = self.node.get_clock().now().nanoseconds
+        now = time.time_ns()
         if self.session is not None and self._health is not None:
-            self.session.fanout.put(self._health.report(now))
+            # The page may have taken a zero as well.
+            self._live.show(self.session.rig)
+            self.session.fanout.put(self._named(self._health.report(now)))
             return
         entry = DiagnosticEntry('psd_deflection: node', STALE, 'not configured', ())
-        (message,) = to_messages(DiagnosticReport(now, (entry,)))
+        (message,) = to_messages(self._named(DiagnosticReport(now, (entry,))))
         self._wire.put(message.topic, message.type, cdr.encode(message.type, message.fields), now)
+
+    def _named(self, report: DiagnosticReport) -> DiagnosticReport:
+        """``report`` under this node's name where that is not the usual one: two rigs are told apart."""
+        node = self.node.get_fully_qualified_name().removeprefix('/')
+        if node == NODE_NAME:
+            return report
+        entries = (e._replace(name=e.name.replace('psd_deflection', node, 1)) for e in report.entries)
+        return report._replace(entries=tuple(entries))
 
     def close(self) -> None:
         """End the session, then the node."""

@@ -48,6 +48,7 @@ class HealthReporter:
         def rate(count: int) -> str:
             return f'{count / seconds:.2f}' if seconds > 0 else 'unknown'
 
+        hello = s.acquisition.hello
         return DiagnosticReport(
             t_ns,
             (
@@ -58,6 +59,7 @@ class HealthReporter:
                 self._laser(2, new),
                 self._recording(),
             ),
+            str(hello.info.get('serial', '')) if hello is not None else '',
         )
 
     def _acquisition(self, new: _Seen, rate: str) -> DiagnosticEntry:
