@@ -180,8 +180,6 @@ class EstimatorNode:
             self._inputs.session = session
             session.start()
             self._monitor = start_monitor(session, self._say)
-            if self._markers is not None:
-                self._markers.session = session
         except BaseException:
             self.cleanup()
             raise
@@ -189,6 +187,8 @@ class EstimatorNode:
     def activate(self) -> None:
         """Publish."""
         self._wire.active = True
+        if self._markers is not None:
+            self._markers.session = self.session
         domain = os.environ.get('ROS_DOMAIN_ID') or '0'
         node = self.node.get_fully_qualified_name()
         topics = ', '.join(self._wire.names((DEFLECTION, '/link_tip/wrench', '/psd/samples', DIAGNOSTICS)))
@@ -196,7 +196,7 @@ class EstimatorNode:
 
     def deactivate(self) -> None:
         """Publish no more; reading and recording go on."""
-        self._wire.active = False
+        self._silence()
         self._say('not publishing; reading and recording go on')
 
     def release(self) -> None:
@@ -212,18 +212,21 @@ class EstimatorNode:
 
     def cleanup(self) -> None:
         """End the session: the port is free."""
-        self._wire.active = False
+        self._silence()
         self._inputs.session = None
         self._live.session = None
         self._health = None
-        if self._markers is not None:
-            self._markers.session = None
         monitor, self._monitor = self._monitor, None
         if monitor is not None:
             monitor.close()
         session, self.session = self.session, None
         if session is not None:
             session.close()
+
+    def _silence(self) -> None:
+        self._wire.active = False
+        if self._markers is not None:
+            self._markers.session = None
 
     def _zero(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = False

@@ -132,7 +132,10 @@ def transform(parent: str, child: str, t_ns: int, at: Vector, rotation: dict[str
 
 
 class RigMarkers:
-    """Publishes ten times a second what ``session`` last knew; nothing while it is None."""
+    """Publishes ten times a second what ``session`` last knew; nothing while it is None.
+
+    What is at rest is published again when the zero was taken: the beams then stand where the dots are.
+    """
 
     def __init__(self, node: Node, rig: Rig) -> None:
         self.session: Session | None = None
@@ -141,6 +144,7 @@ class RigMarkers:
         self._at_rest = node.create_publisher(MarkerArray, relative(AT_REST), _LATCHED)
         self._moving = node.create_publisher(MarkerArray, relative(MOVING), 10)
         self._at_rest.publish(at_rest(rig))
+        self._rest_of = rig
         self._tf: Any = None
         # tf2_msgs comes with a ROS installation, not with the wheels.
         if importlib.util.find_spec('tf2_msgs') is not None:
@@ -164,6 +168,9 @@ class RigMarkers:
         if spots is None or spots.t_ns == self._seen:
             return
         self._seen = spots.t_ns
+        if session.rig is not self._rest_of:
+            self._rest_of = session.rig
+            self._at_rest.publish(at_rest(session.rig))
         self._moving.publish(moving(session.rig, estimate, spots, self._magnify))
         if self._tf is not None and estimate is not None:
             rotation = quaternion(estimate.theta, estimate.phi, estimate.omega)

@@ -12,6 +12,8 @@ import pytest
 pytestmark = pytest.mark.ros
 pytest.importorskip('rclpy')
 
+from rcl_interfaces.srv import SetParameters  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
 
@@ -94,3 +96,8 @@ def test_a_late_rviz_sees_both(start: Callable[..., Any], peer: Any) -> None:
     peer.until(lambda: len(rest) >= 1, 'the latched markers')
     assert {m.ns for m in rest[0].markers} == {'link_at_rest', 'laser', 'beam'}
     assert {m.ns for m in moves[-1].markers} == {'link', 'plate', 'psd', 'dot'}
+    # The beams stand where the unloaded dots are.
+    put = Parameter('psd_1.zero', value=[0.001, 0.0]).to_parameter_msg()
+    peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[put]))
+    x = RIG.psds[0].center[0] + 0.001
+    peer.until(lambda: by_name(rest[-1])['beam', 1].points[0].x == pytest.approx(x), 'the beam at the new zero')
