@@ -233,6 +233,7 @@ class MonitorServer:
                 'entries': entries,
                 'dropped': self._feed.dropped,
                 'browsers': len(self._browsers),
+                'sum_min': self._source.rig.estimator.sum_min,
                 **self._source.describe(),
             }
         )
@@ -328,6 +329,7 @@ class MonitorServer:
             'sum_min': rig.estimator.sum_min,
             'modes': [['bending', rig.dynamics.bending_frequency], ['torsion', rig.dynamics.torsion_frequency]],
             'frequency': [frequencies[0], len(frequencies)],
+            'spectrum_s': self._spectrum.seconds,
             'solver': rig.estimator.solver,
             'control': self._config.control,
             'needs_token': bool(self.token),

@@ -77,6 +77,7 @@ def test_a_browser_gets_the_last_minute_then_what_is_new(serve: Serve) -> None:
     assert hello['columns'][:2] == ['t', 'block']
     assert hello['active_areas'] == [[0.01, 0.01], [0.01, 0.01]]
     assert hello['control'] is False
+    assert hello['spectrum_s'] == 4.0
     rows = rows_in(messages)
     assert [r[1] for r in rows] == list(range(8))
     assert {len(r) for r in rows} == {len(hello['columns'])}
@@ -85,6 +86,8 @@ def test_a_browser_gets_the_last_minute_then_what_is_new(serve: Serve) -> None:
     assert told == ['a message']
     health = next(m['health'] for m in messages if 'health' in m)
     assert health['entries'][0]['name'] == 'acquisition'
+    # A level that is changed while it runs reaches the page.
+    assert health['sum_min'] == serving.rig.estimator.sum_min
 
 
 def test_it_remembers_a_minute_and_not_more(serve: Serve) -> None:

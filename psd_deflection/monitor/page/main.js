@@ -93,6 +93,7 @@ function greet(found) {
     } else plots = new Plots(found, color);
   }
   rows.clear();
+  $('spectrum_s').textContent = String(Number(found.spectrum_s.toPrecision(2)));
   if (anew) notice('connected to a daemon that was started anew');
   body.dataset.instance = found.instance;
   $('messages').replaceChildren();
@@ -181,7 +182,7 @@ function showState() {
     [state, text] = ['offline', 'connection lost, trying again'];
     socket.close();
   } else if (received === 0) [state, text] = ['connecting', 'waiting for samples'];
-  else if (now - lastRowAt > STALE_MS) [state, text] = hello.kind === 'replay' ? ['ended', 'end of recording'] : ['stale', 'no samples'];
+  else if (now - lastRowAt > Math.max(STALE_MS, 3000 * hello.block_s)) [state, text] = hello.kind === 'replay' ? ['ended', 'end of recording'] : ['stale', 'no samples'];
   else {
     const status = rows.last('status');
     if (status > 0) [state, text] = ['refused', hello.statuses[status]];
@@ -212,6 +213,7 @@ function showHealth(found) {
   health = found;
   hello.kind = found.kind;
   hello.name = found.name;
+  hello.sum_min = found.sum_min;
   const values = new Map(found.entries.filter((e) => e.name !== 'recording').flatMap((e) => e.values));
   const tiles = TILES.filter(([, key]) => values.has(key)).map(([label, key]) => [label, values.get(key), LOSSES.has(key) && values.get(key) !== '0']);
   tiles.push(['not shown (page too slow)', String(found.dropped), found.dropped > 0]);
