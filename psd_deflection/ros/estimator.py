@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import rclpy
 from rclpy.clock import Clock, ClockType
@@ -109,6 +109,7 @@ class EstimatorNode:
             self._live = LiveParameters(self.node)
             self.node.create_service(Trigger, '~/zero', self._zero)
             self.node.create_service(SetBool, '~/record', self._record)
+            self._survive_requests()
             self._wire, self._inputs = self._wires()
             # Neither a simulated clock that stands still nor a system clock that is set keeps health from being told.
             self.node.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -133,6 +134,27 @@ class EstimatorNode:
         from psd_deflection.ros.markers import RigMarkers
 
         return RigMarkers(self.node, self.rig)
+
+    def _survive_requests(self) -> None:
+        """Answer a request that goes wrong, and say so, instead of ending by it.
+
+        rclpy raises out of its own services where an active node is asked to activate, or a parameter
+        has a type that there is not: the executor would pass that on to whoever measures.
+        """
+
+        def survivor(carry_out: Callable[[Any, Any], Any], name: str) -> Callable[[Any, Any], Any]:
+            def answer(request: Any, response: Any) -> Any:
+                try:
+                    return carry_out(request, response)
+                except Exception as error:
+                    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+                    self._say(f'{name}: refused: {reason}')
+                    return response
+
+            return answer
+
+        for service in self.node.services:
+            service.callback = survivor(service.callback, service.service_name)
 
     def transition(self, action: Callable[[], None]) -> TransitionCallbackReturn:
         """Run one transition; what goes wrong outside is said, kept in ``error``, and leaves the state as it was."""

@@ -16,6 +16,8 @@ from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from geometry_msgs.msg import PoseStamped, WrenchStamped  # noqa: E402
 from lifecycle_msgs.msg import State, Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
+from rcl_interfaces.msg import Parameter as ParameterMessage  # noqa: E402
+from rcl_interfaces.msg import ParameterValue  # noqa: E402
 from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
@@ -72,6 +74,14 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
     assert not markers
     assert change(peer, Transition.TRANSITION_ACTIVATE)
     assert 'publishing on ROS domain' in daemon.said('publishing on ROS domain')
+    # What this state does not have is refused, and measuring goes on.
+    for wrong in (Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_CONFIGURE, 77):
+        assert not change(peer, wrong)
+    assert daemon.said('change_state: refused')
+    strange = ParameterMessage(name='sum_min', value=ParameterValue(type=42))
+    assert (
+        peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[strange])).results == []
+    )
     peer.until(lambda: len(poses) >= 10 and len(markers) > 0, 'estimates')
     assert change(peer, Transition.TRANSITION_DEACTIVATE)
     seen = len(health)
