@@ -21,6 +21,8 @@ from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Restart
 T = TypeVar('T')
 
 REQUEST_TIMEOUT_S = 1.0
+INTERVAL_S = 1.0
+"""Between two lines about estimates, at least."""
 
 
 class RecordSink(Protocol):
@@ -44,10 +46,9 @@ class Spokesman:
     What came and went meanwhile is counted in the next line.
     """
 
-    def __init__(self, say: Callable[[str], None], interval_s: float = 1.0) -> None:
+    def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
-        self._interval = interval_s
-        self._last_line = -interval_s
+        self._last_line = -INTERVAL_S
         self._now = ''
         self._text = ''
         self._blocks = 0
@@ -59,7 +60,7 @@ class Spokesman:
             self._changes += 1
             self._now, self._text = cause, text
         self._blocks += bool(cause)
-        if not self._changes or now - self._last_line < self._interval:
+        if not self._changes or now - self._last_line < INTERVAL_S:
             return
         line = self._text if cause else 'estimates are back'
         if self._changes > 1 or (not cause and self._blocks):
@@ -82,6 +83,7 @@ class Processing:
         self._say = say
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._latencies: deque[float] = deque(maxlen=50)
+        self._heard_ns = time.monotonic_ns()
         self._thread = threading.Thread(target=self._run, name='pipeline', daemon=True)
         self._spokesman = Spokesman(say)
 
@@ -103,6 +105,10 @@ class Processing:
         """How long the last second's blocks took, or None before the first."""
         taken = sorted(self._latencies)
         return Latency(taken[len(taken) // 2], taken[-1]) if taken else None
+
+    def silent_s(self) -> float:
+        """Since the samples that were processed last came, s."""
+        return (time.monotonic_ns() - self._heard_ns) / 1e9
 
     def request(self, action: Callable[[], T]) -> T:
         """Run ``action`` between two blocks and return what it returns; its errors come through.
@@ -152,6 +158,7 @@ class Processing:
                     self._carry_out()
                     continue
                 if isinstance(item, Chunk):
+                    self._heard_ns = item.read_ns
                     if self.give(self.pipeline.process(item.raw)):
                         self._latencies.append((time.monotonic_ns() - item.read_ns) / 1e9)
                         self._tell_refusals()

@@ -198,7 +198,7 @@ def test_the_oldest_file_can_go(tmp_path: Path) -> None:
         for i in range(200):
             bag.write(block(i))
         assert bag.drop_oldest() == tmp_path / 'run' / 'run_0.mcap'
-        assert [p.name for p in bag.ended_files] == ['run_1.mcap', 'run_2.mcap']
+        assert sorted(p.name for p in bag.folder.glob('*.mcap')) == ['run_1.mcap', 'run_2.mcap', 'run_3.mcap']
     assert [b.index for b in open_recording(tmp_path / 'run').blocks()] == list(range(50, 200))
     assert len(theirs(tmp_path / 'run')['/psd/samples']) == 150
 
@@ -207,11 +207,12 @@ def test_chunks_are_on_the_disk_within_half_a_second_of_log_time(tmp_path: Path)
     with BagWriter(tmp_path / 'run', rig_values={}, durable=True) as bag:
         for i in range(100):
             bag.write(block(i))
+            if i < 26:
+                continue
             # What a kill at this moment would leave.
             (tmp_path / 'left.mcap').write_bytes(bag.path.read_bytes())
-            left = [int(b.t_ns[-1]) for b in open_recording(tmp_path / 'left.mcap').blocks()] if i >= 26 else []
-            if left:
-                assert (100 * 20 * STEP) > int(block(i).t_ns[-1]) - left[-1] <= 520 * STEP
+            left = [int(b.t_ns[-1]) for b in open_recording(tmp_path / 'left.mcap').blocks()]
+            assert int(block(i).t_ns[-1]) - left[-1] <= 520 * STEP
 
 
 def test_the_lock_goes_with_the_writer(tmp_path: Path) -> None:

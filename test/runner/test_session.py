@@ -1,0 +1,72 @@
+"""What is asked of a session while its device is there, away, or silent."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from psd_deflection.config import load_rig
+from psd_deflection.protocol.frames import SampleFrame
+from psd_deflection.runner import session as module
+from psd_deflection.runner.health import STALE, HealthReporter
+from psd_deflection.runner.session import Session
+from test.runner.conftest import ScriptedDevice
+
+Sample = Callable[..., SampleFrame]
+
+
+class Running:
+    """A session on ``device``, past its first estimates."""
+
+    def __init__(self, device: ScriptedDevice, sample: Sample) -> None:
+        self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
+        rig = load_rig(overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False})
+        self.session = Session(rig, self.said.put)
+        self.session.start()
+        device.send_frames(*(sample(seq) for seq in range(200)))
+        while self.session.pipeline.counters.estimates < 5:
+            self.session.processing.request(lambda: None)
+
+    def heard(self, text: str) -> None:
+        while text not in self.said.get(timeout=30.0):
+            pass
+
+
+@pytest.fixture
+def running(device: ScriptedDevice, sample: Sample) -> Iterator[Running]:
+    one = Running(device, sample)
+    yield one
+    one.session.close()
+
+
+def test_no_zero_is_taken_of_a_device_that_is_away(running: Running, device: ScriptedDevice) -> None:
+    assert running.session.zero() is not None
+    device.unplug()
+    running.heard('waiting for it to come back')
+    with pytest.raises(TimeoutError, match='no data flows'):
+        running.session.zero()
+
+
+def test_dots_of_a_device_that_is_away_are_not_called_seen(running: Running, device: ScriptedDevice) -> None:
+    def said_of_dots() -> list[tuple[int, str]]:
+        report = health.report(time.time_ns())
+        return [(e.level, e.message) for e in report.entries if e.name.startswith('psd_deflection: psd_')]
+
+    health = HealthReporter(running.session)
+    assert STALE not in dict(said_of_dots())
+    device.unplug()
+    running.heard('waiting for it to come back')
+    # What came before the unplugging is told once more.
+    said_of_dots()
+    assert said_of_dots() == [(STALE, 'no samples')] * 2
+
+
+def test_no_zero_is_taken_of_a_device_that_has_said_nothing_for_long(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, 'SILENT_S', -1e3)
+    with pytest.raises(TimeoutError, match='no data flows'):
+        running.session.zero()
