@@ -114,6 +114,9 @@ def make_parser(chosen: Collection[str]) -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status (``psd_deflection.errors`` lists them; 130: Ctrl-C)."""
     status = 0
+    if sys.stderr is None:
+        # `2>&-`: print() would put on stdout what is for the standard error.
+        sys.stderr = Path(os.devnull).open('w', encoding='utf-8')  # noqa: SIM115 - open as long as the program
     with contextlib.suppress(AttributeError, ValueError):
         # A Δ that the terminal has no letter for is no reason to fail.
         sys.stdout.reconfigure(errors='replace')  # type: ignore[union-attr]
@@ -125,7 +128,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if sys.stdout is not None:
                 sys.stdout.flush()
     except KeyboardInterrupt:
-        print('psd-deflection: interrupted', file=sys.stderr)
+        _tell('psd-deflection: interrupted')
         return INTERRUPTED
     except BrokenPipeError:
         # `psd-deflection ... | head` is not an error.
@@ -135,9 +138,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         _discard_output()
         refused = RecordingError(f'the standard output cannot be written ({error.strerror})')
-        print(f'psd-deflection: {refused}', file=sys.stderr)
+        _tell(f'psd-deflection: {refused}')
         return refused.exit_status
     return status
+
+
+def _tell(line: str) -> None:
+    """On the standard error; where that cannot be written, the exit status still says it."""
+    with contextlib.suppress(OSError):
+        print(line, file=sys.stderr)
 
 
 def _discard_output() -> None:
@@ -160,7 +169,7 @@ def _run(argv: list[str]) -> int:
             raise UsageError(f'no command {chosen.pop()!r}; {hint}')
         args, unknown = make_parser(chosen).parse_known_args(own)
     except UsageError as error:
-        print(f'{" ".join(["psd-deflection", *chosen])}: {error}', file=sys.stderr)
+        _tell(f'{" ".join(["psd-deflection", *chosen])}: {error}')
         return error.exit_status
     if unknown:
         # The parser of the whole program would answer with its own usage, which names none of the command's options.
@@ -176,11 +185,11 @@ def _run(argv: list[str]) -> int:
         aside = set_aside(Path(out)) if out is not None and fresh else ''
         if not aside:
             raise
-        print(f'psd-deflection {args.command}: interrupted{aside}', file=sys.stderr)
+        _tell(f'psd-deflection {args.command}: interrupted{aside}')
         return INTERRUPTED
     except PsdDeflectionError as error:
         aside = set_aside(Path(out)) if out is not None and fresh else ''
-        print(f'psd-deflection {args.command}: {error}{aside}', file=sys.stderr)
+        _tell(f'psd-deflection {args.command}: {error}{aside}')
         return error.exit_status
 
 

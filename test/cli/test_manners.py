@@ -263,6 +263,21 @@ def test_an_output_that_cannot_be_written_to_is_one_line(command: str, unbuffere
     assert (folder / 'whole.csv').exists() == ('whole.csv' in command)
 
 
+@pytest.mark.skipif(not Path('/dev/full').exists(), reason='no /dev/full here')
+@pytest.mark.parametrize('where', ['2>&-', '2>/dev/full'])
+def test_a_standard_error_that_nobody_reads_changes_nothing_else(where: str, folder: Path) -> None:
+    (folder / 'cut.mcap').write_bytes(Path(CLEAN, 'clean_0.mcap').read_bytes()[:100_000])
+    done = program(f'PROGRAM replay nowhere {where}')
+    assert (done.returncode, done.stdout) == (4, '')
+    done = program(f'PROGRAM replay {CLEAN} --json {where}')
+    assert done.returncode == 0
+    assert strict(done.stdout)['samples'] == 4000
+    # It warns of the cut.
+    done = program('PROGRAM replay cut.mcap --json 2>&-')
+    assert done.returncode == 0
+    assert strict(done.stdout)['samples'] > 1000
+
+
 def test_no_letter_is_missing_so_much_that_it_fails() -> None:
     done = program(f'PROGRAM replay {CLEAN}', PYTHONIOENCODING='ascii')
     assert (done.returncode, done.stderr) == (0, '')
