@@ -31,6 +31,7 @@ from psd_deflection.cli._options import given_as_option
 from psd_deflection.cli._program import program
 from psd_deflection.config import Rig, read_parameter_file, rig_from_values
 from psd_deflection.errors import ConfigError, UsageError
+from psd_deflection.io.sources._registry import source_names
 from psd_deflection.monitor.start import start_monitor
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import SIMULATED, Session
@@ -72,6 +73,8 @@ def overrides_of(args: argparse.Namespace) -> dict[str, object]:
     if args.port is not None:
         values['port'] = args.port
     if args.source is not None:
+        if args.source not in source_names():
+            raise UsageError(f'--source {args.source}: must be one of {", ".join(source_names())}')
         values['source'] = args.source
     if args.baud is not None:
         values['baud'] = args.baud
