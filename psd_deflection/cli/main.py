@@ -1,7 +1,7 @@
 """``psd-deflection``: finds the command and turns our errors into one line and an exit status.
 
-Each command is a module of this package with ``SUMMARY``, ``add_arguments(parser)`` and
-``run(args) -> int``; it is imported only when it is asked for, so that ``--help`` stays quick.
+Each command is a module of this package with ``add_arguments(parser)`` and ``run(args) -> int``; it is
+imported only when it is asked for, so that ``--help`` stays quick.
 """
 
 from __future__ import annotations
