@@ -17,7 +17,7 @@ def from_report(report: DiagnosticReport) -> Fields:
                 'level': entry.level,
                 'name': entry.name,
                 'message': entry.message,
-                'hardware_id': '',
+                'hardware_id': report.hardware_id,
                 'values': [{'key': key, 'value': value} for key, value in entry.values],
             }
             for entry in report.entries

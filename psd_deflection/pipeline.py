@@ -246,13 +246,16 @@ class Pipeline:
         if best is not None and not degraded:
             fx, fy, tz = self._statics.tip_load(best.dx, best.dy, best.theta)
             yield TipLoad(t_ns, fx, fy, tz)
+            # A mean taken across an outage must not become a zero.
+            last = self.last_spots
+            if last is not None and t_ns - last.t_ns > ZERO_BLOCKS * size * self._period_ns:
+                self._recent = []
             self._recent = [*self._recent[1 - ZERO_BLOCKS :], dots]
             for number in range(1, len(self._solvers)):
                 other, _ = self._solve(number, t_ns, block.index, dots, variances)
                 if other is not None:
                     yield other
         else:
-            # A mean taken across an outage must not become a zero.
             self._recent = []
         if best is None:
             name = status.name.lower()

@@ -177,10 +177,11 @@ class DiagnosticEntry(NamedTuple):
 
 
 class DiagnosticReport(NamedTuple):
-    """What is published on ``/diagnostics``, once a second."""
+    """What is published on ``/diagnostics``, once a second. ``hardware_id``: the device's serial number."""
 
     t_ns: int
     entries: tuple[DiagnosticEntry, ...]
+    hardware_id: str = ''
 
 
 Record = (

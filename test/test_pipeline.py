@@ -201,6 +201,16 @@ def test_a_zero_is_not_taken_across_an_outage(rig: Rig) -> None:
     assert pipeline.zero() is None
 
 
+def test_a_zero_forgets_what_was_before_an_unplugging(rig: Rig) -> None:
+    pipeline = Pipeline(rig)
+    pose = (1e-4, -2e-4, 1e-3)
+    run(pipeline.process, chunk_of(still(REST, 200, 1)))
+    run(pipeline.process, chunk_of(still(pose, 20, 2), 20_000))
+    assert pipeline.zero() is not None
+    after = run(pipeline.process, chunk_of(still(pose, 200, 3), 20_020))
+    assert abs(estimates(after, 'exact').mean(axis=0)).max() < 2e-5
+
+
 @pytest.mark.parametrize(
     'effect',
     [

@@ -6,6 +6,7 @@ that compare them skip a topic where they differ, so both are made here from one
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -119,5 +120,10 @@ def bag_information(
 def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:
     """``metadata.yaml`` as a whole or not at all. Raises OSError."""
     partial = folder / 'metadata.yaml.partial'
-    partial.write_text(to_yaml({'rosbag2_bagfile_information': information}), encoding='utf-8')
-    partial.replace(folder / 'metadata.yaml')
+    try:
+        partial.write_text(to_yaml({'rosbag2_bagfile_information': information}), encoding='utf-8')
+        partial.replace(folder / 'metadata.yaml')
+    except OSError:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        raise

@@ -2,7 +2,9 @@
 
 Everything it holds has a fixed size: the rows of the last minute, the last messages, one cursor a
 browser. A browser that is too slow misses rows (its traces have gaps), and nothing waits for it:
-each gets what is new when its last message has left.
+each gets what is new when its last message has left. What strangers send costs an answer, never a
+traceback in the log, and connections that nobody looks through are ended before they use up the
+daemon's file descriptors.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import asyncio
 import contextlib
 import errno
 import json
+import logging
 import os
 import secrets
 import socket
@@ -42,6 +45,10 @@ SPECTRUM_S = 0.5
 HISTORY_S = 60.0
 MESSAGES = 50
 BROWSERS = 16
+CONNECTIONS = 100
+"""That may be open beside the browsers' websockets; a browser opens six at most."""
+
+PATH_CHARACTERS = 100
 START_S = 10.0
 CLOSE_S = 3.0
 
@@ -56,6 +63,10 @@ HEADERS = {
 }
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+# aiohttp logs each malformed request with a traceback: whoever reaches the port could fill the journal.
+_UNHEARD = logging.getLogger('psd_deflection.monitor.http')
+_UNHEARD.disabled = True
 
 
 class MonitorServer:
@@ -78,6 +89,7 @@ class MonitorServer:
         self._spectrum = Spectrum(source.rig)
         self._density: tuple[int, str] = (0, 'null')
         self._browsers: dict[web.WebSocketResponse, asyncio.Event] = {}
+        self._looked_through: set[web.RequestHandler] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._ended: asyncio.Event | None = None
         self._started: Future[str] = Future()
@@ -123,12 +135,14 @@ class MonitorServer:
         application.router.add_post('/api/record', self._record)
         application.router.add_static('/page', PAGE)
         application.on_response_prepare.append(_add_headers)
-        runner = web.AppRunner(application, handle_signals=False, access_log=None, shutdown_timeout=1.0)
+        runner = web.AppRunner(
+            application, handle_signals=False, access_log=None, logger=_UNHEARD, shutdown_timeout=1.0
+        )
         await runner.setup()
         tasks: list[asyncio.Task[None]] = []
         try:
             self._started.set_result(await self._listen(runner))
-            tasks = [asyncio.create_task(self._pump()), asyncio.create_task(self._once_a_second())]
+            tasks = [asyncio.create_task(self._pump(runner)), asyncio.create_task(self._once_a_second())]
             ended = asyncio.create_task(self._ended.wait())
             done, _ = await asyncio.wait([ended, *tasks], return_when=asyncio.FIRST_COMPLETED)
             for task in done - {ended}:
@@ -164,9 +178,13 @@ class MonitorServer:
 
     # What the threads of the run bring.
 
-    async def _pump(self) -> None:
+    async def _pump(self, runner: web.AppRunner) -> None:
         due = 0.0
         while True:
+            if runner.server is not None:
+                others = [c for c in runner.server.connections if c not in self._looked_through]
+                for oldest in others[:-CONNECTIONS]:
+                    oldest.force_close()
             new = False
             for item in self._feed.take():
                 if isinstance(item, BlockResult):
@@ -215,6 +233,7 @@ class MonitorServer:
                 'entries': entries,
                 'dropped': self._feed.dropped,
                 'browsers': len(self._browsers),
+                'sum_min': self._source.rig.estimator.sum_min,
                 **self._source.describe(),
             }
         )
@@ -227,20 +246,33 @@ class MonitorServer:
             return web.Response(status=403, text='this is not the name of this machine')
         if (request.method != 'GET' or request.path == '/ws') and not access.is_own_page(request.headers):
             return web.Response(status=403, text='refused: asked for by another site')
-        return await handler(request)
+        if len(request.path) > PATH_CHARACTERS:
+            return web.Response(status=404, text='not found')
+        try:
+            return await handler(request)
+        except (web.HTTPException, ConnectionError):
+            raise
+        except Exception as error:
+            self._say(f'monitor: {request.path}: {type(error).__name__}: {error}')
+            return web.Response(status=500, text='this should not have happened; the daemon has said what')
 
     async def _index(self, request: web.Request) -> web.StreamResponse:
         return web.FileResponse(PAGE / 'index.html')
 
     async def _websocket(self, request: web.Request) -> web.StreamResponse:
-        if len(self._browsers) >= BROWSERS:
-            return web.Response(status=503, text=f'{BROWSERS} browsers look on already')
         # Who does not read for this long is gone.
         # Not compressed: aiohttp compresses what is long in a task of its own, which outlives a browser that has left.
         browser = web.WebSocketResponse(heartbeat=10.0, max_msg_size=1024, compress=False)
         await browser.prepare(request)
+        if len(self._browsers) >= BROWSERS:
+            # A page is told the reason of a close; that of a handshake which failed, it is not.
+            await browser.close(
+                code=WSCloseCode.TRY_AGAIN_LATER, message=f'{BROWSERS} browsers look on already'.encode()
+            )
+            return browser
         event = asyncio.Event()
         self._browsers[browser] = event
+        self._looked_through.add(request.protocol)
         sender = asyncio.create_task(self._send(browser, event))
         try:
             self._take_health()
@@ -249,6 +281,7 @@ class MonitorServer:
                     break
         finally:
             del self._browsers[browser]
+            self._looked_through.discard(request.protocol)
             sender.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionError):
                 await sender
@@ -296,6 +329,7 @@ class MonitorServer:
             'sum_min': rig.estimator.sum_min,
             'modes': [['bending', rig.dynamics.bending_frequency], ['torsion', rig.dynamics.torsion_frequency]],
             'frequency': [frequencies[0], len(frequencies)],
+            'spectrum_s': self._spectrum.seconds,
             'solver': rig.estimator.solver,
             'control': self._config.control,
             'needs_token': bool(self.token),
@@ -317,8 +351,8 @@ class MonitorServer:
         if request.content_type != 'application/json':
             return _answer(415, 'refused: Content-Type must be application/json')
         try:
-            body = json.loads(await request.text() or '{}')
-        except ValueError:
+            body = json.loads(await request.read() or b'{}')
+        except (ValueError, RecursionError):
             return _answer(400, 'refused: not JSON')
         wanted = body.get('record', True) if isinstance(body, dict) else None
         if not isinstance(wanted, bool):
@@ -327,7 +361,7 @@ class MonitorServer:
             text = await asyncio.get_running_loop().run_in_executor(None, action, wanted)
         except RefusedError as error:
             return _answer(409, str(error))
-        self._say(f'monitor: {text}')
+        self._say(f'monitor: {text} (asked for by {request.remote})')
         if self._browsers:
             self._take_health()
         return _answer(200, text)

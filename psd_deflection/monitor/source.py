@@ -16,7 +16,7 @@ from psd_deflection.monitor.feed import Feed
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport, Record, SpotMeans
 from psd_deflection.runner.health import ERROR, OK, WARN, HealthReporter
-from psd_deflection.runner.session import Session
+from psd_deflection.runner.session import Session, zero_text
 
 LONGEST_WAIT_S = 2.0
 """A pause in a recording is not sat out for longer."""
@@ -46,11 +46,6 @@ class Source(Protocol):
 
     def record(self, wanted: bool) -> str:
         """Start or stop a recording; what was done, in a line. Raises RefusedError."""
-
-
-def _zeros(rig: Rig) -> str:
-    (x1, y1), (x2, y2) = (psd.zero for psd in rig.psds)
-    return f'unloaded dots (mm): psd_1 ({x1 * 1e3:.4f}, {y1 * 1e3:.4f}), psd_2 ({x2 * 1e3:.4f}, {y2 * 1e3:.4f})'
 
 
 class LiveSource:
@@ -86,7 +81,7 @@ class LiveSource:
             raise RefusedError(f'not zeroed: {error}') from None
         if change is None:
             raise RefusedError('not zeroed: no good block yet')
-        return _zeros(self._session.rig)
+        return zero_text(self._session.rig)
 
     def record(self, wanted: bool) -> str:
         """Start or stop the recorder between two blocks."""
@@ -179,7 +174,7 @@ class ReplaySource:
             )
         ]
         refused = tuple((f'refused: {cause}', str(count)) for cause, count in sorted(counters.refused.items()))
-        level, message = OK, 'estimates flow'
+        level, message = OK, 'end of the recording' if self._ended else 'estimates flow'
         if spots is not None and spots.reason:
             level, message = ERROR, spots.reason
         entries.append(
@@ -253,4 +248,4 @@ class ReplaySource:
             if self._pipeline.zero() is None:
                 asked.set_exception(RefusedError('not zeroed: no good block yet'))
             else:
-                asked.set_result(_zeros(self._pipeline.rig))
+                asked.set_result(zero_text(self._pipeline.rig))

@@ -26,7 +26,9 @@ class Spectrum:
     def __init__(self, rig: Rig, seconds: float | None = SECONDS) -> None:
         self.rate_hz = rig.converter.sample_rate_hz
         self._calibration = Calibration.from_rig(rig)
-        samples = None if seconds is None else max(seconds * self.rate_hz, 2.0 * SEGMENT)
+        # At low rates it takes longer until there are two segments.
+        self.seconds = None if seconds is None else max(seconds, 2.0 * SEGMENT / self.rate_hz)
+        samples = None if self.seconds is None else self.seconds * self.rate_hz
         self._blocks: deque[SampleBlock] = deque(
             maxlen=None if samples is None else max(2, round(samples / rig.estimator.block_size))
         )

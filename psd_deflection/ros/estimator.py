@@ -12,10 +12,12 @@ nothing of lifecycles meets an ordinary node.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import rclpy
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -30,10 +32,10 @@ from psd_deflection.io import cdr
 from psd_deflection.monitor.start import start_monitor
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.parameters import LiveParameters, rig_of_node
-from psd_deflection.ros.wires import InputRecorder, PublisherWire
+from psd_deflection.ros.wires import InputRecorder, PublisherWire, say_on_rosout
 from psd_deflection.runner.health import STALE, HealthReporter
 from psd_deflection.runner.realtime import Watchdog, settle
-from psd_deflection.runner.session import Session
+from psd_deflection.runner.session import Session, zero_text
 from psd_deflection.runner.signals import Signals, StopRequestedError
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 
@@ -92,18 +94,25 @@ class EstimatorNode:
             )
         except ParameterException as error:
             raise ConfigError(f'ROS parameters: {error}') from None
+        except ValueError:
+            raise ConfigError(
+                'ROS parameters: one of them is an empty list, of which ROS cannot tell the type; '
+                'leave it out for its default'
+            ) from None
         except RuntimeError as error:
             # What DDS refuses: security that it was built without, or an enclave that may not.
             raise ConfigError('ROS: ' + ' '.join(str(error).split())) from None
         self.node.owner = self
         try:
-            self._say = say or self.node.get_logger().info
+            self._say = say_on_rosout(self.node, say) if say is not None else self.node.get_logger().info
             self.rig = rig_of_node(self.node, {})
             self._live = LiveParameters(self.node)
             self.node.create_service(Trigger, '~/zero', self._zero)
             self.node.create_service(SetBool, '~/record', self._record)
+            self._survive_requests()
             self._wire, self._inputs = self._wires()
-            self.node.create_timer(1.0, self._report)
+            # Neither a simulated clock that stands still nor a system clock that is set keeps health from being told.
+            self.node.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
             self._markers = self._make_markers()
         except BaseException:
             self.node.destroy_node()
@@ -115,7 +124,7 @@ class EstimatorNode:
         outputs.update({solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in solvers})
         try:
             return PublisherWire(self.node, outputs), InputRecorder(self.node)
-        except (InvalidQosOverridesError, ValueError) as error:
+        except (InvalidQosOverridesError, ValueError, RuntimeError) as error:
             raise ConfigError(f'ROS parameters: qos_overrides: {error}') from None
 
     def _make_markers(self) -> RigMarkers | None:
@@ -125,6 +134,27 @@ class EstimatorNode:
         from psd_deflection.ros.markers import RigMarkers
 
         return RigMarkers(self.node, self.rig)
+
+    def _survive_requests(self) -> None:
+        """Answer a request that goes wrong, and say so, instead of ending by it.
+
+        rclpy raises out of its own services where an active node is asked to activate, or a parameter
+        has a type that there is not: the executor would pass that on to whoever measures.
+        """
+
+        def survivor(carry_out: Callable[[Any, Any], Any], name: str) -> Callable[[Any, Any], Any]:
+            def answer(request: Any, response: Any) -> Any:
+                try:
+                    return carry_out(request, response)
+                except Exception as error:
+                    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+                    self._say(f'{name}: refused: {reason}')
+                    return response
+
+            return answer
+
+        for service in self.node.services:
+            service.callback = survivor(service.callback, service.service_name)
 
     def transition(self, action: Callable[[], None]) -> TransitionCallbackReturn:
         """Run one transition; what goes wrong outside is said, kept in ``error``, and leaves the state as it was."""
@@ -149,8 +179,10 @@ class EstimatorNode:
 
     def start(self) -> None:
         """Configure and activate, where ``autostart`` says so. Raises what stands in the way."""
+        if self.node.get_parameter('use_sim_time').value:
+            self._say('use_sim_time is true: what is measured is stamped by the system clock all the same')
         if not self.rig.values['autostart']:
-            self._say('waiting to be configured: ros2 lifecycle set /estimator configure')
+            self._say(f'waiting to be configured: ros2 lifecycle set {self.node.get_fully_qualified_name()} configure')
             return
         self._starting = True
         for trigger in (self.node.trigger_configure, self.node.trigger_activate):
@@ -170,8 +202,6 @@ class EstimatorNode:
             self._inputs.session = session
             session.start()
             self._monitor = start_monitor(session, self._say)
-            if self._markers is not None:
-                self._markers.session = session
         except BaseException:
             self.cleanup()
             raise
@@ -179,6 +209,8 @@ class EstimatorNode:
     def activate(self) -> None:
         """Publish."""
         self._wire.active = True
+        if self._markers is not None:
+            self._markers.session = self.session
         domain = os.environ.get('ROS_DOMAIN_ID') or '0'
         node = self.node.get_fully_qualified_name()
         topics = ', '.join(self._wire.names((DEFLECTION, '/link_tip/wrench', '/psd/samples', DIAGNOSTICS)))
@@ -186,7 +218,7 @@ class EstimatorNode:
 
     def deactivate(self) -> None:
         """Publish no more; reading and recording go on."""
-        self._wire.active = False
+        self._silence()
         self._say('not publishing; reading and recording go on')
 
     def release(self) -> None:
@@ -202,18 +234,21 @@ class EstimatorNode:
 
     def cleanup(self) -> None:
         """End the session: the port is free."""
-        self._wire.active = False
+        self._silence()
         self._inputs.session = None
         self._live.session = None
         self._health = None
-        if self._markers is not None:
-            self._markers.session = None
         monitor, self._monitor = self._monitor, None
         if monitor is not None:
             monitor.close()
         session, self.session = self.session, None
         if session is not None:
             session.close()
+
+    def _silence(self) -> None:
+        self._wire.active = False
+        if self._markers is not None:
+            self._markers.session = None
 
     def _zero(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = False
@@ -222,7 +257,7 @@ class EstimatorNode:
             return response
         try:
             change = self.session.zero()
-        except TimeoutError as error:
+        except (PsdDeflectionError, TimeoutError) as error:
             response.message = f'not zeroed: {error}'
             return response
         if change is None:
@@ -230,10 +265,7 @@ class EstimatorNode:
             return response
         rig = self.session.rig
         self._live.show(rig)
-        (x1, y1), (x2, y2) = (psd.zero for psd in rig.psds)
-        text = f'unloaded dots (mm): psd_1 ({x1 * 1e3:.4f}, {y1 * 1e3:.4f}), psd_2 ({x2 * 1e3:.4f}, {y2 * 1e3:.4f})'
-        self._say(text)
-        response.success, response.message = True, text
+        response.success, response.message = True, zero_text(rig)
         return response
 
     def _record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
@@ -252,13 +284,23 @@ class EstimatorNode:
         return response
 
     def _report(self) -> None:
-        now = self.node.get_clock().now().nanoseconds
+        now = time.time_ns()
         if self.session is not None and self._health is not None:
-            self.session.fanout.put(self._health.report(now))
+            # The page may have taken a zero as well.
+            self._live.show(self.session.rig)
+            self.session.fanout.put(self._named(self._health.report(now)))
             return
         entry = DiagnosticEntry('psd_deflection: node', STALE, 'not configured', ())
-        (message,) = to_messages(DiagnosticReport(now, (entry,)))
+        (message,) = to_messages(self._named(DiagnosticReport(now, (entry,))))
         self._wire.put(message.topic, message.type, cdr.encode(message.type, message.fields), now)
+
+    def _named(self, report: DiagnosticReport) -> DiagnosticReport:
+        """``report`` under this node's name where that is not the usual one: two rigs are told apart."""
+        node = self.node.get_fully_qualified_name().removeprefix('/')
+        if node == NODE_NAME:
+            return report
+        entries = (e._replace(name=e.name.replace('psd_deflection', node, 1)) for e in report.entries)
+        return report._replace(entries=tuple(entries))
 
     def close(self) -> None:
         """End the session, then the node."""

@@ -1,18 +1,22 @@
 """What RViz shows: link, plate, detectors, beams and dots, and the transforms where tf2 is there.
 
 Only made where the parameter ``markers`` is on. What does not move (beams, lasers, link at rest) is
-latched, so that an RViz started later sees it. Micrometres cannot be seen beside half a metre:
-displacements are drawn ``markers_magnify`` times as large; the transforms are not.
+latched, so that an RViz started later sees it. What moves is taken away where there is no estimate,
+and goes by itself when nothing comes any more: a link that is drawn is a link that is measured.
+Micrometres cannot be seen beside half a metre: displacements are drawn ``markers_magnify`` times as
+large; the transforms are not.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import math
+import time
 from collections.abc import Sequence
 from typing import Any
 
 from geometry_msgs.msg import Point, Quaternion, TransformStamped
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from visualization_msgs.msg import Marker, MarkerArray
@@ -20,11 +24,13 @@ from visualization_msgs.msg import Marker, MarkerArray
 from msg_adapters.orientation import quaternion
 from psd_deflection.config import Rig
 from psd_deflection.records import DeflectionEstimate, SpotMeans
+from psd_deflection.ros.wires import relative
 from psd_deflection.runner.session import Session
 
 MOVING = '/link_tip/markers'
 AT_REST = '/link_tip/markers_at_rest'
 PERIOD_S = 0.1
+LIFETIME_S = 1.0
 
 BASE, REST, TIP = 'link_base', 'link_tip_rest', 'link_tip'
 _METAL, _PLATE, _SENSOR, _LASER = (
@@ -71,7 +77,7 @@ def at_rest(rig: Rig) -> Any:
 
 
 def moving(rig: Rig, estimate: DeflectionEstimate | None, spots: SpotMeans, magnify: float) -> Any:
-    """The MarkerArray of bent link, plate, detectors and dots; the pose is that of ``estimate``, else at rest."""
+    """The MarkerArray of bent link, plate, detectors and dots; without ``estimate`` all of them are taken away."""
     length = rig.link.length
     dx, dy, theta = (magnify * v for v in estimate[3:6]) if estimate is not None else (0.0, 0.0, 0.0)
     c, s = math.cos(theta), math.sin(theta)
@@ -105,8 +111,13 @@ def moving(rig: Rig, estimate: DeflectionEstimate | None, spots: SpotMeans, magn
         if spots.sums[i] < rig.estimator.sum_min or not (math.isfinite(mx) and math.isfinite(my)):
             dot.action = Marker.DELETE
         out += [sensor, dot]
+    block_s = rig.estimator.block_size / rig.converter.sample_rate_hz
+    seconds, nanoseconds = divmod(int(max(LIFETIME_S, 3.0 * block_s) * 1e9), 1_000_000_000)
     for marker in out:
         marker.header.stamp.sec, marker.header.stamp.nanosec = divmod(spots.t_ns, 1_000_000_000)
+        marker.lifetime.sec, marker.lifetime.nanosec = seconds, nanoseconds
+        if estimate is None:
+            marker.action = Marker.DELETE
     return MarkerArray(markers=out)
 
 
@@ -121,15 +132,19 @@ def transform(parent: str, child: str, t_ns: int, at: Vector, rotation: dict[str
 
 
 class RigMarkers:
-    """Publishes ten times a second what ``session`` last knew; nothing while it is None."""
+    """Publishes ten times a second what ``session`` last knew; nothing while it is None.
+
+    What is at rest is published again when the zero was taken: the beams then stand where the dots are.
+    """
 
     def __init__(self, node: Node, rig: Rig) -> None:
         self.session: Session | None = None
         self._magnify = rig.monitor.markers_magnify
         self._seen = 0
-        self._at_rest = node.create_publisher(MarkerArray, AT_REST, _LATCHED)
-        self._moving = node.create_publisher(MarkerArray, MOVING, 10)
+        self._at_rest = node.create_publisher(MarkerArray, relative(AT_REST), _LATCHED)
+        self._moving = node.create_publisher(MarkerArray, relative(MOVING), 10)
         self._at_rest.publish(at_rest(rig))
+        self._rest_of = rig
         self._tf: Any = None
         # tf2_msgs comes with a ROS installation, not with the wheels.
         if importlib.util.find_spec('tf2_msgs') is not None:
@@ -138,12 +153,12 @@ class RigMarkers:
             self._tf_message = TFMessage
             self._tf = node.create_publisher(TFMessage, '/tf', 10)
             self._tf_static = node.create_publisher(TFMessage, '/tf_static', _LATCHED)
-            now = node.get_clock().now().nanoseconds
+            now = time.time_ns()
             upright = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
             self._tf_static.publish(
                 TFMessage(transforms=[transform(BASE, REST, now, (0.0, 0.0, rig.link.length), upright)])
             )
-        node.create_timer(PERIOD_S, self._publish)
+        node.create_timer(PERIOD_S, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _publish(self) -> None:
         session = self.session
@@ -153,6 +168,9 @@ class RigMarkers:
         if spots is None or spots.t_ns == self._seen:
             return
         self._seen = spots.t_ns
+        if session.rig is not self._rest_of:
+            self._rest_of = session.rig
+            self._at_rest.publish(at_rest(session.rig))
         self._moving.publish(moving(session.rig, estimate, spots, self._magnify))
         if self._tf is not None and estimate is not None:
             rotation = quaternion(estimate.theta, estimate.phi, estimate.omega)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import math
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from rcl_interfaces.msg import Log
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters import DIAGNOSTICS, INPUTS, SAMPLES, TEMPERATURE, TOPIC_TYPES, from_fields
@@ -31,6 +34,14 @@ def message_class(type_name: str) -> Any:
     return getattr(importlib.import_module(f'{package}.msg'), name)
 
 
+def relative(topic: str) -> str:
+    """``topic`` as the node asks for it: in the node's namespace, as two rigs on one graph want it.
+
+    Without a namespace that is the topic's own name. Health goes where everybody's goes.
+    """
+    return topic if topic == DIAGNOSTICS else topic.removeprefix('/')
+
+
 class PublisherWire:
     """Publishes encoded messages: a wire of the fan-out. While it is not ``active``, diagnostics alone."""
 
@@ -42,7 +53,7 @@ class PublisherWire:
             depth = SAMPLES_DEPTH if topic == SAMPLES else DEPTH
             qos = QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
             self._publishers[topic] = node.create_publisher(
-                message_class(type_name), topic, qos, qos_overriding_options=options
+                message_class(type_name), relative(topic), qos, qos_overriding_options=options
             )
 
     def names(self, topics: Iterable[str]) -> list[str]:
@@ -55,6 +66,23 @@ class PublisherWire:
             self._publishers[topic].publish(cdr)
 
 
+def say_on_rosout(node: Node, say: Callable[[str], None]) -> Callable[[str], None]:
+    """``say``, and a line on ``/rosout`` each time: the terminal's own lines do not go through the ROS log."""
+    qos = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = node.create_publisher(Log, '/rosout', qos)
+    name = node.get_logger().name
+
+    def both(text: str) -> None:
+        say(text)
+        line = Log(level=Log.INFO, name=name, msg=text)
+        line.stamp.sec, line.stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
+        # A thread that was not waited for may have something to say when the node is gone.
+        with contextlib.suppress(RuntimeError):
+            publisher.publish(line)
+
+    return both
+
+
 class InputRecorder:
     """Known loads, references and temperatures go into the recording as they come.
 
@@ -65,11 +93,10 @@ class InputRecorder:
     def __init__(self, node: Node) -> None:
         self.session: Session | None = None
         self.refused = 0
-        self._clock = node.get_clock()
         for topic in INPUTS:
             node.create_subscription(
                 message_class(TOPIC_TYPES[topic]),
-                topic,
+                relative(topic),
                 lambda message, topic=topic: self._received(topic, message),
                 QoSProfile(depth=SAMPLES_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT),
                 raw=True,
@@ -80,7 +107,7 @@ class InputRecorder:
         if len(message) > MAX_INPUT_BYTES:
             self.refused += 1
         elif self.session is not None:
-            self.session.recorder.put(topic, TOPIC_TYPES[topic], bytes(message), self._clock.now().nanoseconds)
+            self.session.recorder.put(topic, TOPIC_TYPES[topic], bytes(message), time.time_ns())
             if topic == TEMPERATURE and self.session.pipeline.needs_temperature:
                 self._correct_for(message, self.session)
 

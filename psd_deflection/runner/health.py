@@ -48,16 +48,18 @@ class HealthReporter:
         def rate(count: int) -> str:
             return f'{count / seconds:.2f}' if seconds > 0 else 'unknown'
 
+        hello = s.acquisition.hello
         return DiagnosticReport(
             t_ns,
             (
                 self._acquisition(new, rate(new.samples)),
                 self._clock(),
                 self._estimates(new, rate(new.estimates)),
-                self._laser(1),
-                self._laser(2),
+                self._laser(1, new),
+                self._laser(2, new),
                 self._recording(),
             ),
+            str(hello.info.get('serial', '')) if hello is not None else '',
         )
 
     def _acquisition(self, new: _Seen, rate: str) -> DiagnosticEntry:
@@ -142,11 +144,14 @@ class HealthReporter:
             values.append(('latency, worst of a second (ms)', f'{latency.worst * 1e3:.3f}'))
         return DiagnosticEntry('psd_deflection: estimates', level, message, tuple(values))
 
-    def _laser(self, psd: int) -> DiagnosticEntry:
+    def _laser(self, psd: int, new: _Seen) -> DiagnosticEntry:
         name = f'psd_deflection: psd_{psd}'
         spots = self._session.pipeline.last_spots
         if spots is None:
             return DiagnosticEntry(name, STALE, 'no block yet', ())
+        if new.samples == 0:
+            # What was seen last says nothing about now.
+            return DiagnosticEntry(name, STALE, 'no samples', ())
         total = spots.sums[psd - 1]
         x, y = spots.dots[2 * psd - 2], spots.dots[2 * psd - 1]
         # Reasons and findings name the detector they are about.

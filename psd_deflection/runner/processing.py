@@ -83,6 +83,7 @@ class Processing:
         self._say = say
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._latencies: deque[float] = deque(maxlen=50)
+        self._heard_ns = time.monotonic_ns()
         self._thread = threading.Thread(target=self._run, name='pipeline', daemon=True)
         self._spokesman = Spokesman(say)
 
@@ -104,6 +105,10 @@ class Processing:
         """How long the last second's blocks took, or None before the first."""
         taken = sorted(self._latencies)
         return Latency(taken[len(taken) // 2], taken[-1]) if taken else None
+
+    def silent_s(self) -> float:
+        """Since the samples that were processed last came, s."""
+        return (time.monotonic_ns() - self._heard_ns) / 1e9
 
     def request(self, action: Callable[[], T]) -> T:
         """Run ``action`` between two blocks and return what it returns; its errors come through.
@@ -153,6 +158,7 @@ class Processing:
                     self._carry_out()
                     continue
                 if isinstance(item, Chunk):
+                    self._heard_ns = item.read_ns
                     if self.give(self.pipeline.process(item.raw)):
                         self._latencies.append((time.monotonic_ns() - item.read_ns) / 1e9)
                         self._tell_refusals()

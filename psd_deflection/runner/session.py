@@ -27,11 +27,20 @@ from psd_deflection.runner.zero_store import ZEROS, ZeroStore
 HUNG_S = 5.0
 """A thread that has not come round for this long hangs: the watchdog is not fed any more."""
 
+SILENT_S = 5.0
+"""Dots that came longer ago than this, and two blocks, are not the present ones."""
+
 JOIN_S = 0.5
 """How long the last blocks may take at the end."""
 
 SIMULATED = ('serial', 'dataq', 'thorlabs', 'lines')
 """Sources for which a simulated rig is started where no port is named."""
+
+
+def zero_text(rig: Rig) -> str:
+    """What ``rig`` takes for the unloaded dots, in a line."""
+    (x1, y1), (x2, y2) = (psd.zero for psd in rig.psds)
+    return f'unloaded dots (mm): psd_1 ({x1 * 1e3:z.4f}, {y1 * 1e3:z.4f}), psd_2 ({x2 * 1e3:z.4f}, {y2 * 1e3:z.4f})'
 
 
 class Session:
@@ -162,10 +171,15 @@ class Session:
     def zero(self) -> ParameterChange | None:
         """Take the present dots as the unloaded ones; None where no good block has come yet.
 
-        They are kept for the next run where the rig says so. Raises TimeoutError where no data flows.
+        They are kept for the next run where the rig says so. Raises TimeoutError where no data flows:
+        where the dots are now, nobody knows then.
         """
+        rig = self.rig
+        patience = SILENT_S + 2.0 * rig.estimator.block_size / rig.converter.sample_rate_hz
 
         def change() -> ParameterChange | None:
+            if self.acquisition.away or self.processing.silent_s() > patience:
+                raise TimeoutError('no data flows')
             taken = self.pipeline.zero()
             if taken is not None:
                 self.processing.give([taken])
@@ -173,6 +187,7 @@ class Session:
 
         taken = self.processing.request(change)
         if taken is not None:
+            self._tell(zero_text(self.rig))
             self._keep_zero()
         return taken
 

@@ -71,9 +71,9 @@ def spots_of(index: int, *, status: BlockStatus = BlockStatus.OK, lost: int = 0)
     )
 
 
-def estimate_of(index: int, *, primary: bool = True) -> DeflectionEstimate:
+def estimate_of(index: int, *, primary: bool = True, spread: float = 1.0) -> DeflectionEstimate:
     phase = index / 10.0
-    sd = (2e-7, 3e-7, 3e-6)
+    sd = (2e-7 * spread, 3e-7 * spread, 3e-6 * spread)
     covariance = (sd[0] ** 2, 0.0, 0.0, 0.0, sd[1] ** 2, 0.0, 0.0, 0.0, sd[2] ** 2)
     return DeflectionEstimate(
         START_NS + index * BLOCK_NS,
@@ -102,8 +102,8 @@ class Serving:
         self.url = self.server.start()
         self.port = int(self.url.rstrip('/').rpartition(':')[2])
 
-    def give(self, first: int, count: int, **options: Any) -> None:
+    def give(self, first: int, count: int, *, spread: float = 1.0, **options: Any) -> None:
         for index in range(first, first + count):
             if options.get('status', BlockStatus.OK) is BlockStatus.OK:
-                self.feed.put(estimate_of(index))
+                self.feed.put(estimate_of(index, spread=spread))
             self.feed.put(spots_of(index, **options))

@@ -62,4 +62,4 @@ def test_only_loopback_is_loopback() -> None:
 
 def test_a_token_is_right_or_wrong() -> None:
     assert is_token('abc', 'abc')
-    assert not any(is_token(given, 'abc') for given in (None, '', 'ab', 'abcd', 'ähc'))
+    assert not any(is_token(given, 'abc') for given in (None, '', 'ab', 'abcd', 'ähc', 'ab\udce9'))

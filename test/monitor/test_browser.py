@@ -78,6 +78,27 @@ COLORED = """(() => {
 """Pixels in the colour of dY."""
 
 
+TINTED = """((plot) => {
+  const canvas = document.querySelector(plot + ' canvas');
+  const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+  let n = 0;
+  for (let i = 3; i < data.length; i += 4) n += Math.abs(data[i] - 0x33) < 3;
+  return n / canvas.width / canvas.height;
+})"""
+"""Share of a plot that one band covers: nothing else on it is as transparent."""
+
+
+STICKING_OUT = """(() => {
+  for (const name of ['dx', 'dy', 'theta']) document.getElementById(name).textContent = '\u221212345.67';
+  return [...document.querySelectorAll('main > section, .number, .number > *, figure, header > *')];
+})().filter((e) => {
+  const [own, parent] = [e.getBoundingClientRect(), e.parentElement.getBoundingClientRect()];
+  const spills = e.scrollWidth > e.clientWidth + 1 && e.clientWidth > 0;
+  return spills || own.right > parent.right + 1 || own.left < parent.left - 1;
+}).map((e) => [e.tagName, e.id, e.className, e.textContent.slice(0, 30)])"""
+"""What is wider than what it lies in, or than itself, where the numbers are long."""
+
+
 @pytest.mark.parametrize('how', ['node', 'alone'])
 def test_the_daemon_on_the_simulated_rig_shows_moving_dots_and_traces(
     page: Page, start: Start, tmp_path: Path, how: str
@@ -180,11 +201,18 @@ def test_the_page_outlives_an_unplugged_device(page: Page, start: Start, tmp_pat
     link = str(tmp_path / 'port')
     device = start('simulate', '--serve', '--link', link)
     device.said('(port: )')
-    program = start('monitor', '--port', link, '--http-port', '0')
+    program = start('monitor', '--port', link, '--http-port', '0', '--control')
     page.open(program.url())
     page.live()
+    faded = 'Number(getComputedStyle(document.querySelector(".numbers")).opacity) < 0.6'
+    assert not page.js(faded)
     device.end()
+    # What was measured last does not look like what is measured now, nor can it become a zero.
     page.until('document.body.dataset.state === "stale"')
+    assert page.js(faded)
+    page.until('document.title.startsWith("no samples ·")')
+    page.driver.find_element(By.ID, 'zero').click()
+    page.until('document.getElementById("notice").textContent === "not zeroed: no data flows"')
     page.until('document.querySelector("#messages").textContent.includes("waiting for it to come back")')
     before = page.rows()
     again = start('simulate', '--serve', '--link', link)
@@ -192,17 +220,19 @@ def test_the_page_outlives_an_unplugged_device(page: Page, start: Start, tmp_pat
     page.live()
     page.until(f'document.body.dataset.rows > {before + 50}')
     page.until('document.querySelector("#messages").textContent.includes("the device is back")')
-    assert page.complaints() == []
+    # A refused zero is a 409.
+    assert [c for c in page.complaints() if '409' not in c] == []
 
 
 def test_the_page_finds_a_daemon_that_was_started_anew(page: Page, start: Start) -> None:
     port = str(free_port())
-    first = start('monitor', str(BAGS / 'clean'), '--loop', '--http-port', port)
+    first = start('monitor', str(BAGS / 'clean'), '--loop', '--http-port', port, '--control')
     page.open(first.url())
     page.until('document.body.dataset.rows > 20')
     instance = page.js('document.body.dataset.instance')
     assert first.end() == 0
     page.until('document.body.dataset.state === "offline"')
+    page.until('document.getElementById("zero").disabled')
     before = page.rows()
     start('monitor', str(BAGS / 'clean'), '--loop', '--http-port', port).url()
     page.live()
@@ -218,6 +248,36 @@ def test_a_lost_laser_is_seen(page: Page, start: Start) -> None:
     page.until('document.getElementById("dx").textContent === "–"')
     page.live()
     page.until('!document.getElementById("detector_2").classList.contains("low")')
+
+
+def test_the_bands_show_two_standard_deviations(page: Page, serve: Callable[..., Serving]) -> None:
+    # A swing of +-0.573 deg with a standard deviation of 0.0002 or 0.17 deg; dX and dY likewise.
+    for spread, drawn in ((1.0, '< 0.02'), (1000.0, '> 0.1')):
+        serving = serve()
+        serving.give(0, 500, spread=spread)
+        page.open(serving.url)
+        page.until(f'document.body.dataset.rows >= 500 && {COLORED} > 200', 'a trace of dY')
+        for plot in ('#plot_shift', '#plot_theta'):
+            page.until(f'{TINTED}("{plot}") {drawn}', f'the bands of {plot}')
+
+
+@pytest.mark.parametrize('width', [390, 844, 1024, 1440])
+def test_nothing_is_cut_off_or_laid_over_its_neighbour(page: Page, serve: Callable[..., Serving], width: int) -> None:
+    serving = serve(monitor_control=True)
+    serving.source.recordings.append('recordings/test')
+    serving.give(0, 20)
+    metrics = {'width': width, 'height': 800, 'deviceScaleFactor': 1, 'mobile': width < 800}
+    page.driver.execute_cdp_cmd('Emulation.setDeviceMetricsOverride', metrics)
+    try:
+        page.open(serving.url)
+        page.until('document.body.dataset.rows >= 20 && document.getElementById("dx").textContent !== "–"')
+        page.until('document.getElementById("record").textContent === "● Recording"')
+        assert page.js('document.documentElement.scrollWidth') <= width
+        assert page.js(STICKING_OUT) == []
+        header = page.js('document.querySelector("header").getBoundingClientRect().height')
+        assert header < 100
+    finally:
+        page.driver.execute_cdp_cmd('Emulation.clearDeviceMetricsOverride', {})
 
 
 def test_an_hour_leaves_the_heap_as_it_was(page: Page, serve: Callable[..., Serving]) -> None:

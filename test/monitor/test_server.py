@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 from psd_deflection.config import load_rig
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor.feed import Feed
-from psd_deflection.monitor.server import MonitorServer
+from psd_deflection.monitor.server import BROWSERS, CONNECTIONS, MonitorServer
 from psd_deflection.records import BlockStatus
 from test.heard import WAIT_S
 
@@ -76,6 +77,7 @@ def test_a_browser_gets_the_last_minute_then_what_is_new(serve: Serve) -> None:
     assert hello['columns'][:2] == ['t', 'block']
     assert hello['active_areas'] == [[0.01, 0.01], [0.01, 0.01]]
     assert hello['control'] is False
+    assert hello['spectrum_s'] == 4.0
     rows = rows_in(messages)
     assert [r[1] for r in rows] == list(range(8))
     assert {len(r) for r in rows} == {len(hello['columns'])}
@@ -84,6 +86,8 @@ def test_a_browser_gets_the_last_minute_then_what_is_new(serve: Serve) -> None:
     assert told == ['a message']
     health = next(m['health'] for m in messages if 'health' in m)
     assert health['entries'][0]['name'] == 'acquisition'
+    # A level that is changed while it runs reaches the page.
+    assert health['sum_min'] == serving.rig.estimator.sum_min
 
 
 def test_it_remembers_a_minute_and_not_more(serve: Serve) -> None:
@@ -168,6 +172,72 @@ def test_another_site_cannot_listen(serve: Serve, headers: dict[str, str]) -> No
     with pytest.raises(aiohttp.WSServerHandshakeError, match='403'):
         listen(serving.url, lambda m: True, headers)
     assert ask(serving.url, 'GET', headers={'Host': 'evil.example'})[0] == 403
+
+
+@pytest.mark.parametrize(
+    ('request_line', 'rest', 'status'),
+    [
+        ('GET /page/' + 'a' * 4000, b'', 404),
+        ('GET /' + 'a' * 9000, b'', 400),
+        ('\x16\x03\x01\x02', b'', 400),
+        ('POST /api/record', b'[' * 4000, 400),
+        ('POST /api/record', b'\xff\xfe', 400),
+        ('POST /api/record', b'x' * 5000, 413),
+        ('PUT /', b'', 405),
+        ('HEAD /', b'', 200),
+    ],
+)
+def test_what_strangers_send_gets_an_answer_and_no_line_in_the_log(
+    serve: Serve, caplog: pytest.LogCaptureFixture, request_line: str, rest: bytes, status: int
+) -> None:
+    serving = serve(monitor_control=True)
+    head = f'Host: 127.0.0.1\r\nContent-Type: application/json; charset=none\r\nContent-Length: {len(rest)}\r\n'
+    with socket.create_connection(('127.0.0.1', serving.port), WAIT_S) as stranger:
+        stranger.sendall(f'{request_line} HTTP/1.1\r\n{head}Connection: close\r\n\r\n'.encode() + rest)
+        answer = stranger.makefile('rb').readline()
+    assert int(answer.split()[1]) == status
+    assert caplog.records == []
+    assert len(serving.said) == 1
+    assert ask(serving.url, 'GET')[0] == 200
+
+
+def test_idle_connections_do_not_use_up_the_daemons_files(serve: Serve) -> None:
+    serving = serve()
+
+    async def go() -> None:
+        async with aiohttp.ClientSession() as session, session.ws_connect(serving.url + 'ws') as browser:
+            assert 'hello' in (await browser.receive()).data
+            idle = [await asyncio.open_connection('127.0.0.1', serving.port) for _ in range(CONNECTIONS + 20)]
+            # The oldest are ended; whoever looks on goes on, and the newest is heard.
+            for reader, _ in idle[:20]:
+                assert await reader.read() == b''
+            reader, writer = idle[-1]
+            writer.write(b'GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n')
+            assert b' 200 ' in await reader.readline()
+            serving.give(0, 1)
+            while 'rows' not in json.loads((await browser.receive()).data):
+                pass
+            for _, writer in idle:
+                writer.close()
+
+    asyncio.run(asyncio.wait_for(go(), WAIT_S))
+
+
+def test_one_browser_too_many_is_told_why(serve: Serve) -> None:
+    serving = serve()
+
+    async def go() -> tuple[int | None, str]:
+        async with aiohttp.ClientSession() as session:
+            lookers = [await session.ws_connect(serving.url + 'ws') for _ in range(BROWSERS)]
+            for one in lookers:
+                await one.receive()
+            late = await session.ws_connect(serving.url + 'ws')
+            told = await late.receive()
+            for one in lookers:
+                await one.close()
+            return told.data, told.extra or ''
+
+    assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == (1013, '16 browsers look on already')
 
 
 def test_on_the_network_the_buttons_need_the_token(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -215,7 +215,7 @@ def test_the_covariance_stands_at_x_y_and_yaw() -> None:
 
 
 def test_diagnostics_keep_levels_and_values() -> None:
-    report = DiagnosticReport(T0, (DiagnosticEntry('clock', 2, 'lost', (('skew_ppm', '12.5'), ('µ', '°'))),))
+    report = DiagnosticReport(T0, (DiagnosticEntry('clock', 2, 'lost', (('skew_ppm', '12.5'), ('µ', '°'))),), 'T-1')
     (m,) = to_messages(report)
     decoded = STORE.deserialize_cdr(cdr.encode(m.type, m.fields), m.type)
     status = decoded.status[0]

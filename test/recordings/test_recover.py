@@ -221,3 +221,55 @@ def test_the_lock_goes_with_the_writer(tmp_path: Path) -> None:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
         out.close()
         fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        '',
+        'rosbag2_bagfile_information: [',
+        'rosbag2_bagfile_information: {storage_identifier: mcap, relative_file_paths: [gone.mcap]}',
+    ],
+    ids=['empty', 'malformed', 'another file'],
+)
+def test_a_metadata_yaml_that_does_not_describe_the_bag_is_made_anew(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = record(tmp_path / 'run')
+    before = theirs(folder)
+    metadata = folder / 'metadata.yaml'
+    metadata.write_text(text)
+    assert main(['info', str(folder)]) == 4
+    assert '`psd-deflection recover` makes' in capsys.readouterr().err
+    assert main(['recover', str(folder)]) == 0
+    assert theirs(folder) == before
+    assert (folder / 'metadata.yaml.cut').read_text() == text
+    # What describes it, and what rosbag2 compressed in its own way, stays.
+    tree = yaml.safe_load(metadata.read_text())
+    tree['rosbag2_bagfile_information'] |= {'compression_mode': 'message', 'relative_file_paths': ['run_0.mcap.zstd']}
+    for kept in (metadata.read_text(), yaml.safe_dump(tree)):
+        metadata.write_text(kept)
+        assert main(['recover', str(folder)]) == 0
+        assert metadata.read_text() == kept
+
+
+def test_a_file_of_first_bytes_has_nothing_to_recover(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / 'a.mcap'
+    path.write_bytes((record(tmp_path / 'run') / 'run_0.mcap').read_bytes()[:8])
+    assert main(['recover', str(path)]) == 4
+    assert 'there is nothing to recover' in capsys.readouterr().err
+
+
+def test_a_repair_that_fails_leaves_the_file_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = record(tmp_path / 'run')
+    cut(folder, 'run_0.mcap', 20_000)
+    before = (folder / 'run_0.mcap').read_bytes()
+
+    def full(self: object) -> None:
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr('psd_deflection.io.recover._Copy.finish', full)
+    with pytest.raises(RecordingError, match='No space left on device'):
+        recover(folder)
+    assert [p.name for p in folder.iterdir()] == ['run_0.mcap']
+    assert (folder / 'run_0.mcap').read_bytes() == before

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,10 +24,13 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped, WrenchStamped  # noqa: E402
-from rcl_interfaces.srv import DescribeParameters, SetParameters  # noqa: E402
+from rcl_interfaces.msg import Log  # noqa: E402
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
+from visualization_msgs.msg import MarkerArray  # noqa: E402
 
 from test.ros.conftest import BLOCK_NS, stamp  # noqa: E402
 
@@ -197,6 +201,40 @@ def test_parameters_have_units_and_ranges_and_are_refused_by_name(start: Callabl
     peer.until_of_now(poses, 'estimates again')
 
 
+def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start: Callable[..., Any], peer: Any) -> None:
+    pytest.importorskip('aiohttp')
+    options = {'use_sim_time': True, 'markers': True, 'monitor': True, 'monitor_port': 0, 'monitor_control': True}
+    arguments = [word for name, value in options.items() for word in ('-p', f'{name}:={str(value).lower()}')]
+    remaps = ('-r', '__ns:=/left', '-r', '/left/psd_1/spot:=/spot')
+    daemon = start('--ros-args', *remaps, *arguments)
+    poses = peer.collect(PoseStamped, '/left/link_tip/deflection')
+    spots = peer.collect(PointStamped, '/spot')
+    markers = peer.collect(MarkerArray, '/left/link_tip/markers')
+    log = peer.collect(Log, '/rosout', QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    health = peer.collect(DiagnosticArray, '/diagnostics')
+    # Health and markers come although nobody publishes /clock.
+    peer.until(lambda: min(len(poses), len(spots)) >= 30 and len(markers) >= 3, 'the second rig')
+    peer.until(lambda: len(health) >= 2, 'its health')
+    assert not [topic for topic, _ in peer.node.get_topic_names_and_types() if topic.startswith(('/link_tip', '/psd'))]
+    assert {s.name for s in health[-1].status} >= {'left/estimator: acquisition', 'left/estimator: clock'}
+    assert {s.hardware_id for s in health[-1].status} == {'SIM-0001'}
+    assert abs(stamp(health[-1]) - stamp(poses[-1])) < 60 * 10**9
+    # What the terminal shows is on /rosout as well.
+    said = 'publishing on ROS domain'
+    peer.until(lambda: any(m.name == 'left.estimator' and m.msg.startswith(said) for m in log), 'its log')
+    # A zero that the page takes can be read where one that ROS takes can.
+    url = daemon.said('monitor: http').split()[1]
+    headers = {'Content-Type': 'application/json'}
+    with urllib.request.urlopen(urllib.request.Request(url + 'api/zero', b'{}', headers), timeout=60.0) as answer:
+        assert json.load(answer)['ok']
+    request = GetParameters.Request(names=['psd_1.zero'])
+
+    def shown() -> list[float]:
+        return list(peer.call(GetParameters, '/left/estimator/get_parameters', request).values[0].double_array_value)
+
+    peer.until(lambda: shown() != [0.0, 0.0], 'the zero among the parameters')
+
+
 @pytest.mark.parametrize('signals', [[signal.SIGINT], [signal.SIGTERM], [signal.SIGINT, signal.SIGINT]])
 def test_signals_end_it_and_leave_a_whole_recording(
     start: Callable[..., Any], peer: Any, tmp_path: Path, signals: list[int]
@@ -224,6 +262,12 @@ def test_signals_end_it_and_leave_a_whole_recording(
         ),
         (['--ros-args', '-p', 'amplifier.noise:=-1.0'], 3, 'amplifier.noise = -1.0 V: must be above 0'),
         (['--ros-args', '-p', 'solver:=magic'], 3, 'magic'),
+        (['--ros-args', '-p', 'solvers:=[]'], 3, 'is an empty list'),
+        (
+            ['--ros-args', '-p', 'qos_overrides./psd/samples.publisher.reliability:=best_efort'],
+            3,
+            'qos_overrides: Unexpected QoS override for policy `reliability`: `best_efort`',
+        ),
         (['--port', '/dev/nothing_here'], 5, '/dev/nothing_here: no such port'),
         (['--params-file', '/nowhere/rig.yaml'], 3, '/nowhere/rig.yaml: no such parameter file'),
         (['--ros-args', '--params-file', '/nowhere/rig.yaml'], 3, '/nowhere/rig.yaml'),

@@ -16,9 +16,12 @@ from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from geometry_msgs.msg import PoseStamped, WrenchStamped  # noqa: E402
 from lifecycle_msgs.msg import State, Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
+from rcl_interfaces.msg import Parameter as ParameterMessage  # noqa: E402
+from rcl_interfaces.msg import ParameterValue  # noqa: E402
 from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
+from visualization_msgs.msg import MarkerArray  # noqa: E402
 
 from psd_deflection.errors import ConfigError, DeviceError  # noqa: E402
 from psd_deflection.io.recordings import open_recording  # noqa: E402
@@ -44,11 +47,15 @@ def parameters(peer: Any, *names: str) -> list[Any]:
 def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simulated_port: str, tmp_path: Path) -> None:
     bags = tmp_path / 'bags'
     daemon = start(
-        '--port', simulated_port, '--ros-args', '-p', 'autostart:=false', '-p', f'bag_dir:={bags}', '-p', 'record:=true'
+        '--port',
+        simulated_port,
+        '--ros-args',
+        *('-p', 'autostart:=false', '-p', f'bag_dir:={bags}', '-p', 'record:=true', '-p', 'markers:=true'),
     )
     daemon.said('waiting to be configured')
     assert state(peer) == State.PRIMARY_STATE_UNCONFIGURED
     poses = peer.collect(PoseStamped, '/link_tip/deflection')
+    markers = peer.collect(MarkerArray, '/link_tip/markers')
     health = peer.collect(DiagnosticArray, '/diagnostics')
     peer.until(lambda: any(s.message == 'not configured' for m in health for s in m.status), 'STALE')
     assert peer.call(Trigger, '/estimator/zero', Trigger.Request()).message == 'not zeroed: the node is not configured'
@@ -62,16 +69,25 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
     seen = len(health)
     peer.until(lambda: len(health) > seen + 1, 'diagnostics while inactive')
     assert not poses
+    assert not markers
     assert change(peer, Transition.TRANSITION_ACTIVATE)
     assert 'publishing on ROS domain' in daemon.said('publishing on ROS domain')
-    peer.until(lambda: len(poses) >= 10, 'estimates')
+    # What this state does not have is refused, and measuring goes on.
+    for wrong in (Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_CONFIGURE, 77):
+        assert not change(peer, wrong)
+    assert daemon.said('change_state: refused')
+    strange = ParameterMessage(name='sum_min', value=ParameterValue(type=42))
+    assert (
+        peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[strange])).results == []
+    )
+    peer.until(lambda: len(poses) >= 10 and len(markers) > 0, 'estimates')
     assert change(peer, Transition.TRANSITION_DEACTIVATE)
     seen = len(health)
     peer.until(lambda: len(health) > seen + 1, 'diagnostics while inactive')
-    stopped = len(poses)
+    stopped, drawn = len(poses), len(markers)
     seen = len(health)
     peer.until(lambda: len(health) > seen, 'more diagnostics')
-    assert len(poses) == stopped
+    assert (len(poses), len(markers)) == (stopped, drawn)
     assert change(peer, Transition.TRANSITION_CLEANUP)
     SerialPort(simulated_port, 921_600).close()
     # What was recorded went on while nothing was published, and is whole.

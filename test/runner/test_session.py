@@ -1,58 +1,74 @@
-"""How a run ends when a part of it hangs: it is waited for, and not for long."""
+"""What is asked of a session while its device is there, away, or silent."""
 
 from __future__ import annotations
 
-import threading
-from pathlib import Path
-from typing import Any, cast
+import queue
+import time
+from collections.abc import Callable, Iterator
 
 import pytest
 
-from psd_deflection.config import Rig, replace_values
+from psd_deflection.config import load_rig
+from psd_deflection.protocol.frames import SampleFrame
+from psd_deflection.runner import session as module
+from psd_deflection.runner.health import STALE, HealthReporter
 from psd_deflection.runner.session import Session
 from test.heard import WAIT_S
+from test.runner.conftest import Estimates, ScriptedDevice
 
-ALLOWED_S = 2.0
-
-
-class Hanging:
-    """A thread that never ends, and the time for which it was waited for."""
-
-    ident = 1
-
-    def __init__(self) -> None:
-        self.waited_s = 0.0
-
-    def is_alive(self) -> bool:
-        return True
-
-    def join(self, timeout: float | None = None) -> None:
-        assert timeout is not None
-        self.waited_s += timeout
+Sample = Callable[..., SampleFrame]
 
 
-@pytest.mark.parametrize(
-    ('part', 'told'),
-    [
-        ('acquisition', 'the source hangs; it is not waited for'),
-        ('processing', 'a subscriber or the disk holds up the last blocks; they are not waited for'),
-        ('recorder', 'the disk is slow; still writing in the background'),
-    ],
-)
-def test_a_part_that_hangs_holds_up_the_end_for_two_seconds_at_most(
-    device: Any, rig: Rig, tmp_path: Path, part: str, told: str
+class Running:
+    """A session on ``device``, past its first estimates."""
+
+    def __init__(self, device: ScriptedDevice, sample: Sample) -> None:
+        self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
+        rig = load_rig(overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False})
+        self.session = Session(rig, self.said.put)
+        estimates = Estimates(5)
+        self.session.processing.sinks.append(estimates)
+        self.session.start()
+        device.send_frames(*(sample(seq) for seq in range(200)))
+        assert estimates.enough.wait(WAIT_S)
+
+    def heard(self, text: str) -> None:
+        while text not in self.said.get(timeout=WAIT_S):
+            pass
+
+
+@pytest.fixture
+def running(device: ScriptedDevice, sample: Sample) -> Iterator[Running]:
+    one = Running(device, sample)
+    yield one
+    one.session.close()
+
+
+def test_no_zero_is_taken_of_a_device_that_is_away(running: Running, device: ScriptedDevice) -> None:
+    assert running.session.zero() is not None
+    device.unplug()
+    running.heard('waiting for it to come back')
+    with pytest.raises(TimeoutError, match='no data flows'):
+        running.session.zero()
+
+
+def test_dots_of_a_device_that_is_away_are_not_called_seen(running: Running, device: ScriptedDevice) -> None:
+    def said_of_dots() -> list[tuple[int, str]]:
+        report = health.report(time.time_ns())
+        return [(e.level, e.message) for e in report.entries if e.name.startswith('psd_deflection: psd_')]
+
+    health = HealthReporter(running.session)
+    assert STALE not in dict(said_of_dots())
+    device.unplug()
+    running.heard('waiting for it to come back')
+    # What came before the unplugging is told once more.
+    said_of_dots()
+    assert said_of_dots() == [(STALE, 'no samples')] * 2
+
+
+def test_no_zero_is_taken_of_a_device_that_has_said_nothing_for_long(
+    running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said: list[str] = []
-    rig = replace_values(rig, {'bag_dir': str(tmp_path), 'record': True, 'realtime': False, 'keep_zero': False})
-    session = Session(rig, said.append)
-    session.start()
-    owner = cast(Any, getattr(session, part))
-    thread: threading.Thread = owner._thread
-    owner._thread = hanging = Hanging()
-    session.close()
-    assert 0.0 < hanging.waited_s <= ALLOWED_S
-    assert any(told in text for text in said)
-    # What was said to hang did not: it ends as it would have.
-    thread.join(WAIT_S)
-    assert not thread.is_alive()
-    session.acquisition.source.close()
+    monkeypatch.setattr(module, 'SILENT_S', -1e3)
+    with pytest.raises(TimeoutError, match='no data flows'):
+        running.session.zero()

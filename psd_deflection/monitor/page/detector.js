@@ -77,7 +77,7 @@ export class Detector {
     g.fillText('x', px(halfX) - 4 * ratio, py(0) - 4 * ratio);
     g.textAlign = 'left';
     g.fillText('y', px(0) + 4 * ratio, py(halfY) + 13 * ratio);
-    g.fillText(`${(step * 1e3).toPrecision(1)} mm grid`, px(-halfX) + 4 * ratio, py(-halfY) - 5 * ratio);
+    g.fillText(`${Number((step * 1e3).toPrecision(1))} mm grid`, px(-halfX) + 4 * ratio, py(-halfY) - 5 * ratio);
   }
 
   // Older is fainter, in a dozen strokes.

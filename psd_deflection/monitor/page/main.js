@@ -35,6 +35,7 @@ let fresh = false;
 let density;
 let newDensity = false;
 let attempts = 0;
+let refusal = '';
 let received = 0;
 let lastRowAt = 0;
 let token = takeToken();
@@ -57,7 +58,8 @@ function connect() {
     heard = performance.now();
     take(JSON.parse(event.data));
   };
-  socket.onclose = () => {
+  socket.onclose = (event) => {
+    refusal = event.reason;
     setTimeout(connect, RETRY_MS[Math.min(attempts, RETRY_MS.length - 1)]);
     attempts += 1;
     showState();
@@ -91,6 +93,7 @@ function greet(found) {
     } else plots = new Plots(found, color);
   }
   rows.clear();
+  $('spectrum_s').textContent = String(Number(found.spectrum_s.toPrecision(2)));
   if (anew) notice('connected to a daemon that was started anew');
   body.dataset.instance = found.instance;
   $('messages').replaceChildren();
@@ -172,25 +175,30 @@ function numbers() {
 function showState() {
   const now = performance.now();
   let [state, text] = ['live', 'live'];
-  if (socket.readyState !== WebSocket.OPEN) [state, text] = hello ? ['offline', 'connection lost, trying again'] : ['connecting', 'connecting'];
+  if (socket.readyState !== WebSocket.OPEN) [state, text] = hello ? ['offline', 'connection lost, trying again'] : ['connecting', refusal || 'connecting'];
   else if (!hello) [state, text] = ['connecting', 'connecting'];
   else if (now - heard > SILENT_MS) {
     // A connection that says nothing is none, whatever the browser thinks of it.
     [state, text] = ['offline', 'connection lost, trying again'];
     socket.close();
   } else if (received === 0) [state, text] = ['connecting', 'waiting for samples'];
-  else if (now - lastRowAt > STALE_MS) [state, text] = ['stale', hello.kind === 'replay' ? 'end of recording' : 'no samples'];
+  else if (now - lastRowAt > Math.max(STALE_MS, 3000 * hello.block_s)) [state, text] = hello.kind === 'replay' ? ['ended', 'end of recording'] : ['stale', 'no samples'];
   else {
     const status = rows.last('status');
     if (status > 0) [state, text] = ['refused', hello.statuses[status]];
     else if (held()) text = 'live, held';
     else if (hello.kind === 'replay') text = 'playing';
   }
-  if (body.dataset.state !== state) body.dataset.state = state;
+  if (body.dataset.state !== state) {
+    body.dataset.state = state;
+    if (hello) buttons();
+  }
   if ($('state').textContent !== text) $('state').textContent = text;
   const kinds = { simulated: 'simulated rig on', live: '', replay: 'recording' };
   const source = hello ? `${kinds[hello.kind]} ${hello.name}`.trim() : '';
   if ($('source').textContent !== source) $('source').textContent = source;
+  const title = `${text} · ${source || 'psd_deflection'}`;
+  if (document.title !== title) document.title = title;
 }
 
 const TILES = [
@@ -205,6 +213,7 @@ function showHealth(found) {
   health = found;
   hello.kind = found.kind;
   hello.name = found.name;
+  hello.sum_min = found.sum_min;
   const values = new Map(found.entries.filter((e) => e.name !== 'recording').flatMap((e) => e.values));
   const tiles = TILES.filter(([, key]) => values.has(key)).map(([label, key]) => [label, values.get(key), LOSSES.has(key) && values.get(key) !== '0']);
   tiles.push(['not shown (page too slow)', String(found.dropped), found.dropped > 0]);
@@ -256,7 +265,7 @@ function tell(t, text) {
 function buttons() {
   const recording = Boolean(health && health.recording);
   for (const id of ['zero', 'record']) {
-    $(id).disabled = !hello.control || (id === 'record' && hello.kind === 'replay');
+    $(id).disabled = !hello.control || body.dataset.state === 'offline' || (id === 'record' && hello.kind === 'replay');
     if (!hello.control) $(id).title = 'off; monitor_control:=true (or --control) allows it';
   }
   $('record').setAttribute('aria-pressed', String(recording));
@@ -320,3 +329,5 @@ matchMedia('(prefers-color-scheme: dark)').onchange = () => {
 
 connect();
 requestAnimationFrame(frame);
+// The tab's title tells what happens while another tab is looked at, where no frames are drawn.
+setInterval(showState, 1000);

@@ -99,11 +99,12 @@ export class Plots {
     this.frequencies = Array.from({ length: bins }, (_, i) => f0 * (i + 1));
     this.plots = {
       shift: new uPlot(options(color, elements.shift, [line(color('--dx')), edge, edge, line(color('--dy')), edge, edge], {
-        bands: [{ series: [2, 3], fill: fade('--dx') }, { series: [5, 6], fill: fade('--dy') }],
+        // uPlot fills from the upper edge down.
+        bands: [{ series: [3, 2], fill: fade('--dx') }, { series: [6, 5], fill: fade('--dy') }],
         scales: { x: time, y: { range: calm(1) } }, hooks,
       }), this.empty(7), elements.shift),
       theta: new uPlot(options(color, elements.theta, [line(color('--theta')), edge, edge], {
-        bands: [{ series: [2, 3], fill: fade('--theta') }],
+        bands: [{ series: [3, 2], fill: fade('--theta') }],
         scales: { x: time, y: { range: calm(0.5) } }, hooks,
       }), this.empty(4), elements.theta),
       sums: new uPlot(options(color, elements.sums, [line(color('--dx')), line(color('--dy'))], {
@@ -131,14 +132,17 @@ export class Plots {
       g.fillStyle = this.color('--quiet');
       g.setLineDash([3 * ratio, 3 * ratio]);
       g.font = `${10 * ratio}px system-ui, sans-serif`;
-      this.hello.modes.forEach(([name, hertz], i) => {
+      const shown = this.hello.modes.filter(([, hertz]) => hertz <= this.frequencies.at(-1)).sort((a, b) => a[1] - b[1]);
+      shown.forEach(([name, hertz], i) => {
         const x = Math.round(u.valToPos(hertz, 'x', true));
         g.beginPath();
         g.moveTo(x, u.bbox.top);
         g.lineTo(x, u.bbox.top + u.bbox.height);
         g.stroke();
-        g.textAlign = i === 0 ? 'right' : 'left';
-        g.fillText(`${name} ${hertz} Hz`, x + (i === 0 ? -4 : 4) * ratio, u.bbox.top + 11 * ratio);
+        const cut = x + 90 * ratio > u.bbox.left + u.bbox.width;
+        const left = i === 0 || cut;
+        g.textAlign = left ? 'right' : 'left';
+        g.fillText(`${name} ${hertz} Hz`, x + (left ? -4 : 4) * ratio, u.bbox.top + (i > 0 && cut ? 23 : 11) * ratio);
       });
       g.restore();
     };
