@@ -46,12 +46,23 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     pytest.fail('no ROS domain is free')
 
 
+PATIENT = f"""
+import sys
+from psd_deflection.cli.main import main
+from psd_deflection.runner import acquisition
+acquisition.SILENCE_S = {WAIT_S}
+sys.exit(main())
+"""
+"""Our program, which waits longer for a first answer of its device than any test does."""
+
+
 class Daemon:
     """``psd-deflection estimator`` as a process; its output line by line."""
 
-    def __init__(self, arguments: Sequence[str]) -> None:
+    def __init__(self, arguments: Sequence[str], patient: bool = False) -> None:
+        program = ['-c', PATIENT] if patient else ['-m', 'psd_deflection']
         self.process = subprocess.Popen(
-            [sys.executable, '-m', 'psd_deflection', 'estimator', *arguments],
+            [sys.executable, *program, 'estimator', *arguments],
             cwd=Path(__file__).parent.parent.parent,
             stderr=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
@@ -92,8 +103,8 @@ def start(domain: int) -> Iterator[Callable[..., Daemon]]:
     """Start a daemon; it ends with the test."""
     started: list[Daemon] = []
 
-    def begin(*arguments: str) -> Daemon:
-        daemon = Daemon(arguments)
+    def begin(*arguments: str, patient: bool = False) -> Daemon:
+        daemon = Daemon(arguments, patient)
         started.append(daemon)
         return daemon
 

@@ -116,7 +116,7 @@ def test_a_device_that_is_not_there_leaves_the_node_unconfigured(start: Callable
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_waiting_for_a_device(start: Callable[..., Any], device: Any, number: signal.Signals) -> None:
     device.answer = b''
-    daemon = start('--port', str(device.link))
+    daemon = start('--port', str(device.link), patient=True)
     assert device.greeted.wait(WAIT_S)
     daemon.signal(number)
     assert daemon.wait() == 0, daemon.lines
