@@ -16,7 +16,7 @@ from typing import Protocol, TypeVar
 
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import Record
-from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Restarted
+from psd_deflection.runner.acquisition import Acquisition, Chunk, Restarted
 
 T = TypeVar('T')
 
@@ -188,6 +188,3 @@ class Processing:
             cause += ' degraded'
             text = f'degraded, translation from one detector alone: {spots.reason}'
         self._spokesman.block(cause, text, time.monotonic())
-
-
-__all__ = ['Ended', 'Latency', 'Processing']
