@@ -160,7 +160,8 @@ class ReplaySource:
         new_lost = max(lost - self._seen[2], 0)
         self._seen = (samples, estimates, lost)
         spots = self._last
-        level, message = OK, f'playing, {self._speed:g} times as fast as recorded'
+        pace = 'as fast as recorded' if self._speed == 1.0 else f'{self._speed:g} times as fast as recorded'
+        level, message = OK, f'playing {pace}'
         if self._ended:
             message = 'end of the recording'
         elif new_lost:
@@ -248,4 +249,6 @@ class ReplaySource:
             if self._pipeline.zero() is None:
                 asked.set_exception(RefusedError('not zeroed: no good block yet'))
             else:
-                asked.set_result(zero_text(self._pipeline.rig))
+                text = zero_text(self._pipeline.rig)
+                self._say(text)
+                asked.set_result(text)

@@ -10,6 +10,7 @@ import pytest
 
 from psd_deflection.config import load_rig
 from psd_deflection.protocol.frames import SampleFrame
+from psd_deflection.runner import processing
 from psd_deflection.runner import session as module
 from psd_deflection.runner.health import STALE, HealthReporter
 from psd_deflection.runner.session import Session
@@ -27,7 +28,7 @@ class Running:
         self.session = Session(rig, self.said.put)
         self.session.start()
         device.send_frames(*(sample(seq) for seq in range(200)))
-        while self.session.pipeline.counters.estimates < 5:
+        while self.session.pipeline.counters.estimates < 5 and self.session.processing.alive:
             self.session.processing.request(lambda: None)
 
     def heard(self, text: str) -> None:
@@ -36,7 +37,10 @@ class Running:
 
 
 @pytest.fixture
-def running(device: ScriptedDevice, sample: Sample) -> Iterator[Running]:
+def running(device: ScriptedDevice, sample: Sample, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
+    # However busy the machine is: only what a test does makes a device silent or a request late.
+    monkeypatch.setattr(module, 'SILENT_S', 1e3)
+    monkeypatch.setattr(processing, 'REQUEST_TIMEOUT_S', 60.0)
     one = Running(device, sample)
     yield one
     one.session.close()
