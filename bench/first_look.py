@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parent.parent
 LIMIT_S = 60.0
 MOVED = 1e-4
 FLAGS = ('--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--disable-background-networking')
-DOT = 'const y = document.querySelector("#detector_1 canvas")?.dataset.y; return y === undefined ? null : Number(y)'
+DOT = 'const y = document.querySelector("#detector_1 canvas")?.dataset.y; return y ? Number(y) : null'
 
 
 def open_browser(profile: str) -> webdriver.Chrome:
@@ -74,7 +74,7 @@ def look(browser: webdriver.Chrome, folder: str) -> tuple[float, float, float]:
 
         first = wait_for(lambda: (y := dot()) is not None and [y], 'a dot')[0]
         shown = time.monotonic() - began
-        wait_for(lambda: abs(dot() - first) > MOVED, 'a dot that moves')
+        wait_for(lambda: (y := dot()) is not None and abs(y - first) > MOVED, 'a dot that moves')
         return served, shown, time.monotonic() - began
     finally:
         os.killpg(program.pid, signal.SIGINT)
@@ -89,7 +89,8 @@ def main() -> int:
         raise SystemExit('Chromium and its driver are needed: apt install chromium chromium-driver')
     # What make sets up is not part of it.
     subprocess.run(['make', '--silent', 'setup'], cwd=ROOT, check=True)
-    with tempfile.TemporaryDirectory() as folder:
+    # A browser that was closed may still tidy up in its profile.
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         browser = open_browser(f'{folder}/profile')
         try:
             for _ in range(args.times):

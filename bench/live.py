@@ -202,10 +202,11 @@ def measure(seconds: float, settle: float, page: bool, into: Latencies) -> None:
         heard, _ = ear.communicate()
         if page:
             received, _ = children[2].communicate()
-            if int(received) < seconds * 20:
+            # It sends what is new as often as the machine lets it; once a second it has at least the health.
+            if int(received) < seconds:
                 raise SystemExit(f'the page sent {received} messages in {seconds:g} s')
         node.terminate()
-        node.wait(10.0)
+        node.wait(60.0)
     device.stop.set()
     device.thread.join()
     since = int(began * 1e9)

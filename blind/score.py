@@ -130,56 +130,82 @@ class _Sheet:
 
 def summary(rows: Sequence[Row]) -> tuple[str, bool]:
     """The report and whether every threshold holds."""
-    t, sheet = THRESHOLDS, _Sheet()
+    sheet = _Sheet()
     single = [r for r in rows if r.kind == 'single' and r.gap >= 3.0]
+    _detections(sheet, single)
+    _false_alarms(sheet, rows)
+    pair = [r for r in rows if r.kind == 'pair']
+    sheet.rate('both of a pair in the answer', pair, [_both(r) for r in pair], THRESHOLDS['both_of_a_pair'], 1.0, True)
+    _unknowns(sheet, rows)
+    _held_out(sheet, rows)
+    cover = [c for r in rows if r.kind == 'single' for c in covered(r)]
+    low, high = THRESHOLDS['coverage_low'], THRESHOLDS['coverage_high']
+    sheet.rate('parameter inside its 95 % interval', [], [inside for _, inside in cover], low, high, False)
+    _cost(sheet, rows)
+    sheet.lines += ['', 'detection (truth in the answer or its sets) by gap:', *_curve(rows)]
+    sheet.lines += ['', 'confusion (truth: first named), gap >= 3 floors:', *_confusion(single)]
+    sheet.lines += ['', f'failures ({len(sheet.failures)}):', *('  ' + f for f in dict.fromkeys(sheet.failures))]
+    outside = [key for key, inside in cover if not inside]
+    sheet.lines += ['', f'parameters outside their interval ({len(outside)}):', *('  ' + k for k in outside)]
+    return '\n'.join(sheet.lines), sheet.passed
+
+
+def _detections(sheet: _Sheet, single: Sequence[Row]) -> None:
+    """Of one effect alone, large enough to be seen."""
+    wanted = THRESHOLDS['named_or_equivalent']
     hit = [bool(r.sets) and r.truth[0]['name'] in r.sets[0] for r in single]
-    sheet.rate('truth named first or in its set, gap >= 3 floors', single, hit, t['named_or_equivalent'], 1.0, True)
+    sheet.rate('truth named first or in its set, gap >= 3 floors', single, hit, wanted, 1.0, True)
     if single:
-        size = float(np.mean([len(r.sets[0]) if r.sets else 1 for r in single]))
-        sheet.check(size <= t['mean_set_size'], f'mean size of that set: {size:.2f}, wanted <= {t["mean_set_size"]}')
+        size, most = float(np.mean([len(r.sets[0]) if r.sets else 1 for r in single])), THRESHOLDS['mean_set_size']
+        sheet.check(size <= most, f'mean size of that set: {size:.2f}, wanted <= {most}')
     apart = [r for r in single if r.told_apart]
     first = [bool(r.named) and r.named[0] == r.truth[0]['name'] for r in apart]
-    name = 'named first where the design tells it apart'
-    sheet.rate(name, apart, first, t['named_first_where_told_apart'], 1.0, True)
+    wanted = THRESHOLDS['named_first_where_told_apart']
+    sheet.rate('named first where the design tells it apart', apart, first, wanted, 1.0, True)
+
+
+def _false_alarms(sheet: _Sheet, rows: Sequence[Row]) -> None:
+    """Where nothing was hidden, with the noise that the rig file tells of and with another."""
     for kind, name in (('null', 'right'), ('wrong', 'wrong')):
         of = [r for r in rows if r.kind == kind]
         alarm = [r.answer['verdict'] != 'nothing_missing' for r in of]
         sheet.failures += [f'{r.key}: {_said(r)}' for r, a in zip(of, alarm, strict=True) if a]
-        sheet.rate(f'false alarm, {name} noise', of, alarm, 0.0, t[f'false_alarm_{name}_noise'], False)
-    pair = [r for r in rows if r.kind == 'pair']
-    sheet.rate('both of a pair in the answer', pair, [_both(r) for r in pair], t['both_of_a_pair'], 1.0, True)
+        sheet.rate(f'false alarm, {name} noise', of, alarm, 0.0, THRESHOLDS[f'false_alarm_{name}_noise'], False)
+
+
+def _unknowns(sheet: _Sheet, rows: Sequence[Row]) -> None:
+    """What the library has not must be called unknown; what it has should not."""
     for kinds in (('leftout',), ('alien',), ('leftout', 'alien')):
         of = [r for r in rows if r.kind in kinds]
         right = [r.answer['verdict'] == 'unknown_effect' for r in of]
-        sheet.rate(f'{" or ".join(kinds)} called unknown', of, right, t['unknown'], 1.0, len(kinds) == 1)
+        sheet.rate(f'{" or ".join(kinds)} called unknown', of, right, THRESHOLDS['unknown'], 1.0, len(kinds) == 1)
     listed = [r for r in rows if r.kind in ('single', 'pair') and r.gap >= 3.0]
     wrongly = [r for r in listed if r.answer['verdict'] == 'unknown_effect']
     sheet.lines.append(
         f'        truth in the library, gap >= 3 floors, and yet something called unknown: {len(wrongly)}/{len(listed)}'
     )
     sheet.lines += [f'          {r.key}: {_said(r)}' for r in wrongly]
+
+
+def _held_out(sheet: _Sheet, rows: Sequence[Row]) -> None:
+    """The gap that is left on load cases that the fit has not seen."""
     known = [r for r in rows if r.kind in ('single', 'pair', 'null', 'wrong')]
-    if known:
-        ratio = np.array([r.answer['gap']['heldout_after'] / r.answer['gap']['floor'] for r in known])
-        middle, top = float(np.median(ratio)), float(np.quantile(ratio, 0.95))
-        good = middle <= t['heldout_over_floor_median'] and top <= t['heldout_over_floor_p95']
-        text = f'held-out gap after, over the floor: median {middle:.3f}, 95th percentile {top:.3f}'
-        sheet.check(good, f'{text}, wanted <= {t["heldout_over_floor_median"]}, {t["heldout_over_floor_p95"]}')
-    cover = [c for r in rows if r.kind == 'single' for c in covered(r)]
-    inside = [c for _, c in cover]
-    sheet.rate('parameter inside its 95 % interval', [], inside, t['coverage_low'], t['coverage_high'], False)
-    if rows:
-        cost = max(r.answer['provenance']['forward_simulations'] for r in rows)
-        wanted = t['forward_simulations']
-        sheet.check(cost <= wanted, f'forward simulations of one search, at most: {cost}, wanted <= {wanted:g}')
-        seconds = np.array([r.answer.get('seconds', 0.0) for r in rows])
-        sheet.lines.append(f'        seconds a case: median {np.median(seconds):.2f}, largest {seconds.max():.2f}')
-    sheet.lines += ['', 'detection (truth in the answer or its sets) by gap:', *_curve(rows)]
-    sheet.lines += ['', 'confusion (truth: first named), gap >= 3 floors:', *_confusion(single)]
-    sheet.lines += ['', f'failures ({len(sheet.failures)}):', *('  ' + f for f in dict.fromkeys(sheet.failures))]
-    outside = [k for k, c in cover if not c]
-    sheet.lines += ['', f'parameters outside their interval ({len(outside)}):', *('  ' + k for k in outside)]
-    return '\n'.join(sheet.lines), sheet.passed
+    if not known:
+        return
+    most, most_p95 = THRESHOLDS['heldout_over_floor_median'], THRESHOLDS['heldout_over_floor_p95']
+    ratio = np.array([r.answer['gap']['heldout_after'] / r.answer['gap']['floor'] for r in known])
+    middle, top = float(np.median(ratio)), float(np.quantile(ratio, 0.95))
+    text = f'held-out gap after, over the floor: median {middle:.3f}, 95th percentile {top:.3f}'
+    sheet.check(middle <= most and top <= most_p95, f'{text}, wanted <= {most}, {most_p95}')
+
+
+def _cost(sheet: _Sheet, rows: Sequence[Row]) -> None:
+    if not rows:
+        return
+    cost, most = max(r.answer['provenance']['forward_simulations'] for r in rows), THRESHOLDS['forward_simulations']
+    sheet.check(cost <= most, f'forward simulations of one search, at most: {cost}, wanted <= {most:g}')
+    seconds = np.array([r.answer.get('seconds', 0.0) for r in rows])
+    sheet.lines.append(f'        seconds a case: median {np.median(seconds):.2f}, largest {seconds.max():.2f}')
 
 
 def _curve(rows: Sequence[Row]) -> list[str]:

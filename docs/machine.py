@@ -8,6 +8,7 @@ the environment has ``MACHINE=1``, which ``.ci/run`` sets on machines that are C
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shlex
@@ -85,7 +86,11 @@ class Machine:
         while time.monotonic() < end and self._nspawn.poll() is None:
             children = Path(f'/proc/{self._nspawn.pid}/task/{self._nspawn.pid}/children').read_text().split()
             for child in children:
-                if Path(f'/proc/{child}/comm').read_text().strip() == 'systemd':
+                name = ''
+                # What prepares the machine comes and goes.
+                with contextlib.suppress(OSError):
+                    name = Path(f'/proc/{child}/comm').read_text().strip()
+                if name == 'systemd':
                     self._init = int(child)
                     # "degraded" is up as well: some unit of the machine that was copied did not like it here.
                     done = subprocess.run(
@@ -129,7 +134,7 @@ class Machine:
             ssh = Terminal(self.typed(line, 'reader'), self._folder.parent, stdin=subprocess.PIPE)
             try:
                 page = self.run(
-                    'ip netns exec reader curl --silent --show-error --retry 30 --retry-connrefused --retry-delay 1 '
+                    'ip netns exec reader curl --silent --show-error --retry 300 --retry-connrefused --retry-delay 1 '
                     'http://127.0.0.1:8790/'
                 )
             finally:
@@ -145,7 +150,8 @@ class Machine:
         """Pull the plug."""
         for process in (self._init, self._nspawn.pid):
             if process and self._nspawn.poll() is None:
-                os.kill(process, signal.SIGKILL)
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(process, signal.SIGKILL)
         self._nspawn.wait()
         Path(self._log.name).unlink()
         self._log.close()
@@ -155,14 +161,19 @@ class Machine:
 def check_service(machine: Machine) -> None:
     """That the unit, once it runs, is what docs/deploy says: started anew when it hangs or dies, whole when ended."""
 
-    def measuring() -> str:
-        """Its process, once that has said two estimates; '' until then.
+    program = '/opt/psd_deflection/bin/psd-deflection'
+    recordings = '/var/lib/psd_deflection/recordings'
 
-        The second comes seconds after the first: by then there is a recording on the disk. Of one killed within
-        its first half second nothing is.
+    def measuring() -> str:
+        """Its process, once that has said an estimate and samples are on the disk; '' until then.
+
+        Of one killed within its first half second nothing is.
         """
         pid = machine.run('systemctl show --property MainPID --value psd-deflection').strip()
-        return pid if machine.run(f'journalctl --no-pager --quiet _PID={pid}').count('θ ') >= 2 else ''
+        if 'θ ' not in machine.run(f'journalctl --no-pager --quiet _PID={pid}'):
+            return ''
+        newest = machine.run(f'{program} info $(ls -d {recordings}/* | sort --version-sort | tail -1)')
+        return pid if re.search(r'samples +[1-9]', newest) else ''
 
     before = ''
     for blow in ('', 'SIGSTOP', 'SIGKILL'):
@@ -180,11 +191,10 @@ def check_service(machine: Machine) -> None:
         raise RuntimeError('it was not the watchdog that ended it')
     machine.run('systemctl stop psd-deflection')
     # The first two were cut off by the signals.
-    recordings = machine.run('ls -d /var/lib/psd_deflection/recordings/*').split()
-    program = '/opt/psd_deflection/bin/psd-deflection'
-    for recording in recordings[:-1]:
+    found = machine.run(f'ls -d {recordings}/* | sort --version-sort').split()
+    for recording in found[:-1]:
         machine.run(f'{program} recover {recording}')
-    for recording in recordings:
+    for recording in found:
         machine.run(f'{program} replay {recording} --compare')
-    if len(recordings) != 3:
-        raise RuntimeError(f'three recordings were wanted, not {recordings}')
+    if len(found) != 3:
+        raise RuntimeError(f'three recordings were wanted, not {found}')

@@ -292,7 +292,8 @@ class Reader:
                 self._background.append(program)
                 return
             if page:
-                with urllib.request.urlopen(program.until(r'monitor: (http://[^\s#]+)')[1], timeout=WAIT_S) as answer:
+                url = program.until(r'monitor: (http://[^\s#]+)[\s#]')[1]
+                with urllib.request.urlopen(url, timeout=WAIT_S) as answer:
                     if b'psd_deflection monitor' not in answer.read():
                         raise RuntimeError('the address that it prints has another page')
             if not re.search(r' monitor bags/', line):

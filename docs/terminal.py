@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import os
 import pty
@@ -30,9 +31,11 @@ class Terminal:
         )
         os.close(theirs)
         self.text = ''
+        # A read may end within a character.
+        self._decoder = codecs.getincrementaldecoder('utf-8')('replace')
 
     def until(self, pattern: str) -> re.Match[str]:
-        """The first match in what it says."""
+        """The first match in what it says; a read may end anywhere, so ``pattern`` says where what it wants ends."""
         end = time.monotonic() + WAIT_S
         while (match := re.search(pattern, self.text)) is None:
             if not self._read(end):
@@ -40,12 +43,14 @@ class Terminal:
         return match
 
     def _read(self, end: float) -> bool:
+        if self._fd < 0:
+            return False
         ready, _, _ = select.select((self._fd,), (), (), max(0.0, end - time.monotonic()))
         try:
             new = os.read(self._fd, 65536) if ready else b''
         except OSError:
             new = b''
-        self.text += new.decode(errors='replace')
+        self.text += self._decoder.decode(new)
         return bool(new)
 
     def end(self) -> int:
@@ -63,8 +68,10 @@ class Terminal:
             status = self.process.wait(max(1.0, end - time.monotonic()))
         except subprocess.TimeoutExpired:
             os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
             raise RuntimeError('did not end') from None
         finally:
-            with contextlib.suppress(OSError):
+            if self._fd >= 0:
                 os.close(self._fd)
+                self._fd = -1
         return status

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-from msg_adapters.header import Fields, header, stamp_ns
-from psd_deflection.records import DiagnosticEntry, DiagnosticReport
+from msg_adapters.header import Fields, header
+from psd_deflection.records import DiagnosticReport
 
 TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 
@@ -26,20 +23,3 @@ def from_report(report: DiagnosticReport) -> Fields:
             for entry in report.entries
         ],
     }
-
-
-def to_report(fields: Mapping[str, Any]) -> DiagnosticReport:
-    """The record of a diagnostics message."""
-    return DiagnosticReport(
-        stamp_ns(fields),
-        tuple(
-            DiagnosticEntry(
-                str(s['name']),
-                int(s['level']),
-                str(s['message']),
-                tuple((str(v['key']), str(v['value'])) for v in s['values']),
-            )
-            for s in fields['status']
-        ),
-        next((str(s['hardware_id']) for s in fields['status']), ''),
-    )

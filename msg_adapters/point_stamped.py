@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-from msg_adapters.header import Fields, header, stamp_ns
+from msg_adapters.header import Fields, header
 from psd_deflection.records import SpotMeans
 
 TYPE = 'geometry_msgs/msg/PointStamped'
@@ -15,8 +12,3 @@ def from_spot(spots: SpotMeans, psd: int) -> Fields:
     """Fields of the dot on PSD ``psd`` (1 or 2), frame ``psd_1`` or ``psd_2``."""
     x, y = spots.dots[2 * psd - 2], spots.dots[2 * psd - 1]
     return {'header': header(spots.t_ns, f'psd_{psd}'), 'point': {'x': x, 'y': y, 'z': 0.0}}
-
-
-def to_dot(fields: Mapping[str, Any]) -> tuple[int, float, float]:
-    """(t_ns, x, y): ns, m, m."""
-    return (stamp_ns(fields), float(fields['point']['x']), float(fields['point']['y']))

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from msg_adapters.header import Fields, header
 from msg_adapters.pose_stamped import FRAME, pose
 from psd_deflection.records import DeflectionEstimate
@@ -30,9 +27,3 @@ def from_estimate(e: DeflectionEstimate) -> Fields:
         'header': header(e.t_ns, FRAME),
         'pose': {'pose': pose(e.dx, e.dy, e.theta, e.phi, e.omega), 'covariance': covariance},
     }
-
-
-def to_covariance(fields: Mapping[str, Any]) -> tuple[float, ...]:
-    """3 x 3 of (dx, dy, theta), row by row: m^2, m rad, rad^2."""
-    covariance = fields['pose']['covariance']
-    return tuple(float(covariance[6 * row + column]) for row in _OBSERVED for column in _OBSERVED)

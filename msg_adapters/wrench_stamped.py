@@ -23,16 +23,7 @@ def from_load(load: TipLoad | AppliedLoad) -> Fields:
     }
 
 
-def _loads(fields: Mapping[str, Any]) -> tuple[int, float, float, float]:
-    force, torque = fields['wrench']['force'], fields['wrench']['torque']
-    return (stamp_ns(fields), float(force['x']), float(force['y']), float(torque['z']))
-
-
-def to_tip_load(fields: Mapping[str, Any]) -> TipLoad:
-    """The record of an estimated load."""
-    return TipLoad(*_loads(fields))
-
-
 def to_applied_load(fields: Mapping[str, Any]) -> AppliedLoad:
     """The record of a known load."""
-    return AppliedLoad(*_loads(fields))
+    force, torque = fields['wrench']['force'], fields['wrench']['torque']
+    return AppliedLoad(stamp_ns(fields), float(force['x']), float(force['y']), float(torque['z']))

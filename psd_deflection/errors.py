@@ -9,8 +9,8 @@ status    meaning
 0         done (``replay --compare``: no bit differs)
 1         done, and the answer is "differs" (``replay --compare``)
 2         the command line was not understood (argparse), or ``UsageError``
-3         ``ConfigError``: parameter file or parameter value
-4         ``RecordingError``: a recording cannot be read or written
+3         ``ConfigError``: parameter file, value in it, or package that is missing
+4         ``RecordingError``: a recording cannot be read, an output cannot be written
 5         ``DeviceError``: port missing, in use, silent, or of another protocol
 6         ``SolverError``: the geometry cannot be solved
 130       Ctrl-C before it was done
@@ -27,9 +27,9 @@ class PsdDeflectionError(Exception):
 
 
 class UsageError(PsdDeflectionError):
-    """Options of a command that do not go together, or one is missing; each by itself argparse has understood.
+    """An option has a value that it does not take, is missing, or does not go together with another.
 
-    Example: ``--out OUT (a recording) or --serve (a device) is needed``.
+    Example: ``--out run.png: no .png is written; X.csv, X.mcap or a bag folder (X) is``.
     """
 
     exit_status = 2
@@ -45,7 +45,7 @@ class ConfigError(PsdDeflectionError):
 
 
 class RecordingError(PsdDeflectionError):
-    """A recording is missing, empty, truncated, of another kind, or cannot be written.
+    """A recording is missing, empty, truncated, of another kind; it or another output cannot be written.
 
     Example: ``run.csv:17: column y2 holds 'abc', which is not a number``.
     """

@@ -55,14 +55,14 @@ def test_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_folder_that_cannot_be_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'taken').write_text('')
-    assert main(['compare-methods', '--out', str(tmp_path / 'taken')]) == 3
+    assert main(['compare-methods', '--out', str(tmp_path / 'taken')]) == 4
     assert 'taken: cannot be made a folder' in capsys.readouterr().err
 
 
 def test_a_figure_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'sign_convention.png').mkdir()
-    assert main(['compare-methods', '--out', str(tmp_path)]) == 3
-    assert f'--out {tmp_path}: cannot be written' in capsys.readouterr().err
+    assert main(['compare-methods', '--out', str(tmp_path)]) == 4
+    assert f'--out {tmp_path / "sign_convention.png"}: cannot be written' in capsys.readouterr().err
 
 
 def test_the_page_has_every_method_and_every_figure() -> None:

@@ -50,16 +50,18 @@ def test_the_drawing_is_written(tmp_path: Path, name: str, capsys: pytest.Captur
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'said'),
+    ('arguments', 'status', 'said'),
     [
-        (['--params-file', RIG, '--sigma', '0'], '--sigma'),
-        (['--params-file', RIG, '--radius', '-1'], '--radius'),
-        (['--params-file', RIG, '--out', 'plan.txt'], '.png, .svg or .pdf'),
-        (['--params-file', RIG, '--out', 'no/such/folder/plan.png'], 'cannot be written'),
+        (['--params-file', RIG, '--sigma', '0'], 2, '--sigma'),
+        (['--params-file', RIG, '--radius', '-1'], 2, '--radius'),
+        (['--params-file', RIG, '--out', 'plan.txt'], 2, '.png, .svg or .pdf'),
+        (['--params-file', RIG, '--out', 'no/such/folder/plan.png'], 4, 'cannot be written'),
     ],
 )
-def test_bad_input_is_refused_in_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['design', *arguments]) == 3
+def test_bad_input_is_refused_in_one_line(
+    arguments: list[str], status: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(['design', *arguments]) == status
     error = capsys.readouterr().err
     assert said in error
     assert error.count('\n') == 1

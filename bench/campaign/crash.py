@@ -28,6 +28,7 @@ from psd_deflection.io.recover import recover
 from psd_deflection.runner.session import Session
 
 ALLOWED_S = 1.0
+WAIT_S = 60.0
 
 
 def daemon(rig: Rig) -> None:
@@ -45,7 +46,7 @@ def left_by_a_kill(rig: Rig, bags: Path, after_s: float) -> tuple[Path, int]:
             daemon(rig)
         finally:
             os._exit(1)
-    deadline = time.monotonic() + 20.0
+    deadline = time.monotonic() + WAIT_S
     while not any(p.stat().st_size > 20_000 for p in bags.glob('*/*.mcap')):
         if time.monotonic() > deadline:
             os.kill(child, signal.SIGKILL)
@@ -99,7 +100,7 @@ def main() -> int:
                 shutil.rmtree(bags)
         finally:
             rig_process.send_signal(signal.SIGINT)
-            rig_process.wait(5.0)
+            rig_process.wait(WAIT_S)
     worst = max(lost)
     print(
         f'{len(lost)} kills: all opened, all recovered, all read by rosbags; '

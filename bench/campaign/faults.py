@@ -31,6 +31,8 @@ from bench.campaign.kinds import FAULTS, Fault
 from bench.campaign.line import DIGIT, VOLTS_PER_COUNT, Line, identities
 from psd_deflection.io.recordings import open_recording
 
+START_S = 300.0
+END_S = 60.0
 RECOVER_S = 5.0
 BACK_S = 1.0
 """A device that is back is read again within this."""
@@ -186,7 +188,7 @@ def main() -> int:
         witness = Witness()
         rows = [Row(f) for f in chosen]
         try:
-            if not witness.spin_until(lambda: witness.newest > 2000 and witness.reports > 2, 60.0):
+            if not witness.spin_until(lambda: witness.newest > 2000 and witness.reports > 2, START_S):
                 raise SystemExit((folder / 'said').read_text())
             start = line.next_identity()
             for number in range(args.times):
@@ -199,7 +201,7 @@ def main() -> int:
             print({k: v for k, v in counters.items() if 'drop' in k or 'lost' in k or k == 'disconnects'})
         finally:
             node.send_signal(signal.SIGINT)
-            node.wait(10.0)
+            node.wait(END_S)
             line.close()
         (recording,) = (folder / 'bags').iterdir()
         good = report(rows, lost_samples(rows, line, recording, start, end))

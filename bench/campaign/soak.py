@@ -48,6 +48,8 @@ from psd_deflection.runner.acquisition import Acquisition, Chunk
 
 SKEW = 30e-6
 MS = 1_000_000
+START_S = 300.0
+END_S = 60.0
 SETTLED_S = 180
 ALLOWED_STD_NS = 50_000
 ALLOWED_GROWTH = 2_000_000
@@ -201,16 +203,21 @@ def real_time(minutes: float) -> bool:
 
         witness.create_subscription(PoseStamped, '/link_tip/deflection', received, 50)
         memory: list[tuple[float, int]] = []
-        began = time.monotonic()
         warm_up = min(60.0, 20.0 * minutes)
         try:
+            deadline = time.monotonic() + START_S
+            while not poses[0]:
+                rclpy.spin_once(witness, timeout_sec=0.5)
+                if node.poll() is not None or time.monotonic() > deadline:
+                    raise SystemExit((folder / 'said').read_text())
+            began = time.monotonic()
             while (passed := time.monotonic() - began) < minutes * 60.0 and node.poll() is None:
                 rclpy.spin_once(witness, timeout_sec=0.5)
                 if passed > warm_up and (not memory or passed - memory[-1][0] > 5.0):
                     memory.append((passed, resident(node.pid)))
         finally:
             node.send_signal(signal.SIGINT)
-            node.wait(10.0)
+            node.wait(END_S)
             device.close()
         rclpy.shutdown()
         (bag,) = (folder / 'bags').iterdir()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,12 +51,18 @@ def evaluate(at: Situation) -> Budget:
     return Budget(at, tuple((cause, cause.contribution(at)) for cause in CAUSES))
 
 
-def monte_carlo(at: Situation, count: int, seed: int, causes: Sequence[Cause] = CAUSES) -> Contribution:
+def monte_carlo(
+    at: Situation,
+    count: int,
+    seed: int,
+    causes: Sequence[Cause] = CAUSES,
+    drawn: Callable[[int], object] = lambda size: None,
+) -> Contribution:
     """Mean error and covariance of ``count`` draws of all ``causes`` at once.
 
     Through the exact chain and the exact estimator: nothing here is linearised. What is not among
     ``causes`` is as drawn, the tilt of the tip included; errors are counted from the answer without
-    ``causes``.
+    ``causes``. ``drawn`` is told how many more are done.
     """
     random = np.random.default_rng(seed)
     plain = at.chain
@@ -71,5 +77,6 @@ def monte_carlo(at: Situation, count: int, seed: int, causes: Sequence[Cause] = 
             chain = cause.perturb(chain, at, size, random)
             beside = beside + cause.beside(at, size, random)
         errors.append(at.estimator.estimate(*measure(chain, at.pose)) - nothing + beside)
+        drawn(size)
     everything = np.concatenate(errors)
     return Contribution(everything.mean(axis=0), np.cov(everything.T))

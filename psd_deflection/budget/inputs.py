@@ -149,8 +149,10 @@ def _read(path: Path) -> dict[object, object]:
         tree = yaml.safe_load(path.read_text(encoding='utf-8'))
     except FileNotFoundError:
         raise ConfigError(f'{path}: no such file of inputs') from None
-    except (OSError, UnicodeDecodeError, RecursionError, ValueError, yaml.YAMLError) as error:
-        raise ConfigError(f'{path}: cannot be read as inputs ({type(error).__name__})') from None
+    except OSError as error:
+        raise ConfigError(f'{path}: cannot be read as inputs ({error.strerror or error})') from None
+    except (RecursionError, ValueError, yaml.YAMLError):
+        raise ConfigError(f'{path}: cannot be read as inputs (it is no YAML)') from None
     if tree is None:
         return {}
     if not isinstance(tree, dict):

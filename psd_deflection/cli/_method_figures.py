@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Circle, Ellipse, FancyArrowPatch, Rectangle
 
 from psd_deflection.calibration.sensors import Duolateral, Quadrant
+from psd_deflection.cli._report import save_figure
 from psd_deflection.solvers._interface import Geometry
 from psd_deflection.solvers._linear import design_matrix, gain_matrix
 from psd_deflection.solvers._registry import make_solver
@@ -46,14 +47,14 @@ _MDEG = 1e3 * 180.0 / np.pi
 
 
 def draw_all(folder: Path) -> list[Path]:
-    """Draw every figure into ``folder``; returns the files. Raises OSError where it cannot be written."""
+    """Draw every figure into ``folder``; returns the files. Raises RecordingError where one cannot be written."""
     written = []
     with plt.rc_context(_STYLE):
         for name, draw in FIGURES.items():
             figure = draw()
             path = folder / f'{name}.png'
             # No date or version in the file: the same figure is the same bytes.
-            figure.savefig(path, metadata={'Software': None})
+            save_figure(figure, path, metadata={'Software': None})
             plt.close(figure)
             written.append(path)
     return written

@@ -1,12 +1,16 @@
-"""Columns that line up and figures on disk, for the commands that report."""
+"""Columns that line up, JSON and figures on disk, for the commands that report."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import RecordingError
 
 
 def columns(rows: Sequence[Sequence[str]], left: int = 1) -> str:
@@ -20,11 +24,35 @@ def columns(rows: Sequence[Sequence[str]], left: int = 1) -> str:
     return '\n'.join(lines)
 
 
-def save_figure(figure: Any, path: Path) -> None:
-    """Write a matplotlib figure; raises ConfigError for a kind or a place that cannot be written."""
-    if path.suffix.lower() not in ('.png', '.svg', '.pdf'):
-        raise ConfigError(f'--out {path}: the name must end in .png, .svg or .pdf')
+def print_json(value: Any, indent: int | None = None) -> None:
+    """Print ``value`` as JSON, with null for what JSON has no number for (NaN, infinite)."""
+    print(json.dumps(_plain(value), indent=indent, allow_nan=False))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {k: _plain(v) for k, v in value.items()}
+    return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
+
+
+def save_figure(figure: Any, path: Path, **options: Any) -> None:
+    """Write a matplotlib figure in the kind that its ending says; raises RecordingError as :func:`save` does."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format=path.suffix[1:].lower(), **options)
+    save(stream.getvalue(), path)
+
+
+def save(content: bytes, path: Path) -> None:
+    """Write ``path`` whole or not at all; raises RecordingError where the disk refuses."""
+    # Where it leads, so that a symbolic link stays one.
+    place = path.resolve()
+    partial = place.with_name(place.name + '.partial')
     try:
-        figure.savefig(path, dpi=150)
+        partial.write_bytes(content)
+        partial.replace(place)
     except OSError as error:
-        raise ConfigError(f'--out {path}: cannot be written ({error.strerror})') from None
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        raise RecordingError(f'--out {path}: cannot be written ({error.strerror or error})') from None

@@ -4,9 +4,9 @@ Every row of the thesis's Table 3.1 with its equations corrected, and the causes
 figures are standard deviations; what follows from the pose itself, because the method's model leaves
 it out, is a known bias and is marked so. The shares are of the mean square of the total.
 
-    psd-deflection budget --params-file config/thesis_rig.yaml
-    psd-deflection budget --params-file config/thesis_rig.yaml --set rotation_tolerance=0.001 --method beam
-    psd-deflection budget --explain
+  psd-deflection budget --params-file config/thesis_rig.yaml
+  psd-deflection budget --set rotation_tolerance=0.001 --method beam --json
+  psd-deflection budget --explain
 
 Inputs that are not in the rig file have defaults (--explain lists them with their sources); set them
 with --set NAME=VALUE, or keep them in a YAML file of NAME: VALUE lines (--inputs).
@@ -15,12 +15,13 @@ with --set NAME=VALUE, or keep them in a YAML file of NAME: VALUE lines (--input
 from __future__ import annotations
 
 import argparse
-import json
+import contextlib
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from psd_deflection.budget import optics
 from psd_deflection.budget.computation import stop_window
@@ -29,9 +30,19 @@ from psd_deflection.budget.estimate import METHOD_OF_SOLVER, METHODS
 from psd_deflection.budget.evaluate import CAUSES, Budget, evaluate, monte_carlo
 from psd_deflection.budget.inputs import INPUTS, read_inputs
 from psd_deflection.budget.term import Contribution, Kind, Situation
-from psd_deflection.cli._report import columns, save_figure
+from psd_deflection.cli._options import (
+    PICTURES,
+    finite,
+    given_as_option,
+    need_folder,
+    picture_name,
+    refuse,
+    seed,
+    whole,
+)
+from psd_deflection.cli._report import columns, print_json, save_figure
 from psd_deflection.config import Rig, load_rig
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import UsageError
 
 MICRO_MILLIDEGREE = np.array([1e6, 1e6, math.degrees(1e3)])
 
@@ -59,40 +70,54 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--method', choices=METHODS, help='whose errors (default: that of the rig file)')
     parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE', help='set one input (repeat)')
     parser.add_argument('--inputs', metavar='FILE.yaml', help='a file of inputs')
-    parser.add_argument('--monte-carlo', type=int, metavar='N', help='check the totals by N draws of everything')
-    parser.add_argument('--seed', type=int, default=1, help='of the draws (default 1)')
-    parser.add_argument('--out', metavar='FILE.png|svg', help='the chart (default: budget.png here)')
+    parser.add_argument(
+        '--monte-carlo',
+        type=whole('--monte-carlo', 100, MAX_DRAWS),
+        metavar='N',
+        help='check the totals by N draws of everything (at least 100)',
+    )
+    parser.add_argument('--seed', type=seed, default=1, help='of the draws (default 1)')
+    parser.add_argument(
+        '--out', type=picture_name(*PICTURES), metavar='FILE.png|svg|pdf', help='the chart (default: budget.png here)'
+    )
     parser.add_argument('--json', action='store_true', help='print JSON in SI units; draws only with --out')
     parser.add_argument('--explain', action='store_true', help='print formulas, inputs and their sources, and stop')
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the table, draw the chart."""
+    if args.explain:
+        refuse(args, {'json': False, 'out': None, 'monte_carlo': None, 'load': None}, 'does nothing beside --explain')
     rig = load_rig(args.params_file)
-    inputs = read_inputs(args.inputs, _settings(args.set))
+    # Of the file alone first, so that what is wrong in it is not laid to the options.
+    read_inputs(args.inputs, {})
+    with given_as_option():
+        inputs = read_inputs(args.inputs, _settings(args.set))
     if args.explain:
         print(explain(rig, inputs))
         return 0
-    draws = args.monte_carlo
-    if draws is not None and not 100 <= draws <= MAX_DRAWS:
-        raise ConfigError(f'--monte-carlo = {draws}: must be at least 100 and at most {MAX_DRAWS}')
-    if args.seed < 0:
-        raise ConfigError(f'--seed = {args.seed}: must be at least 0')
     method = args.method or METHOD_OF_SOLVER.get(rig.estimator.solver, 'exact')
     load = tuple(args.load) if args.load else (0.0, -SIDEBAR_FORCE, -SIDEBAR_FORCE * rig.link.length)
-    if not all(math.isfinite(v) for v in load):
-        raise ConfigError(f'--load = {load}: must be finite')
-    budget = evaluate(Situation.at_load(rig, inputs, load, method))
-    sampled = monte_carlo(budget.at, draws, args.seed) if draws is not None else None
+    finite('--load', load)
+    out = Path(args.out or 'budget.png')
+    if args.out is not None or not args.json:
+        need_folder(out)
+    with given_as_option() if args.load or args.set else contextlib.nullcontext():
+        budget = evaluate(Situation.at_load(rig, inputs, load, method))
+    draws = args.monte_carlo
+    sampled = None
+    if draws is not None:
+        hidden = True if args.json else None
+        with tqdm(total=draws, unit=' draws', delay=1.0, leave=False, disable=hidden, ncols=80) as bar:
+            sampled = monte_carlo(budget.at, draws, args.seed, drawn=bar.update)
     if args.json:
-        print(json.dumps(as_json(budget, load, sampled), indent=1))
+        print_json(as_json(budget, load, sampled), indent=1)
     else:
         print(table(budget, load))
         if sampled is not None:
             print(f'\nMonte Carlo, {draws} draws of everything at once (seed {args.seed}):')
             print('total     ' + _figures_text(sampled))
     if args.out is not None or not args.json:
-        out = Path(args.out or 'budget.png')
         draw(budget, out)
         if not args.json:
             print(f'\n{out}')
@@ -104,7 +129,7 @@ def _settings(pairs: list[str]) -> dict[str, object]:
     for pair in pairs:
         name, equals, value = pair.partition('=')
         if not equals:
-            raise ConfigError(f'--set {pair}: must be NAME=VALUE')
+            raise UsageError(f'--set {pair}: must be NAME=VALUE')
         out[name.strip()] = value.strip()
     return out
 
@@ -237,4 +262,4 @@ def draw(budget: Budget, path: Path) -> None:
     handles.append(Patch(facecolor='white', edgecolor='black', label='total (line)'))
     figure.legend(handles=handles, loc='outside lower center', ncols=4, frameon=False)
     figure.suptitle(f'Error budget, method {budget.at.method}: standard deviation or known bias')
-    save_figure(figure, path)
+    save_figure(figure, path, dpi=150)

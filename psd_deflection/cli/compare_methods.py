@@ -4,6 +4,9 @@ Exact readings of the thesis's rig go through every method; no noise. The first 
 error over a grid of poses (flat plate, independent tilts, tilts of a cantilever), then the largest.
 Then come noise, condition and error bound of the linear methods, and Table 5.1 taken apart by cause.
 --out draws the figures of docs/methods.md as well.
+
+  psd-deflection compare-methods
+  psd-deflection compare-methods --out figures
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import RecordingError
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers import Geometry, make_solver
 from psd_deflection.solvers._linear import condition_number, design_matrix, error_bound
@@ -51,17 +54,14 @@ def run(args: argparse.Namespace) -> int:
         try:
             Path(args.out).mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ConfigError(f'--out {args.out}: cannot be made a folder ({error.strerror})') from None
+            raise RecordingError(f'--out {args.out}: cannot be made a folder ({error.strerror or error})') from None
     print('\n'.join([*error_table(), '', *linear_table(), '', *cause_table()]))
     if args.out is not None:
         # matplotlib takes a second to import; who only reads the tables need not wait for it.
         from psd_deflection.cli._method_figures import draw_all
 
-        try:
-            for path in draw_all(Path(args.out)):
-                print(f'wrote {path}')
-        except OSError as error:
-            raise ConfigError(f'--out {args.out}: cannot be written ({error.strerror})') from None
+        for path in draw_all(Path(args.out)):
+            print(f'wrote {path}')
     return 0
 
 

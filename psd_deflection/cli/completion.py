@@ -1,7 +1,10 @@
 """Print what makes your shell complete psd-deflection's commands and options.
 
-psd-deflection completion bash > ~/.local/share/bash-completion/completions/psd-deflection
-psd-deflection completion zsh > ~/.zfunc/_psd-deflection          (a folder of $fpath)
+The output goes where your shell looks for it: for bash
+~/.local/share/bash-completion/completions/psd-deflection, for zsh _psd-deflection in a folder of $fpath.
+
+  psd-deflection completion bash
+  psd-deflection completion zsh
 """
 
 from __future__ import annotations

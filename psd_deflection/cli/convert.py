@@ -16,10 +16,12 @@ import argparse
 import contextlib
 import heapq
 import itertools
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from psd_deflection.cli._progress import progress_of
+from psd_deflection.cli._options import recording_name
+from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.config import EFFECTS_PREFIX, load_rig
 from psd_deflection.io.bag_writer import BagWriter, McapFile
@@ -37,7 +39,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
     parser.add_argument(
-        '--out', metavar='OUT', required=True, help='what to make: X.csv, X.mcap, X.rrd or a bag folder'
+        '--out',
+        type=recording_name(rerun=True),
+        metavar='OUT',
+        required=True,
+        help='what to make: X.csv, X.mcap, X.rrd or a bag folder (X)',
     )
     parser.add_argument(
         '--params-file',
@@ -52,8 +58,9 @@ def _time(record: Convertible) -> int:
 
 def convert(recording: Recording, out: Path, parameters: dict[str, object]) -> int:
     """Write ``recording`` to ``out``; returns the number of samples. Raises RecordingError."""
-    changes, loads = recording.changes, recording.loads()
-    references, temperatures = recording.references(), recording.temperatures()
+    with told('reading loads, references, temperatures'):
+        changes, loads = recording.changes, recording.loads()
+        references, temperatures = recording.references(), recording.temperatures()
     blocks = progress_of(recording.blocks())
     records: Iterable[Convertible] = heapq.merge(changes, loads, references, temperatures, blocks, key=_time)
     sink: CsvSampleSink | McapFile | BagWriter
@@ -105,4 +112,4 @@ def _to_rerun(recording: Recording, out: Path, params_file: str | None) -> int:
 
 def _warn(recording: Recording) -> None:
     for warning in recording.warnings:
-        print(f'warning: {warning}')
+        print(f'warning: {warning}', file=sys.stderr)

@@ -4,8 +4,8 @@ Without a rig file: Tables B1 and B2 of the thesis recomputed, each cell beside 
 each that differs with the reason. With one: its link's stiffness, and which sensor placement is
 best conditioned inside the room that --radius, --keep-out and --box leave (m, in link_tip).
 
-    psd-deflection design
-    psd-deflection design --params-file config/thesis_rig.yaml --sigma 2e-6 --out placement.png
+  psd-deflection design
+  psd-deflection design --params-file config/thesis_rig.yaml --out placement.png
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from psd_deflection.cli._options import PICTURES, given_as_option, need_folder, picture_name, refuse
 from psd_deflection.cli._report import columns, save_figure
 from psd_deflection.config import Rig, load_rig
-from psd_deflection.errors import ConfigError, UsageError
+from psd_deflection.errors import UsageError
 from psd_deflection.mechanics import LinkStatics, placement, scaling
 from psd_deflection.mechanics.section import TubeSection
 from psd_deflection.records import FloatArray
@@ -50,14 +51,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--box', type=float, nargs=4, metavar=('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX'), help='and inside this box, m'
     )
-    parser.add_argument('--out', metavar='FILE.png|svg', help='draw the placements')
+    parser.add_argument('--out', type=picture_name(*PICTURES), metavar='FILE.png|svg|pdf', help='draw the placements')
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the tables or the study."""
     if args.params_file is None:
-        if args.out is not None:
-            raise UsageError('--out draws the placement of a rig: give --params-file RIG.yaml')
+        placing = {'out': None, 'sigma': None, 'radius': None, 'keep_out': 0.0, 'box': None}
+        refuse(args, placing, 'is for the placement of a rig: give --params-file RIG.yaml')
         print(appendix_b())
         return 0
     rig = load_rig(args.params_file)
@@ -65,10 +66,13 @@ def run(args: argparse.Namespace) -> int:
     if args.sigma is not None:
         sigma = args.sigma
     if not (sigma > 0.0 and math.isfinite(sigma)):
-        raise ConfigError(f'--sigma = {sigma} m: must be above 0')
+        raise UsageError(f'--sigma = {sigma} m: must be above 0')
     radius = float(np.max(np.hypot(*rig.centers.T))) if args.radius is None else args.radius
-    room = placement.Room(radius, args.keep_out, tuple(args.box) if args.box else None)
-    candidates = placements(rig, room)
+    if args.out is not None:
+        need_folder(Path(args.out))
+    with given_as_option():
+        room = placement.Room(radius, args.keep_out, tuple(args.box) if args.box else None)
+        candidates = placements(rig, room)
     print(link_text(rig))
     print()
     print(placement_text(candidates, sigma))
@@ -256,4 +260,4 @@ def draw(candidates: list[Candidate], room: placement.Room, rig: Rig, path: Path
     axes.set(aspect='equal', xlabel='X, mm (link_tip)', ylabel='Y, mm', title='Sensor centres and base lines')
     axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.1), ncols=3, frameon=False)
     axes.grid(alpha=0.2)
-    save_figure(figure, path)
+    save_figure(figure, path, dpi=150)

@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from dataclasses import asdict
 
+from psd_deflection.cli._progress import told
+from psd_deflection.cli._report import print_json
 from psd_deflection.errors import DeviceError
 from psd_deflection.io.port_survey import Port, survey
 
@@ -22,30 +23,35 @@ from psd_deflection.io.port_survey import Port, survey
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('ports', nargs='*', metavar='PORT', help='only these, e.g. /dev/ttyACM0 or /dev/pts/3')
-    parser.add_argument('--json', action='store_true', help='for programs: one JSON list')
+    parser.add_argument('--json', action='store_true', help='for programs: one JSON object')
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the survey; the exit status is 0 whatever was found, unless a port that was named could not be asked."""
-    told = sys.stderr.isatty() and not args.json
-    if told:
-        print('asking; a port that stays silent takes some seconds ...', end='', file=sys.stderr, flush=True)
-    ports = survey(args.ports)
-    if told:
-        print('\r\x1b[K', end='', file=sys.stderr, flush=True)
-    status = DeviceError.exit_status if args.ports and not all(p.asked for p in ports) else 0
+    with told('asking; a port that stays silent takes some seconds', quiet=args.json):
+        ports = survey(args.ports)
     if args.json:
-        print(json.dumps({'ports': [asdict(p) for p in ports], 'suggested': suggestions(ports)}, indent=2))
-        return status
+        print_json({'ports': [asdict(p) for p in ports], 'suggested': suggestions(ports)}, indent=2)
+        _refuse_unasked(args.ports, ports)
+        return 0
     if not ports:
         print('no serial ports; is the device plugged in? (a pseudo-terminal has to be named)')
         return 0
     for port in ports:
+        if args.ports and not port.asked:
+            continue
         about = f' ({port.description})' if port.description and port.description != 'n/a' else ''
         print(f'{port.port}{about}\n  {port.answer}')
     for suggested in suggestions(ports):
         print('\n' + parameter_lines(suggested))
-    return status
+    _refuse_unasked(args.ports, ports)
+    return 0
+
+
+def _refuse_unasked(named: list[str], ports: list[Port]) -> None:
+    unasked = [p for p in ports if not p.asked]
+    if named and unasked:
+        raise DeviceError('; '.join(f'{p.port}: {p.answer}' for p in unasked))
 
 
 def suggestions(ports: list[Port]) -> list[dict[str, object]]:

@@ -9,24 +9,28 @@ given, or a .yaml list of recordings with what differs in each:
 DIR gets model.yaml (the rig with what was found: a --params-file for every command), report.html
 and result.json. Any verdict is a success.
 
-  psd-deflection discover recordings/psd_20260101_120000 --params-file my_rig.yaml --out found
-  psd-deflection discover long.csv short.csv --params-file my_rig.yaml --out found --json
+  psd-deflection discover odd.csv --out found
+  psd-deflection discover a.csv b.csv --params-file my_rig.yaml --out found
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from pathlib import Path
 
 from tqdm import tqdm
 
+from psd_deflection.cli._options import seed
+from psd_deflection.cli._progress import told
+from psd_deflection.cli._report import save
 from psd_deflection.config import load_rig
 from psd_deflection.discovery.discover import discover
 from psd_deflection.discovery.report import report_html
 from psd_deflection.discovery.result import model_yaml, result, sentence
-from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.errors import RecordingError, UsageError
 from psd_deflection.io.observations import read_observations
 from psd_deflection.simulation.catalogue import catalogue
 
@@ -41,9 +45,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--params-file', metavar='RIG.yaml', help='the rig as it is known (default: the parameters in the recording)'
     )
     parser.add_argument('--out', metavar='DIR', required=True, help='folder for model.yaml, report.html, result.json')
-    parser.add_argument('--seed', type=int, default=0, help='seed of the bootstraps; the same gives the same answer')
     parser.add_argument(
-        '--without', metavar='EFFECT', action='append', default=[], help='leave an effect out of the library'
+        '--seed', type=seed, default=0, help='seed of the bootstraps; the same gives the same answer (default 0)'
+    )
+    parser.add_argument(
+        '--without',
+        metavar='EFFECT',
+        action='append',
+        default=[],
+        help='leave an effect out of the library; repeatable',
     )
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     parser.add_argument('--json', action='store_true', help='print what result.json holds')
@@ -54,13 +64,17 @@ def run(args: argparse.Namespace) -> int:
     given = None if args.params_file is None else load_rig(args.params_file)
     for name in args.without:
         if name not in catalogue():
-            raise ConfigError(f'--without {name}: no effect of that name; there are: {", ".join(catalogue())}')
+            raise UsageError(f'--without {name}: no effect of that name; there are: {", ".join(catalogue())}')
+    with told('reading', quiet=args.quiet or args.json):
+        observations = read_observations(args.recordings, given)
     out = Path(args.out)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RecordingError(f'{out}: cannot be made ({error.strerror or error})') from None
-    observations = read_observations(args.recordings, given)
+        raise RecordingError(f'--out {out}: cannot be made a folder ({error.strerror or error})') from None
+    # Before the search, which takes its time.
+    if not os.access(out, os.W_OK):
+        raise RecordingError(f'--out {out}: cannot be written in; give another folder')
     rig = observations[0].rig if given is None else given
     # Reading took most of what can be foreseen; a search has as many steps as it has effects to weigh.
     hidden = True if args.quiet or args.json else None
@@ -83,10 +97,7 @@ def run(args: argparse.Namespace) -> int:
         'report.html': page,
     }
     for name, text in files.items():
-        try:
-            (out / name).write_text(text, encoding='utf-8')
-        except OSError as error:
-            raise RecordingError(f'{out / name}: cannot be written ({error.strerror or error})') from None
+        save(text.encode(errors='replace'), out / name)
     if args.json:
         print(in_json)
         return 0

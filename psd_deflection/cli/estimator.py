@@ -5,7 +5,8 @@ without hardware. Ctrl-C ends it and says how to replay what was recorded.
 
   psd-deflection estimator                                   the simulated rig
   psd-deflection estimator --port /dev/ttyACM0 --record      a device, recorded
-  ros2 run psd_deflection estimator --ros-args --params-file my_rig.yaml -p port:=/dev/ttyACM0
+  psd-deflection estimator --params-file my_rig.yaml --monitor --no-ros
+  ros2 run psd_deflection estimator --ros-args -p port:=/dev/ttyACM0
 
 While it runs:
   ros2 topic echo /link_tip/deflection        the tip's pose, 50 a second
@@ -26,14 +27,16 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from psd_deflection.cli._options import given_as_option
 from psd_deflection.cli._program import program
 from psd_deflection.config import Rig, read_parameter_file, rig_from_values
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, UsageError
 from psd_deflection.monitor.start import start_monitor
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import SIMULATED, Session
 from psd_deflection.runner.signals import Signals, StopRequestedError
 from psd_deflection.runner.simulated_rig import started_early
+from psd_deflection.solvers import SOLVERS
 
 REFRESH_S = 0.25
 PLAIN_REFRESH_S = 5.0
@@ -52,7 +55,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--record', nargs='?', const='', metavar='FOLDER', help='record from the start, below FOLDER (recordings/)'
     )
-    parser.add_argument('--solver', help='solver whose answer is published as /link_tip/deflection')
+    parser.add_argument(
+        '--solver',
+        choices=tuple(SOLVERS),
+        metavar='NAME',
+        help='solver whose answer is published as /link_tip/deflection (default exact)',
+    )
     parser.add_argument('--monitor', action='store_true', help='serve the live page and print its address')
     parser.add_argument('--no-ros', action='store_true', help='acquire and record without ROS')
     parser.add_argument('--ros-args', action='store_true', help='what follows is for ROS (ros2 run, ros2 launch)')
@@ -60,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def overrides_of(args: argparse.Namespace) -> dict[str, object]:
     """The parameters that the arguments give; the file's values below the single ones."""
-    values: dict[str, object] = dict(read_parameter_file(args.params_file)) if args.params_file else {}
+    values: dict[str, object] = {}
     if args.port is not None:
         values['port'] = args.port
     if args.source is not None:
@@ -75,8 +83,12 @@ def overrides_of(args: argparse.Namespace) -> dict[str, object]:
             values['bag_dir'] = args.record
     if args.monitor:
         values['monitor'] = True
-    # Refuse them here, where the file's name is known.
-    rig_from_values(values, args.params_file or 'command line')
+    with given_as_option():
+        rig_from_values(values, 'command line')
+    if args.params_file:
+        values = {**read_parameter_file(args.params_file), **values}
+        # Refuse it here, where the file's name is known.
+        rig_from_values(values, args.params_file)
     return values
 
 
@@ -156,6 +168,11 @@ def live_line(session: Session, rate: float) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Run until Ctrl-C."""
+    # Others are added by `ros2 launch`, and nothing is lost with them.
+    if args.no_ros and any(a in ('-p', '--param', '--params-file') for a in args.ros_arguments):
+        raise UsageError(
+            'parameters behind --ros-args are not read with --no-ros: put them into a --params-file before it'
+        )
     overrides = overrides_of(args)
     display = Display()
     recorded: list[Path] = []

@@ -9,14 +9,14 @@ The whole of it is read, so damage anywhere in it is found. Takes a bag folder, 
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from msg_adapters import DEFLECTION, LOAD, SAMPLES
-from psd_deflection.cli._progress import progress_of
+from psd_deflection.cli._progress import progress_of, told
+from psd_deflection.cli._report import print_json
 from psd_deflection.io.recording import Recording
 from psd_deflection.io.recordings import open_recording
 from psd_deflection.parameters import BY_NAME
@@ -57,7 +57,8 @@ def lacks(recording: Recording, topics: Mapping[str, int]) -> list[str]:
 
 def survey(recording: Recording, quiet: bool = True) -> dict[str, Any]:
     """What ``info --json`` prints: times in s and ns, counts, metadata; reads the whole recording."""
-    topics = recording.topics()
+    with told('counting messages', quiet=quiet):
+        topics = recording.topics()
     blocks = samples = flagged = 0
     first = last = (0, 0)
     counted, lasted = 0, 0
@@ -104,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the survey."""
     found = survey(open_recording(Path(args.recording)), quiet=args.json)
     if args.json:
-        print(json.dumps(found, indent=2))
+        print_json(found, indent=2)
         return 0
     for line in _lines(found):
         print(line)

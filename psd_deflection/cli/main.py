@@ -1,20 +1,27 @@
 """``psd-deflection``: finds the command and turns our errors into one line and an exit status.
 
-Each command is a module of this package with ``SUMMARY``, ``add_arguments(parser)`` and
-``run(args) -> int``; it is imported only when it is asked for, so that ``--help`` stays quick.
+Each command is a module of this package with ``add_arguments(parser)`` and ``run(args) -> int``; it is
+imported only when it is asked for, so that ``--help`` stays quick. Its docstring is its help.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
+import errno
 import importlib
+import itertools
 import os
+import shutil
+import signal
 import sys
-from collections.abc import Collection, Sequence
+import textwrap
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
 
 from psd_deflection import __version__
-from psd_deflection.errors import PsdDeflectionError
+from psd_deflection.errors import PsdDeflectionError, RecordingError, UsageError
 
 COMMANDS: dict[str, str] = {
     'estimator': 'acquire, estimate, publish on ROS 2 and record (the daemon)',
@@ -35,21 +42,49 @@ COMMANDS: dict[str, str] = {
 }
 """Command name to one-line summary; the module is ``psd_deflection.cli.NAME`` (``-`` as ``_``)."""
 
-USAGE = 2
-"""Exit status of a command line that was not understood; argparse has the same."""
-
 ROS_OPTIONS = ('-p', '--param', '-r', '--remap')
 """What ROS 2 takes behind --ros-args and people type without it."""
 
 EPILOG = """\
-A first look, without hardware:   psd-deflection estimator
-What it measured, once more:      psd-deflection replay RECORDING --compare
-Each command explains itself:     psd-deflection COMMAND --help
-"""
+where to begin:
+  psd-deflection estimator                    a first look, without hardware
+  psd-deflection replay RECORDING --compare   what it measured, once more
+  psd-deflection COMMAND --help               each command explains itself
 
+exit status:
+  0    done
+  1    done, and the recording differs (replay --compare)
+  2    the command line: an option, its value, or what does not go together
+  3    a parameter, a parameter file, or a package that is not installed
+  4    a recording or an output that cannot be read or written
+  5    the device: missing, in use, silent, or of another protocol
+  6    the geometry of the rig cannot be solved
+  130  Ctrl-C before it was done
+"""
 
 INTERRUPTED = 130
 """What a shell gives a program that Ctrl-C ended."""
+
+_WIDEST = 100
+_REFUSED_OUTPUT = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG)
+
+
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Wraps what is written in paragraphs as wide as the terminal is; lines that are indented stay."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, width=min(shutil.get_terminal_size().columns - 2, _WIDEST))
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        out = []
+        for indented, lines in itertools.groupby(text.splitlines(), lambda line: line.startswith(' ') or not line):
+            if indented:
+                out += [indent + line for line in lines]
+            else:
+                out += textwrap.wrap(
+                    ' '.join(lines), width, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False
+                )
+        return '\n'.join(out)
 
 
 def make_parser(chosen: Collection[str]) -> argparse.ArgumentParser:
@@ -58,14 +93,12 @@ def make_parser(chosen: Collection[str]) -> argparse.ArgumentParser:
         prog='psd-deflection',
         description='Tip deflection and twist of a flexible link from two position sensing detectors.',
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=_Help,
     )
     parser.add_argument('--version', action='version', version=f'psd-deflection {__version__}')
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
     for name, summary in COMMANDS.items():
-        sub = commands.add_parser(
-            name, help=summary, description=summary, formatter_class=argparse.RawDescriptionHelpFormatter
-        )
+        sub = commands.add_parser(name, help=summary, description=summary, formatter_class=_Help)
         if name in chosen:
             module = importlib.import_module('psd_deflection.cli.' + name.replace('-', '_'))
             sub.description = module.__doc__
@@ -76,24 +109,55 @@ def make_parser(chosen: Collection[str]) -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status (``psd_deflection.errors`` lists them; 130: Ctrl-C)."""
+    status = 0
+    with contextlib.suppress(AttributeError, ValueError):
+        # A Δ that the terminal has no letter for is no reason to fail.
+        sys.stdout.reconfigure(errors='replace')  # type: ignore[union-attr]
     try:
-        return _run(list(sys.argv[1:] if argv is None else argv))
+        try:
+            status = _run(list(sys.argv[1:] if argv is None else argv))
+        finally:
+            # Here, where it can still be said what is wrong, and not as the interpreter ends.
+            if sys.stdout is not None:
+                sys.stdout.flush()
     except KeyboardInterrupt:
         print('psd-deflection: interrupted', file=sys.stderr)
         return INTERRUPTED
+    except BrokenPipeError:
+        # `psd-deflection ... | head` is not an error.
+        _discard_output()
+    except OSError as error:
+        if error.errno not in _REFUSED_OUTPUT or error.filename is not None:
+            raise
+        _discard_output()
+        refused = RecordingError(f'the standard output cannot be written ({error.strerror})')
+        print(f'psd-deflection: {refused}', file=sys.stderr)
+        return refused.exit_status
+    return status
+
+
+def _discard_output() -> None:
+    """Let what is still in its buffer go nowhere, else the interpreter trips over it once more."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
 
 
 def _run(argv: list[str]) -> int:
-    chosen = [a for a in argv if not a.startswith('-')][:1]
-    if chosen and chosen[0] not in COMMANDS:
-        close = difflib.get_close_matches(chosen[0], COMMANDS, 1)
-        hint = f'did you mean {close[0]}?' if close else '`psd-deflection --help` lists them'
-        print(f'psd-deflection: no command {chosen[0]!r}; {hint}', file=sys.stderr)
-        return USAGE
-    parser = make_parser(chosen)
+    chosen = [a for a in argv if a and not a.startswith('-')][:1]
     # `ros2 run` and `ros2 launch` add arguments of their own: they are for rclpy, not for argparse.
     own, ros_arguments = _split_ros_arguments(argv)
-    args, unknown = parser.parse_known_args(own)
+    try:
+        _refuse_empty(own)
+        if chosen and chosen[0] not in COMMANDS:
+            close = difflib.get_close_matches(chosen[0], COMMANDS, 1)
+            hint = f'did you mean {close[0]}?' if close else '`psd-deflection --help` lists them'
+            raise UsageError(f'no command {chosen.pop()!r}; {hint}')
+        args, unknown = make_parser(chosen).parse_known_args(own)
+    except UsageError as error:
+        print(f'{" ".join(["psd-deflection", *chosen])}: {error}', file=sys.stderr)
+        return error.exit_status
     if unknown:
         # The parser of the whole program would answer with its own usage, which names none of the command's options.
         args.refuse(f'unrecognized arguments: {" ".join(unknown)}{_ros_hint(unknown)}')
@@ -102,22 +166,62 @@ def _run(argv: list[str]) -> int:
     # What was there before is another run's, and this one has not written into it.
     fresh = out is not None and not os.path.lexists(out)
     try:
-        return int(args.run(args))
+        with _ended_like_ctrl_c() if fresh else contextlib.nullcontext():
+            return int(args.run(args))
     except KeyboardInterrupt:
-        if out is None or not fresh or not os.path.lexists(out):
+        aside = set_aside(Path(out)) if out is not None and fresh else ''
+        if not aside:
             raise
-        print(
-            f'psd-deflection {args.command}: interrupted; {out} holds only what came before',
-            file=sys.stderr,
-        )
+        print(f'psd-deflection {args.command}: interrupted{aside}', file=sys.stderr)
         return INTERRUPTED
     except PsdDeflectionError as error:
-        print(f'psd-deflection {args.command}: {error}', file=sys.stderr)
+        aside = set_aside(Path(out)) if out is not None and fresh else ''
+        print(f'psd-deflection {args.command}: {error}{aside}', file=sys.stderr)
         return error.exit_status
-    except BrokenPipeError:
-        # `psd-deflection ... | head` is not an error; keep the interpreter's own flush quiet too.
-        sys.stderr.close()
-        return 0
+
+
+@contextlib.contextmanager
+def _ended_like_ctrl_c() -> Iterator[None]:
+    """What a `timeout` or a closed terminal ends leaves no output either that looks whole."""
+    before = {}
+    # Only the main thread may say so.
+    with contextlib.suppress(ValueError):
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is signal.SIG_DFL:
+                before[number] = signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def set_aside(out: Path) -> str:
+    """Take an output that was not finished out of the way of whoever takes it for whole; returns where it is, in words.
+
+    An empty folder goes; else it becomes ``NAME.partial``, or ``NAME.partial2`` and so on.
+    """
+    try:
+        if out.is_dir() and not any(out.iterdir()):
+            out.rmdir()
+            return ''
+        if not os.path.lexists(out):
+            return ''
+        names = (out.with_name(f'{out.name}.partial{n}') for n in ('', *range(2, 1000)))
+        partial = next(p for p in names if not os.path.lexists(p))
+        out.rename(partial)
+    except (OSError, StopIteration):
+        return f'; {out} holds only what came before'
+    return f'; {partial} holds what came before'
+
+
+def _refuse_empty(argv: Sequence[str]) -> None:
+    """Raise UsageError for an argument without content: what a script has where a variable is not set."""
+    for before, argument in itertools.pairwise(['', *argv]):
+        option, equals, value = argument.partition('=')
+        if argument == '' or (option.startswith('--') and equals and not value):
+            where = option or (before if before.startswith('--') else 'an argument')
+            raise UsageError(f'{where} is empty (a variable that is not set?)')
 
 
 def _ros_hint(unknown: Sequence[str]) -> str:

@@ -5,11 +5,11 @@ folder, an .mcap or a .csv) it plays that recording. The page is for this machin
 --address says otherwise; its buttons (zero, record) are off unless --control allows them, and need
 the token in the printed address where others can reach the page. Ctrl-C ends it.
 
-  psd-deflection monitor                                     the simulated rig
-  psd-deflection monitor --port /dev/ttyACM0 --control       a device, with buttons
+  psd-deflection monitor                                 the simulated rig
+  psd-deflection monitor --port /dev/ttyACM0 --control   a device, with buttons
   psd-deflection monitor recordings/psd_20260101_120000 --speed 2 --loop
 
-The node serves the same page:  psd-deflection estimator --monitor, or the parameter monitor:=true.
+The node serves the same page: estimator --monitor, or the parameter monitor:=true.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+from psd_deflection.cli._options import given_as_option, refuse
 from psd_deflection.cli._program import program
 from psd_deflection.cli.estimator import Display, run_without_ros, simulates
 from psd_deflection.cli.replay import replayed, rig_of
@@ -52,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--record', nargs='?', const='', metavar='FOLDER', help='record from the start, below FOLDER (recordings/)'
     )
     play = parser.add_argument_group('a recording (with REC)')
-    play.add_argument('--speed', type=float, default=1.0, help='times as fast as recorded (default 1)')
+    play.add_argument('--speed', type=float, default=1.0, metavar='X', help='times as fast as recorded (default 1)')
     play.add_argument('--loop', action='store_true', help='start anew at its end')
 
 
@@ -78,6 +79,8 @@ def overrides_of(args: argparse.Namespace) -> dict[str, object]:
 def _check(args: argparse.Namespace) -> None:
     if not math.isfinite(args.speed) or args.speed <= 0.0:
         raise UsageError(f'--speed {args.speed:g}: must be above 0')
+    if args.recording is None:
+        refuse(args, {'speed': 1.0, 'loop': False}, 'is for a recording: give REC')
     for name in ('port', 'baud', 'record'):
         if args.recording is not None and getattr(args, name) is not None:
             raise UsageError(f'--{name} is for a rig; {args.recording} is played')
@@ -87,11 +90,14 @@ def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     _check(args)
     overrides = overrides_of(args)
+    with given_as_option():
+        rig_from_values(overrides, 'command line')
     need_server()
     if args.recording is not None:
         return _play(args, overrides)
     values = dict(read_parameter_file(args.params_file)) if args.params_file else {}
-    rig_from_values({**values, **overrides}, args.params_file or 'command line')
+    if args.params_file:
+        rig_from_values({**values, **overrides}, args.params_file)
     display = Display()
     recorded: list[Path] = []
 

@@ -1,13 +1,16 @@
 """List every parameter with unit, bounds, default and what it is for.
 
 With --params-file the values of that file are shown and checked.
+
+  psd-deflection params
+  psd-deflection params --params-file my_rig.yaml --json
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 
+from psd_deflection.cli._report import print_json
 from psd_deflection.config import load_rig
 from psd_deflection.parameters import PARAMETERS
 
@@ -22,7 +25,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the table."""
     rig = load_rig(args.params_file)
     if args.json:
-        print(json.dumps(dict(rig.values), indent=2))
+        print_json(dict(rig.values), indent=2)
         return 0
     for p in PARAMETERS:
         bounds = p.bound_text() or (', '.join(p.choices) if p.choices else '')

@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import html
 import io
-import json
+import os
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,17 +22,17 @@ from typing import Any
 import numpy as np
 
 from psd_deflection import __version__
-from psd_deflection.cli._progress import progress_of
-from psd_deflection.cli._report import save_figure
+from psd_deflection.cli._options import PICTURES, need_folder, picture_name
+from psd_deflection.cli._progress import progress_of, told
+from psd_deflection.cli._report import print_json, save, save_figure
 from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.errors import RecordingError
 from psd_deflection.io.recordings import open_recording
 from psd_deflection.monitor.spectrum import Spectrum
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, Record, SampleBlock, SpotMeans
 
-KINDS = ('.png', '.svg', '.pdf', '.html')
 SPECTRUM_S = 600.0
 """The spectrum is of the last ten minutes: it does not get better after that, only slower."""
 
@@ -43,7 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
     parser.add_argument('--params-file', metavar='RIG.yaml', help='use this rig instead of the recorded parameters')
-    parser.add_argument('--out', metavar='OUT', help='.png, .svg, .pdf or .html (default: REC.png, here)')
+    parser.add_argument(
+        '--out',
+        type=picture_name(*PICTURES, '.html'),
+        metavar='OUT',
+        help='.png, .svg, .pdf or .html (default: REC.png, here)',
+    )
     parser.add_argument('--json', action='store_true', help='for programs: the summary as one JSON object, in SI units')
 
 
@@ -116,10 +121,12 @@ class Drawn:
 
 def run(args: argparse.Namespace) -> int:
     """Read, replay, draw."""
-    name = Path(args.recording).resolve().name
+    # A name that is no text is shown as far as it is one.
+    name, title = (
+        os.fsencode(n).decode(errors='replace') for n in (Path(args.recording).resolve().name, args.recording)
+    )
     out = Path(args.out) if args.out is not None else default_out(args.recording)
-    if out.suffix.lower() not in KINDS:
-        raise ConfigError(f'--out {out}: the name must end in {", ".join(KINDS)}')
+    need_folder(out)
     rig = rig_of(open_recording(args.recording), args.params_file)
     recording = open_recording(args.recording, block_size=rig.estimator.block_size)
     drawn, spectrum = Drawn(), Spectrum(rig, SPECTRUM_S)
@@ -131,13 +138,14 @@ def run(args: argparse.Namespace) -> int:
     if not drawn.spots:
         raise RecordingError(f'{args.recording}: has no samples to draw')
     summary = summarise(drawn, rig)
-    figure = draw(drawn, spectrum, rig, name)
-    if out.suffix.lower() == '.html':
-        write_html(figure, out, str(args.recording), summary)
-    else:
-        save_figure(figure, out)
+    with told('drawing', quiet=args.json):
+        figure = draw(drawn, spectrum, rig, name)
+        if out.suffix.lower() == '.html':
+            write_html(figure, out, title, summary)
+        else:
+            save_figure(figure, out, dpi=150)
     if args.json:
-        print(json.dumps({**figures(drawn, rig), 'out': str(out)}))
+        print_json({**figures(drawn, rig), 'out': str(out)})
         return 0
     for name, value in summary:
         print(f'{name:<24} {value}')
@@ -310,7 +318,7 @@ td, th {{ text-align: left; padding: .1rem 1.5rem .1rem 0; }} th {{ font-weight:
 
 
 def write_html(figure: Any, path: Path, title: str, summary: list[tuple[str, str]]) -> None:
-    """One page with the figure in it. Raises ConfigError where it cannot be written."""
+    """One page with the figure in it. Raises RecordingError where it cannot be written."""
     stream = io.StringIO()
     figure.savefig(stream, format='svg', metadata={'Date': None})
     picture = stream.getvalue()
@@ -318,7 +326,4 @@ def write_html(figure: Any, path: Path, title: str, summary: list[tuple[str, str
     page = PAGE.format(
         title=html.escape(title), rows=rows, picture=picture[picture.index('<svg') :], version=__version__
     )
-    try:
-        path.write_text(page, encoding='utf-8')
-    except OSError as error:
-        raise ConfigError(f'--out {path}: cannot be written ({error.strerror})') from None
+    save(page.encode(), path)

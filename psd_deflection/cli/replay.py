@@ -12,7 +12,6 @@ anything differs. With --params-file another rig is used: what would it have mea
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Iterable, Iterator
@@ -21,7 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from psd_deflection.cli._progress import progress_of
+from psd_deflection.cli._options import recording_name
+from psd_deflection.cli._progress import progress_of, told
+from psd_deflection.cli._report import print_json
 from psd_deflection.config import Rig, load_rig, rig_from_values
 from psd_deflection.io.comparison import Comparison
 from psd_deflection.io.recording import Recording
@@ -39,7 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--params-file', metavar='RIG.yaml', help='use this rig instead of the parameters in the recording'
     )
-    parser.add_argument('--out', metavar='OUT', help='write the estimates: OUT.csv, OUT.mcap, OUT.rrd, or a bag folder')
+    parser.add_argument(
+        '--out',
+        type=recording_name(rerun=True),
+        metavar='OUT',
+        help='write the estimates: X.csv, X.mcap, X.rrd or a bag folder (X)',
+    )
     parser.add_argument(
         '--compare', action='store_true', help='compare with the recorded estimates; exit 1 where a bit differs'
     )
@@ -107,7 +113,8 @@ def run(args: argparse.Namespace) -> int:
     rig = rig_of(recording, args.params_file)
     recording = open_recording(args.recording, block_size=rig.estimator.block_size)
     pipeline = Pipeline(rig)
-    comparison = Comparison(recording) if args.compare else None
+    with told('looking for what was recorded', quiet=args.json):
+        comparison = Comparison(recording) if args.compare else None
     sink: Sink | None = None
     if args.out is not None:
         effects = {f'effects.{name}': value for name, value in rig.effects.items()}
@@ -132,10 +139,11 @@ def run(args: argparse.Namespace) -> int:
     seconds = time.perf_counter() - began
     for warning in [*recording.warnings, *_rate_warning(recording, rig)]:
         print(f'warning: {warning}', file=sys.stderr)
-    _print_summary(args, rig, pipeline, totals, seconds)
+    if comparison is not None:
+        comparison.finish()
+    _print_summary(args, rig, pipeline, totals, seconds, comparison)
     if comparison is None:
         return 0
-    comparison.finish()
     print(comparison.summary(), file=sys.stderr if args.json else sys.stdout)
     return 0 if comparison.same else DIFFERS
 
@@ -150,7 +158,14 @@ def _rate_warning(recording: Recording, rig: Rig) -> list[str]:
     ]
 
 
-def _print_summary(args: argparse.Namespace, rig: Rig, pipeline: Pipeline, totals: Totals, seconds: float) -> None:
+def _print_summary(
+    args: argparse.Namespace,
+    rig: Rig,
+    pipeline: Pipeline,
+    totals: Totals,
+    seconds: float,
+    comparison: Comparison | None,
+) -> None:
     counters = pipeline.counters
     poses = np.array(totals.poses).reshape(-1, 3)
     recorded_seconds = totals.blocks * rig.estimator.block_size / rig.converter.sample_rate_hz
@@ -166,8 +181,9 @@ def _print_summary(args: argparse.Namespace, rig: Rig, pipeline: Pipeline, total
             'seconds': recorded_seconds,
             'replay_seconds': seconds,
             'out': args.out,
+            'compared': None if comparison is None else comparison.counts(),
         }
-        print(json.dumps(summary))
+        print_json(summary)
         return
     print(
         f'{args.recording}: {totals.samples} samples, {totals.lost} lost, {totals.blocks} blocks, '

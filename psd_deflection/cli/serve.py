@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 
+from psd_deflection.cli._options import given_as_option, number, whole
 from psd_deflection.cli._program import program
 from psd_deflection.config import Rig, load_rig, rig_from_values
 from psd_deflection.errors import ConfigError
@@ -26,6 +27,11 @@ from psd_deflection.simulation.loads import CyclicLoads, thesis_load_cases
 
 DEVICES = SIMULATED
 """What can be simulated, named as the sources that read it."""
+
+OF_A_DEVICE = {'device': None, 'link': None, 'skew_ppm': 0.0, 'first_seq': 0}
+"""Options of a device, and what they are where they are not given."""
+
+MAX_SKEW_PPM = 100_000.0
 
 DWELL_S = 4.0
 FIRST_LOAD_S = 1.0
@@ -45,8 +51,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'lines of text; default: what source: of the rig says',
     )
     group.add_argument('--link', metavar='PATH', help='a symbolic link to the port, for a name that stays')
-    group.add_argument('--skew-ppm', type=float, default=0.0, help="how much too fast the device's clock runs")
-    group.add_argument('--first-seq', type=int, default=0, help='sample number at power-up')
+    group.add_argument(
+        '--skew-ppm',
+        type=number('--skew-ppm', -MAX_SKEW_PPM, MAX_SKEW_PPM),
+        metavar='PPM',
+        default=0.0,
+        help="how much too fast the device's clock runs, 1e-6 (default 0)",
+    )
+    group.add_argument(
+        '--first-seq',
+        type=whole('--first-seq', 0, 2**32 - 1),
+        metavar='N',
+        default=0,
+        help='sample number at power-up (default 0)',
+    )
     # How the daemon starts one: the parameters come as a line of JSON, the end of the input ends it.
     group.add_argument('--attached', action='store_true', help=argparse.SUPPRESS)
 
@@ -55,15 +73,16 @@ def run_device(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C, or until the daemon that started it is gone."""
     stop = threading.Event()
     rig = _attached_rig(stop) if args.attached else load_rig(args.params_file)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    for one in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(one, lambda *_: stop.set())
     loads = served_loads(rig.converter.sample_rate_hz)
     name = args.device or rig.acquisition.source
     if name not in DEVICES:
         raise ConfigError(f'source = {name!r}: cannot be simulated; --device takes one of {", ".join(DEVICES)}')
     devices = make_devices(name, rig, lambda _, n: loads.take(n), args)
     links = [args.link] if len(devices) == 1 or args.link is None else [f'{args.link}_{i}' for i in (1, 2)]
-    ports = [PseudoTerminal(link) for link in (links if args.link else [None] * len(devices))]
+    with given_as_option():
+        ports = [PseudoTerminal(link) for link in (links if args.link else [None] * len(devices))]
     names = ','.join(port.name for port in ports)
     try:
         print(f'{PORT_LINE}{names}', flush=True)

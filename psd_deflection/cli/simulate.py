@@ -5,7 +5,8 @@ of: neither the estimates nor the parameters in the recording tell of it. A reco
 samples, the loads, the temperature where one is given, and with --reference the true pose.
 
   psd-deflection simulate --out run --loads thesis --temperature 20,24
-  psd-deflection simulate --out odd.csv --loads identification --effect sensor_rotation,psd=2,angle=0.01
+  psd-deflection simulate --out odd.csv --effect axis_crosstalk,psd=1,xy=0.02
+  psd-deflection simulate --out s.mcap --loads 'steps:0,0,0;0,-10,-5.85:2'
   psd-deflection simulate --serve --link rig_port
 """
 
@@ -20,6 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 from psd_deflection.cli import serve
+from psd_deflection.cli._options import given_as_option, recording_name, refuse, seed
 from psd_deflection.config import EFFECTS_PREFIX, Rig, load_rig, replace_values
 from psd_deflection.errors import ConfigError, UsageError
 from psd_deflection.io.bag_writer import BagWriter, McapFile
@@ -40,6 +42,12 @@ from psd_deflection.simulation.load_words import HELP, load_history, temperature
 from psd_deflection.simulation.simulator import RigSimulator
 
 CHUNK_SECONDS = 1.0
+LEAST_SAMPLES = 2
+"""Fewer tell no sample rate: such a CSV could not be read again."""
+
+OF_A_RECORDING: dict[str, object] = {'out': None, 'loads': None, 'temperature': None, 'effect': [], 'reference': False}
+"""Options of a recording, and what they are where they are not given."""
+
 BAG_START_NS = 1_000_000_000
 """A bag's stamps start here: zero means "no stamp" to many tools."""
 
@@ -48,13 +56,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.epilog = HELP
     parser.add_argument('--params-file', metavar='RIG.yaml', help='the rig and its known effects')
-    parser.add_argument('--seed', type=int, default=0, help='seed of the noise')
+    parser.add_argument('--seed', type=seed, default=0, help='seed of the noise (default 0)')
     group = parser.add_argument_group('as a recording (--out)')
-    group.add_argument('--out', metavar='OUT', help='X.csv, X.mcap or a bag folder')
+    group.add_argument('--out', type=recording_name(), metavar='OUT', help='X.csv, X.mcap or a bag folder (X)')
     group.add_argument(
         '--loads', metavar='WORDS', action='append', help='a load history, see below (default: thesis); repeatable'
     )
-    group.add_argument('--temperature', metavar='T0[,T1...]', help='degrees Celsius, straight lines through these')
+    group.add_argument(
+        '--temperature', metavar='T0[,T1...]', help='°C, straight lines through these, evenly spread over the recording'
+    )
     group.add_argument(
         '--effect',
         metavar='NAME,KEY=VALUE,...',
@@ -69,15 +79,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve or write."""
     if args.serve or args.attached:
+        refuse(args, OF_A_RECORDING, 'is for a recording (--out), not for a device (--serve)')
         return serve.run_device(args)
     if args.out is None:
         raise UsageError('--out OUT (a recording) or --serve (a device) is needed')
-    known = load_rig(args.params_file)
-    rig = with_effects(known, args.effect)
-    rate = rig.converter.sample_rate_hz
-    parts = [load_history(words, rate) for words in args.loads or ['thesis']]
-    history = parts[0].then(*parts[1:])
-    temperature = None if args.temperature is None else temperature_history(args.temperature, len(history))
+    refuse(args, serve.OF_A_DEVICE, 'is for a device: give --serve and no --out')
+    # With its own effects first, so that what is wrong in the file is not laid to the options.
+    known = with_effects(load_rig(args.params_file), ())
+    with given_as_option():
+        rig = with_effects(known, args.effect)
+        rate = rig.converter.sample_rate_hz
+        parts = [load_history(words, rate) for words in args.loads or ['thesis']]
+        history = parts[0].then(*parts[1:])
+        if len(history) < LEAST_SAMPLES:
+            raise UsageError(
+                f'--loads: last {len(history)} samples at {rate:g} Hz; a recording has at least {LEAST_SAMPLES}'
+            )
+        temperature = None if args.temperature is None else temperature_history(args.temperature, len(history))
     out = Path(args.out)
     count = write_recording(out, rig, known, history.loads, temperature, args.seed, args.reference)
     names = ', '.join(a.label for a in effects_of_rig(rig)) or 'none'

@@ -231,12 +231,48 @@ def _answer(
     if lattice is not None:
         null = refit(ws, ())
         ws.base = (*ws.base, lattice)
-    covariance = fit.covariance()
-    named: list[NamedEffect] = []
     progress('alternatives')
+    named = _named(search, result, fit, heldout)
+    if lattice is not None:
+        named.append(_named_lattice(ws, lattice))
+        ws.base = ws.base[:-1]
+    progress('where')
+    before = left if fit is null else localise(ws, null.residual, None, rng)
+    floor = ws.floor()
+    # Coarse steps make noise that comes and goes with the signal; what they explain stands against that.
+    explained = max(null.chi2 - fit.chi2, 0.0) + (0.0 if lattice is None else 2.0 * _lattice_gain(ws, lattice))
+    unknown = _unknown(left, explained) or _tied(coincidences(fit, ws.physics), fit, result, before)
+    verdict = 'unknown_effect' if unknown else 'effects_found' if named else 'nothing_missing'
+    channels = ws.gap_per_channel(null.difference), ws.gap_per_channel(fit.difference)
+    gap_before, gap_after = ws.gap(null.difference), ws.gap(fit.difference)
+    return Discovery(
+        verdict,
+        tuple(named),
+        unknown,
+        before,
+        left,
+        gap_before,
+        gap_after,
+        floor,
+        gap_before,
+        heldout_gap(ws, fit),
+        {n: (float(a), float(b)) for n, a, b in zip(('x1', 'y1', 'x2', 'y2'), *channels, strict=True)},
+        _waterfall(ws, fit, gap_before, gap_after),
+        ws.simulations,
+        result,
+        fit,
+        ws,
+        seed,
+    )
+
+
+def _named(search: Search, result: SearchResult, fit: Fit, heldout: Sequence[HeldOut]) -> list[NamedEffect]:
+    """The effects of ``fit`` with their standard deviations, and with what explains the recording as well."""
+    ws, covariance = search.workspace, fit.covariance()
+    # Where the joint rule has taken effects out, what stood beside them is no longer comparable.
+    as_found = fit is result.fit
+    named: list[NamedEffect] = []
     for i, active in enumerate(fit.effects):
-        # Where the joint rule has taken effects out, what stood beside them is no longer comparable.
-        as_found = fit is result.fit
         fits = result.alternatives[i] if as_found else search.alternatives(result.null, fit, i, result.delta_chi2[i])
         rows, equal = [], []
         for f in fits:
@@ -259,44 +295,18 @@ def _answer(
                 suggest(ws, fit, equal[: 3 if ws.simulations < BUDGET else 1]) if equal else None,
             )
         )
-    if lattice is not None:
-        named.append(_named_lattice(ws, lattice))
-        ws.base = ws.base[:-1]
-    progress('where')
-    before = left if fit is null else localise(ws, null.residual, None, rng)
-    floor = ws.floor()
-    # Coarse steps make noise that comes and goes with the signal; what they explain stands against that.
-    explained = max(null.chi2 - fit.chi2, 0.0) + (0.0 if lattice is None else 2.0 * _lattice_gain(ws, lattice))
-    unknown = _unknown(left, explained) or _tied(coincidences(fit, ws.physics), fit, result, before)
-    verdict = 'unknown_effect' if unknown else 'effects_found' if named else 'nothing_missing'
-    channels = ws.gap_per_channel(null.difference), ws.gap_per_channel(fit.difference)
-    gap_before, gap_after = ws.gap(null.difference), ws.gap(fit.difference)
-    waterfall = [('as described', gap_before)]
+    return named
+
+
+def _waterfall(ws: Workspace, fit: Fit, gap_before: float, gap_after: float) -> tuple[tuple[str, float], ...]:
+    """The gap as each effect is added, and what noise alone would leave."""
+    steps = [('as described', gap_before)]
     for i in range(len(fit.effects) - 1):
         _, difference = ws.residual([*ws.base, *fit.effects[: i + 1]])
-        waterfall.append(('+ ' + fit.effects[i].effect.name, ws.gap(difference)))
+        steps.append(('+ ' + fit.effects[i].effect.name, ws.gap(difference)))
     if fit.effects:
-        waterfall.append(('+ ' + fit.effects[-1].effect.name, gap_after))
-    waterfall.append(('noise alone', floor))
-    return Discovery(
-        verdict,
-        tuple(named),
-        unknown,
-        before,
-        left,
-        gap_before,
-        gap_after,
-        floor,
-        gap_before,
-        heldout_gap(ws, fit),
-        {n: (float(a), float(b)) for n, a, b in zip(('x1', 'y1', 'x2', 'y2'), *channels, strict=True)},
-        tuple(waterfall),
-        ws.simulations,
-        result,
-        fit,
-        ws,
-        seed,
-    )
+        steps.append(('+ ' + fit.effects[-1].effect.name, gap_after))
+    return (*steps, ('noise alone', ws.floor()))
 
 
 def _lattice_gain(workspace: Workspace, lattice: ActiveEffect) -> float:

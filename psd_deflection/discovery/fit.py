@@ -19,6 +19,9 @@ from psd_deflection.simulation.catalogue import ActiveEffect, EffectParameter
 STEP = 0.05
 """Finite difference, in scales of the parameter."""
 
+STOP = 0.05
+"""A refit ends with the iteration that gains less than this in chi-square."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
@@ -70,11 +73,8 @@ def _moved(
     return [ActiveEffect(a.effect, v) for a, v in zip(effects, values, strict=True)]
 
 
-def refit(workspace: Workspace, effects: Sequence[ActiveEffect], iterations: int = 8, stop: float = 0.05) -> Fit:
-    """Fit all parameters of ``effects``, from where they stand.
-
-    ``stop``: ends when an iteration gains less than this in chi-square.
-    """
+def refit(workspace: Workspace, effects: Sequence[ActiveEffect], iterations: int = 8) -> Fit:
+    """Fit all parameters of ``effects``, from where they stand."""
     free = _free(effects)
     x = np.array([effects[i].values[p.name] for i, p in free])
     bounds = [p.bounds(workspace.physics, effects[i].values) for i, p in free]
@@ -125,7 +125,7 @@ def refit(workspace: Workspace, effects: Sequence[ActiveEffect], iterations: int
                 damping = max(damping * 0.1, 1e-9)
                 break
             damping = max(damping * 20.0, 1e-4)
-        if gained < stop + 1e-7 * chi2:
+        if gained < STOP + 1e-7 * chi2:
             break
     bound = tuple((i, p.name) for (i, p), v, (a, b) in zip(free, x, bounds, strict=True) if v <= a or v >= b)
     final = tuple(_moved(effects, free, x))

@@ -6,6 +6,7 @@ that compare them skip a topic where they differ, so both are made here from one
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,22 +21,18 @@ _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
 Qos = Mapping[str, Any]
 
 
-def qos_profile(depth: int = 10, reliability: str = 'reliable', durability: str = 'volatile') -> Qos:
-    """One publisher's profile, named as rosbag2 names it from version 9 on."""
-    return {
-        'history': 'keep_last',
-        'depth': depth,
-        'reliability': reliability,
-        'durability': durability,
-        'deadline': dict(_INFINITE),
-        'lifespan': dict(_INFINITE),
-        'liveliness': 'automatic',
-        'liveliness_lease_duration': dict(_INFINITE),
-        'avoid_ros_namespace_conventions': False,
-    }
-
-
-DEFAULT_QOS = qos_profile()
+DEFAULT_QOS: Qos = {
+    'history': 'keep_last',
+    'depth': 10,
+    'reliability': 'reliable',
+    'durability': 'volatile',
+    'deadline': _INFINITE,
+    'lifespan': _INFINITE,
+    'liveliness': 'automatic',
+    'liveliness_lease_duration': _INFINITE,
+    'avoid_ros_namespace_conventions': False,
+}
+"""Our publishers' profile, named as rosbag2 names it from version 9 on."""
 
 
 def qos_text(qos: Qos) -> str:
@@ -123,5 +120,10 @@ def bag_information(
 def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:
     """``metadata.yaml`` as a whole or not at all. Raises OSError."""
     partial = folder / 'metadata.yaml.partial'
-    partial.write_text(to_yaml({'rosbag2_bagfile_information': information}), encoding='utf-8')
-    partial.replace(folder / 'metadata.yaml')
+    try:
+        partial.write_text(to_yaml({'rosbag2_bagfile_information': information}), encoding='utf-8')
+        partial.replace(folder / 'metadata.yaml')
+    except OSError:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        raise

@@ -79,7 +79,7 @@ class BagRecording(Recording):
                 raise RecordingError(f'{folder}: is no bag: it holds neither metadata.yaml nor an .mcap file')
             self._own_warnings.append(f'{folder}: has no metadata.yaml (a recorder that was stopped hard?)')
             return found
-        information = _read_information(meta_file)
+        information = read_information(meta_file)
         storage = information.get('storage_identifier')
         if storage != 'mcap':
             raise RecordingError(f'{folder}: is a bag with {storage} storage; only mcap is read (see ros2 bag convert)')
@@ -95,7 +95,9 @@ class BagRecording(Recording):
         files = [folder / PurePath(n).name for n in named]
         for file in files:
             if not file.is_file():
-                raise RecordingError(f'{file}: is named by metadata.yaml and is not there')
+                raise RecordingError(
+                    f'{file}: is named by metadata.yaml and is not there; `psd-deflection recover` makes that one anew'
+                )
         return files
 
     @property
@@ -152,7 +154,9 @@ class BagRecording(Recording):
                 waiting = block
         if waiting is None:
             cut = '' if self.complete else ' before the cut'
-            raise RecordingError(f'{self.path}: holds no samples{cut} (topic {SAMPLES})')
+            raise RecordingError(
+                f'{self.path}: holds no samples{cut} (topic {SAMPLES}); `psd-deflection info` lists what it holds'
+            )
         yield waiting
 
     def _samples_in_order(self) -> Iterator[tuple[IntArray, IntArray, npt.NDArray[np.float32], npt.NDArray[np.uint8]]]:
@@ -354,17 +358,19 @@ def _file_number(path: Path) -> tuple[int, str]:
     return (int(number[1]) if number else -1, path.name)
 
 
-def _read_information(path: Path) -> dict[str, Any]:
+def read_information(path: Path) -> dict[str, Any]:
+    """What ``metadata.yaml`` says of its bag. Raises RecordingError where that is nothing."""
+    way_out = '`psd-deflection recover` makes it anew'
     try:
         if path.stat().st_size > MAX_YAML_BYTES:
             raise RecordingError(f'{path}: is larger than {MAX_YAML_BYTES} bytes')
         tree = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f'{path}: cannot be read ({error})') from None
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         problem = getattr(error, 'problem', None) or 'not YAML'
-        raise RecordingError(f'{path}: malformed YAML: {problem}; without this file the .mcap files are read') from None
+        raise RecordingError(f'{path}: malformed YAML: {problem}; {way_out}') from None
     information = tree.get('rosbag2_bagfile_information') if isinstance(tree, dict) else None
     if not isinstance(information, dict):
-        raise RecordingError(f'{path}: has no rosbag2_bagfile_information; without this file the .mcap files are read')
+        raise RecordingError(f'{path}: has no rosbag2_bagfile_information; {way_out}')
     return information

@@ -29,7 +29,6 @@ from psd_deflection.io import cdr
 from psd_deflection.io.bag_metadata import (
     DEFAULT_QOS,
     FileCount,
-    Qos,
     TopicCount,
     bag_information,
     qos_text,
@@ -110,7 +109,6 @@ class McapFile:
         *,
         rig_values: Mapping[str, object],
         device_hello: Mapping[str, object] | None = None,
-        qos: Mapping[str, Qos] | None = None,
         durable: bool = False,
     ) -> None:
         self.path = path
@@ -118,7 +116,6 @@ class McapFile:
         self.topics: dict[str, TopicCount] = {}
         self.start_ns = 0
         self.end_ns = 0
-        self._qos = dict(qos or {})
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._chunk_first: int | None = None
@@ -232,13 +229,12 @@ class McapFile:
         if schema is None:
             schema = self._writer.register_schema(type_name, 'ros2msg', definition(type_name).encode())
             self._schemas[type_name] = schema
-        qos = self._qos.get(topic, DEFAULT_QOS)
         type_hash = TYPE_HASHES[type_name]
         channel: int = self._writer.register_channel(
-            topic, 'cdr', schema, {'offered_qos_profiles': qos_text(qos), 'topic_type_hash': type_hash}
+            topic, 'cdr', schema, {'offered_qos_profiles': qos_text(DEFAULT_QOS), 'topic_type_hash': type_hash}
         )
         self._channels[topic] = channel
-        self.topics[topic] = TopicCount(topic, type_name, qos, type_hash)
+        self.topics[topic] = TopicCount(topic, type_name, DEFAULT_QOS, type_hash)
         return channel
 
     def count(self) -> FileCount:
@@ -277,8 +273,7 @@ class McapFile:
 class BagWriter:
     """A rosbag2 bag being written: ``NAME/NAME_0.mcap`` and so on, ``NAME/metadata.yaml`` at the end.
 
-    ``rig_values``: the flat parameter set, effects included. ``qos``: topic to profile
-    (:func:`psd_deflection.io.bag_metadata.qos_profile`) where it is not the default one.
+    ``rig_values``: the flat parameter set, effects included.
     ``max_bytes``, ``max_s``: a file that is as large, or spans as much log time, is ended and the
     next one begun (0: never); each file can be read alone. Raises RecordingError where the folder
     exists already or cannot be made; :meth:`write` and the others as :class:`McapFile` does.
@@ -290,7 +285,6 @@ class BagWriter:
         *,
         rig_values: Mapping[str, object],
         device_hello: Mapping[str, object] | None = None,
-        qos: Mapping[str, Qos] | None = None,
         max_bytes: int = 0,
         max_s: float = 0.0,
         durable: bool = False,
@@ -303,7 +297,7 @@ class BagWriter:
         except OSError as error:
             raise RecordingError(f'{self.folder}: cannot be made ({error.strerror or error})') from None
         self._name = self.folder.resolve().name
-        self._rig_values, self._hello, self._qos = rig_values, device_hello, qos
+        self._rig_values, self._hello = rig_values, device_hello
         self._max_bytes, self._max_ns, self._durable = max_bytes, round(max_s * 1e9), durable
         self._number = 0
         self._ended: list[tuple[FileCount, list[TopicCount]]] = []
@@ -319,17 +313,11 @@ class BagWriter:
         """True once nothing more can be written, be it after ``close`` or after an error."""
         return self._file.closed
 
-    @property
-    def ended_files(self) -> list[Path]:
-        """The files that are whole already, oldest first."""
-        return [self.folder / count.path for count, _ in self._ended]
-
     def _begin(self) -> McapFile:
         file = McapFile(
             self.folder / f'{self._name}_{self._number}.mcap',
             rig_values=self._rig_values,
             device_hello=self._hello,
-            qos=self._qos,
             durable=self._durable,
         )
         self._number += 1

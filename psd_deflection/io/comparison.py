@@ -86,6 +86,16 @@ class Comparison:
             for t_ns, _ in self._replayed[topic]:
                 self._count_only_replayed(topic, t_ns)
 
+    def counts(self) -> dict[str, int | bool]:
+        """For programs: messages by how they compare, and ``same``."""
+        return {
+            'same': self.same,
+            'equal': self.equal,
+            'different': self.different,
+            'only_recorded': self.only_recorded,
+            'only_replayed': self.only_replayed,
+        }
+
     def summary(self) -> str:
         """One line, and the largest difference where there is one."""
         if self.same:

@@ -91,8 +91,9 @@ class CsvRecording(Recording):
             columns = {name: i for i, name in enumerate(names)}
             missing = [n for n in REQUIRED if n not in columns]
             if missing:
+                hint = ', between commas' if len(names) == 1 else ''
                 raise self._refuse(
-                    f'the header lacks {", ".join(missing)}; a recording begins with {",".join(REQUIRED)}', number
+                    f'the header lacks {", ".join(missing)}; a recording begins with {",".join(REQUIRED)}{hint}', number
                 )
             for name in KNOWN:
                 if names.count(name) > 1:

@@ -140,8 +140,8 @@ def read_observations(paths: Sequence[str | Path], rig: Rig | None = None) -> li
 def _listed(path: Path) -> list[tuple[str, dict[str, object]]]:
     try:
         tree = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f'{path}: cannot be read as a list of recordings ({error})') from None
+    except OSError as error:
+        raise ConfigError(f'{path}: cannot be read as a list of recordings ({error.strerror or error})') from None
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise ConfigError(f'{path}: malformed YAML: {getattr(error, "problem", None) or "not YAML"}') from None
     if not isinstance(tree, list) or not tree:

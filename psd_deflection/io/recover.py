@@ -14,7 +14,7 @@ import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 import yaml
@@ -23,6 +23,7 @@ from mcap.writer import CompressionType, Writer
 from psd_deflection import __version__
 from psd_deflection.errors import RecordingError
 from psd_deflection.io.bag_metadata import DEFAULT_QOS, FileCount, Qos, TopicCount, bag_information, write_metadata
+from psd_deflection.io.bag_reader import read_information
 from psd_deflection.io.bag_writer import CHUNK_NS, CUSTOM
 from psd_deflection.io.mcap_source import (
     CHANNEL,
@@ -241,8 +242,10 @@ def _recover_file(path: Path) -> RecoveredFile:
             except DamagedError as error:
                 source.warnings.append(f'{path}: {error}; it is left out')
         copy.finish()
-    finally:
+    except BaseException:
         copy.abandon()
+        partial.unlink(missing_ok=True)
+        raise
     count = FileCount(path.name, copy.start, copy.end, copy.messages)
     if cut:
         aside = path.with_name(path.name + '.cut')
@@ -280,9 +283,23 @@ def recover(path: str | Path) -> Recovered:
         if not path.is_file():
             raise RecordingError(f'{path}: no such recording')
         _refuse_if_written(path)
-        return Recovered([_recover_file(path)], False, [])
+        file = _recover_file(path)
+        if path.stat().st_size <= len(MAGIC):
+            raise RecordingError(f'{path}: has no more than its first bytes; there is nothing to recover')
+        return Recovered([file], False, [])
     except OSError as error:
         raise RecordingError(f'{path}: cannot be repaired ({error.strerror or error})') from None
+
+
+def _describes(metadata: Path, files: list[RecoveredFile]) -> bool:
+    """Whether ``metadata.yaml`` can be read and names the files that are there; what rosbag2 compressed is its own."""
+    try:
+        information = read_information(metadata)
+    except RecordingError:
+        return False
+    named = information.get('relative_file_paths')
+    names = {PurePath(str(n)).name for n in named} if isinstance(named, list) else set()
+    return bool(information.get('compression_mode')) or names == {f.path.name for f in files}
 
 
 def _recover_folder(folder: Path) -> Recovered:
@@ -302,7 +319,9 @@ def _recover_folder(folder: Path) -> Recovered:
         files.append(_recover_file(file))
     metadata = folder / 'metadata.yaml'
     if metadata.is_file() and not set_aside and not any(f.repaired for f in files):
-        return Recovered(files, False, set_aside)
+        if _describes(metadata, files):
+            return Recovered(files, False, set_aside)
+        metadata.replace(metadata.with_name(metadata.name + '.cut'))
     topics: dict[str, TopicCount] = {}
     for file_ in files:
         for t in file_.topics:

@@ -43,10 +43,10 @@ class SharedRig:
 class SimulatedAligner:
     """One KPA101. ``psd``: 1 or 2."""
 
-    def __init__(self, shared: SharedRig, psd: int, *, serial: int | None = None, answer_ns: int = ANSWER_NS) -> None:
+    def __init__(self, shared: SharedRig, psd: int, *, answer_ns: int = ANSWER_NS) -> None:
         self._shared = shared
         self._psd = psd
-        self._serial = serial if serial is not None else 69_000_000 + psd
+        self._serial = 69_000_000 + psd
         self._answer_ns = answer_ns
         self._input = b''
         self._queue: list[tuple[int, bytes]] = []

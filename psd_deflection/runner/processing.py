@@ -21,6 +21,8 @@ from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Restart
 T = TypeVar('T')
 
 REQUEST_TIMEOUT_S = 1.0
+INTERVAL_S = 1.0
+"""Between two lines about estimates, at least."""
 
 
 class RecordSink(Protocol):
@@ -44,10 +46,9 @@ class Spokesman:
     What came and went meanwhile is counted in the next line.
     """
 
-    def __init__(self, say: Callable[[str], None], interval_s: float = 1.0) -> None:
+    def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
-        self._interval = interval_s
-        self._last_line = -interval_s
+        self._last_line = -INTERVAL_S
         self._now = ''
         self._text = ''
         self._blocks = 0
@@ -59,7 +60,7 @@ class Spokesman:
             self._changes += 1
             self._now, self._text = cause, text
         self._blocks += bool(cause)
-        if not self._changes or now - self._last_line < self._interval:
+        if not self._changes or now - self._last_line < INTERVAL_S:
             return
         line = self._text if cause else 'estimates are back'
         if self._changes > 1 or (not cause and self._blocks):

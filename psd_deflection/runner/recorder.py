@@ -35,9 +35,9 @@ Message = tuple[str, str, bytes, int]
 Item = Message | ParameterChange | None
 
 
-def new_folder(parent: Path, now: float | None = None) -> Path:
+def new_folder(parent: Path) -> Path:
     """A folder that does not exist yet: ``psd_`` and the time, then ``_2``, ``_3`` ..."""
-    stem = time.strftime('psd_%Y%m%d_%H%M%S', time.localtime(now))
+    stem = time.strftime('psd_%Y%m%d_%H%M%S')
     folder = parent / stem
     count = 1
     while folder.exists():

@@ -209,7 +209,7 @@ class Session:
     def close(self) -> Path | None:
         """Stop reading, process what was read, end the recording; returns its folder.
 
-        Ends within two seconds whatever hangs. Does nothing the second time.
+        Ends within two seconds whichever part hangs. Does nothing the second time.
         """
         if self._closed:
             return None

@@ -199,24 +199,19 @@ def make_active(name: str, values: Mapping[str, object], source: str) -> ActiveE
     return ActiveEffect(effect, out)
 
 
-def effects_from_values(flat: Mapping[str, object], source: str = 'effects') -> list[ActiveEffect]:
-    """Effects of flat keys ``KEY.name``, ``KEY.angle`` ...; raises ConfigError."""
+def effects_of_rig(rig: Rig) -> list[ActiveEffect]:
+    """The effects that a rig file has on, of flat keys ``KEY.name``, ``KEY.angle`` ...; raises ConfigError."""
     groups: dict[str, dict[str, object]] = {}
-    for key, value in flat.items():
+    for key, value in rig.effects.items():
         group, dot, name = key.partition('.')
         if not dot:
-            raise ConfigError(f'{source}.{key} = {value!r}: must be a map like {{name: sensor_gain, psd: 1, x: 0.001}}')
+            raise ConfigError(f'effects.{key} = {value!r}: must be a map like {{name: sensor_gain, psd: 1, x: 0.001}}')
         groups.setdefault(group, {})[name] = value
     found = []
     for group, body in groups.items():
         name = str(body.pop('name', group))
-        found.append(make_active(name, body, f'{source}.{group}'))
+        found.append(make_active(name, body, f'effects.{group}'))
     return sort_effects(found)
-
-
-def effects_of_rig(rig: Rig) -> list[ActiveEffect]:
-    """The effects that a rig file has on; raises ConfigError."""
-    return effects_from_values(rig.effects)
 
 
 def sort_effects(effects: Sequence[ActiveEffect]) -> list[ActiveEffect]:

@@ -12,14 +12,15 @@ from psd_deflection.simulation import loads
 from psd_deflection.simulation.loads import LoadHistory
 
 HELP = """\
-load histories (a load is FX,FY,TZ in N, N, N m; several --loads follow one another):
-  thesis[:DWELL]                   0, 10, 30, 50 N on the sidebar, 0, the same on the link, 0
-  identification                   24 s that show most effects of the catalogue
+load histories (a load is FX,FY,TZ in N, N, N m; DWELL and SECONDS in s):
+  thesis[:DWELL]             0, 10, 30, 50 N on the sidebar, 0, the same on the
+                             link, 0 (default: 4 s each)
+  identification             24 s that show most effects of the catalogue
   constant:LOAD:SECONDS
   steps:LOAD;LOAD;...:DWELL
   ramp:LOAD;LOAD:SECONDS
-  chirp:LOAD:F0,F1:SECONDS         a sine of this amplitude, from F0 to F1 Hz
-  FILE.csv                         columns t, load_fx, load_fy, load_tz, held between rows
+  chirp:LOAD:F0,F1:SECONDS   a sine of this amplitude, from F0 to F1 Hz
+  FILE.csv                   columns t, load_fx, load_fy, load_tz, held
 """
 
 MAX_SECONDS = 86_400.0

@@ -150,8 +150,10 @@ def from_csv(path: str | Path, rate: float = 1000.0) -> LoadHistory:
                     raise RecordingError(f'{path}:{reader.line_num}: column t does not rise')
                 times.append(numbers[0])
                 rows.append(numbers[1:])
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f'{path}: cannot be read as a load history ({error})') from None
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read as a load history ({error.strerror or error})') from None
+    except UnicodeDecodeError:
+        raise RecordingError(f'{path}: cannot be read as a load history (it is not text in UTF-8)') from None
     if not rows:
         raise RecordingError(f'{path}: no rows below the header')
     t = np.asarray(times) - times[0]

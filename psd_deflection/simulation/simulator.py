@@ -104,13 +104,13 @@ class ForwardModel:
         """What acts on the signal with its noise on it: clipping and coarse steps."""
         self._at('output', chunk)
 
-    def expect(self, loads: FloatArray, temperature: FloatArray | None = None, noise: float | None = None) -> Chunk:
-        """Like :meth:`run`, then the mean of the output over the noise (``noise`` V rms).
+    def expect(self, loads: FloatArray, temperature: FloatArray | None = None) -> Chunk:
+        """Like :meth:`run`, then the mean of the output over the rig's noise.
 
         What leaves the converter's range stays at its ends, as in a recording.
         """
         chunk = self.run(loads, temperature)
-        chunk.noise = self.physics.noise if noise is None else noise
+        chunk.noise = self.physics.noise
         self.finish(chunk)
         full = self.physics.full_scale
         np.clip(chunk.volts, -full, full - self.physics.volts_per_count, out=chunk.volts)

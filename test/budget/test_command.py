@@ -72,22 +72,24 @@ def test_the_method_follows_the_rigs_solver(tmp_path: Path, capsys: pytest.Captu
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'said'),
+    ('arguments', 'status', 'said'),
     [
-        (['--set', 'nothing'], 'NAME=VALUE'),
-        (['--set', 'nothing=1'], 'no such input'),
-        (['--monte-carlo', '1'], '--monte-carlo'),
-        (['--monte-carlo', '1000', '--seed', '-1'], '--seed'),
-        (['--load', 'nan', '0', '0'], 'must be finite'),
-        (['--load', '0', '-500', '0'], 'take a smaller load'),
-        (['--load', '1e300', '0', '0'], 'than the link is long'),
-        (['--out', 'budget.txt'], '.png, .svg or .pdf'),
-        (['--inputs', 'absent.yaml'], 'absent.yaml'),
-        (['--params-file', 'absent.yaml'], 'absent.yaml'),
+        (['--set', 'nothing'], 2, 'NAME=VALUE'),
+        (['--set', 'nothing=1'], 2, 'no such input'),
+        (['--monte-carlo', '1'], 2, '--monte-carlo'),
+        (['--monte-carlo', '1000', '--seed', '-1'], 2, '--seed'),
+        (['--load', 'nan', '0', '0'], 2, 'must be finite'),
+        (['--load', '0', '-500', '0'], 2, 'take a smaller load'),
+        (['--load', '1e300', '0', '0'], 2, 'than the link is long'),
+        (['--out', 'budget.txt'], 2, '.png, .svg or .pdf'),
+        (['--inputs', 'absent.yaml'], 3, 'absent.yaml'),
+        (['--params-file', 'absent.yaml'], 3, 'absent.yaml'),
     ],
 )
-def test_bad_input_is_refused_in_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['budget', *arguments]) == 3
+def test_bad_input_is_refused_in_one_line(
+    arguments: list[str], status: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(['budget', *arguments]) == status
     error = capsys.readouterr().err
     assert said in error
     assert error.count('\n') == 1

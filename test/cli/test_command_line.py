@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 from pathlib import Path
 
@@ -187,61 +186,6 @@ def test_ctrl_c_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     monkeypatch.setattr('psd_deflection.cli.params.run', interrupted)
     assert main(['params']) == 130
     assert capsys.readouterr().err == 'psd-deflection: interrupted\n'
-
-
-@pytest.mark.parametrize(
-    ('argv', 'sink'),
-    [
-        (['simulate', '--loads', 'thesis'], 'psd_deflection.cli.simulate.CsvSampleSink.put'),
-        (['convert', str(BAGS / 'clean')], 'psd_deflection.cli.convert.CsvSampleSink.put'),
-        (['replay', str(BAGS / 'clean')], 'psd_deflection.cli.replay.Totals.add'),
-    ],
-    ids=lambda v: v[0] if isinstance(v, list) else '',
-)
-def test_ctrl_c_says_that_the_output_is_cut(
-    argv: list[str],
-    sink: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    def interrupted(self: object, record: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(sink, interrupted)
-    out = tmp_path / 'out.csv'
-    assert main([*argv, '--out', str(out)]) == 130
-    told = f'psd-deflection {argv[0]}: interrupted; {out} holds only what came before\n'
-    assert capsys.readouterr().err == told
-    assert out.exists()
-
-
-def test_ctrl_c_does_not_say_so_of_what_was_there_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupted(args: object) -> int:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr('psd_deflection.cli.simulate.run', interrupted)
-    out = tmp_path / 'out.csv'
-    assert main(['simulate', '--out', str(out)]) == 130
-    assert capsys.readouterr().err == 'psd-deflection: interrupted\n'
-    out.write_text('mine')
-    assert main(['simulate', '--out', str(out)]) == 130
-    assert capsys.readouterr().err == 'psd-deflection: interrupted\n'
-
-
-def test_a_closed_pipe_is_no_error() -> None:
-    done = subprocess.run(
-        f'"{sys.executable}" -m psd_deflection params | head -1',
-        shell=True,
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        check=False,
-    )
-    assert done.returncode == 0
-    assert 'Traceback' not in done.stderr
 
 
 @pytest.mark.parametrize(

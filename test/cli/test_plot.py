@@ -137,9 +137,9 @@ def test_the_picture_is_named_like_the_recording(
     ('arguments', 'status', 'told'),
     [
         (['no_such'], 4, 'no such recording'),
-        ([str(BAGS / 'clean'), '--out', 'x.bmp'], 3, 'the name must end in'),
-        ([str(BAGS / 'clean'), '--out', '/no/such/folder/x.html'], 3, 'cannot be written'),
-        ([str(BAGS / 'clean'), '--out', '/no/such/folder/x.png'], 3, 'cannot be written'),
+        ([str(BAGS / 'clean'), '--out', 'x.bmp'], 2, 'the name must end in'),
+        ([str(BAGS / 'clean'), '--out', '/no/such/folder/x.html'], 4, 'cannot be written'),
+        ([str(BAGS / 'clean'), '--out', '/no/such/folder/x.png'], 4, 'cannot be written'),
     ],
 )
 def test_what_cannot_be_drawn_is_one_line(

@@ -30,6 +30,7 @@ from psd_deflection.protocol.frames import (
 )
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock
 from psd_deflection.runner.session import Session
+from test.runner.conftest import WAIT_S, Estimates
 
 EMULATOR = Path(__file__).parent / 'second_device.py'
 PAGE = Path(__file__).parent.parent.parent / 'docs' / 'protocol.md'
@@ -70,7 +71,7 @@ def port() -> Iterator[str]:
     assert process.stdout is not None
     yield process.stdout.readline().strip()
     process.stdin.close()
-    process.wait(10.0)
+    process.wait(WAIT_S)
     process.stdout.close()
 
 
@@ -86,14 +87,14 @@ def test_it_works_unchanged_with_the_daemon(port: str) -> None:
     said: list[str] = []
     session = Session(load_rig(overrides={'port': port}), said.append)
     kept = Kept()
-    session.processing.sinks.append(kept)
+    estimates = Estimates(40)
+    session.processing.sinks += [kept, estimates]
     hello = session.acquisition.hello
     assert hello is not None
     assert hello.info['serial'] == 'SECOND-7'
     try:
         session.start()
-        while session.pipeline.counters.estimates < 40 and session.acquisition.counters.samples < 20_000:
-            session.processing.request(lambda: None)
+        assert estimates.enough.wait(WAIT_S)
     finally:
         session.close()
     assert session.failed is None

@@ -109,6 +109,7 @@ class Program:
 
     def __init__(self, arguments: Sequence[str], cwd: Path) -> None:
         self.lines: list[str] = []
+        self._ended = False
         self._new = threading.Condition()
         self.process = subprocess.Popen(
             [sys.executable, '-m', 'psd_deflection', *arguments],
@@ -127,6 +128,9 @@ class Program:
             with self._new:
                 self.lines.append(line.rstrip('\n'))
                 self._new.notify_all()
+        with self._new:
+            self._ended = True
+            self._new.notify_all()
 
     def said(self, pattern: str) -> str:
         """Group 1 of the first line that matches."""
@@ -134,7 +138,7 @@ class Program:
 
         def look() -> bool:
             found.extend(m.group(1) for line in self.lines if (m := re.search(pattern, line)))
-            return bool(found) or not self._thread.is_alive()
+            return bool(found) or self._ended
 
         with self._new:
             self._new.wait_for(look, WAIT_S)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.server
 import importlib.util
+import random
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -55,9 +57,12 @@ def parameter_file(folder: Path, **values: object) -> str:
 
 
 def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(('127.0.0.1', 0))
-        return int(one.getsockname()[1])
+    """One that stays free while nobody serves on it: none of those that the system gives to whoever connects."""
+    for port in random.sample(range(10_000, 32_000), 100):
+        with socket.socket() as one, contextlib.suppress(OSError):
+            one.bind(('127.0.0.1', port))
+            return port
+    pytest.fail('no port is free')
 
 
 def picture(page: Page, selector: str) -> str:

@@ -19,7 +19,7 @@ from psd_deflection.records import BlockStatus
 
 from .serving import Serving, StillSource
 
-WAIT_S = 30.0
+WAIT_S = 60.0
 Serve = Callable[..., Serving]
 
 

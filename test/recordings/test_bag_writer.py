@@ -23,10 +23,9 @@ from psd_deflection import __version__
 from psd_deflection.config import load_rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.io import cdr
-from psd_deflection.io.bag_metadata import qos_profile
 from psd_deflection.io.bag_writer import META_HELLO, META_PARAMETERS, META_SOFTWARE, BagWriter, McapFile
 
-from .making import T0, block, estimate, run
+from .making import T0, block, run
 
 HELLO = {'serial': 'A1', 'firmware': '1.2', 'sample_rate_hz': 1000, 'channels': ['x1', 'y1']}
 
@@ -170,16 +169,6 @@ def test_an_empty_bag_opens(tmp_path: Path) -> None:
         pass
     with Reader(tmp_path / 'empty') as reader:
         assert reader.message_count == 0
-
-
-def test_qos_can_be_chosen_for_a_topic(tmp_path: Path) -> None:
-    with BagWriter(
-        tmp_path / 'run', rig_values={}, qos={'/psd/samples': qos_profile(50, reliability='best_effort')}
-    ) as bag:
-        bag.write(block(0))
-        bag.write(estimate(0))
-    with Reader(tmp_path / 'run') as reader:
-        assert len(list(reader.messages())) == 4
 
 
 def test_nothing_is_overwritten(tmp_path: Path) -> None:

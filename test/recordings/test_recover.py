@@ -198,7 +198,7 @@ def test_the_oldest_file_can_go(tmp_path: Path) -> None:
         for i in range(200):
             bag.write(block(i))
         assert bag.drop_oldest() == tmp_path / 'run' / 'run_0.mcap'
-        assert [p.name for p in bag.ended_files] == ['run_1.mcap', 'run_2.mcap']
+        assert sorted(p.name for p in bag.folder.glob('*.mcap')) == ['run_1.mcap', 'run_2.mcap', 'run_3.mcap']
     assert [b.index for b in open_recording(tmp_path / 'run').blocks()] == list(range(50, 200))
     assert len(theirs(tmp_path / 'run')['/psd/samples']) == 150
 
@@ -207,11 +207,12 @@ def test_chunks_are_on_the_disk_within_half_a_second_of_log_time(tmp_path: Path)
     with BagWriter(tmp_path / 'run', rig_values={}, durable=True) as bag:
         for i in range(100):
             bag.write(block(i))
+            if i < 26:
+                continue
             # What a kill at this moment would leave.
             (tmp_path / 'left.mcap').write_bytes(bag.path.read_bytes())
-            left = [int(b.t_ns[-1]) for b in open_recording(tmp_path / 'left.mcap').blocks()] if i >= 26 else []
-            if left:
-                assert (100 * 20 * STEP) > int(block(i).t_ns[-1]) - left[-1] <= 520 * STEP
+            left = [int(b.t_ns[-1]) for b in open_recording(tmp_path / 'left.mcap').blocks()]
+            assert int(block(i).t_ns[-1]) - left[-1] <= 520 * STEP
 
 
 def test_the_lock_goes_with_the_writer(tmp_path: Path) -> None:
@@ -220,3 +221,55 @@ def test_the_lock_goes_with_the_writer(tmp_path: Path) -> None:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
         out.close()
         fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        '',
+        'rosbag2_bagfile_information: [',
+        'rosbag2_bagfile_information: {storage_identifier: mcap, relative_file_paths: [gone.mcap]}',
+    ],
+    ids=['empty', 'malformed', 'another file'],
+)
+def test_a_metadata_yaml_that_does_not_describe_the_bag_is_made_anew(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = record(tmp_path / 'run')
+    before = theirs(folder)
+    metadata = folder / 'metadata.yaml'
+    metadata.write_text(text)
+    assert main(['info', str(folder)]) == 4
+    assert '`psd-deflection recover` makes' in capsys.readouterr().err
+    assert main(['recover', str(folder)]) == 0
+    assert theirs(folder) == before
+    assert (folder / 'metadata.yaml.cut').read_text() == text
+    # What describes it, and what rosbag2 compressed in its own way, stays.
+    tree = yaml.safe_load(metadata.read_text())
+    tree['rosbag2_bagfile_information'] |= {'compression_mode': 'message', 'relative_file_paths': ['run_0.mcap.zstd']}
+    for kept in (metadata.read_text(), yaml.safe_dump(tree)):
+        metadata.write_text(kept)
+        assert main(['recover', str(folder)]) == 0
+        assert metadata.read_text() == kept
+
+
+def test_a_file_of_first_bytes_has_nothing_to_recover(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / 'a.mcap'
+    path.write_bytes((record(tmp_path / 'run') / 'run_0.mcap').read_bytes()[:8])
+    assert main(['recover', str(path)]) == 4
+    assert 'there is nothing to recover' in capsys.readouterr().err
+
+
+def test_a_repair_that_fails_leaves_the_file_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = record(tmp_path / 'run')
+    cut(folder, 'run_0.mcap', 20_000)
+    before = (folder / 'run_0.mcap').read_bytes()
+
+    def full(self: object) -> None:
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr('psd_deflection.io.recover._Copy.finish', full)
+    with pytest.raises(RecordingError, match='No space left on device'):
+        recover(folder)
+    assert [p.name for p in folder.iterdir()] == ['run_0.mcap']
+    assert (folder / 'run_0.mcap').read_bytes() == before

@@ -24,8 +24,10 @@ rclpy = pytest.importorskip('rclpy', reason='the ROS tests need rclpy: pip insta
 WARNINGS = "error,ignore:module 'sre_parse' is deprecated:DeprecationWarning,"
 WARNINGS += "ignore:module 'sre_constants' is deprecated:DeprecationWarning"
 
-START_S = 60.0
-"""Longest that a test waits for a first message: discovery takes 0.1 or, at random, 2.7 s."""
+WAIT_S = 60.0
+"""Longest that a test waits for what will come: discovery takes 0.1 or, at random, 2.7 s; a busy machine longer."""
+
+BLOCK_NS = 20_000_000
 
 
 @pytest.fixture(scope='session')
@@ -53,6 +55,7 @@ class Daemon:
 
     def __init__(self, arguments: list[str], cwd: Path) -> None:
         self.lines: list[str] = []
+        self._ended = False
         self._new = threading.Condition()
         self.process = subprocess.Popen(
             [sys.executable, '-m', 'psd_deflection', 'estimator', *arguments],
@@ -71,6 +74,9 @@ class Daemon:
             with self._new:
                 self.lines.append(line.rstrip('\n'))
                 self._new.notify_all()
+        with self._new:
+            self._ended = True
+            self._new.notify_all()
 
     def said(self, pattern: str) -> str:
         """Wait for a line that matches; it is returned."""
@@ -78,10 +84,11 @@ class Daemon:
 
         def look() -> bool:
             found.extend(line for line in self.lines if re.search(pattern, line))
-            return bool(found) or self.process.poll() is not None
+            # Not the process's end: its last lines may be on their way still.
+            return bool(found) or self._ended
 
         with self._new:
-            self._new.wait_for(look, START_S)
+            self._new.wait_for(look, WAIT_S)
         if not found:
             pytest.fail(f'the daemon did not say {pattern!r}; it said: {self.lines}')
         return found[0]
@@ -89,20 +96,21 @@ class Daemon:
     def signal(self, number: int) -> None:
         os.killpg(self.process.pid, number)
 
-    def wait(self, timeout: float) -> int:
-        status = self.process.wait(timeout)
-        self._thread.join(10.0)
+    def wait(self) -> int:
+        """Its exit status; all its lines are there then."""
+        status = self.process.wait(WAIT_S)
+        self._thread.join(WAIT_S)
         return status
 
     def end(self) -> None:
         if self.process.poll() is None:
             self.signal(signal.SIGTERM)
             try:
-                self.process.wait(10.0)
+                self.process.wait(WAIT_S)
             except subprocess.TimeoutExpired:
                 self.process.kill()
                 self.process.wait()
-        self._thread.join(10.0)
+        self._thread.join(WAIT_S)
         if self.process.stderr is not None:
             self.process.stderr.close()
 
@@ -122,6 +130,11 @@ def start(domain: int, tmp_path: Path) -> Iterator[Callable[..., Daemon]]:
         daemon.end()
 
 
+def stamp(message: Any) -> int:
+    """Of a message's header, ns."""
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
 class Peer:
     """A second participant: collects messages, calls services."""
 
@@ -138,12 +151,17 @@ class Peer:
         self.node.create_subscription(kind, topic, got.append, qos)
         return got
 
-    def until(self, condition: Callable[[], bool], what: str, timeout: float = START_S) -> None:
-        deadline = time.monotonic() + timeout
+    def until(self, condition: Callable[[], bool], what: str) -> None:
+        deadline = time.monotonic() + WAIT_S
         while not condition():
             if time.monotonic() > deadline:
-                pytest.fail(f'waited {timeout:g} s for {what}')
+                pytest.fail(f'waited {WAIT_S:g} s for {what}')
             self.executor.spin_once(timeout_sec=0.1)
+
+    def until_of_now(self, messages: list[Any], what: str) -> None:
+        """Until the last message is of a block that began after this call: not of those that are on their way."""
+        now = time.time_ns()
+        self.until(lambda: bool(messages) and stamp(messages[-1]) > now + BLOCK_NS, what)
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
         client = self.node.create_client(kind, name)
@@ -179,7 +197,7 @@ def simulated_port(domain: int) -> Iterator[str]:
     assert process.stdout is not None
     yield process.stdout.readline().removeprefix('port: ').strip()
     process.send_signal(signal.SIGINT)
-    assert process.wait(10.0) == 0
+    assert process.wait(WAIT_S) == 0
     process.stdout.close()
 
 

@@ -64,7 +64,7 @@ def main() -> int:
     qos = Qos(Policy.Reliability.Reliable(duration(seconds=1)), Policy.History.KeepLast(100))
     reader = DataReader(participant, Topic(participant, name, PoseStamped), qos=qos, listener=Listener())
     rows: list[list[object]] = []
-    for message in reader.take_iter(timeout=duration(seconds=30)):
+    for message in reader.take_iter(timeout=duration(seconds=60)):
         t, p, o = message.header.stamp, message.pose.position, message.pose.orientation
         rows.append([t.sec * 10**9 + t.nanosec, message.header.frame_id, p.x, p.y, p.z, o.x, o.y, o.z, o.w])
         if len(rows) == count:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import threading
@@ -20,7 +21,8 @@ from psd_deflection.protocol.frames import (
     SampleFrame,
     encode,
 )
-from psd_deflection.records import CHANNELS
+from psd_deflection.records import CHANNELS, DeflectionEstimate, Record
+from psd_deflection.runner import acquisition
 
 HELLO = HelloFrame(
     1,
@@ -32,6 +34,10 @@ HELLO = HelloFrame(
         'volts_per_count': 10.0 / 32768,
     },
 )
+
+
+WAIT_S = 60.0
+"""Longest that a test waits for what will come; a busy machine takes its time."""
 
 
 class ScriptedDevice:
@@ -65,7 +71,9 @@ class ScriptedDevice:
                     continue
                 for frame in decoder.feed(b'\x00' + received):
                     if isinstance(frame, HelloRequestFrame):
-                        self.send(self.answer)
+                        # Who asked may have left by now.
+                        with contextlib.suppress(OSError):
+                            self.send(self.answer)
                         self.greeted.set()
 
     def send(self, stream: bytes) -> None:
@@ -84,6 +92,20 @@ class ScriptedDevice:
         self.terminal.close()
 
 
+class Estimates:
+    """A sink; ``enough`` is set with the ``wanted``-th block that has an estimate."""
+
+    def __init__(self, wanted: int) -> None:
+        self.enough = threading.Event()
+        self._wanted = wanted
+
+    def put(self, record: Record) -> None:
+        if isinstance(record, DeflectionEstimate) and record.primary:
+            self._wanted -= 1
+            if self._wanted == 0:
+                self.enough.set()
+
+
 @pytest.fixture(scope='session')
 def sample() -> Callable[..., SampleFrame]:
     def make(seq: int, t_us: int | None = None, flags: int = 0) -> SampleFrame:
@@ -95,6 +117,12 @@ def sample() -> Callable[..., SampleFrame]:
 @pytest.fixture(scope='session')
 def hello() -> HelloFrame:
     return HELLO
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A device that answers is heard, however late the machine lets it."""
+    monkeypatch.setattr(acquisition, 'SILENCE_S', WAIT_S)
 
 
 @pytest.fixture

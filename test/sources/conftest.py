@@ -21,7 +21,7 @@ from psd_deflection.config import Rig
 from psd_deflection.errors import DeviceError
 from psd_deflection.io.serial_port import PortClosedError
 from psd_deflection.io.simulated_device import LineDevice, PseudoTerminal, serve
-from psd_deflection.io.sources import dataq, thorlabs
+from psd_deflection.io.sources import dataq, text_lines, thorlabs
 from psd_deflection.records import FloatArray
 from psd_deflection.runner import acquisition
 from psd_deflection.runner.acquisition import Acquisition, Chunk
@@ -96,6 +96,10 @@ class Wired:
             raise PortClosedError(f'{self.link}: the device is gone')
         return self.device
 
+    def greet(self) -> None:
+        """Somebody opened the port."""
+        self._waiting += self._there().greeting()
+
     def due_in_ns(self) -> int:
         """Until it has something to be read; 0 where it has, or is gone."""
         gone = self.device is None or self._waiting
@@ -127,6 +131,7 @@ class WiredPort:
         self._line = lines[self._number]
         if self._line.device is None:
             raise DeviceError(f'{name}: no such port')
+        self._line.greet()
         self.read, self.write, self.discard_input = self._line.read, self._line.write, self._line.discard
 
     def fileno(self) -> int:
@@ -152,14 +157,14 @@ class Run:
         """The next chunks until ``n`` samples have come."""
         chunks: list[Chunk] = []
         while sum(len(c.raw.seq) for c in chunks) < n:
-            item = self.acquisition.queue.get(timeout=20.0)
+            item = self.acquisition.queue.get(timeout=60.0)
             if isinstance(item, Chunk):
                 chunks.append(item)
         return chunks
 
     def heard(self, text: str) -> str:
         while True:
-            message = self.said.get(timeout=20.0)
+            message = self.said.get(timeout=60.0)
             if text in message:
                 return message
 
@@ -202,7 +207,7 @@ def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[[LineDevice], Wired]:
         waits = [made[number].due_in_ns() for number in ports]
         clock.now += min(max(min(waits), 1000), round(timeout * 1e9))
 
-    for module in (thorlabs, dataq):
+    for module in (thorlabs, dataq, text_lines):
         monkeypatch.setattr(module, 'time', clock)
         monkeypatch.setattr(module, 'SerialPort', port)
     monkeypatch.setattr(thorlabs, 'select', SimpleNamespace(select=select))

@@ -27,8 +27,15 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_each_is_known_by_its_answer(
-    served: Any, unloaded: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    served: Any,
+    unloaded: Any,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    # Each of them answers: however late, it is waited for.
+    monkeypatch.setattr(port_survey, 'ONCE_A_SECOND_S', 60.0)
+    monkeypatch.setattr(port_survey, 'BOOT_S', 60.0)
     rig = load_rig()
     shared = SharedRig(rig, unloaded, 0)
     devices = [
@@ -78,6 +85,7 @@ def test_a_port_in_use_or_missing_is_named_and_left_alone(
 
 
 def test_something_else_is_said_to_be_something_else(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(port_survey, 'BOOT_S', 20.0)
     monkeypatch.setattr(port_survey, 'ANSWER_S', 0.1)
     monkeypatch.setattr(port_survey, 'ONCE_A_SECOND_S', 0.1)
 

@@ -95,7 +95,7 @@ def run(acquisition: Acquisition) -> list[Item]:
     acquisition.start()
     items: list[Item] = []
     while not items or not isinstance(items[-1], Ended):
-        items.append(acquisition.queue.get(timeout=10.0))
+        items.append(acquisition.queue.get(timeout=60.0))
     acquisition.stop()
     return items
 
@@ -198,7 +198,7 @@ def test_a_device_that_goes_away_before_it_starts_is_waited_for(monkeypatch: pyt
 @pytest.mark.parametrize('gives_up', [True, False])
 def test_a_run_that_ends_waits_for_no_source(monkeypatch: pytest.MonkeyPatch, gives_up: bool) -> None:
     """One that waits for its device is told to give up; one that hangs is left behind."""
-    monkeypatch.setattr('psd_deflection.runner.acquisition.GIVE_UP_TIMES', 20 if gives_up else 1)
+    monkeypatch.setattr('psd_deflection.runner.acquisition.GIVE_UP_TIMES', 1000 if gives_up else 1)
     waiting, over = threading.Event(), threading.Event()
 
     class Patient(Scripted):
@@ -217,9 +217,9 @@ def test_a_run_that_ends_waits_for_no_source(monkeypatch: pytest.MonkeyPatch, gi
     source.script = [PortClosedError('scripted: gone')]
     acquisition.open()
     acquisition.start()
-    assert waiting.wait(10.0)
+    assert waiting.wait(60.0)
     acquisition.stop()
-    assert isinstance(acquisition.queue.get(timeout=10.0), Ended)
+    assert isinstance(acquisition.queue.get(timeout=60.0), Ended)
     hangs = ['scripted: the source hangs; it is not waited for']
     assert said[said.index('scripted: gone; waiting for it to come back') + 1 :] == ([] if gives_up else hangs)
     over.set()
@@ -243,11 +243,11 @@ def test_each_of_ours_gives_up_waiting(name: str, tmp_path: Path, monkeypatch: p
 
     thread = threading.Thread(target=wait, daemon=True)
     thread.start()
-    for _ in range(200):
+    for _ in range(1000):
         source.give_up()
         thread.join(0.05)
         if not thread.is_alive():
             break
-    assert 'given up' in str(outcome.get(timeout=10.0))
+    assert 'given up' in str(outcome.get(timeout=60.0))
     for one in ports:
         one.close()

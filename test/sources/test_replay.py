@@ -94,7 +94,7 @@ def test_the_reader_ends_with_the_recording(tmp_path: Path) -> None:
     acquisition.start()
     items: list[Any] = []
     while not items or not isinstance(items[-1], Ended):
-        items.append(acquisition.queue.get(timeout=10.0))
+        items.append(acquisition.queue.get(timeout=60.0))
     acquisition.stop()
     assert sum(len(i.raw.seq) for i in items if isinstance(i, Chunk)) == 100
     assert any('at its end' in s for s in said)

@@ -7,6 +7,7 @@ import pytest
 from psd_deflection.config import load_rig
 from psd_deflection.errors import ConfigError, DeviceError
 from psd_deflection.runner.session import Session
+from test.runner.conftest import WAIT_S, Estimates
 
 SLOW: dict[str, object] = {'converter.sample_rate_hz': 25.0, 'block_size': 2, 'min_samples': 1}
 
@@ -21,11 +22,12 @@ SLOW: dict[str, object] = {'converter.sample_rate_hz': 25.0, 'block_size': 2, 'm
 )
 def test_estimates_come_of_every_device(source: str, overrides: dict[str, object], described: str) -> None:
     said: list[str] = []
+    estimates = Estimates(4)
     session = Session(load_rig(overrides={'source': source, **overrides}), said.append)
     try:
+        session.processing.sinks.append(estimates)
         session.start()
-        while session.pipeline.counters.estimates < 4 and session.acquisition.counters.samples < 20_000:
-            session.processing.request(lambda: None)
+        assert estimates.enough.wait(WAIT_S)
     finally:
         session.close()
     assert session.failed is None

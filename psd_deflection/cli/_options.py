@@ -1,0 +1,106 @@
+"""What the values of options must be: a mistake in one ends with status 2, before anything is read or written."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+from psd_deflection.errors import ConfigError, RecordingError, UsageError
+
+_FOREIGN = """
+.7z .arrow .avi .bag .bmp .bz2 .db .db3 .eps .feather .gif .gz .h5 .hdf .hdf5 .htm .html .jpeg .jpg .json .jsonl .log
+.mat .md .mp4 .nc .npy .npz .ods .parquet .pdf .pickle .pkl .png .ps .rar .rrd .sqlite .sqlite3 .svg .tar .tdms .tgz
+.tif .tiff .toml .tsv .txt .ulg .webp .xls .xlsx .xml .xz .yaml .yml .zip .zst
+"""
+FOREIGN = frozenset(_FOREIGN.split())
+"""Endings of files of other kinds. Any other ending is a part of a folder's name, as in ``run_0.5N``."""
+
+PICTURES = ('.png', '.svg', '.pdf')
+
+
+def seed(text: str) -> int:
+    """A value of --seed; raises UsageError."""
+    return whole('--seed', 0)(text)
+
+
+def whole(option: str, least: int, most: int | None = None) -> Callable[[str], int]:
+    """Reads a whole number within bounds; what it gives raises UsageError."""
+    bounds = f'at least {least}' + ('' if most is None else f' and at most {most}')
+
+    def read(text: str) -> int:
+        with contextlib.suppress(ValueError):
+            value = int(text)
+            if least <= value and (most is None or value <= most):
+                return value
+        raise UsageError(f'{option} {text}: must be a whole number of {bounds}')
+
+    return read
+
+
+def number(option: str, least: float, most: float) -> Callable[[str], float]:
+    """Reads a number within bounds; what it gives raises UsageError."""
+
+    def read(text: str) -> float:
+        with contextlib.suppress(ValueError):
+            value = float(text)
+            # NaN is within no bounds.
+            if least <= value <= most:
+                return value
+        raise UsageError(f'{option} {text}: must be a number of at least {least:g} and at most {most:g}')
+
+    return read
+
+
+def recording_name(*, rerun: bool = False) -> Callable[[str], str]:
+    """Reads the --out of a recording (an .rrd where ``rerun``) by its ending; what it gives raises UsageError."""
+
+    def read(text: str) -> str:
+        suffix = Path(text).suffix.lower()
+        if suffix in FOREIGN and not (rerun and suffix == '.rrd'):
+            files = 'X.csv, X.mcap, X.rrd' if rerun else 'X.csv, X.mcap'
+            raise UsageError(f'--out {text}: no {suffix} is written; {files} or a bag folder (X) is')
+        return text
+
+    return read
+
+
+def picture_name(*suffixes: str) -> Callable[[str], str]:
+    """Reads the --out of a picture by its ending; what it gives raises UsageError."""
+
+    def read(text: str) -> str:
+        if Path(text).suffix.lower() not in suffixes:
+            raise UsageError(f'--out {text}: the name must end in {", ".join(suffixes[:-1])} or {suffixes[-1]}')
+        return text
+
+    return read
+
+
+def need_folder(out: Path) -> None:
+    """Raise RecordingError, before the work is done, where the folder of ``out`` is not there."""
+    if not out.parent.is_dir():
+        raise RecordingError(f'--out {out}: cannot be written (there is no folder {out.parent})')
+
+
+@contextlib.contextmanager
+def given_as_option() -> Iterator[None]:
+    """A value that is refused within came as an option: a mistake of the command line (2), not of a file (3)."""
+    try:
+        yield
+    except ConfigError as error:
+        raise UsageError(str(error)) from None
+
+
+def refuse(args: argparse.Namespace, defaults: Mapping[str, object], why: str) -> None:
+    """Raise UsageError where one of the options ``defaults`` has another value: it would be passed over in silence."""
+    for name, default in defaults.items():
+        if getattr(args, name) != default:
+            raise UsageError(f'--{name.replace("_", "-")} {why}')
+
+
+def finite(option: str, values: tuple[float, ...]) -> None:
+    """Raise UsageError where one is not."""
+    if not all(map(math.isfinite, values)):
+        raise UsageError(f'{option} {" ".join(f"{v:g}" for v in values)}: must be finite')

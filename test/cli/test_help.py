@@ -1,0 +1,83 @@
+"""What ``--help`` says: as wide as the terminal, options with their defaults, examples that run."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.cli.main import COMMANDS, INTERRUPTED, main, make_parser
+
+ROOT = Path(__file__).parent.parent.parent
+OURS = 'psd-deflection '
+ENDLESS = ('estimator', 'monitor', 'discover', 'devices', 'simulate --serve', 'compare-methods --out')
+"""Examples that go on until Ctrl-C, take long, or want a device: only their options are parsed."""
+
+
+def help_of(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, columns: int) -> str:
+    monkeypatch.setenv('COLUMNS', str(columns))
+    with pytest.raises(SystemExit):
+        main([command, '--help'] if command else ['--help'])
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize('command', ['', *COMMANDS])
+def test_it_is_no_wider_than_the_terminal(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = help_of(command, capsys, monkeypatch, 80)
+    assert [line for line in text.splitlines() if len(line) > 80] == []
+    # Prose fills a narrow terminal too; examples and tables stay as they are.
+    narrow = help_of(command, capsys, monkeypatch, 60).partition('\n\n')[2]
+    assert [line for line in narrow.splitlines() if len(line) > 60 and not line.startswith(' ')] == []
+
+
+def test_it_tells_the_exit_statuses(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    text = help_of('', capsys, monkeypatch, 80)
+    documented = re.findall(r'^\| (\d+) \|', (ROOT / 'docs' / 'commands.md').read_text(), re.MULTILINE)
+    told = re.findall(r'^  (\d+) +\S', text[text.index('exit status:') :], re.MULTILINE)
+    assert told == documented
+    assert str(INTERRUPTED) in told
+
+
+@pytest.mark.parametrize('command', COMMANDS)
+def test_json_is_named_on_the_page(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = (ROOT / 'docs' / 'commands.md').read_text().partition('take `--json`')[0].rpartition('standard error. ')[2]
+    assert ('--json' in help_of(command, capsys, monkeypatch, 80)) == (f'`{command}`' in words)
+
+
+def examples(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The command lines that its help shows, without what is said beside them."""
+    lines = help_of(command, capsys, monkeypatch, 80).splitlines()
+    return [re.split(r' {2,}', line.strip())[0] for line in lines if line.startswith(f'  {OURS}')]
+
+
+@pytest.mark.parametrize('command', COMMANDS)
+def test_its_examples_run(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = examples(command, capsys, monkeypatch)
+    assert found
+    for link, target in (('bags', 'bags'), ('config', 'config'), ('my_rig.yaml', 'config/thesis_rig.yaml')):
+        (tmp_path / link).symlink_to(ROOT / target)
+    shutil.copytree(ROOT / 'bags' / 'clean', tmp_path / 'recordings' / 'psd_20260101_120000')
+    shutil.copy(ROOT / 'bags' / 'clean' / 'clean_0.mcap', tmp_path / 'lone.mcap')
+    monkeypatch.chdir(tmp_path)
+    assert main(['convert', 'bags/clean', '--out', 'run.csv']) == 0
+    for line in found:
+        argv = shlex.split(line)[1:]
+        args = make_parser([argv[0]]).parse_args(argv)
+        assert args.command == command
+        rerun = getattr(args, 'out', None) is not None and str(args.out).endswith('.rrd')
+        if rerun or line.removeprefix(OURS).startswith(ENDLESS):
+            continue
+        if line.endswith('--out run'):
+            # Its own example makes the recording under the name that others read.
+            argv[-1] = 'again'
+        # A recording of another machine may differ in its last bits.
+        assert main(argv) in ((0, 1) if '--compare' in argv else (0,)), line

@@ -1,0 +1,320 @@
+"""What a script relies on: exit status, one line of error, JSON alone on stdout, outputs whole or not there."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.writer import Writer
+
+from psd_deflection.cli import _report
+from psd_deflection.cli._options import FOREIGN
+from psd_deflection.cli.main import main
+from psd_deflection.errors import RecordingError
+
+ROOT = Path(__file__).parent.parent.parent
+CLEAN = str(ROOT / 'bags' / 'clean')
+RIG = str(ROOT / 'config' / 'thesis_rig.yaml')
+SHORT = ('--loads', 'constant:0,-10,0:0.1')
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where nothing is yet, and where relative names lead."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
+    """Exit status and the one line of error; nothing else is said."""
+    status = main(list(argv))
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert err.count('\n') == 1, err
+    assert err.startswith(f'psd-deflection {argv[0]}: ')
+    return status, err
+
+
+@pytest.mark.parametrize(
+    ('argv', 'said'),
+    [
+        (['simulate', '--out', 'a.csv', '--seed', '-1'], '--seed -1: must be a whole number of at least 0'),
+        (['simulate', '--out', 'a.csv', '--seed', '1.5'], '--seed 1.5: must be a whole number'),
+        (['simulate', '--serve', '--seed', '-1'], '--seed -1'),
+        (['simulate', '--serve', '--skew-ppm', 'nan'], '--skew-ppm nan: must be a number of at least'),
+        (['simulate', '--serve', '--first-seq', '-5'], '--first-seq -5: must be a whole number of at least 0 and at'),
+        (['simulate', '--serve', '--link', 'taken'], 'taken: no link can be made there'),
+        (['simulate', '--serve', *SHORT], '--loads is for a recording'),
+        (['simulate', '--serve', '--out', 'a.csv'], '--out is for a recording'),
+        (['simulate', '--out', 'a.csv', '--device', 'dataq'], '--device is for a device'),
+        (['simulate', '--out', 'a.csv', '--loads', 'constant:0,0,0:0.001'], 'last 1 samples at 1000 Hz'),
+        (['simulate', '--out', 'a.csv', '--effect', 'sensor_gain,psd=9'], "psd = '9': must be one of 1, 2"),
+        (['discover', CLEAN, '--out', 'found', '--seed', '-1'], '--seed -1'),
+        (['discover', CLEAN, '--out', 'found', '--without', 'everything'], 'no effect of that name'),
+        (['monitor', '--speed', '2'], '--speed is for a recording'),
+        (['monitor', '--loop'], '--loop is for a recording'),
+        (['monitor', CLEAN, '--speed', 'nan'], '--speed nan: must be above 0'),
+        (['monitor', CLEAN, '--http-port', '99999'], 'monitor_port = 99999: must be at least 0 and at most 65535'),
+        (['monitor', '--baud', '-1'], 'baud = -1'),
+        (['estimator', '--no-ros', '--baud', '-1'], 'baud = -1'),
+        (['estimator', '--no-ros', '--baud', '-1', '--params-file', RIG], 'command line: baud = -1'),
+        (['estimator', '--no-ros', '--ros-args', '-p', 'port:=/dev/ttyACM0'], 'not read with --no-ros'),
+        (['budget', '--explain', '--json'], '--json does nothing beside --explain'),
+        (['design', '--radius', '0.1'], '--radius is for the placement of a rig'),
+        (['design', '--params-file', RIG, '--box', '0', '0', 'nan', '1'], '--box'),
+        (['plot', CLEAN, '--out', 'a.jpg'], '--out a.jpg: the name must end in .png, .svg, .pdf or .html'),
+        (['replay', ''], 'an argument is empty (a variable that is not set?)'),
+        (['replay', CLEAN, '--out', ''], '--out is empty'),
+        (['replay', CLEAN, '--params-file='], '--params-file is empty'),
+        (['estimator', '--record', ''], '--record is empty'),
+    ],
+    ids=lambda v: ' '.join(v)[-60:] if isinstance(v, list) else '',
+)
+def test_a_value_that_an_option_does_not_take_is_status_2(
+    argv: list[str], said: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / 'taken').touch()
+    status, err = refused(capsys, *argv)
+    assert status == 2
+    assert said in err
+    assert [p.name for p in folder.iterdir()] == ['taken']
+
+
+@pytest.mark.parametrize(('command', 'also'), [('convert', '.rrd'), ('replay', '.rrd'), ('simulate', '')])
+def test_a_recording_is_not_written_under_the_ending_of_something_else(
+    command: str, also: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [] if command == 'simulate' else [CLEAN]
+    for suffix in sorted(FOREIGN - {also}):
+        for name in (f'run{suffix}', f'run_0.5N{suffix.upper()}'):
+            status, err = refused(capsys, command, *arguments, '--out', name)
+            assert status == 2
+            assert f'--out {name}: no {suffix} is written; X.csv, X.mcap' in err
+            assert ('X.rrd' in err) == bool(also)
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize('name', ['run', 'run_0.5N', 'run.2026.01.02', '12.5', 'a.b', '.hidden', 'run.'])
+def test_any_other_dot_is_part_of_a_folder_s_name(name: str, folder: Path) -> None:
+    assert main(['convert', CLEAN, '--out', name]) == 0
+    assert (folder / name / 'metadata.yaml').is_file()
+    assert main(['simulate', *SHORT, '--out', f'sim_{name}']) == 0
+    assert (folder / f'sim_{name}' / 'metadata.yaml').is_file()
+
+
+def bad_from_row(folder: Path, row: int) -> Path:
+    """A CSV that can be read up to ``row``."""
+    path = folder / 'bad.csv'
+    rows = [f'{i / 1000:.3f},0,0,5,0,{"0" if i < row else "abc"},5' for i in range(row + 3)]
+    path.write_text('\n'.join(['t,x1,y1,sum1,x2,y2,sum2', *rows]) + '\n')
+    return path
+
+
+@pytest.mark.parametrize('name', ['out.csv', 'out.mcap', 'out'])
+@pytest.mark.parametrize('command', ['convert', 'replay'])
+def test_an_output_that_was_not_finished_does_not_pretend_to_be_whole(
+    command: str, name: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad = bad_from_row(folder, 2000)
+    for partial in (f'{name}.partial', f'{name}.partial2'):
+        status, err = refused(capsys, command, str(bad), '--out', name)
+        assert status == 4
+        assert "column y2 holds 'abc'" in err
+        assert f'{partial} holds what came before' in err
+        assert (folder / partial).exists()
+        assert not (folder / name).exists()
+
+
+@pytest.fixture
+def signals() -> Iterator[None]:
+    """Handlers as in a program that has just begun: commands that go on until Ctrl-C leave theirs behind."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)}
+    before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures('signals')
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    ('argv', 'sink'),
+    [
+        (['simulate', '--loads', 'thesis'], 'psd_deflection.cli.simulate.CsvSampleSink.put'),
+        (['convert', CLEAN], 'psd_deflection.cli.convert.CsvSampleSink.put'),
+        (['replay', CLEAN], 'psd_deflection.cli.replay.Totals.add'),
+    ],
+    ids=lambda v: v[0] if isinstance(v, list) else '',
+)
+def test_ctrl_c_leaves_no_output_that_looks_whole(
+    argv: list[str],
+    sink: str,
+    number: signal.Signals,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def interrupted(self: object, record: object) -> None:
+        signal.raise_signal(number)
+
+    monkeypatch.setattr(sink, interrupted)
+    before = signal.getsignal(number)
+    assert main([*argv, '--out', 'out.csv']) == 130
+    assert signal.getsignal(number) is before
+    told = f'psd-deflection {argv[0]}: interrupted; out.csv.partial holds what came before\n'
+    assert capsys.readouterr().err == told
+    assert [p.name for p in folder.iterdir()] == ['out.csv.partial']
+
+
+def test_what_was_there_before_stays_where_it_is(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(args: object) -> int:
+        raise KeyboardInterrupt
+
+    out = folder / 'out.csv'
+    out.write_text('mine')
+    status, err = refused(capsys, 'convert', CLEAN, '--out', 'out.csv')
+    assert (status, 'never overwritten' in err) == (4, True)
+    monkeypatch.setattr('psd_deflection.cli.simulate.run', interrupted)
+    for name in ('out.csv', 'none.csv'):
+        assert main(['simulate', '--out', name]) == 130
+        assert capsys.readouterr().err == 'psd-deflection: interrupted\n'
+    assert out.read_text() == 'mine'
+    assert list(folder.iterdir()) == [out]
+
+
+def test_discover_leaves_no_folder_where_it_found_nothing_to_read(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert refused(capsys, 'discover', CLEAN, '--out', 'found')[0] == 4
+    assert list(folder.iterdir()) == []
+
+
+def test_a_picture_is_whole_or_as_it_was(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place, link = folder / 'a.png', folder / 'link.png'
+    place.write_bytes(b'old')
+    link.symlink_to(place)
+    _report.save(b'new', link)
+    assert place.read_bytes() == b'new'
+    assert link.is_symlink()
+
+    def full(self: Path, content: bytes) -> int:
+        with self.open('wb') as stream:
+            stream.write(content[:1])
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr(Path, 'write_bytes', full)
+    with pytest.raises(RecordingError, match=r'^--out .*a\.png: cannot be written \(No space left on device\)$'):
+        _report.save(b'newer', place)
+    assert sorted(folder.iterdir()) == [place, link]
+    assert place.read_bytes() == b'new'
+
+
+def program(line: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """``line`` in a shell, with PROGRAM as our program; a pipe's status is that of the program."""
+    command = line.replace('PROGRAM', f'"{sys.executable}" -m psd_deflection')
+    return subprocess.run(
+        ['bash', '-o', 'pipefail', '-c', command],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, 'PYTHONPATH': str(ROOT), **environment},
+    )
+
+
+@pytest.mark.parametrize('unbuffered', ['', '1'], ids=['buffered', 'unbuffered'])
+@pytest.mark.parametrize('command', ['params', 'params --json', 'info CLEAN', '--help'])
+def test_a_reader_that_leaves_is_no_error(command: str, unbuffered: str) -> None:
+    command = command.replace('CLEAN', CLEAN)
+    for reader in ('true', 'head -1'):
+        done = program(f'PROGRAM {command} | {reader}', PYTHONUNBUFFERED=unbuffered)
+        assert (done.returncode, done.stderr) == (0, '')
+
+
+@pytest.mark.skipif(not Path('/dev/full').exists(), reason='no /dev/full here')
+@pytest.mark.parametrize('unbuffered', ['', '1'], ids=['buffered', 'unbuffered'])
+@pytest.mark.parametrize('command', ['params', 'info CLEAN --json', 'convert CLEAN --out whole.csv'])
+def test_an_output_that_cannot_be_written_to_is_one_line(command: str, unbuffered: str, folder: Path) -> None:
+    done = program(f'PROGRAM {command.replace("CLEAN", CLEAN)} > /dev/full', PYTHONUNBUFFERED=unbuffered)
+    assert done.returncode == 4
+    assert done.stderr == 'psd-deflection: the standard output cannot be written (No space left on device)\n'
+    # The file was done before it could not be told.
+    assert (folder / 'whole.csv').exists() == ('whole.csv' in command)
+
+
+def test_no_letter_is_missing_so_much_that_it_fails() -> None:
+    done = program(f'PROGRAM replay {CLEAN}', PYTHONIOENCODING='ascii')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert '4000 samples' in done.stdout
+
+
+def test_a_name_that_is_no_text_is_drawn_as_far_as_it_is(folder: Path) -> None:
+    name = os.fsdecode(b'n\xff.mcap')
+    (folder / name).write_bytes(Path(CLEAN, 'clean_0.mcap').read_bytes())
+    assert main(['plot', name, '--out', 'a.html']) == 0
+    assert 'n\ufffd.mcap' in (folder / 'a.html').read_text(encoding='utf-8')
+
+
+def strict(text: str) -> Any:
+    """``text`` as JSON; NaN and Infinity are none."""
+
+    def refuse(constant: str) -> float:
+        raise AssertionError(constant)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def odd_recording(folder: Path) -> Path:
+    """A foreign .mcap without samples, whose metadata holds numbers that JSON has not."""
+    path = folder / 'odd.mcap'
+    with path.open('wb') as stream:
+        writer = Writer(stream)
+        writer.start(profile='ros2')
+        writer.add_metadata('psd_deflection.parameters', {'link.length': 'NaN', 'psd_1.center': '[Infinity, 0.0]'})
+        channel = writer.register_channel(
+            '/chatter', 'cdr', writer.register_schema('std_msgs/msg/String', 'ros2msg', b'string data')
+        )
+        writer.add_message(channel, 1, b'\0\1\0\0\2\0\0\0a\0', 1)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    'argv',
+    [
+        ['info', CLEAN],
+        ['info', 'odd.mcap'],
+        ['replay', CLEAN],
+        ['replay', CLEAN, '--compare'],
+        ['plot', CLEAN, '--out', 'a.svg'],
+        ['plot', 'dark.csv', '--out', 'a.svg'],
+        ['params'],
+        ['budget', '--load', '0', '0', '0', '--monte-carlo', '100'],
+        ['devices'],
+    ],
+    ids=' '.join,
+)
+def test_json_is_all_that_is_on_stdout(argv: list[str], folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    odd_recording(folder)
+    rows = [f'{i / 1000:.3f},0,0,0,0,0,0' for i in range(100)]
+    (folder / 'dark.csv').write_text('\n'.join(['t,x1,y1,sum1,x2,y2,sum2', *rows]) + '\n')
+    # A recording of another machine may differ in its last bits.
+    assert main([*argv, '--json']) in ((0, 1) if '--compare' in argv else (0,))
+    out, err = capsys.readouterr()
+    found = strict(out)
+    assert isinstance(found, dict)
+    if '--compare' in argv:
+        compared = found['compared']
+        assert compared['equal'] + compared['different'] > 1000
+        assert compared['same'] == (not compared['different'])
+    elif argv[0] == 'replay':
+        assert found['compared'] is None
+    assert (err == '') == ('--compare' not in argv)
