@@ -1,11 +1,7 @@
 """``psd-deflection``: finds the command and turns our errors into one line and an exit status.
 
 Each command is a module of this package with ``add_arguments(parser)`` and ``run(args) -> int``; it is
-<<<<<<< HEAD
-imported only when it is asked for, so that ``--help`` stays quick.
-=======
 imported only when it is asked for, so that ``--help`` stays quick. Its docstring is its help.
->>>>>>> main
 """
 
 from __future__ import annotations

@@ -134,6 +134,7 @@ def test_the_zero_holds_for_the_next_run(
     put = Parameter('psd_1.zero', value=[0.0002, 0.0001]).to_parameter_msg()
     answer = peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[put]))
     assert answer.results[0].successful
+    assert first.said(r'changed: psd_1.zero = \[0.0002, 0.0001\]')
     peer.until_of_now(poses, 'estimates after the change')
     assert abs(poses[-1].pose.position.x) > 5e-5
     assert peer.call(Trigger, '/estimator/zero', Trigger.Request()).success

@@ -10,6 +10,7 @@ import pytest
 
 from psd_deflection.config import load_rig
 from psd_deflection.protocol.frames import SampleFrame
+from psd_deflection.runner import processing
 from psd_deflection.runner import session as module
 from psd_deflection.runner.health import STALE, HealthReporter
 from psd_deflection.runner.session import Session
@@ -38,7 +39,10 @@ class Running:
 
 
 @pytest.fixture
-def running(device: ScriptedDevice, sample: Sample) -> Iterator[Running]:
+def running(device: ScriptedDevice, sample: Sample, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
+    # However busy the machine is: only what a test does makes a device silent or a request late.
+    monkeypatch.setattr(module, 'SILENT_S', 1e3)
+    monkeypatch.setattr(processing, 'REQUEST_TIMEOUT_S', 60.0)
     one = Running(device, sample)
     yield one
     one.session.close()
