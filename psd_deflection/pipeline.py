@@ -144,7 +144,7 @@ class Pipeline:
     def zero(self) -> ParameterChange | None:
         """Take the mean of the last blocks' dots as the unloaded ones, from the next block on.
 
-        None where no good block has come yet. The change is a record: replay applies it again.
+        None where no good block has come yet or the last was not one. The change is a record: replay applies it again.
         """
         if not self._recent or self.last_spots is None:
             return None

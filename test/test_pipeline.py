@@ -24,6 +24,7 @@ from psd_deflection.records import (
     SpotMeans,
     TipLoad,
 )
+from psd_deflection.runner.session import why_no_zero
 from psd_deflection.simulation.loads import direct, sidebar
 from psd_deflection.simulation.simulator import RigSimulator
 
@@ -197,8 +198,10 @@ def test_a_zero_is_not_taken_across_an_outage(rig: Rig) -> None:
     run(pipeline.process, chunk_of(still(REST, 200, 1)))
     dark = still(REST, 20, 2)
     dark[:, :3] = 0
+    assert why_no_zero(pipeline) == 'no good block yet'
     run(pipeline.process, chunk_of(dark, 200))
     assert pipeline.zero() is None
+    assert why_no_zero(pipeline).startswith('no good block now: laser 1 lost')
 
 
 def test_a_zero_forgets_what_was_before_an_unplugging(rig: Rig) -> None:

@@ -253,7 +253,7 @@ class MonitorServer:
         except (web.HTTPException, ConnectionError):
             raise
         except Exception as error:
-            self._say(f'monitor: {request.path}: {type(error).__name__}: {error}')
+            self._say(f'monitor: {request.path!r}: {type(error).__name__}: {error}')
             return web.Response(status=500, text='this should not have happened; the daemon has said what')
 
     async def _index(self, request: web.Request) -> web.StreamResponse:

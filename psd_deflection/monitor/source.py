@@ -16,7 +16,7 @@ from psd_deflection.monitor.feed import Feed
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport, Record, SpotMeans
 from psd_deflection.runner.health import ERROR, OK, WARN, HealthReporter
-from psd_deflection.runner.session import Session, zero_text
+from psd_deflection.runner.session import Session, why_no_zero, zero_text
 
 LONGEST_WAIT_S = 2.0
 """A pause in a recording is not sat out for longer."""
@@ -80,7 +80,7 @@ class LiveSource:
         except (TimeoutError, PsdDeflectionError) as error:
             raise RefusedError(f'not zeroed: {error}') from None
         if change is None:
-            raise RefusedError('not zeroed: no good block yet')
+            raise RefusedError(f'not zeroed: {why_no_zero(self._session.pipeline)}')
         return zero_text(self._session.rig)
 
     def record(self, wanted: bool) -> str:
@@ -160,7 +160,8 @@ class ReplaySource:
         new_lost = max(lost - self._seen[2], 0)
         self._seen = (samples, estimates, lost)
         spots = self._last
-        level, message = OK, f'playing, {self._speed:g} times as fast as recorded'
+        pace = 'as fast as recorded' if self._speed == 1.0 else f'{self._speed:g} times as fast as recorded'
+        level, message = OK, f'playing {pace}'
         if self._ended:
             message = 'end of the recording'
         elif new_lost:
@@ -246,6 +247,8 @@ class ReplaySource:
             if not asked.set_running_or_notify_cancel():
                 continue
             if self._pipeline.zero() is None:
-                asked.set_exception(RefusedError('not zeroed: no good block yet'))
+                asked.set_exception(RefusedError(f'not zeroed: {why_no_zero(self._pipeline)}'))
             else:
-                asked.set_result(zero_text(self._pipeline.rig))
+                text = zero_text(self._pipeline.rig)
+                self._say(text)
+                asked.set_result(text)

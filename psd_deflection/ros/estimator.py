@@ -35,7 +35,7 @@ from psd_deflection.ros.parameters import LiveParameters, rig_of_node
 from psd_deflection.ros.wires import InputRecorder, PublisherWire, say_on_rosout
 from psd_deflection.runner.health import STALE, HealthReporter
 from psd_deflection.runner.realtime import Watchdog, settle
-from psd_deflection.runner.session import Session, zero_text
+from psd_deflection.runner.session import Session, why_no_zero, zero_text
 from psd_deflection.runner.signals import Signals, StopRequestedError
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 
@@ -261,7 +261,7 @@ class EstimatorNode:
             response.message = f'not zeroed: {error}'
             return response
         if change is None:
-            response.message = 'not zeroed: no good block yet'
+            response.message = f'not zeroed: {why_no_zero(self.session.pipeline)}'
             return response
         rig = self.session.rig
         self._live.show(rig)

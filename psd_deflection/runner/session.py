@@ -43,6 +43,12 @@ def zero_text(rig: Rig) -> str:
     return f'unloaded dots (mm): psd_1 ({x1 * 1e3:z.4f}, {y1 * 1e3:z.4f}), psd_2 ({x2 * 1e3:z.4f}, {y2 * 1e3:z.4f})'
 
 
+def why_no_zero(pipeline: Pipeline) -> str:
+    """What to say where :meth:`Pipeline.zero` took none."""
+    last = pipeline.last_spots
+    return f'no good block now: {last.reason}' if last is not None and last.reason else 'no good block yet'
+
+
 class Session:
     """Opens on construction. ``say``: told of changes of state, one line each, from any thread; so
     is whoever else is put on ``listeners``.
@@ -169,7 +175,7 @@ class Session:
         self.processing.request(change)
 
     def zero(self) -> ParameterChange | None:
-        """Take the present dots as the unloaded ones; None where no good block has come yet.
+        """Take the present dots as the unloaded ones; None where the last block is not good.
 
         They are kept for the next run where the rig says so. Raises TimeoutError where no data flows:
         where the dots are now, nobody knows then.
@@ -198,6 +204,8 @@ class Session:
         nothing has changed.
         """
         self.processing.request(lambda: self.processing.give([self.pipeline.change(values)]))
+        shown = (f'{name} = {list(v) if isinstance(v, tuple) else v}' for name, v in values.items())
+        self._tell(f'changed: {", ".join(shown)}')
         if any(name in ZEROS for name in values):
             self._keep_zero()
 

@@ -16,6 +16,7 @@ import pytest
 pytest.importorskip('selenium', reason='the browser tests need selenium: pip install .[test]')
 
 from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
 
 from .browsing import Page, Program, Start
 from .serving import Serving
@@ -190,8 +191,11 @@ def test_the_token_of_the_printed_address_opens_the_buttons(page: Page, serve: C
     assert serving.source.zeros == 0
     page.driver.find_element(By.ID, 'zero').click()
     page.until('document.getElementById("ask").open')
-    page.driver.find_element(By.ID, 'token').send_keys(serving.server.token)
-    page.driver.find_element(By.CSS_SELECTOR, '#ask button.main').click()
+    page.driver.find_element(By.ID, 'cancel').click()
+    page.until('!document.getElementById("ask").open')
+    page.driver.find_element(By.ID, 'zero').click()
+    page.until('document.getElementById("ask").open')
+    page.driver.find_element(By.ID, 'token').send_keys(serving.server.token + Keys.ENTER)
     page.until('document.getElementById("notice").textContent === "unloaded dots taken"')
     assert serving.source.zeros == 1
     assert serving.server.token not in str(page.js('location.href'))
@@ -205,15 +209,14 @@ def test_the_page_outlives_an_unplugged_device(page: Page, start: Start, tmp_pat
     page.open(program.url())
     page.live()
     faded = 'Number(getComputedStyle(document.querySelector(".numbers")).opacity) < 0.6'
-    assert not page.js(faded)
+    page.until(f'document.body.dataset.state === "live" && !({faded})')
     device.end()
     # What was measured last does not look like what is measured now, nor can it become a zero.
-    page.until('document.body.dataset.state === "stale"')
-    assert page.js(faded)
+    page.until(f'document.body.dataset.state === "stale" && {faded}')
     page.until('document.title.startsWith("no samples ·")')
+    page.until('document.querySelector("#messages").textContent.includes("waiting for it to come back")')
     page.driver.find_element(By.ID, 'zero').click()
     page.until('document.getElementById("notice").textContent === "not zeroed: no data flows"')
-    page.until('document.querySelector("#messages").textContent.includes("waiting for it to come back")')
     before = page.rows()
     again = start('simulate', '--serve', '--link', link)
     again.said('(port: )')

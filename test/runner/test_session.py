@@ -10,10 +10,12 @@ import pytest
 
 from psd_deflection.config import load_rig
 from psd_deflection.protocol.frames import SampleFrame
+from psd_deflection.runner import processing
 from psd_deflection.runner import session as module
 from psd_deflection.runner.health import STALE, HealthReporter
 from psd_deflection.runner.session import Session
-from test.runner.conftest import ScriptedDevice
+from test.heard import WAIT_S
+from test.runner.conftest import Estimates, ScriptedDevice
 
 Sample = Callable[..., SampleFrame]
 
@@ -25,18 +27,22 @@ class Running:
         self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
         rig = load_rig(overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False})
         self.session = Session(rig, self.said.put)
+        estimates = Estimates(5)
+        self.session.processing.sinks.append(estimates)
         self.session.start()
         device.send_frames(*(sample(seq) for seq in range(200)))
-        while self.session.pipeline.counters.estimates < 5:
-            self.session.processing.request(lambda: None)
+        assert estimates.enough.wait(WAIT_S)
 
     def heard(self, text: str) -> None:
-        while text not in self.said.get(timeout=30.0):
+        while text not in self.said.get(timeout=WAIT_S):
             pass
 
 
 @pytest.fixture
-def running(device: ScriptedDevice, sample: Sample) -> Iterator[Running]:
+def running(device: ScriptedDevice, sample: Sample, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
+    # However busy the machine is: only what a test does makes a device silent or a request late.
+    monkeypatch.setattr(module, 'SILENT_S', 1e3)
+    monkeypatch.setattr(processing, 'REQUEST_TIMEOUT_S', 60.0)
     one = Running(device, sample)
     yield one
     one.session.close()

@@ -316,6 +316,7 @@ function askToken() {
 
 $('zero').onclick = () => act('/api/zero', {});
 $('record').onclick = () => act('/api/record', { record: !(health && health.recording) });
+$('cancel').onclick = () => $('ask').close('');
 $('span').onchange = () => { fresh = true; };
 $('hold').onclick = () => {
   $('hold').setAttribute('aria-pressed', String(!held()));
