@@ -5,6 +5,7 @@ What ends in a moment is run here; ``make doc-commands`` runs the rest (docs/run
 
 from __future__ import annotations
 
+import argparse
 import ast
 import importlib.util
 import json
@@ -240,6 +241,25 @@ def test_completion_knows_commands_and_options(shell: str, capsys: pytest.Captur
     script = capsys.readouterr().out
     for word in (*COMMANDS, '--params-file', '--no-ros', '--control'):
         assert word in script
+
+
+def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[str]) -> None:
+    values = {}
+    for name in COMMANDS:
+        (commands,) = (a for a in make_parser([name])._actions if isinstance(a, argparse._SubParsersAction))
+        for action in commands.choices[name]._actions:
+            if action.nargs != 0 and action.choices is None:
+                flag = (action.option_strings or ['pos_0'])[-1]
+                values[re.sub(r'\W', '_', f'{name}_{flag}')] = action.metavar or action.dest.upper()
+    assert main(['completion', 'bash']) == 0
+    script = capsys.readouterr().out
+    as_path = set(re.findall(r'_shtab_psd_deflection_(\w+)_COMPGEN=_shtab_compgen_(?:files|dirs)', script))
+    assert as_path <= set(values)
+    # What is left is numbers and words: a new kind of value is to be put here or among the paths.
+    assert {str(values[name]) for name in set(values) - as_path} == {
+        'ADDRESS', 'BAUD', 'EFFECT', 'M', 'N', 'NAME=VALUE', 'NAME,KEY=VALUE,...', 'PPM', 'SEED', 'SOURCE',
+        'T0[,T1...]', 'WORDS', 'X', "('FX', 'FY', 'TZ')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
+    }  # fmt: skip
 
 
 def test_the_navigation_has_every_page() -> None:

@@ -23,8 +23,8 @@ from psd_deflection.protocol.frames import encode
 class Fault:
     """``act(line, pid)`` returns when the fault is over. ``seen``: diagnostics of which one must have risen.
 
-    ``samples_flow``: False where what must come back is the estimate, not the sample. ``back``: the
-    port was away, so the time to recover counts against the second that is allowed.
+    ``estimates``: what must come back is the estimate, not the sample. ``back``: the port was away,
+    so the time to recover counts against the second that is allowed.
     """
 
     name: str

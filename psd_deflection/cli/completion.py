@@ -11,10 +11,15 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+from collections.abc import Iterator
 
 from psd_deflection.errors import ConfigError
 
 SHELLS = ('bash', 'zsh', 'tcsh')
+
+FILES = ('REC', 'OUT', 'RIG.yaml', 'FILE.yaml', 'FILE.png|svg|pdf', 'PORT', 'PATH')
+FOLDERS = ('DIR', 'FOLDER')
+"""Names of values in the help that are to be completed as paths; a bag is a folder, and completed as a file is."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,5 +36,22 @@ def run(args: argparse.Namespace) -> int:
     # Only here: the parser of all commands, which imports all of them.
     from psd_deflection.cli.main import COMMANDS, make_parser
 
-    print(shtab.complete(make_parser(COMMANDS), shell=args.shell))
+    parser = make_parser(COMMANDS)
+    for action in _actions(parser):
+        name = action.metavar or action.dest.upper()
+        if name in FOLDERS:
+            action.complete = shtab.DIRECTORY  # type: ignore[attr-defined]
+        elif name in FILES:
+            action.complete = shtab.FILE  # type: ignore[attr-defined]
+    print(shtab.complete(parser, shell=args.shell))
     return 0
+
+
+def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """Every argument of every command."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for sub in action.choices.values():
+                yield from _actions(sub)
+        elif action.nargs != 0:
+            yield action

@@ -22,6 +22,7 @@ from pathlib import Path
 
 from psd_deflection.cli._options import recording_name
 from psd_deflection.cli._progress import progress_of, told
+from psd_deflection.cli._report import print_json
 from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.config import EFFECTS_PREFIX, load_rig
 from psd_deflection.io.bag_writer import BagWriter, McapFile
@@ -50,18 +51,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='RIG.yaml',
         help="the rig to note in a bag or to use for an .rrd; otherwise the recording's own",
     )
+    parser.add_argument('--json', action='store_true', help='for programs: the summary as one JSON object')
 
 
 def _time(record: Convertible) -> int:
     return int(record.t_ns[0]) if isinstance(record, SampleBlock) else record.t_ns
 
 
-def convert(recording: Recording, out: Path, parameters: dict[str, object]) -> int:
+def convert(recording: Recording, out: Path, parameters: dict[str, object], quiet: bool = False) -> int:
     """Write ``recording`` to ``out``; returns the number of samples. Raises RecordingError."""
-    with told('reading loads, references, temperatures'):
+    with told('reading loads, references, temperatures', quiet=quiet):
         changes, loads = recording.changes, recording.loads()
         references, temperatures = recording.references(), recording.temperatures()
-    blocks = progress_of(recording.blocks())
+    blocks = progress_of(recording.blocks(), quiet=quiet)
     records: Iterable[Convertible] = heapq.merge(changes, loads, references, temperatures, blocks, key=_time)
     sink: CsvSampleSink | McapFile | BagWriter
     if out.suffix.lower() == '.csv':
@@ -84,28 +86,35 @@ def run(args: argparse.Namespace) -> int:
     """Convert and say what was written."""
     recording = open_recording(Path(args.recording))
     if Path(args.out).suffix.lower() == '.rrd':
-        return _to_rerun(recording, Path(args.out), args.params_file)
+        return _to_rerun(recording, Path(args.out), args.params_file, args.json)
     parameters: dict[str, object] = dict(recording.parameters)
     if args.params_file is not None:
         rig = load_rig(args.params_file)
         parameters = {**rig.values, **{EFFECTS_PREFIX + k: e for k, e in rig.effects.items()}}
-    samples = convert(recording, Path(args.out), parameters)
-    print(f'{args.out}: {samples} samples')
+    samples = convert(recording, Path(args.out), parameters, args.json)
+    if args.json:
+        print_json({'out': args.out, 'samples': samples, 'warnings': list(recording.warnings)})
+    else:
+        print(f'{args.out}: {samples} samples')
     _warn(recording)
     return 0
 
 
-def _to_rerun(recording: Recording, out: Path, params_file: str | None) -> int:
+def _to_rerun(recording: Recording, out: Path, params_file: str | None, in_json: bool) -> int:
     rig = rig_of(recording, params_file)
     recording = open_recording(recording.path, block_size=rig.estimator.block_size)
     pipeline = Pipeline(rig)
-    with contextlib.closing(RerunFile(out, rig, recording.path.stem)) as sink, progress_of(recording.blocks()) as bar:
+    bar = progress_of(recording.blocks(), quiet=in_json)
+    with contextlib.closing(RerunFile(out, rig, recording.path.stem)) as sink, bar:
         for records in replayed(recording, pipeline, bar):
             for record in records:
                 sink.put(record)
-    print(
-        f'{out}: {pipeline.counters.estimates} estimates of {pipeline.counters.blocks} blocks; look at it: rerun {out}'
-    )
+    estimates, blocks = pipeline.counters.estimates, pipeline.counters.blocks
+    if in_json:
+        found = {'out': str(out), 'blocks': blocks, 'estimates': estimates, 'warnings': list(recording.warnings)}
+        print_json(found)
+    else:
+        print(f'{out}: {estimates} estimates of {blocks} blocks; look at it: rerun {out}')
     _warn(recording)
     return 0
 

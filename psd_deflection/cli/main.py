@@ -13,6 +13,7 @@ import errno
 import importlib
 import itertools
 import os
+import re
 import shutil
 import signal
 import sys
@@ -65,6 +66,7 @@ exit status:
 INTERRUPTED = 130
 """What a shell gives a program that Ctrl-C ended."""
 
+_NEGATIVE = re.compile(r'^-[\d.][\d.,eE+-]*$')
 _WIDEST = 100
 _REFUSED_OUTPUT = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG)
 
@@ -99,6 +101,8 @@ def make_parser(chosen: Collection[str]) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
     for name, summary in COMMANDS.items():
         sub = commands.add_parser(name, help=summary, description=summary, formatter_class=_Help)
+        # `-5,20` and `-2.9e1` are values, which argparse takes for options.
+        sub._negative_number_matcher = _NEGATIVE
         if name in chosen:
             module = importlib.import_module('psd_deflection.cli.' + name.replace('-', '_'))
             sub.description = module.__doc__

@@ -13,27 +13,61 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
+from typing import Any
 
-from psd_deflection.io.recover import recover
+from psd_deflection.cli._progress import told
+from psd_deflection.cli._report import print_json
+from psd_deflection.io.recover import Recovered, recover
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('recording', metavar='REC', nargs='+', help='a bag folder or an .mcap')
+    parser.add_argument('--json', action='store_true', help='for programs: the summary as one JSON object')
 
 
 def run(args: argparse.Namespace) -> int:
     """Repair and say what was done."""
+    found = []
     for path in args.recording:
-        done = recover(path)
-        for file in done.files:
-            for warning in file.warnings:
-                print(f'warning: {warning}', file=sys.stderr)
-            span = (file.count.end_ns - file.count.start_ns) * 1e-9
-            what = f'repaired, the old one is {file.path.name}.cut' if file.repaired else 'was whole'
-            print(f'{file.path}: {file.count.messages} messages, {span:.3f} s; {what}')
-        for aside in done.set_aside:
-            print(f'{aside}: held nothing and is set aside')
-        if done.metadata_written:
-            print(f'{path}: metadata.yaml written')
+        with told(f'reading {path}, and writing anew what is cut', quiet=args.json):
+            done = recover(path)
+        for warning in (w for file in done.files for w in file.warnings):
+            print(f'warning: {warning}', file=sys.stderr)
+        found.append({'path': path, **in_json(done)})
+        if not args.json:
+            print('\n'.join(_lines(path, done)))
+    if args.json:
+        print_json({'recordings': found})
     return 0
+
+
+def in_json(done: Recovered) -> dict[str, Any]:
+    """What ``--json`` prints of one: counts, ns."""
+    return {
+        'files': [
+            {
+                'path': str(file.path),
+                'repaired': file.repaired,
+                'messages': file.count.messages,
+                'start_ns': file.count.start_ns,
+                'end_ns': file.count.end_ns,
+                'warnings': file.warnings,
+            }
+            for file in done.files
+        ],
+        'metadata_written': done.metadata_written,
+        'set_aside': [str(aside) for aside in done.set_aside],
+    }
+
+
+def _lines(path: str, done: Recovered) -> Iterator[str]:
+    for file in done.files:
+        span = (file.count.end_ns - file.count.start_ns) * 1e-9
+        what = f'repaired, the old one is {file.path.name}.cut' if file.repaired else 'was whole'
+        yield f'{file.path}: {file.count.messages} messages, {span:.3f} s; {what}'
+    for aside in done.set_aside:
+        yield f'{aside}: held nothing and is set aside'
+    if done.metadata_written:
+        yield f'{path}: metadata.yaml written'

@@ -22,6 +22,7 @@ from tqdm import tqdm
 
 from psd_deflection.cli import serve
 from psd_deflection.cli._options import given_as_option, recording_name, refuse, seed
+from psd_deflection.cli._report import print_json
 from psd_deflection.config import EFFECTS_PREFIX, Rig, load_rig, replace_values
 from psd_deflection.errors import ConfigError, UsageError
 from psd_deflection.io.bag_writer import BagWriter, McapFile
@@ -45,7 +46,14 @@ CHUNK_SECONDS = 1.0
 LEAST_SAMPLES = 2
 """Fewer tell no sample rate: such a CSV could not be read again."""
 
-OF_A_RECORDING: dict[str, object] = {'out': None, 'loads': None, 'temperature': None, 'effect': [], 'reference': False}
+OF_A_RECORDING: dict[str, object] = {
+    'out': None,
+    'loads': None,
+    'temperature': None,
+    'effect': [],
+    'reference': False,
+    'json': False,
+}
 """Options of a recording, and what they are where they are not given."""
 
 BAG_START_NS = 1_000_000_000
@@ -73,6 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='hide an effect in it, for example sensor_rotation,psd=2,angle=0.01; repeatable',
     )
     group.add_argument('--reference', action='store_true', help='record the true pose as an independent measurement')
+    group.add_argument('--json', action='store_true', help='for programs: the summary as one JSON object')
     serve.add_arguments(parser)
 
 
@@ -97,9 +106,12 @@ def run(args: argparse.Namespace) -> int:
             )
         temperature = None if args.temperature is None else temperature_history(args.temperature, len(history))
     out = Path(args.out)
-    count = write_recording(out, rig, known, history.loads, temperature, args.seed, args.reference)
-    names = ', '.join(a.label for a in effects_of_rig(rig)) or 'none'
-    print(f'{out}: {count} samples, {count / rate:.1f} s; effects: {names}')
+    count = write_recording(out, rig, known, history.loads, temperature, args.seed, args.reference, args.json)
+    names = [a.label for a in effects_of_rig(rig)]
+    if args.json:
+        print_json({'out': args.out, 'samples': count, 'duration_s': count / rate, 'effects': names})
+    else:
+        print(f'{out}: {count} samples, {count / rate:.1f} s; effects: {", ".join(names) or "none"}')
     return 0
 
 
@@ -120,7 +132,14 @@ def with_effects(rig: Rig, words: Sequence[str]) -> Rig:
 
 
 def write_recording(
-    out: Path, rig: Rig, known: Rig, loads: FloatArray, temperature: FloatArray | None, seed: int, reference: bool
+    out: Path,
+    rig: Rig,
+    known: Rig,
+    loads: FloatArray,
+    temperature: FloatArray | None,
+    seed: int,
+    reference: bool,
+    quiet: bool = False,
 ) -> int:
     """Simulate ``rig`` and write what a daemon with the parameters ``known`` would; returns the number of samples.
 
@@ -135,7 +154,7 @@ def write_recording(
         sink = McapFile(out, rig_values=values)
     else:
         sink = BagWriter(out, rig_values=values)
-    bar = tqdm(total=len(loads), unit=' samples', delay=1.0, leave=False, disable=None, ncols=80)
+    bar = tqdm(total=len(loads), unit=' samples', delay=1.0, leave=False, disable=quiet or None, ncols=80)
     with contextlib.closing(sink), bar:
         for record in records(rig, known, loads, temperature, seed, reference, 0 if is_csv else BAG_START_NS):
             sink.put(record)

@@ -16,11 +16,13 @@ from typing import Protocol, TypeVar
 
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import Record
-from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Restarted
+from psd_deflection.runner.acquisition import Acquisition, Chunk, Restarted
 
 T = TypeVar('T')
 
-REQUEST_TIMEOUT_S = 1.0
+REQUEST_TIMEOUT_S = 2.0
+"""The end of a recording may take the recorder's ``JOIN_S`` of it."""
+
 INTERVAL_S = 1.0
 """Between two lines about estimates, at least."""
 
@@ -113,7 +115,7 @@ class Processing:
     def request(self, action: Callable[[], T]) -> T:
         """Run ``action`` between two blocks and return what it returns; its errors come through.
 
-        Raises TimeoutError where no data flows for a second.
+        Raises TimeoutError where the thread does not come round within ``REQUEST_TIMEOUT_S``.
         """
         box: queue.SimpleQueue[tuple[T | None, BaseException | None]] = queue.SimpleQueue()
         cancelled = threading.Event()
@@ -188,6 +190,3 @@ class Processing:
             cause += ' degraded'
             text = f'degraded, translation from one detector alone: {spots.reason}'
         self._spokesman.block(cause, text, time.monotonic())
-
-
-__all__ = ['Ended', 'Latency', 'Processing']

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from psd_deflection.config import Rig
 from psd_deflection.errors import DeviceError
 
-START_S = 20.0
+START_S = 60.0
 PORT_LINE = 'port: '
 
 

@@ -4,7 +4,7 @@ Theory of operation. A :class:`Chunk` holds consecutive samples, one row a quant
 stages in order. What must be remembered between chunks (modes, hysteresis, delays) lives in the
 simulator, so that a history cut anywhere gives the same samples bit for bit; for this everything
 is elementwise or a recursive filter, and the noise is drawn sample by sample. Effects hook in at
-named points (:data:`POINTS`).
+named points (:data:`~psd_deflection.simulation.catalogue.Point`).
 """
 
 from __future__ import annotations

@@ -109,6 +109,19 @@ def test_any_other_dot_is_part_of_a_folder_s_name(name: str, folder: Path) -> No
     assert (folder / f'sim_{name}' / 'metadata.yaml').is_file()
 
 
+@pytest.mark.parametrize(
+    'argv',
+    [
+        ['simulate', '--out', 'a.csv', *SHORT, '--temperature', '-5,-2.5e1'],
+        ['budget', '--json', '--load', '-1e0', '-5e1', '-.5'],
+        ['design', '--params-file', RIG, '--box', '-1.2e-1', '-.1', '1e-1', '1e-1'],
+    ],
+    ids=lambda argv: argv[0],
+)
+def test_a_negative_number_is_a_value_however_it_is_written(argv: list[str]) -> None:
+    assert main(argv) == 0
+
+
 def bad_from_row(folder: Path, row: int) -> Path:
     """A CSV that can be read up to ``row``."""
     path = folder / 'bad.csv'
@@ -296,6 +309,9 @@ def odd_recording(folder: Path) -> Path:
         ['replay', CLEAN, '--compare'],
         ['plot', CLEAN, '--out', 'a.svg'],
         ['plot', 'dark.csv', '--out', 'a.svg'],
+        ['convert', CLEAN, '--out', 'a.csv'],
+        ['recover', 'cut.mcap'],
+        ['simulate', *SHORT, '--out', 'a'],
         ['params'],
         ['budget', '--load', '0', '0', '0', '--monte-carlo', '100'],
         ['devices'],
@@ -306,6 +322,7 @@ def test_json_is_all_that_is_on_stdout(argv: list[str], folder: Path, capsys: py
     odd_recording(folder)
     rows = [f'{i / 1000:.3f},0,0,0,0,0,0' for i in range(100)]
     (folder / 'dark.csv').write_text('\n'.join(['t,x1,y1,sum1,x2,y2,sum2', *rows]) + '\n')
+    (folder / 'cut.mcap').write_bytes(Path(CLEAN, 'clean_0.mcap').read_bytes()[:100_000])
     # A recording of another machine may differ in its last bits.
     assert main([*argv, '--json']) in ((0, 1) if '--compare' in argv else (0,))
     out, err = capsys.readouterr()
@@ -317,4 +334,10 @@ def test_json_is_all_that_is_on_stdout(argv: list[str], folder: Path, capsys: py
         assert compared['same'] == (not compared['different'])
     elif argv[0] == 'replay':
         assert found['compared'] is None
-    assert (err == '') == ('--compare' not in argv)
+    elif argv[0] == 'recover':
+        (recording,) = found['recordings']
+        (file,) = recording['files']
+        assert file['repaired']
+        assert file['messages'] > 500
+    # A verdict and a warning are for whoever reads the log.
+    assert (err == '') == ('--compare' not in argv and argv[0] != 'recover')

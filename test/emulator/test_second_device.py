@@ -30,7 +30,8 @@ from psd_deflection.protocol.frames import (
 )
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock
 from psd_deflection.runner.session import Session
-from test.runner.conftest import WAIT_S, Estimates
+from test.heard import WAIT_S
+from test.runner.conftest import Estimates
 
 EMULATOR = Path(__file__).parent / 'second_device.py'
 PAGE = Path(__file__).parent.parent.parent / 'docs' / 'protocol.md'

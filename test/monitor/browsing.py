@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import pytest
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.support.ui import WebDriverWait
 
-WAIT_S = 60.0
+from test.heard import WAIT_S, Heard
+
 ROOT = Path(__file__).parent.parent.parent
 FLAGS = (
     '--headless',
@@ -108,9 +107,6 @@ class Program:
     """``psd-deflection ...`` as a process; what it says, line by line."""
 
     def __init__(self, arguments: Sequence[str], cwd: Path) -> None:
-        self.lines: list[str] = []
-        self._ended = False
-        self._new = threading.Condition()
         self.process = subprocess.Popen(
             [sys.executable, '-m', 'psd_deflection', *arguments],
             cwd=cwd,
@@ -120,31 +116,12 @@ class Program:
             start_new_session=True,
             env={**os.environ, 'PYTHONPATH': str(ROOT), 'PYTHONUNBUFFERED': '1', 'XDG_STATE_HOME': str(cwd)},
         )
-        self._thread = threading.Thread(target=self._read, args=(self.process.stdout,), daemon=True)
-        self._thread.start()
-
-    def _read(self, stream: IO[str]) -> None:
-        for line in stream:
-            with self._new:
-                self.lines.append(line.rstrip('\n'))
-                self._new.notify_all()
-        with self._new:
-            self._ended = True
-            self._new.notify_all()
+        assert self.process.stdout is not None
+        self._heard = Heard(self.process.stdout)
 
     def said(self, pattern: str) -> str:
         """Group 1 of the first line that matches."""
-        found: list[str] = []
-
-        def look() -> bool:
-            found.extend(m.group(1) for line in self.lines if (m := re.search(pattern, line)))
-            return bool(found) or self._ended
-
-        with self._new:
-            self._new.wait_for(look, WAIT_S)
-        if not found:
-            pytest.fail(f'{pattern!r} was not said, but: {self.lines}')
-        return found[0]
+        return str(self._heard.until(pattern)[1])
 
     def url(self) -> str:
         return self.said(r'monitor: (http://\S+)')
@@ -153,9 +130,7 @@ class Program:
         if self.process.poll() is None:
             os.killpg(self.process.pid, signal.SIGINT)
         status = self.process.wait(WAIT_S)
-        self._thread.join(WAIT_S)
-        if self.process.stdout is not None:
-            self.process.stdout.close()
+        self._heard.close()
         return status
 
 

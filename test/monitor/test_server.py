@@ -17,10 +17,10 @@ from psd_deflection.monitor import server
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.monitor.server import BROWSERS, CONNECTIONS, MonitorServer
 from psd_deflection.records import BlockStatus
+from test.heard import WAIT_S
 
 from .serving import Serving, StillSource
 
-WAIT_S = 60.0
 Serve = Callable[..., Serving]
 
 

@@ -4,28 +4,24 @@ from __future__ import annotations
 
 import fcntl
 import os
-import re
 import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import pytest
 
+from test.heard import WAIT_S, Heard
 from test.runner.conftest import ScriptedDevice
 
 rclpy = pytest.importorskip('rclpy', reason='the ROS tests need rclpy: pip install .[ros]')
 
 WARNINGS = "error,ignore:module 'sre_parse' is deprecated:DeprecationWarning,"
 WARNINGS += "ignore:module 'sre_constants' is deprecated:DeprecationWarning"
-
-WAIT_S = 60.0
-"""Longest that a test waits for what will come: discovery takes 0.1 or, at random, 2.7 s; a busy machine longer."""
 
 BLOCK_NS = 20_000_000
 
@@ -50,15 +46,23 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     pytest.fail('no ROS domain is free')
 
 
+PATIENT = f"""
+import sys
+from psd_deflection.cli.main import main
+from psd_deflection.runner import acquisition
+acquisition.SILENCE_S = {WAIT_S}
+sys.exit(main())
+"""
+"""Our program, which waits longer for a first answer of its device than any test does."""
+
+
 class Daemon:
     """``psd-deflection estimator`` as a process; its output line by line."""
 
-    def __init__(self, arguments: list[str], cwd: Path) -> None:
-        self.lines: list[str] = []
-        self._ended = False
-        self._new = threading.Condition()
+    def __init__(self, arguments: Sequence[str], patient: bool = False) -> None:
+        program = ['-c', PATIENT] if patient else ['-m', 'psd_deflection']
         self.process = subprocess.Popen(
-            [sys.executable, '-m', 'psd_deflection', 'estimator', *arguments],
+            [sys.executable, *program, 'estimator', *arguments],
             cwd=Path(__file__).parent.parent.parent,
             stderr=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
@@ -66,32 +70,13 @@ class Daemon:
             start_new_session=True,
             env={**os.environ, 'PYTHONWARNINGS': WARNINGS, 'PYTHONUNBUFFERED': '1'},
         )
-        self._thread = threading.Thread(target=self._read, args=(self.process.stderr,), daemon=True)
-        self._thread.start()
-
-    def _read(self, stream: IO[str]) -> None:
-        for line in stream:
-            with self._new:
-                self.lines.append(line.rstrip('\n'))
-                self._new.notify_all()
-        with self._new:
-            self._ended = True
-            self._new.notify_all()
+        assert self.process.stderr is not None
+        self._heard = Heard(self.process.stderr)
+        self.lines = self._heard.lines
 
     def said(self, pattern: str) -> str:
         """Wait for a line that matches; it is returned."""
-        found: list[str] = []
-
-        def look() -> bool:
-            found.extend(line for line in self.lines if re.search(pattern, line))
-            # Not the process's end: its last lines may be on their way still.
-            return bool(found) or self._ended
-
-        with self._new:
-            self._new.wait_for(look, WAIT_S)
-        if not found:
-            pytest.fail(f'the daemon did not say {pattern!r}; it said: {self.lines}')
-        return found[0]
+        return self._heard.until(pattern).string
 
     def signal(self, number: int) -> None:
         os.killpg(self.process.pid, number)
@@ -99,7 +84,7 @@ class Daemon:
     def wait(self) -> int:
         """Its exit status; all its lines are there then."""
         status = self.process.wait(WAIT_S)
-        self._thread.join(WAIT_S)
+        self._heard.close()
         return status
 
     def end(self) -> None:
@@ -110,18 +95,16 @@ class Daemon:
             except subprocess.TimeoutExpired:
                 self.process.kill()
                 self.process.wait()
-        self._thread.join(WAIT_S)
-        if self.process.stderr is not None:
-            self.process.stderr.close()
+        self._heard.close()
 
 
 @pytest.fixture
-def start(domain: int, tmp_path: Path) -> Iterator[Callable[..., Daemon]]:
+def start(domain: int) -> Iterator[Callable[..., Daemon]]:
     """Start a daemon; it ends with the test."""
     started: list[Daemon] = []
 
-    def begin(*arguments: str) -> Daemon:
-        daemon = Daemon(list(arguments), tmp_path)
+    def begin(*arguments: str, patient: bool = False) -> Daemon:
+        daemon = Daemon(arguments, patient)
         started.append(daemon)
         return daemon
 

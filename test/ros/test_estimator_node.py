@@ -247,7 +247,7 @@ def test_signals_end_it_and_leave_a_whole_recording(
     peer.until(lambda: len(poses) >= 25, 'estimates')
     for number in signals:
         daemon.signal(number)
-    assert daemon.wait() == 0
+    assert daemon.wait() == 0, daemon.lines
     (folder,) = tmp_path.glob('psd_*')
     assert f' replay {folder} --compare' in daemon.lines[-1]
     with Reader(folder) as bag:

@@ -27,7 +27,7 @@ from psd_deflection.errors import ConfigError, DeviceError  # noqa: E402
 from psd_deflection.io.recordings import open_recording  # noqa: E402
 from psd_deflection.io.serial_port import SerialPort  # noqa: E402
 from psd_deflection.ros import estimator  # noqa: E402
-from test.ros.conftest import WAIT_S  # noqa: E402
+from test.heard import WAIT_S  # noqa: E402
 
 
 def change(peer: Any, transition: int) -> bool:
@@ -100,7 +100,7 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
     assert change(peer, Transition.TRANSITION_ACTIVATE)
     peer.until(lambda: len(poses) >= stopped + 10, 'estimates once more')
     daemon.signal(signal.SIGINT)
-    assert daemon.wait() == 0
+    assert daemon.wait() == 0, daemon.lines
 
 
 def test_a_device_that_is_not_there_leaves_the_node_unconfigured(start: Callable[..., Any], peer: Any) -> None:
@@ -110,16 +110,16 @@ def test_a_device_that_is_not_there_leaves_the_node_unconfigured(start: Callable
     assert daemon.said('no such port')
     assert state(peer) == State.PRIMARY_STATE_UNCONFIGURED
     daemon.signal(signal.SIGTERM)
-    assert daemon.wait() == 0
+    assert daemon.wait() == 0, daemon.lines
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_waiting_for_a_device(start: Callable[..., Any], device: Any, number: signal.Signals) -> None:
     device.answer = b''
-    daemon = start('--port', str(device.link))
+    daemon = start('--port', str(device.link), patient=True)
     assert device.greeted.wait(WAIT_S)
     daemon.signal(number)
-    assert daemon.wait() == 0
+    assert daemon.wait() == 0, daemon.lines
     assert not any('Traceback' in line for line in daemon.lines)
 
 
@@ -142,13 +142,13 @@ def test_the_zero_holds_for_the_next_run(
     assert taken[0] != [0.0002, 0.0001]
     assert taken != [[0.0, 0.0], [0.0, 0.0]]
     first.signal(signal.SIGINT)
-    assert first.wait() == 0
+    assert first.wait() == 0, first.lines
     second = start(*arguments)
     assert 'zero of the last run' in second.said('zero of the last run')
     second.said('publishing on ROS domain')
     assert parameters(peer, 'psd_1.zero', 'psd_2.zero') == taken
     second.signal(signal.SIGINT)
-    assert second.wait() == 0
+    assert second.wait() == 0, second.lines
     # Switched off, the rig file holds.
     third = start(*arguments, '-p', 'keep_zero:=false')
     third.said('publishing on ROS domain')
@@ -160,7 +160,7 @@ def test_a_shutdown_ends_the_daemon(start: Callable[..., Any], peer: Any, simula
     daemon.said('publishing on ROS domain')
     assert change(peer, Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert daemon.said('shut down by change_state')
-    assert daemon.wait() == 0
+    assert daemon.wait() == 0, daemon.lines
     SerialPort(simulated_port, 921_600).close()
 
 

@@ -23,6 +23,7 @@ from psd_deflection.protocol.frames import (
 )
 from psd_deflection.records import CHANNELS, DeflectionEstimate, Record
 from psd_deflection.runner import acquisition
+from test.heard import WAIT_S
 
 HELLO = HelloFrame(
     1,
@@ -34,10 +35,6 @@ HELLO = HelloFrame(
         'volts_per_count': 10.0 / 32768,
     },
 )
-
-
-WAIT_S = 60.0
-"""Longest that a test waits for what will come; a busy machine takes its time."""
 
 
 class ScriptedDevice:

@@ -22,7 +22,7 @@ from psd_deflection.io.sources._interface import Clock, Event, Reading, Sample, 
 from psd_deflection.protocol.frames import HelloFrame, encode
 from psd_deflection.runner import acquisition as module
 from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Item, Restarted
-from test.runner.conftest import WAIT_S
+from test.heard import WAIT_S
 
 HELLO_INFO: dict[str, object] = {
     'serial': 'T-1',

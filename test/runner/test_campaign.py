@@ -22,7 +22,7 @@ from bench.campaign.line import DIGIT, VOLTS_PER_COUNT, Line, identities
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.protocol.frames import FrameDecoder, HelloRequestFrame, SampleFrame, encode
 from psd_deflection.runner.acquisition import Acquisition
-from test.runner.conftest import WAIT_S
+from test.heard import WAIT_S
 
 ROOT = Path(__file__).resolve().parents[2]
 FOUND = sorted((ROOT / 'test' / 'data' / 'fuzz').glob('*'))

@@ -22,8 +22,8 @@ from psd_deflection.io.recover import recover
 from psd_deflection.records import ParameterChange, SampleBlock
 from psd_deflection.runner import recorder as module
 from psd_deflection.runner.recorder import Recorder
+from test.heard import WAIT_S
 from test.recordings.making import block
-from test.runner.conftest import WAIT_S
 
 MB = 1_000_000
 

@@ -14,7 +14,8 @@ from psd_deflection.runner import processing
 from psd_deflection.runner import session as module
 from psd_deflection.runner.health import STALE, HealthReporter
 from psd_deflection.runner.session import Session
-from test.runner.conftest import ScriptedDevice
+from test.heard import WAIT_S
+from test.runner.conftest import Estimates, ScriptedDevice
 
 Sample = Callable[..., SampleFrame]
 
@@ -26,13 +27,14 @@ class Running:
         self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
         rig = load_rig(overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False})
         self.session = Session(rig, self.said.put)
+        estimates = Estimates(5)
+        self.session.processing.sinks.append(estimates)
         self.session.start()
         device.send_frames(*(sample(seq) for seq in range(200)))
-        while self.session.pipeline.counters.estimates < 5 and self.session.processing.alive:
-            self.session.processing.request(lambda: None)
+        assert estimates.enough.wait(WAIT_S)
 
     def heard(self, text: str) -> None:
-        while text not in self.said.get(timeout=30.0):
+        while text not in self.said.get(timeout=WAIT_S):
             pass
 
 

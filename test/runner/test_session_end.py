@@ -10,7 +10,7 @@ import pytest
 
 from psd_deflection.config import Rig, replace_values
 from psd_deflection.runner.session import Session
-from test.runner.conftest import WAIT_S
+from test.heard import WAIT_S
 
 ALLOWED_S = 2.0
 

@@ -26,7 +26,7 @@ def test_a_signal_ends_the_waiting_for_a_silent_device(
     before = signal.getsignal(number)
 
     def end() -> None:
-        device.greeted.wait(30.0)
+        device.greeted.wait(60.0)
         os.kill(os.getpid(), number)
 
     threading.Thread(target=end, daemon=True).start()
@@ -51,7 +51,7 @@ def test_a_signal_ends_the_waiting_for_one_that_is_away(device: Any, sample: Any
             threading.Thread(target=end, daemon=True).start()
 
     def end() -> None:
-        device.greeted.wait(30.0)
+        device.greeted.wait(60.0)
         os.kill(os.getpid(), signal.SIGINT)
 
     sent: list[int] = []

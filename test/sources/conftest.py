@@ -25,6 +25,7 @@ from psd_deflection.io.sources import dataq, text_lines, thorlabs
 from psd_deflection.records import FloatArray
 from psd_deflection.runner import acquisition
 from psd_deflection.runner.acquisition import Acquisition, Chunk
+from test.heard import WAIT_S
 
 
 def no_load(_: int, n: int) -> FloatArray:
@@ -157,14 +158,14 @@ class Run:
         """The next chunks until ``n`` samples have come."""
         chunks: list[Chunk] = []
         while sum(len(c.raw.seq) for c in chunks) < n:
-            item = self.acquisition.queue.get(timeout=60.0)
+            item = self.acquisition.queue.get(timeout=WAIT_S)
             if isinstance(item, Chunk):
                 chunks.append(item)
         return chunks
 
     def heard(self, text: str) -> str:
         while True:
-            message = self.said.get(timeout=60.0)
+            message = self.said.get(timeout=WAIT_S)
             if text in message:
                 return message
 

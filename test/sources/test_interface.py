@@ -23,6 +23,7 @@ from psd_deflection.io.sources.contract_frames import ContractFrames
 from psd_deflection.protocol.frames import BadFrame, HelloFrame
 from psd_deflection.records import CHANNELS
 from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Item
+from test.heard import WAIT_S
 
 VOLTS = (0.1, 0.2, 5.0, 0.3, 0.4, 5.0)
 
@@ -95,7 +96,7 @@ def run(acquisition: Acquisition) -> list[Item]:
     acquisition.start()
     items: list[Item] = []
     while not items or not isinstance(items[-1], Ended):
-        items.append(acquisition.queue.get(timeout=60.0))
+        items.append(acquisition.queue.get(timeout=WAIT_S))
     acquisition.stop()
     return items
 
@@ -217,9 +218,9 @@ def test_a_run_that_ends_waits_for_no_source(monkeypatch: pytest.MonkeyPatch, gi
     source.script = [PortClosedError('scripted: gone')]
     acquisition.open()
     acquisition.start()
-    assert waiting.wait(60.0)
+    assert waiting.wait(WAIT_S)
     acquisition.stop()
-    assert isinstance(acquisition.queue.get(timeout=60.0), Ended)
+    assert isinstance(acquisition.queue.get(timeout=WAIT_S), Ended)
     hangs = ['scripted: the source hangs; it is not waited for']
     assert said[said.index('scripted: gone; waiting for it to come back') + 1 :] == ([] if gives_up else hangs)
     over.set()
@@ -248,6 +249,6 @@ def test_each_of_ours_gives_up_waiting(name: str, tmp_path: Path, monkeypatch: p
         thread.join(0.05)
         if not thread.is_alive():
             break
-    assert 'given up' in str(outcome.get(timeout=60.0))
+    assert 'given up' in str(outcome.get(timeout=WAIT_S))
     for one in ports:
         one.close()

@@ -15,6 +15,7 @@ from psd_deflection.io.sources._interface import Sample, SourceEndedError
 from psd_deflection.io.sources._registry import make_source
 from psd_deflection.io.sources.replay import Pacer, Replay
 from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended
+from test.heard import WAIT_S
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
 
@@ -94,7 +95,7 @@ def test_the_reader_ends_with_the_recording(tmp_path: Path) -> None:
     acquisition.start()
     items: list[Any] = []
     while not items or not isinstance(items[-1], Ended):
-        items.append(acquisition.queue.get(timeout=60.0))
+        items.append(acquisition.queue.get(timeout=WAIT_S))
     acquisition.stop()
     assert sum(len(i.raw.seq) for i in items if isinstance(i, Chunk)) == 100
     assert any('at its end' in s for s in said)

@@ -7,7 +7,8 @@ import pytest
 from psd_deflection.config import load_rig
 from psd_deflection.errors import ConfigError, DeviceError
 from psd_deflection.runner.session import Session
-from test.runner.conftest import WAIT_S, Estimates
+from test.heard import WAIT_S
+from test.runner.conftest import Estimates
 
 SLOW: dict[str, object] = {'converter.sample_rate_hz': 25.0, 'block_size': 2, 'min_samples': 1}
 
