@@ -42,6 +42,7 @@ TOKEN_HEADER = 'X-Monitor-Token'
 
 PUMP_S = 0.03
 SPECTRUM_S = 0.5
+HEALTH_S = 0.9
 HISTORY_S = 60.0
 MESSAGES = 50
 BROWSERS = 16
@@ -86,6 +87,8 @@ class MonitorServer:
         self._messages: deque[tuple[int, float, str]] = deque(maxlen=MESSAGES)
         self._message_count = 0
         self._health: tuple[int, str] = (0, 'null')
+        self._report: DiagnosticReport | None = None
+        self._report_at = 0.0
         self._spectrum = Spectrum(source.rig)
         self._density: tuple[int, str] = (0, 'null')
         self._browsers: dict[web.WebSocketResponse, asyncio.Event] = {}
@@ -209,8 +212,11 @@ class MonitorServer:
             await asyncio.sleep(1.0)
 
     def _take_health(self) -> None:
-        report = self._source.health(time.time_ns())
-        self._health = (self._health[0] + 1, self._health_json(report))
+        now = time.monotonic()
+        if self._report is None or now - self._report_at >= HEALTH_S:
+            # A report tells of the time since the last one: of a moment, it would say that nothing came.
+            self._report, self._report_at = self._source.health(time.time_ns()), now
+        self._health = (self._health[0] + 1, self._health_json(self._report))
         self._wake()
 
     def _wake(self) -> None:

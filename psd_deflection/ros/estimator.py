@@ -84,6 +84,7 @@ class EstimatorNode:
         self.finished = False
         self._signals = signals
         self._starting = False
+        self._alone = True
         self._health: HealthReporter | None = None
         self._monitor: MonitorServer | None = None
         try:
@@ -283,7 +284,15 @@ class EstimatorNode:
         response.message = f'{verb} {folder}' if folder is not None else 'no recording was made'
         return response
 
+    def _look_for_others(self) -> None:
+        (topic,) = self._wire.names((DEFLECTION,))
+        alone = self.node.count_publishers(topic) <= 1
+        if self._alone and not alone:
+            self._say(f'another node publishes on {topic} too: start one of them in a namespace (-r __ns:=/NAME)')
+        self._alone = alone
+
     def _report(self) -> None:
+        self._look_for_others()
         now = time.time_ns()
         if self.session is not None and self._health is not None:
             # The page may have taken a zero as well.

@@ -31,12 +31,14 @@ class StillSource:
         self.zeros = 0
         self.recordings: list[str | None] = []
         self.refusal = ''
+        self.reports = 0
         self.acted = threading.Event()
 
     def describe(self) -> dict[str, Any]:
         return {'kind': 'live', 'name': 'test', 'recording': self.recordings[-1] if self.recordings else None}
 
     def health(self, t_ns: int) -> DiagnosticReport:
+        self.reports += 1
         return DiagnosticReport(
             t_ns, (DiagnosticEntry('psd_deflection: acquisition', 0, 'samples flow', (('rate (samples/s)', '1000'),)),)
         )

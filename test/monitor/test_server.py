@@ -13,6 +13,7 @@ import pytest
 
 from psd_deflection.config import load_rig
 from psd_deflection.errors import ConfigError
+from psd_deflection.monitor import server
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.monitor.server import BROWSERS, CONNECTIONS, MonitorServer
 from psd_deflection.records import BlockStatus
@@ -238,6 +239,19 @@ def test_one_browser_too_many_is_told_why(serve: Serve) -> None:
             return told.data, told.extra or ''
 
     assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == (1013, '16 browsers look on already')
+
+
+def test_a_browser_that_comes_between_two_reports_is_shown_the_last(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, 'HEALTH_S', 1e6)
+    serving = serve(monitor_control=True)
+    for _ in range(2):
+        messages = listen(serving.url, lambda m: 'health' in m)
+        assert messages[-1]['health']['entries'][0]['message'] == 'samples flow'
+        assert ask(serving.url + 'api/record', body={'record': True})[0] == 200
+    assert messages[-1]['health']['recording'] == 'recordings/test'
+    assert serving.source.reports == 1
 
 
 def test_on_the_network_the_buttons_need_the_token(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:

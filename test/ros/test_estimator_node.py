@@ -222,6 +222,9 @@ def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start:
     # What the terminal shows is on /rosout as well.
     said = 'publishing on ROS domain'
     peer.until(lambda: any(m.name == 'left.estimator' and m.msg.startswith(said) for m in log), 'its log')
+    # Whose estimates would be mixed with somebody else's hears of it.
+    peer.node.create_publisher(PoseStamped, '/left/link_tip/deflection', 10)
+    assert daemon.said('another node publishes on /left/link_tip/deflection too')
     # A zero that the page takes can be read where one that ROS takes can.
     url = daemon.said('monitor: http').split()[1]
     headers = {'Content-Type': 'application/json'}
