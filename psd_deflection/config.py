@@ -222,6 +222,8 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
         )
     if v['min_samples'] > v['block_size']:
         raise ConfigError(f'{source}: min_samples = {v["min_samples"]}: must be at most block_size = {v["block_size"]}')
+    if v['sum_min'] >= v['sum_max']:
+        raise ConfigError(f'{source}: sum_min = {v["sum_min"]} V: must be less than sum_max = {v["sum_max"]} V')
     if v['solver'] not in v['solvers']:
         v['solvers'] = [v['solver'], *v['solvers']]
         got['solvers'] = v['solvers']

@@ -27,6 +27,7 @@ def test_the_shipped_rig_file_is_the_default() -> None:
         ('psd_1.center', [1.0], '2 elements'),
         ('psd_1.center', 'here', 'list'),
         ('link.inner_radius', 0.02, 'link.outer_radius'),
+        ('sum_min', 8.0, 'less than sum_max = 7.5 V'),
         ('link.lenght', 1.0, 'did you mean link.length'),
         ('wls.weights', 'mine', 'inverse_variance, thesis'),
         ('record', 'yes', 'true or false'),

@@ -190,7 +190,7 @@ def test_parameters_have_units_and_ranges_and_are_refused_by_name(start: Callabl
     assert not put('sum_min', -1.0).successful
     assert not put('link.length', 2.0).successful
     # A level above what the lasers give: they count as lost, and the estimates stop.
-    assert put('sum_min', 9.0).successful
+    assert put('sum_min', 6.0).successful
     health = peer.collect(DiagnosticArray, '/diagnostics')
 
     def lost() -> bool:
