@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 from pathlib import Path
 
 import pytest
@@ -40,6 +42,17 @@ def test_tables(capsys: pytest.CaptureFixture[str]) -> None:
         assert sum(line.startswith(cause.label + ' ') for line in lines) == 1
     (alone,) = (line for line in lines if line.startswith('the algorithms alone'))
     assert alone.split()[3:] == ['-8.6', '84.9', '0.0', '|', '-0.4', '19.2', '-0.5']
+
+
+def test_programs_get_the_errors_in_si_units(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['compare-methods', '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert list(found) == [m.label for m in METHODS]
+    cantilever = found['exact (default)']['cantilever tilts']
+    assert cantilever['rms'] == pytest.approx([3.34e-6, 2.67e-6, math.radians(1.83e-3)], rel=2e-3)
+    assert cantilever['largest'] == pytest.approx([8.98e-6, 6.30e-6, math.radians(3.32e-3)], rel=2e-3)
+    silent = max(condition['silent'] for condition in found['Appendix D iterative'].values())
+    assert silent == pytest.approx(0.058, abs=5e-4)
 
 
 def test_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 from pathlib import Path
 
 import pytest
@@ -33,11 +35,22 @@ def test_a_rigs_placement_is_compared(capsys: pytest.CaptureFixture[str]) -> Non
     assert rows['this rig, two sensors'][-1] == 'unseen'
 
 
+def test_programs_get_the_same_placements_in_si_units(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['design', '--params-file', RIG, '--sigma', '2e-6', '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    own, _, best = found['placements']
+    assert own['centers'] == [[0.0, 0.07], [-0.1, 0.0]]
+    assert own['sd'] == pytest.approx({'dx': 1.630e-6, 'dy': 1.828e-6, 'theta': math.radians(1.328e-3)}, rel=1e-3)
+    assert best['sd'] == pytest.approx({'dx': 1.414e-6, 'dy': 1.414e-6, 'theta': math.radians(0.810e-3)}, rel=1e-3)
+
+
 def test_sensors_on_one_spot_are_unseen_not_a_crash(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = tmp_path / 'rig.yaml'
     rig.write_text('/**:\n  ros__parameters:\n    psd_2:\n      center: [0.0, 0.07]\n')
     assert main(['design', '--params-file', str(rig)]) == 0
     assert 'unseen' in capsys.readouterr().out
+    assert main(['design', '--params-file', str(rig), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['placements'][0]['sd'] == {'dx': None, 'dy': None, 'theta': None}
 
 
 @pytest.mark.parametrize('name', ['plan.png', 'plan.svg'])

@@ -7,17 +7,20 @@ Then come noise, condition and error bound of the linear methods, and Table 5.1 
 
   psd-deflection compare-methods
   psd-deflection compare-methods --out figures
+  psd-deflection compare-methods --json
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from psd_deflection.cli._report import print_json
 from psd_deflection.errors import RecordingError
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers import Geometry, make_solver
@@ -46,6 +49,7 @@ _UNITS = (1e6, 1e6, _MDEG_PER_RAD)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('--out', metavar='DIR', help='draw the figures into this folder')
+    parser.add_argument('--json', action='store_true', help='the errors of every method as JSON in SI units')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -55,14 +59,29 @@ def run(args: argparse.Namespace) -> int:
             Path(args.out).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise RecordingError(f'--out {args.out}: cannot be made a folder ({error.strerror or error})') from None
-    print('\n'.join([*error_table(), '', *linear_table(), '', *cause_table()]))
+    if args.json:
+        print_json(figures())
+    else:
+        print('\n'.join([*error_table(), '', *linear_table(), '', *cause_table()]))
     if args.out is not None:
         # matplotlib takes a second to import; who only reads the tables need not wait for it.
         from psd_deflection.cli._method_figures import draw_all
 
         for path in draw_all(Path(args.out)):
-            print(f'wrote {path}')
+            print(f'wrote {path}', file=sys.stderr if args.json else sys.stdout)
     return 0
+
+
+def figures() -> dict[str, dict[str, dict[str, object]]]:
+    """Method to condition to its errors, dX, dY in m and theta in rad; ``silent``: the share without an answer."""
+    return {
+        method.label: {
+            condition: {'rms': list(e.rms), 'largest': list(e.largest), 'silent': e.silent}
+            for condition in CONDITIONS
+            for e in [errors(method, condition)]
+        }
+        for method in METHODS
+    }
 
 
 def error_table() -> list[str]:

@@ -6,6 +6,7 @@ best conditioned inside the room that --radius, --keep-out and --box leave (m, i
 
   psd-deflection design
   psd-deflection design --params-file config/thesis_rig.yaml --out placement.png
+  psd-deflection design --params-file config/thesis_rig.yaml --json
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from psd_deflection.cli._options import PICTURES, given_as_option, need_folder, picture_name, refuse
-from psd_deflection.cli._report import columns, save_figure
+from psd_deflection.cli._report import columns, print_json, save_figure
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import UsageError
 from psd_deflection.mechanics import LinkStatics, placement, scaling
@@ -52,12 +53,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--box', type=float, nargs=4, metavar=('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX'), help='and inside this box, m'
     )
     parser.add_argument('--out', type=picture_name(*PICTURES), metavar='FILE.png|svg|pdf', help='draw the placements')
+    parser.add_argument('--json', action='store_true', help='of a rig: link and placements as JSON in SI units')
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the tables or the study."""
     if args.params_file is None:
-        placing = {'out': None, 'sigma': None, 'radius': None, 'keep_out': 0.0, 'box': None}
+        placing = {'out': None, 'sigma': None, 'radius': None, 'keep_out': 0.0, 'box': None, 'json': False}
         refuse(args, placing, 'is for the placement of a rig: give --params-file RIG.yaml')
         print(appendix_b())
         return 0
@@ -73,6 +75,11 @@ def run(args: argparse.Namespace) -> int:
     with given_as_option():
         room = placement.Room(radius, args.keep_out, tuple(args.box) if args.box else None)
         candidates = placements(rig, room)
+    if args.out is not None:
+        draw(candidates, room, rig, Path(args.out))
+    if args.json:
+        print_json({**figures(rig, candidates, sigma), 'out': args.out})
+        return 0
     print(link_text(rig))
     print()
     print(placement_text(candidates, sigma))
@@ -81,7 +88,6 @@ def run(args: argparse.Namespace) -> int:
     print()
     print(tied_text(rig, candidates[-1].centers, sigma))
     if args.out is not None:
-        draw(candidates, room, rig, Path(args.out))
         print(f'\n{args.out}')
     return 0
 
@@ -170,18 +176,49 @@ def link_text(rig: Rig) -> str:
     )
 
 
+def figures(rig: Rig, candidates: list[Candidate], sigma: float) -> dict[str, Any]:
+    """The link and its placements for programs: m, N, rad; no number for what cannot be seen."""
+    statics = LinkStatics.from_rig(rig)
+    bend, _, twist = np.diag(statics.compliance).tolist()
+    return {
+        'link': {
+            'bending_stiffness': statics.bending_stiffness,
+            'torsional_stiffness': statics.torsional_stiffness,
+            'tip_compliance': {'bending': bend, 'torsion': twist},
+            'torsion_to_bending_ratio': scaling.torsion_to_bending_ratio(
+                rig.link.youngs_modulus, rig.link.shear_modulus
+            ),
+        },
+        'sigma': sigma,
+        'placements': [
+            {
+                'name': name,
+                'centers': centers.tolist(),
+                'sd': _spread(centers, sigma)._asdict(),
+            }
+            for name, centers in candidates
+        ],
+    }
+
+
+def _spread(centers: FloatArray, sigma: float) -> placement.Spread:
+    """Infinite where both sensors are at one place: they see no twist then, and nothing that it moves."""
+    if math.dist(centers[0], centers[1]) > 0.0:
+        return placement.spread_of_pair(centers, sigma)
+    return placement.Spread(math.inf, math.inf, math.inf)
+
+
 def placement_text(candidates: list[Candidate], sigma: float) -> str:
     """Spreads and condition numbers, and how much the best one gains."""
     head = ['placement', 'c1 mm', 'c2 mm', 'dX um', 'dY um', 'theta mdeg', 'cond (0.1 m rad)', 'cond (m, rad)']
     rows = [head]
     spreads = []
     for name, centers in candidates:
-        if not math.dist(centers[0], centers[1]) > 0.0:
-            rows.append([name, *_places(centers), *['unseen'] * 3, 'inf', 'inf'])
-            spreads.append(placement.Spread(math.inf, math.inf, math.inf))
-            continue
-        s = placement.spread_of_pair(centers, sigma)
+        s = _spread(centers, sigma)
         spreads.append(s)
+        if not math.isfinite(s.theta):
+            rows.append([name, *_places(centers), *['unseen'] * 3, 'inf', 'inf'])
+            continue
         design = placement.design_matrix(centers)
         in_metres, scaled = placement.condition(design, 1.0).two, placement.condition(design).two
         theta = f'{math.degrees(s.theta) * 1e3:.3f}'
