@@ -10,6 +10,7 @@ import contextlib
 import errno
 import os
 import select
+import sys
 import termios
 from pathlib import Path
 
@@ -47,9 +48,9 @@ class SerialPort:
             raise DeviceError(f'{name}: cannot be opened at {baud} baud ({error})') from None
         self._fd = self._serial.fileno()
         self._empty_reads = 0
-        if hasattr(self._serial, 'set_low_latency_mode'):
-            # Only some drivers have a latency timer to shorten.
-            with contextlib.suppress(OSError, ValueError, NotImplementedError):
+        if sys.platform == 'linux':
+            # Only some drivers have a latency timer to shorten; of the others pyserial makes a ValueError.
+            with contextlib.suppress(ValueError):
                 self._serial.set_low_latency_mode(True)
         self.discard_input()
 
