@@ -1,11 +1,14 @@
-"""Records of every kind, made up for the tests of recordings."""
+"""Records of every kind, made up for the tests of recordings; files of them, and whether they came back."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from psd_deflection.io.bag_writer import McapFile
 from psd_deflection.records import (
     AppliedLoad,
     BlockStatus,
@@ -22,6 +25,7 @@ from psd_deflection.records import (
 
 T0 = 1_760_000_000_123_456_789
 STEP = 1_000_000
+HELLO = {'serial': 'A1', 'sample_rate_hz': 1000}
 
 
 def block(index: int, *, lost: tuple[int, ...] = (), flags: int = 0, t0: int = T0, first_index: int = 0) -> SampleBlock:
@@ -62,3 +66,23 @@ def run(blocks: int) -> Iterator[Record]:
         if i % 50 == 49:
             entry = DiagnosticEntry('psd_deflection: samples', 1, '2 lost', (('rate', '998.0'),))
             yield DiagnosticReport(T0 + 20 * STEP * i, (entry,))
+
+
+def same_block(a: SampleBlock, b: SampleBlock) -> bool:
+    return (
+        a.index == b.index
+        and all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ('seq', 't_ns', 'volts', 'flags'))
+        and all(getattr(a, n).dtype == getattr(b, n).dtype for n in ('seq', 't_ns', 'volts', 'flags'))
+    )
+
+
+def assert_same(got: Sequence[SampleBlock], expected: Sequence[SampleBlock]) -> None:
+    assert [b.index for b in got] == [b.index for b in expected]
+    assert all(same_block(a, b) for a, b in zip(got, expected, strict=True))
+
+
+def write_mcap(path: Path, records: Sequence[Record], **kwargs: Any) -> Path:
+    with McapFile(path, rig_values=kwargs.pop('rig_values', {}), **kwargs) as out:
+        for r in records:
+            out.write(r)
+    return path
