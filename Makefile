@@ -102,7 +102,7 @@ SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 firmware: $(VENV)/.installed
 	(command -v arm-none-eabi-gcc && command -v qemu-system-arm) || ($(SUDO) apt-get update -qq && $(SUDO) apt-get install -y -qq --no-install-recommends gcc-arm-none-eabi qemu-system-arm)
 	$(MAKE) -C docs/firmware OUT=$(CURDIR)/build/firmware
-	$(BIN)/python docs/firmware/check.py build/firmware/psd_synthetic.elf
+	$(BIN)/python tools/check_firmware.py build/firmware/psd_synthetic.elf
 
 golden: $(VENV)/.installed
 	$(BIN)/python bags/make.py
@@ -114,11 +114,11 @@ docs: $(VENV)/.installed
 
 SHOT_SECONDS ?= 40
 shots: $(VENV)/.installed
-	$(BIN)/python docs/shots.py --seconds $(SHOT_SECONDS)
+	$(BIN)/python tools/shots.py --seconds $(SHOT_SECONDS)
 
 # Each command of README and docs that the tests do not run themselves; ONLY='monitor' for those with that word, or on a page with it.
 doc-commands: $(VENV)/.installed
-	$(BIN)/python -m docs.run_commands $(ONLY)
+	$(BIN)/python -m tools.run_commands $(ONLY)
 
 # In an environment of its own, without ROS: the wheel made from the sdist, as `pip install dist/*.whl` has it.
 wheel: $(VENV)/.installed
@@ -136,7 +136,7 @@ RERUN ?=
 rerun:
 	test -x build/rerun/use/bin/rerun || ($(PYTHON) -m venv build/rerun/use && build/rerun/use/bin/pip install --quiet --disable-pip-version-check '.[rerun]')
 	build/rerun/use/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall .
-	build/rerun/use/bin/python docs/check_rerun.py bags/clean bags/laser_off bags/lost_samples --out build/rerun $(RERUN)
+	build/rerun/use/bin/python tools/check_rerun.py bags/clean bags/laser_off bags/lost_samples --out build/rerun $(RERUN)
 
 # Truth hidden by a second generator: fresh seeds, both cores with JOBS=2; a run that was stopped goes on.
 JOBS ?= $(shell nproc)

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from psd_deflection.config import Rig, load_rig
-from psd_deflection.io.bag_writer import BagWriter
-from psd_deflection.io.simulated_device import SimulatedDevice
+from psd_deflection.devices.simulated_device import SimulatedDevice
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.protocol.frames import FrameDecoder, HelloFrame, SampleFrame
+from psd_deflection.recordings.bag_writer import BagWriter
 from psd_deflection.records import FloatArray, RawChunk
 from psd_deflection.simulation.loads import LoadHistory, direct, sidebar, steps
 

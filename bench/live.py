@@ -121,7 +121,7 @@ class Device:
 
     def __init__(self) -> None:
         from psd_deflection.config import load_rig
-        from psd_deflection.io.simulated_device import PseudoTerminal, SimulatedDevice
+        from psd_deflection.devices.simulated_device import PseudoTerminal, SimulatedDevice
 
         self.port = PseudoTerminal()
         self.device = SimulatedDevice(load_rig(), lambda _, n: np.zeros((n, 3)))
@@ -247,8 +247,8 @@ def live(seconds: float, settle: float, rounds: int) -> None:
 def make_recording(folder: Path, minutes: float) -> tuple[Path, int]:
     """Ten minutes as the daemon would have recorded them, without waiting for them."""
     from psd_deflection.config import load_rig
-    from psd_deflection.io.bag_writer import BagWriter
     from psd_deflection.pipeline import Pipeline
+    from psd_deflection.recordings.bag_writer import BagWriter
     from psd_deflection.records import RawChunk
     from psd_deflection.simulation.loads import CyclicLoads, thesis_load_cases
     from psd_deflection.simulation.simulator import RigSimulator
@@ -273,8 +273,8 @@ def replay(minutes: float) -> None:
     from mcap.reader import make_reader
 
     from psd_deflection.cli.replay import replayed, rig_of
-    from psd_deflection.io.recordings import open_recording
     from psd_deflection.pipeline import Pipeline
+    from psd_deflection.recordings.opening import open_recording
 
     with tempfile.TemporaryDirectory() as folder:
         path, n = make_recording(Path(folder), minutes)

@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers import SOLVERS, Solver, make_solver
-from psd_deflection.solvers.comparison import VARIANCES, dots_of, thesis_geometry
+from psd_deflection.thesis.comparison import VARIANCES, dots_of, thesis_geometry
 
 STEP = np.radians(0.01)
 

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from psd_deflection.discovery.adapter import Model, PlantDiscovery, PlantEffect, discover_in
+from blind.adapter import Model, PlantDiscovery, PlantEffect, discover_in
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.catalogue import EffectParameter
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from psd_deflection.config import Rig
     from psd_deflection.discovery.discover import Discovery
-    from psd_deflection.io.recording import Recording
+    from psd_deflection.recordings.recording import Recording
 
 __version__ = '0.1.0'
 
@@ -24,7 +24,7 @@ def open(path: str | Path) -> Recording:
     Raises :class:`psd_deflection.errors.RecordingError` where it cannot be read.
     """
     # Only here, so that `import psd_deflection` stays light.
-    from psd_deflection.io.recordings import open_recording
+    from psd_deflection.recordings.opening import open_recording
 
     return open_recording(path)
 
@@ -42,7 +42,7 @@ def discover(recordings: Sequence[str | Path], rig: Rig | str | Path | None = No
 
     from psd_deflection.config import load_rig
     from psd_deflection.discovery.discover import discover as of_observations
-    from psd_deflection.io.observations import read_observations
+    from psd_deflection.recordings.observations import read_observations
 
     known = load_rig(rig) if isinstance(rig, str | Path) else rig
     return of_observations(read_observations(recordings, known), known, seed=seed)

@@ -38,8 +38,8 @@ from psd_deflection.records import (
 )
 from psd_deflection.simulation.correction import Correction
 from psd_deflection.solvers import solver_from_rig
-from psd_deflection.solvers._interface import SolverStatus
-from psd_deflection.solvers._rig import geometry_from_rig
+from psd_deflection.solvers.from_rig import geometry_from_rig
+from psd_deflection.solvers.interface import SolverStatus
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 from psd_deflection.solvers.one_psd import OnePsd
 

@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from msg_adapters import DIAGNOSTICS, INPUTS, TOPIC_TYPES
-from psd_deflection.io import cdr
-from psd_deflection.io.recordings import open_recording
+from psd_deflection.recordings import cdr
+from psd_deflection.recordings.opening import open_recording
 
 ROOT = Path(__file__).parent.parent
 CONFIG = ROOT / 'config'

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from docs.ros2 import launched
 from psd_deflection import __version__
 from psd_deflection.cli.main import COMMANDS
 from psd_deflection.config import read_parameter_file, rig_from_values
+from tools.ros2 import launched
 
 ROOT = Path(__file__).parent.parent
 EXECUTABLES = ('estimator', 'replay', 'simulate', 'discover')

@@ -87,9 +87,9 @@ def bag_target() -> tuple[Target, list[bytes]]:
     """A lone ``.mcap``: everything that a command may ask of it; and ``recover``."""
     from psd_deflection.config import load_rig
     from psd_deflection.errors import PsdDeflectionError
-    from psd_deflection.io.bag_writer import McapFile
-    from psd_deflection.io.recordings import open_recording
-    from psd_deflection.io.recover import recover
+    from psd_deflection.recordings.bag_writer import McapFile
+    from psd_deflection.recordings.opening import open_recording
+    from psd_deflection.recordings.recover import recover
     from psd_deflection.records import AppliedLoad
 
     def read(path: Path) -> None:
@@ -118,7 +118,7 @@ def bag_target() -> tuple[Target, list[bytes]]:
 def csv_target() -> tuple[Target, list[bytes]]:
     """A CSV recording."""
     from psd_deflection.errors import PsdDeflectionError
-    from psd_deflection.io.recordings import open_recording
+    from psd_deflection.recordings.opening import open_recording
 
     def read(path: Path) -> None:
         for ask in ('blocks', 'loads', 'references', 'temperatures'):

@@ -30,8 +30,7 @@ import numpy as np
 
 from bench.campaign.line import hello_of
 from psd_deflection.config import load_rig
-from psd_deflection.io.recordings import open_recording
-from psd_deflection.io.simulated_device import PseudoTerminal
+from psd_deflection.devices.simulated_device import PseudoTerminal
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.protocol.frames import (
     FrameDecoder,
@@ -43,6 +42,7 @@ from psd_deflection.protocol.frames import (
     StatusFrame,
     encode,
 )
+from psd_deflection.recordings.opening import open_recording
 from psd_deflection.records import IntArray
 from psd_deflection.runner.acquisition import Acquisition, Chunk
 

@@ -25,7 +25,7 @@ from psd_deflection.errors import RecordingError
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers import Geometry, make_solver
 from psd_deflection.solvers._linear import condition_number, design_matrix, error_bound
-from psd_deflection.solvers.comparison import (
+from psd_deflection.thesis.comparison import (
     CAUSES,
     CONDITIONS,
     DIRECT,
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         print('\n'.join([*error_table(), '', *linear_table(), '', *cause_table()]))
     if args.out is not None:
         # matplotlib takes a second to import; who only reads the tables need not wait for it.
-        from psd_deflection.cli._method_figures import draw_all
+        from psd_deflection.thesis.figures import draw_all
 
         for path in draw_all(Path(args.out)):
             print(f'wrote {path}', file=sys.stderr if args.json else sys.stdout)

@@ -25,12 +25,12 @@ from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json
 from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.config import EFFECTS_PREFIX, load_rig
-from psd_deflection.io.bag_writer import BagWriter, McapFile
-from psd_deflection.io.csv_writer import CsvSampleSink
-from psd_deflection.io.recording import Recording
-from psd_deflection.io.recordings import open_recording
-from psd_deflection.io.rerun_writer import RerunFile
 from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.bag_writer import BagWriter, McapFile
+from psd_deflection.recordings.csv_writer import CsvSampleSink
+from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.rerun_writer import RerunFile
 from psd_deflection.records import AppliedLoad, ParameterChange, ReferencePose, SampleBlock, TemperatureReading
 
 Convertible = SampleBlock | ParameterChange | AppliedLoad | ReferencePose | TemperatureReading

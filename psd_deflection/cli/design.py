@@ -22,9 +22,10 @@ from psd_deflection.cli._options import PICTURES, given_as_option, need_folder, 
 from psd_deflection.cli._report import columns, print_json, save_figure
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import UsageError
-from psd_deflection.mechanics import LinkStatics, placement, scaling
+from psd_deflection.mechanics import LinkStatics, placement
 from psd_deflection.mechanics.section import TubeSection
 from psd_deflection.records import FloatArray
+from psd_deflection.thesis import scaling
 
 TILTED = np.array([0.0, 0.0, 0.0, math.radians(0.3), math.radians(0.1)])
 """Where observability of tilt is stated: phi 0.3 deg, omega 0.1 deg. At rest coplanar sensors see none."""

@@ -16,8 +16,8 @@ from dataclasses import asdict
 
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json
+from psd_deflection.devices.survey import Port, survey
 from psd_deflection.errors import DeviceError
-from psd_deflection.io.port_survey import Port, survey
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -31,7 +31,7 @@ from psd_deflection.discovery.discover import discover
 from psd_deflection.discovery.report import report_html
 from psd_deflection.discovery.result import model_yaml, result, sentence
 from psd_deflection.errors import RecordingError, UsageError
-from psd_deflection.io.observations import read_observations
+from psd_deflection.recordings.observations import read_observations
 from psd_deflection.simulation.catalogue import catalogue
 
 STEPS = 8

@@ -30,8 +30,8 @@ from pathlib import Path
 from psd_deflection.cli._options import given_as_option
 from psd_deflection.cli._program import program
 from psd_deflection.config import Rig, read_parameter_file, rig_from_values
+from psd_deflection.devices.registry import source_names
 from psd_deflection.errors import ConfigError, UsageError
-from psd_deflection.io.sources._registry import source_names
 from psd_deflection.monitor.start import start_monitor
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import SIMULATED, Session

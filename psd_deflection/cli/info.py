@@ -17,9 +17,9 @@ from typing import Any
 from msg_adapters import DEFLECTION, LOAD, SAMPLES
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json
-from psd_deflection.io.recording import Recording
-from psd_deflection.io.recordings import open_recording
 from psd_deflection.parameters import BY_NAME
+from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.recording import Recording
 
 _EPOCH_FROM_NS = 10**18
 """September 2001; smaller times count from a zero of their own."""

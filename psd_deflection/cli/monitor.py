@@ -28,11 +28,11 @@ from psd_deflection.cli.estimator import Display, run_without_ros, simulates
 from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.config import read_parameter_file, replace_values, rig_from_values
 from psd_deflection.errors import UsageError
-from psd_deflection.io.recordings import open_recording
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.monitor.source import ReplaySource
 from psd_deflection.monitor.start import need_server
 from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.opening import open_recording
 from psd_deflection.records import Record
 from psd_deflection.runner.session import Session
 from psd_deflection.runner.simulated_rig import started_early

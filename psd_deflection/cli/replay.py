@@ -24,11 +24,11 @@ from psd_deflection.cli._options import recording_name
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json
 from psd_deflection.config import Rig, load_rig, rig_from_values
-from psd_deflection.io.comparison import Comparison
-from psd_deflection.io.recording import Recording
-from psd_deflection.io.recordings import open_recording
-from psd_deflection.io.sinks import Sink, open_sink
 from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.comparison import Comparison
+from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.sinks import Sink, open_sink
 from psd_deflection.records import ENVIRONMENT, DeflectionEstimate, RawChunk, Record, SampleBlock
 
 DIFFERS = 1

@@ -15,11 +15,11 @@ from collections.abc import Callable, Sequence
 from psd_deflection.cli._options import given_as_option, number, whole
 from psd_deflection.cli._program import program
 from psd_deflection.config import Rig, load_rig, rig_from_values
+from psd_deflection.devices.simulated_dataq import SimulatedDataq
+from psd_deflection.devices.simulated_device import LineDevice, PseudoTerminal, SimulatedDevice, serve
+from psd_deflection.devices.simulated_lines import SimulatedLines
+from psd_deflection.devices.simulated_thorlabs import SharedRig, SimulatedAligner
 from psd_deflection.errors import ConfigError
-from psd_deflection.io.simulated_dataq import SimulatedDataq
-from psd_deflection.io.simulated_device import LineDevice, PseudoTerminal, SimulatedDevice, serve
-from psd_deflection.io.simulated_lines import SimulatedLines
-from psd_deflection.io.simulated_thorlabs import SharedRig, SimulatedAligner
 from psd_deflection.records import FloatArray
 from psd_deflection.runner.session import SIMULATED
 from psd_deflection.runner.simulated_rig import PORT_LINE

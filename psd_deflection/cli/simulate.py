@@ -25,10 +25,10 @@ from psd_deflection.cli._options import given_as_option, recording_name, refuse,
 from psd_deflection.cli._report import print_json
 from psd_deflection.config import EFFECTS_PREFIX, Rig, load_rig, replace_values
 from psd_deflection.errors import ConfigError, UsageError
-from psd_deflection.io.bag_writer import BagWriter, McapFile
-from psd_deflection.io.csv_writer import CsvSampleSink
-from psd_deflection.io.sinks import Sink
 from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.bag_writer import BagWriter, McapFile
+from psd_deflection.recordings.csv_writer import CsvSampleSink
+from psd_deflection.recordings.sinks import Sink
 from psd_deflection.records import (
     AppliedLoad,
     FloatArray,

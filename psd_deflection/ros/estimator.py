@@ -28,8 +28,8 @@ from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters import DEFLECTION, DIAGNOSTICS, INPUTS, TOPIC_TYPES, solver_topic, to_messages
 from psd_deflection.errors import ConfigError, PsdDeflectionError
-from psd_deflection.io import cdr
 from psd_deflection.monitor.start import start_monitor
+from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.parameters import LiveParameters, rig_of_node
 from psd_deflection.ros.wires import InputRecorder, PublisherWire, say_on_rosout

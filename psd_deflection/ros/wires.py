@@ -16,7 +16,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters import DIAGNOSTICS, INPUTS, SAMPLES, TEMPERATURE, TOPIC_TYPES, from_fields
-from psd_deflection.io import cdr
+from psd_deflection.recordings import cdr
 from psd_deflection.records import TemperatureReading
 from psd_deflection.runner.session import Session
 

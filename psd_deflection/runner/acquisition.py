@@ -20,15 +20,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from psd_deflection.config import Rig
-from psd_deflection.errors import DeviceError
-from psd_deflection.io.sources._interface import (
+from psd_deflection.devices.registry import make_source
+from psd_deflection.devices.source import (
     Clock,
     Event,
     Sample,
     Source,
     SourceEndedError,
 )
-from psd_deflection.io.sources._registry import make_source
+from psd_deflection.errors import DeviceError
 from psd_deflection.protocol.frames import (
     BadFrame,
     BadReason,

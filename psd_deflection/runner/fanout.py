@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from msg_adapters import messages
-from psd_deflection.io import cdr
+from psd_deflection.recordings import cdr
 from psd_deflection.records import ParameterChange, Record
 
 

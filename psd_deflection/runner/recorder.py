@@ -18,7 +18,7 @@ from pathlib import Path
 
 from psd_deflection.config import AcquisitionConfig, Rig
 from psd_deflection.errors import RecordingError
-from psd_deflection.io.bag_writer import BagWriter
+from psd_deflection.recordings.bag_writer import BagWriter
 from psd_deflection.records import ParameterChange
 
 MESSAGES_PER_BLOCK = 100

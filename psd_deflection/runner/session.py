@@ -13,8 +13,8 @@ from pathlib import Path
 
 from msg_adapters import TOPIC_TYPES
 from psd_deflection.config import Rig, replace_values
-from psd_deflection.io import cdr
 from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings import cdr
 from psd_deflection.records import ParameterChange
 from psd_deflection.runner.acquisition import Acquisition
 from psd_deflection.runner.fanout import Fanout

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from psd_deflection.errors import SolverError
-from psd_deflection.solvers._interface import Geometry
+from psd_deflection.solvers.interface import Geometry
 
 SMALLEST_BASE_LINE = 1e-6
 """m. Closer beams than a spot's own noise are one beam."""

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._interface import Geometry, Solution, Solutions, SolverStatus
 from psd_deflection.solvers._plane import interleave, split
+from psd_deflection.solvers.interface import Geometry, Solution, Solutions, SolverStatus
 
 
 def design_matrix(geometry: Geometry) -> FloatArray:

@@ -27,9 +27,9 @@ from psd_deflection.errors import ConfigError, SolverError
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers._gauss_newton import fit, fit_many
 from psd_deflection.solvers._geometry import SMALLEST_BASE_LINE, check_twist
-from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver, SolverStatus
 from psd_deflection.solvers._tilted_plate import Row
 from psd_deflection.solvers.beam import slope_per_metre
+from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
 
 Assume = Literal['beam', 'no_twist', 'nothing']
 

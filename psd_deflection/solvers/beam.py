@@ -19,9 +19,9 @@ from psd_deflection.errors import SolverError
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers._gauss_newton import fit, fit_many
 from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver, SolverStatus
 from psd_deflection.solvers._plane import split, turn_onto
 from psd_deflection.solvers._tilted_plate import crossing, crossings
+from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
 
 
 class BeamSolver(Solver):

@@ -26,7 +26,6 @@ import numpy.typing as npt
 from psd_deflection.errors import SolverError
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver, SolverStatus
 from psd_deflection.solvers._plane import (
     interleave,
     positive,
@@ -35,6 +34,7 @@ from psd_deflection.solvers._plane import (
     turn_covariance_many,
     weighted_covariance,
 )
+from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
 
 _MAX_STEPS = 30
 _LAST_STEP = 1e-10

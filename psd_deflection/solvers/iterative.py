@@ -21,8 +21,8 @@ import numpy as np
 
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver, SolverStatus
 from psd_deflection.solvers._plane import Covariance, interleave, split, turn_covariance, turn_covariance_many
+from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
 
 _MAX_TRIALS = 50
 _LAST_STEP = 1e-8

@@ -22,9 +22,9 @@ import numpy as np
 from psd_deflection.errors import SolverError
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver, SolverStatus
 from psd_deflection.solvers._plane import Covariance, split, turn_covariance
 from psd_deflection.solvers.exact import ExactSolver
+from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
 
 _TOO_SHORT = 3.0
 """Standard deviations by which the base line may be shorter than the beams' before we say so."""

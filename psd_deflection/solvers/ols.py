@@ -14,8 +14,8 @@ import numpy as np
 
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver
 from psd_deflection.solvers._linear import FixedGain, design_matrix
+from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver
 
 
 class OlsSolver(Solver):

@@ -19,9 +19,9 @@ import numpy as np
 from psd_deflection.errors import ConfigError, SolverError
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver, SolverStatus
 from psd_deflection.solvers._linear import FixedGain, design_matrix, status_of
 from psd_deflection.solvers._plane import interleave, split, weighted_covariance
+from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
 
 THESIS_ROW_SCALING = (0.03, 0.5, 10.0, 0.1)
 """Po of x1, y1, x2, y2 for the thesis's loads on the sidebar (section 5.5, Figs 5.12-5.20)."""

@@ -20,8 +20,8 @@ from typing import ClassVar
 import numpy as np
 
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._interface import Geometry, Solution, Solutions, Solver, SolverStatus
 from psd_deflection.solvers._plane import split, turn_covariance, turn_covariance_many
+from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
 from psd_deflection.solvers.wls import THESIS_ROW_SCALING, Weights, WlsSolver
 
 

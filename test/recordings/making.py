@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.io.bag_writer import McapFile
+from psd_deflection.recordings.bag_writer import McapFile
 from psd_deflection.records import (
     AppliedLoad,
     BlockStatus,

@@ -25,8 +25,8 @@ from msg_adapters import (
 )
 from msg_adapters.header import header, stamp_ns
 from msg_adapters.orientation import angles, quaternion
-from psd_deflection.io import cdr
-from psd_deflection.io.ros2msg import TYPE_HASHES, definition
+from psd_deflection.recordings import cdr
+from psd_deflection.recordings.ros2msg import TYPE_HASHES, definition
 from psd_deflection.records import (
     CHANNELS,
     AppliedLoad,

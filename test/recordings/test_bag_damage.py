@@ -13,9 +13,9 @@ from mcap.writer import CompressionType, Writer
 
 from msg_adapters import to_messages
 from psd_deflection.errors import RecordingError
-from psd_deflection.io import cdr
-from psd_deflection.io.bag_reader import BagRecording
-from psd_deflection.io.ros2msg import definition
+from psd_deflection.recordings import cdr
+from psd_deflection.recordings.bag_reader import BagRecording
+from psd_deflection.recordings.ros2msg import definition
 from psd_deflection.records import SampleBlock
 
 from .making import HELLO, assert_same, run, write_mcap

@@ -19,10 +19,10 @@ import psd_deflection
 from msg_adapters import LOAD, SAMPLES, to_messages
 from psd_deflection.config import load_rig
 from psd_deflection.errors import RecordingError
-from psd_deflection.io import cdr
-from psd_deflection.io.bag_writer import META_CHANGE, BagWriter, McapFile
-from psd_deflection.io.recordings import open_recording
-from psd_deflection.io.ros2msg import definition
+from psd_deflection.recordings import cdr
+from psd_deflection.recordings.bag_writer import META_CHANGE, BagWriter, McapFile
+from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.ros2msg import definition
 from psd_deflection.records import (
     CHANNELS,
     AppliedLoad,

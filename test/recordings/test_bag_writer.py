@@ -22,8 +22,8 @@ from msg_adapters import TOPIC_TYPES, to_messages
 from psd_deflection import __version__
 from psd_deflection.config import load_rig
 from psd_deflection.errors import RecordingError
-from psd_deflection.io import cdr
-from psd_deflection.io.bag_writer import META_HELLO, META_PARAMETERS, META_SOFTWARE, BagWriter, McapFile
+from psd_deflection.recordings import cdr
+from psd_deflection.recordings.bag_writer import META_HELLO, META_PARAMETERS, META_SOFTWARE, BagWriter, McapFile
 
 from .making import T0, block, run
 

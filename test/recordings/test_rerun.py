@@ -16,12 +16,12 @@ import pytest
 import psd_deflection
 from psd_deflection.cli.main import main
 from psd_deflection.cli.replay import replayed, rig_of
-from psd_deflection.io import rerun_writer
-from psd_deflection.io.rerun_writer import POSE, RerunFile, Row
 from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings import rerun_writer
+from psd_deflection.recordings.rerun_writer import POSE, RerunFile, Row
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
-FIND = 'psd_deflection.io.rerun_writer.importlib.util.find_spec'
+FIND = 'psd_deflection.recordings.rerun_writer.importlib.util.find_spec'
 
 
 @pytest.fixture

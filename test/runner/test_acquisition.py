@@ -15,10 +15,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from psd_deflection.config import Rig, load_rig
+from psd_deflection.devices import contract_frames
+from psd_deflection.devices.serial_port import SerialPort
+from psd_deflection.devices.source import Clock, Event, Reading, Sample, Source, SourceEndedError
 from psd_deflection.errors import DeviceError
-from psd_deflection.io.serial_port import SerialPort
-from psd_deflection.io.sources import contract_frames
-from psd_deflection.io.sources._interface import Clock, Event, Reading, Sample, Source, SourceEndedError
 from psd_deflection.protocol.frames import HelloFrame, encode
 from psd_deflection.runner import acquisition as module
 from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Item, Restarted

@@ -16,9 +16,9 @@ from rosbags.rosbag2 import Reader
 from msg_adapters import to_messages
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import RecordingError
-from psd_deflection.io import cdr
-from psd_deflection.io.recordings import open_recording
-from psd_deflection.io.recover import recover
+from psd_deflection.recordings import cdr
+from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.recover import recover
 from psd_deflection.records import ParameterChange, SampleBlock
 from psd_deflection.runner import recorder as module
 from psd_deflection.runner.recorder import Recorder
@@ -127,7 +127,7 @@ def test_no_error_ends_a_recording_in_silence(tmp_path: Path, monkeypatch: pytes
 
     run = Run(rig_for(tmp_path))
     run.put(3)
-    monkeypatch.setattr('psd_deflection.io.bag_writer.BagWriter.write_encoded', fails)
+    monkeypatch.setattr('psd_deflection.recordings.bag_writer.BagWriter.write_encoded', fails)
     run.put(1)
     assert "KeyError: 'no such type'" in run.heard()
     assert run.recorder.folder is None

@@ -9,9 +9,9 @@ import pytest
 
 from psd_deflection.solvers import SolverStatus, make_solver
 from psd_deflection.solvers._linear import condition_number, design_matrix, gain_matrix
-from psd_deflection.solvers.appendix_d import appendix_d_iterative
-from psd_deflection.solvers.appendix_d_least_squares import printed_design_matrix
 from psd_deflection.solvers.minimum_tilt import tilt_branches
+from psd_deflection.thesis.appendix_d import appendix_d_iterative
+from psd_deflection.thesis.appendix_d_least_squares import printed_design_matrix
 
 CASES = [f'G{i}' for i in range(1, 13)]
 PARALLEL_BEAMS = CASES[:11]

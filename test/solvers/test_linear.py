@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.solvers._linear import condition_number, design_matrix, error_bound
-from psd_deflection.solvers.comparison import DIRECT, SIDEBAR
+from psd_deflection.thesis.comparison import DIRECT, SIDEBAR
 
 
 @pytest.mark.parametrize('scaling', [(1.0,) * 4, SIDEBAR, DIRECT])

@@ -1,0 +1,1 @@
+"""Devices: where samples come from, and their simulated twins."""

@@ -1,0 +1,229 @@
+"""A pair of Thorlabs KPA101/TQD001 position aligners, one a PSD, each on a port of its own.
+
+They answer when they are asked, about 2 ms later, so 1 kHz cannot be had: the source asks both at
+once in slots of ``converter.sample_rate_hz``, which has to be a rate that they can do (it is
+measured at the start, and a rate out of reach is refused with the one that is not). A slot in which
+no answer came, or for which the host was late, is a lost sample, and counted. A sample's time is
+half-way between asking and the answer, on the host's clock; the two devices are read within one
+answer time of each other, not at one instant. A sample whose time falls out of its slot is none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import select
+import time
+from collections.abc import Mapping
+
+from psd_deflection.config import Rig
+from psd_deflection.devices.serial_port import SerialPort
+from psd_deflection.devices.source import Clock, Event, Reading, Sample, Source
+from psd_deflection.errors import ConfigError, DeviceError
+from psd_deflection.protocol.apt import (
+    INFO_REQUEST,
+    READINGS_REQUEST,
+    AptDecoder,
+    HardwareInfo,
+    Message,
+    Readings,
+)
+from psd_deflection.protocol.frames import PROTOCOL_VERSION, BadFrame, HelloFrame
+from psd_deflection.records import CHANNELS
+
+BAUD = 115_200
+ANSWER_S = 0.1
+"""An answer that takes longer is given up; the devices take about 2 ms."""
+
+TRIAL = 50
+HEADROOM = 0.8
+"""Share of the rate measured at the start that may be asked for."""
+
+SECOND_NS = 1_000_000_000
+
+
+class ThorlabsPair(Source):
+    """``source: thorlabs``; ``port`` names two ports with a comma between, PSD 1 first."""
+
+    clock = Clock.HOST
+
+    def __init__(self, rig: Rig) -> None:
+        self.name = rig.acquisition.port
+        self._names = [n.strip() for n in self.name.split(',')]
+        if len(self._names) != 2 or not all(self._names) or self._names[0] == self._names[1]:
+            raise ConfigError(
+                f'source = thorlabs: port = {self.name!r}: two ports are needed, PSD 1 first, with a comma between: '
+                '/dev/ttyUSB0,/dev/ttyUSB1'
+            )
+        self._rate = rig.converter.sample_rate_hz
+        self._period_ns = round(SECOND_NS / self._rate)
+        # Two drivers of other people found x to come with its sign turned; a parameter says it here.
+        self._x_sign = float(rig.values['thorlabs.x_sign'])  # type: ignore[arg-type]
+        if abs(self._x_sign) != 1.0:
+            raise ConfigError(f'thorlabs.x_sign = {self._x_sign:g}: must be 1 or -1')
+        self._ports: list[SerialPort] = []
+        self._decoders = [AptDecoder(), AptDecoder()]
+        self._origin_ns: int | None = None
+        self._slot = -1
+        self._reach = 0.0
+        self._taken = 0
+        self._first_ns = self._last_ns = 0
+        self._models = ('?', '?')
+
+    def open(self, timeout: float) -> HelloFrame:
+        """Open both, ask who they are, and measure how many readings a second they give."""
+        try:
+            for name in self._names:
+                port = SerialPort(name, BAUD, rtscts=True)
+                self._ports.append(port)
+            infos = [self._identify(number, timeout) for number in range(2)]
+            self._models = (infos[0].model, infos[1].model)
+            self._reach = self._measure()
+        except BaseException:
+            self.close()
+            raise
+        if self._rate > HEADROOM * self._reach:
+            self.close()
+            raise DeviceError(
+                f'{self.name}: the pair gives {self._reach:.0f} readings/s, converter.sample_rate_hz = {self._rate:g} '
+                f'is out of reach; set it to at most {_floor(HEADROOM * self._reach)}, and block_size with it'
+            )
+        return HelloFrame(
+            PROTOCOL_VERSION,
+            {
+                'serial': f'{infos[0].serial},{infos[1].serial}',
+                'firmware': f'Thorlabs {infos[0].model} {infos[0].firmware}, {infos[1].model} {infos[1].firmware}',
+                'sample_rate_hz': self._rate,
+                'channels': list(CHANNELS),
+                'volts_per_count': None,
+                'sample_times': 'of the host',
+            },
+        )
+
+    def _identify(self, number: int, timeout: float) -> HardwareInfo:
+        port, decoder = self._ports[number], self._decoders[number]
+        deadline = time.monotonic() + timeout
+        received = 0
+        port.write(INFO_REQUEST)
+        while (left := deadline - time.monotonic()) > 0:
+            piece = port.read(left)
+            received += len(piece)
+            for message in decoder.feed(piece):
+                if isinstance(message, HardwareInfo):
+                    return message
+        raise DeviceError(
+            f'{self._names[number]}: {"nothing" if not received else f"{received} bytes but no hardware info"} '
+            f'in {timeout:g} s; is it a KPA101 or TQD001, powered, and not open in Kinesis?'
+        )
+
+    def _measure(self) -> float:
+        good = 0
+        started = time.monotonic_ns()
+        for _ in range(TRIAL):
+            first, second, _, _ = self._ask([])
+            good += first is not None and second is not None
+        if good < TRIAL // 2:
+            raise DeviceError(f'{self.name}: {good} of {TRIAL} readings were answered; are the cables good?')
+        return good / ((time.monotonic_ns() - started) * 1e-9)
+
+    def _ask(self, events: list[Event]) -> tuple[Readings | None, Readings | None, int, int]:
+        """Both readings, the instant half-way, and how many bytes came; what is none goes to ``events``."""
+        asked = time.monotonic_ns()
+        for port, decoder in zip(self._ports, self._decoders, strict=True):
+            port.discard_input()
+            decoder.reset()
+            port.write(READINGS_REQUEST)
+        found: list[Readings | None] = [None, None]
+        size = 0
+        deadline = asked + round(ANSWER_S * 1e9)
+        while None in found and (left := deadline - time.monotonic_ns()) > 0:
+            waiting = [p for p, f in zip(self._ports, found, strict=True) if f is None]
+            select.select([p.fileno() for p in waiting], (), (), left * 1e-9)
+            for number, port in enumerate(self._ports):
+                if found[number] is None:
+                    piece = port.read(0.0)
+                    size += len(piece)
+                    found[number] = _reading(self._decoders[number].feed(piece), events)
+        now = time.monotonic_ns()
+        for decoder, reading in zip(self._decoders, found, strict=True):
+            left_over = decoder.reset()
+            if reading is None:
+                events.append(BadFrame('no answer in time', left_over))
+        return found[0], found[1], (asked + now) // 2, size
+
+    def start(self) -> None:
+        """The first slot begins now. After a reconnection the slots go on, so that the gap is seen."""
+        if self._origin_ns is None:
+            self._origin_ns = time.monotonic_ns()
+
+    def read(self, timeout: float) -> Reading:
+        """Wait for the next slot, ask both, and give the sample of that slot."""
+        origin = self._origin_ns or 0
+        now = time.monotonic_ns()
+        slot = max(self._slot + 1, (now - origin) // self._period_ns)
+        wait = origin + slot * self._period_ns - now
+        if wait > timeout * 1e9:
+            time.sleep(timeout)
+            return Reading([], time.monotonic_ns(), 0)
+        if wait > 0:
+            time.sleep(wait * 1e-9)
+        self._slot = slot
+        events: list[Event] = []
+        first, second, t_ns, size = self._ask(events)
+        if first is None or second is None:
+            pass
+        elif (t_ns - origin) // self._period_ns != slot:
+            # Between question and answer the next slot began: this is no sample of the one it was asked for.
+            events.append(BadFrame('answered too late for its slot', size))
+        else:
+            sign = self._x_sign
+            values = (sign * first.x, first.y, first.total, sign * second.x, second.y, second.total)
+            events.append(Sample(0, slot % 2**32, t_ns, values))
+            self._first_ns = self._first_ns or t_ns
+            self._last_ns = t_ns
+            self._taken += 1
+        return Reading(events, time.monotonic_ns(), max(size, 1))
+
+    def give_up(self) -> None:
+        """Wait for the devices no longer."""
+        for port in tuple(self._ports):
+            port.give_up()
+
+    def close(self) -> None:
+        """Give both ports back."""
+        for port in self._ports:
+            port.close()
+        self._ports = []
+        for decoder in self._decoders:
+            decoder.reset()
+
+    def describe(self) -> Mapping[str, str]:
+        """Models, the rate asked for, the one that is done, and what the times are."""
+        passed = (self._last_ns - self._first_ns) * 1e-9
+        done = f'{(self._taken - 1) / passed:.1f}' if passed > 0 else 'not yet known'
+        return {
+            'source': f'Thorlabs {self._models[0]} and {self._models[1]} on {self.name}, polled',
+            'rate asked for (1/s)': f'{self._rate:g}',
+            'rate within reach at start (1/s)': f'{self._reach:.0f}',
+            'rate done (1/s)': done,
+            'sample numbers': 'slots of the host; a slot without an answer is a lost sample',
+            'sample times': 'of the host, half-way between question and answer',
+        }
+
+
+def _reading(messages: list[Message], events: list[Event]) -> Readings | None:
+    found = None
+    for message in messages:
+        if isinstance(message, Readings):
+            found = message
+        elif isinstance(message, BadFrame):
+            events.append(message)
+    return found
+
+
+def _floor(rate: float) -> str:
+    """A rate that a person would type: two digits."""
+    digits = 10.0 ** (math.floor(math.log10(max(rate, 1.0))) - 1)
+    with contextlib.suppress(OverflowError):
+        return f'{math.floor(rate / digits) * digits:g}'
+    return f'{rate:g}'

@@ -1,1 +1,0 @@
-"""Where bytes meet the world: serial ports, recordings, CSV."""

@@ -1,0 +1,1 @@
+"""Recordings: bags, MCAP and CSV, read, written, recovered, compared and replayed."""

@@ -1,0 +1,376 @@
+"""Reads bags (folders) and lone MCAP files, ours and those of ``ros2 bag record`` and others.
+
+Sample numbers are recorded modulo 2^32 and are extended again here, so that blocks come out as the
+writer cut them (2^32 is no multiple of 20).
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from pathlib import Path, PurePath
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+
+from msg_adapters import (
+    DEFLECTION_WITH_COVARIANCE,
+    LOAD,
+    REFERENCE,
+    SAMPLES,
+    TEMPERATURE,
+    TOPIC_TYPES,
+    pose_stamped,
+    pose_with_covariance_stamped,
+    temperature,
+    wrench_stamped,
+)
+from msg_adapters.header import header, stamp_ns
+from msg_adapters.orientation import angles
+from psd_deflection.errors import RecordingError
+from psd_deflection.recordings import cdr
+from psd_deflection.recordings.bag_writer import META_CHANGE, META_HELLO, META_PARAMETERS, META_SOFTWARE
+from psd_deflection.recordings.mcap_records import McapSource, RawMessage
+from psd_deflection.recordings.message_decode import CloudDecoder, Samples, header_and_doubles, joined_points
+from psd_deflection.recordings.recording import EstimateSeries, Recording, from_json
+from psd_deflection.records import (
+    AppliedLoad,
+    IntArray,
+    ParameterChange,
+    ReferencePose,
+    SampleBlock,
+    TemperatureReading,
+)
+
+MAX_YAML_BYTES = 16_000_000
+
+_BATCH = 50
+"""Messages whose samples are decoded at once: numpy's cost is by the call."""
+
+T = TypeVar('T')
+
+
+class BagRecording(Recording):
+    """A bag folder or a lone ``.mcap``. Raises RecordingError where nothing of it can be read."""
+
+    def __init__(self, path: Path, block_size: int | None = None) -> None:
+        super().__init__(path, block_size)
+        self._own_warnings: list[str] = []
+        files = self._files_of(path) if path.is_dir() else [path]
+        self._sources = [McapSource(f) for f in files]
+        metadata: dict[str, dict[str, str]] = {}
+        for source in self._sources:
+            metadata.update(source.metadata)
+        self.parameters = from_json(metadata.get(META_PARAMETERS, {}))
+        self.hello = from_json(metadata[META_HELLO]) if META_HELLO in metadata else None
+        self.version = metadata.get(META_SOFTWARE, {}).get('version', '')
+        self.changes = self._changes_in(metadata)
+
+    def _files_of(self, folder: Path) -> list[Path]:
+        """The bag's files in order: as ``metadata.yaml`` names them, else by their number."""
+        meta_file = folder / 'metadata.yaml'
+        found = sorted(folder.glob('*.mcap'), key=_file_number)
+        if not meta_file.is_file():
+            if not found:
+                raise RecordingError(f'{folder}: is no bag: it holds neither metadata.yaml nor an .mcap file')
+            self._own_warnings.append(f'{folder}: has no metadata.yaml (a recorder that was stopped hard?)')
+            return found
+        information = read_information(meta_file)
+        storage = information.get('storage_identifier')
+        if storage != 'mcap':
+            raise RecordingError(f'{folder}: is a bag with {storage} storage; only mcap is read (see ros2 bag convert)')
+        if information.get('compression_mode') in ('file', 'FILE', 'message', 'MESSAGE'):
+            raise RecordingError(
+                f'{folder}: is compressed by rosbag2 (compression_mode {information["compression_mode"]}); '
+                'record with --storage-preset-profile zstd_fast instead, or unpack it with ros2 bag convert'
+            )
+        named = information.get('relative_file_paths')
+        if not isinstance(named, list) or not named or not all(isinstance(n, str) for n in named):
+            raise RecordingError(f'{meta_file}: relative_file_paths names no file')
+        # Bags before version 4 have the folder's name before the file's.
+        files = [folder / PurePath(n).name for n in named]
+        for file in files:
+            if not file.is_file():
+                raise RecordingError(
+                    f'{file}: is named by metadata.yaml and is not there; `psd-deflection recover` makes that one anew'
+                )
+        return files
+
+    @property
+    def complete(self) -> bool:
+        """True where every file has its end and all that was read so far was whole."""
+        return not any(s.warnings for s in self._sources)
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """One line for each cut or damage, and for samples that were left out."""
+        return [*self._own_warnings, *(w for s in self._sources for w in s.warnings)]
+
+    def _warn(self, text: str) -> None:
+        line = f'{self.path}: {text}'
+        if line not in self._own_warnings:
+            self._own_warnings.append(line)
+
+    def _changes_in(self, metadata: Mapping[str, Mapping[str, str]]) -> list[ParameterChange]:
+        out = []
+        for name in sorted(n for n in metadata if n.startswith(META_CHANGE)):
+            try:
+                change = _to_change(metadata[name])
+            except (KeyError, ValueError, TypeError, AttributeError, RecursionError):
+                self._warn(f'the change of parameters {name!r} is not readable and is left out')
+            else:
+                out.append(change)
+        return sorted(out, key=lambda change: change.block)
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Messages as they lie in the files: (channel, log_time, cdr), of ``topics`` or of all."""
+        for source in self._sources:
+            yield from source.messages(topics)
+
+    def topics(self) -> dict[str, int]:
+        """How many messages of each topic it holds."""
+        counts: dict[str, int] = {}
+        for channel, _, _ in self.messages():
+            counts[channel.topic] = counts.get(channel.topic, 0) + 1
+        return counts
+
+    def blocks(self) -> Iterator[SampleBlock]:
+        """The samples, cut into blocks at seq // block_size."""
+        size = self.block_size
+        waiting: SampleBlock | None = None
+        for seq, t_ns, volts, flags in self._samples_in_order():
+            edges = [0, *(np.flatnonzero(np.diff(seq // size)) + 1).tolist(), len(seq)]
+            for a, b in itertools.pairwise(edges):
+                block = SampleBlock(int(seq[a]) // size, seq[a:b], t_ns[a:b], volts[a:b], flags[a:b])
+                if waiting is not None and waiting.index == block.index:
+                    waiting = _joined(waiting, block)
+                    continue
+                if waiting is not None:
+                    yield waiting
+                waiting = block
+        if waiting is None:
+            cut = '' if self.complete else ' before the cut'
+            raise RecordingError(
+                f'{self.path}: holds no samples{cut} (topic {SAMPLES}); `psd-deflection info` lists what it holds'
+            )
+        yield waiting
+
+    def _samples_in_order(self) -> Iterator[tuple[IntArray, IntArray, npt.NDArray[np.float32], npt.NDArray[np.uint8]]]:
+        """(seq, t_ns, volts, flags), many messages at once; seq extended, so that it rises throughout."""
+        count = _SequenceCounter(self.block_size, self._warn)
+        for log_time, messages in self._clouds():
+            together = joined_points(messages)
+            parts = [together] if count.follows(together) else [joined_points([m]) for m in messages]
+            for part in parts:
+                try:
+                    seq = count.extended(part)
+                except ValueError as error:
+                    raise RecordingError(f'{self.path}: {SAMPLES} at log time {log_time} ns: {error}') from None
+                _, _, t_ns, volts, flags = part
+                finite = np.isfinite(volts)
+                if finite.all():
+                    yield seq, t_ns, volts, flags
+                    continue
+                self._warn('samples that are not numbers (NaN or infinite) are left out as lost')
+                keep = finite.all(axis=1)
+                if keep.any():
+                    yield seq[keep], t_ns[keep], volts[keep], flags[keep]
+
+    def _clouds(self) -> Iterator[tuple[int, list[tuple[int, npt.NDArray[np.void]]]]]:
+        """(log time, messages as (stamp, points)); those of one yield are alike in layout."""
+        decoder = CloudDecoder()
+        batch: list[tuple[int, npt.NDArray[np.void]]] = []
+        first_time = 0
+        for channel, log_time, message in self.messages([SAMPLES]):
+            self._check_type(channel.type, channel.encoding, SAMPLES)
+            try:
+                stamp, points = decoder.decode(message)
+            except ValueError as error:
+                raise RecordingError(f'{self.path}: {SAMPLES} at log time {log_time} ns: {error}') from None
+            if batch and (len(batch) == _BATCH or points.dtype != batch[0][1].dtype):
+                yield first_time, batch
+                batch = []
+            if len(points):
+                first_time = first_time if batch else log_time
+                batch.append((stamp, points))
+        if batch:
+            yield first_time, batch
+
+    def _check_type(self, found: str, encoding: str, topic: str, wanted: str = '') -> None:
+        wanted = wanted or TOPIC_TYPES[topic]
+        if found != wanted or encoding != 'cdr':
+            raise RecordingError(f'{self.path}: {topic} is {found!r} in {encoding!r}, not {wanted} in cdr')
+
+    def _decoded(self, topic: str, convert: Callable[[dict[str, Any]], T]) -> list[T]:
+        """Every message of ``topic``; one without a stamp (0) has the time at which it came."""
+        out = []
+        for channel, log_time, message in self.messages([topic]):
+            self._check_type(channel.type, channel.encoding, topic)
+            try:
+                fields = cdr.decode(channel.type, message)
+                if stamp_ns(fields) == 0:
+                    fields['header'] = header(log_time, fields['header']['frame_id'])
+                out.append(convert(fields))
+            except ValueError as error:
+                raise RecordingError(f'{self.path}: {topic} at log time {log_time}: {error}') from None
+        return out
+
+    def loads(self) -> list[AppliedLoad]:
+        """Known loads, each held until the next."""
+        return self._decoded(LOAD, wrench_stamped.to_applied_load)
+
+    def references(self) -> list[ReferencePose]:
+        """Independent measurements of the tip."""
+        return self._decoded(REFERENCE, pose_stamped.to_reference)
+
+    def temperatures(self) -> list[TemperatureReading]:
+        """Ambient temperatures."""
+        return self._decoded(TEMPERATURE, temperature.to_reading)
+
+    def estimates(self) -> dict[str, EstimateSeries]:
+        """Recorded deflections by topic: the primary one, with covariance, and each solver's."""
+        rows: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
+        for channel, log_time, message in self.messages():
+            topic = channel.topic
+            if topic == DEFLECTION_WITH_COVARIANCE:
+                count, wanted = 43, pose_with_covariance_stamped.TYPE
+            elif topic.startswith('/link_tip/') and topic.endswith('/deflection'):
+                count, wanted = 7, pose_stamped.TYPE
+            else:
+                continue
+            self._check_type(channel.type, channel.encoding, topic, wanted)
+            try:
+                rows.setdefault(topic, []).append(header_and_doubles(message, count))
+            except ValueError as error:
+                raise RecordingError(f'{self.path}: {topic} at log time {log_time}: {error}') from None
+        return {topic: _series(topic, found) for topic, found in rows.items()}
+
+
+class _SequenceCounter:
+    """Extends sample numbers past the 32 bits that others' recordings have, and ours until then.
+
+    A number that goes back is a wrap where so many samples could have been taken meanwhile, else a
+    device that started anew; then counting goes on in the next block, so that nothing is mixed.
+    """
+
+    _FASTEST_HZ = 20_000
+
+    def __init__(self, block_size: int, warn: Callable[[str], None]) -> None:
+        self._wrapped = 0
+        self._moved = 0
+        self._block_size = block_size
+        self._warn = warn
+        self._last: int | None = None
+        self._last_t = -1
+
+    def follows(self, samples: Samples) -> bool:
+        """Whether these samples go on from the last ones without any number or time going back."""
+        return (
+            (self._last is None or int(samples.seq[0]) + self._base_of(samples) > self._last)
+            and int(samples.t_ns[0]) > self._last_t
+            and bool((np.diff(samples.seq) > 0).all())
+            and bool((np.diff(samples.t_ns) > 0).all())
+        )
+
+    def _base_of(self, samples: Samples) -> int:
+        return self._moved if samples.whole else self._moved + self._wrapped
+
+    def extended(self, samples: Samples) -> IntArray:
+        """Numbers that rise from call to call. Raises ValueError where they do not rise within one."""
+        seq, t_ns = samples.seq.copy(), samples.t_ns
+        if seq[-1] < seq[0] and not samples.whole:
+            seq[seq < seq[0]] += 2**32
+        if bool((np.diff(seq) <= 0).any()):
+            raise ValueError('seq does not rise within the message')
+        if bool((np.diff(t_ns) <= 0).any()):
+            raise ValueError('dt does not rise within the message')
+        base = self._base_of(samples)
+        first = int(seq[0]) + base
+        if self._last is not None and first <= self._last:
+            self._go_on_from(first, int(t_ns[0]), samples.whole)
+            base = self._base_of(samples)
+        if t_ns[0] <= self._last_t:
+            self._warn(f'time goes back in {SAMPLES} to {t_ns[0]} ns')
+        seq += base
+        self._last, self._last_t = int(seq[-1]), int(t_ns[-1])
+        return seq
+
+    def _go_on_from(self, first: int, t_ns: int, whole: bool) -> None:
+        """Take up counting at ``first``, which is not above the last number."""
+        assert self._last is not None
+        step = (first - self._last) % 2**32
+        if not whole and 0 < step <= 1000 + (t_ns - self._last_t) * self._FASTEST_HZ // 1_000_000_000:
+            self._wrapped += self._last + step - first
+            return
+        self._warn(f'sample numbers start anew after {self._last}')
+        size = self._block_size
+        self._moved += (self._last // size + 1 - first // size) * size
+
+
+def _joined(a: SampleBlock, b: SampleBlock) -> SampleBlock:
+    return SampleBlock(
+        a.index,
+        np.concatenate([a.seq, b.seq]),
+        np.concatenate([a.t_ns, b.t_ns]),
+        np.concatenate([a.volts, b.volts]),
+        np.concatenate([a.flags, b.flags]),
+    )
+
+
+def _to_change(entry: Mapping[str, str]) -> ParameterChange:
+    def number(value: object) -> float:
+        # As they are: a whole number must come back as one.
+        if isinstance(value, int | float):
+            return value
+        raise TypeError
+
+    values: list[tuple[str, float | str | tuple[float, ...]]] = []
+    for key, value in json.loads(entry['values']).items():
+        if isinstance(value, list):
+            values.append((key, tuple(map(number, value))))
+        else:
+            values.append((key, value if isinstance(value, str) else number(value)))
+    return ParameterChange(int(entry['t_ns']), int(entry['block']), tuple(values))
+
+
+def _series(topic: str, rows: list[tuple[int, tuple[float, ...]]]) -> EstimateSeries:
+    values = np.array([v for _, v in rows], dtype=np.float64)
+    turned = np.array([angles(dict(zip('xyzw', q, strict=True))) for q in values[:, 3:7].tolist()])
+    covariance = None
+    if values.shape[1] == 43:
+        axes = np.ix_(range(len(values)), [0, 1, 5], [0, 1, 5])
+        covariance = values[:, 7:].reshape(-1, 6, 6)[axes]
+    return EstimateSeries(
+        topic,
+        np.array([t for t, _ in rows], dtype=np.int64),
+        np.column_stack([values[:, 0], values[:, 1], turned[:, 0]]),
+        turned[:, 1:],
+        covariance,
+    )
+
+
+def _file_number(path: Path) -> tuple[int, str]:
+    number = re.search(r'_([0-9]{1,9})$', path.stem)
+    return (int(number[1]) if number else -1, path.name)
+
+
+def read_information(path: Path) -> dict[str, Any]:
+    """What ``metadata.yaml`` says of its bag. Raises RecordingError where that is nothing."""
+    way_out = '`psd-deflection recover` makes it anew'
+    try:
+        if path.stat().st_size > MAX_YAML_BYTES:
+            raise RecordingError(f'{path}: is larger than {MAX_YAML_BYTES} bytes')
+        tree = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        problem = getattr(error, 'problem', None) or 'not YAML'
+        raise RecordingError(f'{path}: malformed YAML: {problem}; {way_out}') from None
+    information = tree.get('rosbag2_bagfile_information') if isinstance(tree, dict) else None
+    if not isinstance(information, dict):
+        raise RecordingError(f'{path}: has no rosbag2_bagfile_information; {way_out}')
+    return information

@@ -1,0 +1,406 @@
+"""Writes recordings: rosbag2 bags (a folder with ``metadata.yaml`` and MCAP) and lone MCAP files.
+
+A crash must cost at most a second: chunks span less than half a second of log time and are handed
+to the operating system as they end (``durable``: to the disk); parameters, version and hello are at
+the front of every file. What a crash leaves is read up to the cut by
+:mod:`psd_deflection.recordings.bag_reader` and made whole again by :mod:`psd_deflection.recordings.recover`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+from mcap.data_stream import RecordBuilder
+from mcap.records import ChunkIndex
+from mcap.writer import CompressionType, Writer
+
+from msg_adapters import to_messages
+from psd_deflection import __version__
+from psd_deflection.errors import RecordingError
+from psd_deflection.recordings import cdr
+from psd_deflection.recordings.bag_metadata import (
+    DEFAULT_QOS,
+    FileCount,
+    TopicCount,
+    bag_information,
+    qos_text,
+    to_yaml,
+    write_metadata,
+)
+from psd_deflection.recordings.ros2msg import TYPE_HASHES, definition
+from psd_deflection.records import ParameterChange, Record
+
+CHUNK_NS = 500_000_000
+"""Log time that a chunk spans at most: with what waits in queues, a crash costs less than a second."""
+
+META_SOFTWARE = 'psd_deflection'
+META_PARAMETERS = 'psd_deflection.parameters'
+META_HELLO = 'psd_deflection.device_hello'
+META_CHANGE = 'psd_deflection.change.'
+"""Names of the MCAP metadata records; every value in the last three is JSON."""
+
+
+_CHUNK_INDICES = '_Writer__chunk_indices'
+"""Where mcap's writer keeps them; it has no public place for them."""
+
+CUSTOM = {'psd_deflection_version': __version__}
+
+
+def _json_values(values: Mapping[str, object]) -> dict[str, str]:
+    def plain(value: object) -> object:
+        if isinstance(value, Mapping):
+            return dict(value)
+        if isinstance(value, tuple):
+            return list(value)
+        raise TypeError(f'{type(value).__name__} {value!r} has no JSON')
+
+    return {key: json.dumps(value, default=plain) for key, value in values.items()}
+
+
+class _IndexSpool:
+    """The chunk indexes of a recording until its end, in a file without a name beside it.
+
+    The writer keeps them in a list: a kilobyte a chunk, 180 MB a day.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - open as long as the recording
+
+    def append(self, index: ChunkIndex) -> None:
+        """Put one behind the others."""
+        record = RecordBuilder()
+        index.write(record)
+        self._file.write(record.end())
+
+    def __iter__(self) -> Iterator[_IndexSpool]:
+        yield self
+
+    def write(self, summary: RecordBuilder) -> None:
+        """All of them, as they stand in the summary."""
+        self._file.seek(0)
+        while part := self._file.read(1 << 20):
+            summary.write(part)
+
+    def close(self) -> None:
+        """It is gone."""
+        self._file.close()
+
+
+class McapFile:
+    """One MCAP file being written; the part that a bag and a lone file share.
+
+    ``write`` takes the records of one thread. Raises RecordingError where the file exists, cannot
+    be made, or the disk refuses more; after such an error the file is closed and holds all chunks
+    that were complete. While it is written the file is locked (``flock``), so that nobody repairs it.
+    ``durable``: chunks reach the disk before the next one begins, not only the operating system.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        rig_values: Mapping[str, object],
+        device_hello: Mapping[str, object] | None = None,
+        durable: bool = False,
+    ) -> None:
+        self.path = path
+        self._durable = durable
+        self.topics: dict[str, TopicCount] = {}
+        self.start_ns = 0
+        self.end_ns = 0
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._chunk_first: int | None = None
+        self._chunk_last = 0
+        self.changes: list[ParameterChange] = []
+        self._stream: BinaryIO | None = None
+        self._spool: _IndexSpool | None = None
+        parameters = _json_values(rig_values)
+        hello = None if device_hello is None else _json_values(device_hello)
+        try:
+            self._stream = path.open('xb')
+        except FileExistsError:
+            raise RecordingError(f'{path}: exists already; a recording is never overwritten') from None
+        except OSError as error:
+            raise RecordingError(f'{path}: cannot be made ({error.strerror or error})') from None
+        with contextlib.suppress(OSError):
+            fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._writer = Writer(self._stream, compression=CompressionType.ZSTD, enable_crcs=True)
+        with self._guard():
+            self._spool = vars(self._writer)[_CHUNK_INDICES] = _IndexSpool(path.parent)
+            self._writer.start(profile='ros2', library=f'psd_deflection {__version__}')
+            self._writer.add_metadata(META_SOFTWARE, {'version': __version__})
+            self._writer.add_metadata(META_PARAMETERS, parameters)
+            if hello is not None:
+                self._writer.add_metadata(META_HELLO, hello)
+            self._flush()
+
+    @property
+    def closed(self) -> bool:
+        """True once nothing more can be written, be it after ``close`` or after an error."""
+        return self._stream is None
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file so far; what is in the unfinished chunk not counted."""
+        return self._stream.tell() if self._stream is not None else 0
+
+    def flush(self) -> None:
+        """End the chunk, so that a crash from now on does not cost it."""
+        with self._guard():
+            self._flush()
+            self._chunk_first = None
+
+    def _flush(self) -> None:
+        self._writer.flush()
+        if self._durable and self._stream is not None:
+            os.fsync(self._stream.fileno())
+
+    @contextlib.contextmanager
+    def _guard(self) -> Any:
+        if self._stream is None:
+            raise RecordingError(f'{self.path}: the recording is closed')
+        try:
+            yield
+        except OSError as error:
+            self._abandon()
+            raise RecordingError(
+                f'{self.path}: cannot be written ({error.strerror or error}); it ends with the last complete chunk'
+            ) from None
+
+    def _abandon(self) -> None:
+        stream, self._stream = self._stream, None
+        for one in (stream, self._spool):
+            if one is not None:
+                with contextlib.suppress(OSError):
+                    one.close()
+
+    def write_hello(self, device_hello: Mapping[str, object]) -> None:
+        """Note the device's hello when it comes after the start of the recording; the last one counts."""
+        with self._guard():
+            self._writer.add_metadata(META_HELLO, _json_values(device_hello))
+
+    def write(self, record: Record) -> None:
+        """Write all messages of one record; the log time is the record's own stamp."""
+        if isinstance(record, ParameterChange):
+            with self._guard():
+                self.changes.append(record)
+                head = {'t_ns': str(record.t_ns), 'block': str(record.block)}
+                self._writer.add_metadata(
+                    f'{META_CHANGE}{len(self.changes):06d}', {**head, 'values': json.dumps(dict(record.values))}
+                )
+            return
+        for message in to_messages(record):
+            self.write_encoded(message.topic, message.type, cdr.encode(message.type, message.fields), message.t_ns)
+
+    def write_encoded(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
+        """Write one message that is CDR already, at log time ``t_ns``.
+
+        Raises KeyError for a type that :mod:`psd_deflection.recordings.ros2msg` does not define.
+        """
+        with self._guard():
+            channel = self._channels.get(topic)
+            if channel is None:
+                channel = self._register(topic, type_name)
+            first = self._chunk_first
+            if first is not None and max(self._chunk_last, t_ns) - min(first, t_ns) >= CHUNK_NS:
+                self._flush()
+                first = None
+            self._chunk_first = t_ns if first is None else min(first, t_ns)
+            self._chunk_last = t_ns if first is None else max(self._chunk_last, t_ns)
+            entry = self.topics[topic]
+            self._writer.add_message(channel, t_ns, message, t_ns, entry.messages)
+        if not any(t.messages for t in self.topics.values()):
+            self.start_ns = self.end_ns = t_ns
+        self.start_ns = min(self.start_ns, t_ns)
+        self.end_ns = max(self.end_ns, t_ns)
+        entry.messages += 1
+
+    def _register(self, topic: str, type_name: str) -> int:
+        schema = self._schemas.get(type_name)
+        if schema is None:
+            schema = self._writer.register_schema(type_name, 'ros2msg', definition(type_name).encode())
+            self._schemas[type_name] = schema
+        type_hash = TYPE_HASHES[type_name]
+        channel: int = self._writer.register_channel(
+            topic, 'cdr', schema, {'offered_qos_profiles': qos_text(DEFAULT_QOS), 'topic_type_hash': type_hash}
+        )
+        self._channels[topic] = channel
+        self.topics[topic] = TopicCount(topic, type_name, DEFAULT_QOS, type_hash)
+        return channel
+
+    def count(self) -> FileCount:
+        """The file as ``metadata.yaml`` has it."""
+        messages = sum(t.messages for t in self.topics.values())
+        return FileCount(self.path.name, self.start_ns, self.end_ns, messages)
+
+    def close(self) -> None:
+        """Write index and summary and close; does nothing the second time."""
+        if self._stream is None:
+            return
+        with self._guard():
+            information = bag_information([self.count()], list(self.topics.values()), CUSTOM)
+            self._writer.add_metadata('rosbag2', {'serialized_metadata': to_yaml(information)})
+            self._writer.finish()
+            if self._durable:
+                self._stream.flush()
+                os.fsync(self._stream.fileno())
+            self._stream.close()
+            if self._spool is not None:
+                self._spool.close()
+        self._stream = None
+
+    # A recorder is a sink like any other.
+    put = write
+
+    def __enter__(self) -> McapFile:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class BagWriter:
+    """A rosbag2 bag being written: ``NAME/NAME_0.mcap`` and so on, ``NAME/metadata.yaml`` at the end.
+
+    ``rig_values``: the flat parameter set, effects included.
+    ``max_bytes``, ``max_s``: a file that is as large, or spans as much log time, is ended and the
+    next one begun (0: never); each file can be read alone. Raises RecordingError where the folder
+    exists already or cannot be made; :meth:`write` and the others as :class:`McapFile` does.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        *,
+        rig_values: Mapping[str, object],
+        device_hello: Mapping[str, object] | None = None,
+        max_bytes: int = 0,
+        max_s: float = 0.0,
+        durable: bool = False,
+    ) -> None:
+        self.folder = Path(folder)
+        try:
+            self.folder.mkdir(parents=True)
+        except FileExistsError:
+            raise RecordingError(f'{self.folder}: exists already; a recording is never overwritten') from None
+        except OSError as error:
+            raise RecordingError(f'{self.folder}: cannot be made ({error.strerror or error})') from None
+        self._name = self.folder.resolve().name
+        self._rig_values, self._hello = rig_values, device_hello
+        self._max_bytes, self._max_ns, self._durable = max_bytes, round(max_s * 1e9), durable
+        self._number = 0
+        self._ended: list[tuple[FileCount, list[TopicCount]]] = []
+        self._file = self._begin()
+
+    @property
+    def path(self) -> Path:
+        """The file that is written at present."""
+        return self._file.path
+
+    @property
+    def closed(self) -> bool:
+        """True once nothing more can be written, be it after ``close`` or after an error."""
+        return self._file.closed
+
+    def _begin(self) -> McapFile:
+        file = McapFile(
+            self.folder / f'{self._name}_{self._number}.mcap',
+            rig_values=self._rig_values,
+            device_hello=self._hello,
+            durable=self._durable,
+        )
+        self._number += 1
+        return file
+
+    def write_hello(self, device_hello: Mapping[str, object]) -> None:
+        """Note the device's hello when it comes after the start of the recording; the last one counts."""
+        self._hello = device_hello
+        self._file.write_hello(device_hello)
+
+    def write(self, record: Record) -> None:
+        """Write all messages of one record; the log time is the record's own stamp."""
+        if isinstance(record, ParameterChange):
+            self._file.write(record)
+            return
+        for message in to_messages(record):
+            self.write_encoded(message.topic, message.type, cdr.encode(message.type, message.fields), message.t_ns)
+
+    def write_encoded(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
+        """Write one message that is CDR already, at log time ``t_ns``; begin a new file where it is time to."""
+        file = self._file
+        full = self._max_bytes and file.size >= self._max_bytes
+        if full or (self._max_ns and file.topics and t_ns - file.start_ns >= self._max_ns):
+            self.rotate()
+        self._file.write_encoded(topic, type_name, message, t_ns)
+
+    def rotate(self) -> None:
+        """End the file and begin the next; what changed so far stands in it as well."""
+        before = self._file
+        before.close()
+        self._ended.append((before.count(), list(before.topics.values())))
+        self._file = self._begin()
+        for change in before.changes:
+            self._file.write(change)
+
+    def drop_oldest(self) -> Path | None:
+        """Delete the oldest file that is whole; None where there is only the one being written."""
+        if not self._ended:
+            return None
+        count, _ = self._ended.pop(0)
+        path = self.folder / count.path
+        try:
+            path.unlink()
+        except OSError as error:
+            raise RecordingError(f'{path}: cannot be deleted ({error.strerror or error})') from None
+        return path
+
+    def flush(self) -> None:
+        """End the chunk, so that a crash from now on does not cost it."""
+        self._file.flush()
+
+    def information(self) -> dict[str, Any]:
+        """The tree of ``metadata.yaml`` for what was written so far."""
+        parts = [*self._ended, (self._file.count(), list(self._file.topics.values()))]
+        topics: dict[str, TopicCount] = {}
+        for _, counts in parts:
+            for t in counts:
+                known = topics.setdefault(t.name, TopicCount(t.name, t.type, t.qos, t.type_hash))
+                known.messages += t.messages
+        return bag_information([count for count, _ in parts], list(topics.values()), CUSTOM)
+
+    def close(self) -> None:
+        """Close the file, then write ``metadata.yaml``; does nothing the second time.
+
+        A bag whose file ended with an error gets no ``metadata.yaml``: ``psd-deflection recover``
+        makes one of what is there, and our reader needs none.
+        """
+        if self.closed:
+            return
+        self._file.close()
+        try:
+            write_metadata(self.folder, self.information())
+        except OSError as error:
+            reason = error.strerror or error
+            raise RecordingError(f'{self.folder / "metadata.yaml"}: cannot be written ({reason})') from None
+
+    # A recorder is a sink like any other.
+    put = write
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

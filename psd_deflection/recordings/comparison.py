@@ -1,0 +1,177 @@
+"""Holds what a replay gives against what was recorded, message by message, byte by byte.
+
+Messages are matched by topic and stamp. Both sides are read as streams, so that a recording of any
+length is compared in little memory.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+
+from msg_adapters import DIAGNOSTICS, INPUTS, SAMPLES, to_messages
+from msg_adapters.orientation import angles
+from psd_deflection.errors import RecordingError
+from psd_deflection.recordings import cdr
+from psd_deflection.recordings.message_decode import header_and_doubles
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.records import ParameterChange, Record
+
+_NOT_ESTIMATED = {DIAGNOSTICS, SAMPLES, *INPUTS}
+_LAG_NS = 2_000_000_000
+"""How far the recorded side is read ahead of the replayed one."""
+
+
+class Comparison:
+    """Feed it the replay's records in order; then ``finish``. ``same``: no bit differs.
+
+    Raises RecordingError where the recording holds no estimates to compare with.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        topics = [t for t in recording.topics() if t not in _NOT_ESTIMATED]
+        if not topics:
+            raise RecordingError(f'{recording.path}: holds no estimates to compare with')
+        self.equal = 0
+        self.different = 0
+        self.only_recorded = 0
+        self.only_replayed = 0
+        self._recording = recording
+        self._complete = True
+        self._recorded: dict[str, deque[tuple[int, bytes]]] = {t: deque() for t in topics}
+        self._replayed: dict[str, deque[tuple[int, bytes]]] = {t: deque() for t in topics}
+        self._worst: dict[str, float] = {}
+        self._first_difference = ''
+        self._stream: Iterator[tuple[str, int, bytes]] = (
+            (m.channel.topic, m.log_time, m.cdr) for m in recording.messages(topics)
+        )
+        self._ended = False
+        self._newest = 0
+
+    @property
+    def same(self) -> bool:
+        """True where every message of either side is in the other, and no bit differs."""
+        return not (self.different or self.only_recorded or self.only_replayed)
+
+    def add(self, records: list[Record]) -> None:
+        """Compare what ``records`` are published as."""
+        newest = 0
+        for record in records:
+            if isinstance(record, ParameterChange):
+                continue
+            for topic, type_name, t_ns, fields in to_messages(record):
+                if topic in self._replayed:
+                    self._replayed[topic].append((t_ns, cdr.encode(type_name, fields)))
+                elif topic not in _NOT_ESTIMATED:
+                    # A solver that runs now and did not then.
+                    self._count_only_replayed(topic, t_ns)
+                newest = max(newest, t_ns)
+        if newest:
+            self._newest = newest
+            self._read_until(newest + _LAG_NS)
+            self._match()
+
+    def finish(self) -> None:
+        """What is left on either side has no counterpart."""
+        self._read_until(None)
+        self._complete = self._recording.complete
+        self._match()
+        for topic in self._recorded:
+            for t_ns, _ in self._recorded[topic]:
+                if t_ns > self._newest and not self._complete:
+                    # The cut took the samples and left what was made of them.
+                    continue
+                self.only_recorded += 1
+                self._note(f'{topic} at {t_ns} ns is recorded, the replay has none')
+            for t_ns, _ in self._replayed[topic]:
+                self._count_only_replayed(topic, t_ns)
+
+    def counts(self) -> dict[str, int | bool]:
+        """For programs: messages by how they compare, and ``same``."""
+        return {
+            'same': self.same,
+            'equal': self.equal,
+            'different': self.different,
+            'only_recorded': self.only_recorded,
+            'only_replayed': self.only_replayed,
+        }
+
+    def summary(self) -> str:
+        """One line, and the largest difference where there is one."""
+        if self.same:
+            return f'compared: {self.equal} messages, no bit differs'
+        lines = [
+            f'compared: {self.equal} messages equal, {self.different} differ, '
+            f'{self.only_recorded} only recorded, {self.only_replayed} only in the replay'
+        ]
+        lines += [f'  largest difference: {name} {value:.3g}' for name, value in sorted(self._worst.items())]
+        if self._first_difference:
+            lines.append(f'  first: {self._first_difference}')
+        return '\n'.join(lines)
+
+    def _count_only_replayed(self, topic: str, t_ns: int) -> None:
+        self.only_replayed += 1
+        self._note(f'{topic} at {t_ns} ns is in the replay and was not recorded')
+
+    def _note(self, text: str) -> None:
+        if not self._first_difference:
+            self._first_difference = text
+
+    def _read_until(self, t_ns: int | None) -> None:
+        while not self._ended:
+            message = next(self._stream, None)
+            if message is None:
+                self._ended = True
+                return
+            topic, log_time, encoded = message
+            self._recorded[topic].append((_stamp(encoded, log_time), encoded))
+            if t_ns is not None and log_time > t_ns:
+                return
+
+    def _match(self) -> None:
+        for topic, recorded in self._recorded.items():
+            replayed = self._replayed[topic]
+            while recorded and replayed:
+                (t_a, a), (t_b, b) = recorded[0], replayed[0]
+                if t_a == t_b:
+                    recorded.popleft()
+                    replayed.popleft()
+                    if a == b:
+                        self.equal += 1
+                    else:
+                        self._differ(topic, t_a, a, b)
+                elif t_a < t_b:
+                    recorded.popleft()
+                    self.only_recorded += 1
+                    self._note(f'{topic} at {t_a} ns is recorded, the replay has none')
+                else:
+                    replayed.popleft()
+                    self._count_only_replayed(topic, t_b)
+
+    def _differ(self, topic: str, t_ns: int, a: bytes, b: bytes) -> None:
+        self.different += 1
+        self._note(f'{topic} at {t_ns} ns')
+        if not topic.endswith('/deflection'):
+            return
+        try:
+            old, new = (header_and_doubles(side, 7)[1] for side in (a, b))
+        except ValueError:
+            return
+        for axis, name in enumerate(('ΔX', 'ΔY')):
+            self._worsen(f'{topic} {name} (m)', abs(old[axis] - new[axis]))
+        self._worsen(f'{topic} θ (rad)', abs(_theta(old) - _theta(new)))
+
+    def _worsen(self, name: str, difference: float) -> None:
+        self._worst[name] = max(self._worst.get(name, 0.0), difference)
+
+
+def _theta(doubles: tuple[float, ...]) -> float:
+    return angles(dict(zip('xyzw', doubles[3:], strict=True)))[0]
+
+
+def _stamp(encoded: bytes, log_time: int) -> int:
+    """The header's stamp, ns: all our messages begin with one."""
+    if len(encoded) < 12:
+        return log_time
+    sec = int.from_bytes(encoded[4:8], 'little', signed=True)
+    return sec * 1_000_000_000 + int.from_bytes(encoded[8:12], 'little')

@@ -1,0 +1,275 @@
+"""Reads CSV recordings: one sample a row, header first, the format of other people's loggers too.
+
+Times are read as decimals into integer nanoseconds, never through a float: seconds since the epoch
+have no nanoseconds left in one. The file is read in passes and never held whole.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Sequence
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
+from psd_deflection.errors import RecordingError
+from psd_deflection.recordings.mcap_records import RawMessage
+from psd_deflection.recordings.recording import EstimateSeries, Recording
+from psd_deflection.records import CHANNELS, AppliedLoad, ReferencePose, SampleBlock, TemperatureReading
+
+LOAD_COLUMNS = ('load_fx', 'load_fy', 'load_tz')
+TEMPERATURE_COLUMN = 'temperature'
+REFERENCE_COLUMNS = ('ref_dx', 'ref_dy', 'ref_theta')
+REQUIRED = ('t', *CHANNELS)
+KNOWN = (*REQUIRED, *LOAD_COLUMNS, TEMPERATURE_COLUMN, *REFERENCE_COLUMNS)
+
+MAX_LINE = 10_000
+"""Characters; a longer line is no row of samples."""
+
+MAX_SECONDS = 2**31
+"""A ROS stamp has 31 bits of seconds."""
+
+MAX_VOLTS = 1e6
+
+_RATE_ROWS = 10_000
+
+
+class _Row(NamedTuple):
+    line: int
+    t_ns: int
+    cells: list[str]
+
+
+class CsvRecording(Recording):
+    """An opened CSV. ``sample_rate_hz`` where it is known; else it is found from the rows' times.
+
+    Raises RecordingError naming file, line and column where something is not as it should be.
+    """
+
+    def __init__(self, path: Path, block_size: int | None = None, sample_rate_hz: float | None = None) -> None:
+        super().__init__(path, block_size)
+        self._warnings: list[str] = []
+        self._header, self._columns = self._read_header()
+        self._step_ns = 1e9 / sample_rate_hz if sample_rate_hz else self._find_step()
+        self.sample_rate_hz = 1e9 / self._step_ns
+
+    @property
+    def complete(self) -> bool:
+        """True: a CSV has no mark of its end."""
+        return True
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Columns that are not read."""
+        return self._warnings
+
+    def _refuse(self, why: str, line: int | None = None) -> RecordingError:
+        return RecordingError(f'{self.path}{"" if line is None else f":{line}"}: {why}')
+
+    def _lines(self) -> Iterator[tuple[int, str]]:
+        """(line number, text) of every line that is not blank."""
+        try:
+            with self.path.open(encoding='utf-8-sig', newline=None) as stream:
+                number = 0
+                while text := stream.readline(MAX_LINE + 1):
+                    number += 1
+                    if len(text) > MAX_LINE:
+                        raise self._refuse(f'is longer than {MAX_LINE} characters', number)
+                    if text.strip():
+                        yield number, text
+        except OSError as error:
+            raise self._refuse(f'cannot be read ({error.strerror or error})') from None
+        except UnicodeDecodeError:
+            raise self._refuse('is not text in UTF-8') from None
+
+    def _read_header(self) -> tuple[list[str], dict[str, int]]:
+        for number, text in self._lines():
+            names = [n.strip() for n in text.split(',')]
+            columns = {name: i for i, name in enumerate(names)}
+            missing = [n for n in REQUIRED if n not in columns]
+            if missing:
+                hint = ', between commas' if len(names) == 1 else ''
+                raise self._refuse(
+                    f'the header lacks {", ".join(missing)}; a recording begins with {",".join(REQUIRED)}{hint}', number
+                )
+            for name in KNOWN:
+                if names.count(name) > 1:
+                    raise self._refuse(f'column {name} is there twice', number)
+            for group in (LOAD_COLUMNS, REFERENCE_COLUMNS):
+                there = [n for n in group if n in columns]
+                if there and len(there) < len(group):
+                    lacking = ', '.join(n for n in group if n not in columns)
+                    raise self._refuse(f'has {", ".join(there)} without {lacking}', number)
+            unknown = [n for n in names if n not in KNOWN]
+            if unknown:
+                self._warnings.append(f'{self.path}:{number}: columns that are not read: {", ".join(unknown)}')
+            return names, columns
+        raise self._refuse('is empty')
+
+    def _rows(self) -> Iterator[_Row]:
+        at = self._columns['t']
+        width = len(self._header)
+        lines = self._lines()
+        next(lines, None)
+        last = -1
+        for number, text in lines:
+            cells = text.split(',')
+            if len(cells) != width:
+                raise self._refuse(f'has {len(cells)} cells, the header has {width}', number)
+            t_ns = self._nanoseconds(cells[at], number)
+            if t_ns <= last:
+                raise self._refuse(f'column t holds {cells[at].strip()!r}, which is not after the row before', number)
+            last = t_ns
+            yield _Row(number, t_ns, cells)
+
+    def _nanoseconds(self, cell: str, line: int) -> int:
+        text = cell.strip()
+        whole, _, part = text.partition('.')
+        if whole.isdecimal() and whole.isascii() and len(whole) <= 10 and len(part) <= 9:
+            if not part:
+                t_ns = int(whole) * 1_000_000_000
+            elif part.isdecimal() and part.isascii():
+                t_ns = int(whole) * 1_000_000_000 + int(part.ljust(9, '0'))
+            else:
+                t_ns = -1
+        else:
+            t_ns = -1
+        if t_ns < 0:
+            try:
+                seconds = Decimal(text)
+            except InvalidOperation:
+                raise self._refuse(f'column t holds {text!r}, which is not a number', line) from None
+            if not seconds.is_finite() or not 0 <= seconds < MAX_SECONDS:
+                raise self._refuse(f'column t holds {text!r}; seconds from 0 to {MAX_SECONDS} are read', line)
+            t_ns = int((seconds * 1_000_000_000).to_integral_value())
+        if t_ns >= MAX_SECONDS * 1_000_000_000:
+            raise self._refuse(f'column t holds {text!r}; seconds from 0 to {MAX_SECONDS} are read', line)
+        return t_ns
+
+    def _number(self, row: _Row, name: str, largest: float = math.inf) -> float:
+        cell = row.cells[self._columns[name]].strip()
+        try:
+            value = float(cell)
+        except ValueError:
+            raise self._refuse(f'column {name} holds {cell!r}, which is not a number', row.line) from None
+        if not math.isfinite(value):
+            raise self._refuse(f'column {name} holds {cell!r}, which is not finite', row.line)
+        if abs(value) > largest:
+            raise self._refuse(f'column {name} holds {cell!r}, which is beyond +-{largest:g}', row.line)
+        return value
+
+    def _find_step(self) -> float:
+        """Time between samples, ns: the mean of those steps that are within half of the median.
+
+        Gaps do not count, and neither do the last digits of times that were written in short.
+        """
+        times = []
+        for row in self._rows():
+            times.append(row.t_ns)
+            if len(times) == _RATE_ROWS:
+                break
+        if len(times) < 2:
+            raise self._refuse(f'holds {len(times)} samples; a recording has at least 2')
+        steps = np.diff(np.array(times, dtype=np.int64)).astype(np.float64)
+        median = float(np.median(steps))
+        near = steps[(steps > 0.5 * median) & (steps < 1.5 * median)]
+        # Between steps of very different length the median may be near to none of them.
+        return float(near.mean()) if len(near) else float(steps.min())
+
+    def blocks(self) -> Iterator[SampleBlock]:
+        """The samples, cut into blocks at seq // block_size; the first sample has seq 0.
+
+        A row's number is that of the row before plus the whole number of steps between them. What
+        is left over is carried on and forgotten slowly, so that neither jitter of less than half a
+        step nor a clock that runs a little fast makes a loss where there is none.
+        """
+        size = self.block_size
+        at = [self._columns[c] for c in CHANNELS]
+        seqs: list[int] = []
+        times: list[int] = []
+        volts: list[list[float]] = []
+        index = seq = 0
+        left_over = 0.0
+        last_t: int | None = None
+        for row in self._rows():
+            if last_t is not None:
+                passed = (row.t_ns - last_t) / self._step_ns + left_over
+                steps = max(1, round(passed))
+                left_over = 0.9 * (passed - steps)
+                seq += steps
+            last_t = row.t_ns
+            if seq // size != index:
+                yield _block(index, seqs, times, volts)
+                seqs, times, volts = [], [], []
+                index = seq // size
+            seqs.append(seq)
+            times.append(row.t_ns)
+            try:
+                values = [float(row.cells[i]) for i in at]
+            except ValueError:
+                values = [math.nan]
+            if not all(-MAX_VOLTS <= v <= MAX_VOLTS for v in values):
+                values = [self._number(row, c, MAX_VOLTS) for c in CHANNELS]
+            volts.append(values)
+        yield _block(index, seqs, times, volts)
+
+    def topics(self) -> dict[str, int]:
+        """As a bag of the same samples would have them."""
+        counts = {SAMPLES: sum(1 for _ in self.blocks())}
+        for topic, found in ((LOAD, self.loads()), (REFERENCE, self.references()), (TEMPERATURE, self.temperatures())):
+            if found:
+                counts[topic] = len(found)
+        return counts
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """None: a CSV has rows."""
+        return iter(())
+
+    def _optional(self, names: Sequence[str]) -> Iterator[tuple[int, tuple[float, ...]]]:
+        """(t_ns, values) of each row whose cells of these columns are filled in."""
+        if names[0] not in self._columns:
+            return
+        at = [self._columns[n] for n in names]
+        for row in self._rows():
+            filled = [n for n, i in zip(names, at, strict=True) if row.cells[i].strip()]
+            if filled and len(filled) < len(names):
+                raise self._refuse(f'has {", ".join(filled)} without the others of {", ".join(names)}', row.line)
+            if filled:
+                yield row.t_ns, tuple(self._number(row, n) for n in names)
+
+    def loads(self) -> list[AppliedLoad]:
+        """The load of the first row and each that differs from the one before it."""
+        out: list[AppliedLoad] = []
+        for t_ns, (fx, fy, tz) in self._optional(LOAD_COLUMNS):
+            if not out or out[-1][1:] != (fx, fy, tz):
+                out.append(AppliedLoad(t_ns, fx, fy, tz))
+        return out
+
+    def references(self) -> list[ReferencePose]:
+        """One for each row that has one."""
+        return [ReferencePose(t_ns, dx, dy, theta) for t_ns, (dx, dy, theta) in self._optional(REFERENCE_COLUMNS)]
+
+    def temperatures(self) -> list[TemperatureReading]:
+        """The first one and each that differs from the one before it."""
+        out: list[TemperatureReading] = []
+        for t_ns, (celsius,) in self._optional((TEMPERATURE_COLUMN,)):
+            if not out or out[-1].celsius != celsius:
+                out.append(TemperatureReading(t_ns, celsius))
+        return out
+
+    def estimates(self) -> dict[str, EstimateSeries]:
+        """None: a CSV of samples has no estimates."""
+        return {}
+
+
+def _block(index: int, seqs: list[int], times: list[int], volts: list[list[float]]) -> SampleBlock:
+    return SampleBlock(
+        index,
+        np.array(seqs, dtype=np.int64),
+        np.array(times, dtype=np.int64),
+        np.array(volts, dtype=np.float32),
+        np.zeros(len(seqs), dtype=np.uint8),
+    )

@@ -1,0 +1,162 @@
+"""Writes CSV: samples as a recording that can be read again, and estimates for a spreadsheet.
+
+Numbers are written with as many digits as bring the same number back (float32 volts, float64
+poses), times with nine decimals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import TextIO
+
+from psd_deflection.errors import RecordingError
+from psd_deflection.recordings.csv_reader import LOAD_COLUMNS, REFERENCE_COLUMNS, REQUIRED, TEMPERATURE_COLUMN
+from psd_deflection.records import (
+    AppliedLoad,
+    DeflectionEstimate,
+    Record,
+    ReferencePose,
+    SampleBlock,
+    TemperatureReading,
+)
+
+
+def seconds(t_ns: int) -> str:
+    """``t_ns`` as seconds with nine decimals, exactly."""
+    whole, part = divmod(t_ns, 1_000_000_000)
+    return f'{whole}.{part:09d}'
+
+
+class _CsvFile:
+    """A CSV being written. Raises RecordingError where it exists or the disk refuses."""
+
+    def __init__(self, path: str | Path, header: Sequence[str]) -> None:
+        self.path = Path(path)
+        self._stream: TextIO | None = None
+        try:
+            self._stream = self.path.open('x', encoding='ascii', newline='\n')
+        except FileExistsError:
+            raise RecordingError(f'{self.path}: exists already; a recording is never overwritten') from None
+        except OSError as error:
+            raise RecordingError(f'{self.path}: cannot be made ({error.strerror or error})') from None
+        self._write([','.join(header)])
+
+    def _write(self, lines: Sequence[str]) -> None:
+        if self._stream is None:
+            raise RecordingError(f'{self.path}: the file is closed')
+        try:
+            self._stream.writelines(line + '\n' for line in lines)
+        except OSError as error:
+            self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        stream, self._stream = self._stream, None
+        try:
+            if stream is not None:
+                stream.close()
+        except OSError:
+            pass
+        raise RecordingError(f'{self.path}: cannot be written ({error.strerror or error})') from None
+
+    def _finish(self) -> None:
+        """Write what is still held back."""
+
+    def close(self) -> None:
+        """Write the rest and close; does nothing the second time."""
+        if self._stream is None:
+            return
+        self._finish()
+        stream = self._stream
+        try:
+            stream.close()
+        except OSError as error:
+            self._give_up(error)
+        self._stream = None
+
+
+class CsvSampleSink(_CsvFile):
+    """Samples as a CSV recording.
+
+    ``loads``, ``references``, ``temperatures``: whether it has their columns. A record of these
+    kinds goes into the first row at or after its time and must come before that row's block; loads
+    and temperatures are held, a reference stands once.
+    """
+
+    def __init__(
+        self, path: str | Path, *, loads: bool = False, references: bool = False, temperatures: bool = False
+    ) -> None:
+        self._waiting: dict[type[Record], deque[AppliedLoad | ReferencePose | TemperatureReading]] = {}
+        self._held: dict[type[Record], str] = {}
+        header = list(REQUIRED)
+        for wanted, kind, columns in (
+            (loads, AppliedLoad, LOAD_COLUMNS),
+            (temperatures, TemperatureReading, (TEMPERATURE_COLUMN,)),
+            (references, ReferencePose, REFERENCE_COLUMNS),
+        ):
+            if wanted:
+                header += columns
+                self._waiting[kind] = deque()
+                self._held[kind] = ',' * (len(columns) - 1)
+        self._empty_reference = self._held.get(ReferencePose, '')
+        super().__init__(path, header)
+
+    def put(self, record: Record) -> None:
+        """Take one record; those that have no place in the file are passed over."""
+        if isinstance(record, SampleBlock):
+            self._write([self._row(record, i) for i in range(len(record.seq))])
+        elif isinstance(record, AppliedLoad | ReferencePose | TemperatureReading) and type(record) in self._waiting:
+            self._waiting[type(record)].append(record)
+
+    def _row(self, block: SampleBlock, i: int) -> str:
+        t_ns = int(block.t_ns[i])
+        cells = [seconds(t_ns), *map(str, block.volts[i])]
+        for kind, waiting in self._waiting.items():
+            while waiting and waiting[0].t_ns <= t_ns:
+                self._held[kind] = ','.join(map(repr, waiting.popleft()[1:]))
+            cells.append(self._held[kind])
+        if self._empty_reference:
+            self._held[ReferencePose] = self._empty_reference
+        return ','.join(cells)
+
+
+class CsvEstimateSink(_CsvFile):
+    """Estimates: ``t,dx,dy,theta,sd_dx,sd_dy,sd_theta`` (s, m, m, rad), then three columns a solver.
+
+    One row for each block that some solver answered; a block without an answer has no row, and a
+    solver that had none in it has empty cells.
+    """
+
+    def __init__(self, path: str | Path, solvers: Collection[str]) -> None:
+        self._solvers = tuple(solvers)
+        self._block: list[DeflectionEstimate] = []
+        names = [f'{solver}_{q}' for solver in self._solvers for q in ('dx', 'dy', 'theta')]
+        super().__init__(path, ['t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta', *names])
+
+    def put(self, record: Record) -> None:
+        """Take one record; all but estimates are passed over."""
+        if not isinstance(record, DeflectionEstimate):
+            return
+        if self._block and self._block[0].block != record.block:
+            self._finish()
+        self._block.append(record)
+
+    def _finish(self) -> None:
+        if not self._block:
+            return
+        primary = next((e for e in self._block if e.primary), None)
+        cells = [seconds(self._block[0].t_ns)]
+        if primary is None:
+            cells += [''] * 6
+        else:
+            variances = [primary.covariance[i] for i in (0, 4, 8)]
+            deviations = [math.sqrt(v) if v >= 0.0 else math.nan for v in variances]
+            cells += map(repr, (primary.dx, primary.dy, primary.theta, *deviations))
+        by_solver = {e.solver: e for e in self._block}
+        for solver in self._solvers:
+            e = by_solver.get(solver)
+            cells += ['', '', ''] if e is None else [repr(e.dx), repr(e.dy), repr(e.theta)]
+        self._block = []
+        self._write([','.join(cells)])

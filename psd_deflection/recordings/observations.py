@@ -1,0 +1,168 @@
+"""Recordings for discover: files to arrays on an unbroken sample grid, loads and temperatures held."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from psd_deflection.config import Rig, replace_values, rig_from_values
+from psd_deflection.discovery.observation import Observation
+from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.records import CHANNELS, ENVIRONMENT, FloatArray, IntArray
+
+MAX_SAMPLES = 20_000_000
+
+
+def recorded_rig(recording: Recording) -> Rig:
+    """The rig that the recording itself tells of; the thesis rig where it tells of none.
+
+    What was changed while it ran (a zero taken) is what the rig was all along, only known better.
+    """
+    rig = rig_from_values(recording.parameters, f'{recording.path} (recorded parameters)')
+    for change in recording.changes:
+        values = {name: value for name, value in change.values if name not in ENVIRONMENT}
+        if values:
+            rig = replace_values(rig, values, f'{recording.path} (changed at block {change.block})')
+    return rig
+
+
+def read_observation(
+    path: str | Path, rig: Rig | None = None, overrides: Mapping[str, object] | None = None, source: str = 'overrides'
+) -> Observation:
+    """One recording, with the rig that it tells of where none is given, and ``overrides`` on it.
+
+    Raises RecordingError where it has no loads or cannot be read, ConfigError for a bad override.
+
+    The sample at t sees the loads applied before t: a load counts from the first sample at or
+    after its own time.
+    """
+    path = Path(path)
+    if rig is None:
+        rig = recorded_rig(open_recording(path))
+    if overrides:
+        rig = replace_values(rig, overrides, source)
+    recording = open_recording(path, block_size=rig.estimator.block_size)
+    samples = recording.samples
+    rate = recording.sample_rate_hz
+    if rate > 0.0 and abs(rate / rig.converter.sample_rate_hz - 1.0) > 0.01:
+        raise RecordingError(
+            f'{path}: {rate:.1f} samples/s, but the rig file says converter.sample_rate_hz = '
+            f'{rig.converter.sample_rate_hz:g}; set it to what was recorded'
+        )
+    first = int(samples['seq'][0])
+    n = int(samples['seq'][-1]) - first + 1
+    if n > MAX_SAMPLES:
+        raise RecordingError(f'{path}: {n} samples; discover takes at most {MAX_SAMPLES}')
+    place = (samples['seq'] - first).astype(np.int64)
+    volts = np.full((n, 6), np.nan)
+    for i, channel in enumerate(CHANNELS):
+        volts[place, i] = samples[channel]
+    period = 1e9 / rig.converter.sample_rate_hz
+    # Times of the whole grid, lost samples included: straight lines between the samples present.
+    t_ns = np.rint(np.interp(np.arange(n), place, (samples['t_ns'] - samples['t_ns'][0]).astype(np.float64)))
+    start = int(samples['t_ns'][0])
+    grace = 0.25 * period
+    applied = recording.loads()
+    if not applied:
+        raise RecordingError(
+            f'{path}: holds no loads; discover compares with a simulation and needs them '
+            f'(CSV columns load_fx, load_fy, load_tz, or the topic /link_tip/load)'
+        )
+    times = np.array([a.t_ns - start for a in applied], dtype=np.int64)
+    held = _held(times, np.array([a[1:] for a in applied]), t_ns, grace, np.zeros(3))
+    temperatures = recording.temperatures()
+    warm: FloatArray | None = None
+    if temperatures:
+        at = np.array([r.t_ns - start for r in temperatures], dtype=np.int64)
+        celsius = np.array([r.celsius for r in temperatures])
+        if path.suffix.lower() == '.csv':
+            # A row's value holds until the next differs; a thermometer's messages are points on a curve.
+            warm = _held(at, celsius, t_ns, grace, celsius[0])
+        else:
+            warm = np.interp(t_ns, at.astype(np.float64), celsius)
+    reference: FloatArray | None = None
+    references = recording.references()
+    if references:
+        reference = np.full((n, 3), np.nan)
+        index = np.clip(np.rint(np.interp([r.t_ns - start for r in references], t_ns, np.arange(n))), 0, n - 1)
+        reference[index.astype(np.int64)] = [r[1:] for r in references]
+    return Observation(path.name, rig, volts, held, warm, reference, digest=_digest(path))
+
+
+def _held(
+    times: IntArray, values: FloatArray, t_ns: FloatArray, grace: float, before: FloatArray | float
+) -> FloatArray:
+    order = np.argsort(times, kind='stable')
+    index = np.searchsorted(times[order], t_ns + grace, side='right') - 1
+    out = values[order][np.maximum(index, 0)].astype(np.float64)
+    out[index < 0] = before
+    return out
+
+
+def _digest(path: Path) -> str:
+    digest = hashlib.sha256()
+    files = sorted(p for p in path.rglob('*') if p.is_file()) if path.is_dir() else [path]
+    try:
+        for file in files:
+            with file.open('rb') as stream:
+                while piece := stream.read(1 << 20):
+                    digest.update(piece)
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
+    return digest.hexdigest()
+
+
+def read_observations(paths: Sequence[str | Path], rig: Rig | None = None) -> list[Observation]:
+    """All of ``paths``: recordings, or ``.yaml`` lists of them with what differs in each::
+
+        - recording: short.csv
+          overrides: {link.length: 0.4}
+
+    Raises ConfigError and RecordingError naming file and key.
+    """
+    out: list[Observation] = []
+    for text in paths:
+        path = Path(text)
+        if path.suffix.lower() not in ('.yaml', '.yml') or path.name == 'metadata.yaml':
+            out.append(read_observation(path, rig))
+            continue
+        for i, (name, overrides) in enumerate(_listed(path)):
+            out.append(read_observation(path.parent / name, rig, overrides, f'{path}: entry {i + 1}'))
+    return out
+
+
+def _listed(path: Path) -> list[tuple[str, dict[str, object]]]:
+    try:
+        tree = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except OSError as error:
+        raise ConfigError(f'{path}: cannot be read as a list of recordings ({error.strerror or error})') from None
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise ConfigError(f'{path}: malformed YAML: {getattr(error, "problem", None) or "not YAML"}') from None
+    if not isinstance(tree, list) or not tree:
+        raise ConfigError(f'{path}: must be a list of "- recording: FILE" with optional "overrides:"')
+    out: list[tuple[str, dict[str, object]]] = []
+    for i, entry in enumerate(tree):
+        if isinstance(entry, str):
+            entry = {'recording': entry}
+        if not isinstance(entry, dict) or not isinstance(entry.get('recording'), str):
+            raise ConfigError(f'{path}: entry {i + 1}: must have "recording: FILE"')
+        unknown = set(entry) - {'recording', 'overrides'}
+        if unknown:
+            raise ConfigError(f'{path}: entry {i + 1}: {sorted(map(str, unknown))[0]}: only recording and overrides')
+        overrides = entry.get('overrides') or {}
+        if not isinstance(overrides, dict):
+            raise ConfigError(f'{path}: entry {i + 1}: overrides = {overrides!r}: must be a map of parameters')
+        flat: dict[str, object] = {}
+        for key, value in overrides.items():
+            if isinstance(value, dict):
+                flat.update({f'{key}.{k}': v for k, v in value.items()})
+            else:
+                flat[str(key)] = value
+        out.append((entry['recording'], flat))
+    return out

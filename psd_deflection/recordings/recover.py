@@ -1,0 +1,338 @@
+"""Makes a recording whole that a crash cut: index and summary for each file, ``metadata.yaml`` for the bag.
+
+Everything that lies whole in a file is copied, byte for byte, into a new one beside it; only then
+does the new one take the name, and the old one becomes ``NAME.mcap.cut``: nothing is lost by
+trying. Files that have their end already are not touched.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path, PurePath
+from typing import Any, NamedTuple
+
+import yaml
+from mcap.writer import CompressionType, Writer
+
+from psd_deflection import __version__
+from psd_deflection.errors import RecordingError
+from psd_deflection.recordings.bag_metadata import (
+    DEFAULT_QOS,
+    FileCount,
+    Qos,
+    TopicCount,
+    bag_information,
+    write_metadata,
+)
+from psd_deflection.recordings.bag_reader import read_information
+from psd_deflection.recordings.bag_writer import CHUNK_NS, CUSTOM
+from psd_deflection.recordings.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    DATA_END,
+    MAGIC,
+    MESSAGE,
+    METADATA,
+    SCHEMA,
+    Cursor,
+    DamagedError,
+    McapSource,
+    unpack_chunk,
+)
+
+_RECORD = struct.Struct('<BQ')
+_MESSAGE_HEAD = struct.Struct('<HIQQ')
+
+_MAX_QOS_TEXT = 100_000
+
+
+class _Message(NamedTuple):
+    channel: int
+    sequence: int
+    log_time: int
+    publish_time: int
+    body: bytes
+
+
+class _Schema(NamedTuple):
+    name: str
+    encoding: str
+    text: bytes
+
+
+class _Channel(NamedTuple):
+    schema: int
+    topic: str
+    encoding: str
+    metadata: dict[str, str]
+
+
+class _Metadata(NamedTuple):
+    name: str
+    values: dict[str, str]
+
+
+@dataclass(slots=True)
+class RecoveredFile:
+    """One file: what it holds now; ``repaired`` where it had to be; ``warnings`` of the reading."""
+
+    path: Path
+    repaired: bool
+    count: FileCount
+    topics: list[TopicCount]
+    warnings: list[str] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class Recovered:
+    """``files`` in order; ``metadata_written``: ``metadata.yaml`` was made anew; ``set_aside``: held nothing."""
+
+    files: list[RecoveredFile]
+    metadata_written: bool
+    set_aside: list[Path]
+
+
+def _content(
+    source: McapSource,
+) -> Iterator[_Message | _Schema | _Channel | _Metadata | tuple[int, _Schema | _Channel]]:
+    """What lies whole in the file, in its order; schemas and channels with their numbers."""
+    with source.path.open('rb') as stream:
+        for opcode, at, length in source.records(stream):
+            if opcode == DATA_END:
+                return
+            if opcode not in (SCHEMA, CHANNEL, METADATA, CHUNK, MESSAGE):
+                continue
+            stream.seek(at)
+            content = stream.read(length)
+            try:
+                if opcode == CHUNK:
+                    yield from _records_in(unpack_chunk(content))
+                else:
+                    yield _parsed(opcode, content)
+            except DamagedError as error:
+                source.warnings.append(f'{source.path}: the part at byte {at} is damaged ({error}) and is left out')
+
+
+def _records_in(plain: bytes) -> Iterator[Any]:
+    at = 0
+    while at < len(plain):
+        if len(plain) - at < _RECORD.size:
+            raise DamagedError('it ends within a record')
+        opcode, length = _RECORD.unpack_from(plain, at)
+        at += _RECORD.size
+        if length > len(plain) - at:
+            raise DamagedError('a record in it is longer than the chunk')
+        if opcode in (SCHEMA, CHANNEL, MESSAGE):
+            yield _parsed(opcode, plain[at : at + length])
+        at += length
+
+
+def _parsed(opcode: int, content: bytes) -> Any:
+    if opcode == MESSAGE:
+        if len(content) < _MESSAGE_HEAD.size:
+            raise DamagedError('a message has no head')
+        channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(content)
+        return _Message(channel, sequence, log_time, publish_time, content[_MESSAGE_HEAD.size :])
+    cursor = Cursor(content)
+    if opcode == METADATA:
+        return _Metadata(cursor.text(), cursor.mapping())
+    number = cursor.number(2)
+    if opcode == SCHEMA:
+        name, encoding = cursor.text(), cursor.text()
+        return number, _Schema(name, encoding, cursor.take(cursor.number(4)))
+    schema = cursor.number(2)
+    return number, _Channel(schema, cursor.text(), cursor.text(), cursor.mapping())
+
+
+def _qos_of(metadata: dict[str, str]) -> Qos | list[Qos]:
+    """The profile of a channel, so that ``metadata.yaml`` and the channel say the same."""
+    text = metadata.get('offered_qos_profiles', '')
+    if not text or len(text) > _MAX_QOS_TEXT:
+        return DEFAULT_QOS if not text else []
+    with contextlib.suppress(yaml.YAMLError, RecursionError, ValueError):
+        found = yaml.safe_load(text)
+        if isinstance(found, list) and all(isinstance(q, dict) for q in found):
+            return found
+    return []
+
+
+class _Copy:
+    """Counts what it is given, and writes it where ``target`` is given."""
+
+    def __init__(self, target: Path | None) -> None:
+        self.topics: dict[str, TopicCount] = {}
+        self.times: list[int] = []
+        self._stream = target.open('xb') if target is not None else None
+        self._writer: Writer | None = None
+        if self._stream is not None:
+            self._writer = Writer(self._stream, compression=CompressionType.ZSTD, enable_crcs=True)
+            self._writer.start(profile='ros2', library=f'psd_deflection {__version__} recover')
+        self._schemas: dict[int, _Schema] = {}
+        self._channels: dict[int, _Channel] = {}
+        self._numbers: dict[int, int] = {}
+        self._schema_numbers: dict[_Schema, int] = {}
+        self._first: int | None = None
+        self.messages = 0
+        self.start = self.end = 0
+
+    def add(self, item: Any) -> None:
+        if isinstance(item, _Metadata):
+            if self._writer is not None and item.name != 'rosbag2':
+                self._writer.add_metadata(item.name, item.values)
+        elif isinstance(item, _Message):
+            self._add_message(item)
+        elif isinstance(item[1], _Schema):
+            self._schemas[item[0]] = item[1]
+        else:
+            self._channels[item[0]] = item[1]
+
+    def _add_message(self, m: _Message) -> None:
+        channel = self._channels.get(m.channel)
+        if channel is None:
+            raise DamagedError('a message belongs to no channel')
+        schema = self._schemas.get(channel.schema, _Schema('', '', b''))
+        topic = self.topics.get(channel.topic)
+        if topic is None:
+            type_hash = channel.metadata.get('topic_type_hash', '')
+            topic = TopicCount(channel.topic, schema.name, _qos_of(channel.metadata), type_hash)
+            self.topics[channel.topic] = topic
+        topic.messages += 1
+        self.start = min(self.start, m.log_time) if self.messages else m.log_time
+        self.end = max(self.end, m.log_time)
+        self.messages += 1
+        writer = self._writer
+        if writer is None:
+            return
+        if m.channel not in self._numbers:
+            if schema not in self._schema_numbers:
+                self._schema_numbers[schema] = writer.register_schema(schema.name, schema.encoding, schema.text)
+            self._numbers[m.channel] = writer.register_channel(
+                channel.topic, channel.encoding, self._schema_numbers[schema], channel.metadata
+            )
+        if self._first is not None and abs(m.log_time - self._first) >= CHUNK_NS:
+            writer.flush()
+            self._first = None
+        self._first = m.log_time if self._first is None else self._first
+        writer.add_message(self._numbers[m.channel], m.log_time, m.body, m.publish_time, m.sequence)
+
+    def finish(self) -> None:
+        if self._writer is None or self._stream is None:
+            return
+        self._writer.finish()
+        self._stream.flush()
+        os.fsync(self._stream.fileno())
+        self._stream.close()
+
+    def abandon(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+
+
+def _recover_file(path: Path) -> RecoveredFile:
+    source = McapSource(path)
+    if path.stat().st_size <= len(MAGIC):
+        return RecoveredFile(path, False, FileCount(path.name, 0, 0, 0), [], [*source.warnings])
+    cut = source.cut_at is not None
+    partial = path.with_name(path.name + '.partial')
+    partial.unlink(missing_ok=True)
+    copy = _Copy(partial if cut else None)
+    try:
+        for item in _content(source):
+            try:
+                copy.add(item)
+            except DamagedError as error:
+                source.warnings.append(f'{path}: {error}; it is left out')
+        copy.finish()
+    except BaseException:
+        copy.abandon()
+        partial.unlink(missing_ok=True)
+        raise
+    count = FileCount(path.name, copy.start, copy.end, copy.messages)
+    if cut:
+        aside = path.with_name(path.name + '.cut')
+        if aside.exists():
+            partial.unlink()
+            raise RecordingError(f'{aside}: is there already, from an earlier repair; move it away first')
+        path.rename(aside)
+        partial.rename(path)
+    return RecoveredFile(path, cut, count, list(copy.topics.values()), list(source.warnings))
+
+
+def _refuse_if_written(path: Path) -> None:
+    with path.open('rb') as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RecordingError(f'{path}: is being recorded at this moment; end the recording first') from None
+
+
+def _number(path: Path) -> tuple[int, str]:
+    found = re.search(r'_(\d+)\.mcap$', path.name)
+    return (int(found.group(1)) if found else -1, path.name)
+
+
+def recover(path: str | Path) -> Recovered:
+    """Repair ``path``, a bag folder or a lone ``.mcap``, in its place.
+
+    Raises RecordingError where nothing of it can be read, where it is being recorded, or where the
+    disk refuses.
+    """
+    path = Path(path)
+    try:
+        if path.is_dir():
+            return _recover_folder(path)
+        if not path.is_file():
+            raise RecordingError(f'{path}: no such recording')
+        _refuse_if_written(path)
+        file = _recover_file(path)
+        if path.stat().st_size <= len(MAGIC):
+            raise RecordingError(f'{path}: has no more than its first bytes; there is nothing to recover')
+        return Recovered([file], False, [])
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be repaired ({error.strerror or error})') from None
+
+
+def _describes(metadata: Path, files: list[RecoveredFile]) -> bool:
+    """Whether ``metadata.yaml`` can be read and names the files that are there; what rosbag2 compressed is its own."""
+    try:
+        information = read_information(metadata)
+    except RecordingError:
+        return False
+    named = information.get('relative_file_paths')
+    names = {PurePath(str(n)).name for n in named} if isinstance(named, list) else set()
+    return bool(information.get('compression_mode')) or names == {f.path.name for f in files}
+
+
+def _recover_folder(folder: Path) -> Recovered:
+    paths = sorted(folder.glob('*.mcap'), key=_number)
+    if not paths:
+        raise RecordingError(f'{folder}: is no bag: it holds no .mcap file')
+    for file in paths:
+        _refuse_if_written(file)
+    files, set_aside = [], []
+    for file in paths:
+        # A file that the crash left without its first bytes has nothing to give.
+        if file.stat().st_size <= len(MAGIC) and len(paths) > 1:
+            aside = file.with_name(file.name + '.cut')
+            file.rename(aside)
+            set_aside.append(aside)
+            continue
+        files.append(_recover_file(file))
+    metadata = folder / 'metadata.yaml'
+    if metadata.is_file() and not set_aside and not any(f.repaired for f in files):
+        if _describes(metadata, files):
+            return Recovered(files, False, set_aside)
+        metadata.replace(metadata.with_name(metadata.name + '.cut'))
+    topics: dict[str, TopicCount] = {}
+    for file_ in files:
+        for t in file_.topics:
+            known = topics.setdefault(t.name, TopicCount(t.name, t.type, t.qos, t.type_hash))
+            known.messages += t.messages
+    write_metadata(folder, bag_information([f.count for f in files], list(topics.values()), CUSTOM))
+    return Recovered(files, True, set_aside)

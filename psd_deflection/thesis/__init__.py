@@ -1,0 +1,1 @@
+"""The methods of the thesis as printed, how they compare with the corrected ones, and its scaling study."""

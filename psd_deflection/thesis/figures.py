@@ -1,0 +1,424 @@
+"""The figures of docs/methods.md, drawn from the methods themselves: ``compare-methods --out DIR``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+
+mpl.use('Agg')
+
+import numpy as np
+from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
+from matplotlib.patches import Arc, Circle, Ellipse, FancyArrowPatch, Rectangle
+
+from psd_deflection.calibration.sensors import Duolateral, Quadrant
+from psd_deflection.cli._report import save_figure
+from psd_deflection.solvers._linear import design_matrix, gain_matrix
+from psd_deflection.solvers.base_pair import landings
+from psd_deflection.solvers.interface import Geometry
+from psd_deflection.solvers.registry import make_solver
+from psd_deflection.thesis.comparison import (
+    CONDITIONS,
+    DIRECT,
+    METHODS,
+    SIDEBAR,
+    VARIANCES,
+    dots_of,
+    errors,
+    thesis_geometry,
+)
+
+_STYLE: Any = {
+    'figure.dpi': 110,
+    'font.size': 9,
+    'axes.grid': True,
+    'grid.alpha': 0.3,
+    'axes.spines.top': False,
+    'axes.spines.right': False,
+    'legend.frameon': False,
+    'svg.hashsalt': 'psd_deflection',
+}
+_BLUE, _ORANGE, _GREEN, _RED, _GREY = '#1f6fb4', '#e07b1a', '#2f9455', '#c23b3b', '#777777'
+_MDEG = 1e3 * 180.0 / np.pi
+
+
+def draw_all(folder: Path) -> list[Path]:
+    """Draw every figure into ``folder``; returns the files. Raises RecordingError where one cannot be written."""
+    written = []
+    with plt.rc_context(_STYLE):
+        for name, draw in FIGURES.items():
+            figure = draw()
+            path = folder / f'{name}.png'
+            # No date or version in the file: the same figure is the same bytes.
+            save_figure(figure, path, metadata={'Software': None})
+            plt.close(figure)
+            written.append(path)
+    return written
+
+
+def _arrow(ax: Any, start: tuple[float, float], end: tuple[float, float], color: str, **options: Any) -> None:
+    ax.add_patch(FancyArrowPatch(start, end, arrowstyle='-|>', mutation_scale=12, color=color, **options))
+
+
+def sign_convention() -> Figure:
+    """Plate, PSDs, beams; and which way each quantity is positive."""
+    figure, (front, side, top) = plt.subplots(1, 3, figsize=(9.6, 4.2), width_ratios=(1.35, 1, 1), layout='constrained')
+    for ax in (front, side, top):
+        ax.set_aspect('equal')
+        ax.axis('off')
+    theta = np.radians(14.0)
+    d = np.array([22.0, -16.0])
+    turn = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+    centers = np.array([[0.0, 70.0], [-100.0, 0.0]])
+    front.add_patch(Circle((0, 0), 13, fill=False, color=_GREY, ls='--'))
+    front.add_patch(Circle(tuple(d), 13, fill=False, color=_BLUE, lw=1.5))
+    for i, c in enumerate(centers):
+        front.add_patch(Rectangle(tuple(c - 15), 30, 30, fill=False, color=_GREY, ls='--'))
+        moved = turn @ c + d
+        corners = (turn @ np.array([[-15, 15, 15, -15, -15], [-15, -15, 15, 15, -15]])).T + moved
+        front.plot(*corners.T, color=_BLUE, lw=1.5)
+        front.plot(*zip(d, moved, strict=True), color=_BLUE, lw=0.8)
+        front.plot(*c, 'o', color=_RED, ms=7)
+        front.annotate(f'beam {i + 1}, PSD {i + 1}', c, (c[0] - 18, c[1] + 24), color=_RED)
+    _arrow(front, (0, 0), (55, 0), 'black')
+    _arrow(front, (0, 0), (0, 45), 'black')
+    front.text(57, -3, 'X')
+    front.text(-12, 40, 'Y')
+    _arrow(front, (0, 0), (d[0], d[1]), _GREEN, lw=2)
+    front.text(d[0] + 16, d[1] - 6, '(dX, dY)', color=_GREEN)
+    front.add_patch(Arc(tuple(d), 70, 70, theta1=90, theta2=90 + np.degrees(theta), color=_ORANGE, lw=2))
+    front.plot([d[0], d[0]], [d[1], d[1] + 44], color=_ORANGE, lw=0.8, ls=':')
+    front.text(d[0] + 4, d[1] + 32, '+theta', color=_ORANGE)
+    front.set(xlim=(-135, 85), ylim=(-72, 120))
+    front.set_title(
+        'from beyond the tip, looking at the base\n(Z towards you; from the lasers, +theta is clockwise)', fontsize=9
+    )
+    for ax, axis, angle, title in (
+        (side, 'Y', 'phi', 'from the side: +phi leans\nthe tip towards -Y'),
+        (top, 'X', 'omega', 'from above: +omega leans\nthe tip towards +X'),
+    ):
+        z = np.linspace(0, 100, 50)
+        sag = (-1 if axis == 'Y' else 1) * 28 * (z / 100) ** 2 * (3 - z / 100) / 2
+        ax.plot(z, 0 * z, color=_GREY, ls='--')
+        ax.plot(z, sag, color=_BLUE, lw=2.5)
+        slope = (sag[-1] - sag[-2]) / (z[-1] - z[-2])
+        out = np.array([1.0, slope]) / np.hypot(1.0, slope)
+        tip = np.array([100.0, sag[-1]])
+        plate = np.outer([-1.0, 1.0], [-out[1], out[0]]) * 26 + tip
+        ax.plot(*plate.T, color=_BLUE, lw=4)
+        _arrow(ax, (100, 0), (130, 0), _GREY, ls='--')
+        _arrow(ax, (tip[0], tip[1]), (tip[0] + 30 * out[0], tip[1] + 30 * out[1]), _ORANGE, lw=2)
+        ax.text(tip[0] + 33, tip[1] + 26 * slope, f'+{angle}', color=_ORANGE)
+        _arrow(ax, (100, 0), (100, sag[-1]), _GREEN, lw=2)
+        ax.text(68, sag[-1] * 0.9 + 5, f'd{axis} {"<" if axis == "Y" else ">"} 0', color=_GREEN)
+        _arrow(ax, (0, 0), (0, 32), 'black')
+        ax.text(-3, 36, axis)
+        ax.text(134, -3, 'Z')
+        ax.plot([0, 112], [20 if axis == 'Y' else -22] * 2, color=_RED, lw=1)
+        ax.text(4, 23 if axis == 'Y' else -19, 'beam', color=_RED)
+        ax.set(xlim=(-12, 150), ylim=(-62, 62))
+        ax.set_title(title, fontsize=9)
+    return figure
+
+
+def comparison() -> Figure:
+    """The table of ``compare-methods`` as a picture."""
+    figure, axes = plt.subplots(1, 2, figsize=(9.6, 5.0), sharey=True, layout='constrained')
+    shown = METHODS[::-1]
+    rows = np.arange(len(shown))
+    for k, (condition, color) in enumerate(zip(CONDITIONS, (_BLUE, _ORANGE, _GREEN), strict=True)):
+        cells = [errors(m, condition) for m in shown]
+        translation = [1e6 * float(np.hypot(c.rms[0], c.rms[1])) for c in cells]
+        twist = [_MDEG * float(c.rms[2]) for c in cells]
+        for ax, values in zip(axes, (translation, twist), strict=True):
+            ax.plot(np.maximum(values, 1e-2), rows + 0.22 * (1 - k), 'o', color=color, ms=5, label=condition)
+    for ax, label in zip(axes, ('tip deflection, rms um', 'twist, rms mdeg'), strict=True):
+        ax.set_xscale('log')
+        ax.set(xlabel=label, xlim=(7e-3, 5e3), yticks=rows, yticklabels=[m.label for m in shown])
+        ax.axvspan(7e-3, 1.4e-2, color=_GREY, alpha=0.15)
+    axes[0].text(1.6e-2, 10.5, 'in the grey band: exact', color=_GREY, fontsize=8)
+    axes[0].axvline(2.45, color='black', lw=0.8, ls=':')
+    axes[1].axvline(1.328, color='black', lw=0.8, ls=':', label='noise, for 2 um a reading')
+    handles, labels = axes[1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside lower center', ncols=4, fontsize=8)
+    return figure
+
+
+def iterative() -> Figure:
+    """What the trial angle sees, and where each criterion stops."""
+    geometry = thesis_geometry()
+    pose = np.array([0.5e-3, -1.2e-3, np.radians(0.55), 0.0, 0.0])
+    dots = dots_of(geometry, pose[None])[0]
+    q = geometry.centers + dots.reshape(2, 2)
+    angles = np.radians(np.linspace(0.0, 1.0, 401))
+    c, s = np.cos(angles), np.sin(angles)
+    gap_x = (geometry.beams[0, 0] - geometry.beams[1, 0]) - (c * (q[0, 0] - q[1, 0]) - s * (q[0, 1] - q[1, 1]))
+    gap_y = (geometry.beams[0, 1] - geometry.beams[1, 1]) - (s * (q[0, 0] - q[1, 0]) + c * (q[0, 1] - q[1, 1]))
+    figure, ax = plt.subplots(figsize=(6.4, 3.4), layout='constrained')
+    degrees = np.degrees(angles)
+    ax.plot(degrees, 1e3 * gap_x, color=_BLUE, label='dX of PSD 1 less PSD 2')
+    ax.plot(degrees, 1e3 * gap_y, color=_ORANGE, label='dY of PSD 1 less PSD 2')
+    ax.axhspan(-0.1, 0.1, color=_GREY, alpha=0.2, label='tolerance 0.1 mm')
+    trial = tuple(dots.tolist()), tuple(VARIANCES.tolist())
+    for criterion, name, color, height in (('absolute', 'first hit', _RED, -0.7), ('argmin', 'least', _GREEN, 0.62)):
+        found = make_solver('iterative_printed', geometry, criterion=criterion).solve(*trial)
+        at = np.degrees(found.theta)
+        ax.axvline(at, color=color, lw=1.2)
+        label = f'{name}: {at:.2f} deg, dX off {1e6 * (found.dx - pose[0]):.0f} um'
+        ax.annotate(label, (at, height), (at - 0.02, height), ha='right', color=color, fontsize=8)
+    ax.set(xlabel='trial angle, deg', ylabel='disagreement, mm', xlim=(0, 1))
+    ax.legend(loc='upper right', fontsize=8)
+    return figure
+
+
+def linear() -> Figure:
+    """What linearising leaves out, and which channels the weights listen to."""
+    geometry = thesis_geometry()
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.4), layout='constrained')
+    theta = np.radians(np.linspace(-3, 3, 121))
+    poses = np.zeros((len(theta), 5))
+    poses[:, 0], poses[:, 1], poses[:, 2] = 2e-3, -2e-3, theta
+    dots = dots_of(geometry, poses)
+    for label, name, options, color, dash in (
+        ('ols', 'ols', {}, _BLUE, '-'),
+        ('wls, thesis weights', 'wls', {'weights': 'thesis'}, _ORANGE, '-'),
+        ('wls_exact (either weights)', 'wls_exact', {'weights': 'thesis'}, _GREEN, '-'),
+    ):
+        found = make_solver(name, geometry, **options).solve_many(dots, VARIANCES).pose
+        left.plot(np.degrees(theta), 1e6 * (found[:, 0] - 2e-3), color=color, ls=dash, label=label)
+    left.set(xlabel='twist, deg', ylabel='error of dX, um', title='tip at (2, -2) mm, no noise')
+    left.legend(fontsize=8)
+    design = design_matrix(geometry)
+    for k, (label, scaling, color) in enumerate(
+        (
+            ('equal', (1.0,) * 4, _BLUE),
+            ('sidebar [0.03, 0.5, 10, 0.1]', SIDEBAR, _ORANGE),
+            ('direct [3, 0.5, 10, 0.1]', DIRECT, _RED),
+        )
+    ):
+        po = np.array(scaling)
+        leverage = np.diag(po[:, None] * design @ gain_matrix(design, po) / po)
+        right.bar(np.arange(4) + 0.27 * (k - 1), leverage, 0.25, color=color, label=label)
+    right.set(xticks=range(4), xticklabels=['x1', 'y1', 'x2', 'y2'], ylabel='leverage', ylim=(0, 1.45))
+    right.set_title('how much of a reading its own fit follows')
+    right.legend(fontsize=8, loc='upper left')
+    return figure
+
+
+def exact() -> Figure:
+    """Draws of the noise and the ellipse that the covariance claims."""
+    geometry = thesis_geometry()
+    pose = np.array([[1.5e-3, -2.5e-3, np.radians(-1.2), 0.0, 0.0]])
+    rng = np.random.default_rng(1)
+    dots = dots_of(geometry, pose) + 2e-6 * rng.standard_normal((3000, 4))
+    found = make_solver('exact', geometry).solve_many(dots, VARIANCES)
+    off = (found.pose - pose[0, :3]) * (1e6, 1e6, _MDEG)
+    claimed = found.covariance[0] * np.outer((1e6, 1e6, _MDEG), (1e6, 1e6, _MDEG))
+    figure, axes = plt.subplots(1, 2, figsize=(8.0, 3.6), layout='constrained')
+    labels = ('error of dX, um', 'error of dY, um', 'error of theta, mdeg')
+    for ax, (i, j) in zip(axes, ((0, 2), (1, 2)), strict=True):
+        ax.plot(off[:, i], off[:, j], '.', ms=1.5, color=_BLUE)
+        values, vectors = np.linalg.eigh(claimed[np.ix_([i, j], [i, j])])
+        size = 2.0 * np.sqrt(5.9915 * values)
+        tilt = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
+        ax.add_patch(Ellipse((0, 0), size[1], size[0], angle=tilt, fill=False, color=_RED, lw=1.5))
+        ax.set(xlabel=labels[i], ylabel=labels[j])
+    axes[0].set_title('3000 draws of 2 um noise')
+    axes[1].set_title('ellipse: 95 % by the covariance')
+    return figure
+
+
+def appendix_d() -> Figure:
+    """Where the code of Appendix D finds the twist, a wrong one, or none."""
+    geometry = thesis_geometry()
+    dy, theta = np.meshgrid(np.linspace(-4e-3, 4e-3, 121), np.radians(np.linspace(-2, 2, 121)))
+    # Off any regular grid, which would beat with the trial angles.
+    theta = theta + np.radians(0.03) * np.random.default_rng(4).uniform(-1.0, 1.0, theta.shape)
+    poses = np.zeros((dy.size, 5))
+    poses[:, 0], poses[:, 1], poses[:, 2] = 1e-4, dy.ravel(), theta.ravel()
+    found = make_solver('appendix_d', geometry).solve_many(dots_of(geometry, poses), VARIANCES)
+    off = np.abs(found.pose[:, 2] - poses[:, 2]) * _MDEG
+    off[found.status != 0] = np.nan
+    figure, ax = plt.subplots(figsize=(6.4, 3.8), layout='constrained')
+    ax.grid(visible=False)
+    extent = (-4.0, 4.0, -2.0, 2.0)
+    silent = np.isnan(off).reshape(dy.shape)
+    ax.imshow(silent, extent=extent, origin='lower', aspect='auto', interpolation='nearest', cmap='Greys', vmax=1.4)
+    image = ax.imshow(
+        np.log10(np.maximum(off, 1.0)).reshape(dy.shape),
+        extent=extent,
+        origin='lower',
+        aspect='auto',
+        interpolation='nearest',
+        cmap=plt.get_cmap('viridis', 8),
+        vmin=0.0,
+        vmax=4.0,
+    )
+    bar = figure.colorbar(image, ticks=[0, 1, 2, 3, 4])
+    bar.ax.set_yticklabels(['1', '10', '100', '1000', '10000'])
+    bar.set_label('error of theta, mdeg')
+    ax.set(
+        xlabel='dY, mm',
+        ylabel='twist, deg (counter-clockwise +)',
+        title='grey: no trial passes, and (0, 0, 0) is returned',
+    )
+    return figure
+
+
+def minimum_tilt() -> Figure:
+    """The tilt found against the tilt there was, with noise."""
+    geometry = thesis_geometry()
+    true = np.radians(np.linspace(0.0, 1.5, 61))
+    along = (geometry.beams[0] - geometry.beams[1]) / np.hypot(*(geometry.beams[0] - geometry.beams[1]))
+    rng = np.random.default_rng(2)
+    figure, ax = plt.subplots(figsize=(6.0, 3.6), layout='constrained')
+    for label, direction, color in (
+        ('along the base line', along, _BLUE),
+        ('about the base line', [-along[1], along[0]], _ORANGE),
+    ):
+        poses = np.zeros((len(true) * 30, 5))
+        lean = np.repeat(true, 30)
+        poses[:, 3], poses[:, 4] = -lean * direction[1], lean * direction[0]
+        dots = dots_of(geometry, poses) + 2e-6 * rng.standard_normal((len(poses), 4))
+        tilt = make_solver('minimum_tilt', geometry).solve_many(dots, VARIANCES).tilt
+        ax.plot(np.degrees(lean), np.degrees(np.hypot(tilt[:, 0], tilt[:, 1])), '.', ms=2.5, color=color, label=label)
+    ax.plot([0, 1.5], [0, 1.5], color='black', lw=0.8)
+    ax.axvline(0.33, color=_GREY, ls=':')
+    ax.text(0.34, 1.4, '50 N', color=_GREY)
+    ax.set(
+        xlabel='tilt of the plate, deg',
+        ylabel='least tilt that explains the dots, deg',
+        title='noise 2 um; the sign is never seen',
+    )
+    ax.legend(fontsize=8, loc='center right')
+    return figure
+
+
+def beam() -> Figure:
+    """What the tilt of a cantilever costs a flat method, by load and height of the sensors."""
+    figure, axes = plt.subplots(1, 2, figsize=(8.6, 3.4), sharey=True, layout='constrained')
+    force = np.linspace(2.0, 50.0, 25)
+    for ax, height in zip(axes, (0.0, 0.020), strict=True):
+        nominal = thesis_geometry()
+        geometry = Geometry(nominal.centers, nominal.zeros, np.full(2, height), nominal.link_length, 1.5)
+        for k, color in ((1.5, _BLUE), (1.395, _GREEN), (2.0, _ORANGE)):
+            poses = np.zeros((len(force), 5))
+            poses[:, 0], poses[:, 1] = 0.12e-3 * force / 50.0, -2.2272e-3 * force / 50.0
+            poses[:, 2] = np.radians(-0.9407) * force / 50.0
+            poses[:, 3], poses[:, 4] = -k * poses[:, 1] / 0.585, k * poses[:, 0] / 0.585
+            dots = dots_of(geometry, poses)
+            for name, dash in (('exact', '--'), ('beam', '-')):
+                off = make_solver(name, geometry).solve_many(dots, VARIANCES).pose - poses[:, :3]
+                size = 1e6 * np.hypot(off[:, 0], off[:, 1])
+                ax.plot(
+                    force,
+                    np.maximum(size, 1.2e-4),
+                    dash,
+                    lw=2 if k == 1.5 else 1.2,
+                    color=color,
+                    label=f'{name}, true k = {k:g}',
+                )
+        ax.set(
+            xlabel='load on the sidebar, N',
+            yscale='log',
+            ylim=(1e-4, 300),
+            title=f'surfaces {1e3 * height:g} mm above the section',
+        )
+    axes[0].set_ylabel('error of (dX, dY), um')
+    axes[0].text(4, 1.5e-4, 'beam, true k = 1.5: exact', color=_BLUE, fontsize=8)
+    axes[0].legend(fontsize=7, ncols=2, loc='upper center')
+    return figure
+
+
+def pose() -> Figure:
+    """How staggering three PSDs makes the tilts visible."""
+    steps = np.geomspace(2e-3, 0.1, 25)
+    turns = np.radians([0.0, 120.0, 240.0])
+    centers = 0.1 * np.column_stack((np.cos(turns), np.sin(turns)))
+    rng = np.random.default_rng(3)
+    deviations = []
+    for step in steps:
+        geometry = Geometry(centers, np.zeros((3, 2)), np.array([step, -step / 2, -step / 2]), 0.585)
+        poses = np.tile([0.1e-3, -2e-3, -0.015, 0.0, 0.0], (400, 1))
+        dots = dots_of(geometry, poses) + 2e-6 * rng.standard_normal((400, 6))
+        found = make_solver('pose', geometry).solve_many(dots, np.full(6, 4e-12))
+        good = found.status == 0
+        deviations.append([*(_MDEG * np.std(found.tilt[good], axis=0)), _MDEG * np.std(found.pose[good, 2])])
+    figure, ax = plt.subplots(figsize=(5.8, 3.6), layout='constrained')
+    for values, label, color in zip(
+        np.transpose(deviations), ('phi', 'omega', 'theta'), (_BLUE, _ORANGE, _GREEN), strict=True
+    ):
+        ax.loglog(1e3 * steps, values, '.-', color=color, label=label)
+    ax.set(xlabel='height of PSD 1, mm (the others half below)', ylabel='standard deviation, mdeg')
+    ax.set_title('three PSDs on a circle of 100 mm, noise 2 um')
+    ax.legend(fontsize=8)
+    return figure
+
+
+def base_pair() -> Figure:
+    """What twist does to the method of section 5.3, and what tying the tilts does about it."""
+    nominal = thesis_geometry()
+    geometry = Geometry(nominal.centers, nominal.zeros, np.array([-0.585, -0.485]), nominal.link_length, 1.5)
+    theta = np.radians(np.linspace(-1, 1, 81))
+    poses = np.zeros((len(theta), 5))
+    poses[:, 0], poses[:, 1], poses[:, 2] = 1e-3, -2e-3, theta
+    poses[:, 3], poses[:, 4] = 1.5 * 2e-3 / 0.585, 1.5 * 1e-3 / 0.585
+    places, _ = landings(geometry.beams, geometry.heights, poses)
+    dots = places - geometry.centers.ravel()
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.4), layout='constrained')
+    for assume, color in (('no_twist', _RED), ('beam', _GREEN)):
+        found = make_solver('base_pair', geometry, assume=assume).solve_many(dots, VARIANCES).pose
+        left.plot(np.degrees(theta), 1e3 * (found[:, 1] + 2e-3), color=color, label=f'assume {assume}')
+    left.set(xlabel='true twist, deg', ylabel='error of dY, mm', title='tip at (1, -2) mm, exact readings')
+    left.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
+    left.legend(fontsize=8)
+    distance = np.linspace(0.0, 0.6, 61)
+    for k, color in ((1.0, _ORANGE), (1.5, _BLUE), (2.0, _GREEN)):
+        right.plot(1e3 * distance, 1.0 - k * distance / 0.585, color=color, label=f'k = {k:g}')
+    right.axhline(0.0, color='black', lw=0.8)
+    right.set(
+        xlabel='lasers to PSD, mm',
+        ylabel='dot travel per deflection',
+        title='where a tilt hides the deflection (Fig. 5.9)',
+    )
+    right.legend(fontsize=8)
+    return figure
+
+
+def sensors() -> Figure:
+    """Ratio of currents against the place of the spot."""
+    x = np.linspace(-5e-3, 5e-3, 401)
+    place = np.column_stack((x, 0.0 * x))
+    figure, ax = plt.subplots(figsize=(5.8, 3.4), layout='constrained')
+    lateral = Duolateral((0.010, 0.010), 0.5e-3)
+    ax.plot(1e3 * x, lateral.to_ratios(place)[:, 0], color=_BLUE, label='lateral: duolateral, tetralateral, pincushion')
+    for w, color in ((0.5e-3, _ORANGE), (2e-3, _GREEN)):
+        quadrant = Quadrant((0.010, 0.010), w)
+        ax.plot(
+            1e3 * x, quadrant.to_ratios(place)[:, 0], color=color, label=f'quadrant, Gaussian spot, w = {1e3 * w:g} mm'
+        )
+        reach = quadrant.reach()[0]
+        edge = quadrant.to_ratios(np.array([[reach, 0.0]]))[0, 0]
+        ax.plot([-1e3 * reach, 1e3 * reach], [-edge, edge], 'o', color=color, ms=4)
+    ax.set(xlabel='spot from the centre, mm', ylabel='difference over sum', ylim=(-1.1, 1.6))
+    ax.legend(fontsize=8, loc='upper left')
+    return figure
+
+
+FIGURES: dict[str, Callable[[], Figure]] = {
+    'sign_convention': sign_convention,
+    'comparison': comparison,
+    'sensors': sensors,
+    'linear': linear,
+    'iterative': iterative,
+    'appendix_d': appendix_d,
+    'exact': exact,
+    'minimum_tilt': minimum_tilt,
+    'beam': beam,
+    'pose': pose,
+    'base_pair': base_pair,
+}

@@ -1,0 +1,292 @@
+"""Faults of the optics one by one, what the node makes of one detector alone, and that replay agrees."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.pipeline import FROZEN, HELD, Pipeline
+from psd_deflection.records import BlockStatus, DeflectionEstimate, ParameterChange, Record, SpotMeans, TipLoad
+from psd_deflection.solvers.from_rig import geometry_from_rig
+from psd_deflection.solvers.one_psd import OnePsd
+from test.test_pipeline import STEP, chunk_of, still
+
+Counts = npt.NDArray[np.int16]
+POSE = (4e-4, -3e-4, 0.004)
+SIZE = 20
+
+
+def dark(counts: Counts, psd: int, blocks: slice) -> Counts:
+    out = counts.copy()
+    rows = slice(blocks.start * SIZE, blocks.stop * SIZE)
+    out[rows, 3 * psd - 3 : 3 * psd] %= 13
+    return out
+
+
+def records_of(pipeline: Pipeline, counts: Counts, first: int = 0) -> list[Record]:
+    return list(pipeline.process(chunk_of(counts, first)))
+
+
+def primaries(records: list[Record]) -> dict[int, DeflectionEstimate]:
+    return {r.block: r for r in records if isinstance(r, DeflectionEstimate) and r.primary}
+
+
+def spots(records: list[Record]) -> list[SpotMeans]:
+    return [r for r in records if isinstance(r, SpotMeans)]
+
+
+def moving(n: int, pose: tuple[float, float, float] = POSE, seed: int = 3) -> Counts:
+    return still(pose, n * SIZE, seed)
+
+
+# ---- one detector alone
+
+
+@pytest.mark.parametrize('psd', [1, 2])
+def test_the_translation_of_one_psd_is_exact_where_the_twist_is(psd: int) -> None:
+    rig = load_rig()
+    dx, dy, theta = POSE
+    c, s = np.cos(theta), np.sin(theta)
+    x, y = rig.centers[psd - 1]
+    dot = (c * (x - dx) + s * (y - dy) - x, -s * (x - dx) + c * (y - dy) - y)
+    got = OnePsd(geometry_from_rig(rig)).solve(psd - 1, dot, (1e-12, 1e-12), theta, 1e-6)
+    assert got[0] == pytest.approx(dx, abs=1e-15)
+    assert got[1] == pytest.approx(dy, abs=1e-15)
+
+
+@pytest.mark.parametrize('psd', [1, 2])
+def test_its_covariance_is_what_a_draw_shows(psd: int) -> None:
+    rig = load_rig()
+    solver = OnePsd(geometry_from_rig(rig))
+    rng = np.random.default_rng(1)
+    variances, sd = (4e-12, 1e-12), 2e-3
+    answers = []
+    for _ in range(20_000):
+        dot = (1e-3 + rng.normal(0, 2e-6), -5e-4 + rng.normal(0, 1e-6))
+        theta = 0.004 + rng.normal(0, sd)
+        dx, dy, _ = solver.solve(psd - 1, dot, variances, theta, sd**2)
+        answers.append((dx, dy, theta))
+    _, _, stated = solver.solve(psd - 1, (1e-3, -5e-4), variances, 0.004, sd**2)
+    seen = np.cov(np.array(answers).T)
+    sds = np.sqrt(np.diag(seen))
+    np.testing.assert_allclose(np.sqrt(np.diag(np.reshape(stated, (3, 3)))), sds, rtol=0.03)
+    np.testing.assert_allclose(np.reshape(stated, (3, 3)) / np.outer(sds, sds), seen / np.outer(sds, sds), atol=0.03)
+
+
+def test_off_is_the_default_and_nothing_is_estimated() -> None:
+    pipeline = Pipeline(load_rig())
+    records = records_of(pipeline, dark(moving(12), 2, slice(4, 8)))
+    assert sorted(primaries(records)) == [0, 1, 2, 3, 8, 9, 10, 11]
+    assert pipeline.counters.degraded == 0
+    assert pipeline.counters.refused == {'laser_lost': 4}
+
+
+@pytest.mark.parametrize('psd', [1, 2])
+@pytest.mark.parametrize('rule', ['hold', 'zero'])
+def test_with_one_laser_lost_the_translation_goes_on_by_the_rule_and_returns(psd: int, rule: str) -> None:
+    rig = load_rig(overrides={'degraded': rule})
+    pipeline = Pipeline(rig)
+    records = records_of(pipeline, dark(moving(40), psd, slice(10, 30)))
+    found = primaries(records)
+    assert sorted(found) == list(range(40))
+    full = found[9]
+    for block in range(10, 30):
+        e = found[block]
+        assert e.solver == 'one_psd'
+        assert e.theta == (full.theta if rule == 'hold' else 0.0)
+        # What is claimed holds: the error is within four of its standard deviations.
+        error = np.array([e.dx - POSE[0], e.dy - POSE[1], e.theta - POSE[2]])
+        covariance = np.reshape(e.covariance, (3, 3))
+        assert (np.abs(error) < 4 * np.sqrt(np.diag(covariance))).all()
+        assert np.linalg.eigvalsh(covariance).min() > 0
+        # And it is worse than with both, for the axis that the arm turns.
+        assert e.covariance[8] > full.covariance[8]
+    assert found[30].solver == 'exact'
+    np.testing.assert_allclose(found[30].covariance, full.covariance, rtol=1e-3)
+    assert pipeline.counters.degraded == 20
+    assert pipeline.counters.refused == {}
+    statuses = [s.status for s in spots(records)]
+    assert statuses[10:30] == [BlockStatus.LASER_LOST] * 20
+    # The torque is not measured: no load is told.
+    loads = {r.t_ns for r in records if isinstance(r, TipLoad)}
+    assert not loads & {found[b].t_ns for b in range(10, 30)}
+    # A zero is not taken from one detector.
+    pipeline = Pipeline(rig)
+    records_of(pipeline, dark(moving(10), psd, slice(5, 10)))
+    assert pipeline.zero() is None
+
+
+def test_a_held_twist_is_forgotten_at_the_stated_rate() -> None:
+    rig = load_rig(overrides={'degraded': 'hold', 'twist_hold': 0.2, 'twist_sd': 0.02})
+    found = primaries(records_of(Pipeline(rig), dark(moving(60), 1, slice(10, 60))))
+    for block in (10, 20, 59):
+        age = 0.02 * (block - 9)
+        expected = found[9].covariance[8] + 0.02**2 * (1 - np.exp(-age / 0.2))
+        assert found[block].covariance[8] == pytest.approx(expected, rel=1e-9)
+
+
+def test_there_is_no_twist_to_hold_before_the_first() -> None:
+    found = primaries(records_of(Pipeline(load_rig(overrides={'degraded': 'hold'})), dark(moving(6), 1, slice(0, 3))))
+    assert sorted(found) == [3, 4, 5]
+
+
+def test_both_lost_is_no_estimate_by_any_rule() -> None:
+    counts = dark(dark(moving(6), 1, slice(2, 4)), 2, slice(2, 4))
+    found = primaries(records_of(Pipeline(load_rig(overrides={'degraded': 'zero'})), counts))
+    assert sorted(found) == [0, 1, 4, 5]
+
+
+def test_a_saturated_or_strayed_detector_leaves_the_other_too() -> None:
+    rig = load_rig(overrides={'degraded': 'zero'})
+    counts = moving(3)
+    counts[SIZE : 2 * SIZE, 3] = 32767
+    records = records_of(Pipeline(rig), counts)
+    assert [s.status for s in spots(records)] == [BlockStatus.OK, BlockStatus.SATURATED, BlockStatus.OK]
+    assert primaries(records)[1].solver == 'one_psd'
+
+
+# ---- memory and replay
+
+
+def replayed(pipeline: Pipeline, counts: Counts, first: int, change: ParameterChange | None) -> list[Record]:
+    if change is not None:
+        pipeline.apply(change)
+    return records_of(pipeline, counts, first)
+
+
+@pytest.mark.parametrize('start', [5, 12, 18])
+def test_a_recording_that_begins_in_an_outage_replays_bit_for_bit(start: int) -> None:
+    rig = load_rig(overrides={'degraded': 'hold'})
+    counts = dark(moving(30), 2, slice(10, 20))
+    counts[14 * SIZE : 24 * SIZE, 0:3] = counts[14 * SIZE, 0:3]
+    live = Pipeline(rig)
+    records_of(live, counts[: start * SIZE])
+    memory = live.memory()
+    assert memory is not None
+    assert memory.block == start
+    after = records_of(live, counts[start * SIZE :], start * SIZE)
+    again = replayed(Pipeline(rig), counts[start * SIZE :], start * SIZE, memory)
+    assert primaries(again) == primaries(after)
+    assert [(s.status, s.reason, s.findings) for s in spots(again)] == [
+        (s.status, s.reason, s.findings) for s in spots(after)
+    ]
+    # Without what was remembered it could not have.
+    if 10 < start < 14:
+        assert primaries(replayed(Pipeline(rig), counts[start * SIZE :], start * SIZE, None)) != primaries(after)
+
+
+def test_what_is_remembered_says_only_what_matters() -> None:
+    pipeline = Pipeline(load_rig())
+    records_of(pipeline, moving(5))
+    assert pipeline.memory() is None
+    pipeline.change({'degraded': 'hold'})
+    memory = pipeline.memory()
+    assert memory is not None
+    assert [name for name, _ in memory.values] == [HELD]
+    frozen = moving(5)
+    frozen[:, 3:6] = frozen[0, 3:6]
+    records_of(pipeline, frozen, 5 * SIZE)
+    memory = pipeline.memory()
+    assert memory is not None
+    assert dict(memory.values)[FROZEN] == (0, 5)
+
+
+# ---- findings
+
+
+def test_a_detector_that_stands_still_is_reported_and_refused_where_it_shall_be() -> None:
+    counts = moving(12)
+    counts[2 * SIZE : 10 * SIZE, 0:3] = counts[2 * SIZE, 0:3]
+    quiet = Pipeline(load_rig())
+    assert {s.status for s in spots(records_of(quiet, counts[: 8 * SIZE]))} == {BlockStatus.OK}
+    assert quiet.counters.findings['psd_1 stands still'] == 2
+    records = records_of(Pipeline(load_rig(overrides={'frozen': 'refuse'})), counts)
+    statuses = [s.status for s in spots(records)]
+    assert statuses == [BlockStatus.OK] * 6 + [BlockStatus.FROZEN] * 4 + [BlockStatus.OK] * 2
+    assert 'psd_1 stands still: no bit has moved for 5 blocks' in [s.reason for s in spots(records)]
+
+
+def test_without_noise_by_the_rig_file_standing_still_is_no_fault() -> None:
+    counts = moving(10)
+    counts[:] = counts[0]
+    records = records_of(Pipeline(load_rig(overrides={'amplifier.noise': 1e-5})), counts)
+    assert all(s.status is BlockStatus.OK for s in spots(records))
+
+
+def findings_of(rig: Rig, counts: Counts) -> tuple[SpotMeans, DeflectionEstimate | None]:
+    records = records_of(Pipeline(rig), counts)
+    (spot,) = spots(records)
+    return spot, primaries(records).get(0)
+
+
+def test_noise_is_told_and_motion_is_not_taken_for_it() -> None:
+    counts = moving(1)
+    rng = np.random.default_rng(2)
+    noisy = counts.copy()
+    noisy[:, 3] += np.rint(rng.normal(0, 0.05 / STEP, SIZE)).astype(np.int16)
+    spot, estimate = findings_of(load_rig(), noisy)
+    assert len(spot.findings) == 1
+    assert spot.findings[0].startswith('psd_2 is noisy')
+    assert estimate is not None
+    swinging = counts.copy()
+    swing = 1e-3 / 5e-4 * np.sin(2 * np.pi * 14.0 * np.arange(SIZE) * 1e-3)
+    swinging[:, 0] += np.rint(swing / STEP).astype(np.int16)
+    assert findings_of(load_rig(), swinging)[0].findings == ()
+
+
+def test_a_spot_at_the_edge_is_told() -> None:
+    counts = moving(1)
+    counts[:, 4] += np.int16(round(4.6e-3 / 5e-4 / STEP))
+    spot, estimate = findings_of(load_rig(), counts)
+    assert spot.findings == ('psd_2: the spot is clipped at the edge',)
+    assert spot.status is BlockStatus.OK
+    assert estimate is not None
+
+
+def test_other_light_is_told_and_widens_the_covariance() -> None:
+    counts = moving(1)
+    _, clean = findings_of(load_rig(), counts)
+    lit = counts.copy()
+    lit[:, 2] = np.int16(round(8.0 / STEP))
+    spot, estimate = findings_of(load_rig(), lit)
+    assert 'psd_1 sees other light' in spot.findings[0]
+    assert clean is not None
+    assert estimate is not None
+    # A share of 3/8 of the light, spread over 10 mm: a millimetre, at an arm of 0.12 m.
+    assert estimate.covariance[8] ** 0.5 == pytest.approx(3 / 8 * 5e-3 / 3**0.5 / 0.122, rel=0.2)
+    assert estimate.covariance[8] > 1e4 * clean.covariance[8]
+
+
+@pytest.fixture
+def half_lit() -> Counts:
+    counts = moving(1)
+    counts[:, 2] //= 2
+    counts[:, 5] //= 2
+    return counts
+
+
+def test_with_the_splitter_one_laser_lost_is_told_and_not_fatal(half_lit: Counts) -> None:
+    spot, estimate = findings_of(load_rig(overrides={'splitter': True}), half_lit)
+    assert spot.status is BlockStatus.OK
+    assert spot.findings == ('one of the two lasers is out: half the light on both detectors',)
+    assert estimate is not None
+    _, full = findings_of(load_rig(overrides={'splitter': True}), moving(1))
+    assert full is not None
+    np.testing.assert_allclose(np.array(estimate.covariance), 4 * np.array(full.covariance), rtol=1e-9, atol=1e-30)
+    # A detector that lost its own beam is lost with the splitter too; without it, half the light is none.
+    assert findings_of(load_rig(overrides={'splitter': True}), dark(moving(1), 1, slice(0, 1)))[0].status == 2
+    half_lit[:, [2, 5]] -= 40
+    assert findings_of(load_rig(), half_lit)[0].status is BlockStatus.LASER_LOST
+
+
+def test_a_change_of_the_rule_while_it_runs_holds_from_the_next_block() -> None:
+    pipeline = Pipeline(load_rig())
+    counts = dark(moving(20), 1, slice(5, 15))
+    first = primaries(records_of(pipeline, counts[: 10 * SIZE]))
+    change = pipeline.change({'degraded': 'zero'})
+    second = primaries(records_of(pipeline, counts[10 * SIZE :], 10 * SIZE))
+    assert sorted(first) == [0, 1, 2, 3, 4]
+    assert sorted(second) == list(range(10, 20))
+    assert change.values == (('degraded', 'zero'),)

@@ -1,0 +1,87 @@
+"""``psd-deflection compare-methods``: the tables, the figures, and that the page on methods has them all."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.cli.main import main
+from psd_deflection.solvers import SOLVERS
+from psd_deflection.thesis.comparison import CAUSES, METHODS
+from psd_deflection.thesis.figures import FIGURES
+
+DOCS = Path(__file__).parents[2] / 'docs'
+
+
+def test_tables(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['compare-methods']) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(len(line) for line in lines) <= 120
+    end = next(i for i, line in enumerate(lines) if line.startswith('Standard deviations'))
+    rows = {m.label: [line for line in lines[:end] if line.startswith(m.label + '  ')] for m in METHODS}
+    assert all(len(found) == 2 for found in rows.values())
+    rms, largest = rows['exact (default)']
+    assert '0 / 0 / 0' in rms
+    assert '3.34 / 2.67 / 1.83' in rms
+    assert '8.98 / 6.3 / 3.32' in largest
+    assert rows['Appendix D iterative'][0].endswith('5.8 %')
+    squeezed = [' '.join(line.split()) for line in lines[end:]]
+    for said in (
+        'exact, ols, wls 1.63 / 1.83 / 1.33',
+        'wls, thesis weights, sidebar 2.00 / 2.00 / 1.55',
+        'wls, thesis weights, direct 2.00 / 1.93 / 2.31',
+        'Appendix D weighted, direct -0.995 mdeg',
+        'A in mm 149.53 (122.07)',
+        '4.33, mm and rad in one norm 3.868',
+    ):
+        assert said in squeezed
+    for cause in CAUSES:
+        assert sum(line.startswith(cause.label + ' ') for line in lines) == 1
+    (alone,) = (line for line in lines if line.startswith('the algorithms alone'))
+    assert alone.split()[3:] == ['-8.6', '84.9', '0.0', '|', '-0.4', '19.2', '-0.5']
+
+
+def test_programs_get_the_errors_in_si_units(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['compare-methods', '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert list(found) == [m.label for m in METHODS]
+    cantilever = found['exact (default)']['cantilever tilts']
+    assert cantilever['rms'] == pytest.approx([3.34e-6, 2.67e-6, math.radians(1.83e-3)], rel=2e-3)
+    assert cantilever['largest'] == pytest.approx([8.98e-6, 6.30e-6, math.radians(3.32e-3)], rel=2e-3)
+    silent = max(condition['silent'] for condition in found['Appendix D iterative'].values())
+    assert silent == pytest.approx(0.058, abs=5e-4)
+
+
+def test_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['compare-methods', '--out', str(tmp_path / 'new' / 'figures')]) == 0
+    written = sorted((tmp_path / 'new' / 'figures').iterdir())
+    assert [p.name for p in written] == sorted(f'{name}.png' for name in FIGURES)
+    said = capsys.readouterr().out
+    for path in written:
+        assert f'wrote {path}' in said
+        assert path.read_bytes().startswith(b'\x89PNG')
+        assert 5_000 < path.stat().st_size < 150_000
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / 'taken').write_text('')
+    assert main(['compare-methods', '--out', str(tmp_path / 'taken')]) == 4
+    assert 'taken: cannot be made a folder' in capsys.readouterr().err
+
+
+def test_a_figure_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / 'sign_convention.png').mkdir()
+    assert main(['compare-methods', '--out', str(tmp_path)]) == 4
+    assert f'--out {tmp_path / "sign_convention.png"}: cannot be written' in capsys.readouterr().err
+
+
+def test_the_page_has_every_method_and_every_figure() -> None:
+    page = (DOCS / 'methods.md').read_text()
+    for name in SOLVERS:
+        assert f'`{name}`' in page, name
+    for name in FIGURES:
+        assert f'(figures/{name}.png)' in page, name
+        assert (DOCS / 'figures' / f'{name}.png').exists()

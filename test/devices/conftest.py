@@ -1,0 +1,240 @@
+"""Simulated devices on lines, pulled out and plugged in by the test.
+
+``served``: on a pseudo-terminal, in real time. ``wired``: on a line of our own, in a time of our own
+that passes only while somebody waits, so that a device is never late and waits for its reader: for
+sources that measure how quick the device is, whatever else the machine does.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psd_deflection.config import Rig
+from psd_deflection.devices import dataq, text_lines, thorlabs
+from psd_deflection.devices.serial_port import PortClosedError
+from psd_deflection.devices.simulated_device import LineDevice, PseudoTerminal, serve
+from psd_deflection.errors import DeviceError
+from psd_deflection.records import FloatArray
+from psd_deflection.runner import acquisition
+from psd_deflection.runner.acquisition import Acquisition, Chunk
+from test.heard import WAIT_S
+
+
+def no_load(_: int, n: int) -> FloatArray:
+    return np.zeros((n, 3))
+
+
+class Served:
+    """A device behind a link that keeps its name while the terminal comes and goes."""
+
+    def __init__(self, link: Path) -> None:
+        self.link = link
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def plug(self, device: LineDevice) -> None:
+        self._stop = threading.Event()
+        self._terminal = PseudoTerminal(self.link)
+        self._thread = threading.Thread(
+            target=serve, args=(device, self._terminal, self._stop.is_set), name='device', daemon=True
+        )
+        self._thread.start()
+
+    def unplug(self) -> None:
+        if self._thread is not None:
+            self._stop.set()
+            self._thread.join()
+            self._terminal.close()
+            self._thread = None
+
+
+class OwnClock:
+    """Stands for the module ``time``; nanoseconds that pass while somebody waits."""
+
+    def __init__(self) -> None:
+        self.now = 10**12
+
+    def monotonic_ns(self) -> int:
+        return self.now
+
+    def monotonic(self) -> float:
+        return self.now / 1e9
+
+    def time_ns(self) -> int:
+        return self.now + 10**18
+
+    def sleep(self, seconds: float) -> None:
+        self.now += round(seconds * 1e9)
+
+
+class Wired:
+    """A device on a line that has no kernel in it; ``link`` is the port's name."""
+
+    def __init__(self, link: str, clock: OwnClock) -> None:
+        self.link = link
+        self._clock = clock
+        self._waiting = b''
+        self._powered = 0
+        self.device: LineDevice | None = None
+
+    def plug(self, device: LineDevice) -> None:
+        self._waiting, self._powered = b'', self._clock.now
+        self.device = device
+
+    def unplug(self) -> None:
+        self.device = None
+
+    def _there(self) -> LineDevice:
+        if self.device is None:
+            raise PortClosedError(f'{self.link}: the device is gone')
+        return self.device
+
+    def greet(self) -> None:
+        """Somebody opened the port."""
+        self._waiting += self._there().greeting()
+
+    def due_in_ns(self) -> int:
+        """Until it has something to be read; 0 where it has, or is gone."""
+        gone = self.device is None or self._waiting
+        return 0 if gone else max(self._there().due_in_ns(self._clock.now - self._powered), 0)
+
+    def read(self, timeout: float) -> bytes:
+        deadline = self._clock.now + round(timeout * 1e9)
+        while True:
+            self._waiting += self._there().take(self._clock.now - self._powered)
+            if self._waiting or self._clock.now >= deadline:
+                received, self._waiting = self._waiting, b''
+                return received
+            self._clock.now = min(self._clock.now + max(self.due_in_ns(), 1000), deadline)
+
+    def write(self, frame: bytes) -> None:
+        device = self._there()
+        self._waiting += device.receive(frame, self._clock.now - self._powered)
+
+    def discard(self) -> None:
+        self._there().take(self._clock.now - self._powered)
+        self._waiting = b''
+
+
+class WiredPort:
+    """Stands for ``SerialPort``."""
+
+    def __init__(self, lines: list[Wired], name: str) -> None:
+        self._number = next(i for i, line in enumerate(lines) if line.link == name)
+        self._line = lines[self._number]
+        if self._line.device is None:
+            raise DeviceError(f'{name}: no such port')
+        self._line.greet()
+        self.read, self.write, self.discard_input = self._line.read, self._line.write, self._line.discard
+
+    def fileno(self) -> int:
+        return self._number
+
+    def give_up(self) -> None:
+        """It never waits long."""
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class Run:
+    """The reader on a rig, and what it said."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.acquisition = Acquisition(rig, self.said.put)
+        self.acquisition.open()
+        self.acquisition.start()
+
+    def take(self, n: int) -> list[Chunk]:
+        """The next chunks until ``n`` samples have come."""
+        chunks: list[Chunk] = []
+        while sum(len(c.raw.seq) for c in chunks) < n:
+            item = self.acquisition.queue.get(timeout=WAIT_S)
+            if isinstance(item, Chunk):
+                chunks.append(item)
+        return chunks
+
+    def heard(self, text: str) -> str:
+        while True:
+            message = self.said.get(timeout=WAIT_S)
+            if text in message:
+                return message
+
+
+@pytest.fixture(scope='session')
+def unloaded() -> Callable[[int, int], FloatArray]:
+    return no_load
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Callable[[LineDevice], Served]]:
+    made: list[Served] = []
+
+    def make(device: LineDevice) -> Served:
+        one = Served(tmp_path / f'port_{len(made)}')
+        one.plug(device)
+        made.append(one)
+        return one
+
+    yield make
+    for one in made:
+        one.unplug()
+
+
+@pytest.fixture
+def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[[LineDevice], Wired]:
+    clock = OwnClock()
+    made: list[Wired] = []
+
+    def make(device: LineDevice) -> Wired:
+        one = Wired(f'port_{len(made)}', clock)
+        one.plug(device)
+        made.append(one)
+        return one
+
+    def port(name: str, baud: int, rtscts: bool = False) -> WiredPort:
+        return WiredPort(made, name)
+
+    def select(ports: Sequence[int], _: object, __: object, timeout: float) -> None:
+        waits = [made[number].due_in_ns() for number in ports]
+        clock.now += min(max(min(waits), 1000), round(timeout * 1e9))
+
+    for module in (thorlabs, dataq, text_lines):
+        monkeypatch.setattr(module, 'time', clock)
+        monkeypatch.setattr(module, 'SerialPort', port)
+    monkeypatch.setattr(thorlabs, 'select', SimpleNamespace(select=select))
+    monkeypatch.setattr(acquisition, 'time', clock)
+    return make
+
+
+@pytest.fixture
+def run() -> Iterator[Callable[[Rig], Run]]:
+    started: list[Run] = []
+
+    def make(rig: Rig) -> Run:
+        one = Run(rig)
+        started.append(one)
+        return one
+
+    yield make
+    for one in started:
+        one.acquisition.stop()
+
+
+@pytest.fixture
+def volts() -> Callable[[list[Chunk]], Any]:
+    def of(chunks: list[Chunk]) -> Any:
+        raws = [c.raw for c in chunks]
+        scale = [1.0 if r.volts_per_count is None else r.volts_per_count for r in raws]
+        return np.concatenate([r.readings * s for r, s in zip(raws, scale, strict=True)])
+
+    return of

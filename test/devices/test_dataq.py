@@ -1,0 +1,210 @@
+"""DATAQ converters: replies and scans written by hand, and the simulated device on a line of our own."""
+
+from __future__ import annotations
+
+import itertools
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psd_deflection.config import load_rig
+from psd_deflection.devices.registry import make_source
+from psd_deflection.devices.simulated_dataq import SimulatedDataq
+from psd_deflection.errors import ConfigError, DeviceError
+from psd_deflection.protocol.dataq import MODELS, ScanDecoder, command, find_reply, plan_rate, scan_list
+from psd_deflection.protocol.frames import BadFrame
+
+# x1 = 1, y1 = -2, sum1 = 16384, x2 = 256, y2 = -32767, sum2 = 16384, then the counter at zero.
+SCAN = bytes.fromhex('0100 feff 0040 0001 0180 0040 0080')
+COUNTS = (1, -2, 16384, 256, -32767, 16384)
+
+
+def test_commands_end_in_a_carriage_return() -> None:
+    assert command('srate 60000') == b'srate 60000\r'
+    assert scan_list(range(6)) == [
+        'slist 0 0', 'slist 1 1', 'slist 2 2', 'slist 3 3', 'slist 4 4', 'slist 5 5', 'slist 6 10',
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('received', 'asked', 'reply'),
+    [
+        (b'info 1 2108\r', 'info 1', '2108'),
+        (b'\x00info 1 2108\r\x00\x00', 'info 1', '2108'),
+        (b'stop\r', 'stop', ''),
+        (SCAN * 3 + b'\x0dstop\r', 'stop', ''),
+        (SCAN * 3 + b'stop\r', 'stop', ''),
+        (b'info 1 21', 'info 1', None),
+        (b'info 12 x\r', 'info 1', None),
+        (b'', 'stop', None),
+    ],
+)
+def test_a_reply_is_found_behind_scans_and_between_zeros(received: bytes, asked: str, reply: str | None) -> None:
+    assert find_reply(received, asked) == reply
+
+
+@given(st.binary(max_size=200))
+def test_no_reply_raises(received: bytes) -> None:
+    find_reply(received, 'info 1')
+
+
+def fed(stream: bytes, cuts: list[int]) -> list[Any]:
+    decoder = ScanDecoder()
+    places = sorted({0, len(stream), *(c % (len(stream) + 1) for c in cuts)})
+    return [item for a, b in itertools.pairwise(places) for item in decoder.feed(stream[a:b])]
+
+
+@given(st.lists(st.integers(0, 10_000), max_size=20))
+def test_scans_come_out_however_the_stream_was_cut(cuts: list[int]) -> None:
+    assert fed(SCAN * 20, cuts) == [COUNTS] * 20
+
+
+@given(st.integers(1, 13), st.lists(st.integers(0, 10_000), max_size=20))
+def test_lost_bytes_are_seen_and_the_step_is_found_again(lost: int, cuts: list[int]) -> None:
+    stream = SCAN * 5 + SCAN[lost:] + SCAN * 10
+    got = fed(stream, cuts)
+    assert got == fed(stream, [])
+    assert [g for g in got if not isinstance(g, BadFrame)] == [COUNTS] * 15
+    assert sum(g.size for g in got if isinstance(g, BadFrame)) == 14 - lost
+
+
+@given(st.binary(max_size=300), st.lists(st.integers(0, 10_000), max_size=8))
+def test_garbage_raises_nothing_and_the_cuts_do_not_matter(junk: bytes, cuts: list[int]) -> None:
+    assert fed(junk, cuts) == fed(junk, [])
+
+
+@pytest.mark.parametrize(
+    ('model', 'hz', 'per_channel', 'srate', 'dec'),
+    [
+        ('2108', 1000.0, False, 60_000, 1),
+        ('2108', 1000.0, True, 8571, 1),
+        ('4108', 100.0, False, 60_000, 10),
+        ('1110', 1000.0, False, 60_000, 1),
+    ],
+)
+def test_the_rate_is_laid_out_from_the_clock(model: str, hz: float, per_channel: bool, srate: int, dec: int) -> None:
+    rate = plan_rate(hz, MODELS[model], per_channel)
+    assert rate is not None
+    assert (rate.srate, rate.dec) == (srate, dec)
+    assert rate.hz == pytest.approx(60e6 / (srate * dec) / (7 if per_channel else 1))
+    assert rate.hz == pytest.approx(hz, rel=1e-3)
+
+
+def test_a_rate_that_the_model_cannot_do_has_no_setting() -> None:
+    assert plan_rate(500.0, MODELS['1110'], False) is None
+    assert plan_rate(1e6, MODELS['2108'], False) is None
+
+
+@pytest.mark.parametrize('per_channel', [False, True])
+def test_it_reads_the_rig_at_the_rate_of_the_rig(
+    wired: Any, run: Any, unloaded: Any, volts: Any, per_channel: bool
+) -> None:
+    port = wired(SimulatedDataq(load_rig(), unloaded, per_channel=per_channel))
+    running = run(load_rig(overrides={'source': 'dataq', 'port': str(port.link)}))
+    hello = running.acquisition.hello.info
+    assert hello['firmware'].startswith('DATAQ DI-2108')
+    assert hello['sample_rate_hz'] == pytest.approx(1000.0, rel=1e-3)
+    chunks = running.take(400)
+    assert [int(s) for c in chunks for s in c.raw.seq] == list(range(400))
+    np.testing.assert_allclose(volts(chunks).mean(axis=0), [0, 0, 5, 0, 0, 5], atol=1e-3)
+    counters = running.acquisition.counters
+    assert (counters.lost, counters.bad) == (0, 0)
+    assert 'lost whole scans are not' in running.acquisition.source.describe()['sample numbers']
+
+
+class Held(SimulatedDataq):
+    """The host is held up behind the 200th scan, in so many trials."""
+
+    trials = 0
+
+    def due_in_ns(self, since_power_up_ns: int) -> int:
+        due = super().due_in_ns(since_power_up_ns)
+        if self._scanning and self._sent == 200 and due > 0 and self.trials:
+            self.trials -= 1
+            return due + 200_000_000
+        return due
+
+
+@pytest.mark.parametrize('trials', [0, 1, 3])
+def test_a_busy_host_measures_again(wired: Any, unloaded: Any, trials: int) -> None:
+    device = Held(load_rig(), unloaded)
+    device.trials = trials
+    source = make_source(load_rig(overrides={'source': 'dataq', 'port': str(wired(device).link)}))
+    source.open(2.0)
+    assert device.trials == 0
+    assert float(source.describe()['scan rate at start (1/s)']) == pytest.approx(1000.0, rel=0.1)
+
+
+def test_another_rate_than_was_set_is_refused(wired: Any, unloaded: Any) -> None:
+    port = wired(SimulatedDataq(load_rig(), unloaded, skew_ppm=-3e5))
+    source = make_source(load_rig(overrides={'source': 'dataq', 'port': str(port.link)}))
+    with pytest.raises(DeviceError, match=r'does 7\d\d\.\d scans/s where 1000\.0 were set'):
+        source.open(2.0)
+
+
+def test_an_unplugged_one_is_configured_anew(wired: Any, run: Any, unloaded: Any) -> None:
+    port = wired(SimulatedDataq(load_rig(), unloaded))
+    running = run(load_rig(overrides={'source': 'dataq', 'port': str(port.link)}))
+    running.take(40)
+    port.unplug()
+    running.heard('waiting for it to come back')
+    port.plug(SimulatedDataq(load_rig(), unloaded))
+    running.heard('the device is back')
+    before = running.acquisition.counters.samples
+    while running.acquisition.counters.samples < before + 40:
+        running.take(20)
+    assert running.acquisition.counters.disconnects == 1
+
+
+def test_one_that_falls_silent_is_configured_anew(wired: Any, run: Any, unloaded: Any) -> None:
+    device = SimulatedDataq(load_rig(), unloaded)
+    running = run(load_rig(overrides={'source': 'dataq', 'port': str(wired(device).link)}))
+    running.take(40)
+    # As a device that lost its supply and has forgotten everything, though its port stays.
+    device._obey('stop', 0)
+    running.heard('no scans come; waiting for it to come back')
+    running.heard('the device is back')
+    before = running.acquisition.counters.samples
+    while running.acquisition.counters.samples < before + 40:
+        running.take(20)
+
+
+@pytest.mark.parametrize(
+    ('model', 'said'),
+    [('1100', '4 analog inputs and no counter'), ('718B', "model '718B'; known are 1100")],
+)
+def test_a_model_that_will_not_do_is_named(wired: Any, unloaded: Any, model: str, said: str) -> None:
+    port = wired(SimulatedDataq(load_rig(), unloaded, model=model))
+    source = make_source(load_rig(overrides={'source': 'dataq', 'port': str(port.link)}))
+    with pytest.raises(DeviceError, match=said):
+        source.open(2.0)
+
+
+def test_a_rate_out_of_reach_is_named(wired: Any, unloaded: Any) -> None:
+    rig = load_rig(overrides={'converter.sample_rate_hz': 500.0})
+    port = wired(SimulatedDataq(rig, unloaded, model='1110'))
+    source = make_source(
+        load_rig(overrides={'source': 'dataq', 'port': str(port.link), 'converter.sample_rate_hz': 500.0})
+    )
+    with pytest.raises(DeviceError, match='cannot do 500 scans/s'):
+        source.open(2.0)
+
+
+def test_another_range_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r'converter\.full_scale = 10'):
+        make_source(load_rig(overrides={'source': 'dataq', 'port': 'x', 'converter.full_scale': 5.0}))
+
+
+def test_the_simulated_one_says_what_it_is_and_nothing_by_itself(unloaded: Any) -> None:
+    device = SimulatedDataq(load_rig(), unloaded)
+    assert device.greeting() == device.take(10**9) == b''
+    assert device.receive(b'info 0\rinfo', 0) == b'info 0 DATAQ\r\x00'
+    assert device.receive(b' 1\r', 0) == b'info 1 2108\r\x00'
+    assert device.receive(b'slist 0 10\rsrate 60000\rdec 1\rstart\r', 0).count(b'\r') == 3
+    assert device.take(2_000_000) == struct.pack('<3h', *[-32768] * 3)
+    assert device.receive(b'info 0\r', 0) == b''
+    assert device.receive(b'stop\r', 0) == b'stop\r\x00'

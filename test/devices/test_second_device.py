@@ -1,0 +1,141 @@
+"""The second emulator against the daemon, and the page's byte examples against the code."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.config import load_rig
+from psd_deflection.devices.serial_port import SerialPort
+from psd_deflection.protocol.frames import (
+    BadFrame,
+    Frame,
+    FrameDecoder,
+    GoodFrame,
+    HelloFrame,
+    HelloRequestFrame,
+    PingFrame,
+    PongFrame,
+    SampleFrame,
+    StartFrame,
+    StatusFrame,
+    StopFrame,
+    encode,
+)
+from psd_deflection.records import DeflectionEstimate, Record, SampleBlock
+from psd_deflection.runner.session import Session
+from test.heard import WAIT_S
+from test.runner.conftest import Estimates
+
+EMULATOR = Path(__file__).parent / 'second_device.py'
+PAGE = Path(__file__).parent.parent.parent / 'docs' / 'protocol.md'
+
+COOKIE = 0x0102030405060708
+EXAMPLES: list[GoodFrame] = [
+    HelloRequestFrame(),
+    StartFrame(),
+    StopFrame(),
+    PingFrame(COOKIE),
+    PongFrame(COOKIE, 1_000_000),
+    StatusFrame(3, 2150),
+    StatusFrame(0, None),
+    SampleFrame(0, 1, 1000, (0, -1, 16384, 256, -32768, 16384)),
+    SampleFrame(3, 0, 0, (32767, 0, 16384, 0, 0, 16384)),
+    HelloFrame(1, {'serial': 'A1'}),
+]
+
+
+def test_the_page_and_the_code_say_the_same_bytes() -> None:
+    on_the_page = [bytes.fromhex(h) for h in re.findall(r'\| `((?:[0-9a-f]{2} )+00)` \|', PAGE.read_text())]
+    assert on_the_page == [encode(frame) for frame in EXAMPLES]
+
+
+def test_the_emulator_imports_nothing_of_ours() -> None:
+    tree = ast.parse(EMULATOR.read_text())
+    names = [n.name for node in ast.walk(tree) if isinstance(node, ast.Import) for n in node.names]
+    names += [str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    assert {n.split('.')[0] for n in names} <= set(sys.stdlib_module_names)
+
+
+@pytest.fixture
+def port() -> Iterator[str]:
+    process = subprocess.Popen(
+        [sys.executable, str(EMULATOR), str(2**32 - 500)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    yield process.stdout.readline().strip()
+    process.stdin.close()
+    process.wait(WAIT_S)
+    process.stdout.close()
+
+
+class Kept:
+    def __init__(self) -> None:
+        self.records: list[Record] = []
+
+    def put(self, record: Record) -> None:
+        self.records.append(record)
+
+
+def test_it_works_unchanged_with_the_daemon(port: str) -> None:
+    said: list[str] = []
+    session = Session(load_rig(overrides={'port': port}), said.append)
+    kept = Kept()
+    estimates = Estimates(40)
+    session.processing.sinks += [kept, estimates]
+    hello = session.acquisition.hello
+    assert hello is not None
+    assert hello.info['serial'] == 'SECOND-7'
+    try:
+        session.start()
+        assert estimates.enough.wait(WAIT_S)
+    finally:
+        session.close()
+    assert session.failed is None
+    counters = session.acquisition.counters
+    assert (counters.bad, counters.repeated, counters.restarts) == (0, 0, 0)
+    # On a busy machine the emulator may have to drop; it then says so.
+    assert counters.lost == 0 or counters.device_dropped > 0
+    blocks = [r for r in kept.records if isinstance(r, SampleBlock)]
+    numbers = [int(s) for b in blocks for s in b.seq]
+    assert numbers == sorted(set(numbers))
+    ramp = [round(v * 32768 / 10) for b in blocks for v in b.volts[:, 0].tolist()]
+    assert ramp == [(s - (2**32 - 500)) % 2**32 % 2000 for s in numbers]
+    assert any(isinstance(r, DeflectionEstimate) for r in kept.records)
+
+
+def test_it_answers_what_the_page_asks_of_it(port: str) -> None:
+    line = SerialPort(port, 921_600)
+    decoder = FrameDecoder()
+    seen: list[Frame] = []
+
+    def until(kind: type[object]) -> Frame:
+        seen.clear()
+        while not any(isinstance(f, kind) for f in seen):
+            seen.extend(decoder.feed(line.read(10.0)))
+        return next(f for f in seen if isinstance(f, kind))
+
+    line.write(b'\x07junk\x00\x00' + encode(PingFrame(COOKIE)))
+    pong = until(PongFrame)
+    assert isinstance(pong, PongFrame)
+    assert pong.cookie == COOKIE
+    line.write(encode(StopFrame()) + encode(PingFrame(1)))
+    until(PongFrame)
+    line.write(encode(PingFrame(2)))
+    until(PongFrame)
+    assert not any(isinstance(f, SampleFrame) for f in seen)
+    line.write(encode(StartFrame()))
+    sample = until(SampleFrame)
+    assert isinstance(sample, SampleFrame)
+    assert not any(isinstance(f, BadFrame) for f in seen)
+    status = until(StatusFrame)
+    assert isinstance(status, StatusFrame)
+    assert status.temperature_centi is None
+    line.close()

@@ -1,0 +1,147 @@
+"""The simulated rig as a device, with the test's own clock."""
+
+from __future__ import annotations
+
+import itertools
+import socket
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from psd_deflection.config import load_rig
+from psd_deflection.devices import simulated_device as module
+from psd_deflection.devices.simulated_device import PseudoTerminal, SimulatedDevice, serve
+from psd_deflection.errors import ConfigError
+from psd_deflection.protocol.frames import (
+    Frame,
+    FrameDecoder,
+    HelloFrame,
+    HelloRequestFrame,
+    PingFrame,
+    PongFrame,
+    SampleFrame,
+    StartFrame,
+    StatusFrame,
+    StopFrame,
+    encode,
+)
+from psd_deflection.records import CHANNELS, FloatArray
+
+MS = 1_000_000
+
+
+def no_load(_: int, n: int) -> FloatArray:
+    return np.zeros((n, 3))
+
+
+def device(**options: object) -> SimulatedDevice:
+    return SimulatedDevice(load_rig(), no_load, **options)  # type: ignore[arg-type]
+
+
+def frames(stream: bytes) -> list[Frame]:
+    return FrameDecoder().feed(b'\x00' + stream)
+
+
+def samples(stream: bytes) -> list[SampleFrame]:
+    return [f for f in frames(stream) if isinstance(f, SampleFrame)]
+
+
+def test_a_sample_each_millisecond_of_its_clock_and_hello_and_status_once_a_second() -> None:
+    got = frames(device().take(2500 * MS, room=1 << 30))
+    taken = [f for f in got if isinstance(f, SampleFrame)]
+    assert [f.seq for f in taken] == list(range(2501))
+    assert all(f.t_device_us == 1000 * f.seq for f in taken)
+    assert sum(isinstance(f, StatusFrame) for f in got) == 3
+    hellos = [f for f in got if isinstance(f, HelloFrame)]
+    assert len(hellos) == 3
+    assert hellos[0].version == 1
+    assert hellos[0].info['channels'] == list(CHANNELS)
+    assert hellos[0].info['volts_per_count'] == 10.0 / 32768
+    assert hellos[0].info['sample_rate_hz'] == 1000.0
+    volts = np.array([f.counts for f in taken]) * 10.0 / 32768
+    np.testing.assert_allclose(volts.std(axis=0), 2e-3, rtol=0.1)
+    np.testing.assert_allclose(volts.mean(axis=0), [0, 0, 5, 0, 0, 5], atol=2e-4)
+
+
+def test_it_sends_the_same_however_often_it_is_asked() -> None:
+    whole, parts = device(seed=3), device(seed=3)
+    expected = whole.take(500 * MS, room=1 << 30)
+    assert b''.join(parts.take(t * MS, room=1 << 30) for t in range(501)) == expected
+
+
+def test_it_answers_hello_and_ping_and_stops_and_starts() -> None:
+    d = device(first_seq=1000)
+    (hello,) = frames(d.receive(encode(HelloRequestFrame()), 0))
+    assert isinstance(hello, HelloFrame)
+    assert frames(d.receive(encode(PingFrame(77)), 250 * MS)) == [PongFrame(77, 1_250_000)]
+    d.receive(encode(StopFrame()), 0)
+    assert not samples(d.take(100 * MS))
+    d.receive(encode(StartFrame()), 0)
+    assert samples(d.take(101 * MS))[0].seq == 1101
+    assert d.receive(b'rubbish\x00', 0) == b''
+
+
+def test_samples_without_room_are_dropped_counted_and_flagged() -> None:
+    d = device()
+    d.take(100 * MS, room=0)
+    got = samples(d.take(102 * MS))
+    assert [(f.seq, f.flags) for f in got] == [(101, 2), (102, 0)]
+    late = frames(d.take(1000 * MS, room=1 << 30))
+    assert [f.overruns for f in late if isinstance(f, StatusFrame)] == [101]
+
+
+def test_its_number_wraps_and_its_clock_runs_on() -> None:
+    got = samples(device(first_seq=2**32 - 2).take(3 * MS))
+    assert [f.seq for f in got] == [2**32 - 2, 2**32 - 1, 0, 1]
+    assert np.diff([f.t_device_us for f in got]).tolist() == [1000] * 3
+
+
+@pytest.mark.parametrize('skew', [0.0, 1000.0])
+def test_a_fast_clock_takes_more_samples(skew: float) -> None:
+    d = device(skew_ppm=skew)
+    d.take(10_000 * MS, room=1 << 30)
+    assert d.taken == round(10_000 * (1 + skew * 1e-6)) + 1
+
+
+def test_losses_and_a_dark_laser_are_where_they_were_asked_for() -> None:
+    got = samples(device(lose=frozenset({3, 4}), dark=((2, 10, 20),)).take(29 * MS))
+    assert [f.seq for f in got] == [s for s in range(30) if s not in (3, 4)]
+    low = [f.seq for f in got if f.counts[5] < 1000]
+    assert low == list(range(10, 20))
+    assert all(f.counts[2] > 1000 for f in got)
+
+
+def test_a_process_that_wakes_late_catches_up_and_drops_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Half a second passes at each look at the clock: 500 samples, four times what the device may hold back.
+    clock = itertools.count(0, 250 * MS)
+    monkeypatch.setattr(module, 'time', SimpleNamespace(monotonic_ns=lambda: next(clock), sleep=lambda _: None))
+    near, far = socket.socketpair()
+    near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
+    near.setblocking(False)
+    d = device()
+    # A line that always takes what it is given: what is missing then, the device dropped.
+    serve(d, cast(PseudoTerminal, SimpleNamespace(master=near.fileno())), lambda: d.taken > 1000)
+    near.close()
+    received = b''.join(iter(lambda: far.recv(1 << 16), b''))
+    far.close()
+    got = frames(received)
+    assert [f.seq for f in got if isinstance(f, SampleFrame)] == list(range(d.taken))
+    assert {f.overruns for f in got if isinstance(f, StatusFrame)} == {0}
+
+
+def test_a_link_replaces_a_link_and_nothing_else(tmp_path: Path) -> None:
+    mine = tmp_path / 'my_rig.yaml'
+    mine.write_text('precious')
+    for place in (mine, tmp_path, tmp_path / 'nothing' / 'port'):
+        with pytest.raises(ConfigError, match=r'no link can be made there \((File exists|No such file or directory)\)'):
+            PseudoTerminal(place)
+    assert mine.read_text() == 'precious'
+    first = PseudoTerminal(tmp_path / 'port')
+    second = PseudoTerminal(tmp_path / 'port')
+    first.close()
+    assert str((tmp_path / 'port').readlink()) == second.name
+    second.close()
+    assert not (tmp_path / 'port').is_symlink()

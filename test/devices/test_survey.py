@@ -1,0 +1,123 @@
+"""``devices``: what answers on a port, from the simulated devices and from none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import yaml
+
+from psd_deflection.cli.main import main
+from psd_deflection.config import load_rig, read_parameter_file
+from psd_deflection.devices import survey as port_survey
+from psd_deflection.devices.serial_port import SerialPort
+from psd_deflection.devices.simulated_dataq import SimulatedDataq
+from psd_deflection.devices.simulated_device import SimulatedDevice
+from psd_deflection.devices.simulated_lines import SimulatedLines
+from psd_deflection.devices.simulated_thorlabs import SharedRig, SimulatedAligner
+from psd_deflection.devices.survey import serial_ports, survey
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(port_survey, 'BOOT_S', 0.3)
+
+
+def test_each_is_known_by_its_answer(
+    served: Any,
+    unloaded: Any,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # Each of them answers: however late, it is waited for.
+    monkeypatch.setattr(port_survey, 'ONCE_A_SECOND_S', 60.0)
+    monkeypatch.setattr(port_survey, 'BOOT_S', 60.0)
+    rig = load_rig()
+    shared = SharedRig(rig, unloaded, 0)
+    devices = [
+        SimulatedDevice(rig, unloaded),
+        SimulatedDataq(rig, unloaded),
+        SimulatedLines(load_rig(overrides={'converter.sample_rate_hz': 200.0}), unloaded),
+        SimulatedAligner(shared, 1),
+        SimulatedAligner(shared, 2),
+        SimulatedDataq(rig, unloaded, model='1100'),
+    ]
+    names = [str(served(d).link) for d in devices]
+    assert main(['devices', '--json', *names]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [p['source'] for p in found['ports']] == ['serial', 'dataq', 'lines', 'thorlabs', 'thorlabs', '']
+    assert 'SIM-0001' in found['ports'][0]['answer']
+    assert 'DI-1100: six analog inputs' in found['ports'][5]['answer']
+    one, two, three, pair = found['suggested']
+    assert (one['source'], one['port'], one['converter.full_scale']) == ('serial', names[0], 10.0)
+    assert two['source'] == 'dataq'
+    assert three['converter.sample_rate_hz'] == 200.0
+    assert pair['port'] == f'{names[3]},{names[4]}'
+
+    assert main(['devices', *names[3:5]]) == 0
+    text = capsys.readouterr().out
+    lines = text[text.index('/**:') :]
+    assert yaml.safe_load(lines)['/**']['ros__parameters']['source'] == 'thorlabs'
+    path = tmp_path / 'suggested.yaml'
+    path.write_text(lines)
+    assert load_rig(path).converter.sample_rate_hz == 200.0
+    assert read_parameter_file(path)['port'] == pair['port']
+
+
+def test_a_port_in_use_or_missing_is_named_and_left_alone(
+    served: Any, unloaded: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = str(served(SimulatedDevice(load_rig(), unloaded)).link)
+    mine = SerialPort(name, 921_600)
+    busy, missing = survey([name, str(tmp_path / 'none')])
+    assert main(['devices', name]) == 5
+    mine.close()
+    assert main(['devices', name]) == 0
+    assert main(['devices', '--json', name, str(tmp_path / 'none')]) == 5
+    assert 'no such port' in capsys.readouterr().out
+    assert 'another program has the port open' in busy.answer
+    assert 'no such port' in missing.answer
+    assert busy.source == missing.source == ''
+
+
+def test_something_else_is_said_to_be_something_else(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(port_survey, 'BOOT_S', 20.0)
+    monkeypatch.setattr(port_survey, 'ANSWER_S', 0.1)
+    monkeypatch.setattr(port_survey, 'ONCE_A_SECOND_S', 0.1)
+
+    class Other:
+        def greeting(self) -> bytes:
+            return b''
+
+        def due_in_ns(self, since_power_up_ns: int) -> int:
+            return 1_000_000
+
+        def receive(self, received: bytes, since_power_up_ns: int) -> bytes:
+            return b''
+
+        def take(self, since_power_up_ns: int, room: int = 4096) -> bytes:
+            return b'$GPGGA,123519\r\n'
+
+    (found,) = survey([str(served(Other()).link)])
+    assert found.source == ''
+    assert 'bytes that we cannot read at 921600 baud' in found.answer
+
+
+def test_the_system_s_list_is_taken_without_the_fixed_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    listed = [
+        SimpleNamespace(device='/dev/ttyS0', hwid='n/a', description='n/a', serial_number=None),
+        SimpleNamespace(device='/dev/ttyACM0', hwid='USB VID:PID=1209:0001', description='PSD', serial_number='A7'),
+    ]
+    monkeypatch.setattr('serial.tools.list_ports.comports', lambda: listed)
+    (port,) = serial_ports()
+    assert (port.port, port.description, port.usb_serial) == ('/dev/ttyACM0', 'PSD', 'A7')
+
+
+def test_no_ports_at_all(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr('serial.tools.list_ports.comports', list)
+    assert main(['devices']) == 0
+    assert 'no serial ports' in capsys.readouterr().out

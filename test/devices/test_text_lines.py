@@ -1,0 +1,170 @@
+"""Lines of text: written by hand, and the simulated device on a pseudo-terminal."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psd_deflection.config import load_rig
+from psd_deflection.devices.registry import make_source
+from psd_deflection.devices.simulated_lines import SimulatedLines
+from psd_deflection.errors import DeviceError
+from psd_deflection.protocol.frames import BadFrame
+from psd_deflection.protocol.text_lines import Description, Line, LineDecoder, TimeExtender, parse, with_check
+
+VALUES = (0.1, -0.2, 5.0, 0.0, 1.5, 4.75)
+LINE = Line(7, 7000, VALUES)
+
+
+@pytest.mark.parametrize(
+    ('text', 'item'),
+    [
+        (b'7,7000,0.1,-0.2,5,0,1.5,4.75', LINE),
+        (b'7,7000,.1,-0.2,5.0,+0,1.5,4.75\r', LINE),
+        (b' 7, 7000, 0.1, -0.2, 5, 0, 1.5, 4.75 ', LINE),
+        (b'', None),
+        (b'\r', None),
+        (b'# {"sample_rate_hz": 200}', Description({'sample_rate_hz': 200})),
+        (b'# a remark', BadFrame('comment without a description', 10)),
+        (b'#[1]', BadFrame('comment without a description', 4)),
+        (b'7,7000,0.1,-0.2,5,0,1.5', BadFrame('not eight fields', 23)),
+        (b'7,7000,0.1,-0.2,5,0,1.5,x', BadFrame('a reading is no number', 25)),
+        (b'7,7000,0.1,-0.2,5,0,1.5,nan', BadFrame('a reading is no number', 27)),
+        (b'7,7000,0.1,-0.2,5,0,1.5,1e9', BadFrame('a reading is no number', 27)),
+        (b'-7,7000,0,0,5,0,0,5', BadFrame('seq or t_us is no whole number', 19)),
+        (b'7,4294967296,0,0,5,0,0,5', BadFrame('seq or t_us is over 32 bits', 24)),
+        (b'1,1,0,0,5,0,0,5*00', BadFrame('check differs', 18)),
+        (b'1,1,0,0,5,0,0,5*zz', BadFrame('check differs', 18)),
+    ],
+)
+def test_one_line(text: bytes, item: object) -> None:
+    assert parse(text) == item
+
+
+def test_the_check_is_the_exclusive_or() -> None:
+    # By hand: 31 ^ 2c ^ 31 ^ 2c ^ 30 = 30, hexadecimal.
+    assert with_check('1,1,0') == b'1,1,0*30\n'
+    line = with_check('7,7000,0.1,-0.2,5,0,1.5,4.75')
+    assert parse(line[:-1]) == LINE
+    flipped = line.replace(b'0.1', b'0.3')
+    assert parse(flipped[:-1]) == BadFrame('check differs', len(flipped) - 1)
+
+
+STREAM = b'tail\n7,7000,0.1,-0.2,5,0,1.5,4.75\r\n\n#{"a":1}\nrubbish\n' + b'x' * 1000 + b'\n1,2,0,0,5,0,0,5\n9,'
+ITEMS = [
+    LINE,
+    Description({'a': 1}),
+    BadFrame('not eight fields', 7),
+    BadFrame('longer than a line', 1000),
+    Line(1, 2, (0, 0, 5, 0, 0, 5)),
+]
+
+
+@given(st.lists(st.integers(0, len(STREAM)), max_size=30))
+def test_lines_come_out_however_the_stream_was_cut(cuts: list[int]) -> None:
+    decoder = LineDecoder()
+    places = sorted({0, len(STREAM), *cuts})
+    assert [i for a, b in itertools.pairwise(places) for i in decoder.feed(STREAM[a:b])] == ITEMS
+
+
+@given(st.lists(st.binary(max_size=100), max_size=10))
+def test_garbage_raises_nothing(pieces: list[bytes]) -> None:
+    decoder = LineDecoder()
+    for piece in pieces:
+        decoder.feed(piece)
+
+
+def test_micros_wraps_and_a_restart_starts_it_anew() -> None:
+    extender = TimeExtender()
+    got = [
+        extender.extend(Line(s, t % 2**32, VALUES))
+        for s, t in [(100, 2**32 - 1000), (101, 2**32), (102, 2**32 + 1000), (0, 500), (1, 1500)]
+    ]
+    assert got == [2**32 - 1000, 2**32, 2**32 + 1000, 500, 1500]
+
+
+def test_it_reads_the_rig(wired: Any, run: Any, unloaded: Any, volts: Any) -> None:
+    port = wired(SimulatedLines(load_rig(), unloaded, first_seq=2**32 - 200))
+    running = run(load_rig(overrides={'source': 'lines', 'port': str(port.link)}))
+    chunks = running.take(400)
+    numbers = [int(s) for c in chunks for s in c.raw.seq]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    np.testing.assert_allclose(volts(chunks).mean(axis=0), [0, 0, 5, 0, 0, 5], atol=1e-3)
+    times = np.concatenate([c.raw.t_ns for c in chunks])
+    assert (np.diff(times) > 0).all()
+    counters = running.acquisition.counters
+    assert (counters.lost, counters.bad, counters.restarts) == (0, 0, 0)
+
+
+def test_an_unplugged_one_comes_back(wired: Any, run: Any, unloaded: Any) -> None:
+    port = wired(SimulatedLines(load_rig(), unloaded))
+    running = run(load_rig(overrides={'source': 'lines', 'port': str(port.link)}))
+    running.take(40)
+    port.unplug()
+    running.heard('waiting for it to come back')
+    port.plug(SimulatedLines(load_rig(), unloaded))
+    running.heard('the device is back')
+    before = running.acquisition.counters.samples
+    while running.acquisition.counters.samples < before + 40:
+        running.take(20)
+    assert running.acquisition.counters.disconnects == 1
+
+
+class Says:
+    """Sends the same bytes whenever its port is opened, and nothing else."""
+
+    def __init__(self, text: bytes) -> None:
+        self.text = text
+
+    def greeting(self) -> bytes:
+        return self.text
+
+    def due_in_ns(self, since_power_up_ns: int) -> int:
+        return 10_000_000
+
+    def receive(self, received: bytes, since_power_up_ns: int) -> bytes:
+        return b''
+
+    def take(self, since_power_up_ns: int, room: int = 4096) -> bytes:
+        return b''
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        (b'', 'nothing comes'),
+        (b'\nhello\n', '7 bytes but no line of ours; is the baud rate'),
+        (b'\n1,2,0,0,5,0,0,5\n', 'no line that describes them'),
+    ],
+)
+def test_what_is_no_such_device_is_named(wired: Any, text: bytes, said: str) -> None:
+    port = wired(Says(text))
+    with pytest.raises(DeviceError, match=said):
+        make_source(load_rig(overrides={'source': 'lines', 'port': str(port.link)})).open(2.0)
+
+
+@pytest.mark.parametrize(
+    ('info', 'line', 'reason'),
+    [
+        (b'"volts_per_count": 0.001', b'1,1000,0,0,40000,0,0,5', 'counts are whole numbers of 16 bits'),
+        (b'"volts_per_count": 0.001', b'1,1000,0,0,0.5,0,0,5', 'counts are whole numbers of 16 bits'),
+        (b'"serial": "a"', b'1,1000,0,0,123456,0,0,5', 'a reading is out of all bounds'),
+    ],
+)
+def test_readings_out_of_bounds_are_no_samples(wired: Any, info: bytes, line: bytes, reason: str) -> None:
+    device = Says(b'\n#{"sample_rate_hz": 1000, %s}\n' % info)
+    device.take = lambda since_power_up_ns, room=4096: line + b'\n'  # type: ignore[method-assign]
+    source = make_source(load_rig(overrides={'source': 'lines', 'port': str(wired(device).link)}))
+    source.open(2.0)
+    source.start()
+    events: list[object] = []
+    while not events:
+        events += source.read(1.0).events
+    source.close()
+    assert isinstance(events[0], BadFrame)
+    assert events[0].reason == reason

@@ -1,0 +1,188 @@
+"""Thorlabs aligners: messages written by hand, and the simulated pair on lines of our own."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.devices.registry import make_source
+from psd_deflection.devices.serial_port import PortClosedError
+from psd_deflection.devices.simulated_thorlabs import SharedRig, SimulatedAligner
+from psd_deflection.errors import ConfigError, DeviceError
+from psd_deflection.protocol.apt import (
+    INFO_REQUEST,
+    READINGS_REQUEST,
+    AptDecoder,
+    HardwareInfo,
+    Readings,
+    encode_info,
+    encode_readings,
+    readings_of,
+)
+from psd_deflection.protocol.frames import BadFrame
+
+# Submessage 3; x = 8191, y = -16384, sum = 32768 counts (5 V); the position outputs do not matter.
+REPLY = bytes.fromhex('7208 0c00 81 50  0300 ff1f 00c0 0080 0000 0000')
+# 5 V of sum: a difference of 2.5 V is half-way to the edge, which is 5 V to us.
+X, Y = 8191 / 32767 * 10.0 * 2.0, -16384 / 32767 * 10.0 * 2.0
+
+
+def is_reply(reading: object) -> bool:
+    return (
+        isinstance(reading, Readings)
+        and reading.x == pytest.approx(X, rel=1e-4)
+        and reading.y == pytest.approx(Y, rel=1e-4)
+        and reading.total == pytest.approx(5.0, rel=1e-4)
+    )
+
+
+def test_questions_and_answers_byte_by_byte() -> None:
+    assert bytes.fromhex('710803005001') == READINGS_REQUEST
+    assert bytes.fromhex('050000005001') == INFO_REQUEST
+    (reading,) = AptDecoder().feed(REPLY)
+    assert is_reply(reading)
+    assert encode_readings(8191, -16384, 32768)[:14] == REPLY[:14]
+    (info,) = AptDecoder().feed(encode_info(69251980, 'KPA101'))
+    assert info == HardwareInfo(69251980, 'KPA101', '1.0.0')
+    assert len(encode_info(1, 'TQD001')) == 90
+
+
+def test_without_light_no_place_is_made_up() -> None:
+    assert readings_of(20000, -20000, 0) == Readings(0.0, 0.0, 0.0)
+    assert readings_of(3, -3, 300)[:2] == (0.0, 0.0)
+
+
+STREAM = (
+    b'\x01\x02\x03' + REPLY + b'\x81\x00\x02\x00\x01\x50' + REPLY + bytes.fromhex('7208 0200 81 50 0300') + REPLY * 2
+)
+
+
+@given(st.lists(st.integers(0, len(STREAM)), max_size=30))
+def test_messages_come_out_however_the_stream_was_cut(cuts: list[int]) -> None:
+    decoder = AptDecoder()
+    places = sorted({0, len(STREAM), *cuts})
+    got = [m for a, b in itertools.pairwise(places) for m in decoder.feed(STREAM[a:b])]
+    assert [type(m) for m in got] == [BadFrame, Readings, Readings, BadFrame, Readings, Readings]
+    assert all(is_reply(m) for m in got if isinstance(m, Readings))
+    assert got[0] == BadFrame('no APT header', 3)
+    assert got[3] == BadFrame('length does not fit the message', 8)
+
+
+@given(st.lists(st.binary(max_size=100), max_size=10))
+def test_garbage_raises_nothing_and_is_not_kept(pieces: list[bytes]) -> None:
+    decoder = AptDecoder()
+    for piece in pieces:
+        decoder.feed(piece)
+    decoder.reset()
+    assert decoder.reset() == 0
+
+
+@pytest.mark.parametrize('port', ['', '/dev/ttyUSB0', 'a,b,c', 'a,', 'a,a'])
+def test_two_ports_are_needed(port: str) -> None:
+    with pytest.raises(ConfigError, match='two ports are needed'):
+        make_source(load_rig(overrides={'source': 'thorlabs', 'port': port}))
+
+
+def test_a_sign_is_a_sign() -> None:
+    with pytest.raises(ConfigError, match='must be 1 or -1'):
+        make_source(load_rig(overrides={'source': 'thorlabs', 'port': 'a,b', 'thorlabs.x_sign': 0.5}))
+
+
+SLOW: dict[str, object] = {
+    'converter.sample_rate_hz': 100.0,
+    'block_size': 5,
+    'min_samples': 2,
+    'source': 'thorlabs',
+    'psd_1.zero': [1e-3, 0.5e-3],
+}
+
+
+@pytest.fixture
+def pair(wired: Any, unloaded: Any) -> Callable[..., tuple[Any, Any, Rig]]:
+    def make(**options: object) -> tuple[Any, Any, Rig]:
+        shared = SharedRig(load_rig(overrides=SLOW), unloaded, 0)
+        ports = [wired(SimulatedAligner(shared, psd, answer_ns=500_000)) for psd in (1, 2)]
+        rig = load_rig(overrides={**SLOW, 'port': ','.join(str(p.link) for p in ports), **options})
+        return ports[0], ports[1], rig
+
+    return make
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_it_reads_the_rig_in_slots_of_its_rate(pair: Any, run: Any, volts: Any, sign: float) -> None:
+    _, _, rig = pair(**{'thorlabs.x_sign': sign})
+    running = run(rig)
+    assert running.acquisition.hello.info['serial'] == '69000001,69000002'
+    chunks = running.take(30)
+    assert all(c.raw.volts_per_count is None for c in chunks)
+    means = volts(chunks).mean(axis=0)
+    np.testing.assert_allclose(means, [sign * 2.0, 1.0, 5.0, 0.0, 0.0, 5.0], atol=5e-3)
+    numbers = np.concatenate([c.raw.seq for c in chunks])
+    times = np.concatenate([c.raw.t_ns for c in chunks])
+    # Every sample lies in its own slot: number and time tell the same.
+    offsets = times - numbers * 10_000_000
+    assert offsets.max() - offsets.min() < 10_000_000
+    assert running.acquisition.counters.lost >= int(numbers[-1] - numbers[0]) + 1 - len(numbers)
+    state = running.acquisition.source.describe()
+    assert state['rate asked for (1/s)'] == '100'
+    assert float(state['rate done (1/s)']) > 0
+
+
+def test_a_rate_out_of_reach_is_refused_with_the_one_that_is_not(pair: Any) -> None:
+    _, _, rig = pair(**{'converter.sample_rate_hz': 5000.0})
+    with pytest.raises(DeviceError, match=r'gives \d+ readings/s, .* = 5000 is out of reach; set it to at most \d+'):
+        make_source(rig).open(2.0)
+
+
+def test_one_that_is_pulled_out_is_lost_time_not_lost_order(pair: Any, run: Any, unloaded: Any) -> None:
+    _, second, rig = pair()
+    running = run(rig)
+    last = max(int(s) for c in running.take(10) for s in c.raw.seq)
+    second.unplug()
+    running.heard('waiting for it to come back')
+    second.plug(SimulatedAligner(SharedRig(load_rig(overrides=SLOW), unloaded, 0), 2, answer_ns=500_000))
+    running.heard('the device is back')
+    later = [int(s) for c in running.take(10) for s in c.raw.seq]
+    assert min(later) > last
+    counters = running.acquisition.counters
+    assert counters.disconnects == 1
+    assert counters.lost > 0
+    assert counters.restarts == 0
+
+
+def test_a_port_where_nothing_answers_is_named(wired: Any, unloaded: Any) -> None:
+    shared = SharedRig(load_rig(), unloaded, 0)
+    good = wired(SimulatedAligner(shared, 1))
+    mute = wired(SimulatedAligner(shared, 2, answer_ns=10**12))
+    rig = load_rig(overrides={**SLOW, 'port': f'{good.link},{mute.link}'})
+    with pytest.raises(DeviceError, match=r'port_1: nothing in 0\.3 s; is it a KPA101'):
+        make_source(rig).open(0.3)
+
+
+def test_an_answer_that_does_not_come_is_counted(pair: Any) -> None:
+    _, _, rig = pair()
+    source = make_source(rig)
+    source.open(2.0)
+    source.start()
+    source._ports[1].write = lambda _: None  # type: ignore[attr-defined]
+    reading = source.read(0.1)
+    source.close()
+    assert reading.events == [BadFrame('no answer in time', 0)]
+
+
+def test_a_port_that_goes_away_while_it_is_asked_is_a_port_that_is_gone(pair: Any) -> None:
+    first, _, rig = pair()
+    source = make_source(rig)
+    source.open(2.0)
+    source.start()
+    first.unplug()
+    with pytest.raises(PortClosedError):
+        source.read(0.1)
+    source.close()

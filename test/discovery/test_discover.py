@@ -1,0 +1,393 @@
+"""discover: names what was hidden, keeps silent where nothing was, and leaves files that work."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import psd_deflection
+from psd_deflection.cli.main import main
+from psd_deflection.config import Rig, load_rig, replace_values
+from psd_deflection.discovery import proposals
+from psd_deflection.discovery.coincidence import coincidences
+from psd_deflection.discovery.discover import Discovery, discover
+from psd_deflection.discovery.fit import refit
+from psd_deflection.discovery.noise import estimate_noise, rest_windows, strip_lines
+from psd_deflection.discovery.observation import Observation, load_cases
+from psd_deflection.discovery.result import model_yaml, result, sentence
+from psd_deflection.discovery.screen import solve_seen
+from psd_deflection.discovery.signatures import SignatureBank
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.errors import RecordingError
+from psd_deflection.recordings.observations import recorded_rig
+from psd_deflection.recordings.opening import open_recording
+from psd_deflection.records import FloatArray, ParameterChange
+from psd_deflection.simulation import loads
+from psd_deflection.simulation.catalogue import effects_of_rig, make_active
+from psd_deflection.simulation.simulator import RigSimulator
+
+SCHEMA = Path(__file__).parents[3] / 'shared' / 'checks' / 'result.schema.json'
+RIG = load_rig()
+HISTORY = loads.identification()
+WARM = 21.0 + 2.0 * np.sin(np.linspace(0.0, 5.0, len(HISTORY)))
+BANK = SignatureBank()
+
+
+def observe(rig: Rig, seed: int = 0, known: Rig = RIG, history: FloatArray = HISTORY.loads) -> Observation:
+    counts = RigSimulator(rig, seed).step(history, WARM[: len(history)]).counts
+    volts = counts.astype(np.float64) * rig.converter.volts_per_count
+    return Observation('test', known, volts, history, WARM[: len(history)])
+
+
+def with_effect(name: str, **values: object) -> Rig:
+    return replace_values(RIG, {'effects.e.name': name, **{f'effects.e.{k}': v for k, v in values.items()}})
+
+
+@pytest.fixture(scope='module')
+def rotated() -> Discovery:
+    return discover([observe(with_effect('sensor_rotation', psd=2, angle=0.002))], RIG, bank=BANK)
+
+
+def test_nothing_missing_is_the_answer_to_noise() -> None:
+    found = discover([observe(RIG, seed=7)], RIG, bank=BANK)
+    assert found.verdict == 'nothing_missing'
+    assert found.effects == ()
+    assert found.gap_after == pytest.approx(found.gap_floor, rel=0.05)
+    assert sentence(found).startswith('Nothing is missing')
+
+
+def test_the_hidden_effect_is_named_with_its_size(rotated: Discovery) -> None:
+    assert rotated.verdict == 'effects_found'
+    (effect,) = rotated.effects
+    assert effect.active.effect.name == 'sensor_rotation'
+    assert effect.active.values['psd'] == 2
+    assert abs(effect.active.values['angle'] - 0.002) < 4 * effect.sd['angle']
+    assert effect.sd['angle'] < 2e-5
+    assert rotated.gap_before > 4 * rotated.gap_after
+    assert rotated.gap_heldout_after < 1.05 * rotated.gap_floor
+    assert rotated.simulations < 2000
+
+
+def test_where_is_the_turned_sensor(rotated: Discovery) -> None:
+    assert {c.channel for c in rotated.where.cells[:5]} <= {'x2', 'y2'}
+    assert rotated.where.cells[0].p < 1e-6
+    assert 'dot_position' in rotated.where.cells[0].depends_on
+
+
+def test_the_model_closes_the_gap_on_new_data(rotated: Discovery, tmp_path: Path) -> None:
+    path = tmp_path / 'model.yaml'
+    path.write_text(model_yaml(RIG, rotated.active_effects))
+    model = load_rig(path)
+    assert model.values == RIG.values
+    assert [a.effect.name for a in effects_of_rig(model)] == ['sensor_rotation']
+    again = discover([observe(with_effect('sensor_rotation', psd=2, angle=0.002), seed=9, known=model)], model)
+    assert again.verdict == 'nothing_missing'
+
+
+def check_schema(tree: dict[str, Any]) -> None:
+    """The contract's own conditions on result.json; those of its schema too, where one lies beside the checkout."""
+    if SCHEMA.exists():
+        jsonschema = pytest.importorskip('jsonschema')
+        jsonschema.validate(tree, json.loads(SCHEMA.read_text()))
+    assert set(tree) >= {'verdict', 'where', 'effects', 'unknown', 'gap'}
+    assert tree['verdict'] in ('effects_found', 'nothing_missing', 'unknown_effect')
+    for w in tree['where']:
+        assert set(w) >= {'channel', 'when', 'band_hz', 'depends_on', 'statistic', 'p'}
+        assert len(w['when']) == 2
+        assert len(w['band_hz']) == 2
+        assert 0 <= w['p'] <= 1
+    for e in tree['effects']:
+        assert set(e) >= {'name', 'stage', 'parameters', 'equivalent', 'evidence'}
+        assert e['stage'] in ('link', 'load', 'optics', 'psd', 'electronics')
+        assert set(e['evidence']) >= {'delta_bic', 'p', 'heldout_gain'}
+    gap = tree['gap']
+    assert gap['unit'] == 'm'
+    assert all(gap[k] >= 0 for k in ('before', 'after', 'floor', 'heldout_before', 'heldout_after'))
+
+
+def test_result_keeps_to_the_contract_and_to_json(rotated: Discovery) -> None:
+    tree = result(rotated)
+    check_schema(tree)
+    assert json.loads(json.dumps(tree, allow_nan=False)) == tree
+
+
+def test_the_same_seed_gives_the_same_answer(rotated: Discovery) -> None:
+    again = discover([observe(with_effect('sensor_rotation', psd=2, angle=0.002))], RIG)
+    assert result(again)['effects'] == result(rotated)['effects']
+    assert result(again)['where'] == result(rotated)['where']
+
+
+def test_what_one_length_cannot_tell_two_can() -> None:
+    one = discover([observe(with_effect('clamp_bending_compliance', compliance=2e-7))], RIG, bank=BANK)
+    (effect,) = one.effects
+    names = {effect.active.effect.name, *effect.equivalent}
+    assert names == {'clamp_bending_compliance', 'bending_stiffness'}
+    assert effect.suggestion is not None
+    assert 'link of 0.41 m' in effect.suggestion.text
+    short = replace_values(RIG, {'link.length': 0.4})
+    hidden = {'effects.e.name': 'clamp_bending_compliance', 'effects.e.compliance': 2e-7}
+    both = [
+        observe(replace_values(RIG, hidden)),
+        observe(replace_values(short, hidden), seed=1, known=short),
+    ]
+    (effect,) = discover(both, RIG).effects
+    assert effect.active.effect.name == 'clamp_bending_compliance'
+    assert effect.equivalent == ()
+
+
+def test_what_is_not_in_the_library_is_unknown_and_not_merged() -> None:
+    seen = observe(RIG, seed=3)
+    volts = seen.volts.copy()
+    # The square of y2 leaks into x2: in no catalogue.
+    volts[:, 3] += 0.004 * volts[:, 4] ** 2
+    found = discover([Observation('alien', RIG, volts, seen.loads, seen.temperature)], RIG, bank=BANK)
+    assert found.verdict == 'unknown_effect'
+    assert 'x2' in found.unknown[0].signature
+    check_schema(result(found))
+
+
+def two_effects(first: dict[str, object], second: dict[str, object]) -> Rig:
+    both = {'a': first, 'b': second}
+    return replace_values(RIG, {f'effects.{k}.{n}': v for k, e in both.items() for n, v in e.items()})
+
+
+def test_sizes_that_agree_beyond_chance_are_put_down_to_one_cause() -> None:
+    lag = observe(with_effect('amplifier_lag', time_constant=3e-5))
+    found = discover([lag], RIG, without=['amplifier_lag'])
+    assert [e.active.effect.name for e in found.effects] == ['channel_skew', 'channel_skew']
+    assert found.verdict == 'unknown_effect'
+    assert not found.unknown[0].remains
+    assert 'agree in size (delay 3' in found.unknown[0].signature
+    assert found.unknown[0].explains > 0.9
+    assert 'their sizes are tied' in sentence(found)
+    # With the cause in the library it is named alone.
+    assert [e.active.effect.name for e in discover([lag], RIG, bank=BANK).effects] == ['amplifier_lag']
+
+
+def test_independent_sizes_are_left_alone() -> None:
+    skews = [{'name': 'channel_skew', 'psd': psd, 'delay': delay} for psd, delay in ((1, 2e-5), (2, 3.1e-5))]
+    found = discover([observe(two_effects(*skews))], RIG, bank=BANK)
+    assert found.verdict == 'effects_found'
+    assert coincidences(found.fit, found.workspace.physics) == []
+
+
+def test_a_parameter_stays_where_the_rig_lets_it() -> None:
+    workspace = Workspace([observe(RIG)])
+    ambient = make_active('ambient_light', {'psd': 2, 'level': 0.01, 'x': 0.4, 'y': 0.0}, 'test')
+    fit = refit(workspace, [ambient], iterations=1)
+    assert fit.effects[0].values['x'] <= 0.5 * RIG.psds[1].active_area[0]
+
+
+def test_lost_samples_cost_nothing_but_themselves() -> None:
+    seen = observe(with_effect('sensor_rotation', psd=2, angle=0.002))
+    volts = seen.volts.copy()
+    volts[np.random.default_rng(0).integers(0, len(volts), 400)] = np.nan
+    found = discover([Observation('lossy', RIG, volts, seen.loads, seen.temperature)], RIG, bank=BANK)
+    assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
+    assert found.gap_after == pytest.approx(found.gap_floor, rel=0.05)
+
+
+# Pieces.
+
+
+def test_load_cases_are_whole() -> None:
+    case = load_cases(HISTORY.loads, 1e-3)
+    # Nine changes of level and a sweep that is one case.
+    assert case.max() == 10
+    assert np.all(np.diff(case) >= 0)
+    assert np.all(np.bincount(load_cases(np.zeros((100, 3)), 1e-3)) == 25)
+
+
+def test_rest_is_before_the_first_load_and_long_after_the_last() -> None:
+    history = loads.steps([(0, 0, 0), (0, -10, 0)], 10.0).loads
+    seen = observe(RIG, history=history)
+    first, second = rest_windows(seen)
+    assert first == slice(0, 10_000)
+    # 7 time constants of the bending mode: 7/(2 pi 14 Hz 0.02) = 3.98 s.
+    assert second.start == pytest.approx(13_979, abs=2)
+
+
+@pytest.mark.parametrize(('memory', 'level'), [(0.0, 2e-3), (0.0, 3e-3), (0.6, 2e-3)])
+def test_noise_is_known_whatever_it_is(memory: float, level: float) -> None:
+    seen = observe(RIG, history=np.zeros((20_000, 3)))
+    rng = np.random.default_rng(1)
+    noise = np.empty((20_000, 6))
+    e = level * np.sqrt(1 - memory**2) * rng.standard_normal(noise.shape)
+    noise[0] = e[0]
+    for i in range(1, len(e)):
+        noise[i] = memory * noise[i - 1] + e[i]
+    model = estimate_noise(seen, noise, 4, 1e-5)
+    assert set(model.coloured) == {memory > 0}
+    np.testing.assert_allclose(model.sigma, level, rtol=0.06)
+    blocks = noise.reshape(-1, 20, 6).mean(axis=1).std(axis=0)
+    np.testing.assert_allclose(model.block_sigma, blocks, rtol=0.12)
+    fine = noise.reshape(-1, 4, 6).mean(axis=1).T
+    white = model.whiten(fine, np.ones(fine.shape[1], dtype=bool))
+    np.testing.assert_allclose(white.std(axis=1), 1.0, rtol=0.06)
+
+
+def test_a_line_is_stripped_before_noise_is_judged() -> None:
+    t = np.arange(4000) * 1e-3
+    noise = np.random.default_rng(0).standard_normal(4000)
+    assert strip_lines(noise + 3.0 * np.sin(2 * np.pi * 50.0 * t)).std() == pytest.approx(1.0, abs=0.05)
+
+
+def test_spectral_peak_is_refined_beyond_its_bin() -> None:
+    t = np.arange(8000) * 1e-3
+    rows = np.random.default_rng(0).standard_normal((8000, 6))
+    rows[:, 2] += 0.5 * np.sin(2 * np.pi * 57.317 * t)
+    (peak,) = proposals.spectral_peaks([rows], [np.ones(6)], [1e-3])
+    assert peak == pytest.approx(57.317, abs=0.01)
+    assert proposals.persistent([peak], [rows], [np.ones(6)], [1e-3]) == [peak]
+    rows[2000:, 2] -= 0.5 * np.sin(2 * np.pi * 57.317 * t[2000:])
+    assert proposals.persistent([peak], [rows], [np.ones(6)], [1e-3]) == []
+
+
+@pytest.mark.parametrize('step', [1e-3, 4.7e-3, 0.02])
+def test_coarse_steps_are_seen_in_the_values(step: float) -> None:
+    found = proposals.coarse_step(observe(with_effect('quantisation', step=step)))
+    assert found is not None
+    assert found[0] == pytest.approx(step, rel=1e-3)
+    assert abs(found[0] - step) < 4.0 * found[1]
+
+
+def test_fine_steps_are_not_imagined() -> None:
+    assert proposals.coarse_step(observe(RIG)) is None
+
+
+def test_directions_that_cannot_be_seen_are_left_alone() -> None:
+    fisher = np.array([[1.0, 1.0], [1.0, 1.0]])
+    gain, rank, c = solve_seen(fisher, np.array([2.0, 2.0]), np.diag(fisher))
+    assert rank == 1
+    assert gain == pytest.approx(4.0)
+    np.testing.assert_allclose(c, [1.0, 1.0])
+
+
+def test_gap_and_floor_of_pure_noise_agree() -> None:
+    ws = Workspace([observe(RIG, seed=5)])
+    _, difference = ws.residual([])
+    assert ws.gap(difference) == pytest.approx(ws.floor(), rel=0.04)
+    assert ws.floor() == pytest.approx(2e-3 * 0.5e-3 / np.sqrt(20), rel=0.03)
+
+
+def test_too_short_a_recording_is_refused() -> None:
+    with pytest.raises(RecordingError, match='at least 4 blocks'):
+        Observation('short', RIG, np.zeros((50, 6)), np.zeros((50, 3)))
+
+
+# The commands.
+
+
+def simulate(tmp_path: Path, *words: str) -> Path:
+    out = tmp_path / 'seen.csv'
+    assert main(['simulate', '--out', str(out), *words]) == 0
+    return out
+
+
+def test_from_simulate_to_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recorded = simulate(
+        tmp_path, '--loads', 'thesis:1.5', '--effect', 'sensor_gain,psd=1,x=0.004,y=0.003', '--reference'
+    )
+    out = tmp_path / 'out'
+    assert main(['discover', str(recorded), '--out', str(out), '--quiet']) == 0
+    said = capsys.readouterr().out
+    assert 'sensor_gain (psd 1) is missing' in said
+    tree = json.loads((out / 'result.json').read_text())
+    check_schema(tree)
+    assert tree['provenance']['forward_simulations'] <= 2000
+    page = (out / 'report.html').read_text()
+    assert 'http' not in page.replace('http-equiv', '')
+    assert page.count('data:image/png;base64,') == 4
+    assert (
+        main(['discover', str(recorded), '--params-file', str(out / 'model.yaml'), '--out', str(out), '--quiet']) == 0
+    )
+    assert 'Nothing is missing' in capsys.readouterr().out
+
+
+def test_a_bag_tells_its_own_rig_but_not_what_was_hidden(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    short = tmp_path / 'short.yaml'
+    short.write_text(model_yaml(replace_values(RIG, {'link.length': 0.4}), ()))
+    words = ['--params-file', str(short), '--loads', 'thesis:1', '--effect', 'sensor_rotation,psd=1,angle=0.003']
+    assert main(['simulate', '--out', str(tmp_path / 'run'), *words]) == 0
+    assert main(['discover', str(tmp_path / 'run'), '--out', str(tmp_path / 'found'), '--quiet']) == 0
+    assert 'sensor_rotation (psd 1) is missing' in capsys.readouterr().out
+    assert load_rig(tmp_path / 'found' / 'model.yaml').link.length == 0.4
+    # The front door says the same; and the model it left, nothing missing.
+    found = psd_deflection.discover([tmp_path / 'run'], tmp_path / 'found' / 'model.yaml')
+    assert found.verdict == 'nothing_missing'
+
+
+def test_a_zero_taken_while_it_ran_is_part_of_the_rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert main(['simulate', '--out', str(tmp_path / 'run'), '--loads', 'thesis:0.5']) == 0
+    recording = open_recording(tmp_path / 'run')
+    later = ParameterChange(0, 3, (('psd_2.zero', (1e-4, -2e-4)), ('environment.temperature', 22.0)))
+    monkeypatch.setattr(recording, 'changes', [later])
+    assert recorded_rig(recording).zeros.tolist() == [[0.0, 0.0], [1e-4, -2e-4]]
+
+
+def test_a_bag_and_a_csv_of_one_run_give_one_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ['--loads', 'thesis:1', '--effect', 'creep,amplitude=0.02,time_constant=1', '--temperature', '20,22']
+    answers = []
+    for name in ('run.csv', 'run'):
+        assert main(['simulate', '--out', str(tmp_path / name), *words]) == 0
+        assert main(['discover', str(tmp_path / name), '--out', str(tmp_path / ('of_' + name)), '--quiet']) == 0
+        answers.append(json.loads((tmp_path / ('of_' + name) / 'result.json').read_text()))
+    assert [a['effects'][0]['name'] for a in answers] == ['creep'] * 2
+    first, second = (a['effects'][0]['parameters']['amplitude']['value'] for a in answers)
+    assert first == pytest.approx(second, rel=1e-3)
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ('listed', 'said'),
+    [
+        ('{}', 'must be a list'),
+        ('- {rec: a.csv}', 'must have "recording: FILE"'),
+        ('- {recording: seen.csv, overrides: 3}', 'must be a map'),
+        ('- {recording: seen.csv, length: 3}', 'only recording and overrides'),
+        ('- {recording: seen.csv, overrides: {link.lenght: 0.4}}', 'did you mean link.length'),
+        ('- {recording: gone.csv}', 'no such recording'),
+        ('- [', 'malformed YAML'),
+    ],
+)
+def test_a_bad_list_is_refused_by_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], listed: str, said: str
+) -> None:
+    simulate(tmp_path, '--loads', 'constant:0,0,0:1')
+    path = tmp_path / 'list.yaml'
+    path.write_text(listed)
+    assert main(['discover', str(path), '--out', str(tmp_path / 'out'), '--quiet']) in (3, 4)
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'said'),
+    [
+        (['--loads', 'thesis:0'], 'above 0'),
+        (['--loads', 'constant:1,2:3'], 'must be 3 numbers'),
+        (['--loads', 'chirp:1,0,0:1,900:3'], 'below 500 Hz'),
+        (['--loads', 'up and down'], 'not a load history'),
+        (['--effect', 'sensor_gain,psd'], 'not KEY=VALUE'),
+        (['--effect', 'sensor_gian,psd=1'], 'did you mean sensor_gain'),
+        (['--temperature', 'warm'], 'not a list of numbers'),
+    ],
+)
+def test_bad_words_of_simulate_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+) -> None:
+    assert main(['simulate', '--out', str(tmp_path / 'x.csv'), *arguments]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_recording_without_loads_is_refused_with_the_way_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / 'bare.csv'
+    rows = [f'{i / 1000:.3f},0,0,5,0,0,5' for i in range(200)]
+    path.write_text('\n'.join(['t,x1,y1,sum1,x2,y2,sum2', *rows]) + '\n')
+    assert main(['discover', str(path), '--out', str(tmp_path / 'out'), '--quiet']) == 4
+    assert 'holds no loads' in capsys.readouterr().err

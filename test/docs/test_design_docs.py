@@ -1,0 +1,56 @@
+"""What docs/mechanics.md and docs/budget.md quote is what the commands print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.cli.main import main
+
+ROOT = Path(__file__).parents[2]
+RIG = str(ROOT / 'config' / 'thesis_rig.yaml')
+
+
+@pytest.mark.parametrize(
+    ('page', 'arguments'),
+    [
+        ('mechanics.md', ['design']),
+        ('mechanics.md', ['design', '--params-file', RIG, '--sigma', '2e-6']),
+        ('budget.md', ['budget', '--params-file', RIG, '--monte-carlo', '20000']),
+    ],
+)
+def test_the_quoted_tables_are_the_printed_ones(
+    page: str, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out.removesuffix('\nbudget.png\n').rstrip()
+    assert f'```\n{printed}\n```' in (ROOT / 'docs' / page).read_text(encoding='utf-8')
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'quoted'),
+    [
+        (['--method', 'wls'], '29.826 | 5.017 | 0.042'),
+        (['--method', 'thesis_iteration'], '66.025 | 0.000 | 52.375'),
+        (
+            [
+                *('--set', 'rotation_tolerance=1e-3', '--set', 'center_tolerance=1e-4'),
+                *('--set', 'height_tolerance=2e-4', '--set', 'pointing_drift=2e-6'),
+            ],
+            '2.992 um, 5.048 um and 2.723 mdeg',
+        ),
+    ],
+)
+def test_the_quoted_figures_are_the_printed_ones(
+    arguments: list[str], quoted: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(['budget', '--params-file', RIG, '--out', str(tmp_path / 'chart.png'), *arguments]) == 0
+    out = capsys.readouterr().out
+    assert quoted in (ROOT / 'docs' / 'budget.md').read_text(encoding='utf-8')
+    name = 'computation' if '--method' in arguments else 'total'
+    line = next(line.split() for line in out.splitlines() if line.startswith(name))
+    figures = line[4:7] if name == 'computation' else line[1:4]
+    # 'computation  E_C  known bias  dX dY theta ...'
+    assert [w for w in quoted.replace('|', ' ').split() if w[0].isdigit()] == figures

@@ -1,0 +1,271 @@
+"""The documents do what they say: every command is run, every link leads somewhere.
+
+What ends in a moment is run here; ``make doc-commands`` runs the rest (tools/run_commands.py), and CI runs both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib.util
+import json
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from psd_deflection import errors
+from psd_deflection.cli.main import COMMANDS, INTERRUPTED, main, make_parser
+from tools import run_commands
+from tools.run_commands import FENCE, PAGES, ROOT, Command
+
+ALL = list(run_commands.commands())
+OURS = [c for c in ALL if c.line.startswith('psd-deflection ')]
+
+
+def words(line: str) -> list[str]:
+    """The arguments of one of our commands, with what a reader would put in for a placeholder."""
+    return shlex.split(run_commands.filled(line))[1:]
+
+
+@pytest.fixture(scope='module')
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what a checkout has, where commands may write."""
+    folder = tmp_path_factory.mktemp('checkout')
+    for name in ('bags', 'config', 'docs'):
+        (folder / name).symlink_to(ROOT / name)
+    return folder
+
+
+def test_there_are_commands() -> None:
+    assert len(OURS) > 40
+    assert {'README.md', 'docs/quickstart.md', 'docs/monitor.md', 'docs/security.md'} <= {c.page for c in ALL}
+
+
+def test_every_command_is_run() -> None:
+    here = {c.line for block in run_commands.blocks_to_run() for c in block}
+    for command in ALL:
+        line = command.line
+        elsewhere = run_commands.is_quick(line) or run_commands.run_by_ci(line) is not None
+        assert elsewhere != (line in here) or line.startswith('psd-deflection simulate '), command
+    assert run_commands.stale() == []
+
+
+def test_ci_runs_what_it_is_said_to_run() -> None:
+    for _, file, text in run_commands.CI_RUNS:
+        assert text in (ROOT / file).read_text(), (file, text)
+    targets = set(re.findall(r'^([a-z-]+):', (ROOT / 'Makefile').read_text(), re.M))
+    assert set(run_commands.SHORTEST) <= targets
+    assert {c.line.split()[1] for c in ALL if c.line.startswith('make ')} <= targets
+
+
+@pytest.mark.parametrize('command', OURS, ids=lambda c: f'{c.page}: {c.line}'[:90])
+def test_a_command_is_understood(command: Command) -> None:
+    argv = words(command.line)
+    assert argv[0] in COMMANDS
+    arguments = argv[: argv.index('--ros-args')] if '--ros-args' in argv else argv
+    if '--help' not in arguments:
+        make_parser([argv[0]]).parse_args(arguments)
+
+
+@pytest.mark.parametrize(
+    'line',
+    sorted({' '.join(words(c.line)) for c in OURS if run_commands.is_quick(c.line)}),
+    ids=lambda line: str(line)[:80],
+)
+def test_a_command_runs(
+    line: str, checkout: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(checkout)
+    argv = shlex.split(line)
+    if '--help' in argv:
+        with pytest.raises(SystemExit):
+            main(argv)
+        return
+    if '--out' in argv:
+        # A page may write the same name as another one, and no test writes into the documents.
+        out = Path(Path(argv[argv.index('--out') + 1]).name)
+        argv[argv.index('--out') + 1] = f'again_{abs(hash(line))}{out.suffix}' if out.exists() else str(out)
+    # A recording of another machine may differ in its last bits: that is what 1 says.
+    assert main(argv) in ((0, 1) if '--compare' in argv else (0,)), capsys.readouterr().err
+
+
+def anchors(page: Path) -> set[str]:
+    headings = re.findall(r'^#+ (.+)$', page.read_text(), re.M)
+    return {re.sub(r'[^\w\- ]', '', h.lower()).strip().replace(' ', '-') for h in headings}
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda p: p.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    text = FENCE.sub('', page.read_text())
+    for target in re.findall(r'\]\(([^)\s]+)(?: "[^"]*")?\)', text):
+        if target.startswith(('http://', 'https://', 'mailto:')):
+            continue
+        name, _, anchor = target.partition('#')
+        path = (page.parent / name).resolve() if name else page
+        assert path.exists(), f'{page.name}: {target}'
+        if anchor and path.suffix == '.md':
+            assert anchor in anchors(path), f'{page.name}: {target}'
+
+
+def test_no_page_loads_anything_from_elsewhere() -> None:
+    for page in PAGES:
+        assert not re.search(r'!\[[^\]]*\]\(https?:', page.read_text()), page
+
+
+PYTHON = [
+    (page, number, block['text'])
+    for page in PAGES
+    for number, block in enumerate(FENCE.finditer(page.read_text()))
+    if block['kind'] == 'python'
+]
+
+
+@pytest.mark.parametrize(('page', 'number', 'text'), PYTHON, ids=lambda v: getattr(v, 'name', None))
+def test_python_blocks_run(
+    page: Path, number: int, text: str, checkout: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(checkout)
+    script = tmp_path / f'block_{number}.py'
+    script.write_text(text)
+    runpy.run_path(str(script))
+
+
+def test_the_notebook_runs(checkout: Path, tmp_path: Path) -> None:
+    if importlib.util.find_spec('pandas') is None:
+        pytest.skip('the notebook needs pandas: pip install .[test]')
+    cells = json.loads((ROOT / 'docs' / 'recording.ipynb').read_text())['cells']
+    sources = [''.join(cell['source']) for cell in cells if cell['cell_type'] == 'code']
+    assert len(sources) >= 4
+    script = tmp_path / 'notebook.py'
+    # As a notebook does: all in one namespace.
+    script.write_text(
+        "import matplotlib\nmatplotlib.use('Agg')\n" + '\n\n'.join(sources) + '\nassert len(samples) == 4000\n'
+    )
+    done = subprocess.run(
+        [sys.executable, str(script)],
+        cwd=checkout,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={'PYTHONPATH': str(ROOT), 'PATH': '', 'MPLCONFIGDIR': str(tmp_path)},
+    )
+    assert done.returncode == 0, done.stderr
+    assert 'sd at rest: 0.18 µm, 0.20 µm, 0.15 mdeg' in done.stdout
+
+
+@pytest.fixture(scope='module')
+def hooks() -> Any:
+    spec = importlib.util.spec_from_file_location('docs_hooks', ROOT / 'tools' / 'hooks.py')
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def fragments(node: ast.expr) -> Iterator[str]:
+    """What a message says in any case, between the parts that depend on it."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        yield node.value
+    elif isinstance(node, ast.JoinedStr):
+        for value in node.values:
+            yield from fragments(value)
+    elif isinstance(node, ast.BinOp):
+        yield from fragments(node.left)
+        yield from fragments(node.right)
+    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == 'replace':
+        yield from fragments(node.func.value)
+
+
+def test_every_error_message_is_on_the_troubleshooting_page(hooks: Any) -> None:
+    page = hooks.on_page_markdown((ROOT / 'docs' / 'troubleshooting.md').read_text())
+    found = list(hooks.messages())
+    assert len(found) > 200
+    assert {kind for kind, _, _ in found} == {*hooks.STATUS, *hooks.WITHOUT_STATUS}
+    for name, status in hooks.STATUS.items():
+        assert f'Exit status {status}: {name}' in page
+    # Not through the collector: whatever is raised in the source with a text of its own, directly or by a function
+    # that says it gives one of ours.
+    ours = hooks.error_kinds()
+    missing = []
+    raised = 0
+    for module, tree in hooks.trees():
+        makers = {
+            f.name for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) and getattr(f.returns, 'id', '') in ours
+        }
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.Raise) or not isinstance(node.exc, ast.Call) or not node.exc.args:
+                continue
+            name = getattr(node.exc.func, 'id', None) or getattr(node.exc.func, 'attr', '')
+            if name not in ours and name not in makers:
+                continue
+            raised += 1
+            for text in fragments(node.exc.args[0]):
+                if len(text.strip()) > 5 and hooks._cell(text)[1:-1] not in page:
+                    missing.append(f'{module}:{node.lineno}: {text}')
+    assert missing == []
+    assert raised > 200
+
+
+def test_exit_statuses_are_documented(hooks: Any) -> None:
+    page = (ROOT / 'docs' / 'commands.md').read_text()
+    rows = {int(n) for n in re.findall(r'^\| (\d+) \|', page, re.M)}
+    assert rows == {0, 1, 2, INTERRUPTED, *hooks.STATUS.values()}
+    kinds = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, errors.PsdDeflectionError)]
+    assert {k.exit_status for k in kinds} - rows == {errors.PsdDeflectionError.exit_status}
+
+
+def test_every_command_and_parameter_is_on_its_page(hooks: Any) -> None:
+    page = hooks.on_page_markdown((ROOT / 'docs' / 'commands.md').read_text())
+    assert '<!--' not in page
+    for name in COMMANDS:
+        assert f'usage: psd-deflection {name}' in page
+    assert '| `monitor_control` | `False` |' in page
+
+
+def test_what_docstrings_say_for_sphinx_is_not_shown(hooks: Any) -> None:
+    html = '<p>Raises :class:<code>~psd_deflection.errors.ConfigError</code>; see :meth:<code>Pipeline.zero</code>.</p>'
+    assert hooks.on_page_content(html) == '<p>Raises <code>ConfigError</code>; see <code>Pipeline.zero</code>.</p>'
+
+
+@pytest.mark.parametrize('shell', ['bash', 'zsh'])
+def test_completion_knows_commands_and_options(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['completion', shell]) == 0
+    script = capsys.readouterr().out
+    for word in (*COMMANDS, '--params-file', '--no-ros', '--control'):
+        assert word in script
+
+
+def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[str]) -> None:
+    values = {}
+    for name in COMMANDS:
+        (commands,) = (a for a in make_parser([name])._actions if isinstance(a, argparse._SubParsersAction))
+        for action in commands.choices[name]._actions:
+            if action.nargs != 0 and action.choices is None:
+                flag = (action.option_strings or ['pos_0'])[-1]
+                values[re.sub(r'\W', '_', f'{name}_{flag}')] = action.metavar or action.dest.upper()
+    assert main(['completion', 'bash']) == 0
+    script = capsys.readouterr().out
+    as_path = set(re.findall(r'_shtab_psd_deflection_(\w+)_COMPGEN=_shtab_compgen_(?:files|dirs)', script))
+    assert as_path <= set(values)
+    # What is left is numbers and words: a new kind of value is to be put here or among the paths.
+    assert {str(values[name]) for name in set(values) - as_path} == {
+        'ADDRESS', 'BAUD', 'EFFECT', 'M', 'N', 'NAME=VALUE', 'NAME,KEY=VALUE,...', 'PPM', 'SEED', 'SOURCE',
+        'T0[,T1...]', 'WORDS', 'X', "('FX', 'FY', 'TZ')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
+    }  # fmt: skip
+
+
+def test_the_navigation_has_every_page() -> None:
+    nav = (ROOT / 'mkdocs.yml').read_text().partition('\nnav:')[2]
+    listed = set(re.findall(r'(\S+\.md)$', nav, re.M))
+    docs = ROOT / 'docs'
+    missing = {str(p.relative_to(docs)) for p in docs.rglob('*.md')} - listed
+    assert not missing, f'to be put into nav of mkdocs.yml: {missing}'
+    assert all((docs / name).exists() for name in listed)

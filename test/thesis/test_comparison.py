@@ -1,0 +1,87 @@
+"""The printed methods have the errors that the audit of the source found, cell by cell; so has Table 5.1."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psd_deflection.thesis.comparison import CAUSES, CONDITIONS, METHODS, Method, errors, table_5_1
+
+Cell = tuple[float, float, float]
+
+# rms of dX um, dY um, theta mdeg for flat poses, independent tilts, cantilever tilts.
+AUDIT: dict[str, tuple[Cell, Cell, Cell]] = {
+    'section 2.2 as printed': ((73.01, 3.474, 59.71), (81.36, 9.492, 66.27), (76.67, 5.028, 62.69)),
+    'section 2.2 with magnitudes': ((60.81, 2.894, 49.74), (57.42, 9.098, 45.85), (61.03, 4.438, 49.74)),
+    'section 2.2 least on the grid': ((2.269, 3.237, 3.7), (9.034, 6.9, 5.024), (3.882, 4.616, 4.479)),
+    'Appendix D iterative': ((474.2, 21.46, 413.6), (477.7, 22.83, 416.4), (474.9, 21.46, 414.1)),
+    'Appendix D least squares': ((1647, 1158, 1318), (1647, 1158, 1318), (1647, 1158, 1318)),
+    'Appendix D weighted, sidebar': ((141.8, 130.2, 179.6), (137.9, 128.1, 178.8), (140.3, 129.4, 179.3)),
+    'Appendix D weighted, direct': ((141.8, 298.8, 66.84), (137.9, 297.9, 62.23), (140.3, 298.5, 64.81)),
+    'ols': ((123.3, 119.9, 0.7675), (122.4, 119.5, 4.741), (122.9, 119.7, 1.959)),
+    'wls, thesis weights, sidebar': ((141.8, 129.4, 28.09), (137.9, 127.4, 25.68), (140.3, 128.6, 27.17)),
+    'wls, thesis weights, direct': ((141.8, 126.8, 65.9), (137.9, 125.2, 61.29), (140.3, 126.2, 63.87)),
+    'exact (default)': ((0, 0, 0), (8.549, 6.672, 4.703), (3.341, 2.671, 1.829)),
+    'iterative': ((0, 0, 0), (8.549, 6.672, 4.703), (3.341, 2.671, 1.829)),
+    'minimum_tilt': ((0, 0, 0), (8.394, 7.005, 4.703), (3.217, 2.782, 1.829)),
+    'beam, k = 1.5': ((3.339, 2.67, 1.829), (8.086, 6.511, 5.045), (0, 0, 0)),
+}
+LARGEST: dict[str, tuple[Cell, Cell, Cell]] = {
+    'section 2.2 as printed': ((96.45, 6.515, 73.7), (123.4, 20.36, 103.7), (111.5, 14.18, 93.7)),
+    'section 2.2 with magnitudes': ((70.27, 4.735, 53.7), (80.8, 16.11, 53.7), (83, 10.79, 53.7)),
+    'section 2.2 least on the grid': ((2.582, 3.553, 3.7), (17.98, 12.14, 6.3), (11.21, 9.306, 6.3)),
+    'Appendix D iterative': ((6717, 346.4, 5934), (6772, 347.5, 5964), (6718, 341, 5934)),
+    'Appendix D least squares': ((2843, 2106, 2050), (2843, 2106, 2050), (2835, 2102, 2050)),
+    'Appendix D weighted, sidebar': ((407.4, 383.7, 322.3), (407.5, 383.7, 322.3), (401.6, 379.3, 322.3)),
+    'Appendix D weighted, direct': ((406.5, 771.9, 127.9), (406.5, 771.9, 132.4), (400.7, 767.5, 131)),
+    'ols': ((338.8, 317.8, 1.376), (341.1, 321.6, 7.081), (337.5, 316, 4.694)),
+    'wls, thesis weights, sidebar': ((407.5, 365.4, 49.13), (407.5, 365.5, 49.24), (401.7, 360.9, 49.19)),
+    'wls, thesis weights, direct': ((407.4, 354.7, 113.4), (407.5, 355.6, 118), (401.7, 350.3, 116.5)),
+    'exact (default)': ((0, 0, 0), (16.55, 11.6, 5.741), (8.982, 6.296, 3.323)),
+    'minimum_tilt': ((0, 0, 0), (16.39, 11.72, 5.741), (8.888, 6.296, 3.323)),
+    'beam, k = 1.5': ((8.95, 6.279, 3.33), (17.93, 13.21, 9.087), (0, 0, 0)),
+}
+UNITS = np.array([1e6, 1e6, 1e3 * 180.0 / np.pi])
+
+
+@pytest.mark.parametrize('method', [m for m in METHODS if m.label in AUDIT], ids=lambda m: m.label)
+def test_the_audits_table(method: Method) -> None:
+    for i, condition in enumerate(CONDITIONS):
+        got = errors(method, condition)
+        np.testing.assert_allclose(got.rms * UNITS, AUDIT[method.label][i], rtol=5e-4, atol=5e-4)
+        if method.label in LARGEST:
+            np.testing.assert_allclose(got.largest * UNITS, LARGEST[method.label][i], rtol=6e-4, atol=5e-4)
+        if method.name != 'appendix_d':
+            assert got.silent == 0.0
+        elif condition == 'independent tilts':
+            assert got.silent == pytest.approx(0.058, abs=5e-4)
+
+
+def test_beam_is_exact_on_a_beam_and_the_flat_methods_on_a_flat_plate() -> None:
+    by_label = {m.label: m for m in METHODS}
+    assert errors(by_label['beam, k = 1.5'], 'cantilever tilts').largest.max() < 1e-13
+    for label in ('exact (default)', 'iterative', 'minimum_tilt', 'wls_exact', 'wls_exact, thesis weights'):
+        assert errors(by_label[label], 'flat').largest.max() < 1e-13
+
+
+# Per cent of theta, dX, dY: Appendix D's iteration; weighted least squares.
+TABLE_5_1: dict[str, tuple[Cell, Cell]] = {
+    'the algorithms alone': ((-8.6, 84.9, 0.0), (-0.4, 19.2, -0.5)),
+    'twist, dY of Table B1 at 60 N, scaled': ((-7.6, 86.0, 0.1), (-0.5, 29.2, -0.5)),
+    'PSDs 22 mm above the section': ((-8.0, 82.3, 5.7), (-0.5, 25.2, 5.1)),
+    'both PSDs rotated 1 deg': ((-10.7, 73.2, 1.0), (0.6, 10.7, 0.5)),
+    'all gains +5 %': ((-3.3, 85.3, 5.1), (4.5, 25.2, 4.5)),
+    'pre-load 70/-50 um left in': ((-8.6, 85.0, 0.0), (6.2, 60.2, 2.7)),
+    'camera rolled +1 deg': ((-8.6, 173.5, 0.0), (-0.4, 76.4, -0.5)),
+    'camera rolled -1 deg': ((-8.6, 39.7, 0.2), (-0.4, -9.9, -0.4)),
+    'plate centre off (2, 2) mm': ((-8.6, 112.1, 1.5), (-0.4, 46.8, 1.0)),
+    'no cantilever tilt': ((-8.6, 84.8, 0.0), (-0.5, 19.2, -0.5)),
+    "the code's matrix": ((-8.6, 84.9, 0.0), (-9.3, 19.3, -0.7)),
+}
+
+
+@pytest.mark.parametrize('label', TABLE_5_1)
+def test_table_5_1_by_cause(label: str) -> None:
+    cause = next(c for c in CAUSES if c.label == label)
+    got = table_5_1(cause)
+    np.testing.assert_allclose(100.0 * np.array(got), TABLE_5_1[label], atol=0.06)

@@ -1,0 +1,172 @@
+"""``make firmware``: runs the firmware in qemu, joins its UART to the daemon, and checks every sample.
+
+The daemon opens the pseudo-terminal that qemu makes, as it opens any port. The synthetic converter's
+counts are a function of the sample's number, so that each is checked, not only counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+from psd_deflection.config import load_rig
+from psd_deflection.devices.serial_port import SerialPort
+from psd_deflection.protocol.frames import (
+    BadFrame,
+    Frame,
+    FrameDecoder,
+    HelloFrame,
+    HelloRequestFrame,
+    PingFrame,
+    PongFrame,
+    SampleFrame,
+    StartFrame,
+    StatusFrame,
+    StopFrame,
+    encode,
+)
+from psd_deflection.records import Record, SampleBlock
+from psd_deflection.runner.session import Session
+
+COMMAND = [
+    'qemu-system-arm',
+    '-machine',
+    'mps2-an385',
+    '-display',
+    'none',
+    '-monitor',
+    'none',
+    '-chardev',
+    'pty,id=uart',
+]
+PATIENCE_S = 60.0
+
+
+def expected(number: int) -> tuple[int, ...]:
+    """What synthetic.c makes of a sample's number."""
+    ramp = number % 2000 - 1000
+    return (ramp, -ramp, 16384 + number % 7, number % 256, number % 5, 16384 - number % 11)
+
+
+def dialogue(port: str) -> tuple[int, float]:
+    """Ask for each answer that the page promises; bad frames seen, and the median round trip of a PING, s."""
+    line = SerialPort(port, 921_600)
+    decoder = FrameDecoder()
+    bad = 0
+
+    def until(kind: type[Frame], kept: list[Frame] | None = None) -> Frame:
+        nonlocal bad
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline:
+            frames = decoder.feed(line.read(0.1))
+            bad += sum(isinstance(f, BadFrame) for f in frames)
+            if kept is not None:
+                kept += frames
+            for frame in frames:
+                if isinstance(frame, kind):
+                    return frame
+        raise SystemExit(f'FAILED: no {kind.__name__} in {PATIENCE_S:g} s')
+
+    line.write(b'\x00' + encode(HelloRequestFrame()))
+    hello = until(HelloFrame)
+    if not isinstance(hello, HelloFrame) or hello.version != 1:
+        raise SystemExit(f'FAILED: HELLO is {hello!r}')
+    until(StatusFrame)
+    trips = []
+    for cookie in range(100):
+        asked = time.monotonic()
+        line.write(encode(PingFrame(cookie)))
+        pong = until(PongFrame)
+        trips.append(time.monotonic() - asked)
+        if not isinstance(pong, PongFrame) or pong.cookie != cookie:
+            raise SystemExit(f'FAILED: {pong!r} answers PING {cookie}')
+    line.write(encode(StopFrame()) + encode(PingFrame(0)))
+    until(PongFrame)
+    # What was on its way is through; from here on only HELLO and STATUS may come.
+    quiet: list[Frame] = []
+    line.write(encode(PingFrame(1)))
+    until(PongFrame, quiet)
+    quiet = []
+    until(StatusFrame, quiet)
+    if any(isinstance(f, SampleFrame) for f in quiet):
+        raise SystemExit('FAILED: samples after STOP')
+    line.write(encode(StartFrame()))
+    until(SampleFrame)
+    line.close()
+    return bad, sorted(trips)[len(trips) // 2]
+
+
+class Checked:
+    """Counts samples and those whose counts are not what the firmware makes of their number.
+
+    ``enough`` is set once their stamps span ``seconds``.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self.samples = 0
+        self.wrong = 0
+        self.span_s = 0.0
+        self.enough = threading.Event()
+        self._seconds = seconds
+        self._first_ns = 0
+
+    def put(self, record: Record) -> None:
+        if not isinstance(record, SampleBlock):
+            return
+        self._first_ns = self._first_ns or int(record.t_ns[0])
+        self.span_s = (int(record.t_ns[-1]) - self._first_ns) / 1e9
+        if self.span_s >= self._seconds:
+            self.enough.set()
+        for seq, volts in zip(record.seq.tolist(), record.volts.tolist(), strict=True):
+            self.samples += 1
+            self.wrong += tuple(round(v * 32768 / 10) for v in volts) != expected(seq)
+
+
+def main() -> int:
+    """Run it; 0 where all is as it should be."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('elf', type=Path)
+    parser.add_argument('--seconds', type=float, default=20.0)
+    args = parser.parse_args()
+    qemu = subprocess.Popen(
+        [*COMMAND, '-serial', 'chardev:uart', '-kernel', str(args.elf)], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        port = ''
+        for line in qemu.stdout or ():
+            if found := re.search(r'redirected to (\S+)', line):
+                port = found[1]
+                break
+        bad, trip = dialogue(port)
+        session = Session(load_rig(overrides={'port': port}), lambda text: print(f'  {text}', file=sys.stderr))
+        checked = Checked(args.seconds)
+        session.processing.sinks.append(checked)
+        session.start()
+        checked.enough.wait(10.0 * args.seconds)
+        clock = session.acquisition.clock_state()
+        session.close()
+    finally:
+        qemu.kill()
+        qemu.wait()
+    wire = session.acquisition.counters
+    print(
+        f'firmware in qemu: {checked.samples} samples in {checked.span_s:.1f} s, {wire.lost} lost '
+        f'({wire.device_overruns} dropped by the device), {checked.wrong} wrong, {bad + wire.bad} bad frames, '
+        f'{wire.restarts} restarts, skew {clock.skew_ppm:.1f} ppm, PING median {trip * 1e3:.2f} ms'
+    )
+    # A busy host starves qemu, and the device then drops: what it took and what it says it dropped make up the time.
+    enough = checked.enough.is_set() and checked.samples + wire.lost >= 0.95 * 1000 * checked.span_s
+    enough = enough and checked.samples > 1000
+    silent = wire.lost > wire.device_overruns or (wire.lost > 0 and wire.device_dropped == 0)
+    good = enough and not (checked.wrong or bad or wire.bad or wire.restarts or silent)
+    print('firmware: OK' if good else 'firmware: FAILED')
+    return 0 if good else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,205 @@
+"""``make rerun``: converts recordings for Rerun, reads them with Rerun's own reader, and looks at the viewer's picture.
+
+Poses, bands, dots, sums and losses must be the recording's own, and nothing may stand where nothing was measured. Where
+there is no screen, the viewer gets a virtual one (xvfb-run, a software Vulkan: apt install xvfb mesa-vulkan-drivers).
+
+  python tools/check_rerun.py bags/lost_samples --out build/rerun
+  python tools/check_rerun.py bags/lost_samples --out build/rerun --figure docs/figures/rerun.png
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import rerun.chunk
+from PIL import Image
+
+import psd_deflection
+from psd_deflection.config import Rig, rig_from_values
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.rerun_writer import APPLICATION, POSE, TIMELINE, blueprint
+from psd_deflection.records import FloatArray, IntArray
+
+BIN = Path(sys.executable).parent
+WINDOW = '1500x900'
+VIEWER_S = 180.0
+LIGHT = (255, 80, 60)
+SHARE = 5e-4
+"""Of the pixels have a trace's colour, at least (seen: 2e-3); an empty viewport has a few of its icons'."""
+FIGURE_SPEED = 4.0
+"""What plays faster has moved by the time the picture is taken."""
+
+
+def need(true: bool, what: str) -> None:
+    """End with ``what`` where it is not so."""
+    if not true:
+        raise SystemExit(f'FAILED: {what}')
+
+
+class Written:
+    """The rows of an ``.rrd``, entity by entity: times of all rows, which of them have values, and these."""
+
+    def __init__(self, path: Path) -> None:
+        reader = rerun.chunk.RrdReader(path)
+        (recording,) = reader.recordings()
+        need(recording.application_id == APPLICATION, f'{path}: the application is {recording.application_id}')
+        need(len(reader.blueprints()) == 1, f'{path}: {len(reader.blueprints())} blueprints')
+        self._chunks: dict[str, list[rerun.chunk.Chunk]] = {}
+        for chunk in reader.stream():
+            self._chunks.setdefault(chunk.entity_path.strip('/'), []).append(chunk)
+
+    def rows(self, entity: str, component: str) -> tuple[IntArray, IntArray, FloatArray]:
+        """Times (n,) ns of all rows, how many values each has (n,), and all values one after the other."""
+        times, counts, values = [], [], []
+        for chunk in self._chunks[entity]:
+            if chunk.is_static:
+                continue
+            batch = chunk.to_record_batch()
+            times.append(batch.column(TIMELINE).to_numpy(zero_copy_only=False).astype(np.int64))
+            rows = batch.column(component).to_pylist()
+            counts += [len(row or ()) for row in rows]
+            values += [v for row in rows for v in row or ()]
+        return np.concatenate(times), np.array(counts, np.int64), np.array(values, np.float64)
+
+
+def check_poses(written: Written, recording: Recording) -> int:
+    """Each recorded estimate is there and no other; a line breaks wherever one is missing. The number of breaks."""
+    series = recording.estimates()['/link_tip/deflection_with_covariance']
+    need(series.covariance is not None, 'the recording has no covariance')
+    assert series.covariance is not None
+    breaks = 0
+    step = float(np.median(np.diff(series.t_ns)))
+    gone = np.flatnonzero(np.diff(series.t_ns) > 1.5 * step)
+    for i, (name, _, _, scale, _) in enumerate(POSE):
+        times, counts, values = written.rows(f'tip/{name}', 'Scalars:scalars')
+        need(bool((np.diff(times) > 0).all()), f'{name}: times do not rise')
+        need(
+            np.array_equal(times[counts == 1], series.t_ns),
+            f'{name}: {len(values)} values, {len(series.t_ns)} estimates',
+        )
+        # Another machine's last bits may differ.
+        need(np.allclose(values, series.pose[:, i] * scale, rtol=1e-9, atol=1e-9), f'{name} differs')
+        empty = times[counts == 0]
+        for k in gone:
+            inside = (empty > series.t_ns[k]) & (empty < series.t_ns[k + 1])
+            need(bool(inside.any()), f'{name}: the line goes on where nothing was measured, at {series.t_ns[k]} ns')
+        breaks = len(empty)
+        _, _, band = written.rows(f'tip/{name}/band', 'Scalars:scalars')
+        sd = np.sqrt(series.covariance[:, i, i]) * scale
+        need(np.allclose(np.diff(band.reshape(-1, 2), axis=1)[:, 0], 4.0 * sd, rtol=1e-6), f'{name}: the band differs')
+    return breaks
+
+
+def check_dots(written: Written, recording: Recording, rig: Rig) -> None:
+    """Each block's mean, reckoned from its volts, stands where the light is seen and nowhere else."""
+    samples = recording.samples
+    _, first = np.unique(samples['seq'] // recording.block_size, return_index=True)
+    present = np.diff([*first, len(samples)])
+    for n in (1, 2):
+        light = np.add.reduceat(samples[f'sum{n}'].astype(np.float64), first) / present
+        seen = light >= rig.estimator.sum_min
+        dots = [
+            np.add.reduceat(samples[f'{axis}{n}'].astype(np.float64), first) / present * rig.amplifier.sensitivity
+            for axis in 'xy'
+        ]
+        _, _, found = written.rows(f'psd_{n}/plane/dot', 'Points2D:positions')
+        need(len(found) == int(seen.sum()), f'PSD {n}: {len(found)} dots, {seen.sum()} blocks with light')
+        need(np.allclose(found, 1e3 * np.stack(dots, axis=-1)[seen], atol=1e-5), f'PSD {n}: dots differ')
+        _, _, sums = written.rows(f'sums/psd_{n}', 'Scalars:scalars')
+        need(np.allclose(sums, light, rtol=1e-6), f'sum{n} differs')
+    _, _, lost = written.rows('lost', 'Scalars:scalars')
+    whole = recording.block_size
+    need(int(lost[lost < whole].sum()) == int((whole - present).sum()), 'the count of lost samples differs')
+
+
+def picture(files: list[Path], target: Path) -> bool:
+    """What the viewer shows of ``files``, on a screen that is not there; False where that cannot be had."""
+    missing = shutil.which('xvfb-run') is None or not list(Path('/usr/share/vulkan/icd.d').glob('*.json'))
+    if missing:
+        print('no picture: it needs xvfb-run and a Vulkan driver (apt install xvfb mesa-vulkan-drivers)')
+        return False
+    target.unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory() as home:
+        # A first start has no settings, and tells nobody that it was.
+        environment = {**os.environ, 'HOME': home, 'XDG_RUNTIME_DIR': home, 'XDG_CONFIG_HOME': home}
+        subprocess.run([BIN / 'rerun', 'analytics', 'disable'], env=environment, capture_output=True, check=True)
+        command = ['xvfb-run', '-a', '-s', '-screen 0 1600x1000x24', str(BIN / 'rerun'), '--port', 'auto']
+        command += ['--bind', '127.0.0.1', '--renderer', 'vulkan', '--screenshot-to', str(target)]
+        command += ['--window-size', WINDOW, *map(str, files)]
+        # In a session of its own, so that screen and viewer end with it.
+        viewer = subprocess.Popen(
+            command,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+        try:
+            said, _ = viewer.communicate(timeout=VIEWER_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(viewer.pid, signal.SIGKILL)
+            said, _ = viewer.communicate()
+    need(viewer.returncode == 0 and target.exists(), f'the viewer made no picture\n{said[-3000:]}')
+    return True
+
+
+def check_picture(path: Path) -> None:
+    """Every trace is seen on the left, the dots and beams above on the right."""
+    pixels = np.asarray(Image.open(path).convert('RGB'), np.int64)
+    height, width = pixels.shape[:2]
+    left, above = pixels[:, : width // 2], pixels[: height // 3, width // 2 :]
+    for name, part, color in (*((p[1], left, p[4]) for p in POSE), ('the light', above, LIGHT)):
+        found = int((np.abs(part - np.array(color)).max(axis=-1) <= 24).sum())
+        need(found >= SHARE * part[..., 0].size, f'{path}: {found} pixels of {name}: nothing is shown')
+
+
+def main() -> int:
+    """Check each recording; the picture is of the last one."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('recordings', metavar='REC', nargs='+', type=Path)
+    parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='where the .rrd go')
+    parser.add_argument('--figure', metavar='PNG', type=Path, help='make the figure of the documents, too')
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    target, rig = Path(), rig_from_values({}, '')
+    for path in args.recordings:
+        target = args.out / f'{path.stem}.rrd'
+        target.unlink(missing_ok=True)
+        began = time.monotonic()
+        subprocess.run([BIN / 'psd-deflection', 'convert', path, '--out', target], check=True)
+        seconds = time.monotonic() - began
+        subprocess.run([BIN / 'rerun', 'rrd', 'verify', target], check=True, capture_output=True)
+        recording, written = psd_deflection.open(path), Written(target)
+        rig = rig_from_values(recording.parameters, str(path))
+        breaks = check_poses(written, recording)
+        check_dots(written, recording, rig)
+        size = target.stat().st_size
+        print(f'  as recorded: poses, bands, dots, sums, losses; {breaks} breaks; {size} bytes, {seconds:.1f} s')
+    shot = args.out / 'shot.png'
+    if picture([target], shot):
+        check_picture(shot)
+        print(f'  the viewer shows {target}: {shot}')
+    if args.figure is not None:
+        faster = args.out / 'faster.rbl'
+        blueprint(rig, FIGURE_SPEED).save(APPLICATION, faster)
+        if picture([target, faster], shot):
+            check_picture(shot)
+            small = Image.open(shot).convert('RGB').resize((1500, 900), Image.Resampling.LANCZOS)
+            small.quantize(256, Image.Quantize.MAXCOVERAGE).save(args.figure, optimize=True)
+            print(f'  {args.figure}: {args.figure.stat().st_size} bytes')
+    print('all is as it should be')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
