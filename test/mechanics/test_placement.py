@@ -15,9 +15,9 @@ from psd_deflection.mechanics import placement
 from psd_deflection.mechanics.placement import Room
 from psd_deflection.records import FloatArray
 
-CONSTANTS: dict[str, Any] = json.loads((Path(__file__).parents[1] / 'data' / 'golden.json').read_text(encoding='utf-8'))[
-    'constants'
-]
+CONSTANTS: dict[str, Any] = json.loads(
+    (Path(__file__).parents[1] / 'data' / 'golden.json').read_text(encoding='utf-8')
+)['constants']
 THESIS = np.array([[0.0, 0.070], [-0.100, 0.0]])
 SIGMA = 2e-6
 MICRO_MILLIDEGREE = np.array([1e6, 1e6, math.degrees(1e3)])

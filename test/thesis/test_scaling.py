@@ -30,9 +30,9 @@ from psd_deflection.thesis.scaling import (
     torsion_to_bending_ratio_exact,
 )
 
-CONSTANTS: dict[str, Any] = json.loads((Path(__file__).parents[1] / 'data' / 'golden.json').read_text(encoding='utf-8'))[
-    'constants'
-]
+CONSTANTS: dict[str, Any] = json.loads(
+    (Path(__file__).parents[1] / 'data' / 'golden.json').read_text(encoding='utf-8')
+)['constants']
 CASES = table_b1_cases()
 
 
