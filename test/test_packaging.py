@@ -13,8 +13,6 @@ import pytest
 
 from psd_deflection import __version__
 from psd_deflection.cli.main import COMMANDS
-from psd_deflection.config import read_parameter_file, rig_from_values
-from tools.ros2 import launched
 
 ROOT = Path(__file__).parent.parent
 EXECUTABLES = ('estimator', 'replay', 'simulate', 'discover')
@@ -50,19 +48,6 @@ def test_the_executable_that_ros2_run_starts_runs(name: str, tmp_path: Path) -> 
     done = subprocess.run([program, '--help'], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert f'usage: psd-deflection {name}' in done.stdout
-
-
-def test_a_launch_leaves_to_the_file_what_it_is_not_told(tmp_path: Path) -> None:
-    installed_files()
-    prefix = Path(sys.prefix)
-    plain = launched('ros2 launch psd_deflection estimator.launch.py params_file:=rig.yaml', prefix, tmp_path)
-    program = str(prefix / 'lib/psd_deflection/estimator')
-    assert plain == [program, '--ros-args', '--params-file', 'rig.yaml', '-r', '__node:=estimator']
-    told = launched('ros2 launch psd_deflection estimator.launch.py record:=true port:=7', prefix, tmp_path)
-    assert told[3] == str(prefix / 'share/psd_deflection/config/thesis_rig.yaml')
-    given = read_parameter_file(told[-1])
-    assert given == {'record': True, 'port': '7'}
-    rig_from_values(given)
 
 
 def test_type_hints_are_shipped() -> None:

@@ -23,7 +23,8 @@ import pytest
 from psd_deflection import errors
 from psd_deflection.cli.main import COMMANDS, INTERRUPTED, main, make_parser
 from tools import run_commands
-from tools.run_commands import FENCE, PAGES, ROOT, Command
+from tools.program import ROOT
+from tools.run_commands import FENCE, PAGES, Command
 
 ALL = list(run_commands.commands())
 OURS = [c for c in ALL if c.line.startswith('psd-deflection ')]
