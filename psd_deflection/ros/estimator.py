@@ -31,6 +31,7 @@ from psd_deflection.errors import ConfigError, PsdDeflectionError
 from psd_deflection.monitor.start import start_monitor
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
+from psd_deflection.ros.names import RECORD, ZERO
 from psd_deflection.ros.parameters import LiveParameters, rig_of_node
 from psd_deflection.ros.wires import InputRecorder, PublisherWire, say_on_rosout
 from psd_deflection.runner.health import STALE, HealthReporter
@@ -108,8 +109,8 @@ class EstimatorNode:
             self._say = say_on_rosout(self.node, say) if say is not None else self.node.get_logger().info
             self.rig = rig_of_node(self.node, {})
             self._live = LiveParameters(self.node)
-            self.node.create_service(Trigger, '~/zero', self._zero)
-            self.node.create_service(SetBool, '~/record', self._record)
+            self.node.create_service(Trigger, ZERO, self._zero)
+            self.node.create_service(SetBool, RECORD, self._record)
             self._survive_requests()
             self._wire, self._inputs = self._wires()
             # Neither a simulated clock that stands still nor a system clock that is set keeps health from being told.
