@@ -13,7 +13,7 @@ INTERRUPTED = 130
 EXIT_STATUSES: Mapping[int, str] = {
     0: 'done',
     1: 'done, and the recording differs (replay --compare)',
-    2: 'the command line: an option, its value, or options that exclude each other',
+    2: 'the command line: an option, its value, or two that do not fit',
     3: 'a parameter, a parameter file, or a package that is not installed',
     4: 'a recording or an output that cannot be read or written',
     5: 'the device: missing, in use, silent, or of another protocol',
