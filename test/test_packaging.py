@@ -15,6 +15,12 @@ from psd_deflection import __version__
 from psd_deflection.cli.main import COMMANDS
 
 ROOT = Path(__file__).parent.parent
+BESIDE_THE_PACKAGE = {'bench', 'blind', 'data', 'docs'}
+"""Folders of test/ that are no room of the package: what they test, or use, lies beside it."""
+
+TESTED_ELSEWHERE = {'errors', 'parameters', 'records'}
+"""Rooms that hold declarations only: the tests of those that use them are theirs."""
+
 EXECUTABLES = ('estimator', 'replay', 'simulate', 'discover')
 
 
@@ -60,3 +66,16 @@ def test_the_version_is_the_same_everywhere() -> None:
     root = xml.etree.ElementTree.parse(ROOT / 'package.xml').getroot()
     assert root.findtext('version') == __version__
     assert f'## {__version__}' in (ROOT / 'CHANGELOG.md').read_text()
+
+
+def rooms(package: Path) -> set[str]:
+    """Folders and modules of the package, without ``__init__`` and ``__main__``."""
+    return {p.stem for p in package.iterdir() if p.stem.isidentifier() and not p.stem.startswith('__')}
+
+
+def test_the_tests_mirror_the_package() -> None:
+    ours = rooms(ROOT / 'psd_deflection') - {'py'}
+    folders = {p.name for p in (ROOT / 'test').iterdir() if p.is_dir() and p.name != '__pycache__'}
+    assert folders - ours == BESIDE_THE_PACKAGE
+    untested = {room for room in ours - folders if not (ROOT / 'test' / f'test_{room}.py').exists()}
+    assert untested == TESTED_ELSEWHERE

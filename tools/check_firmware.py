@@ -115,6 +115,7 @@ class Checked:
         self._first_ns = 0
 
     def put(self, record: Record) -> None:
+        """Take a record, as a sink does."""
         if not isinstance(record, SampleBlock):
             return
         self._first_ns = self._first_ns or int(record.t_ns[0])

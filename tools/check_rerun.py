@@ -74,8 +74,8 @@ class Written:
 def check_poses(written: Written, recording: Recording) -> int:
     """Each recorded estimate is there and no other; a line breaks wherever one is missing. The number of breaks."""
     series = recording.estimates()['/link_tip/deflection_with_covariance']
-    need(series.covariance is not None, 'the recording has no covariance')
-    assert series.covariance is not None
+    if series.covariance is None:
+        raise SystemExit('FAILED: the recording has no covariance')
     breaks = 0
     step = float(np.median(np.diff(series.t_ns)))
     gone = np.flatnonzero(np.diff(series.t_ns) > 1.5 * step)

@@ -91,7 +91,7 @@ def make_parser(chosen: Collection[str], value: type[argparse.Action] | None = N
     for name, summary in COMMANDS.items():
         sub = commands.add_parser(name, help=summary, description=summary, formatter_class=_Help)
         # `-5,20` and `-2.9e1` are values, which argparse takes for options; it has no public way to be told.
-        sub._negative_number_matcher = _NEGATIVE
+        sub._negative_number_matcher = _NEGATIVE  # noqa: SLF001
         if value is not None:
             sub.register('action', None, value)
         if name in chosen:
