@@ -2,7 +2,8 @@
 
 The ROS node and the command line are two users of it; neither is needed. Threads: ``reader``
 (acquisition), ``pipeline`` (processing), ``recorder`` while recording; the caller's own thread
-opens, asks and closes. No thread but ``recorder`` waits for the recording's disk.
+opens, asks and closes. No other thread waits for the disk:
+a zero is kept by a thread ``zero``, which ends when it is on the disk.
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ SILENT_S = 5.0
 
 JOIN_S = 0.5
 """How long the last blocks may take at the end."""
+
+KEEP_S = 0.2
+"""How long the last zero may take to be on the disk at the end."""
 
 OPEN_S = 2.0
 """How long the start waits for the disk of a recording that is wanted from the start."""
@@ -224,9 +228,8 @@ class Session:
             self._keep_zero()
 
     def _keep_zero(self) -> None:
-        trouble = self._store.save(self.rig) if self._store is not None else ''
-        if trouble:
-            self._tell(trouble)
+        if self._store is not None:
+            self._store.keep(self.rig, self._tell)
 
     def close(self) -> Path | None:
         """Stop reading, process what was read, end the recording; returns its folder.
@@ -243,6 +246,8 @@ class Session:
         if self.processing.alive:
             self._tell('a subscriber holds up the last blocks; they are not waited for')
         folder = self.recorder.close()
+        if self._store is not None and not self._store.join(KEEP_S):
+            self._tell(f'{self._store.path}: the disk is slow; the zero may not be kept')
         if self._simulated is not None:
             self._simulated.close()
         return folder

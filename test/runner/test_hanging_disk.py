@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import queue
 import threading
@@ -85,8 +86,8 @@ class Live:
     def __init__(self, device: ScriptedDevice, sample: Sample, bags: Path, **parameters: Any) -> None:
         self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
         self.estimates = threading.Semaphore(0)
-        values = {'port': str(device.link), 'bag_dir': str(bags), 'keep_zero': False, 'realtime': False}
-        self.session = Session(load_rig(overrides={**values, **parameters}), self.said.put)
+        values = {'port': str(device.link), 'bag_dir': str(bags), 'zero_file': str(bags.parent / 'zero.json')}
+        self.session = Session(load_rig(overrides={**values, 'realtime': False, **parameters}), self.said.put)
         self.session.processing.sinks.append(self)
         self._device, self._sample, self._sent = device, sample, 0
 
@@ -120,8 +121,9 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[Disk]:
     one = Disk(monkeypatch)
     yield one
     one.go_on.set()
-    for thread in recorders():
-        thread.join(WAIT_S)
+    for thread in threading.enumerate():
+        if thread.name in ('recorder', 'zero'):
+            thread.join(WAIT_S)
 
 
 @pytest.fixture
@@ -319,3 +321,28 @@ def test_a_recording_that_the_pipeline_does_not_take_leaves_nothing(tmp_path: Pa
     for thread in recorders():
         thread.join(WAIT_S)
     assert list((tmp_path / 'bags').iterdir()) == []
+
+
+def test_estimates_flow_while_the_disk_hangs_at_a_zero(live: Live, disk: Disk, tmp_path: Path) -> None:
+    disk.hang('fsync')
+    assert live.session.zero() is not None
+    assert disk.is_reached()
+    live.flow()
+    live.session.change({'psd_1.zero': (3e-4, 0.0)})
+    live.session.change({'psd_1.zero': (1e-4, -2e-4)})
+    live.flow()
+    disk.go_on.set()
+    live.session.close()
+    assert json.loads((tmp_path / 'zero.json').read_text())['psd_1.zero'] == [1e-4, -2e-4]
+
+
+def test_a_zero_that_hangs_holds_up_the_end_of_the_run_for_its_time_alone(
+    live: Live, disk: Disk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(session_module, 'KEEP_S', 0.01)
+    disk.hang('fsync')
+    assert live.session.zero() is not None
+    assert disk.is_reached()
+    live.session.close()
+    assert live.heard('the zero may not be kept').startswith(str(tmp_path / 'zero.json'))
+    assert not disk.go_on.is_set()
