@@ -251,7 +251,6 @@ class Recorder:
         take.closed.set_exception(RecordingError(f'recording stopped: {why}'))
 
     def _open(self, rig: Rig, hello: Mapping[str, object] | None) -> BagWriter:
-        effects = {f'effects.{name}': value for name, value in rig.effects.items()}
         config = rig.acquisition
         with self._naming:
             folder = new_folder(Path(config.bag_dir).expanduser())
@@ -261,7 +260,7 @@ class Recorder:
             try:
                 return BagWriter(
                     folder,
-                    rig_values={**rig.values, **effects},
+                    rig_values=rig.flat(),
                     device_hello=hello,
                     max_bytes=config.bag_max_bytes,
                     max_s=config.bag_max_duration,
