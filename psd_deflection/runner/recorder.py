@@ -239,10 +239,7 @@ class Recorder:
             return
         take.opened.set_result(bag.folder)
         why = self._record(take, bag)
-        with self._lock:
-            del self._writing[take]
-            if self._take is take:
-                self._take = None
+        del self._writing[take]
         if not why:
             take.closed.set_result(bag.folder)
             return
@@ -278,10 +275,16 @@ class Recorder:
         take.opened.set_exception(error)
 
     def _record(self, take: Take, bag: BagWriter) -> str:
-        """Write until the end, and close; '' or why it ended by itself."""
+        """Write until the end, and close; '' or why it ended without that."""
         try:
             try:
-                self._write(bag, take.queue, take.config)
+                try:
+                    self._write(bag, take.queue, take.config)
+                finally:
+                    # Before the disk is waited for again: a start must not be told that this one runs.
+                    with self._lock:
+                        if self._take is take:
+                            self._take = None
             except _FullError as error:
                 # There is room for index and summary: that is what the reserve is for.
                 bag.close()

@@ -221,6 +221,27 @@ def test_a_recording_that_cannot_be_closed_is_not_called_ended(
         live.session.record(False).result(WAIT_S)
 
 
+def test_a_recording_that_ends_by_itself_is_not_taken_for_one_that_runs(
+    live: Live, disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(*_: object) -> None:
+        raise KeyError('no such type')
+
+    first = live.record(True)
+    disk.hang('close')
+    with monkeypatch.context() as broken:
+        broken.setattr('psd_deflection.recordings.bag_writer.BagWriter.write_encoded', gone)
+        live.flow()
+        assert disk.is_reached()
+    assert live.session.recorder.folder is None
+    second = live.record(True)
+    assert second != first
+    live.flow()
+    disk.go_on.set()
+    live.heard('no such type')
+    assert live.session.recorder.folder == second
+
+
 def test_a_start_that_hangs_can_be_ended(live: Live, disk: Disk, tmp_path: Path) -> None:
     disk.hang('fsync')
     started = live.session.record(True)
