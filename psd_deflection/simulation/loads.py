@@ -39,11 +39,6 @@ class LoadHistory:
         """This one, then the others (all at this one's rate)."""
         return LoadHistory(np.concatenate([self.loads, *(o.loads for o in others)]), self.sample_rate_hz)
 
-    def plus(self, other: LoadHistory) -> LoadHistory:
-        """Both at once, as long as the shorter."""
-        n = min(len(self), len(other))
-        return LoadHistory(self.loads[:n] + other.loads[:n], self.sample_rate_hz)
-
 
 def sidebar(force: float) -> tuple[float, float, float]:
     """The load of a weight of ``force`` N on the sidebar."""
