@@ -63,11 +63,14 @@ def _places() -> dict[str, Place]:
     names = [module.name for module in pkgutil.iter_modules(ours.__path__)]
     places: dict[str, Place] = {name: EntryPoint(name, f'{ours.__name__}.{name}:EFFECT', GROUP) for name in names}
     others: list[tuple[str, Place]] = []
-    for folder in effect_folders():
+    for folder in dict.fromkeys(effect_folders()):
         try:
-            files = sorted(folder.glob('*.py')) if folder.is_dir() else []
+            files = sorted(f for f in folder.iterdir() if f.suffix == '.py')
         except OSError as error:
-            raise ConfigError(f'{folder}: cannot be read as a folder of effects ({error.strerror or error})') from None
+            # Few have the default one, and a service may not look into a home.
+            if FOLDERS in os.environ:
+                raise ConfigError(f'{FOLDERS}: {folder}: cannot be read ({error.strerror or error})') from None
+            continue
         others += [(f.stem, f) for f in files if f.stem.isidentifier() and not f.stem.startswith('_')]
     others += [(point.name, point) for point in entry_points(group=GROUP)]
     for name, place in others:

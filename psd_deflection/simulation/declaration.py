@@ -44,7 +44,7 @@ class EffectParameter:
     PSD), otherwise one.
 
     ``propose``: where the recordings themselves say what to try, or a function of the choices that
-    says it. ``spectral``: peaks of the residual's spectrum; ``line``: those of steady amplitude and
+    says it. ``spectral``: peaks of the residual's spectrum, and ``grid``; ``line``: those of steady amplitude and
     phase; ``highest``: the largest voltage seen, ``highest_dots``: the same without the sums;
     ``lattice``: the step on whose multiples all readings lie, and the effect is then named without a
     search. ``power``: the signature of a ``finite`` effect grows with this power of the parameter;

@@ -30,11 +30,6 @@ class LoadHistory:
     def __len__(self) -> int:
         return len(self.loads)
 
-    @property
-    def duration(self) -> float:
-        """s."""
-        return len(self.loads) / self.sample_rate_hz
-
     def then(self, *others: LoadHistory) -> LoadHistory:
         """This one, then the others (all at this one's rate)."""
         return LoadHistory(np.concatenate([self.loads, *(o.loads for o in others)]), self.sample_rate_hz)

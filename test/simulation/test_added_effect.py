@@ -164,6 +164,17 @@ def test_a_broken_file_is_named_with_the_cause(folder: Path, code: str, said: st
     Pipeline(load_rig(overrides={'effects.one.name': 'sensor_gain', 'effects.one.psd': 1, 'effects.one.x': 0.01}))
 
 
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(FOLDERS, str(tmp_path / 'efects'))
+    with pytest.raises(ConfigError, match=rf'{FOLDERS}: .*efects: cannot be read'):
+        effect_names()
+    # Nobody needs the default one, and a rig without effects none.
+    Pipeline(load_rig())
+    monkeypatch.delenv(FOLDERS)
+    monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path))
+    assert NAME not in effect_names()
+
+
 def test_two_effects_of_one_name_are_refused(folder: Path) -> None:
     file = folder / 'creep.py'
     file.write_text(CODE)
