@@ -23,6 +23,7 @@ from psd_deflection.averaging import BlockCutter, block_middle_ns, covariance
 from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_variances
 from psd_deflection.calibration.health import OpticsHealth, Verdict
 from psd_deflection.config import Rig, replace_values
+from psd_deflection.correction import Correction
 from psd_deflection.mechanics import LinkStatics
 from psd_deflection.records import (
     ENVIRONMENT,
@@ -36,7 +37,6 @@ from psd_deflection.records import (
     SpotMeans,
     TipLoad,
 )
-from psd_deflection.simulation.correction import Correction
 from psd_deflection.solvers import solver_from_rig
 from psd_deflection.solvers.from_rig import geometry_from_rig
 from psd_deflection.solvers.interface import SolverStatus
