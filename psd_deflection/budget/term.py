@@ -63,7 +63,7 @@ class Situation:
         pose = np.array(LinkStatics.from_rig(rig).deflection(*load))
         if not np.all(np.abs(pose) <= [rig.link.length, rig.link.length, math.pi]):
             raise ConfigError(
-                f'--load {load[0]:g} {load[1]:g} {load[2]:g}: the tip would move by more than the link is long '
+                f'load = {load[0]:g} {load[1]:g} {load[2]:g}: the tip would move by more than the link is long '
                 'or turn by more than half a turn: take a smaller load'
             )
         chain = Chain.of(rig)
@@ -73,7 +73,7 @@ class Situation:
         if not np.all(over <= 0.0):
             psd, axis = (int(i) for i in np.unravel_index(int(np.argmax(over)), over.shape))
             raise ConfigError(
-                f'--load {load[0]:g} {load[1]:g} {load[2]:g}: the dot of psd_{psd + 1} would lie at '
+                f'load = {load[0]:g} {load[1]:g} {load[2]:g}: the dot of psd_{psd + 1} would lie at '
                 f'{"xy"[axis]} = {places[0, psd, axis] * 1e3:.2f} mm, outside its '
                 f'+-{chain.half_area[psd, axis] * 1e3:g} mm: take a smaller load'
             )

@@ -157,7 +157,7 @@ def live_line(session: Session, rate: float) -> str:
         # An old estimate beside a device that sends nothing would look like a new one.
         body = 'no samples: the device is away' if session.acquisition.away else 'no samples come'
     elif estimate is not None:
-        sd = [math.sqrt(estimate.covariance[i]) for i in (0, 4, 8)]
+        sd = [math.sqrt(v) for v in estimate.variances]
         mdeg = 1e3 * 180.0 / math.pi
         body = (
             f'ΔX {estimate.dx * 1e6:+9.2f} ± {sd[0] * 1e6:.2f} µm  '

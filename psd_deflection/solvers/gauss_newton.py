@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._plane import positive
+from psd_deflection.solvers.plane import positive
 
 Model = Callable[[Sequence[float]], tuple[list[float], list[Sequence[float]]]]
 """Parameters (p) to predicted readings (m) and rows of derivatives (m of p)."""
