@@ -27,43 +27,30 @@ from psd_deflection.records import FloatArray
 
 Number = TypeVar('Number', float, FloatArray)
 
-Row = tuple[float, float, float, float, float]
+Turns = tuple[Number, Number, Number, Number, Number, Number]
+"""Cosine and sine of theta, of phi, of omega."""
+
+Five = tuple[Number, Number, Number, Number, Number]
 """Derivatives of one coordinate by dX, dY (m/m), theta, phi, omega (m/rad)."""
+
+Row = Five[float]
 
 
 def _point(
-    lx: Number,
-    ly: Number,
-    height: Number,
-    dx: Number,
-    dy: Number,
-    ct: Number,
-    st: Number,
-    cp: Number,
-    sp: Number,
-    co: Number,
-    so: Number,
+    lx: Number, ly: Number, height: Number, dx: Number, dy: Number, turns: Turns[Number]
 ) -> tuple[Number, Number, Number, Number]:
     """x', y', q_x, q_y of the module's text."""
+    ct, st, cp, sp, co, so = turns
     y = (ly - dy + height * sp) / cp
     x = (lx - dx - height * so * cp - y * so * sp) / co
     return x, y, ct * x + st * y, ct * y - st * x
 
 
 def _rows(
-    x: Number,
-    y: Number,
-    qx: Number,
-    qy: Number,
-    height: Number,
-    ct: Number,
-    st: Number,
-    cp: Number,
-    sp: Number,
-    co: Number,
-    so: Number,
-) -> tuple[tuple[Number, Number, Number, Number, Number], tuple[Number, Number, Number, Number, Number]]:
+    x: Number, y: Number, qx: Number, qy: Number, height: Number, turns: Turns[Number]
+) -> tuple[Five[Number], Five[Number]]:
     """Derivatives of q_x and of q_y."""
+    ct, st, cp, sp, co, so = turns
     # (x', y') by dX: (-1/co, 0); by dY: (y_dx, y_dy); by phi; by omega: (o, 0).
     y_dy = -1.0 / cp
     y_dx = so * sp / (co * cp)
@@ -81,15 +68,13 @@ def crossing(
 ) -> tuple[float, float, Row, Row]:
     """(q_x, q_y, dq_x, dq_y) of one beam: m; m/m for dX, dY and m/rad for the angles."""
     turns = cos(theta), sin(theta), cos(phi), sin(phi), cos(omega), sin(omega)
-    x, y, qx, qy = _point(lx, ly, height, dx, dy, *turns)
-    row_x, row_y = _rows(x, y, qx, qy, height, *turns)
+    x, y, qx, qy = _point(lx, ly, height, dx, dy, turns)
+    row_x, row_y = _rows(x, y, qx, qy, height, turns)
     return qx, qy, row_x, row_y
 
 
-def _parts(poses: FloatArray) -> tuple[FloatArray, FloatArray, tuple[FloatArray, ...]]:
-    """dX, dY and the six cosines and sines, (..., 1) each, of ``poses`` (..., 5)."""
-    dx, dy, theta, phi, omega = (poses[..., i, None] for i in range(5))
-    return dx, dy, tuple(f(angle) for angle in (theta, phi, omega) for f in (np.cos, np.sin))
+def _turns(theta: FloatArray, phi: FloatArray, omega: FloatArray) -> Turns[FloatArray]:
+    return np.cos(theta), np.sin(theta), np.cos(phi), np.sin(phi), np.cos(omega), np.sin(omega)
 
 
 def crossings(poses: FloatArray, beams: FloatArray, heights: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -97,11 +82,12 @@ def crossings(poses: FloatArray, beams: FloatArray, heights: FloatArray) -> tupl
 
     ``poses`` (..., 5): dX, dY m, theta, phi, omega rad; ``beams`` (P, 2) or (..., P, 2) m; ``heights`` (P,) m.
     """
-    dx, dy, turns = _parts(poses)
-    x, y, qx, qy = _point(beams[..., 0], beams[..., 1], heights, dx, dy, *turns)
+    dx, dy, theta, phi, omega = (poses[..., i, None] for i in range(5))
+    turns = _turns(theta, phi, omega)
+    x, y, qx, qy = _point(beams[..., 0], beams[..., 1], heights, dx, dy, turns)
     points = np.stack((qx, qy), axis=-1)
     jacobian = np.empty((*points.shape, 5))
-    for axis, row in enumerate(_rows(x, y, qx, qy, heights, *turns)):
+    for axis, row in enumerate(_rows(x, y, qx, qy, heights, turns)):
         for i, derivative in enumerate(row):
             jacobian[..., axis, i] = derivative
     return points, jacobian
@@ -109,8 +95,8 @@ def crossings(poses: FloatArray, beams: FloatArray, heights: FloatArray) -> tupl
 
 def plate_points(poses: FloatArray, beams: FloatArray, heights: FloatArray) -> FloatArray:
     """The points of :func:`crossings` alone, (..., P, 2) m."""
-    dx, dy, turns = _parts(poses)
-    _, _, qx, qy = _point(beams[..., 0], beams[..., 1], heights, dx, dy, *turns)
+    dx, dy, theta, phi, omega = (poses[..., i, None] for i in range(5))
+    qx, qy = points_under(beams[..., 0], beams[..., 1], heights, dx, dy, theta, phi, omega)
     return np.stack((qx, qy), axis=-1)
 
 
@@ -125,9 +111,7 @@ def points_under(
     omega: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """q_x and q_y, m, one coordinate an array, of any shapes that broadcast: for long runs of samples."""
-    turns = [f(angle) for angle in (theta, phi, omega) for f in (np.cos, np.sin)]
-    _, _, qx, qy = _point(lx, ly, height, dx, dy, *turns)
-    return qx, qy
+    return _point(lx, ly, height, dx, dy, _turns(theta, phi, omega))[2:]
 
 
 def flat_points(poses: FloatArray, beams: FloatArray) -> FloatArray:

@@ -74,13 +74,13 @@ def solver_from_rig(name: str, rig: Rig) -> Solver:
 
 
 def check_live(name: str) -> None:
-    """Raise ConfigError if ``name`` is a method for comparison only: a live run must not publish its answer.
+    """Raise ConfigError if ``name`` is for comparison only: its answer must not be ``/link_tip/deflection``.
 
-    Replay, ``compare-methods`` and the list ``solvers:`` take it, beside the answer that counts.
+    Replay and ``compare-methods`` take it, and so does a live run's list ``solvers``, on a topic of its own.
     """
     entry = SOLVERS.get(name)
     if entry is not None and entry.instead:
         raise ConfigError(
-            f'solver = {name!r}: a method as printed, for comparison only; a live run takes {entry.instead!r}, '
-            f'the same method corrected (replay takes {name!r}, and so does the list `solvers`)'
+            f'solver = {name!r}: a method as printed, for comparison only: for a live run take {entry.instead!r}, '
+            f'its corrected form (`solvers` may list {name!r} beside it, and replay takes it)'
         )
