@@ -77,6 +77,6 @@ COMPUTATION = Computation()
 
 
 def perfect_answer(at: Situation) -> FloatArray:
-    """(3,): the estimator's answer where the chain is as the estimator models it."""
+    """(3,): the estimator's answer if the chain is as the estimator models it."""
     chain = replace(at.chain, slope_ratio=np.array([at.estimator.slope_ratio]))
     return np.asarray(at.estimator.estimate(*measure(chain, at.pose))[0])

@@ -118,7 +118,7 @@ def estimator_of(rig: Rig, method: str) -> Estimator:
     """The estimator of one of ``METHODS``.
 
     ``thesis_iteration`` gives the exact angle less what its stop rule leaves (``budget.computation``), so
-    it responds to errors as ``exact`` does. Raises ConfigError for another name, or where the two
+    it responds to errors as ``exact`` does. Raises ConfigError for another name, or if the two
     centres coincide.
     """
     if method not in METHODS:

@@ -25,7 +25,7 @@ def beam_diameter(initial_diameter: float, wavelength: float, distance: float) -
 def refracted_angle(angle: float, index_1: float, index_2: float) -> float:
     """Snell's law (3.2): the angle to the normal in medium 2, rad, of a beam at ``angle`` in medium 1.
 
-    Raises ConfigError where the beam is reflected totally.
+    Raises ConfigError if the beam is reflected totally.
     """
     sine = math.sin(angle) * index_1 / index_2
     if abs(sine) > 1.0:

@@ -76,7 +76,7 @@ def error_bound(
 
     ``pose`` (3,) as solved with ``design`` (2P, 3). The true matrix is off by at most ``design_error``
     (2P, 3) and the readings, with all that the linear model lacks, by at most ``reading_error`` (2P,)
-    m, entry by entry. ``row_scaling`` (2P,): Po, where the answer is a weighted one. Infinite where
+    m, entry by entry. ``row_scaling`` (2P,): Po, if the answer is a weighted one. Infinite if
     errors of that size could hide the pose altogether.
 
     Replaces 4.33 and 4.34. Those add metres to radians in one norm, so that the number depends on the

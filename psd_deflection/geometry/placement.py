@@ -27,7 +27,7 @@ from psd_deflection.geometry.plate import crossings, tie_matrix, tied_pose
 from psd_deflection.records import FloatArray
 
 SCALE = 0.1
-"""m: the length by which theta is scaled where a condition number or a single cost is formed."""
+"""m: the length by which theta is scaled when a condition number or a single cost is formed."""
 
 
 class Spread(NamedTuple):

@@ -51,7 +51,7 @@ class BasePairSolver(Solver):
     def __init__(self, geometry: Geometry, assume: Assume = 'beam') -> None:
         """Bind to ``geometry`` under the assumption ``assume`` (see the module).
 
-        Raises ConfigError for another assumption, SolverError with the reason where that leaves
+        Raises ConfigError for another assumption, SolverError with the reason if that leaves
         something unseen.
         """
         self._count = check_twist(geometry)
@@ -140,10 +140,7 @@ class BasePairSolver(Solver):
         for i, (cx, cy, _, _, _) in enumerate(self._rows):
             measured.append(cx + dots[2 * i])
             measured.append(cy + dots[2 * i + 1])
-        try:
-            found = fit(self._model, (0.0,) * self._unknowns, measured, variances)
-        except ZeroDivisionError:
-            raise SolverError('solve: variances must be above 0 m^2') from None
+        found = fit(self._model, (0.0,) * self._unknowns, measured, variances)
         full = [sum([a * x for a, x in zip(row, found.parameters, strict=True)]) for row in self._spread]
         spread = self._spread[:3]
         half = [

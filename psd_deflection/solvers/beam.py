@@ -31,7 +31,7 @@ class BeamSolver(Solver):
     def __init__(self, geometry: Geometry) -> None:
         """Bind to ``geometry``.
 
-        Raises SolverError where the beams coincide, or where a surface stands so high that the
+        Raises SolverError if the beams coincide, or if a surface stands so high that the
         plate's turning takes back what its translation does (1 + k h/L = 0).
         """
         check_twist(geometry)
@@ -60,10 +60,7 @@ class BeamSolver(Solver):
         for i, (cx, cy, _, _, _) in enumerate(self._rows):
             q.append(cx + dots[2 * i])
             q.append(cy + dots[2 * i + 1])
-        try:
-            found = fit(self._model, flat_pose(q, self._places), q, variances)
-        except ZeroDivisionError:
-            raise SolverError('solve: variances must be above 0 m^2') from None
+        found = fit(self._model, flat_pose(q, self._places), q, variances)
         dx, dy, theta = found.parameters
         (vxx, vxy, vxt), (_, vyy, vyt), (_, _, vtt) = found.covariance
         return Solution(

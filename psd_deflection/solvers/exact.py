@@ -55,7 +55,7 @@ class ExactSolver(Solver):
     budgeted_as: ClassVar[str] = 'exact'
 
     def __init__(self, geometry: Geometry) -> None:
-        """Bind to ``geometry``. Raises SolverError where the beams coincide."""
+        """Bind to ``geometry``. Raises SolverError if the beams coincide."""
         self._count = check_twist(geometry)
         self._centers = np.asarray(geometry.centers, dtype=np.float64)
         self._beams = np.asarray(geometry.beams, dtype=np.float64)

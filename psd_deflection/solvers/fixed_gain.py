@@ -60,5 +60,5 @@ class FixedGain:
 
 
 def status_of(pose: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.int8]]:
-    """OK where the pose (n, 3) is finite, int8 (n,)."""
+    """OK if the pose (n, 3) is finite, int8 (n,)."""
     return np.where(np.isfinite(pose).all(axis=1), SolverStatus.OK, SolverStatus.NOT_CONVERGED).astype(np.int8)

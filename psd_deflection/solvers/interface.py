@@ -39,7 +39,7 @@ class SolverStatus(IntEnum):
 class Solution(NamedTuple):
     """One block's answer.
 
-    ``dx``, ``dy`` m; ``theta``, ``phi``, ``omega`` rad, right-hand positive (tilts are 0 where the
+    ``dx``, ``dy`` m; ``theta``, ``phi``, ``omega`` rad, right-hand positive (tilts are 0 if the
     method has none). ``covariance``: 3 x 3 of (dx, dy, theta), row by row; NaN of a printed threshold
     method, which has none. ``residual``:
     (x1, y1, x2, y2, ...) measured minus modelled dots, m. ``iterations``: 0 for a closed form.

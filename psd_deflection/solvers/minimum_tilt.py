@@ -43,7 +43,7 @@ class MinimumTiltSolver(Solver):
     budgeted_as: ClassVar[str] = 'exact'
 
     def __init__(self, geometry: Geometry) -> None:
-        """Bind to ``geometry``. Raises SolverError where the beams coincide or there are not two."""
+        """Bind to ``geometry``. Raises SolverError if the beams coincide or there are not two."""
         if check_twist(geometry) != 2:
             raise SolverError('minimum_tilt takes two PSDs; with three at different heights use pose')
         if np.any(geometry.heights):

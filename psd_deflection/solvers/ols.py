@@ -26,7 +26,7 @@ class OlsSolver(Solver):
     budgeted_as: ClassVar[str] = 'wls'
 
     def __init__(self, geometry: Geometry) -> None:
-        """Bind to ``geometry``. Raises SolverError where the beams coincide."""
+        """Bind to ``geometry``. Raises SolverError if the beams coincide."""
         count = check_twist(geometry)
         self._linear = FixedGain(design_matrix(geometry.beams), np.asarray(geometry.zeros), np.ones(2 * count))
 

@@ -39,7 +39,7 @@ def turn_covariance(
 
 
 def positive(variances: FloatArray) -> FloatArray:
-    """Variances as (n or 1, 2P). Raises SolverError where one is not above 0."""
+    """Variances as (n or 1, 2P). Raises SolverError if one is not above 0."""
     v = np.atleast_2d(np.asarray(variances, dtype=np.float64))
     if not (v > 0.0).all():
         raise SolverError('solve: variances must be above 0 m^2')
@@ -92,7 +92,7 @@ def turn_covariance_many(
     vtt: FloatArray,
     out: FloatArray | None = None,
 ) -> FloatArray:
-    """:func:`turn_covariance` for n blocks: (n, 3, 3), written into ``out`` where it is given."""
+    """:func:`turn_covariance` for n blocks: (n, 3, 3), written into ``out`` if it is given."""
     if out is None:
         out = np.empty((c.shape[0], 3, 3))
     cs = c * s

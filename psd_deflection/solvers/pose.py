@@ -30,7 +30,7 @@ class PoseSolver(Solver):
     def __init__(self, geometry: Geometry) -> None:
         """Bind to ``geometry``.
 
-        Raises SolverError with the reason where the tilts cannot be seen: two PSDs, surfaces at one
+        Raises SolverError with the reason if the tilts cannot be seen: two PSDs, surfaces at one
         height, or surfaces on one line in space.
         """
         if check_twist(geometry) == 2:
@@ -62,10 +62,7 @@ class PoseSolver(Solver):
         """One block. See :class:`Solver`."""
         points = np.asarray(dots).reshape(-1, 2) + self._centers
         start = flat_poses(points, self._beams).tolist()
-        try:
-            found = fit(self._model, [*start, 0.0, 0.0], points.ravel().tolist(), variances)
-        except ZeroDivisionError:
-            raise SolverError('solve: variances must be above 0 m^2') from None
+        found = fit(self._model, [*start, 0.0, 0.0], points.ravel().tolist(), variances)
         dx, dy, theta, phi, omega = found.parameters
         v = found.covariance
         return Solution(

@@ -50,7 +50,7 @@ class WlsSolver(Solver):
         """Bind to ``geometry``.
 
         ``weights``: from the variances that ``solve`` is given, or ``thesis``: the squares of
-        ``row_scaling`` (2P,), each above 0. Raises SolverError where the beams coincide and
+        ``row_scaling`` (2P,), each above 0. Raises SolverError if the beams coincide and
         ConfigError for a row scaling of another length.
         """
         self._count = check_twist(geometry)

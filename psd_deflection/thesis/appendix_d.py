@@ -90,7 +90,7 @@ class AppendixDSolver(Solver):
     budgeted_as: ClassVar[str] = ''
 
     def __init__(self, geometry: Geometry) -> None:
-        """Bind to ``geometry``. Raises SolverError where the code's arctangents have no meaning."""
+        """Bind to ``geometry``. Raises SolverError if the code's arctangents have no meaning."""
         if check_twist(geometry) != 2:
             raise SolverError(f'{self.name} takes two PSDs')
         self._centers = np.asarray(geometry.centers, dtype=np.float64)

@@ -44,7 +44,7 @@ _CHUNK = 4096
 
 
 class IterativePrintedSolver(Solver):
-    """Section 2.2 with its threshold; two PSDs. ``NO_HIT``, and no number, where no trial passes.
+    """Section 2.2 with its threshold; two PSDs. ``NO_HIT``, and no number, if no trial passes.
 
     The covariance is NaN: the answer is a step function of the readings.
     """
@@ -53,7 +53,7 @@ class IterativePrintedSolver(Solver):
     budgeted_as: ClassVar[str] = 'thesis_iteration'
 
     def __init__(self, geometry: Geometry, criterion: Criterion = 'printed') -> None:
-        """Bind to ``geometry``. Raises SolverError where the beams coincide or there are not two."""
+        """Bind to ``geometry``. Raises SolverError if the beams coincide or there are not two."""
         if check_twist(geometry) != 2:
             raise SolverError(f'{self.name} takes two PSDs')
         if criterion not in get_args(Criterion):

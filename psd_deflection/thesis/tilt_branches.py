@@ -35,7 +35,7 @@ def tilt_branches(geometry: Geometry, dots: tuple[float, ...], theta: float) -> 
     - 2.40, 2.41: omega = atan2(Pr_1 - Pr_2, X^_1 - X^_2) +- acos((l_1x - l_2x)/DT);
     - 2.42: dX = l_1x - X^_1 cos omega - Pr_1 sin omega.
 
-    Raises SolverError where the beams stand side by side or one above the other (l_1y = l_2y loses
+    Raises SolverError if the beams stand side by side or one above the other (l_1y = l_2y loses
     phi, l_1x = l_2x loses omega).
     """
     if check_twist(geometry) != 2:
