@@ -25,6 +25,7 @@ from psd_deflection.runner.realtime import lock_memory
 from psd_deflection.runner.recorder import Recorder
 from psd_deflection.runner.simulated_rig import SimulatedRigProcess
 from psd_deflection.runner.zero_store import ZEROS, ZeroStore
+from psd_deflection.solvers.registry import check_live
 
 HUNG_S = 5.0
 """A thread that has not come round for this long hangs: the watchdog is not fed any more."""
@@ -69,6 +70,7 @@ class Session:
         self._closed = False
         self.listeners: list[Callable[[str], None]] = [say]
         say = self._tell
+        check_live(rig.estimator.solver)
         # The geometry first: a rig that cannot be solved must not open a port.
         pipeline = Pipeline(rig)
         if not rig.acquisition.port and rig.acquisition.source in SIMULATED:

@@ -302,6 +302,7 @@ def test_signals_end_it_and_leave_a_whole_recording(
         ),
         (['--ros-args', '-p', 'amplifier.noise:=-1.0'], 3, 'amplifier.noise = -1.0 V: must be above 0'),
         (['--ros-args', '-p', 'solver:=magic'], 3, 'magic'),
+        (['--ros-args', '-p', 'solver:=appendix_d'], 3, "solver = 'appendix_d': a method as printed"),
         (['--ros-args', '-p', 'solvers:=[]'], 3, 'is an empty list'),
         (
             ['--ros-args', '-p', 'qos_overrides./psd/samples.publisher.reliability:=best_efort'],
