@@ -18,8 +18,8 @@ ROOT = Path(__file__).parent.parent
 BESIDE_THE_PACKAGE = {'bench', 'blind', 'data', 'docs'}
 """Folders of test/ that are no room of the package: what they test, or use, lies beside it."""
 
-TESTED_ELSEWHERE = {'errors', 'parameters', 'records'}
-"""Rooms that hold declarations only: the tests of those that use them are theirs."""
+TESTED_ELSEWHERE = {'correction', 'errors', 'parameters', 'records'}
+"""Rooms without a test file of their own: declarations, and the correction, which the tests of the effects put through."""
 
 EXECUTABLES = ('estimator', 'replay', 'simulate', 'discover')
 

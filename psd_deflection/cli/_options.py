@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
@@ -85,12 +86,18 @@ def need_folder(out: Path) -> None:
 
 
 @contextlib.contextmanager
-def given_as_option() -> Iterator[None]:
-    """A value that is refused within came as an option: a mistake of the command line (2), not of a file (3)."""
+def given_as_option(*parameters: str) -> Iterator[None]:
+    """A value that is refused within came as an option: a mistake of the command line (2), not of a file (3).
+
+    ``parameters`` have an option of their own: where the message says ``keep_out = ...`` it says ``--keep-out = ...``.
+    """
     try:
         yield
     except ConfigError as error:
-        raise UsageError(str(error)) from None
+        text = str(error)
+        for name in parameters:
+            text = re.sub(rf'\b{name}(?= = )', f'--{name.replace("_", "-")}', text)
+        raise UsageError(text) from None
 
 
 def refuse(args: argparse.Namespace, defaults: Mapping[str, object], why: str) -> None:

@@ -37,7 +37,7 @@ from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import SIMULATED, Session
 from psd_deflection.runner.signals import Signals, StopRequestedError
 from psd_deflection.runner.simulated_rig import started_early
-from psd_deflection.solvers import SOLVERS
+from psd_deflection.solvers.registry import SOLVERS, check_live
 
 REFRESH_S = 0.25
 PLAIN_REFRESH_S = 5.0
@@ -58,13 +58,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--solver',
-        choices=tuple(SOLVERS),
+        type=_live_solver,
+        choices=[name for name, entry in SOLVERS.items() if not entry.instead],
         metavar='NAME',
         help='solver whose answer is published as /link_tip/deflection (default exact)',
     )
     parser.add_argument('--monitor', action='store_true', help='serve the live page and print its address')
     parser.add_argument('--no-ros', action='store_true', help='acquire and record without ROS')
     parser.add_argument('--ros-args', action='store_true', help='what follows is for ROS (ros2 run, ros2 launch)')
+
+
+def _live_solver(name: str) -> str:
+    with given_as_option('solver'):
+        check_live(name)
+    return name
 
 
 def overrides_of(args: argparse.Namespace) -> dict[str, object]:
@@ -157,7 +164,7 @@ def live_line(session: Session, rate: float) -> str:
         # An old estimate beside a device that sends nothing would look like a new one.
         body = 'no samples: the device is away' if session.acquisition.away else 'no samples come'
     elif estimate is not None:
-        sd = [math.sqrt(estimate.covariance[i]) for i in (0, 4, 8)]
+        sd = [math.sqrt(v) for v in estimate.variances]
         mdeg = 1e3 * 180.0 / math.pi
         body = (
             f'ΔX {estimate.dx * 1e6:+9.2f} ± {sd[0] * 1e6:.2f} µm  '

@@ -18,7 +18,7 @@ from psd_deflection.discovery.discover import Discovery, NamedEffect
 from psd_deflection.discovery.localise import BANDS
 from psd_deflection.discovery.result import parameters_of, provenance, sentence
 from psd_deflection.discovery.screen import Score
-from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 
 BEFORE, AFTER, HELD, FLOOR = '#c44e52', '#4c72b0', '#55a868', '#8c8c8c'
 DOTS = ('x1', 'y1', 'x2', 'y2')
@@ -71,11 +71,10 @@ def _residual_figure(discovery: Discovery) -> Figure:
 
 
 def _spectrum(rows: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
-    n = rows.shape[1]
-    window = np.hanning(n)
-    filled = np.where(np.isfinite(rows), rows, 0.0)
-    power = np.abs(np.fft.rfft(filled * window, axis=1)) ** 2 * 2.0 * period / np.sum(window**2)
-    frequency = np.fft.rfftfreq(n, period)
+    """Frequencies, Hz, and power density, unit of ``rows`` squared per Hz, mean over the rows (k, n)."""
+    from scipy.signal import periodogram
+
+    frequency, power = periodogram(np.nan_to_num(rows), 1.0 / period, window='hann', detrend=False)
     # Log-spaced averages: a raw periodogram hides its lines in its own scatter.
     edges = np.geomspace(frequency[1], frequency[-1], 90)
     index = np.digitize(frequency[1:], edges)
@@ -92,7 +91,7 @@ def _spectrum_figure(discovery: Discovery) -> Figure:
     figure = Figure(figsize=(10, 3.2), layout='constrained')
     axis = figure.subplots()
     o, size = ws.observations[0], ws.fine[0]
-    rows = [0, 1, 3, 4]
+    rows = list(DOT_CHANNELS)
     for fit, color, name in (
         (discovery.search.null, BEFORE, 'before'),
         (discovery.fit, AFTER, 'after'),

@@ -7,9 +7,9 @@ import numpy.typing as npt
 import pytest
 
 from psd_deflection.config import Rig, load_rig
+from psd_deflection.geometry import Geometry
 from psd_deflection.pipeline import FROZEN, HELD, Pipeline
 from psd_deflection.records import BlockStatus, DeflectionEstimate, ParameterChange, Record, SpotMeans, TipLoad
-from psd_deflection.solvers.from_rig import geometry_from_rig
 from psd_deflection.solvers.one_psd import OnePsd
 from test.test_pipeline import STEP, chunk_of, still
 
@@ -51,7 +51,7 @@ def test_the_translation_of_one_psd_is_exact_where_the_twist_is(psd: int) -> Non
     c, s = np.cos(theta), np.sin(theta)
     x, y = rig.centers[psd - 1]
     dot = (c * (x - dx) + s * (y - dy) - x, -s * (x - dx) + c * (y - dy) - y)
-    got = OnePsd(geometry_from_rig(rig)).solve(psd - 1, dot, (1e-12, 1e-12), theta, 1e-6)
+    got = OnePsd(Geometry.from_rig(rig)).solve(psd - 1, dot, (1e-12, 1e-12), theta, 1e-6)
     assert got[0] == pytest.approx(dx, abs=1e-15)
     assert got[1] == pytest.approx(dy, abs=1e-15)
 
@@ -59,7 +59,7 @@ def test_the_translation_of_one_psd_is_exact_where_the_twist_is(psd: int) -> Non
 @pytest.mark.parametrize('psd', [1, 2])
 def test_its_covariance_is_what_a_draw_shows(psd: int) -> None:
     rig = load_rig()
-    solver = OnePsd(geometry_from_rig(rig))
+    solver = OnePsd(Geometry.from_rig(rig))
     rng = np.random.default_rng(1)
     variances, sd = (4e-12, 1e-12), 2e-3
     answers = []
@@ -163,7 +163,7 @@ def test_a_recording_that_begins_in_an_outage_replays_bit_for_bit(start: int) ->
     counts[14 * SIZE : 24 * SIZE, 0:3] = counts[14 * SIZE, 0:3]
     live = Pipeline(rig)
     records_of(live, counts[: start * SIZE])
-    memory = live.memory()
+    memory = live.memory(live.rig)
     assert memory is not None
     assert memory.block == start
     after = records_of(live, counts[start * SIZE :], start * SIZE)
@@ -180,15 +180,15 @@ def test_a_recording_that_begins_in_an_outage_replays_bit_for_bit(start: int) ->
 def test_what_is_remembered_says_only_what_matters() -> None:
     pipeline = Pipeline(load_rig())
     records_of(pipeline, moving(5))
-    assert pipeline.memory() is None
+    assert pipeline.memory(pipeline.rig) is None
     pipeline.change({'degraded': 'hold'})
-    memory = pipeline.memory()
+    memory = pipeline.memory(pipeline.rig)
     assert memory is not None
     assert [name for name, _ in memory.values] == [HELD]
     frozen = moving(5)
     frozen[:, 3:6] = frozen[0, 3:6]
     records_of(pipeline, frozen, 5 * SIZE)
-    memory = pipeline.memory()
+    memory = pipeline.memory(pipeline.rig)
     assert memory is not None
     assert dict(memory.values)[FROZEN] == (0, 5)
 

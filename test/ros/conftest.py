@@ -54,14 +54,31 @@ sys.exit(main())
 """
 """Our program, which waits longer for a first answer of its device than any test does."""
 
+HANGING_DISK = """
+import sys
+from pathlib import Path
+from psd_deflection.cli.main import main
+from psd_deflection.runner import recorder
+new_folder = recorder.new_folder
+def hanging(parent):
+    answer = parent.parent / 'answer'
+    if answer.exists():
+        answer.read_text()
+        answer.unlink()
+    return new_folder(parent)
+recorder.new_folder = hanging
+sys.exit(main())
+"""
+"""Our program, whose disk hangs at the first recording until somebody writes to the named pipe ``answer``."""
+
 
 @pytest.fixture
 def start(domain: int) -> Iterator[Callable[..., Program]]:
     """Start a daemon; it ends with the test."""
     started: list[Program] = []
 
-    def begin(*arguments: str, patient: bool = False) -> Program:
-        command = (sys.executable, '-c', PATIENT) if patient else PSD_DEFLECTION
+    def begin(*arguments: str, script: str = '') -> Program:
+        command = (sys.executable, '-c', script) if script else PSD_DEFLECTION
         started.append(Program([*command, 'estimator', *arguments], env={'PYTHONWARNINGS': WARNINGS}))
         return started[-1]
 
