@@ -1,4 +1,4 @@
-# make setup    a virtual environment in .venv with all that is needed
+# make setup    a virtual environment in .venv with all that is needed (Python 3.11 to 3.14)
 # make run      set-up, then the daemon on the simulated rig, recorded below recordings/
 #               (make run PORT=/dev/ttyACM0 ARGS='--params-file my_rig.yaml' for a real one)
 # make test     set-up, then lint, types, import contracts and every test
@@ -26,6 +26,8 @@ PORT ?=
 ARGS ?=
 # Further words for pytest, e.g. PYTEST='-m "not browser"'.
 PYTEST ?=
+# Tests that run at a time; many of them wait.
+WORKERS ?= 2
 BIN := $(VENV)/bin
 
 .PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware golden docs shots blind demo-discover colcon wheel rerun doc-commands clean
@@ -62,7 +64,7 @@ contracts: $(VENV)/.installed
 	$(BIN)/lint-imports --no-cache
 
 unit: $(VENV)/.installed
-	$(BIN)/python -m pytest $(PYTEST)
+	$(BIN)/python -m pytest -n $(WORKERS) $(PYTEST)
 
 run: $(VENV)/.installed
 	$(BIN)/psd-deflection estimator --monitor --record recordings $(if $(PORT),--port $(PORT)) $(ARGS)

@@ -19,7 +19,7 @@ BESIDE_THE_PACKAGE = {'bench', 'blind', 'data', 'docs'}
 """Folders of test/ that are no room of the package: what they test, or use, lies beside it."""
 
 TESTED_ELSEWHERE = {'correction', 'errors', 'parameters', 'records'}
-"""Rooms without a test file of their own: declarations, and the correction, which the tests of the effects put through."""
+"""Rooms without a test file of their own: declarations; and the correction, of which the effects' tests are."""
 
 EXECUTABLES = ('estimator', 'replay', 'simulate', 'discover')
 

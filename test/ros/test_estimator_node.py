@@ -88,7 +88,12 @@ def test_what_is_published_and_how_often(start: Callable[..., Any], peer: Any) -
     names = {s.name for s in health[-1].status}
     assert 'psd_deflection: acquisition' in names
     values = {v.key: v.value for s in health[-1].status for v in s.values}
-    assert values['lost'] == values.get('lost: dropped by the device', '0')
+    # On a busy machine the simulated device drops samples, and says so; there is no other cause here.
+    causes = {key: int(value) for key, value in values.items() if key.startswith('lost: ')}
+    assert set(causes) <= {'lost: dropped by the device'}
+    assert int(values['lost']) == sum(causes.values())
+    missing = int((blocks - 1).sum())
+    assert int(values['lost']) >= 10 * missing, 'a block is left out if half of its 20 samples are lost'
     assert values['bad frames'] == '0'
     assert float(values['rate (samples/s)']) > 0
 
