@@ -208,7 +208,7 @@ class AcquisitionConfig:
     port: str = parameter(
         '',
         '',
-        'serial port (two with a comma between for thorlabs, a recording for replay); empty starts the simulated rig',
+        'serial port (thorlabs: two with a comma between; replay: a recording); without it a simulated rig is started',
     )
     baud: int = parameter(921_600, 'baud', 'line speed (USB-CDC devices ignore it)', minimum=1200, maximum=12_000_000)
     latency_offset: float = parameter(

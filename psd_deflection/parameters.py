@@ -31,9 +31,9 @@ Value = float | int | bool | str | list[float] | list[str]
 T = TypeVar('T')
 
 _SHORT = reprlib.Repr()
-_SHORT.maxlevel = 3
+_SHORT.maxlevel = 1
 _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 20
-_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 300
+_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 200
 
 _KINDS: Mapping[object, Kind] = {float: 'double', int: 'integer', bool: 'bool', str: 'string'}
 
