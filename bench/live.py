@@ -274,7 +274,7 @@ def replay(minutes: float) -> None:
 
     from psd_deflection.cli.replay import replayed, rig_of
     from psd_deflection.pipeline import Pipeline
-    from psd_deflection.recordings.opening import open_recording
+    from psd_deflection.recordings.readers import open_recording
 
     with tempfile.TemporaryDirectory() as folder:
         path, n = make_recording(Path(folder), minutes)

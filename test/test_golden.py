@@ -12,7 +12,7 @@ import pytest
 from psd_deflection.cli.main import main
 from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import DeflectionEstimate, SpotMeans
 
 BAGS = Path(__file__).parent.parent / 'bags'

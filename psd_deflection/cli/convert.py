@@ -28,7 +28,7 @@ from psd_deflection.config import EFFECTS_PREFIX, load_rig
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.bag_writer import BagWriter, McapFile
 from psd_deflection.recordings.csv_writer import CsvSampleSink
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.rerun_writer import RerunFile
 from psd_deflection.records import AppliedLoad, ParameterChange, ReferencePose, SampleBlock, TemperatureReading

@@ -32,7 +32,7 @@ from psd_deflection.monitor.feed import Feed
 from psd_deflection.monitor.source import ReplaySource
 from psd_deflection.monitor.start import need_server
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import Record
 from psd_deflection.runner.session import Session
 from psd_deflection.runner.simulated_rig import started_early

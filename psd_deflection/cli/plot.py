@@ -30,7 +30,7 @@ from psd_deflection.config import Rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.monitor.spectrum import Spectrum
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, Record, SampleBlock, SpotMeans
 
 SPECTRUM_S = 600.0

@@ -26,7 +26,7 @@ from psd_deflection.cli._report import print_json
 from psd_deflection.config import Rig, load_rig, rig_from_values
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.comparison import Comparison
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.sinks import Sink, open_sink
 from psd_deflection.records import ENVIRONMENT, DeflectionEstimate, RawChunk, Record, SampleBlock

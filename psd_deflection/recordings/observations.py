@@ -12,7 +12,7 @@ import yaml
 from psd_deflection.config import Rig, replace_values, rig_from_values
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.errors import ConfigError, RecordingError
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import CHANNELS, ENVIRONMENT, FloatArray, IntArray
 

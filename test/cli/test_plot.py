@@ -41,7 +41,7 @@ def test_losses_and_missing_estimates_are_marked() -> None:
     from psd_deflection.cli.plot import Drawn
     from psd_deflection.cli.replay import replayed, rig_of
     from psd_deflection.pipeline import Pipeline
-    from psd_deflection.recordings.opening import open_recording
+    from psd_deflection.recordings.readers import open_recording
 
     recording = open_recording(BAGS / 'lost_samples')
     drawn = Drawn()
@@ -66,7 +66,7 @@ def test_blocks_cut_by_start_and_stop_have_lost_nothing(tmp_path: Path, capsys: 
     from psd_deflection.cli.plot import Drawn, _mark_losses
     from psd_deflection.cli.replay import replayed, rig_of
     from psd_deflection.pipeline import Pipeline
-    from psd_deflection.recordings.opening import open_recording
+    from psd_deflection.recordings.readers import open_recording
     from psd_deflection.records import SampleBlock
 
     recording = open_recording(BAGS / 'clean')

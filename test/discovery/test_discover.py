@@ -24,7 +24,7 @@ from psd_deflection.discovery.signatures import SignatureBank
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.errors import RecordingError
 from psd_deflection.recordings.observations import recorded_rig
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import FloatArray, ParameterChange
 from psd_deflection.simulation import loads
 from psd_deflection.simulation.catalogue import effects_of_rig, make_active

@@ -11,7 +11,7 @@ from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.monitor.feed import BlockResult, Feed
 from psd_deflection.monitor.source import RefusedError, ReplaySource
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import Record
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'

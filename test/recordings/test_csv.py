@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from psd_deflection.errors import RecordingError
 from psd_deflection.recordings.csv_reader import CsvRecording
 from psd_deflection.recordings.csv_writer import CsvEstimateSink, CsvSampleSink, seconds
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import (
     AppliedLoad,
     DeflectionEstimate,

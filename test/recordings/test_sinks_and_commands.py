@@ -15,7 +15,7 @@ from psd_deflection.cli.main import main
 from psd_deflection.config import load_rig
 from psd_deflection.recordings.bag_writer import BagWriter, McapFile
 from psd_deflection.recordings.csv_writer import CsvEstimateSink
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.sinks import open_sink
 from psd_deflection.records import SampleBlock
 
