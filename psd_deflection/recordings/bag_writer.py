@@ -182,11 +182,6 @@ class McapFile:
                 with contextlib.suppress(OSError):
                     one.close()
 
-    def write_hello(self, device_hello: Mapping[str, object]) -> None:
-        """Note the device's hello when it comes after the start of the recording; the last one counts."""
-        with self._guard():
-            self._writer.add_metadata(META_HELLO, _json_values(device_hello))
-
     def write(self, record: Record) -> None:
         """Write all messages of one record; the log time is the record's own stamp."""
         if isinstance(record, ParameterChange):
@@ -321,11 +316,6 @@ class BagWriter:
         )
         self._number += 1
         return file
-
-    def write_hello(self, device_hello: Mapping[str, object]) -> None:
-        """Note the device's hello when it comes after the start of the recording; the last one counts."""
-        self._hello = device_hello
-        self._file.write_hello(device_hello)
 
     def write(self, record: Record) -> None:
         """Write all messages of one record; the log time is the record's own stamp."""

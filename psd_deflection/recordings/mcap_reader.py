@@ -90,7 +90,8 @@ _READ: Mapping[int, Callable[[ReadDataStream], McapRecord]] = {
 def _parsed(opcode: int, content: bytes) -> McapRecord:
     """A schema, channel, metadata record or message. Raises DamagedError if it contradicts itself."""
     if opcode == Opcode.MESSAGE:
-        return _read(lambda fields: Message.read(fields, len(content)), content)
+        message: Message = _read(lambda fields: Message.read(fields, len(content)), content)
+        return message
     return _read(_READ[opcode], content)
 
 

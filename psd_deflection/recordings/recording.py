@@ -92,7 +92,7 @@ class Recording(abc.ABC):
         """
         cutter = BlockCutter(self.block_size)
         for chunk in self._chunks():
-            yield from cutter.add(chunk, chunk.readings)
+            yield from cutter.add(chunk, chunk.readings.astype(np.float32, copy=False))
         yield from cutter.flush()
 
     @abc.abstractmethod

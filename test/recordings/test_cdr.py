@@ -52,7 +52,7 @@ def test_the_encoder_takes_every_kind_of_field() -> None:
     made_up = MessageType(
         'test_msgs/msg/MadeUp', '', f'{text}string word\nint16[3] three\nuint8[2] two\nstring[] words\n'
     )
-    values_of = {f'{kind}_': i % 2 for i, kind in enumerate(kinds)}
+    values_of: dict[str, Any] = {f'{kind}_': i % 2 for i, kind in enumerate(kinds)}
     values_of |= {'word': 'µ', 'three': [1, -2, 3], 'two': b'ab', 'words': ['', 'long']}
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(made_up.definition, made_up.name))

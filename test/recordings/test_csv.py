@@ -117,7 +117,7 @@ def test_samples_with_all_columns_come_back(tmp_path: Path) -> None:
     loads = [AppliedLoad(T0, 0.0, 0.0, 0.0), AppliedLoad(T0 + 25 * STEP, 1.0, -2.0, 0.1)]
     references = [ReferencePose(T0 + 7 * STEP, 1e-3, 2e-3, 0.1), ReferencePose(T0 + 30 * STEP, 1.5e-3, 2e-3, 0.2)]
     temperatures = [TemperatureReading(T0 + 10 * STEP, 21.5)]
-    sink = CsvSampleSink(tmp_path / 'a.csv', loads=True, references=True, temperatures=True)
+    sink = CsvSampleSink(tmp_path / 'a.csv', [AppliedLoad, ReferencePose, TemperatureReading])
     records: list[Record] = [*loads, *references, *temperatures, TipLoad(T0, 9.0, 9.0, 9.0), *blocks]
     for record in records:
         sink.put(record)
@@ -131,7 +131,7 @@ def test_samples_with_all_columns_come_back(tmp_path: Path) -> None:
 
 
 def test_what_comes_between_two_samples_goes_to_the_later(tmp_path: Path) -> None:
-    sink = CsvSampleSink(tmp_path / 'a.csv', loads=True)
+    sink = CsvSampleSink(tmp_path / 'a.csv', [AppliedLoad])
     sink.put(AppliedLoad(T0 + 3 * STEP + 1, 1.0, 0.0, 0.0))
     sink.put(block(0))
     sink.close()
