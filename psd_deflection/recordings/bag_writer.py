@@ -48,7 +48,8 @@ META_CHANGE = 'psd_deflection.change.'
 
 
 _CHUNK_INDICES = '_Writer__chunk_indices'
-"""Where mcap's writer keeps them; it has no public place for them."""
+"""Where mcap's writer keeps them; it has no public place for them. Under another name in a later mcap they would
+stay in memory, and the tests fail."""
 
 CUSTOM = {'psd_deflection_version': __version__}
 

@@ -10,6 +10,7 @@ import csv
 import math
 from collections.abc import Collection, Iterator, Sequence
 from decimal import Decimal, InvalidOperation
+from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -73,8 +74,7 @@ class CsvRecording(Recording):
     def _refuse(self, why: str, line: int | None = None) -> RecordingError:
         return RecordingError(f'{self.path}{"" if line is None else f":{line}"}: {why}')
 
-    def _lines(self) -> Iterator[tuple[int, str]]:
-        """(line number, text) of every line that is not blank."""
+    def _lines(self) -> Iterator[str]:
         try:
             with self.path.open(encoding='utf-8-sig', newline=None) as stream:
                 number = 0
@@ -82,8 +82,7 @@ class CsvRecording(Recording):
                     number += 1
                     if len(text) > MAX_LINE:
                         raise self._refuse(f'is longer than {MAX_LINE} characters', number)
-                    if text.strip():
-                        yield number, text
+                    yield text
         except OSError as error:
             raise self._refuse(f'cannot be read ({error.strerror or error})') from None
         except UnicodeDecodeError:
@@ -91,19 +90,13 @@ class CsvRecording(Recording):
 
     def _cells(self) -> Iterator[tuple[int, list[str]]]:
         """(line number, cells) of every line that is not blank."""
-        line = 0
-
-        def texts() -> Iterator[str]:
-            nonlocal line
-            for number, text in self._lines():
-                line = number
-                yield text
-
+        reader = csv.reader(self._lines(), strict=True, skipinitialspace=True)
         try:
-            for cells in csv.reader(texts(), strict=True, skipinitialspace=True):
-                yield line, cells
+            for cells in reader:
+                if len(cells) > 1 or (cells and cells[0].strip()):
+                    yield reader.line_num, cells
         except csv.Error as error:
-            raise self._refuse(f'is no row of a CSV ({error})', line) from None
+            raise self._refuse(f'is no row of a CSV ({error})', reader.line_num) from None
 
     def _read_header(self) -> tuple[list[str], dict[str, int]]:
         for number, cells in self._cells():
@@ -205,7 +198,7 @@ class CsvRecording(Recording):
         is left over is carried on and forgotten slowly, so that neither jitter of less than half a
         step nor a clock that runs a little fast makes a loss where there is none.
         """
-        at = [self._columns[c] for c in CHANNELS]
+        take = itemgetter(*(self._columns[c] for c in CHANNELS))
         seqs: list[int] = []
         times: list[int] = []
         volts: list[list[float]] = []
@@ -221,10 +214,11 @@ class CsvRecording(Recording):
                     seq += steps
                 last_t = row.t_ns
                 try:
-                    values = [float(row.cells[i]) for i in at]
+                    values = list(map(float, take(row.cells)))
                 except ValueError:
                     values = [math.nan]
-                if not all(-MAX_VOLTS <= v <= MAX_VOLTS for v in values):
+                # NaN and what is beyond the bound come through the sum; which cell it was is looked up then.
+                if not sum(map(abs, values)) <= MAX_VOLTS:
                     values = [self._number(row, c, MAX_VOLTS) for c in CHANNELS]
                 seqs.append(seq)
                 times.append(row.t_ns)

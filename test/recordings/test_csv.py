@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from decimal import Decimal
 from pathlib import Path
@@ -16,6 +17,7 @@ from psd_deflection.recordings.csv_reader import CsvRecording
 from psd_deflection.recordings.csv_writer import CsvEstimateSink, CsvSampleSink, seconds
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import (
+    CHANNELS,
     AppliedLoad,
     DeflectionEstimate,
     Record,
@@ -263,3 +265,25 @@ def test_files_are_not_overwritten_and_errors_are_one_line(tmp_path: Path) -> No
     sink.close()
     with pytest.raises(RecordingError, match='is closed'):
         sink.put(block(0))
+
+
+def test_cells_may_be_quoted(tmp_path: Path) -> None:
+    path = tmp_path / 'q.csv'
+    head = ['t', *CHANNELS, 'note, of the operator']
+    rows = [[0.001 * i, *(0.5 * i + c for c in range(6)), 'said "go", and went'] for i in range(40)]
+    with path.open('w', newline='') as stream:
+        csv.writer(stream, quoting=csv.QUOTE_ALL).writerows([head, *rows])
+    recording = open_recording(path)
+    assert [s['x1'] for s in recording.samples] == [0.5 * i for i in range(40)]
+    assert recording.warnings == [f'{path}:1: columns that are not read: note, of the operator']
+
+
+@pytest.mark.parametrize(
+    ('row', 'why'), [('0.004,1,2,3,4,5,"6', 'no row of a CSV'), ('0.004,1,2,3,4,5,"6"7', 'no row')]
+)
+def test_a_quote_that_does_not_end_is_told(tmp_path: Path, row: str, why: str) -> None:
+    path = tmp_path / 'q.csv'
+    rows = [f'{0.001 * i:.3f},1,2,3,4,5,6' for i in range(4)]
+    path.write_text('\n'.join([','.join(['t', *CHANNELS]), *rows, row]) + '\n')
+    with pytest.raises(RecordingError, match=r'q\.csv:6: is no row of a CSV'):
+        open_recording(path).samples  # noqa: B018
