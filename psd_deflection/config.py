@@ -8,7 +8,6 @@ the node calls with the values that rclpy gives it. What can be set is listed in
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.parameters import BY_NAME, PARAMETERS, Value, check_value
 from psd_deflection.records import FloatArray
 
@@ -214,9 +213,7 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             continue
         parameter = BY_NAME.get(key)
         if parameter is None:
-            near = difflib.get_close_matches(key, BY_NAME, n=1)
-            hint = f'; did you mean {near[0]}?' if near else ''
-            raise ConfigError(f'{source}: {key} = {value!r}: no parameter of that name{hint}')
+            raise ConfigError(f'{source}: {key} = {value!r}: no parameter of that name{did_you_mean(key, BY_NAME)}')
         got[key] = check_value(parameter, value, source)
     v: dict[str, Any] = dict(got)
     if v['link.inner_radius'] >= v['link.outer_radius']:

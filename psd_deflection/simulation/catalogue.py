@@ -11,7 +11,6 @@ so that the file remains a ROS 2 parameter file.
 
 from __future__ import annotations
 
-import difflib
 import functools
 import importlib
 import math
@@ -21,7 +20,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.physics import Physics
@@ -167,8 +166,7 @@ def make_active(name: str, values: Mapping[str, object], source: str) -> ActiveE
     """Check one effect's parameters; raises ConfigError naming source, key, value, bound."""
     effect = catalogue().get(name)
     if effect is None:
-        near = difflib.get_close_matches(name, catalogue(), n=1)
-        hint = f'; did you mean {near[0]}?' if near else f'; there are: {", ".join(catalogue())}'
+        hint = did_you_mean(name, catalogue()) or f'; there are: {", ".join(catalogue())}'
         raise ConfigError(f'{source}: name = {name!r}: no effect of that name{hint}')
     known = [p.name for p in effect.parameters]
     for key in values:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 from types import MappingProxyType
 from typing import Any
 
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.solvers.base_pair import BasePairSolver
 from psd_deflection.solvers.beam import BeamSolver
 from psd_deflection.solvers.exact import ExactSolver
@@ -49,7 +48,5 @@ def make_solver(name: str, geometry: Geometry, **options: Any) -> Solver:
     """
     cls = SOLVERS.get(name)
     if cls is None:
-        near = difflib.get_close_matches(name, SOLVERS, n=1)
-        hint = f'; did you mean {near[0]}?' if near else ''
-        raise ConfigError(f'solver = {name!r}: must be one of {", ".join(SOLVERS)}{hint}')
+        raise ConfigError(f'solver = {name!r}: must be one of {", ".join(SOLVERS)}{did_you_mean(name, SOLVERS)}')
     return cls(geometry, **options)
