@@ -11,7 +11,6 @@ the node calls with the values that rclpy gives it.
 
 from __future__ import annotations
 
-import difflib
 import math
 import operator
 from collections.abc import Mapping
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.parameters import Parameter, Section, Value, check_value, parameter, shown
 from psd_deflection.records import FloatArray
 
@@ -389,9 +388,9 @@ def _rig(values: Mapping[str, Value], effects: Mapping[str, Any], changes: Mappi
         elif key in BY_NAME:
             v[key] = check_value(BY_NAME[key], value, source)
         elif key not in ROS_OWN and not key.startswith(QOS_OVERRIDES_PREFIX):
-            near = difflib.get_close_matches(key, BY_NAME, n=1)
-            hint = f'; did you mean {near[0]}?' if near else ''
-            raise ConfigError(f'{source}: {key} = {shown(value)}: no parameter of that name{hint}')
+            raise ConfigError(
+                f'{source}: {key} = {shown(value)}: no parameter of that name{did_you_mean(key, BY_NAME)}'
+            )
     _check_together(v, source)
     return Rig(
         link=LINK.of(v),

@@ -19,6 +19,9 @@ status    meaning
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class PsdDeflectionError(Exception):
     """Base of every error that is the outside world's, not ours."""
@@ -69,3 +72,9 @@ class SolverError(PsdDeflectionError):
     """
 
     exit_status = 6
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """``; did you mean X?`` for a name that is nearly one of ``known``, else nothing."""
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f'; did you mean {near[0]}?' if near else ''

@@ -75,3 +75,9 @@ def test_the_version_is_the_same_everywhere() -> None:
     root = xml.etree.ElementTree.parse(ROOT / 'package.xml').getroot()
     assert root.findtext('version') == __version__
     assert f'## {__version__}' in (ROOT / 'CHANGELOG.md').read_text()
+
+
+def test_importing_the_package_is_light() -> None:
+    code = 'import sys, psd_deflection; print([m for m in ("numpy", "mcap", "yaml") if m in sys.modules])'
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == '[]'

@@ -34,7 +34,7 @@ WITHOUT_STATUS = ('DamagedError', 'RefusedError', 'SourceEndedError', '_FullErro
 
 READERS = (
     'msg_adapters',
-    'psd_deflection.recordings.message_decode',
+    'psd_deflection.recordings.clouds',
     'psd_deflection.recordings.cdr',
     'psd_deflection.recordings.bag_reader',
 )

@@ -88,8 +88,8 @@ def bag_target() -> tuple[Target, list[bytes]]:
     from psd_deflection.config import load_rig
     from psd_deflection.errors import PsdDeflectionError
     from psd_deflection.recordings.bag_writer import McapFile
-    from psd_deflection.recordings.opening import open_recording
-    from psd_deflection.recordings.recover import recover
+    from psd_deflection.recordings.readers import open_recording
+    from psd_deflection.recordings.repair import recover
     from psd_deflection.records import AppliedLoad
 
     def read(path: Path) -> None:
@@ -118,7 +118,7 @@ def bag_target() -> tuple[Target, list[bytes]]:
 def csv_target() -> tuple[Target, list[bytes]]:
     """A CSV recording."""
     from psd_deflection.errors import PsdDeflectionError
-    from psd_deflection.recordings.opening import open_recording
+    from psd_deflection.recordings.readers import open_recording
 
     def read(path: Path) -> None:
         for ask in ('blocks', 'loads', 'references', 'temperatures'):

@@ -25,14 +25,14 @@ from pathlib import Path
 from psd_deflection.cli._options import given_as_option, given_parameters, parameter_option, refuse
 from psd_deflection.cli._program import program
 from psd_deflection.cli.estimator import Display, run_without_ros, simulates
-from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.config import read_parameter_file, replace_values, rig_from_values
 from psd_deflection.errors import UsageError
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.monitor.source import ReplaySource
 from psd_deflection.monitor.start import need_server
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.replay_engine import open_for_replay, replayed
 from psd_deflection.records import Record
 from psd_deflection.runner.session import Session
 from psd_deflection.runner.simulated_rig import started_early
@@ -100,12 +100,12 @@ def run(args: argparse.Namespace) -> int:
 def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     from psd_deflection.monitor.server import MonitorServer
 
-    rig = replace_values(rig_of(open_recording(args.recording), args.params_file), overrides, 'command line')
+    rig = replace_values(open_for_replay(args.recording, args.params_file)[1], overrides, 'command line')
 
     def open_steps() -> tuple[Pipeline, Iterator[list[Record]]]:
         recording = open_recording(args.recording, block_size=rig.estimator.block_size)
         pipeline = Pipeline(rig)
-        return pipeline, replayed(recording, pipeline, recording.blocks())
+        return pipeline, replayed(recording, pipeline)
 
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -16,7 +16,7 @@ from psd_deflection.config import Rig
 from psd_deflection.devices.source import Clock, Event, Reading, Sample, Source, SourceEndedError
 from psd_deflection.errors import ConfigError, DeviceError, RecordingError
 from psd_deflection.protocol.frames import PROTOCOL_VERSION, HelloFrame
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import CHANNELS, SampleBlock
 
