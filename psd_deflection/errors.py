@@ -6,7 +6,8 @@ is raised is a defect of ours and ends with a traceback.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import difflib
+from collections.abc import Iterable, Mapping
 
 INTERRUPTED = 130
 
@@ -72,3 +73,9 @@ class SolverError(PsdDeflectionError):
     """
 
     exit_status = 6
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """``; did you mean X?`` for a name that is nearly one of ``known``, else nothing."""
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f'; did you mean {near[0]}?' if near else ''

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from psd_deflection.averaging import BlockCutter, block_middle_ns, covariance
 from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_variances
 from psd_deflection.calibration.health import OpticsHealth, Verdict
-from psd_deflection.config import Rig, replace_values
+from psd_deflection.config import ZEROS, Rig, replace_values
 from psd_deflection.correction import Correction
 from psd_deflection.geometry import Geometry
 from psd_deflection.mechanics import LinkStatics
@@ -149,7 +149,7 @@ class Pipeline:
         if not self._recent or self.last_spots is None:
             return None
         x1, y1, x2, y2 = (sum(column) / len(self._recent) for column in zip(*self._recent, strict=True))
-        return self.change({'psd_1.zero': (x1, y1), 'psd_2.zero': (x2, y2)})
+        return self.change(dict(zip(ZEROS, ((x1, y1), (x2, y2)), strict=True)))
 
     def change(self, values: Mapping[str, float | str | tuple[float, ...]]) -> ParameterChange:
         """Change parameters from the next block on; the change as a record.

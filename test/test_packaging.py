@@ -18,7 +18,7 @@ ROOT = Path(__file__).parent.parent
 BESIDE_THE_PACKAGE = {'bench', 'blind', 'data', 'docs'}
 """Folders of test/ that are no room of the package: what they test, or use, lies beside it."""
 
-TESTED_ELSEWHERE = {'correction', 'errors', 'parameters', 'records'}
+TESTED_ELSEWHERE = {'correction', 'errors', 'files', 'parameters', 'records'}
 """Rooms without a test file of their own: declarations; and the correction, of which the effects' tests are."""
 
 EXECUTABLES = ('estimator', 'replay', 'simulate', 'discover')
@@ -79,3 +79,9 @@ def test_the_tests_mirror_the_package() -> None:
     assert folders - ours == BESIDE_THE_PACKAGE
     untested = {room for room in ours - folders if not (ROOT / 'test' / f'test_{room}.py').exists()}
     assert untested == TESTED_ELSEWHERE
+
+
+def test_importing_the_package_is_light() -> None:
+    code = 'import sys, psd_deflection; print([m for m in ("numpy", "mcap", "yaml") if m in sys.modules])'
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == '[]'

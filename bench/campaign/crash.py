@@ -22,8 +22,8 @@ from pathlib import Path
 from rosbags.rosbag2 import Reader
 
 from psd_deflection.config import Rig, load_rig
-from psd_deflection.recordings.opening import open_recording
-from psd_deflection.recordings.recover import recover
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.repair import recover
 from psd_deflection.runner.session import Session
 from tools.program import PSD_DEFLECTION, WAIT_S, Program
 

@@ -100,8 +100,8 @@ def bag_target() -> tuple[Target, list[bytes]]:
     """A lone ``.mcap``: everything that a command may ask of it; and ``recover``."""
     from psd_deflection.config import load_rig
     from psd_deflection.recordings.bag_writer import McapFile
-    from psd_deflection.recordings.opening import open_recording
-    from psd_deflection.recordings.recover import recover
+    from psd_deflection.recordings.readers import open_recording
+    from psd_deflection.recordings.repair import recover
     from psd_deflection.records import AppliedLoad
 
     with tempfile.TemporaryDirectory() as name:
@@ -123,7 +123,7 @@ def bag_target() -> tuple[Target, list[bytes]]:
 
 def csv_target() -> tuple[Target, list[bytes]]:
     """A CSV recording."""
-    from psd_deflection.recordings.opening import open_recording
+    from psd_deflection.recordings.readers import open_recording
 
     seed = b't,x1,y1,sum1,x2,y2,sum2,load_fx,load_fy,load_tz\n'
     seed += b''.join(b'%d.%03d,0,1e-3,5,-1,2,5,1,0,0\n' % (i // 1000, i % 1000) for i in range(30))

@@ -40,7 +40,7 @@ from psd_deflection.protocol.frames import (
     StatusFrame,
     encode,
 )
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import IntArray
 from psd_deflection.runner.acquisition import Acquisition, Chunk
 from tools.program import PSD_DEFLECTION, Program

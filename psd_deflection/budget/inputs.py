@@ -7,7 +7,6 @@ it is the first thing to replace by what is known of a real rig.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import cast
 import yaml
 
 from psd_deflection.config import MAX_FILE_BYTES
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.parameters import Parameter, check_value
 
 
@@ -137,8 +136,7 @@ def read_inputs(
         for name, value in given.items():
             found = INPUT_BY_NAME.get(str(name))
             if found is None:
-                near = difflib.get_close_matches(str(name), INPUT_BY_NAME, n=1)
-                hint = f'; did you mean {near[0]}?' if near else ''
+                hint = did_you_mean(str(name), INPUT_BY_NAME)
                 raise ConfigError(
                     f'{place}: {name} = {value!r}: no such input{hint} (`psd-deflection budget --explain` has all)'
                 )

@@ -54,7 +54,7 @@ class Calibration:
         """What the rig's parameters say."""
         return cls(
             sensitivity=rig.amplifier.sensitivity,
-            sensors=(make_sensor(rig.psd_1), make_sensor(rig.psd_2)),
+            sensors=(make_sensor(rig.psds[0]), make_sensor(rig.psds[1])),
             sum_min=rig.estimator.sum_min,
             full_scale=rig.converter.full_scale,
             step=rig.converter.volts_per_count,

@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+from psd_deflection.config import BY_NAME
 from psd_deflection.errors import ConfigError, RecordingError, UsageError
 
 _FOREIGN = """
@@ -53,6 +54,33 @@ def number(option: str, least: float, most: float) -> Callable[[str], float]:
         raise UsageError(f'{option} {text}: must be a number of at least {least:g} and at most {most:g}')
 
     return read
+
+
+def parameter_option(parser: argparse._ActionsContainer, option: str, name: str) -> None:
+    """Add ``option``, which sets the parameter ``name``; its declaration says what it is, its type and its default.
+
+    :func:`given_parameters` has what was given.
+    """
+    p = BY_NAME[name]
+    text = p.description + (f' (default {p.default})' if p.default != '' else '')
+    parser.add_argument(
+        option,
+        dest=name,
+        type=int if p.kind == 'integer' else str,
+        metavar='N' if p.kind == 'integer' else option.strip('-').upper(),
+        help=text.replace('%', '%%'),
+    )
+
+
+def given_parameters(args: argparse.Namespace) -> dict[str, object]:
+    """What was given for options that bear a parameter's name; ``--record FOLDER`` sets ``bag_dir`` as well."""
+    values = {name: v for name, v in vars(args).items() if name in BY_NAME and v is not None and v is not False}
+    folder = values.get('record')
+    if folder is not None:
+        values['record'] = True
+    if folder:
+        values['bag_dir'] = folder
+    return values
 
 
 def recording_name(*, rerun: bool = False) -> Callable[[str], str]:

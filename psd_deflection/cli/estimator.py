@@ -27,7 +27,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from psd_deflection.cli._options import given_as_option
+from psd_deflection.cli._options import given_as_option, given_parameters, parameter_option
 from psd_deflection.cli._program import program
 from psd_deflection.config import Rig, read_parameter_file, rig_from_values
 from psd_deflection.devices.registry import source_names
@@ -47,11 +47,11 @@ LOOK_S = 0.1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('--port', help='serial port of the device; without it a simulated rig is started')
+    parameter_option(parser, '--port', 'port')
     parser.add_argument(
         '--source', help='what the device speaks: serial (our own frames), dataq, thorlabs, lines, replay'
     )
-    parser.add_argument('--baud', type=int, help='line speed (default 921600; USB-CDC devices ignore it)')
+    parameter_option(parser, '--baud', 'baud')
     parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig')
     parser.add_argument(
         '--record', nargs='?', const='', metavar='FOLDER', help='record from the start, below FOLDER (recordings/)'
@@ -76,23 +76,9 @@ def _live_solver(name: str) -> str:
 
 def overrides_of(args: argparse.Namespace) -> dict[str, object]:
     """The parameters that the arguments give; the file's values below the single ones."""
-    values: dict[str, object] = {}
-    if args.port is not None:
-        values['port'] = args.port
-    if args.source is not None:
-        if args.source not in source_names():
-            raise UsageError(f'--source {args.source}: must be one of {", ".join(source_names())}')
-        values['source'] = args.source
-    if args.baud is not None:
-        values['baud'] = args.baud
-    if args.solver is not None:
-        values['solver'] = args.solver
-    if args.record is not None:
-        values['record'] = True
-        if args.record:
-            values['bag_dir'] = args.record
-    if args.monitor:
-        values['monitor'] = True
+    values = given_parameters(args)
+    if args.source is not None and args.source not in source_names():
+        raise UsageError(f'--source {args.source}: must be one of {", ".join(source_names())}')
     with given_as_option():
         rig_from_values(values, 'command line')
     if args.params_file:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import difflib
 import errno
 import importlib
 import itertools
@@ -22,7 +21,14 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from psd_deflection import __version__
-from psd_deflection.errors import EXIT_STATUSES, INTERRUPTED, PsdDeflectionError, RecordingError, UsageError
+from psd_deflection.errors import (
+    EXIT_STATUSES,
+    INTERRUPTED,
+    PsdDeflectionError,
+    RecordingError,
+    UsageError,
+    did_you_mean,
+)
 
 COMMANDS: dict[str, str] = {
     'estimator': 'acquire, estimate, publish on ROS 2 and record (the daemon)',
@@ -155,9 +161,8 @@ def _run(argv: list[str]) -> int:
     try:
         _refuse_empty(own)
         if chosen and chosen[0] not in COMMANDS:
-            close = difflib.get_close_matches(chosen[0], COMMANDS, 1)
-            hint = f'did you mean {close[0]}?' if close else '`psd-deflection --help` lists them'
-            raise UsageError(f'no command {chosen.pop()!r}; {hint}')
+            hint = did_you_mean(chosen[0], COMMANDS) or '; `psd-deflection --help` lists them'
+            raise UsageError(f'no command {chosen.pop()!r}{hint}')
         args, unknown = make_parser(chosen).parse_known_args(own)
     except UsageError as error:
         _tell(f'{" ".join(["psd-deflection", *chosen])}: {error}')

@@ -10,7 +10,6 @@ derived from :class:`~psd_deflection.devices.source.Source`, made with the rig a
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from collections.abc import Callable
 from importlib.metadata import entry_points
@@ -18,7 +17,7 @@ from types import MappingProxyType
 
 from psd_deflection.config import Rig
 from psd_deflection.devices.source import Source
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, did_you_mean
 
 GROUP = 'psd_deflection.sources'
 
@@ -56,9 +55,7 @@ def _find(name: str) -> Callable[[Rig], Source]:
         points = [e for e in entry_points(group=GROUP) if e.name == name]
         if not points:
             known = source_names()
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f'; did you mean {near[0]}?' if near else ''
-            raise ConfigError(f'source = {name!r}: must be one of {", ".join(known)}{hint}')
+            raise ConfigError(f'source = {name!r}: must be one of {", ".join(known)}{did_you_mean(name, known)}')
         try:
             found = points[0].load()
         except Exception as error:

@@ -16,7 +16,7 @@ from psd_deflection.config import Rig
 from psd_deflection.devices.source import Clock, Event, Reading, Sample, Source, SourceEndedError
 from psd_deflection.errors import ConfigError, DeviceError, RecordingError
 from psd_deflection.protocol.frames import PROTOCOL_VERSION, HelloFrame
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import CHANNELS, SampleBlock
 
@@ -53,7 +53,7 @@ class Replay(Source):
         self.name = rig.acquisition.port
         if not self.name:
             raise ConfigError("source = replay: port = '': name the recording (a bag folder, an .mcap or a .csv)")
-        self._stamps = str(rig.values['replay.stamps'])
+        self._stamps = rig.acquisition.replay_stamps
         self._rate = rig.converter.sample_rate_hz
         self._block_size = rig.estimator.block_size
         self.clock = Clock.RECORDED if self._stamps == 'recorded' else Clock.HOST

@@ -14,7 +14,7 @@ from concurrent.futures import Future, wait
 from pathlib import Path
 
 from msg_adapters import TOPIC_TYPES
-from psd_deflection.config import Rig, replace_values
+from psd_deflection.config import ZEROS, Rig, replace_values
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings import cdr
 from psd_deflection.records import ParameterChange
@@ -24,7 +24,7 @@ from psd_deflection.runner.processing import Processing
 from psd_deflection.runner.realtime import lock_memory
 from psd_deflection.runner.recorder import Recorder
 from psd_deflection.runner.simulated_rig import SimulatedRigProcess
-from psd_deflection.runner.zero_store import ZEROS, ZeroStore
+from psd_deflection.runner.zero_store import ZeroStore
 from psd_deflection.solvers.registry import check_live
 
 HUNG_S = 5.0

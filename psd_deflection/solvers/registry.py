@@ -7,13 +7,12 @@ asked for.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.geometry.layout import Geometry
 from psd_deflection.solvers.interface import Solver
 
@@ -49,9 +48,7 @@ def solver_class(name: str) -> type[Solver]:
     """The class of the method ``name``. Raises ConfigError for an unknown name."""
     entry = SOLVERS.get(name)
     if entry is None:
-        near = difflib.get_close_matches(name, SOLVERS, n=1)
-        hint = f'; did you mean {near[0]}?' if near else ''
-        raise ConfigError(f'solver = {name!r}: must be one of {", ".join(SOLVERS)}{hint}')
+        raise ConfigError(f'solver = {name!r}: must be one of {", ".join(SOLVERS)}{did_you_mean(name, SOLVERS)}')
     module, _, attribute = entry.path.partition(':')
     found: type[Solver] = getattr(importlib.import_module(module), attribute)
     return found

@@ -24,8 +24,8 @@ from psd_deflection.discovery.screen import solve_seen
 from psd_deflection.discovery.signatures import SignatureBank
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.errors import RecordingError
-from psd_deflection.recordings.observations import recorded_rig
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.replay_engine import rig_at_end
 from psd_deflection.records import FloatArray, ParameterChange
 from psd_deflection.simulation import loads
 from psd_deflection.simulation.catalogue import effects_of_rig, make_active
@@ -311,7 +311,7 @@ def test_a_zero_taken_while_it_ran_is_part_of_the_rig(tmp_path: Path, monkeypatc
     recording = open_recording(tmp_path / 'run')
     later = ParameterChange(0, 3, (('psd_2.zero', (1e-4, -2e-4)), ('environment.temperature', 22.0)))
     monkeypatch.setattr(recording, 'changes', [later])
-    assert recorded_rig(recording).zeros.tolist() == [[0.0, 0.0], [1e-4, -2e-4]]
+    assert rig_at_end(recording).zeros.tolist() == [[0.0, 0.0], [1e-4, -2e-4]]
 
 
 def test_a_bag_and_a_csv_of_one_run_give_one_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

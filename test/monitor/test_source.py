@@ -8,23 +8,23 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.monitor.feed import BlockResult, Feed
 from psd_deflection.monitor.source import RefusedError, ReplaySource
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.replay_engine import replayed, rig_at_start
 from psd_deflection.records import Record
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
 
 
 def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event) -> ReplaySource:
-    rig = rig_of(open_recording(BAGS / name), None)
+    rig = rig_at_start(open_recording(BAGS / name))
 
     def open_steps() -> tuple[Pipeline, Iterator[list[Record]]]:
         recording = open_recording(BAGS / name)
         pipeline = Pipeline(rig)
-        return pipeline, replayed(recording, pipeline, recording.blocks())
+        return pipeline, replayed(recording, pipeline)
 
     def say(text: str) -> None:
         said.append(text)

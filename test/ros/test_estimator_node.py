@@ -93,7 +93,8 @@ def test_what_is_published_and_how_often(start: Callable[..., Any], peer: Any) -
     assert set(causes) <= {'lost: dropped by the device'}
     assert int(values['lost']) == sum(causes.values())
     missing = int((blocks - 1).sum())
-    assert int(values['lost']) >= 10 * missing, 'a block is left out if half of its 20 samples are lost'
+    # A block is left out if more than half of its 20 samples are lost.
+    assert int(values['lost']) + int(values['dropped by a full queue']) >= 10 * missing
     assert values['bad frames'] == '0'
     assert float(values['rate (samples/s)']) > 0
 
@@ -231,6 +232,10 @@ def test_parameters_have_units_and_ranges_and_are_refused_by_name(start: Callabl
 
     assert not put('sum_min', -1.0).successful
     assert not put('link.length', 2.0).successful
+    # The same words as for a file, with what must fit together as well; then nothing has changed.
+    assert "degraded = 'sideways': must be one of off, hold, zero" in put('degraded', 'sideways').reason
+    assert 'psd_1.zero = [9.0, 0.0] m: must be at least -0.5 and at most 0.5' in put('psd_1.zero', [9.0, 0.0]).reason
+    assert 'sum_min = 9.0 V: must be less than sum_max = 7.5 V' in put('sum_min', 9.0).reason
     # A level above what the lasers give: they count as lost, and the estimates stop.
     assert put('sum_min', 6.0).successful
     health = peer.collect(DiagnosticArray, '/diagnostics')

@@ -25,7 +25,7 @@ from visualization_msgs.msg import MarkerArray  # noqa: E402
 
 from psd_deflection.devices.serial_port import SerialPort  # noqa: E402
 from psd_deflection.errors import ConfigError, DeviceError  # noqa: E402
-from psd_deflection.recordings.opening import open_recording  # noqa: E402
+from psd_deflection.recordings.readers import open_recording  # noqa: E402
 from psd_deflection.ros import estimator  # noqa: E402
 from test.heard import WAIT_S  # noqa: E402
 from test.ros.conftest import PATIENT  # noqa: E402

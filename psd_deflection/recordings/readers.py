@@ -7,7 +7,7 @@ from pathlib import Path
 from psd_deflection.errors import RecordingError
 from psd_deflection.recordings.bag_reader import BagRecording
 from psd_deflection.recordings.csv_reader import CsvRecording
-from psd_deflection.recordings.mcap_records import MAGIC
+from psd_deflection.recordings.mcap_reader import MAGIC
 from psd_deflection.recordings.recording import Recording
 
 

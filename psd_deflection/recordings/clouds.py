@@ -1,15 +1,13 @@
-"""Decodes the messages that a recording is full of, without the generic decoder's cost.
+"""Reads the point clouds that hold the samples, without the generic decoder's cost.
 
-All but the point cloud are a header followed by doubles. The point clouds of one recording differ
-in stamp, width and points alone, so what stands between is parsed once and compared afterwards.
-What does not fit falls back to the generic decoder.
+The clouds of one recording differ in stamp, width and points alone, so what stands between is parsed
+once and compared afterwards. What does not fit is read by the generic decoder.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -22,28 +20,6 @@ from psd_deflection.records import CHANNELS, IntArray
 _LITTLE = b'\x00\x01'
 _STAMP = struct.Struct('<iI')
 _U32 = struct.Struct('<I')
-
-
-@cache
-def _doubles(count: int) -> struct.Struct:
-    return struct.Struct(f'<{count}d')
-
-
-def header_and_doubles(message: bytes, count: int) -> tuple[int, tuple[float, ...]]:
-    """(stamp in ns, the ``count`` doubles after the header) of a little-endian message.
-
-    Raises ValueError where the message is too short or big-endian.
-    """
-    if message[:2] != _LITTLE:
-        raise ValueError('is not little-endian CDR')
-    try:
-        sec, nanosec = _STAMP.unpack_from(message, 4)
-        (length,) = _U32.unpack_from(message, 12)
-        # Alignment counts from the end of the four-byte encapsulation header.
-        at = 4 + (12 + length + 7) // 8 * 8
-        return sec * 1_000_000_000 + nanosec, _doubles(count).unpack_from(message, at)
-    except struct.error:
-        raise ValueError('is shorter than its type') from None
 
 
 class _Layout(NamedTuple):
@@ -78,7 +54,7 @@ class CloudDecoder:
                     return sec * 1_000_000_000 + nanosec, np.frombuffer(message, dtype, width, row_step_at + 8)
                 except (struct.error, ValueError):
                     raise ValueError('is shorter than it declares') from None
-        stamp, points = point_cloud2.to_points(cdr.decode(point_cloud2.TYPE, message))
+        stamp, points = point_cloud2.to_points(cdr.decode(point_cloud2.MESSAGE.name, message))
         if message[:2] == _LITTLE and len(self._layouts) < self._MOST:
             self._layouts.append(_learn(message, points.dtype))
         return stamp, points

@@ -11,13 +11,11 @@ import contextlib
 import fcntl
 import os
 import re
-import struct
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
-from typing import Any, NamedTuple
 
 import yaml
+from mcap.records import Channel, McapRecord, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from psd_deflection import __version__
@@ -32,50 +30,9 @@ from psd_deflection.recordings.bag_metadata import (
 )
 from psd_deflection.recordings.bag_reader import read_information
 from psd_deflection.recordings.bag_writer import CHUNK_NS, CUSTOM
-from psd_deflection.recordings.mcap_records import (
-    CHANNEL,
-    CHUNK,
-    DATA_END,
-    MAGIC,
-    MESSAGE,
-    METADATA,
-    SCHEMA,
-    Cursor,
-    DamagedError,
-    McapSource,
-    unpack_chunk,
-)
-
-_RECORD = struct.Struct('<BQ')
-_MESSAGE_HEAD = struct.Struct('<HIQQ')
+from psd_deflection.recordings.mcap_reader import MAGIC, DamagedError, McapReader
 
 _MAX_QOS_TEXT = 100_000
-
-
-class _Message(NamedTuple):
-    channel: int
-    sequence: int
-    log_time: int
-    publish_time: int
-    body: bytes
-
-
-class _Schema(NamedTuple):
-    name: str
-    encoding: str
-    text: bytes
-
-
-class _Channel(NamedTuple):
-    schema: int
-    topic: str
-    encoding: str
-    metadata: dict[str, str]
-
-
-class _Metadata(NamedTuple):
-    name: str
-    values: dict[str, str]
 
 
 @dataclass(slots=True)
@@ -96,58 +53,6 @@ class Recovered:
     files: list[RecoveredFile]
     metadata_written: bool
     set_aside: list[Path]
-
-
-def _content(
-    source: McapSource,
-) -> Iterator[_Message | _Schema | _Channel | _Metadata | tuple[int, _Schema | _Channel]]:
-    """What lies whole in the file, in its order; schemas and channels with their numbers."""
-    with source.path.open('rb') as stream:
-        for opcode, at, length in source.records(stream):
-            if opcode == DATA_END:
-                return
-            if opcode not in (SCHEMA, CHANNEL, METADATA, CHUNK, MESSAGE):
-                continue
-            stream.seek(at)
-            content = stream.read(length)
-            try:
-                if opcode == CHUNK:
-                    yield from _records_in(unpack_chunk(content))
-                else:
-                    yield _parsed(opcode, content)
-            except DamagedError as error:
-                source.warnings.append(f'{source.path}: the part at byte {at} is damaged ({error}) and is left out')
-
-
-def _records_in(plain: bytes) -> Iterator[Any]:
-    at = 0
-    while at < len(plain):
-        if len(plain) - at < _RECORD.size:
-            raise DamagedError('it ends within a record')
-        opcode, length = _RECORD.unpack_from(plain, at)
-        at += _RECORD.size
-        if length > len(plain) - at:
-            raise DamagedError('a record in it is longer than the chunk')
-        if opcode in (SCHEMA, CHANNEL, MESSAGE):
-            yield _parsed(opcode, plain[at : at + length])
-        at += length
-
-
-def _parsed(opcode: int, content: bytes) -> Any:
-    if opcode == MESSAGE:
-        if len(content) < _MESSAGE_HEAD.size:
-            raise DamagedError('a message has no head')
-        channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(content)
-        return _Message(channel, sequence, log_time, publish_time, content[_MESSAGE_HEAD.size :])
-    cursor = Cursor(content)
-    if opcode == METADATA:
-        return _Metadata(cursor.text(), cursor.mapping())
-    number = cursor.number(2)
-    if opcode == SCHEMA:
-        name, encoding = cursor.text(), cursor.text()
-        return number, _Schema(name, encoding, cursor.take(cursor.number(4)))
-    schema = cursor.number(2)
-    return number, _Channel(schema, cursor.text(), cursor.text(), cursor.mapping())
 
 
 def _qos_of(metadata: dict[str, str]) -> Qos | list[Qos]:
@@ -173,30 +78,29 @@ class _Copy:
         if self._stream is not None:
             self._writer = Writer(self._stream, compression=CompressionType.ZSTD, enable_crcs=True)
             self._writer.start(profile='ros2', library=f'psd_deflection {__version__} recover')
-        self._schemas: dict[int, _Schema] = {}
-        self._channels: dict[int, _Channel] = {}
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
         self._numbers: dict[int, int] = {}
-        self._schema_numbers: dict[_Schema, int] = {}
+        self._schema_numbers: dict[tuple[str, str, bytes], int] = {}
         self._first: int | None = None
         self.messages = 0
         self.start = self.end = 0
 
-    def add(self, item: Any) -> None:
-        if isinstance(item, _Metadata):
-            if self._writer is not None and item.name != 'rosbag2':
-                self._writer.add_metadata(item.name, item.values)
-        elif isinstance(item, _Message):
-            self._add_message(item)
-        elif isinstance(item[1], _Schema):
-            self._schemas[item[0]] = item[1]
-        else:
-            self._channels[item[0]] = item[1]
+    def add(self, record: McapRecord) -> None:
+        if isinstance(record, Message):
+            self._add_message(record)
+        elif isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self._channels[record.id] = record
+        elif isinstance(record, Metadata) and self._writer is not None and record.name != 'rosbag2':
+            self._writer.add_metadata(record.name, record.metadata)
 
-    def _add_message(self, m: _Message) -> None:
-        channel = self._channels.get(m.channel)
+    def _add_message(self, m: Message) -> None:
+        channel = self._channels.get(m.channel_id)
         if channel is None:
             raise DamagedError('a message belongs to no channel')
-        schema = self._schemas.get(channel.schema, _Schema('', '', b''))
+        schema = self._schemas.get(channel.schema_id, Schema(0, b'', '', ''))
         topic = self.topics.get(channel.topic)
         if topic is None:
             type_hash = channel.metadata.get('topic_type_hash', '')
@@ -209,17 +113,18 @@ class _Copy:
         writer = self._writer
         if writer is None:
             return
-        if m.channel not in self._numbers:
-            if schema not in self._schema_numbers:
-                self._schema_numbers[schema] = writer.register_schema(schema.name, schema.encoding, schema.text)
-            self._numbers[m.channel] = writer.register_channel(
-                channel.topic, channel.encoding, self._schema_numbers[schema], channel.metadata
+        if m.channel_id not in self._numbers:
+            key = (schema.name, schema.encoding, schema.data)
+            if key not in self._schema_numbers:
+                self._schema_numbers[key] = writer.register_schema(*key)
+            self._numbers[m.channel_id] = writer.register_channel(
+                channel.topic, channel.message_encoding, self._schema_numbers[key], channel.metadata
             )
         if self._first is not None and abs(m.log_time - self._first) >= CHUNK_NS:
             writer.flush()
             self._first = None
         self._first = m.log_time if self._first is None else self._first
-        writer.add_message(self._numbers[m.channel], m.log_time, m.body, m.publish_time, m.sequence)
+        writer.add_message(self._numbers[m.channel_id], m.log_time, m.data, m.publish_time, m.sequence)
 
     def finish(self) -> None:
         if self._writer is None or self._stream is None:
@@ -235,7 +140,7 @@ class _Copy:
 
 
 def _recover_file(path: Path) -> RecoveredFile:
-    source = McapSource(path)
+    source = McapReader(path)
     if path.stat().st_size <= len(MAGIC):
         return RecoveredFile(path, False, FileCount(path.name, 0, 0, 0), [], [*source.warnings])
     cut = source.cut_at is not None
@@ -243,9 +148,9 @@ def _recover_file(path: Path) -> RecoveredFile:
     partial.unlink(missing_ok=True)
     copy = _Copy(partial if cut else None)
     try:
-        for item in _content(source):
+        for record in source.contents():
             try:
-                copy.add(item)
+                copy.add(record)
             except DamagedError as error:
                 source.warnings.append(f'{path}: {error}; it is left out')
         copy.finish()
