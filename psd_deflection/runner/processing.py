@@ -16,7 +16,7 @@ from typing import Protocol, TypeVar
 
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import Record
-from psd_deflection.runner.acquisition import Acquisition, Chunk, Restarted
+from psd_deflection.runner.acquisition import Acquisition, Arrival, Restarted
 
 T = TypeVar('T')
 
@@ -159,7 +159,7 @@ class Processing:
                 except queue.Empty:
                     self._carry_out()
                     continue
-                if isinstance(item, Chunk):
+                if isinstance(item, Arrival):
                     self._heard_ns = item.read_ns
                     if self.give(self.pipeline.process(item.raw)):
                         self._latencies.append((time.monotonic_ns() - item.read_ns) / 1e9)

@@ -21,7 +21,7 @@ from psd_deflection.runner.fanout import Fanout
 from psd_deflection.runner.processing import Processing
 from psd_deflection.runner.realtime import lock_memory
 from psd_deflection.runner.recorder import Recorder
-from psd_deflection.runner.simulated_rig import SimulatedRigProcess
+from psd_deflection.runner.simulated_rig import SimulatedRigProcess, simulates
 from psd_deflection.runner.zero_store import ZEROS, ZeroStore
 
 HUNG_S = 5.0
@@ -32,9 +32,6 @@ SILENT_S = 5.0
 
 JOIN_S = 0.5
 """How long the last blocks may take at the end."""
-
-SIMULATED = ('serial', 'dataq', 'thorlabs', 'lines')
-"""Sources for which a simulated rig is started where no port is named."""
 
 
 def zero_text(rig: Rig) -> str:
@@ -63,7 +60,7 @@ class Session:
         say = self._tell
         # The geometry first: a rig that cannot be solved must not open a port.
         pipeline = Pipeline(rig)
-        if not rig.acquisition.port and rig.acquisition.source in SIMULATED:
+        if simulates(rig.values):
             self._simulated = SimulatedRigProcess(rig)
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)
