@@ -241,14 +241,14 @@ PARAMETERS: tuple[Parameter, ...] = (
         'string',
         'serial',
         '',
-        'what the device speaks: serial (our own frames), dataq, thorlabs, lines, replay, or the name of a plug-in',
+        'what the device speaks: serial for our own frames; `psd-deflection devices --help` lists the others',
     ),
     Parameter(
         'port',
         'string',
         '',
         '',
-        'serial port (two with a comma between for thorlabs, a recording for replay); empty starts the simulated rig',
+        'serial port (several with a comma between, if the device has them) or recording; empty starts the simulated rig',
     ),
     Parameter(
         'baud', 'integer', 921_600, 'baud', 'line speed (USB-CDC devices ignore it)', minimum=1200, maximum=12_000_000

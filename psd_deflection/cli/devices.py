@@ -70,7 +70,7 @@ def epilog(devices: Sequence[Device]) -> str:
     for device in devices:
         remark = '' if device.probe is not None else ' (not asked for)'
         lines.append(f'  {device.name:{width}}  {device.help}{remark}')
-    return '\n'.join(['what source: takes, and what the ports are asked for:', *lines])
+    return '\n'.join(['what source: may say, and which devices the ports are asked for:', *lines])
 
 
 def parameter_lines(values: dict[str, object]) -> str:

@@ -26,7 +26,7 @@ from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.config import read_parameter_file, replace_values, rig_from_values
 from psd_deflection.errors import UsageError
 from psd_deflection.monitor.feed import Feed
-from psd_deflection.monitor.source import ReplaySource
+from psd_deflection.monitor.shown import ShownRecording
 from psd_deflection.monitor.start import need_server, start_monitor
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.opening import open_recording
@@ -125,16 +125,16 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
         if server is not None:
             server.tell(text)
 
-    source = ReplaySource(str(args.recording), open_steps, feed, say, speed=args.speed, loop=args.loop)
-    server = MonitorServer(source, feed, rig.monitor, display.say)
+    shown = ShownRecording(str(args.recording), open_steps, feed, say, speed=args.speed, loop=args.loop)
+    server = MonitorServer(shown, feed, rig.monitor, display.say)
     server.start()
     try:
-        source.start()
-        while not stop.wait(0.1) and source.failed is None:
+        shown.start()
+        while not stop.wait(0.1) and shown.failed is None:
             pass
     finally:
-        source.close()
+        shown.close()
         server.close()
-    if source.failed is not None:
-        raise source.failed
+    if shown.failed is not None:
+        raise shown.failed
     return 0

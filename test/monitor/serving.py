@@ -10,7 +10,7 @@ import numpy as np
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.monitor.server import MonitorServer
-from psd_deflection.monitor.source import RefusedError
+from psd_deflection.monitor.shown import RefusedError
 from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
