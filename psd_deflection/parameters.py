@@ -248,7 +248,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         'string',
         '',
         '',
-        'serial port (several with a comma between, if the device has them) or recording; empty starts the simulated rig',
+        'serial port (two with a comma between, if the device has two) or recording; empty starts the simulated rig',
     ),
     Parameter(
         'baud', 'integer', 921_600, 'baud', 'line speed (USB-CDC devices ignore it)', minimum=1200, maximum=12_000_000
