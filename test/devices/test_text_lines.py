@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from psd_deflection.config import load_rig
@@ -76,7 +76,12 @@ def test_lines_come_out_however_the_stream_was_cut(cuts: list[int]) -> None:
 ALMOST = st.text('0123456789,.-+*#{} \r\n', max_size=60).map(str.encode)
 
 
-@given(st.lists(st.binary(max_size=100) | ALMOST | st.just(b'\n3,4,1,2,3,4,5,6\n'), max_size=10))
+FIELDS = st.lists(st.sampled_from(['7', '-2', '.5', '1e3', 'x', '']), min_size=6, max_size=10)
+
+
+@given(st.lists(st.binary(max_size=100) | ALMOST | FIELDS.map(lambda f: f'\n{",".join(f)}\n'.encode()), max_size=10))
+@example([b'\n3,4,1,2,3,4,5,6\n'])
+@example([b'\n3,4,1,2,3,4,5\n', b'\n3,4,1,2,3,4,5,6,7\n'])
 def test_garbage_makes_up_no_sample_and_what_follows_is_read(pieces: list[bytes]) -> None:
     decoder = LineDecoder()
     lines = [i for piece in pieces for i in decoder.feed(piece) if isinstance(i, Line)]
