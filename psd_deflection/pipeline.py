@@ -23,6 +23,7 @@ from psd_deflection.averaging import BlockCutter, block_middle_ns, covariance
 from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_variances
 from psd_deflection.calibration.health import OpticsHealth, Verdict
 from psd_deflection.config import Rig, replace_values
+from psd_deflection.correction import Correction
 from psd_deflection.mechanics import LinkStatics
 from psd_deflection.records import (
     ENVIRONMENT,
@@ -36,7 +37,6 @@ from psd_deflection.records import (
     SpotMeans,
     TipLoad,
 )
-from psd_deflection.simulation.correction import Correction
 from psd_deflection.solvers import solver_from_rig
 from psd_deflection.solvers.from_rig import geometry_from_rig
 from psd_deflection.solvers.interface import SolverStatus
@@ -178,17 +178,25 @@ class Pipeline:
         if values:
             self._build(replace_values(self.rig, values, 'change'))
 
-    def memory(self) -> ParameterChange | None:
-        """What the next block depends on beside its samples and the rig, or None where that is nothing."""
-        values: list[tuple[str, float | str | tuple[float, ...]]] = list(self._environment.items())
+    def memory(self, rig: Rig) -> ParameterChange | None:
+        """What the next block depends on beside its samples and ``rig``, or None if that is nothing.
+
+        ``rig``: as it was before; what was changed since is part of the memory.
+        """
+        changed = {name: value for name, value in self.rig.values.items() if value != rig.values[name]}
+        values: list[tuple[str, float | str | tuple[float, ...]]] = []
+        for name, value in changed.items():
+            values.append((name, tuple(map(float, value)) if isinstance(value, list) else value))
+        values += self._environment.items()
         if self._held is not None and self.rig.estimator.degraded == 'hold':
             values.append((HELD, tuple(self._held)))
         if self._frozen != (0, 0):
             values.append((FROZEN, self._frozen))
-        last = self.last_spots
-        if not values or last is None:
+        if not values:
             return None
-        return ParameterChange(last.t_ns, last.index + 1, tuple(values))
+        last = self.last_spots
+        t_ns, block = (last.t_ns, last.index + 1) if last is not None else (0, 0)
+        return ParameterChange(t_ns, block, tuple(values))
 
     def temperature(self, celsius: float) -> ParameterChange | None:
         """The ambient temperature from the next block on; None where no correction needs it."""
