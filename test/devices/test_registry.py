@@ -28,7 +28,7 @@ def test_the_registry_imports_no_device_and_a_device_no_simulation() -> None:
         'import sys, psd_deflection.devices.registry as registry\n'
         'print([m for m in registry.DEVICES.values() if m in sys.modules], "serial" in sys.modules)\n'
         'for name in registry.DEVICES: registry.find_device(name)\n'
-        'heavy = ("simulation.simulator", "simulation.loads", "simulation.modes", "devices.rig_feed", "devices.serve")\n'
+        'heavy = ("simulation.simulator", "simulation.loads", "simulation.modes", "devices.serve")\n'
         'print([m for m in heavy if "psd_deflection." + m in sys.modules])'
     )
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True, cwd=ROOT)
