@@ -28,7 +28,7 @@ import numpy as np
 
 from bench.campaign.line import hello_of
 from psd_deflection.config import load_rig
-from psd_deflection.devices.simulated_device import PseudoTerminal
+from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.protocol.frames import (
     FrameDecoder,
@@ -42,7 +42,7 @@ from psd_deflection.protocol.frames import (
 )
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import IntArray
-from psd_deflection.runner.acquisition import Acquisition, Chunk
+from psd_deflection.runner.acquisition import Acquisition, Arrival
 from tools.program import PSD_DEFLECTION, Program
 
 SKEW = 30e-6
@@ -259,10 +259,10 @@ def simulated_time(hours: float) -> bool:
             arrival = -(-true_last // MS) * MS + 200_000 + read
             size = 20 * (FRAME.itemsize + 2)
             piece = wire[number * size : (number + 1) * size]
-            acquisition.feed(decoder.feed(piece + (once_a_second if number == 0 else b'')), arrival)  # type: ignore[arg-type]
+            acquisition.feed(decoder.feed(piece + (once_a_second if number == 0 else b'')), arrival)
             while not acquisition.queue.empty():
                 item = acquisition.queue.get()
-                if isinstance(item, Chunk):
+                if isinstance(item, Arrival):
                     blocks += 1
                     present += len(item.raw.seq)
                     for _ in pipeline.process(item.raw):

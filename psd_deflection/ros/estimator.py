@@ -36,7 +36,7 @@ from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.names import RECORD, ZERO
 from psd_deflection.ros.parameters import LiveParameters, rig_of_node
 from psd_deflection.ros.wires import InputRecorder, PublisherWire, say_on_rosout
-from psd_deflection.runner.health import STALE, HealthReporter
+from psd_deflection.runner.diagnostics import STALE, HealthReporter
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import Session, why_no_zero, zero_text
 from psd_deflection.runner.signals import Signals, StopRequestedError

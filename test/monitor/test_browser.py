@@ -184,7 +184,7 @@ def test_another_site_cannot_press_the_button_nor_look_on(page: Page, serve: Cal
         events = 's.onopen = () => ok("open"); s.onclose = () => ok("closed");'
         opened = page.later(f'new Promise((ok) => {{ const s = {socket_of}; {events} }})')
         assert opened == 'closed'
-        assert serving.source.zeros == 0
+        assert serving.shown.zeros == 0
     finally:
         server.shutdown()
         thread.join()
@@ -199,7 +199,7 @@ def test_the_token_of_the_printed_address_opens_the_buttons(page: Page, serve: C
     page.until('document.getElementById("zero").disabled === false')
     page.driver.find_element(By.ID, 'zero').click()
     page.until('document.getElementById("notice").textContent.includes("token is missing or wrong")')
-    assert serving.source.zeros == 0
+    assert serving.shown.zeros == 0
     page.driver.find_element(By.ID, 'zero').click()
     page.until('document.getElementById("ask").open')
     page.driver.find_element(By.ID, 'cancel').click()
@@ -208,7 +208,7 @@ def test_the_token_of_the_printed_address_opens_the_buttons(page: Page, serve: C
     page.until('document.getElementById("ask").open')
     page.driver.find_element(By.ID, 'token').send_keys(serving.server.token + Keys.ENTER)
     page.until('document.getElementById("notice").textContent === "unloaded dots taken"')
-    assert serving.source.zeros == 1
+    assert serving.shown.zeros == 1
     assert serving.server.token not in str(page.js('location.href'))
 
 
@@ -278,7 +278,7 @@ def test_the_bands_show_two_standard_deviations(page: Page, serve: Callable[...,
 @pytest.mark.parametrize('width', [390, 844, 1024, 1440])
 def test_nothing_is_cut_off_or_laid_over_its_neighbour(page: Page, serve: Callable[..., Serving], width: int) -> None:
     serving = serve(monitor_control=True)
-    serving.source.recordings.append('recordings/test')
+    serving.shown.recordings.append('recordings/test')
     serving.give(0, 20)
     metrics = {'width': width, 'height': 800, 'deviceScaleFactor': 1, 'mobile': width < 800}
     page.driver.execute_cdp_cmd('Emulation.setDeviceMetricsOverride', metrics)
