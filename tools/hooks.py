@@ -17,7 +17,7 @@ from typing import Any
 
 from psd_deflection import errors
 from psd_deflection.cli.main import COMMANDS, main, make_parser
-from psd_deflection.parameters import PARAMETERS
+from psd_deflection.config import PARAMETERS
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ('psd_deflection', 'msg_adapters')
@@ -160,9 +160,8 @@ def parameter_table() -> str:
     """Every parameter with unit, bounds and default."""
     rows = ['| parameter | default | unit | bounds | |', '|---|---|---|---|---|']
     for p in PARAMETERS:
-        bounds = p.bound_text() or (', '.join(p.choices) if p.choices else '')
         live = ' (may change while running)' if p.live else ''
-        rows.append(f'| `{p.name}` | `{p.default}` | {p.unit} | {bounds} | {p.description}{live} |')
+        rows.append(f'| `{p.name}` | `{p.default}` | {p.unit} | {p.bound_text()} | {p.description}{live} |')
     return '\n'.join(rows)
 
 

@@ -122,21 +122,25 @@ INPUTS: tuple[Input, ...] = (
 INPUT_BY_NAME: Mapping[str, Input] = MappingProxyType({i.parameter.name: i for i in INPUTS})
 
 
-def read_inputs(path: str | Path | None = None, settings: Mapping[str, object] | None = None) -> dict[str, float]:
+def read_inputs(
+    path: str | Path | None = None, settings: Mapping[str, object] | None = None, source: str = 'settings'
+) -> dict[str, float]:
     """All inputs: the defaults, under those of a YAML file (``name: value`` lines), under ``settings``.
+
+    ``source``: where ``settings`` come from, for messages.
 
     Raises ConfigError naming the source, the input, the value and the bound.
     """
     values = {i.parameter.name: float(i.parameter.default) for i in INPUTS}
-    for source, given in ((str(path), _read(Path(path)) if path is not None else {}), ('--set', settings or {})):
+    for place, given in ((str(path), _read(Path(path)) if path is not None else {}), (source, settings or {})):
         for name, value in given.items():
             found = INPUT_BY_NAME.get(str(name))
             if found is None:
                 hint = did_you_mean(str(name), INPUT_BY_NAME)
                 raise ConfigError(
-                    f'{source}: {name} = {value!r}: no such input{hint} (`psd-deflection budget --explain` has all)'
+                    f'{place}: {name} = {value!r}: no such input{hint} (`psd-deflection budget --explain` has all)'
                 )
-            values[str(name)] = cast(float, check_value(found.parameter, value, source))
+            values[str(name)] = cast(float, check_value(found.parameter, value, place))
     return values
 
 

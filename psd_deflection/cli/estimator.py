@@ -27,7 +27,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from psd_deflection.cli._options import given_as_option
+from psd_deflection.cli._options import given_as_option, given_parameters, parameter_option
 from psd_deflection.cli._program import program
 from psd_deflection.config import Rig, read_parameter_file, rig_from_values
 from psd_deflection.devices.registry import source_names
@@ -37,7 +37,7 @@ from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import SIMULATED, Session
 from psd_deflection.runner.signals import Signals, StopRequestedError
 from psd_deflection.runner.simulated_rig import started_early
-from psd_deflection.solvers import SOLVERS
+from psd_deflection.solvers.registry import SOLVERS, check_live
 
 REFRESH_S = 0.25
 PLAIN_REFRESH_S = 5.0
@@ -47,18 +47,19 @@ LOOK_S = 0.1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('--port', help='serial port of the device; without it a simulated rig is started')
+    parameter_option(parser, '--port', 'port')
     parser.add_argument(
         '--source', help='what the device speaks: serial (our own frames), dataq, thorlabs, lines, replay'
     )
-    parser.add_argument('--baud', type=int, help='line speed (default 921600; USB-CDC devices ignore it)')
+    parameter_option(parser, '--baud', 'baud')
     parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig')
     parser.add_argument(
         '--record', nargs='?', const='', metavar='FOLDER', help='record from the start, below FOLDER (recordings/)'
     )
     parser.add_argument(
         '--solver',
-        choices=tuple(SOLVERS),
+        type=_live_solver,
+        choices=[name for name, entry in SOLVERS.items() if not entry.instead],
         metavar='NAME',
         help='solver whose answer is published as /link_tip/deflection (default exact)',
     )
@@ -67,25 +68,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--ros-args', action='store_true', help='what follows is for ROS (ros2 run, ros2 launch)')
 
 
+def _live_solver(name: str) -> str:
+    with given_as_option('solver'):
+        check_live(name)
+    return name
+
+
 def overrides_of(args: argparse.Namespace) -> dict[str, object]:
     """The parameters that the arguments give; the file's values below the single ones."""
-    values: dict[str, object] = {}
-    if args.port is not None:
-        values['port'] = args.port
-    if args.source is not None:
-        if args.source not in source_names():
-            raise UsageError(f'--source {args.source}: must be one of {", ".join(source_names())}')
-        values['source'] = args.source
-    if args.baud is not None:
-        values['baud'] = args.baud
-    if args.solver is not None:
-        values['solver'] = args.solver
-    if args.record is not None:
-        values['record'] = True
-        if args.record:
-            values['bag_dir'] = args.record
-    if args.monitor:
-        values['monitor'] = True
+    values = given_parameters(args)
+    if args.source is not None and args.source not in source_names():
+        raise UsageError(f'--source {args.source}: must be one of {", ".join(source_names())}')
     with given_as_option():
         rig_from_values(values, 'command line')
     if args.params_file:
@@ -157,7 +150,7 @@ def live_line(session: Session, rate: float) -> str:
         # An old estimate beside a device that sends nothing would look like a new one.
         body = 'no samples: the device is away' if session.acquisition.away else 'no samples come'
     elif estimate is not None:
-        sd = [math.sqrt(estimate.covariance[i]) for i in (0, 4, 8)]
+        sd = [math.sqrt(v) for v in estimate.variances]
         mdeg = 1e3 * 180.0 / math.pi
         body = (
             f'ΔX {estimate.dx * 1e6:+9.2f} ± {sd[0] * 1e6:.2f} µm  '

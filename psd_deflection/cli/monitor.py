@@ -22,7 +22,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-from psd_deflection.cli._options import given_as_option, refuse
+from psd_deflection.cli._options import given_as_option, given_parameters, parameter_option, refuse
 from psd_deflection.cli._program import program
 from psd_deflection.cli.estimator import Display, run_without_ros, simulates
 from psd_deflection.config import read_parameter_file, replace_values, rig_from_values
@@ -43,37 +43,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('recording', nargs='?', metavar='REC', help='a bag folder, an .mcap or a .csv to play')
     parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig')
     page = parser.add_argument_group('the page')
-    page.add_argument('--http-port', type=int, metavar='N', help='port of the page (default 8790; 0: any free one)')
-    page.add_argument('--address', help='address to serve on (default 127.0.0.1; 0.0.0.0 shows it to the network)')
-    page.add_argument('--control', action='store_true', help='let the page take the zero and record')
+    parameter_option(page, '--http-port', 'monitor_port')
+    parameter_option(page, '--address', 'monitor_address')
+    page.add_argument(
+        '--control', dest='monitor_control', action='store_true', help='let the page take the zero and record'
+    )
     live = parser.add_argument_group('the rig (without REC)')
-    live.add_argument('--port', help='serial port of the device; without it a simulated rig is started')
-    live.add_argument('--baud', type=int, help='line speed (default 921600)')
+    parameter_option(live, '--port', 'port')
+    parameter_option(live, '--baud', 'baud')
     live.add_argument(
         '--record', nargs='?', const='', metavar='FOLDER', help='record from the start, below FOLDER (recordings/)'
     )
     play = parser.add_argument_group('a recording (with REC)')
     play.add_argument('--speed', type=float, default=1.0, metavar='X', help='times as fast as recorded (default 1)')
     play.add_argument('--loop', action='store_true', help='start anew at its end')
-
-
-def overrides_of(args: argparse.Namespace) -> dict[str, object]:
-    """The parameters that the arguments give."""
-    values: dict[str, object] = {'monitor': True}
-    if args.http_port is not None:
-        values['monitor_port'] = args.http_port
-    if args.address is not None:
-        values['monitor_address'] = args.address
-    if args.control:
-        values['monitor_control'] = True
-    for name in ('port', 'baud'):
-        if getattr(args, name) is not None:
-            values[name] = getattr(args, name)
-    if args.record is not None:
-        values['record'] = True
-        if args.record:
-            values['bag_dir'] = args.record
-    return values
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -89,7 +72,7 @@ def _check(args: argparse.Namespace) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     _check(args)
-    overrides = overrides_of(args)
+    overrides = {'monitor': True, **given_parameters(args)}
     with given_as_option():
         rig_from_values(overrides, 'command line')
     need_server()

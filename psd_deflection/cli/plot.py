@@ -92,9 +92,7 @@ class Drawn:
                     rows.append((before + k * step, *nothing, *(np.nan,) * 7, 0.0))
             index = s.index
             e = self.estimates.get(s.index)
-            pose = (
-                nothing if e is None else (e.dx, e.dy, e.theta, *(max(e.covariance[i], 0.0) ** 0.5 for i in (0, 4, 8)))
-            )
+            pose = nothing if e is None else (*e.pose, *(max(v, 0.0) ** 0.5 for v in e.variances))
             lost = self._lost(s)
             unfinished = s.status is BlockStatus.TOO_FEW_SAMPLES and lost == 0
             rows.append(((s.t_ns - start) / 1e9, *pose, *s.dots, *s.sums, float(lost), float(unfinished)))

@@ -53,7 +53,7 @@ class Replay(Source):
         self.name = rig.acquisition.port
         if not self.name:
             raise ConfigError("source = replay: port = '': name the recording (a bag folder, an .mcap or a .csv)")
-        self._stamps = str(rig.values['replay.stamps'])
+        self._stamps = rig.acquisition.replay_stamps
         self._rate = rig.converter.sample_rate_hz
         self._block_size = rig.estimator.block_size
         self.clock = Clock.RECORDED if self._stamps == 'recorded' else Clock.HOST

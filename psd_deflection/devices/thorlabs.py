@@ -58,7 +58,7 @@ class ThorlabsPair(Source):
         self._rate = rig.converter.sample_rate_hz
         self._period_ns = round(SECOND_NS / self._rate)
         # Two drivers of other people found x to come with its sign turned; a parameter says it here.
-        self._x_sign = float(rig.values['thorlabs.x_sign'])  # type: ignore[arg-type]
+        self._x_sign = rig.acquisition.thorlabs_x_sign
         if abs(self._x_sign) != 1.0:
             raise ConfigError(f'thorlabs.x_sign = {self._x_sign:g}: must be 1 or -1')
         self._ports: list[SerialPort] = []

@@ -152,9 +152,8 @@ class CsvEstimateSink(_CsvFile):
         if primary is None:
             cells += [''] * 6
         else:
-            variances = [primary.covariance[i] for i in (0, 4, 8)]
-            deviations = [math.sqrt(v) if v >= 0.0 else math.nan for v in variances]
-            cells += map(repr, (primary.dx, primary.dy, primary.theta, *deviations))
+            deviations = [math.sqrt(v) if v >= 0.0 else math.nan for v in primary.variances]
+            cells += map(repr, (*primary.pose, *deviations))
         by_solver = {e.solver: e for e in self._block}
         for solver in self._solvers:
             e = by_solver.get(solver)

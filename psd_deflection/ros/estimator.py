@@ -108,7 +108,7 @@ class EstimatorNode:
         self.node.owner = self
         try:
             self._say = say_on_rosout(self.node, say) if say is not None else self.node.get_logger().info
-            self.rig = rig_of_node(self.node, {})
+            self.rig = rig_of_node(self.node)
             self._live = LiveParameters(self.node)
             self.node.create_service(Trigger, '~/zero', self._zero)
             # In a group of its own: while one request waits for the disk, the node serves everything else.
@@ -185,7 +185,7 @@ class EstimatorNode:
         """Configure and activate, where ``autostart`` says so. Raises what stands in the way."""
         if self.node.get_parameter('use_sim_time').value:
             self._say('use_sim_time is true: what is measured is stamped by the system clock all the same')
-        if not self.rig.values['autostart']:
+        if not self.rig.acquisition.autostart:
             self._say(f'waiting to be configured: ros2 lifecycle set {self.node.get_fully_qualified_name()} configure')
             return
         self._starting = True

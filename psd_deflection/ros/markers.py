@@ -79,7 +79,7 @@ def at_rest(rig: Rig) -> Any:
 def moving(rig: Rig, estimate: DeflectionEstimate | None, spots: SpotMeans, magnify: float) -> Any:
     """The MarkerArray of bent link, plate, detectors and dots; without ``estimate`` all of them are taken away."""
     length = rig.link.length
-    dx, dy, theta = (magnify * v for v in estimate[3:6]) if estimate is not None else (0.0, 0.0, 0.0)
+    dx, dy, theta = (magnify * v for v in estimate.pose) if estimate is not None else (0.0, 0.0, 0.0)
     c, s = math.cos(theta), math.sin(theta)
 
     def placed(x: float, y: float, z: float) -> Vector:

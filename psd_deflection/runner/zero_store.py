@@ -17,12 +17,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.config import Rig, replace_values
+from psd_deflection.config import BY_NAME, ZEROS, Rig, replace_values
 from psd_deflection.errors import ConfigError
 from psd_deflection.files import replace_file
-from psd_deflection.parameters import BY_NAME, check_value
+from psd_deflection.parameters import check_value
 
-ZEROS = ('psd_1.zero', 'psd_2.zero')
 MAX_BYTES = 10_000
 
 

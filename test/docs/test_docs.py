@@ -257,7 +257,7 @@ def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[s
     assert as_path <= set(values)
     # What is left is numbers and words: a new kind of value is to be put here or among the paths.
     assert {str(values[name]) for name in set(values) - as_path} == {
-        'ADDRESS', 'BAUD', 'EFFECT', 'M', 'N', 'NAME=VALUE', 'NAME,KEY=VALUE,...', 'PPM', 'SEED', 'SOURCE',
+        'ADDRESS', 'EFFECT', 'M', 'N', 'NAME=VALUE', 'NAME,KEY=VALUE,...', 'PPM', 'SEED', 'SOURCE',
         'T0[,T1...]', 'WORDS', 'X', "('FX', 'FY', 'TZ')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
     }  # fmt: skip
 

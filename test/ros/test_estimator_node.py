@@ -226,6 +226,10 @@ def test_parameters_have_units_and_ranges_and_are_refused_by_name(start: Callabl
 
     assert not put('sum_min', -1.0).successful
     assert not put('link.length', 2.0).successful
+    # The same words as for a file, with what must fit together as well; then nothing has changed.
+    assert "degraded = 'sideways': must be one of off, hold, zero" in put('degraded', 'sideways').reason
+    assert 'psd_1.zero = [9.0, 0.0] m: must be at least -0.5 and at most 0.5' in put('psd_1.zero', [9.0, 0.0]).reason
+    assert 'sum_min = 9.0 V: must be less than sum_max = 7.5 V' in put('sum_min', 9.0).reason
     # A level above what the lasers give: they count as lost, and the estimates stop.
     assert put('sum_min', 6.0).successful
     health = peer.collect(DiagnosticArray, '/diagnostics')
@@ -302,6 +306,7 @@ def test_signals_end_it_and_leave_a_whole_recording(
         ),
         (['--ros-args', '-p', 'amplifier.noise:=-1.0'], 3, 'amplifier.noise = -1.0 V: must be above 0'),
         (['--ros-args', '-p', 'solver:=magic'], 3, 'magic'),
+        (['--ros-args', '-p', 'solver:=appendix_d'], 3, "solver = 'appendix_d': a method as printed"),
         (['--ros-args', '-p', 'solvers:=[]'], 3, 'is an empty list'),
         (
             ['--ros-args', '-p', 'qos_overrides./psd/samples.publisher.reliability:=best_efort'],

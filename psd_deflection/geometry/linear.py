@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._plane import interleave, split
-from psd_deflection.solvers.interface import Geometry, Solution, Solutions, SolverStatus
 
 
-def design_matrix(geometry: Geometry) -> FloatArray:
-    """A (2P, 3): rows x1, y1, x2, y2, ...; columns dX, dY (1) and theta (m/rad). 4.5, 4.6 corrected."""
-    beams = geometry.beams
+def design_matrix(beams: FloatArray) -> FloatArray:
+    """A (2P, 3) of ``beams`` (P, 2) m: rows x1, y1, x2, y2, ...; columns dX, dY (1) and theta (m/rad).
+
+    4.5 and 4.6 corrected.
+    """
     a = np.zeros((2 * len(beams), 3))
     a[0::2, 0] = -1.0
     a[0::2, 2] = beams[:, 1]
@@ -27,12 +27,14 @@ def design_matrix(geometry: Geometry) -> FloatArray:
     return a
 
 
-def gain_matrix(design: FloatArray, row_scaling: FloatArray) -> FloatArray:
+def gain_matrix(design: FloatArray, row_scaling: FloatArray | None = None) -> FloatArray:
     """G (3, 2P) of x = G b: the pseudo-inverse of diag(Po) A, times diag(Po); W = Po^2.
 
-    The angle is scaled by the size of the rig first, so that the inverse does not depend on the
-    unit of length.
+    ``design`` (2P, 3); ``row_scaling`` (2P,): Po, None for ordinary least squares. The angle is scaled by the
+    size of the rig first, so that the inverse does not depend on the unit of length.
     """
+    if row_scaling is None:
+        row_scaling = np.ones(len(design))
     length = float(np.abs(design[:, 2]).max())
     units = np.array([1.0, 1.0, length])
     gain: FloatArray = np.linalg.pinv(row_scaling[:, None] * design / units) * row_scaling / units[:, None]
@@ -74,7 +76,7 @@ def error_bound(
 
     ``pose`` (3,) as solved with ``design`` (2P, 3). The true matrix is off by at most ``design_error``
     (2P, 3) and the readings, with all that the linear model lacks, by at most ``reading_error`` (2P,)
-    m, entry by entry. ``row_scaling`` (2P,): Po, where the answer is a weighted one. Infinite where
+    m, entry by entry. ``row_scaling`` (2P,): Po, if the answer is a weighted one. Infinite if
     errors of that size could hide the pose altogether.
 
     Replaces 4.33 and 4.34. Those add metres to radians in one norm, so that the number depends on the
@@ -87,65 +89,10 @@ def error_bound(
 
     where E >= |dA|, e >= |db|, in magnitudes, and nothing is neglected.
     """
-    scale = np.ones(len(design)) if row_scaling is None else np.asarray(row_scaling, dtype=np.float64)
-    gain = np.abs(gain_matrix(design, scale))
+    gain = np.abs(gain_matrix(design, row_scaling))
     e_a = np.abs(design_error)
     k = gain @ e_a
     if np.abs(np.linalg.eigvals(k)).max() >= 1.0:
         return np.full(3, np.inf)
     bound: FloatArray = np.linalg.solve(np.eye(3) - k, gain @ (np.abs(reading_error) + e_a @ np.abs(pose)))
     return bound
-
-
-class FixedGain:
-    """x = G (m - m_0) for a gain that does not depend on the noise; covariance G V G^T."""
-
-    def __init__(self, design: FloatArray, zeros: FloatArray, row_scaling: FloatArray) -> None:
-        """``design`` (2P, 3); ``zeros`` (P, 2) m, subtracted first; ``row_scaling`` (2P,)."""
-        self.design = design
-        self.gain = gain_matrix(design, row_scaling)
-        self._zeros = zeros.ravel()
-        self._columns = tuple(
-            (zero, *gain, *row)
-            for zero, gain, row in zip(self._zeros.tolist(), self.gain.T.tolist(), design.tolist(), strict=True)
-        )
-
-    def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
-        """One block, pure floats."""
-        dx = dy = theta = vxx = vxy = vxt = vyy = vyt = vtt = 0.0
-        for m, v, (zero, x, y, t, _, _, _) in zip(dots, variances, self._columns, strict=True):
-            b = m - zero
-            dx += x * b
-            dy += y * b
-            theta += t * b
-            xv = x * v
-            yv = y * v
-            vxx += xv * x
-            vxy += xv * y
-            vxt += xv * t
-            vyy += yv * y
-            vyt += yv * t
-            vtt += t * v * t
-        residual = tuple(
-            [
-                m - zero - ax * dx - ay * dy - at * theta
-                for m, (zero, _, _, _, ax, ay, at) in zip(dots, self._columns, strict=True)
-            ]
-        )
-        status = SolverStatus.OK if theta - theta == 0.0 else SolverStatus.NOT_CONVERGED
-        covariance = (vxx, vxy, vxt, vxy, vyy, vyt, vxt, vyt, vtt)
-        return Solution(dx, dy, theta, 0.0, 0.0, covariance, residual, status, 0)
-
-    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks."""
-        x, y, vx, vy = split(dots, variances)
-        b = interleave(x, y) - self._zeros
-        v = interleave(np.broadcast_to(vx, x.shape), np.broadcast_to(vy, x.shape))
-        pose = b @ self.gain.T
-        covariance = np.einsum('ij,nj,kj->nik', self.gain, v, self.gain)
-        return Solutions(pose, np.zeros((len(b), 2)), covariance, b - pose @ self.design.T, status_of(pose))
-
-
-def status_of(pose: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.int8]]:
-    """OK where the pose (n, 3) is finite, int8 (n,)."""
-    return np.where(np.isfinite(pose).all(axis=1), SolverStatus.OK, SolverStatus.NOT_CONVERGED).astype(np.int8)

@@ -1,7 +1,7 @@
 """Which sensor placement conditions the measurement best, and by how much.
 
-At rest the dots move by A (dX, dY, theta), A of rows [-1, 0, c_y], [0, -1, -c_x] (``dots``). For
-readings of equal deviation sigma and two PSDs at c1, c2 with midpoint m and distance b = |c1 - c2|::
+At rest the dots move by A (dX, dY, theta), A the design matrix (``linear``). For readings of equal
+deviation sigma and two PSDs at c1, c2 with midpoint m and distance b = |c1 - c2|::
 
     var theta = 2 sigma^2/b^2
     var dX    = sigma^2/2 + m_y^2 var theta       var dY = sigma^2/2 + m_x^2 var theta
@@ -23,46 +23,11 @@ from typing import NamedTuple
 import numpy as np
 
 from psd_deflection.errors import ConfigError
-from psd_deflection.mechanics.dots import plate_jacobian, plate_points, tie_matrix
+from psd_deflection.geometry.plate import crossings, tie_matrix, tied_pose
 from psd_deflection.records import FloatArray
 
 SCALE = 0.1
-"""m: the length by which theta is scaled where a condition number or a single cost is formed."""
-
-
-def design_matrix(centers: FloatArray) -> FloatArray:
-    """A (2P, 3): what (dX, dY, theta) do to (x1, y1, x2, y2, ...) at rest; ``centers`` (P, 2) m."""
-    out: FloatArray = plate_jacobian(np.zeros(5), centers, np.zeros(len(centers)))[..., :3].reshape(-1, 3)
-    return out
-
-
-def gain_matrix(design: FloatArray, row_scaling: FloatArray | None = None) -> FloatArray:
-    """(3, 2P): readings to (dX, dY, theta) by least squares; ``row_scaling`` multiplies A's and b's rows.
-
-    The thesis's Po; the statistical weights are its squares.
-    """
-    scaling = np.ones(len(design)) if row_scaling is None else np.asarray(row_scaling, dtype=np.float64)
-    return np.asarray(np.linalg.pinv(scaling[:, None] * design) * scaling)
-
-
-class Condition(NamedTuple):
-    """Norms of one design matrix: 2-norm condition, Frobenius condition (>= 3 here), ||A||_F, ||A+||_F."""
-
-    two: float
-    frobenius: float
-    norm: float
-    norm_inverse: float
-
-
-def condition(design: FloatArray, angle_length: float = SCALE) -> Condition:
-    """The condition of A with theta counted as the way of a point ``angle_length`` (m) out.
-
-    The same number says what the "units" of A were: 1e-3 is the thesis's mm and rad (Frobenius
-    149.5 for its placement), 1 is m and rad (23.3), 0.1 is this module's (3.95).
-    """
-    scaled = design * np.array([1.0, 1.0, 1.0 / angle_length])
-    norm, norm_inverse = float(np.linalg.norm(scaled)), float(np.linalg.norm(np.linalg.pinv(scaled)))
-    return Condition(float(np.linalg.cond(scaled)), norm * norm_inverse, norm, norm_inverse)
+"""m: the length by which theta is scaled when a condition number or a single cost is formed."""
 
 
 class Spread(NamedTuple):
@@ -73,15 +38,11 @@ class Spread(NamedTuple):
     theta: float
 
 
-def spread(centers: FloatArray, sigma: float) -> Spread:
-    """Of (dX, dY, theta) at rest for readings of equal deviation ``sigma`` (m), by the normal equations."""
-    design = design_matrix(centers)
-    deviations = sigma * np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
-    return Spread(*deviations.tolist())
-
-
 def spread_of_pair(centers: FloatArray, sigma: float) -> Spread:
-    """The same for two PSDs in closed form (module docstring)."""
+    """Of (dX, dY, theta) at rest for two PSDs whose readings have equal deviation ``sigma`` (m).
+
+    The closed form of the module's text.
+    """
     distance = math.hypot(*(centers[0] - centers[1]))
     middle_x, middle_y = (centers[0] + centers[1]) / 2.0
     theta = math.sqrt(2.0) * sigma / distance
@@ -90,24 +51,6 @@ def spread_of_pair(centers: FloatArray, sigma: float) -> Spread:
         math.hypot(sigma / math.sqrt(2.0), middle_x * theta),
         theta,
     )
-
-
-def error_bound(
-    design: FloatArray,
-    design_error: FloatArray,
-    readings_error: FloatArray,
-    answer: FloatArray,
-    order: int | None = None,
-) -> float:
-    """Bound on the norm of an answer's error, ||A+|| (||db|| + ||dA|| ||x||) (4.33).
-
-    ``order`` None: Frobenius norms of the matrices; 2: spectral. Its two flaws: the answer's norm
-    mixes lengths and angle, so say in which units A is; and it holds only where A x = b is
-    consistent. At 50 N it allows a thousand times what happens.
-    """
-    inverse = np.linalg.norm(np.linalg.pinv(design), order)
-    change = np.linalg.norm(design_error, order)
-    return float(inverse * (np.linalg.norm(readings_error) + change * np.linalg.norm(answer)))
 
 
 def opposite(radius: float, azimuth: float = math.pi / 2.0) -> FloatArray:
@@ -128,8 +71,7 @@ def pose_spread(pose: FloatArray, centers: FloatArray, heights: FloatArray, sigm
     What the readings do not determine is infinite: both tilts at rest, and always one of the five
     for two PSDs.
     """
-    points = plate_points(pose, centers, heights)
-    jacobian = plate_jacobian(pose, points, heights).reshape(-1, 5)
+    jacobian = crossings(pose, centers, heights)[1].reshape(-1, 5)
     return _deviations(jacobian, sigma)
 
 
@@ -140,9 +82,8 @@ def slope_ratio_spread(
 
     ``pose`` (3,): dX, dY, theta; it must be deflected, for at rest k does nothing.
     """
-    full = np.concatenate([pose, slope_ratio / link_length * np.array([-pose[1], pose[0]])])
-    points = plate_points(full, centers, heights)
-    jacobian = plate_jacobian(full, points, heights).reshape(-1, 5)
+    full = tied_pose(pose, slope_ratio, link_length)
+    jacobian = crossings(full, centers, heights)[1].reshape(-1, 5)
     tie = np.zeros((5, 4))
     tie[:, :3] = tie_matrix(slope_ratio, link_length)
     tie[3, 3], tie[4, 3] = -pose[1] / link_length, pose[0] / link_length
@@ -176,16 +117,14 @@ class Room:
 
     def __post_init__(self) -> None:
         if not self.radius > 0.0 or not math.isfinite(self.radius):
-            raise ConfigError(f'--radius = {self.radius} m: must be above 0')
+            raise ConfigError(f'radius = {self.radius} m: must be above 0')
         if not 0.0 <= self.keep_out <= self.radius:
-            raise ConfigError(
-                f'--keep-out = {self.keep_out} m: must be at least 0 and at most --radius = {self.radius} m'
-            )
+            raise ConfigError(f'keep_out = {self.keep_out} m: must be at least 0 and at most radius = {self.radius} m')
         if self.box is not None:
             x_min, y_min, x_max, y_max = self.box
             if not (x_min < x_max and y_min < y_max):
                 raise ConfigError(
-                    f'--box = {self.box} m: must be X_MIN Y_MIN X_MAX Y_MAX, each minimum below its maximum'
+                    f'box = {self.box} m: must be x_min, y_min, x_max, y_max, each minimum below its maximum'
                 )
 
     def holds(self, points: FloatArray) -> FloatArray:
@@ -232,7 +171,10 @@ def best_pair(room: Room) -> FloatArray:
     """
     points = room.candidates()
     if len(points) < 2:
-        raise ConfigError('no room for two sensors inside --radius, --keep-out and --box: widen one of them')
+        raise ConfigError(
+            f'radius = {room.radius} m, keep_out = {room.keep_out} m, box = {room.box} m: no room for two sensors: '
+            'widen one of them'
+        )
     costs = np.stack([_pair_costs(p, points) for p in points])
     i, j = np.unravel_index(int(np.argmin(costs)), costs.shape)
     best, least = np.stack([points[i], points[j]]), float(costs[i, j])

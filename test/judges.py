@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
-from psd_deflection.solvers import Geometry
+from psd_deflection.geometry import Geometry
 
 Array = np.ndarray[Any, Any]
 
@@ -89,13 +88,3 @@ class RayPlane:
             hit = self.cross(laser, -r[:, 2], plane, np.array([0.0, 0.0, 1.0]))
             dots.append(hit[:2] - geometry.centers[i])
         return np.concatenate(dots)
-
-
-@pytest.fixture(scope='session')
-def golden() -> Golden:
-    return Golden(Path(__file__).parent.parent / 'data' / 'golden.json')
-
-
-@pytest.fixture(scope='session')
-def rays() -> RayPlane:
-    return RayPlane()

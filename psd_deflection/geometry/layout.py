@@ -1,14 +1,48 @@
-"""Which geometries can be solved at all; refused here by name, so that no method divides by zero."""
+"""Where the PSDs, the beams and the link are; a layout that cannot be solved is refused by name.
+
+Theory of operation. A dot reading m_i is where laser i falls on PSD i, from the PSD's centre c_i,
+in plate axes. Before load it was m_i0, so the beam stands at l_i = c_i + m_i0, fixed to the base,
+and the plate point under it now is q_i = c_i + m_i.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from psd_deflection.config import Rig
 from psd_deflection.errors import SolverError
-from psd_deflection.solvers.interface import Geometry
+from psd_deflection.records import FloatArray
 
 SMALLEST_BASE_LINE = 1e-6
 """m. Closer beams than a spot's own noise are one beam."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Geometry:
+    """The layout of P PSDs and their beams.
+
+    ``centers`` (P, 2): c_i, m, in ``link_tip``. ``zeros`` (P, 2): m_i0, the dots before load, m.
+    ``heights`` (P,): h_i, the sensitive surface above the reference section, m (``base_pair``: -L_i).
+    ``link_length``: L, m. ``slope_ratio``: k of phi = -k dY/L, omega = +k dX/L.
+    """
+
+    centers: FloatArray
+    zeros: FloatArray
+    heights: FloatArray
+    link_length: float
+    slope_ratio: float = 1.5
+
+    @classmethod
+    def from_rig(cls, rig: Rig) -> Geometry:
+        """What ``psd_N.center``, ``.zero``, ``.height`` and ``link`` of a parameter file describe."""
+        return cls(rig.centers, rig.zeros, rig.heights, rig.link.length, rig.link.slope_ratio)
+
+    @property
+    def beams(self) -> FloatArray:
+        """l_i = c_i + m_i0, (P, 2), m."""
+        return self.centers + self.zeros
 
 
 def check_shapes(geometry: Geometry) -> int:

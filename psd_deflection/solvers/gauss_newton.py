@@ -14,8 +14,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.errors import SolverError
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._plane import positive
+from psd_deflection.solvers.plane import positive
 
 Model = Callable[[Sequence[float]], tuple[list[float], list[Sequence[float]]]]
 """Parameters (p) to predicted readings (m) and rows of derivatives (m of p)."""
@@ -51,10 +52,13 @@ class Fits(NamedTuple):
 
 
 def fit(model: Model, start: Sequence[float], measured: Sequence[float], variances: Sequence[float]) -> Fit:
-    """One block; every variance above 0."""
+    """One block. Raises SolverError if a variance is 0."""
     x = list(start)
     p = len(x)
-    weights = [1.0 / v for v in variances]
+    try:
+        weights = [1.0 / v for v in variances]
+    except ZeroDivisionError:
+        raise SolverError('solve: variances must be above 0 m^2') from None
     steps = 0
     while True:
         predicted, rows = model(x)
@@ -153,7 +157,7 @@ def fit_many(model: ModelMany, start: FloatArray, measured: FloatArray, variance
 
 
 def _invert_many(normal: FloatArray) -> FloatArray:
-    """Inverses (n, p, p); NaN where a block is singular, so that it does not spoil its neighbours."""
+    """Inverses (n, p, p); NaN if a block is singular, so that it does not spoil its neighbours."""
     try:
         return np.asarray(np.linalg.inv(normal))
     except np.linalg.LinAlgError:

@@ -39,7 +39,7 @@ def turn_covariance(
 
 
 def positive(variances: FloatArray) -> FloatArray:
-    """Variances as (n or 1, 2P). Raises SolverError where one is not above 0."""
+    """Variances as (n or 1, 2P). Raises SolverError if one is not above 0."""
     v = np.atleast_2d(np.asarray(variances, dtype=np.float64))
     if not (v > 0.0).all():
         raise SolverError('solve: variances must be above 0 m^2')
@@ -92,7 +92,7 @@ def turn_covariance_many(
     vtt: FloatArray,
     out: FloatArray | None = None,
 ) -> FloatArray:
-    """:func:`turn_covariance` for n blocks: (n, 3, 3), written into ``out`` where it is given."""
+    """:func:`turn_covariance` for n blocks: (n, 3, 3), written into ``out`` if it is given."""
     if out is None:
         out = np.empty((c.shape[0], 3, 3))
     cs = c * s
@@ -106,18 +106,3 @@ def turn_covariance_many(
     out[:, 1, 2] = out[:, 2, 1] = s * vxt + c * vyt
     out[:, 2, 2] = vtt
     return out
-
-
-def turn_onto(qx: FloatArray, qy: FloatArray, beams: FloatArray) -> FloatArray:
-    """The flat plate's unweighted answer (n, 3) for plate points (n, P) under beams (P, 2)."""
-    middle = beams.mean(axis=0)
-    lx = beams[:, 0] - middle[0]
-    ly = beams[:, 1] - middle[1]
-    mx = qx.mean(axis=1)
-    my = qy.mean(axis=1)
-    ux = qx - mx[:, None]
-    uy = qy - my[:, None]
-    theta = np.arctan2((ux * ly - uy * lx).sum(axis=1), (ux * lx + uy * ly).sum(axis=1))
-    c = np.cos(theta)
-    s = np.sin(theta)
-    return np.column_stack((middle[0] - c * mx + s * my, middle[1] - s * mx - c * my, theta))
