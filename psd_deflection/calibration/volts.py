@@ -1,4 +1,4 @@
-"""Converter counts to volts, volts to the places of the dots, and which of them not to believe."""
+"""Converter counts to volts, volts to the places of the dots, with flags for unreliable readings."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from psd_deflection.records import DOT_CHANNELS, FloatArray
 
 
 class SensorFlag(IntFlag):
-    """Why a reading of one PSD is not to be believed."""
+    """Why a reading of one PSD is unreliable."""
 
     LASER_LOST = 1
     """The sum signal is below ``sum_min``."""
     SATURATED = 2
-    """A channel stands at an end of the converter's range."""
+    """A channel is at an end of the converter's range."""
     OUTSIDE = 4
-    """The spot's centre is off the active area, or past where a segmented sensor still tells places."""
+    """The spot's centre is off the active area or beyond the valid range of a segmented sensor."""
     CLIPPED = 8
     """Part of the spot is off the active area: the reading is pulled inward."""
 
@@ -29,8 +29,8 @@ class SensorFlag(IntFlag):
 def counts_to_volts(counts: npt.NDArray[np.int16], volts_per_count: float) -> npt.NDArray[np.float32]:
     """Volts (n, 6) of converter counts (n, 6); ``volts_per_count`` V.
 
-    The product is formed in double precision and rounded once to float32, which is what a
-    recording holds: a replay from volts then starts from the very same numbers.
+    The product is computed in double precision and rounded once to float32, as in a recording. So a
+    replay from volts starts from exactly the same numbers.
     """
     return np.multiply(counts, volts_per_count, dtype=np.float64).astype(np.float32)
 
@@ -39,8 +39,8 @@ def counts_to_volts(counts: npt.NDArray[np.int16], volts_per_count: float) -> np
 class Calibration:
     """Readings to the places of the dots.
 
-    ``sensitivity``: m/V on x and y, at the centre. ``sensors``: both. ``sum_min`` V: less means that
-    the laser is lost. ``full_scale``, ``step``: the converter's, V.
+    ``sensitivity``: m/V on x and y, at the centre. ``sensors``: one for each PSD. ``sum_min`` V: a
+    lower sum means that the laser is lost. ``full_scale``, ``step``: of the converter, V.
     """
 
     sensitivity: float
@@ -51,7 +51,7 @@ class Calibration:
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Calibration:
-        """What the rig's parameters say."""
+        """The calibration of the rig's parameters."""
         return cls(
             sensitivity=rig.amplifier.sensitivity,
             sensors=(make_sensor(rig.psds[0]), make_sensor(rig.psds[1])),
@@ -63,8 +63,8 @@ class Calibration:
     def dots(self, volts: npt.NDArray[np.float32]) -> FloatArray:
         """Places (n, 4), m: x1, y1, x2, y2, each from its PSD's centre; ``volts`` (n, 6) float32.
 
-        Volts are those of an amplifier that divides by the sum: place over ``sensitivity``. A
-        segmented sensor's bend is undone.
+        The amplifier divides by the sum, so a voltage is the place over ``sensitivity``. The
+        nonlinear curve of a segmented sensor is inverted.
         """
         dots = np.multiply(volts[:, DOT_CHANNELS], self.sensitivity, dtype=np.float64)
         for i, sensor in enumerate(self.sensors):
@@ -86,7 +86,7 @@ class Calibration:
     def flags(self, volts: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
         """:class:`SensorFlag` of each sample and PSD, (n, 2); ``volts`` (n, 6) float32."""
         dots = np.abs(np.multiply(volts[:, DOT_CHANNELS], self.sensitivity, dtype=np.float64))
-        # A converter at its end gives its last step, a little less than the full scale on one side.
+        # A saturated converter gives its last step, a little less than full scale on one side.
         at_end = np.abs(volts) >= self.full_scale - 1.5 * self.step
         out = np.zeros((len(volts), 2), dtype=np.uint8)
         for i, sensor in enumerate(self.sensors):
