@@ -161,7 +161,7 @@ class EstimatorConfig:
     twist_sd: float = parameter(
         0.01,
         'rad',
-        'standard deviation of the twist where it is not measured (degraded)',
+        'standard deviation of the twist if it is not measured (degraded)',
         above=0.0,
         maximum=10.0,
         live=True,

@@ -1,11 +1,11 @@
 """The measuring chain with its imperfections, exact: from a pose of the tip to readings and stored zeros.
 
-Theory of operation. A sensor stands at C = (c + error, h + error) on the plate, its axes turned and
+Theory of operation. A sensor is at C = (c + error, h + error) on the plate, its axes turned and
 tilted by R_s = Ry Rx Rz. Its beam was set so that the dot lies at m_0 before load: it passes through
-C + R_s (m_0, 0) and runs along (u_x, u_y, 1). Under load the plate is at d + R(.), with the tilts of a
-cantilever, so the dot is where the beam meets the plane through d + R C with normal R R_s e_z. Nothing
-is linearised: every error of the budget is a field of :class:`Chain`, and its effect is computed
-exactly. Changes after the zero was stored (``..._shift``) act on the loaded reading only.
+C + R_s (m_0, 0) and runs along (u_x, u_y, 1). Under load the plate is at d + R(.), with the tilts of
+a cantilever, so the dot is where the beam meets the plane through d + R C with normal R R_s e_z.
+Nothing is linearised: every error of the budget is a field of :class:`Chain`, and its effect is
+computed exactly. Changes after the zero was stored (``..._shift``) act on the loaded reading only.
 
 Arrays have a leading axis of n trials or of 1, then P sensors, then x and y.
 """

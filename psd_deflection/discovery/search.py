@@ -256,8 +256,8 @@ class Search:
                 continue
             if name not in best:
                 best[name] = s
-        # The best eight: an exact confounder scores as high as the named effect itself. Where the
-        # search itself was dear, the data are no simple case, and three must do.
+        # The best eight: an exact confounder scores as high as the named effect itself. If the search was
+        # already expensive, the case is complicated; try two only.
         ranked = sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.workspace.simulations < BUDGET else 2]
         fits = []
         for s in ranked:

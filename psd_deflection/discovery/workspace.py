@@ -75,7 +75,7 @@ class Workspace:
             self.noise.append(estimate_noise(o, o.volts - chunk.volts.T, size, floor))
 
     def raw_residual(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
-        """Measured minus simulated (n, 6) V of each recording, samples, 0 where lost."""
+        """Measured minus simulated (n, 6) V of each recording, samples, 0 if lost."""
         self.simulations += 1
         out = []
         for o in self.observations:
@@ -123,7 +123,7 @@ class Workspace:
         )
 
     def block_dots(self, fine: Sequence[FloatArray]) -> list[FloatArray]:
-        """Block means of the dots (4, blocks), m, of fine-block volts; NaN where a sample is lost."""
+        """Block means of the dots (4, blocks), m, of fine-block volts; NaN if a sample is lost."""
         out = []
         for f, v, s, o in zip(fine, self.valid, self.fine, self.observations, strict=True):
             rows = np.where(v, f[list(DOT_CHANNELS)], np.nan)

@@ -41,7 +41,7 @@ SUM_FLOOR = 0.05
 
 
 class Readings(NamedTuple):
-    """``x``, ``y``: 10 V at the edge of the active area, 0 where ``total`` is too low; ``total`` V."""
+    """``x``, ``y``: 10 V at the edge of the active area, 0 if ``total`` is too low; ``total`` V."""
 
     x: float
     y: float

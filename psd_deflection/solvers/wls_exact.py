@@ -8,7 +8,7 @@ solution this gives, for any weights and any size of angle,
     dY'    = f_y + xbar_y (sin theta - theta') + ybar_y (1 - cos theta),
 
 with means of the beams weighted by wx (.._x) and wy (.._y) and kappa a number of the rig and the
-weights (0 where the weights of x and y agree: then theta = asin theta'). One arcsine inverts it. The
+weights (0 if the weights of x and y agree: then theta = asin theta'). One arcsine inverts it. The
 readings are combined as ``wls`` combines them, ``thesis`` weights included.
 """
 
