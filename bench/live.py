@@ -121,10 +121,12 @@ class Device:
 
     def __init__(self) -> None:
         from psd_deflection.config import load_rig
-        from psd_deflection.devices.simulated_device import PseudoTerminal, SimulatedDevice
+        from psd_deflection.devices.contract_frames import SimulatedFrames
+        from psd_deflection.devices.pseudo_terminal import PseudoTerminal
+        from psd_deflection.devices.rig_feed import RigFeed
 
         self.port = PseudoTerminal()
-        self.device = SimulatedDevice(load_rig(), lambda _, n: np.zeros((n, 3)))
+        self.device = SimulatedFrames(RigFeed(load_rig(), lambda _, n: np.zeros((n, 3))))
         self.written: list[int] = []
         self.stop = threading.Event()
         self.thread = threading.Thread(target=self._run, daemon=True)

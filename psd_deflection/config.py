@@ -202,12 +202,12 @@ class AcquisitionConfig:
     source: str = parameter(
         'serial',
         '',
-        'what the device speaks: serial (our own frames), dataq, thorlabs, lines, replay, or the name of a plug-in',
+        'what the device speaks: serial for our own frames; `psd-deflection devices --help` lists the others',
     )
     port: str = parameter(
         '',
         '',
-        'serial port (thorlabs: two with a comma between; replay: a recording); without it a simulated rig is started',
+        'serial port (two with a comma between, if the device has two) or recording; empty starts the simulated rig',
     )
     baud: int = parameter(921_600, 'baud', 'line speed (USB-CDC devices ignore it)', minimum=1200, maximum=12_000_000)
     latency_offset: float = parameter(

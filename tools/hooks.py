@@ -1,7 +1,7 @@
 """What the pages get from the program itself when the site is built, so that they cannot disagree.
 
 ``<!-- messages -->``: every error message, by exit status. ``<!-- commands -->``: every command's
-help. ``<!-- parameters -->``: every parameter.
+help. ``<!-- parameters -->``: every parameter. ``<!-- exit statuses -->``: what each one means.
 """
 
 from __future__ import annotations
@@ -133,12 +133,13 @@ def message_tables() -> str:
         rows = sorted({(text, module) for kind, text, module in found if kind in names})
         if rows:
             out.append(f'### {heading}\n\n| message | from |\n|---|---|')
-            out += [f'| {_cell(text)} | `{module}` |' for text, module in rows]
+            out += [f'| {cell(text)} | `{module}` |' for text, module in rows]
             out.append('')
     return '\n'.join(out)
 
 
-def _cell(text: str) -> str:
+def cell(text: str) -> str:
+    """``text`` as the tables show it."""
     text = re.sub(r'…+', '…', re.sub(r'\s+', ' ', text))
     return '`' + text.replace('|', '\\|').replace('`', "'") + '`'
 
@@ -165,7 +166,18 @@ def parameter_table() -> str:
     return '\n'.join(rows)
 
 
-FILLED = {'messages': message_tables, 'commands': command_help, 'parameters': parameter_table}
+def exit_statuses() -> str:
+    """Each exit status and its meaning."""
+    rows = [f'| {status} | {meaning} |' for status, meaning in errors.EXIT_STATUSES.items()]
+    return '\n'.join(['| status | meaning |', '|---|---|', *rows])
+
+
+FILLED = {
+    'exit statuses': exit_statuses,
+    'messages': message_tables,
+    'commands': command_help,
+    'parameters': parameter_table,
+}
 
 
 def on_page_markdown(markdown: str, **kwargs: Any) -> str:

@@ -16,26 +16,23 @@ from __future__ import annotations
 
 import argparse
 import math
-import shlex
 import signal
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 
+from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import given_as_option, given_parameters, parameter_option, refuse
-from psd_deflection.cli._program import program
-from psd_deflection.cli.estimator import Display, run_without_ros, simulates
 from psd_deflection.config import read_parameter_file, replace_values, rig_from_values
 from psd_deflection.errors import UsageError
 from psd_deflection.monitor.feed import Feed
-from psd_deflection.monitor.source import ReplaySource
-from psd_deflection.monitor.start import need_server
+from psd_deflection.monitor.shown import ShownRecording
+from psd_deflection.monitor.start import need_server, start_monitor
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.replay_engine import open_for_replay, replayed
 from psd_deflection.records import Record
-from psd_deflection.runner.session import Session
-from psd_deflection.runner.simulated_rig import started_early
+from psd_deflection.runner.headless import run_headless
+from psd_deflection.runner.simulated_rig import simulates, started_early
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -82,18 +79,10 @@ def run(args: argparse.Namespace) -> int:
     if args.params_file:
         rig_from_values({**values, **overrides}, args.params_file)
     display = Display()
-    recorded: list[Path] = []
-
-    def watch(session: Session) -> None:
-        folder = session.recorder.folder
-        if folder is not None and folder not in recorded:
-            recorded.append(folder)
-        display.update(session)
-
-    with started_early(simulates({**values, **overrides})):
-        status = run_without_ros({**values, **overrides}, display, watch)
-    for folder in recorded:
-        display.say(f'recorded {folder}\n  replay it:  {program()} replay {shlex.quote(str(folder))} --compare')
+    values |= overrides
+    with started_early(simulates(values)):
+        status = run_headless(values, display.say, display.watch, start_monitor)
+    display.tell_recorded()
     return status
 
 
@@ -119,16 +108,16 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
         if server is not None:
             server.tell(text)
 
-    source = ReplaySource(str(args.recording), open_steps, feed, say, speed=args.speed, loop=args.loop)
-    server = MonitorServer(source, feed, rig.monitor, display.say)
+    shown = ShownRecording(str(args.recording), open_steps, feed, say, speed=args.speed, loop=args.loop)
+    server = MonitorServer(shown, feed, rig.monitor, display.say)
     server.start()
     try:
-        source.start()
-        while not stop.wait(0.1) and source.failed is None:
+        shown.start()
+        while not stop.wait(0.1) and shown.failed is None:
             pass
     finally:
-        source.close()
+        shown.close()
         server.close()
-    if source.failed is not None:
-        raise source.failed
+    if shown.failed is not None:
+        raise shown.failed
     return 0

@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve or write."""
-    if args.serve or args.attached:
+    if args.serve:
         refuse(args, OF_A_RECORDING, 'is for a recording (--out), not for a device (--serve)')
         return serve.run_device(args)
     if args.out is None:

@@ -23,7 +23,7 @@ from psd_deflection.runner.fanout import Fanout
 from psd_deflection.runner.processing import Processing
 from psd_deflection.runner.realtime import lock_memory
 from psd_deflection.runner.recorder import Recorder
-from psd_deflection.runner.simulated_rig import SimulatedRigProcess
+from psd_deflection.runner.simulated_rig import SimulatedRigProcess, simulates
 from psd_deflection.runner.zero_store import ZeroStore
 from psd_deflection.solvers.registry import check_live
 
@@ -41,9 +41,6 @@ KEEP_S = 0.2
 
 OPEN_S = 2.0
 """How long the start waits for the disk of a recording that is wanted from the start."""
-
-SIMULATED = ('serial', 'dataq', 'thorlabs', 'lines')
-"""Sources for which a simulated rig is started where no port is named."""
 
 
 def zero_text(rig: Rig) -> str:
@@ -73,7 +70,7 @@ class Session:
         check_live(rig.estimator.solver)
         # The geometry first: a rig that cannot be solved must not open a port.
         pipeline = Pipeline(rig)
-        if not rig.acquisition.port and rig.acquisition.source in SIMULATED:
+        if simulates(rig.values):
             self._simulated = SimulatedRigProcess(rig)
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)

@@ -23,7 +23,7 @@ from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import DeflectionEstimate, Record
 from psd_deflection.runner import recorder as recorder_module
 from psd_deflection.runner import session as session_module
-from psd_deflection.runner.health import WARN, HealthReporter
+from psd_deflection.runner.diagnostics import WARN, HealthReporter
 from psd_deflection.runner.recorder import Recorder
 from psd_deflection.runner.session import Session
 from test.heard import WAIT_S

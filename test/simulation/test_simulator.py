@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from psd_deflection.cli.serve import served_loads
 from psd_deflection.config import load_rig
+from psd_deflection.devices.serve import served_loads
 from psd_deflection.errors import RecordingError
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation import loads

@@ -1,59 +1,15 @@
-"""What came off the wire, counted, and whether the device that sends it fits the rig.
-
-Every sample that is missing is counted once, under its cause, as far as it can be known.
-"""
+"""Whether the device that says HELLO fits the rig."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass, field
 
 from psd_deflection.config import Rig
 from psd_deflection.errors import DeviceError
 from psd_deflection.protocol.frames import PROTOCOL_VERSION, HelloFrame
 from psd_deflection.records import CHANNELS
 
-BY_DEVICE = 'dropped by the device'
-DAMAGED = 'damaged on the wire'
-AWAY = 'while the port was away'
-UNSEEN = 'on the wire, without a trace'
-"""Why samples are missing."""
-
-
-@dataclass(slots=True)
-class AcquisitionCounters:
-    """What came off the wire. Written by the reader alone; anyone may read."""
-
-    bytes: int = 0
-    samples: int = 0
-    lost: int = 0
-    lost_by: dict[str, int] = field(default_factory=dict)
-    repeated: int = 0
-    queue_dropped: int = 0
-    device_dropped: int = 0
-    device_overruns: int = 0
-    restarts: int = 0
-    disconnects: int = 0
-    silences: int = 0
-    refused_reopenings: int = 0
-    clock_jumps: int = 0
-    pings: int = 0
-    pongs: int = 0
-    bad_frames: dict[str, int] = field(default_factory=dict)
-    temperature: float | None = None
-
-    @property
-    def bad(self) -> int:
-        """Frames that were none, of every reason."""
-        return sum(self.bad_frames.values())
-
-    def count_lost(self, missing: int, cause: str) -> None:
-        """``missing`` samples will not come."""
-        self.lost += missing
-        self.lost_by[cause] = self.lost_by.get(cause, 0) + missing
-
 
 def check_hello(frame: HelloFrame, rig: Rig, port: str) -> float | None:
-    """Volts per count of a device that fits the rig, None where it gives volts; DeviceError naming what does not."""
+    """Volts per count of a device that fits the rig, None if it gives volts; DeviceError naming what does not."""
     if frame.version != PROTOCOL_VERSION:
         raise DeviceError(
             f'{port}: the device speaks protocol version {frame.version}, this is version {PROTOCOL_VERSION}; '

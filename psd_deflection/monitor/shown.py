@@ -15,7 +15,7 @@ from psd_deflection.errors import PsdDeflectionError
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport, Record, SpotMeans
-from psd_deflection.runner.health import ERROR, OK, WARN, HealthReporter
+from psd_deflection.runner.diagnostics import ERROR, OK, WARN, HealthReporter
 from psd_deflection.runner.session import Session, why_no_zero, zero_text
 
 LONGEST_WAIT_S = 2.0
@@ -28,7 +28,7 @@ class RefusedError(Exception):
     """What was asked for cannot be done now; the message says why, in one line."""
 
 
-class Source(Protocol):
+class Shown(Protocol):
     """What the server asks of whatever it shows. Every call may come from the server's threads."""
 
     @property
@@ -48,7 +48,7 @@ class Source(Protocol):
         """Start or stop a recording; what was done, in a line, once the disk has answered. Raises RefusedError."""
 
 
-class LiveSource:
+class ShownSession:
     """A running session."""
 
     def __init__(self, session: Session) -> None:
@@ -96,7 +96,7 @@ class LiveSource:
         return f'recording to {folder}' if wanted else f'recording ended: {folder}'
 
 
-class ReplaySource:
+class ShownRecording:
     """A recording, once or over and over; a thread of its own feeds ``feed``.
 
     ``open_steps``: a fresh pipeline and the records of each step of it. ``speed``: times as fast as

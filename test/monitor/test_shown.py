@@ -9,7 +9,7 @@ import pytest
 
 from psd_deflection.cli.main import main
 from psd_deflection.monitor.feed import BlockResult, Feed
-from psd_deflection.monitor.source import RefusedError, ReplaySource
+from psd_deflection.monitor.shown import RefusedError, ShownRecording
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.replay_engine import replayed, rig_at_start
@@ -18,7 +18,7 @@ from psd_deflection.records import Record
 BAGS = Path(__file__).parent.parent.parent / 'bags'
 
 
-def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event) -> ReplaySource:
+def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event) -> ShownRecording:
     rig = rig_at_start(open_recording(BAGS / name))
 
     def open_steps() -> tuple[Pipeline, Iterator[list[Record]]]:
@@ -30,7 +30,7 @@ def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event) ->
         said.append(text)
         ended.set()
 
-    return ReplaySource(name, open_steps, feed, say, speed=1e6)
+    return ShownRecording(name, open_steps, feed, say, speed=1e6)
 
 
 def test_a_recording_is_shown_as_it_is_with_its_losses() -> None:
