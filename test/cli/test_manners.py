@@ -161,8 +161,8 @@ def signals() -> Iterator[None]:
 @pytest.mark.parametrize(
     ('argv', 'sink'),
     [
-        (['simulate', '--loads', 'thesis'], 'psd_deflection.recordings.sinks.CsvSampleSink.put'),
-        (['convert', CLEAN], 'psd_deflection.recordings.sinks.CsvSampleSink.put'),
+        (['simulate', '--loads', 'thesis'], 'psd_deflection.recordings.csv_writer.CsvSampleSink.put'),
+        (['convert', CLEAN], 'psd_deflection.recordings.csv_writer.CsvSampleSink.put'),
         (['replay', CLEAN], 'psd_deflection.cli.replay.Totals.add'),
     ],
     ids=lambda v: v[0] if isinstance(v, list) else '',
@@ -223,7 +223,7 @@ def test_a_picture_is_whole_or_as_it_was(folder: Path, monkeypatch: pytest.Monke
     def full(number: int) -> None:
         raise OSError(28, 'No space left on device')
 
-    monkeypatch.setattr('psd_deflection.files.os.fsync', full)
+    monkeypatch.setattr(os, 'fsync', full)
     with pytest.raises(RecordingError, match=r'^--out .*a\.png: cannot be written \(No space left on device\)$'):
         _report.save(b'newer', place)
     assert sorted(folder.iterdir()) == [place, link]
