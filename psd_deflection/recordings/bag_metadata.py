@@ -6,7 +6,7 @@ that compare them skip a topic where they differ, so both are made here from one
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,6 +61,15 @@ class TopicCount:
     qos: Qos | list[Qos]
     type_hash: str
     messages: int = 0
+
+
+def totals(counts: Iterable[TopicCount]) -> list[TopicCount]:
+    """One count a topic, of all files together."""
+    topics: dict[str, TopicCount] = {}
+    for t in counts:
+        known = topics.setdefault(t.name, TopicCount(t.name, t.type, t.qos, t.type_hash))
+        known.messages += t.messages
+    return list(topics.values())
 
 
 @dataclass(frozen=True, slots=True)

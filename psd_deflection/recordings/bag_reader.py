@@ -73,7 +73,7 @@ class BagRecording(Recording):
     def _files_of(self, folder: Path) -> list[Path]:
         """The bag's files in order: as ``metadata.yaml`` names them, else by their number."""
         meta_file = folder / 'metadata.yaml'
-        found = sorted(folder.glob('*.mcap'), key=_file_number)
+        found = files_in(folder)
         if not meta_file.is_file():
             if not found:
                 raise RecordingError(f'{folder}: is no bag: it holds neither metadata.yaml nor an .mcap file')
@@ -322,9 +322,14 @@ def _series(topic: str, rows: list[tuple[int, tuple[float, ...]]]) -> EstimateSe
     return EstimateSeries(topic, t_ns, pose, tilt, covariance)
 
 
-def _file_number(path: Path) -> tuple[int, str]:
-    number = re.search(r'_([0-9]{1,9})$', path.stem)
-    return (int(number[1]) if number else -1, path.name)
+def files_in(folder: Path) -> list[Path]:
+    """The ``.mcap`` files of a folder in the order of their numbers."""
+
+    def number(path: Path) -> tuple[int, str]:
+        found = re.search(r'_([0-9]{1,9})$', path.stem)
+        return (int(found[1]) if found else -1, path.name)
+
+    return sorted(folder.glob('*.mcap'), key=number)
 
 
 def read_information(path: Path) -> dict[str, Any]:

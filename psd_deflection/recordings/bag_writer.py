@@ -15,8 +15,7 @@ import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 
 from mcap.data_stream import RecordBuilder
 from mcap.records import ChunkIndex
@@ -33,6 +32,7 @@ from psd_deflection.recordings.bag_metadata import (
     bag_information,
     qos_text,
     to_yaml,
+    totals,
     write_metadata,
 )
 from psd_deflection.records import ParameterChange, Record
@@ -94,7 +94,20 @@ class _IndexSpool:
         self._file.close()
 
 
-class McapFile:
+class _Closing:
+    """What ``with`` closes."""
+
+    def close(self) -> None:
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class McapFile(_Closing):
     """One MCAP file being written; the part that a bag and a lone file share.
 
     ``write`` takes the records of one thread. Raises RecordingError where the file exists, cannot
@@ -256,16 +269,8 @@ class McapFile:
     # A recorder is a sink like any other.
     put = write
 
-    def __enter__(self) -> McapFile:
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-
-class BagWriter:
+class BagWriter(_Closing):
     """A rosbag2 bag being written: ``NAME/NAME_0.mcap`` and so on, ``NAME/metadata.yaml`` at the end.
 
     ``rig_values``: the flat parameter set, effects included.
@@ -362,12 +367,8 @@ class BagWriter:
     def information(self) -> dict[str, Any]:
         """The tree of ``metadata.yaml`` for what was written so far."""
         parts = [*self._ended, (self._file.count(), list(self._file.topics.values()))]
-        topics: dict[str, TopicCount] = {}
-        for _, counts in parts:
-            for t in counts:
-                known = topics.setdefault(t.name, TopicCount(t.name, t.type, t.qos, t.type_hash))
-                known.messages += t.messages
-        return bag_information([count for count, _ in parts], list(topics.values()), CUSTOM)
+        topics = totals(t for _, counts in parts for t in counts)
+        return bag_information([count for count, _ in parts], topics, CUSTOM)
 
     def close(self) -> None:
         """Close the file, then write ``metadata.yaml``; does nothing the second time.
@@ -392,11 +393,3 @@ class BagWriter:
 
     # A recorder is a sink like any other.
     put = write
-
-    def __enter__(self) -> BagWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

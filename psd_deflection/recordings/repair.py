@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import re
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 
@@ -26,9 +25,10 @@ from psd_deflection.recordings.bag_metadata import (
     Qos,
     TopicCount,
     bag_information,
+    totals,
     write_metadata,
 )
-from psd_deflection.recordings.bag_reader import read_information
+from psd_deflection.recordings.bag_reader import files_in, read_information
 from psd_deflection.recordings.bag_writer import CHUNK_NS, CUSTOM
 from psd_deflection.recordings.mcap_reader import MAGIC, DamagedError, McapReader
 
@@ -177,11 +177,6 @@ def _refuse_if_written(path: Path) -> None:
             raise RecordingError(f'{path}: is being recorded at this moment; end the recording first') from None
 
 
-def _number(path: Path) -> tuple[int, str]:
-    found = re.search(r'_(\d+)\.mcap$', path.name)
-    return (int(found.group(1)) if found else -1, path.name)
-
-
 def recover(path: str | Path) -> Recovered:
     """Repair ``path``, a bag folder or a lone ``.mcap``, in its place.
 
@@ -215,7 +210,7 @@ def _describes(metadata: Path, files: list[RecoveredFile]) -> bool:
 
 
 def _recover_folder(folder: Path) -> Recovered:
-    paths = sorted(folder.glob('*.mcap'), key=_number)
+    paths = files_in(folder)
     if not paths:
         raise RecordingError(f'{folder}: is no bag: it holds no .mcap file')
     for file in paths:
@@ -234,10 +229,6 @@ def _recover_folder(folder: Path) -> Recovered:
         if _describes(metadata, files):
             return Recovered(files, False, set_aside)
         metadata.replace(metadata.with_name(metadata.name + '.cut'))
-    topics: dict[str, TopicCount] = {}
-    for file_ in files:
-        for t in file_.topics:
-            known = topics.setdefault(t.name, TopicCount(t.name, t.type, t.qos, t.type_hash))
-            known.messages += t.messages
-    write_metadata(folder, bag_information([f.count for f in files], list(topics.values()), CUSTOM))
+    topics = totals(t for f in files for t in f.topics)
+    write_metadata(folder, bag_information([f.count for f in files], topics, CUSTOM))
     return Recovered(files, True, set_aside)
