@@ -1,4 +1,4 @@
-"""A second rig, written from the contract alone: nothing of ``psd_deflection.simulation`` is imported.
+"""A second rig, written from docs/simulation.md alone: nothing of ``psd_deflection.simulation`` is imported.
 
 Its own way in everything: the motion is integrated by Runge-Kutta of order four at a fifth of a
 millisecond (as one matrix polynomial a step, the loads held over each sample), the optics intersect
