@@ -76,8 +76,8 @@ def serve(device: LineDevice, port: PseudoTerminal, stopped: Callable[[], bool])
             until = now + min(device.due_in_ns(now), 0)
             caught_up = False
             while not caught_up:
-                # A device is never late; this process may be, on a busy machine. What fell due
-                # meanwhile is sent piece by piece: only a host that does not read makes it drop.
+                # Unlike a device, this process may be late on a busy machine. Then the overdue samples
+                # are sent piece by piece: they are dropped only if the host does not read.
                 until = min(until + CATCH_UP_NS, now)
                 caught_up = until == now
                 pending += device.take(until, room=OUTPUT_LIMIT - len(pending))
