@@ -1,4 +1,4 @@
-"""Once a second: what the run looks like, in numbers, for ``/diagnostics`` and for the terminal."""
+"""The state of the run in numbers, once a second, for ``/diagnostics`` and for the terminal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from psd_deflection.runner.session import Session
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 
 CLOCK_STEP_NS = 20_000_000
-"""A system clock that has moved by more against CLOCK_MONOTONIC was set."""
+"""A system clock that has moved by more than this against CLOCK_MONOTONIC was set."""
 
 
 class _Seen(NamedTuple):
@@ -39,7 +39,7 @@ class HealthReporter:
         now = _Seen(
             t_ns, wire.samples, wire.lost, wire.bad, dropped, pipeline.blocks, pipeline.estimates, pipeline.degraded
         )
-        # The first report counts from the start; its rates are those of an unknown time.
+        # The first report counts from the start. The time that it covers is unknown, so it gives no rates.
         before = self._seen
         self._seen = now
         seconds = (now.t_ns - before.t_ns) / 1e9 if before is not None else 0.0
@@ -150,7 +150,7 @@ class HealthReporter:
         if spots is None:
             return DiagnosticEntry(name, STALE, 'no block yet', ())
         if new.samples == 0:
-            # What was seen last says nothing about now.
+            # The last readings are out of date.
             return DiagnosticEntry(name, STALE, 'no samples', ())
         total = spots.sums[psd - 1]
         x, y = spots.dots[2 * psd - 2], spots.dots[2 * psd - 1]
