@@ -1,0 +1,139 @@
+"""The one reading too many: whether the four readings belong to one flat plate, and which one does not.
+
+Two PSDs give four readings for three unknowns. What is left is one number a block: how much longer
+the base line between the dots is than that between the beams, r = a^T e for errors e of the readings,
+with a = (n, -n)/sqrt(2) and n along the base line. Over its variance a^T C a it is a chi-square of one
+degree of freedom. A sound rig is beyond ``LIMIT`` in one block of 10^5; a dead, stuck, swapped or
+inverted reading, a PSD that is turned or scaled, and a plate that tilts are beyond it as soon as they
+cost more than a few standard deviations.
+
+If one reading i alone is wrong, it is wrong by e_i = r/a_i. Which one, a single block cannot tell; so
+``widen`` adds the errors that each of them would cause, sum_i (K_i e_i)(K_i e_i)^T with the solver's
+gain K, and the truth stays inside. While the link rings, two wrong readings may cancel in r for a block;
+so r is held and forgotten over a second. Over many blocks and poses the wrong one can often be told:
+the true reading of i is m_i - r/a_i if the others are right, and what i says of it must then follow
+one law: nothing (dead or stuck), or the opposite (inverted). If two readings would do, none is named.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from psd_deflection.records import FloatArray
+
+LIMIT = 20.0
+"""Chi-square beyond which the readings contradict each other: one sound block in 130 000 (Gaussian noise)."""
+
+NAMES = ('x1', 'y1', 'x2', 'y2')
+
+_FADE = 0.98
+"""What is left of a held r^2 after a block."""
+
+_UNSEEN = 0.02
+"""A reading with a smaller part in the base line cannot be checked by it."""
+
+_FORGET = 1.0 / 500.0
+_ENOUGH = 10
+"""Blocks before a reading is named."""
+
+_NEAR = 0.02
+"""How near to -1 the slope of an inverted reading on what it should be must be."""
+
+
+class Checked(NamedTuple):
+    """One block's answer.
+
+    ``chi_square`` of this block. ``contradict``: this block or one shortly before is beyond ``LIMIT``.
+    ``errors`` (4,): of each reading if it alone is wrong, m. ``possible`` (4,): the same with the r that is held, m.
+    """
+
+    chi_square: float
+    contradict: bool
+    errors: FloatArray
+    possible: FloatArray
+
+
+class Consistency:
+    """Holds the readings of each block against each other; it remembers the r of the last second."""
+
+    def __init__(self) -> None:
+        self.held = 0.0
+
+    def check(self, apart: tuple[float, float], residual: tuple[float, ...], covariance: FloatArray) -> Checked:
+        """Check one block.
+
+        ``apart``: centre of PSD 1 and its dot less those of PSD 2, m. ``residual`` (4,): what the solver leaves of
+        the dots, m. ``covariance`` (4, 4) of the dots, m^2.
+        """
+        x, y = apart
+        size = (2.0 * (x * x + y * y)) ** 0.5
+        if size == 0.0:
+            return Checked(0.0, False, np.zeros(4), np.zeros(4))
+        a = np.array([x, y, -x, -y]) / size
+        r = float((a * residual).sum())
+        variance = float((a[:, None] * covariance * a).sum())
+        chi_square = r * r / variance if variance > 0.0 else 0.0
+        contradict = chi_square > LIMIT
+        self.held = max(_FADE * self.held, r * r if contradict else 0.0)
+        if self.held <= LIMIT * variance:
+            self.held = 0.0
+        seen = np.abs(a) > _UNSEEN
+        one = np.where(seen, 1.0 / np.where(seen, a, 1.0), 0.0)
+        return Checked(chi_square, self.held > 0.0, one * r, one * self.held**0.5)
+
+
+def widened(covariance: FloatArray, gain: FloatArray, errors: FloatArray) -> FloatArray:
+    """``covariance`` (3, 3) and what each of ``errors`` (4,) alone would cause through ``gain`` (3, 4)."""
+    caused = gain * errors
+    return np.asarray(covariance + (caused[:, None] * caused).sum(axis=2))
+
+
+class Suspect:
+    """Finds the reading that is most likely wrong from the poses that were seen since the last :meth:`clear`."""
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget what was seen."""
+        self._blocks = 0
+        self._weight = 0.0
+        self._sum = np.zeros(8)
+        self._squares = np.zeros((3, 4))
+
+    def add(self, dots: FloatArray, errors: FloatArray) -> None:
+        """A block's readings (4,) m and :attr:`Checked.errors`."""
+        should = dots - errors
+        both = np.concatenate((dots, should))
+        if not self._blocks:
+            self._first = both
+        both = both - self._first
+        said, should = both[:4], both[4:]
+        keep = 1.0 - _FORGET
+        self._blocks += 1
+        self._weight = keep * self._weight + 1.0
+        self._sum = keep * self._sum + both
+        self._squares = keep * self._squares + np.stack((said * said, said * should, should * should))
+
+    def most_likely(self, noise: float) -> str:
+        """What is wrong, as 'y2 does not move', or '' if that cannot be told. ``noise``: sd of a reading, m."""
+        if self._blocks < _ENOUGH:
+            return ''
+        mean = self._sum / self._weight
+        said, should = mean[:4], mean[4:]
+        moments = self._squares / self._weight - np.stack((said * said, said * should, should * should))
+        found = []
+        for c, name in enumerate(NAMES):
+            own, shared, wanted = moments[:, c].tolist()
+            # It must have had reason to move, by far more than noise.
+            if wanted < (20.0 * noise) ** 2:
+                continue
+            slope = shared / wanted
+            off = own - slope * shared
+            if own < (5.0 * noise) ** 2:
+                found.append(f'{name} does not move with the others')
+            elif abs(slope + 1.0) < _NEAR and off < (10.0 * noise) ** 2 + 1e-4 * wanted:
+                found.append(f'{name} has the wrong sign')
+        return found[0] if len(found) == 1 else ''
