@@ -40,8 +40,13 @@ _SUDDEN = 12.0
 _MISFIT = 5.0
 """Standard deviations of the sum of squares that is left, above which the polynomial does not fit."""
 
-_MOST = 1.0
-"""m^2: no motion is more."""
+_ANY = 1e30
+"""m^2: nothing is known of order 0 beforehand."""
+
+_LARGEST = 64
+"""Samples a block up to which the colour of the noise makes the weights; of larger ones it makes the variance alone."""
+
+_ORDERS = np.arange(ORDER + 1)
 
 _WIDEN = 1.0
 """Times what is left of the samples: the standard deviation of a misfit's error in the middle."""
@@ -81,14 +86,15 @@ class BlockFit:
     """Fits block after block; see the module's text. It remembers how much motion there was."""
 
     def __init__(self, size: int, centers: FloatArray, beams: FloatArray, poly: bool = True) -> None:
-        """``size``: N samples of a whole block. ``centers``, ``beams`` (2, 2) m. ``poly``: False fits order 0."""
+        """``size``: N samples of a whole block. ``centers``, ``beams`` (2, 2) m. ``poly``: False gives the mean."""
         self._size = size
+        self._poly = poly
         self._q = basis(size) if poly else basis(size)[:, :1]
-        orders = self._q.shape[1]
+        self._orders = self._q.shape[1]
         self._fft = 1 << (2 * size - 1).bit_length()
         self._middle = _at_middle(self._q)
-        self._squares = np.zeros((4, orders))
-        self._weight = np.zeros((4, orders))
+        self._squares = np.zeros((4, self._orders))
+        self._weight = np.zeros((4, self._orders))
         self._folds = np.full(self._fft // 2 + 1, 2.0 / self._fft)
         self._folds[[0, -1]] = 1.0 / self._fft
         self.set_geometry(centers, beams)
@@ -110,63 +116,75 @@ class BlockFit:
         # The covariance with an earlier sample is the transposed one with a later.
         whole[:, :, self._fft - self._size + 1 :] = turned.transpose(1, 0, 2)[:, :, :0:-1]
         self._spectrum = np.fft.fft(whole)[:, :, : self._fft // 2 + 1] * self._folds
-        self._own = np.einsum('aaf->af', self._spectrum).real
-        q = np.fft.rfft(self._q, self._fft, axis=0)
-        # Covariance of the coefficients of a whole block.
-        self._of_whole = np.einsum('fk,abf,fj->akbj', q, self._spectrum, np.conj(q)).real
-        self._v = np.maximum(np.einsum('akak->ak', self._of_whole), 1e-30)
-        # What noise leaves about the polynomial, a degree of freedom.
-        left = self._size - self._q.shape[1]
-        total = self._size * turned[range(4), range(4), 0]
-        self._rough = np.maximum((total - self._v.sum(axis=1)) / max(left, 1), 1e-30)
+        own = turned[range(4), range(4)]
+        self._precision = _precision(own, white=not self._poly or self._size > _LARGEST)
+        self._u = np.einsum('ast,tk->ask', self._precision, self._q)
+        self._information = np.einsum('sj,ask->ajk', self._q, self._u)
+        self._inverse = inverse(self._information)
+        self._v = np.einsum('akk->ak', self._inverse).copy()
+        f = np.fft.rfft(self._u, self._fft, axis=1)
+        self._of_whole = np.einsum('afk,abf,bfj->akbj', f, self._spectrum, np.conj(f)).real
 
     def fit(self, slots: IntArray, dots: FloatArray) -> Fitted:
         """The dots at the middle of the block. ``slots`` (n,): which samples are present. ``dots`` (n, 4), m."""
-        z = np.einsum('ac,sc->sa', self._turn, dots)
+        z = np.einsum('ac,sc->as', self._turn, dots)
         # The length itself, not its first order: a twist by 1 degree would move that by 13 um.
-        z[:, 3] = np.hypot(z[:, 3] + self._along, z[:, 2] + self._across) - self._base_line
-        whole = len(slots) == self._size
-        q = self._q if whole else self._q[slots]
+        z[3] = np.hypot(z[3] + self._along, z[2] + self._across) - self._base_line
         # Of numbers about their mean: motion of millimetres leaves no rounding in what is left of it.
-        offset = z.sum(axis=0) / len(z)
-        z -= offset
-        projected = np.einsum('sk,sa->ak', q, z)
-        gram: FloatArray | None = None
+        offset = z.sum(axis=1) / len(slots)
+        z -= offset[:, None]
+        whole = len(slots) == self._size
         if whole:
-            c, v = projected, self._v
+            q, precision, u, information, inverted, v = (
+                self._q,
+                self._precision,
+                self._u,
+                self._information,
+                self._inverse,
+                self._v,
+            )
         else:
-            gram = np.einsum('sk,sj->kj', q, q)
-            c, v = self._least_squares(slots, q, gram, projected)
-        motion = self._motion(c, v)
-        if gram is None:
-            x = self._middle / (1.0 + self._v / motion)
-            reached = x
+            q = self._q[slots]
+            precision = self._without(slots)
+            u = np.einsum('ast,tk->ask', precision, q)
+            information = np.einsum('sj,ask->ajk', q, u)
+            inverted = inverse(information)
+            v = np.einsum('akk->ak', inverted)
+        h = np.einsum('ask,as->ak', u, z)
+        c = np.einsum('akj,aj->ak', inverted, h)
+        if self._orders > 1:
+            motion = self._motion(c, v)
+            # In a whole block odd orders are 0 in the middle and uncorrelated with even ones.
+            step = 2 if whole else 1
+            known = information[:, ::step, ::step].copy()
+            diagonal = _ORDERS[: known.shape[1]]
+            known[:, diagonal, diagonal] += 1.0 / motion[:, ::step]
+            x = np.zeros((4, self._orders))
+            x[:, ::step] = (inverse(known) * self._middle[::step]).sum(axis=2)
         else:
-            ridge = np.zeros((4, *gram.shape))
-            ridge += gram
-            ridge[:, range(len(gram)), range(len(gram))] += self._v / motion
-            x = np.einsum('akj,j->ak', inverse(ridge), self._middle)
-            reached = np.einsum('kj,aj->ak', gram, x)
-        value = (x * projected).sum(axis=1)
-        missed = self._middle - reached
-        missed[:, 0] = 0.0
-        if gram is None:
-            covariance = np.einsum('ak,akbj,bj->ab', x, self._of_whole, x)
+            motion = v
+            x = inverted[:, :, 0] * self._middle
+        value = np.einsum('ak,ak->a', x, h) + offset
+        if whole:
+            covariance = np.einsum('ak,akb->ab', x, np.einsum('akbj,bj->akb', self._of_whole, x))
         else:
             weights = np.zeros((4, self._size))
-            weights[:, slots] = np.einsum('ak,sk->as', x, q)
+            weights[:, slots] = np.einsum('ask,ak->as', u, x)
             covariance = self._spread(weights)
-        more = (missed * missed * np.minimum(motion, _MOST)).sum(axis=1)
-        left = len(slots) - q.shape[1]
         misfit = False
-        if q.shape[1] > 1 and left > 0:
-            rest = ((z * z).sum(axis=0) - (projected * c).sum(axis=1)) / left
-            outside = rest > self._rough * (1.0 + _MISFIT * (2.0 / left) ** 0.5)
+        left = len(slots) - self._orders
+        if self._orders > 1 and left > 0:
+            missed = self._middle - np.einsum('akj,aj->ak', information, x)
+            missed[:, 0] = 0.0
+            more = np.einsum('ak,ak->a', missed * missed, motion)
+            # In units of the noise: a chi-square of n - K degrees of freedom.
+            squares = np.einsum('as,as->a', z, np.einsum('ast,at->as', precision, z)) - np.einsum('ak,ak->a', h, c)
+            outside = squares > left + _MISFIT * (2.0 * left) ** 0.5
             misfit = bool(outside.any())
             if misfit:
-                more += np.where(outside, _WIDEN**2 * rest, 0.0)
-        covariance[range(4), range(4)] += more
-        value += offset
+                rest = z - np.einsum('sk,ak->as', q, c)
+                more += np.where(outside, _WIDEN**2 * (rest * rest).sum(axis=1) / left, 0.0)
+            covariance[_ORDERS[:4], _ORDERS[:4]] += more
         # Back from the length to the part along the base line at rest.
         length, across = float(value[3]) + self._base_line, float(value[2]) + self._across
         along = max(length * length - across * across, 1e-4 * length * length) ** 0.5
@@ -175,7 +193,9 @@ class BlockFit:
         back[2] -= (across / along) * back[3]
         back[3] *= length / along
         return Fitted(
-            np.einsum('ac,a->c', self._turn, value), np.einsum('ac,ab,bd->cd', back, covariance, back), misfit
+            np.einsum('ac,a->c', self._turn, value),
+            np.einsum('ac,ad->cd', back, np.einsum('ab,bd->ad', covariance, back)),
+            misfit,
         )
 
     def state(self) -> tuple[float, ...]:
@@ -190,16 +210,15 @@ class BlockFit:
         self._squares = np.array(values[:size]).reshape(4, -1)
         self._weight = np.array(values[size:]).reshape(4, -1)
 
-    def _least_squares(
-        self, slots: IntArray, q: FloatArray, gram: FloatArray, projected: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Coefficients (4, K) of a block with gaps and the variances that noise gives them."""
-        solved = inverse(gram[None])[0]
-        weights = np.zeros((len(solved), self._size))
-        weights[:, slots] = np.einsum('kj,sj->ks', solved, q)
-        spectrum = np.fft.rfft(weights, self._fft)
-        power = spectrum.real**2 + spectrum.imag**2
-        return np.einsum('kj,aj->ak', solved, projected), np.einsum('kf,af->ak', power, self._own)
+    def _without(self, slots: IntArray) -> FloatArray:
+        """The precision (4, n, n) of the samples that are present: a block of a matrix's inverse, inverted."""
+        lost = np.ones(self._size, dtype=bool)
+        lost[slots] = False
+        gone = np.flatnonzero(lost)
+        p = self._precision
+        cross = p[:, slots[:, None], gone]
+        inner = inverse(p[:, gone[:, None], gone])
+        return np.asarray(p[:, slots[:, None], slots] - np.einsum('asg,agh,ath->ast', cross, inner, cross))
 
     def _motion(self, c: FloatArray, v: FloatArray) -> FloatArray:
         """tau^2 (4, K) after this block; infinite for order 0, of which nothing is known beforehand."""
@@ -210,7 +229,7 @@ class BlockFit:
         self._weight += _FORGET * (sure - self._weight)
         tau = np.maximum(self._squares, 0.0) / np.maximum(self._weight, 1e-12)
         tau = np.where(c * c > _SUDDEN * (v + tau), np.maximum(excess, tau), tau)
-        tau[:, 0] = _MOST * 1e12
+        tau[:, 0] = _ANY
         return np.maximum(tau, self._v * 1e-9)
 
     def _spread(self, weights: FloatArray) -> FloatArray:
@@ -235,6 +254,17 @@ def inverse(matrices: FloatArray) -> FloatArray:
         out[:, :, i] = -column * pivot[:, None]
         out[:, i, i] = pivot
     return out
+
+
+def _precision(gamma: FloatArray, white: bool) -> FloatArray:
+    """Inverse (4, N, N) of the covariance that ``gamma`` (4, N) stands for; of white noise as strong if ``white``."""
+    size = gamma.shape[1]
+    lags = np.abs(np.arange(size)[:, None] - np.arange(size))
+    if not white:
+        out = inverse(gamma[:, lags])
+        if np.isfinite(out).all() and (np.einsum('ass->as', out) > 0.0).all():
+            return out
+    return np.asarray(np.eye(size) / gamma[:, :1, None])
 
 
 def _at_middle(q: FloatArray) -> FloatArray:

@@ -34,6 +34,8 @@ _FADE = 0.98
 _UNSEEN = 0.02
 """A reading with a smaller part in the base line cannot be checked by it."""
 
+_NONE = (0.0, 0.0, 0.0, 0.0)
+
 _FORGET = 1.0 / 500.0
 _ENOUGH = 10
 """Blocks before a reading is named."""
@@ -51,8 +53,8 @@ class Checked(NamedTuple):
 
     chi_square: float
     contradict: bool
-    errors: FloatArray
-    possible: FloatArray
+    errors: tuple[float, ...]
+    possible: tuple[float, ...]
 
 
 class Consistency:
@@ -70,42 +72,49 @@ class Consistency:
         x, y = apart
         size = (2.0 * (x * x + y * y)) ** 0.5
         if size == 0.0:
-            return Checked(0.0, False, np.zeros(4), np.zeros(4))
-        a = np.array([x, y, -x, -y]) / size
-        r = float((a * residual).sum())
-        variance = float((a[:, None] * covariance * a).sum())
+            return Checked(0.0, False, _NONE, _NONE)
+        ax, ay = x / size, y / size
+        a = (ax, ay, -ax, -ay)
+        r = sum(p * e for p, e in zip(a, residual, strict=True))
+        variance = sum(
+            p * sum(q * c for q, c in zip(a, row, strict=True)) for p, row in zip(a, covariance.tolist(), strict=True)
+        )
         chi_square = r * r / variance if variance > 0.0 else 0.0
         contradict = chi_square > LIMIT
-        self.held = max(_FADE * self.held, r * r if contradict else 0.0)
-        if self.held <= LIMIT * variance:
-            self.held = 0.0
-        seen = np.abs(a) > _UNSEEN
-        one = np.where(seen, 1.0 / np.where(seen, a, 1.0), 0.0)
-        return Checked(chi_square, self.held > 0.0, one * r, one * self.held**0.5)
+        held = max(_FADE * self.held, r * r if contradict else 0.0)
+        self.held = held if held > LIMIT * variance else 0.0
+        one = tuple(1.0 / p if abs(p) > _UNSEEN else 0.0 for p in a)
+        root = self.held**0.5
+        return Checked(chi_square, self.held > 0.0, tuple(r * p for p in one), tuple(root * p for p in one))
 
 
-def widened(covariance: FloatArray, gain: FloatArray, errors: FloatArray) -> FloatArray:
+def widened(covariance: FloatArray, gain: FloatArray, errors: tuple[float, ...]) -> FloatArray:
     """``covariance`` (3, 3) and what each of ``errors`` (4,) alone would cause through ``gain`` (3, 4)."""
-    caused = gain * errors
-    return np.asarray(covariance + (caused[:, None] * caused).sum(axis=2))
+    caused = gain * np.array(errors)
+    return np.asarray(covariance + np.einsum('ik,jk->ij', caused, caused))
 
 
 class Suspect:
-    """Finds the reading that is most likely wrong from the poses that were seen since the last :meth:`clear`."""
+    """Finds the reading that is most likely wrong from the poses that were seen."""
 
-    def __init__(self) -> None:
-        self.clear()
-
-    def clear(self) -> None:
-        """Forget what was seen."""
+    def __init__(self, centers: FloatArray, beams: FloatArray) -> None:
+        """``centers``, ``beams`` (2, 2), m. Beginning anew forgets what was seen."""
+        self._apart = tuple((centers[0] - centers[1]).tolist())
+        self._base_line = float(np.hypot(*(beams[0] - beams[1])))
+        self._swapped = [0.0, 0.0, 0.0]
         self._blocks = 0
         self._weight = 0.0
         self._sum = np.zeros(8)
         self._squares = np.zeros((3, 4))
 
-    def add(self, dots: FloatArray, errors: FloatArray) -> None:
+    def add(self, dots: tuple[float, ...], errors: tuple[float, ...]) -> None:
         """A block's readings (4,) m and :attr:`Checked.errors`."""
-        should = dots - errors
+        x1, y1, x2, y2 = dots
+        should = np.array(dots) - errors
+        ax, ay = self._apart
+        for i, (x, y) in enumerate(((x1 - x2, y1 - y2), (y1 - x2, x1 - y2), (x1 - y2, y1 - x2))):
+            r = ((ax + x) ** 2 + (ay + y) ** 2) ** 0.5 - self._base_line
+            self._swapped[i] = (1.0 - _FORGET) * self._swapped[i] + r * r
         both = np.concatenate((dots, should))
         if not self._blocks:
             self._first = both
@@ -121,6 +130,10 @@ class Suspect:
         """What is wrong, as 'y2 does not move', or '' if that cannot be told. ``noise``: sd of a reading, m."""
         if self._blocks < _ENOUGH:
             return ''
+        for psd in (1, 2):
+            # The length of the base line is right if the axes are exchanged, and far off if not.
+            if self._swapped[psd] < min(0.01 * self._swapped[0], self._weight * (10.0 * noise) ** 2):
+                return f'the axes of psd_{psd} are exchanged'
         mean = self._sum / self._weight
         said, should = mean[:4], mean[4:]
         moments = self._squares / self._weight - np.stack((said * said, said * should, should * should))
@@ -128,7 +141,7 @@ class Suspect:
         for c, name in enumerate(NAMES):
             own, shared, wanted = moments[:, c].tolist()
             # It must have had reason to move, by far more than noise.
-            if wanted < (20.0 * noise) ** 2:
+            if wanted < (100.0 * noise) ** 2:
                 continue
             slope = shared / wanted
             off = own - slope * shared

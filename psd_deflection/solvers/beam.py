@@ -21,7 +21,7 @@ from psd_deflection.solvers._gauss_newton import fit, fit_many
 from psd_deflection.solvers._geometry import check_twist
 from psd_deflection.solvers._plane import split, turn_onto
 from psd_deflection.solvers._tilted_plate import crossing, crossings
-from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus, flat_gain
 
 
 class BeamSolver(Solver):
@@ -46,6 +46,7 @@ class BeamSolver(Solver):
                 )
         self._centers = np.asarray(geometry.centers, dtype=np.float64)
         self._beams = np.asarray(geometry.beams, dtype=np.float64)
+        self._places = tuple(self._centers.ravel().tolist())
         self._heights = np.asarray(geometry.heights, dtype=np.float64)
         self._rows = tuple(
             (cx, cy, lx, ly, h)
@@ -104,6 +105,10 @@ class BeamSolver(Solver):
             rows.append((jx[0] + tie * jx[4], jx[1] - tie * jx[3], jx[2]))
             rows.append((jy[0] + tie * jy[4], jy[1] - tie * jy[3], jy[2]))
         return predicted, rows
+
+    def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
+        """As of a flat plate: the tilts change it by their own size, some thousandths. See :class:`Solver`."""
+        return flat_gain(self._places, dots, variances, solution)
 
     def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
         """N blocks. See :class:`Solver`."""
