@@ -172,6 +172,10 @@ class Rig:
     values: Mapping[str, Value] = field(repr=False)
     effects: Mapping[str, Any] = field(default_factory=dict)
 
+    def flat(self) -> dict[str, object]:
+        """All values under their flat names, those of the simulated effects too: :func:`rig_from_values` reads them."""
+        return {**self.values, **{EFFECTS_PREFIX + key: value for key, value in self.effects.items()}}
+
     @property
     def psds(self) -> tuple[PsdConfig, PsdConfig]:
         """Both detectors, in order."""
@@ -292,8 +296,7 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
 
 def replace_values(rig: Rig, changes: Mapping[str, object], source: str = 'override') -> Rig:
     """The same rig with some values changed, checked like any others."""
-    effects = {EFFECTS_PREFIX + k: e for k, e in rig.effects.items()}
-    return rig_from_values({**rig.values, **effects, **changes}, source)
+    return rig_from_values({**rig.flat(), **changes}, source)
 
 
 def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[str, object]:

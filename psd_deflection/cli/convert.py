@@ -24,7 +24,7 @@ from psd_deflection.cli._options import recording_name
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json
 from psd_deflection.cli.replay import replayed, rig_of
-from psd_deflection.config import EFFECTS_PREFIX, load_rig
+from psd_deflection.config import load_rig
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.bag_writer import BagWriter, McapFile
 from psd_deflection.recordings.csv_writer import CsvSampleSink
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     parameters: dict[str, object] = dict(recording.parameters)
     if args.params_file is not None:
         rig = load_rig(args.params_file)
-        parameters = {**rig.values, **{EFFECTS_PREFIX + k: e for k, e in rig.effects.items()}}
+        parameters = rig.flat()
     samples = convert(recording, Path(args.out), parameters, args.json)
     if args.json:
         print_json({'out': args.out, 'samples': samples, 'warnings': list(recording.warnings)})

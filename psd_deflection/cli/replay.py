@@ -117,10 +117,7 @@ def run(args: argparse.Namespace) -> int:
         comparison = Comparison(recording) if args.compare else None
     sink: Sink | None = None
     if args.out is not None:
-        effects = {f'effects.{name}': value for name, value in rig.effects.items()}
-        sink = open_sink(
-            args.out, rig_values={**rig.values, **effects}, solvers=rig.estimator.solvers, device_hello=recording.hello
-        )
+        sink = open_sink(args.out, rig_values=rig.flat(), solvers=rig.estimator.solvers, device_hello=recording.hello)
     totals = Totals()
     began = time.perf_counter()
     bar = progress_of(recording.blocks(), quiet=args.json)

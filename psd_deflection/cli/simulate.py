@@ -147,7 +147,7 @@ def write_recording(
     """
     is_csv = out.suffix.lower() == '.csv'
     sink: Sink
-    values = {**known.values, **{EFFECTS_PREFIX + k: e for k, e in known.effects.items()}}
+    values = known.flat()
     if is_csv:
         sink = CsvSampleSink(out, loads=True, references=reference, temperatures=temperature is not None)
     elif out.suffix.lower() == '.mcap':

@@ -89,7 +89,6 @@ class Recorder:
         """
         if self._bag is not None:
             return self._bag.folder
-        effects = {f'effects.{name}': value for name, value in rig.effects.items()}
         config = rig.acquisition
         folder = new_folder(Path(config.bag_dir).expanduser())
         missing = _missing_room(_nearest(folder), config.disk_reserve)
@@ -98,7 +97,7 @@ class Recorder:
         try:
             bag = BagWriter(
                 folder,
-                rig_values={**rig.values, **effects},
+                rig_values=rig.flat(),
                 device_hello=hello,
                 max_bytes=config.bag_max_bytes,
                 max_s=config.bag_max_duration,

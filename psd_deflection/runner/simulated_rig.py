@@ -50,11 +50,10 @@ class SimulatedRigProcess:
     """The process behind ``port``; it ends when this one closes its standard input, or dies."""
 
     def __init__(self, rig: Rig) -> None:
-        effects = {f'effects.{name}': value for name, value in rig.effects.items()}
         self._process = _waiting.pop() if _waiting else _start()
         if self._process.stdin is None or self._process.stdout is None:
             raise DeviceError('the simulated rig has no pipes')
-        self._process.stdin.write(json.dumps({**rig.values, **effects}).encode() + b'\n')
+        self._process.stdin.write(json.dumps(rig.flat()).encode() + b'\n')
         self._process.stdin.flush()
         try:
             ready, _, _ = select.select((self._process.stdout,), (), (), START_S)
