@@ -112,6 +112,9 @@ class EstimatorConfig:
     min_samples: int
     sum_min: float
     sum_max: float
+    block_fit: str
+    covariance: str
+    consistency: str
     splitter: bool
     degraded: str
     frozen: str
@@ -254,6 +257,9 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
             min_samples=v['min_samples'],
             sum_min=v['sum_min'],
             sum_max=v['sum_max'],
+            block_fit=v['block_fit'],
+            covariance=v['covariance'],
+            consistency=v['consistency'],
             splitter=v['splitter'],
             degraded=v['degraded'],
             frozen=v['frozen'],
@@ -292,6 +298,16 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
         values=MappingProxyType(got),
         effects=MappingProxyType(effects),
     )
+
+
+def rig_as_recorded(values: Mapping[str, object], source: str) -> Rig:
+    """The rig of a recording's parameters: one that they do not name was not there yet, and what held before it holds.
+
+    A recording names every parameter of its time; one that names none (CSV) has today's defaults. Raises ConfigError
+    as :func:`rig_from_values` does.
+    """
+    then = {p.name: p.before for p in PARAMETERS if p.before is not None} if values else {}
+    return rig_from_values({**then, **values}, source)
 
 
 def replace_values(rig: Rig, changes: Mapping[str, object], source: str = 'override') -> Rig:

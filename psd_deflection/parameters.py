@@ -26,7 +26,8 @@ SENSOR_TYPES = ('duolateral', 'tetralateral', 'pincushion', 'quadrant')
 class Parameter:
     """One thing that can be set. ``minimum``/``maximum`` hold for each element of an array.
 
-    ``above``: an exclusive lower bound. ``live``: may change while the node runs.
+    ``above``: an exclusive lower bound. ``live``: may change while the node runs. ``before``: what held before there
+    was this parameter, and so what a recording that does not name it was made with; None: the default.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Parameter:
     length: int | None = None
     choices: tuple[str, ...] | None = None
     live: bool = False
+    before: Any = None
 
     def bound_text(self) -> str:
         """The bounds in words, for an error message or ``--help``."""
@@ -143,6 +145,33 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('block_size', 'integer', 20, 'samples', 'samples averaged for one estimate', minimum=1, maximum=1000),
     Parameter(
         'min_samples', 'integer', 10, 'samples', 'a block with fewer present has no estimate', minimum=1, maximum=1000
+    ),
+    Parameter(
+        'block_fit',
+        'string',
+        'poly',
+        '',
+        'what a block gives: its mean, or a polynomial at the stamp (poly), which follows motion inside the block',
+        choices=('mean', 'poly'),
+        before='mean',
+    ),
+    Parameter(
+        'covariance',
+        'string',
+        'measured',
+        '',
+        "noise behind the covariances: the rig file's, or measured in the stream after 100 blocks",
+        choices=('file', 'measured'),
+        before='file',
+    ),
+    Parameter(
+        'consistency',
+        'string',
+        'widen',
+        '',
+        'when the four readings contradict each other: widen the covariance, refuse the block, or only report it',
+        choices=('widen', 'refuse', 'report'),
+        before='report',
     ),
     Parameter(
         'sum_min',

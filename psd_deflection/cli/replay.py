@@ -23,7 +23,7 @@ import numpy as np
 from psd_deflection.cli._options import recording_name
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json
-from psd_deflection.config import Rig, load_rig, rig_from_values
+from psd_deflection.config import Rig, load_rig, rig_as_recorded
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.comparison import Comparison
 from psd_deflection.recordings.opening import open_recording
@@ -104,7 +104,7 @@ def rig_of(recording: Recording, params_file: str | None) -> Rig:
     """The rig to use: of the file, else of the recording, else the thesis rig's."""
     if params_file is not None:
         return load_rig(params_file)
-    return rig_from_values(recording.parameters, f'{recording.path} (recorded parameters)')
+    return rig_as_recorded(recording.parameters, f'{recording.path} (recorded parameters)')
 
 
 def run(args: argparse.Namespace) -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from psd_deflection.config import Rig, replace_values, rig_from_values
+from psd_deflection.config import Rig, replace_values, rig_as_recorded
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.errors import ConfigError, RecordingError
 from psd_deflection.recordings.opening import open_recording
@@ -24,7 +24,7 @@ def recorded_rig(recording: Recording) -> Rig:
 
     What was changed while it ran (a zero taken) is what the rig was all along, only known better.
     """
-    rig = rig_from_values(recording.parameters, f'{recording.path} (recorded parameters)')
+    rig = rig_as_recorded(recording.parameters, f'{recording.path} (recorded parameters)')
     for change in recording.changes:
         values = {name: value for name, value in change.values if name not in ENVIRONMENT}
         if values:

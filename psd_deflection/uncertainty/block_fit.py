@@ -71,7 +71,7 @@ def basis(size: int) -> FloatArray:
         for _ in range(2):
             for q in columns:
                 column = column - (q * column).sum() * q
-        columns.append(column / np.sqrt((column * column).sum()))
+        columns.append(column / float((column * column).sum()) ** 0.5)
     return np.stack(columns, axis=1)
 
 
@@ -94,7 +94,8 @@ class BlockFit:
         self._fft = 1 << (2 * size - 1).bit_length()
         self._middle = _at_middle(self._q)
         self._squares = np.zeros((4, self._orders))
-        self._weight = np.zeros((4, self._orders))
+        # Until motion is seen there was none.
+        self._weight = np.ones((4, self._orders))
         self._folds = np.full(self._fft // 2 + 1, 2.0 / self._fft)
         self._folds[[0, -1]] = 1.0 / self._fft
         self.set_geometry(centers, beams)
@@ -227,7 +228,7 @@ class BlockFit:
         sure = np.minimum(self._v / v, 1.0) ** 2
         self._squares += _FORGET * (sure * excess - self._squares)
         self._weight += _FORGET * (sure - self._weight)
-        tau = np.maximum(self._squares, 0.0) / np.maximum(self._weight, 1e-12)
+        tau = np.maximum(self._squares, 0.0) / np.maximum(self._weight, 1e-3)
         tau = np.where(c * c > _SUDDEN * (v + tau), np.maximum(excess, tau), tau)
         tau[:, 0] = _ANY
         return np.maximum(tau, self._v * 1e-9)

@@ -1,8 +1,8 @@
 """The dots of one block at its stamp and how sure they are: by the rule that the rig asks for.
 
-Joins what is measured of the noise (:mod:`psd_deflection.noise`), the fit through the block
-(:mod:`psd_deflection.block_fit`) and the check of the four readings against each other
-(:mod:`psd_deflection.consistency`), and tells what they remember.
+Joins what is measured of the noise (:mod:`psd_deflection.uncertainty.noise`), the fit through the block
+(:mod:`psd_deflection.uncertainty.block_fit`) and the check of the four readings against each other
+(:mod:`psd_deflection.uncertainty.consistency`), and tells what they remember.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from psd_deflection.block_fit import BlockFit, Fitted
+from psd_deflection.uncertainty.block_fit import BlockFit, Fitted
 from psd_deflection.calibration import dot_noise_variances
 from psd_deflection.config import Rig
-from psd_deflection.consistency import NAMES, Checked, Consistency, Suspect
-from psd_deflection.noise import StreamNoise
+from psd_deflection.uncertainty.consistency import NAMES, Checked, Consistency, Suspect
+from psd_deflection.uncertainty.noise import StreamNoise
 from psd_deflection.records import FloatArray, IntArray
 
 NOISE, FIT, HELD_RESIDUAL = 'state.noise', 'state.block_fit', 'state.residual'
@@ -46,8 +46,6 @@ class StampedDots:
         self._size = config.block_size
         self.contradictions = 0
         self.misfits = 0
-        self._white = {n: np.eye(4) * (variance / n) for n in range(1, config.block_size + 1)}
-        self._centers = rig.centers
         (x1, y1), (x2, y2) = rig.centers.tolist()
         self._apart = (x1 - x2, y1 - y2)
 
@@ -70,10 +68,6 @@ class StampedDots:
         more = self._size / present
         return tuple(more * sd * sd for sd in self.noise.mean_sd().tolist())
 
-    def white(self, present: int) -> FloatArray:
-        """Covariance (4, 4), m^2, of the mean of that many samples by the rig file."""
-        return self._white[present]
-
     def check(self, dots: tuple[float, ...], residual: tuple[float, ...], covariance: FloatArray) -> Checked:
         """Hold the four readings of a block against each other."""
         x1, y1, x2, y2 = dots
@@ -87,9 +81,10 @@ class StampedDots:
         if self._measures and self.noise.add(index, slots, samples):
             self._fit.set_noise(self.noise.gamma)
 
-    def suspect(self, dots: tuple[float, ...], checked: Checked) -> None:
-        """Take a block into the search for a wrong reading."""
-        self._suspect.add(dots, checked.errors)
+    def suspect(self, index: int, dots: tuple[float, ...], checked: Checked) -> None:
+        """Take a block into the search for a wrong reading: each that contradicts itself, of the others some."""
+        if checked.contradict or index % 10 == 0:
+            self._suspect.add(dots, checked.errors)
 
     def most_likely_wrong(self) -> str:
         """The reading that is most likely wrong and what is wrong with it, or '' if it cannot be told."""
@@ -118,7 +113,8 @@ class StampedDots:
             out[NOISE] = self.noise.state()
         if self.active:
             out[FIT] = self._fit.state()
-        out[HELD_RESIDUAL] = (self._consistency.held,)
+        if self._consistency.held > 0.0:
+            out[HELD_RESIDUAL] = (self._consistency.held,)
         return out
 
     def restore(self, values: Mapping[str, tuple[float, ...]]) -> None:

@@ -24,7 +24,7 @@ from math import exp, pi
 
 import numpy as np
 
-from psd_deflection.block_fit import basis, combinations
+from psd_deflection.uncertainty.block_fit import basis, combinations
 from psd_deflection.records import FloatArray, IntArray
 
 SEGMENT_BLOCKS = 50
@@ -89,11 +89,11 @@ class StreamNoise:
 
     def sample_sd(self) -> FloatArray:
         """Standard deviation (4,), m, of one sample."""
-        return np.sqrt(np.einsum('ccl->cl', self.gamma)[:, 0])
+        return np.asarray(np.sqrt(self.gamma[range(4), range(4), 0]))
 
     def mean_sd(self) -> FloatArray:
         """Standard deviation (4,), m, of the mean of a whole block."""
-        return np.sqrt(np.einsum('ccl,l->c', self.gamma, self._mean_of))
+        return np.asarray(np.sqrt(np.einsum('ccl,l->c', self.gamma, self._mean_of)))
 
     def add(self, index: int, slots: IntArray, dots: FloatArray) -> bool:
         """A block's samples; True where they ended a segment that changed ``gamma``.
