@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import EffectParameter
+from psd_deflection.simulation.declaration import EffectParameter
 
 BIC_ACCEPT = 10.0
 MAX_EFFECTS = 4

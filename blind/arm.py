@@ -22,7 +22,7 @@ import numpy as np
 
 from blind.adapter import Model, PlantDiscovery, PlantEffect, discover_in
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import EffectParameter
+from psd_deflection.simulation.declaration import EffectParameter
 
 DATA = Path(__file__).parent.parent / 'test' / 'data' / 'two_link_arm' / 'excerpt.csv'
 RATE = 100.0

@@ -21,9 +21,9 @@ from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.result import sentence
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation import loads
-from psd_deflection.simulation.catalogue import ActiveEffect, catalogue
+from psd_deflection.simulation.catalogue import catalogue
+from psd_deflection.simulation.declaration import ActiveEffect
 from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.probes import off_values, variants
 from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
 from psd_deflection.solvers import solver_from_rig
 
@@ -45,8 +45,8 @@ def knobs(rig: Rig) -> Iterator[tuple[str, Callable[[float], ActiveEffect], floa
     """Each amplitude of each effect: label, maker, and the sizes to try, low and high."""
     physics = Physics.of(rig)
     for effect in catalogue().values():
-        for choice in variants(effect):
-            off = off_values(effect, physics, choice)
+        for choice in effect.variants():
+            off = effect.off_values(physics, choice)
             for p in effect.parameters:
                 if p.kind != 'amplitude' or p.name.startswith('amplitude_sum'):
                     continue

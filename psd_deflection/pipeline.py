@@ -23,7 +23,7 @@ from psd_deflection.averaging import BlockCutter, block_middle_ns, covariance
 from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_variances
 from psd_deflection.calibration.health import OpticsHealth, Verdict
 from psd_deflection.config import Rig, replace_values
-from psd_deflection.uncertainty.consistency import Checked, widened
+from psd_deflection.correction import Correction
 from psd_deflection.mechanics import LinkStatics
 from psd_deflection.records import (
     ENVIRONMENT,
@@ -37,12 +37,12 @@ from psd_deflection.records import (
     SpotMeans,
     TipLoad,
 )
-from psd_deflection.simulation.correction import Correction
 from psd_deflection.solvers import solver_from_rig
 from psd_deflection.solvers.from_rig import geometry_from_rig
 from psd_deflection.solvers.interface import Solution, SolverStatus
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 from psd_deflection.solvers.one_psd import OnePsd
+from psd_deflection.uncertainty.consistency import Checked, widened
 from psd_deflection.uncertainty.stamped import FIT, HELD_RESIDUAL, NOISE, StampedDots
 
 ZERO_BLOCKS = 25
@@ -185,18 +185,27 @@ class Pipeline:
             self.stamped.set_zeros(self.rig)
         self.stamped.restore(told)
 
-    def memory(self) -> ParameterChange | None:
-        """What the next block depends on beside its samples and the rig, or None where that is nothing."""
-        values: list[tuple[str, float | str | tuple[float, ...]]] = list(self._environment.items())
+    def memory(self, rig: Rig) -> ParameterChange | None:
+        """What the next block depends on beside its samples and ``rig``, or None if that is nothing.
+
+        ``rig``: as it was before; what was changed since is part of the memory.
+        """
+        changed = {name: value for name, value in self.rig.values.items() if value != rig.values[name]}
+        values: list[tuple[str, float | str | tuple[float, ...]]] = []
+        for name, value in changed.items():
+            values.append((name, tuple(map(float, value)) if isinstance(value, list) else value))
+        values += self._environment.items()
         if self._held is not None and self.rig.estimator.degraded == 'hold':
             values.append((HELD, tuple(self._held)))
         if self._frozen != (0, 0):
             values.append((FROZEN, self._frozen))
-        values += self.stamped.memory().items()
-        last = self.last_spots
-        if not values or last is None:
+        if self.last_spots is not None:
+            values += self.stamped.memory().items()
+        if not values:
             return None
-        return ParameterChange(last.t_ns, last.index + 1, tuple(values))
+        last = self.last_spots
+        t_ns, block = (last.t_ns, last.index + 1) if last is not None else (0, 0)
+        return ParameterChange(t_ns, block, tuple(values))
 
     def temperature(self, celsius: float) -> ParameterChange | None:
         """The ambient temperature from the next block on; None where no correction needs it."""

@@ -32,7 +32,7 @@ from psd_deflection.discovery.report import report_html
 from psd_deflection.discovery.result import model_yaml, result, sentence
 from psd_deflection.errors import RecordingError, UsageError
 from psd_deflection.recordings.observations import read_observations
-from psd_deflection.simulation.catalogue import catalogue
+from psd_deflection.simulation.catalogue import effect_names
 
 STEPS = 8
 """Steps that the progress bar counts: described, signatures, adding, weighing, alternatives, where, report, done."""
@@ -63,8 +63,8 @@ def run(args: argparse.Namespace) -> int:
     """Read, discover, write, and say it in a sentence."""
     given = None if args.params_file is None else load_rig(args.params_file)
     for name in args.without:
-        if name not in catalogue():
-            raise UsageError(f'--without {name}: no effect of that name; there are: {", ".join(catalogue())}')
+        if name not in effect_names():
+            raise UsageError(f'--without {name}: no effect of that name; there are: {", ".join(effect_names())}')
     with told('reading', quiet=args.quiet or args.json):
         observations = read_observations(args.recordings, given)
     out = Path(args.out)

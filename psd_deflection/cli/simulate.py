@@ -78,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='NAME,KEY=VALUE,...',
         action='append',
         default=[],
-        help='hide an effect in it, for example sensor_rotation,psd=2,angle=0.01; repeatable',
+        help='hide an effect in it; repeatable',
     )
     group.add_argument('--reference', action='store_true', help='record the true pose as an independent measurement')
     group.add_argument('--json', action='store_true', help='for programs: the summary as one JSON object')
@@ -98,13 +98,15 @@ def run(args: argparse.Namespace) -> int:
     with given_as_option():
         rig = with_effects(known, args.effect)
         rate = rig.converter.sample_rate_hz
-        parts = [load_history(words, rate) for words in args.loads or ['thesis']]
+        parts = [load_history(words, rate, '--loads') for words in args.loads or ['thesis']]
         history = parts[0].then(*parts[1:])
         if len(history) < LEAST_SAMPLES:
             raise UsageError(
                 f'--loads: last {len(history)} samples at {rate:g} Hz; a recording has at least {LEAST_SAMPLES}'
             )
-        temperature = None if args.temperature is None else temperature_history(args.temperature, len(history))
+        temperature = (
+            None if args.temperature is None else temperature_history(args.temperature, len(history), '--temperature')
+        )
     out = Path(args.out)
     count = write_recording(out, rig, known, history.loads, temperature, args.seed, args.reference, args.json)
     names = [a.label for a in effects_of_rig(rig)]

@@ -24,7 +24,8 @@ from psd_deflection.discovery.search import BIC_ACCEPT, BUDGET, P_ACCEPT, Search
 from psd_deflection.discovery.signatures import SignatureBank, candidates
 from psd_deflection.discovery.validate import HeldOut, heldout_gain, heldout_gap
 from psd_deflection.discovery.workspace import Workspace
-from psd_deflection.simulation.catalogue import ActiveEffect, effects_of_rig, make_active
+from psd_deflection.simulation.catalogue import catalogue, effects_of_rig
+from psd_deflection.simulation.declaration import ActiveEffect, Effect
 from psd_deflection.simulation.physics import Physics
 
 EQUIVALENT = 21.6
@@ -103,8 +104,8 @@ def _proposals(workspace: Workspace) -> dict[str, list[float]]:
     return {
         'spectral': peaks,
         'line': propose.persistent(peaks, raw, sigmas, periods),
-        'highest': propose.highest_voltages(observations, False, noise),
-        'highest_sums': propose.highest_voltages(observations, True, noise),
+        'highest': propose.highest_voltages(observations, True, noise),
+        'highest_dots': propose.highest_voltages(observations, False, noise),
     }
 
 
@@ -132,13 +133,14 @@ def discover(
     bank = SignatureBank() if bank is None else bank
     bank.nominal(workspace)
     found = _proposals(workspace)
-    lattice = _lattice(workspace, base, without)
+    of_lattice = [e for e in catalogue().values() if e.lattice]
+    lattice = _lattice(workspace, base, [e for e in of_lattice if e.name not in without])
     if lattice is not None:
         workspace.base = (*workspace.base, lattice)
     physics = Physics.of(rig)
 
     def screen(ws: Workspace) -> Screen:
-        listed = candidates(physics, found, (*without, 'quantisation'))
+        listed = candidates(physics, found, (*without, *(e.name for e in of_lattice)))
         return Screen(ws, [(c, bank.get(c, ws)) for c in listed])
 
     progress('signatures of every effect')
@@ -174,15 +176,18 @@ def _credible(
     return fit, heldout, left
 
 
-def _lattice(workspace: Workspace, base: Sequence[ActiveEffect], without: Sequence[str]) -> ActiveEffect | None:
-    if 'quantisation' in without or any(a.effect.name == 'quantisation' for a in base):
+def _lattice(workspace: Workspace, base: Sequence[ActiveEffect], effects: Sequence[Effect]) -> ActiveEffect | None:
+    """The first of ``effects`` with the step that is seen in the values themselves, if there is one."""
+    if not effects or any(a.effect.lattice for a in base):
         return None
     found = [propose.coarse_step(o) for o in workspace.observations]
     steps = [s for s in found if s is not None]
     if len(steps) < len(found):
         return None
+    effect = effects[0]
+    values = effect.off_values(workspace.physics, next(effect.variants()))
     # The recording with the longest lever knows it best.
-    return make_active('quantisation', {'step': min(steps, key=lambda s: s[1])[0]}, 'discover')
+    return ActiveEffect(effect, {**values, effect.lattice: min(steps, key=lambda s: s[1])[0]})
 
 
 def _accept(search: Search, result: SearchResult, rng: np.random.Generator) -> tuple[list[HeldOut], Fit]:
@@ -312,14 +317,15 @@ def _waterfall(ws: Workspace, fit: Fit, gap_before: float, gap_after: float) -> 
 def _lattice_gain(workspace: Workspace, lattice: ActiveEffect) -> float:
     """Log-likelihood of all readings lying on the lattice: by chance each does with 1 in step/LSB."""
     lsb = workspace.observations[0].rig.converter.volts_per_count
-    return workspace.size * workspace.fine[0] * float(np.log(max(lattice.values['step'] / lsb, 1.0)))
+    return workspace.size * workspace.fine[0] * float(np.log(max(lattice.values[lattice.effect.lattice] / lsb, 1.0)))
 
 
 def _named_lattice(workspace: Workspace, lattice: ActiveEffect) -> NamedEffect:
     """Coarse steps are seen in the values themselves."""
     gain = _lattice_gain(workspace, lattice)
     sd = min(s[1] for o in workspace.observations if (s := propose.coarse_step(o)) is not None)
-    return NamedEffect(lattice, {'step': sd}, 0.0, 2.0 * gain, HeldOut(gain, float(np.sqrt(2.0 * gain))), (), (), None)
+    heldout = HeldOut(gain, float(np.sqrt(2.0 * gain)))
+    return NamedEffect(lattice, {lattice.effect.lattice: sd}, 0.0, 2.0 * gain, heldout, (), (), None)
 
 
 def _unknown(left: Localisation, explained: float) -> tuple[Unknown, ...]:

@@ -12,7 +12,8 @@ from psd_deflection.discovery.fit import STEP, Fit
 from psd_deflection.discovery.workspace import Workspace, fine_means
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation import loads
-from psd_deflection.simulation.catalogue import ActiveEffect, sort_effects
+from psd_deflection.simulation.catalogue import sort_effects
+from psd_deflection.simulation.declaration import ActiveEffect
 from psd_deflection.simulation.loads import LoadHistory
 from psd_deflection.simulation.simulator import ForwardModel
 

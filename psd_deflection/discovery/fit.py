@@ -14,7 +14,7 @@ import numpy as np
 
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import ActiveEffect, EffectParameter
+from psd_deflection.simulation.declaration import ActiveEffect, EffectParameter
 
 STEP = 0.05
 """Finite difference, in scales of the parameter."""
@@ -42,10 +42,6 @@ class Fit:
     def parameters(self) -> int:
         """How many were fitted."""
         return len(self.free)
-
-    def bic(self, sample_size: float) -> float:
-        """Bayesian information criterion."""
-        return self.chi2 + self.parameters * float(np.log(sample_size))
 
     def covariance(self) -> FloatArray:
         """(p, p), of the parameters, from the curvature; unseen directions come out large."""

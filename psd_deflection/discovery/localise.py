@@ -263,7 +263,7 @@ def localise(
 
 
 def _plain(regressor: str) -> str:
-    """The contract's word for a regressor: a load, its rate, the dot's position, temperature, time."""
+    """The word of result.json for a regressor: a load, its rate, the dot's position, temperature, time."""
     for word in ('load_fx', 'load_fy', 'load_tz'):
         if word in regressor:
             return word

@@ -23,8 +23,8 @@ QUIET = 0.25
 class Observation:
     """``volts`` (n, 6) V, NaN where a sample is lost; ``loads`` (n, 3) N, N, N m, held.
 
-    ``temperature`` (n,) degrees Celsius or None; ``reference`` (n, 3) m, m, rad or None (NaN where
-    there is none). ``rig``: the rig with this recording's own overrides. ``digest``: of its source.
+    ``temperature`` (n,) degrees Celsius or None. ``rig``: the rig with this recording's own
+    overrides. ``digest``: of its source.
     """
 
     name: str
@@ -32,7 +32,6 @@ class Observation:
     volts: FloatArray
     loads: FloatArray
     temperature: FloatArray | None = None
-    reference: FloatArray | None = None
     digest: str = ''
 
     def __post_init__(self) -> None:

@@ -71,11 +71,10 @@ def _residual_figure(discovery: Discovery) -> Figure:
 
 
 def _spectrum(rows: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
-    n = rows.shape[1]
-    window = np.hanning(n)
-    filled = np.where(np.isfinite(rows), rows, 0.0)
-    power = np.abs(np.fft.rfft(filled * window, axis=1)) ** 2 * 2.0 * period / np.sum(window**2)
-    frequency = np.fft.rfftfreq(n, period)
+    """Frequencies, Hz, and power density, unit of ``rows`` squared per Hz, mean over the rows (k, n)."""
+    from scipy.signal import periodogram
+
+    frequency, power = periodogram(np.nan_to_num(rows), 1.0 / period, window='hann', detrend=False)
     # Log-spaced averages: a raw periodogram hides its lines in its own scatter.
     edges = np.geomspace(frequency[1], frequency[-1], 90)
     index = np.digitize(frequency[1:], edges)

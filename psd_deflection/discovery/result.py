@@ -1,4 +1,4 @@
-"""What discover leaves: result.json and model.yaml (contract section 6)."""
+"""What discover leaves: result.json and model.yaml (docs/discover.md)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import yaml
 from psd_deflection import __version__
 from psd_deflection.config import Rig
 from psd_deflection.discovery.discover import Discovery, NamedEffect
-from psd_deflection.simulation.catalogue import ActiveEffect, effects_to_values
+from psd_deflection.simulation.catalogue import effects_to_values
+from psd_deflection.simulation.declaration import ActiveEffect
 
 
 def _number(value: float) -> float:

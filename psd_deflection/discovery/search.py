@@ -16,7 +16,7 @@ from scipy.stats import chi2 as chi2_law
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.screen import Score, Screen
 from psd_deflection.discovery.workspace import Workspace
-from psd_deflection.simulation.catalogue import ActiveEffect
+from psd_deflection.simulation.declaration import ActiveEffect, Effect
 
 P_ACCEPT = 0.01
 """Library-wide p of an effect at most this."""
@@ -52,12 +52,12 @@ class SearchResult:
 
 def key_of(active: ActiveEffect) -> tuple[object, ...]:
     """Effect and discrete choices."""
-    return (active.effect.name, *(active.values[p.name] for p in active.effect.parameters if p.kind == 'choice'))
+    return (active.effect.name, *active.choices)
 
 
-def slot(effect: str, values: Mapping[str, float]) -> tuple[object, ...]:
+def slot(effect: Effect, values: Mapping[str, float]) -> tuple[object, ...]:
     """What there is one of: an effect, for each PSD. Two readings of one effect at once explain nothing."""
-    return (effect, values.get('psd'))
+    return (effect.name, *(values[p.name] for p in effect.parameters if p.each))
 
 
 def promising(scores: Sequence[Score], penalty: float, share: float, limit: int) -> list[Score]:
@@ -155,8 +155,8 @@ class Search:
         while len(current.effects) < MAX_EFFECTS and ws.simulations < BUDGET:
             if current.effects:
                 scores = self.screen.score(current.residual, current.jacobian)
-            taken = {slot(a.effect.name, a.values) for a in current.effects}
-            scores = [s for s in scores if slot(s.candidate.effect.name, s.candidate.start) not in taken]
+            taken = {slot(a.effect, a.values) for a in current.effects}
+            scores = [s for s in scores if slot(s.candidate.effect, s.candidate.start) not in taken]
             if not scores or min(s.p for s in scores) > P_ACCEPT:
                 break
             # From the second on, what is left is smaller and the first guess better.
@@ -204,7 +204,7 @@ class Search:
         pairs = self.screen.pairs(null.residual, self.penalty, 5)
         starts = []
         for a, b, _ in pairs:
-            same = slot(a.candidate.effect.name, a.candidate.start) == slot(b.candidate.effect.name, b.candidate.start)
+            same = slot(a.candidate.effect, a.candidate.start) == slot(b.candidate.effect, b.candidate.start)
             if not same and {a.candidate.variant, b.candidate.variant} != {key_of(e) for e in current.effects}:
                 starts.append(
                     [a.candidate.from_coefficients(a.coefficients), b.candidate.from_coefficients(b.coefficients)]

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import ActiveEffect, Effect, catalogue
+from psd_deflection.simulation.catalogue import catalogue
+from psd_deflection.simulation.declaration import ActiveEffect, Effect
 from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.probes import off_values, variants
 
 Columns = list[list[FloatArray]]
 """Per column, per recording: fine-block volts (6, nf)."""
@@ -52,9 +52,8 @@ class Candidate:
         values = dict(self.start)
         if self.effect.finite:
             p = self.effect.parameter(self.free[0])
-            if p.name == 'slope_ratio':
-                # An even effect: the signature goes with the square.
-                values[p.name] = self.start[p.name] * math.sqrt(max(float(coefficients[0]), 1e-4))
+            if p.power:
+                values[p.name] = self.start[p.name] * max(float(coefficients[0]), 1e-4) ** (1.0 / p.power)
             return ActiveEffect(self.effect, values)
         by_name = dict(zip(self.free, (float(c) for c in coefficients), strict=True))
         main = next(n for n in self.free if self.effect.parameter(n).kind == 'amplitude')
@@ -65,8 +64,8 @@ class Candidate:
             elif p.kind == 'coupled':
                 values[name] = c / by_name[main] * p.scale if abs(by_name[main]) > 1e-6 else 0.0
         for name, c in by_name.items():
-            if self.effect.parameter(name).kind == 'phase':
-                partner = 'amplitude_' + name.removeprefix('phase_')
+            partner = self.effect.parameter(name).partner
+            if partner:
                 values[name] = math.atan2(c, by_name[partner])
                 values[partner] = self.effect.parameter(partner).scale * math.hypot(c, by_name[partner])
         for name in self.free:
@@ -82,25 +81,24 @@ def candidates(
 ) -> Iterator[Candidate]:
     """Every candidate of the catalogue but those named in ``without``.
 
-    ``proposals``: for ``spectral``, ``highest``, ``highest_sums`` and ``lattice``, values to try.
+    ``proposals``: the values to try, by the name that a parameter's ``propose`` gives.
     """
     for effect in catalogue().values():
         if effect.name in without:
             continue
-        for choice in variants(effect):
-            off = off_values(effect, physics, choice)
+        for choice in effect.variants():
+            off = effect.off_values(physics, choice)
             shapes: list[list[tuple[str, float]]] = []
             probed: list[tuple[str, float]] = []
             for p in effect.parameters:
+                propose = p.proposed_by(choice)
+                grid = list(proposals.get(propose, ())) if propose else list(p.grid)
                 if p.kind == 'shape':
-                    grid = list(proposals.get(p.propose, ())) if p.propose else list(p.grid)
-                    if p.propose == 'spectral':
+                    if propose == 'spectral':
                         grid += p.grid
                     low, high = p.bounds(physics, off)
                     shapes.append([(p.name, v) for v in grid if low <= v <= high])
                 elif p.kind == 'amplitude' and effect.finite:
-                    key = 'highest_sums' if p.propose == 'highest' and choice.get('sums') else p.propose
-                    grid = list(proposals.get(key, ())) if p.propose else list(p.grid)
                     probed += [(p.name, v) for v in grid]
             for combination in itertools.product(*shapes):
                 start = {**off, **dict(combination)}
@@ -140,7 +138,7 @@ def columns(
             moved = minus(simulate({**start, name: start[name] + sign * p.scale}), nominal)
             out.append([sign * m for m in moved])
         elif p.kind == 'phase':
-            partner = effect.parameter('amplitude_' + name.removeprefix('phase_'))
+            partner = effect.parameter(p.partner)
             out.append(minus(simulate({**start, partner.name: partner.scale, name: math.pi / 2.0}), nominal))
         else:
             if dosed is None:

@@ -14,7 +14,8 @@ import numpy as np
 from psd_deflection.discovery.noise import NoiseModel, estimate_noise
 from psd_deflection.discovery.observation import Observation, load_cases
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.simulation.catalogue import ActiveEffect, sort_effects
+from psd_deflection.simulation.catalogue import sort_effects
+from psd_deflection.simulation.declaration import ActiveEffect
 from psd_deflection.simulation.physics import Physics
 from psd_deflection.simulation.simulator import ForwardModel
 

@@ -343,12 +343,12 @@ class MonitorServer:
         }
 
     async def _zero(self, request: web.Request) -> web.StreamResponse:
-        return await self._act(request, lambda wanted: self._source.zero())
+        return await self._act(request, lambda wanted: asyncio.to_thread(self._source.zero))
 
     async def _record(self, request: web.Request) -> web.StreamResponse:
         return await self._act(request, self._source.record)
 
-    async def _act(self, request: web.Request, action: Callable[[bool], str]) -> web.StreamResponse:
+    async def _act(self, request: web.Request, action: Callable[[bool], Awaitable[str]]) -> web.StreamResponse:
         if not self._config.control:
             return _answer(403, 'refused: the buttons are off; monitor_control:=true (--control) allows them')
         if self.token and not access.is_token(request.headers.get(TOKEN_HEADER), self.token):
@@ -364,7 +364,7 @@ class MonitorServer:
         if not isinstance(wanted, bool):
             return _answer(400, 'refused: expected {"record": true} or {"record": false}')
         try:
-            text = await asyncio.get_running_loop().run_in_executor(None, action, wanted)
+            text = await action(wanted)
         except RefusedError as error:
             return _answer(409, str(error))
         self._say(f'monitor: {text} (asked for by {request.remote})')

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from pathlib import Path
 from typing import Any, Protocol
 
 from psd_deflection.config import Rig
@@ -44,8 +44,8 @@ class Source(Protocol):
     def zero(self) -> str:
         """Take the present dots as the unloaded ones; what was done, in a line. Raises RefusedError."""
 
-    def record(self, wanted: bool) -> str:
-        """Start or stop a recording; what was done, in a line. Raises RefusedError."""
+    async def record(self, wanted: bool) -> str:
+        """Start or stop a recording; what was done, in a line, once the disk has answered. Raises RefusedError."""
 
 
 class LiveSource:
@@ -83,10 +83,12 @@ class LiveSource:
             raise RefusedError(f'not zeroed: {why_no_zero(self._session.pipeline)}')
         return zero_text(self._session.rig)
 
-    def record(self, wanted: bool) -> str:
+    async def record(self, wanted: bool) -> str:
         """Start or stop the recorder between two blocks."""
         try:
-            folder: Path | None = self._session.record(wanted)
+            asked = await asyncio.to_thread(self._session.record, wanted)
+            # Not in a thread of a pool: a disk that hangs would take one after the other, and hold up the exit.
+            folder = await asyncio.wrap_future(asked)
         except (TimeoutError, PsdDeflectionError) as error:
             raise RefusedError(str(error)) from None
         if folder is None:
@@ -200,7 +202,7 @@ class ReplaySource:
             asked.cancel()
             raise RefusedError('not zeroed: no data flows') from None
 
-    def record(self, wanted: bool) -> str:
+    async def record(self, wanted: bool) -> str:
         """Refuse: it is recorded already."""
         raise RefusedError('a recording is not recorded again; `psd-deflection replay REC --out OUT` writes one')
 

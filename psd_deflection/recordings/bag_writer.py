@@ -394,6 +394,12 @@ class BagWriter:
             reason = error.strerror or error
             raise RecordingError(f'{self.folder / "metadata.yaml"}: cannot be written ({reason})') from None
 
+    def discard(self) -> None:
+        """Close and delete a bag into which nothing was written. Raises OSError, RecordingError if the disk refuses."""
+        self._file.close()
+        self.path.unlink()
+        self.folder.rmdir()
+
     # A recorder is a sink like any other.
     put = write
 

@@ -86,13 +86,7 @@ def read_observation(
             warm = _held(at, celsius, t_ns, grace, celsius[0])
         else:
             warm = np.interp(t_ns, at.astype(np.float64), celsius)
-    reference: FloatArray | None = None
-    references = recording.references()
-    if references:
-        reference = np.full((n, 3), np.nan)
-        index = np.clip(np.rint(np.interp([r.t_ns - start for r in references], t_ns, np.arange(n))), 0, n - 1)
-        reference[index.astype(np.int64)] = [r[1:] for r in references]
-    return Observation(path.name, rig, volts, held, warm, reference, digest=_digest(path))
+    return Observation(path.name, rig, volts, held, warm, digest=_digest(path))
 
 
 def _held(

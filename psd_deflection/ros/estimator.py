@@ -17,13 +17,15 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor, await_or_execute
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters import DEFLECTION, DIAGNOSTICS, INPUTS, TOPIC_TYPES, solver_topic, to_messages
@@ -109,7 +111,8 @@ class EstimatorNode:
             self.rig = rig_of_node(self.node, {})
             self._live = LiveParameters(self.node)
             self.node.create_service(Trigger, '~/zero', self._zero)
-            self.node.create_service(SetBool, '~/record', self._record)
+            # In a group of its own: while one request waits for the disk, the node serves everything else.
+            self.node.create_service(SetBool, '~/record', self._record, callback_group=ReentrantCallbackGroup())
             self._survive_requests()
             self._wire, self._inputs = self._wires()
             # Neither a simulated clock that stands still nor a system clock that is set keeps health from being told.
@@ -144,9 +147,9 @@ class EstimatorNode:
         """
 
         def survivor(carry_out: Callable[[Any, Any], Any], name: str) -> Callable[[Any, Any], Any]:
-            def answer(request: Any, response: Any) -> Any:
+            async def answer(request: Any, response: Any) -> Any:
                 try:
-                    return carry_out(request, response)
+                    return await await_or_execute(carry_out, request, response)
                 except Exception as error:
                     reason = str(error).splitlines()[0] if str(error) else type(error).__name__
                     self._say(f'{name}: refused: {reason}')
@@ -269,13 +272,17 @@ class EstimatorNode:
         response.success, response.message = True, zero_text(rig)
         return response
 
-    def _record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    async def _record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         response.success = False
         if self.session is None:
             response.message = 'the node is not configured'
             return response
         try:
-            folder = self.session.record(request.data)
+            asked = self.session.record(request.data)
+            answered: Any = Future()
+            asked.add_done_callback(lambda _: answered.set_result(None))
+            await answered
+            folder = asked.result()
         except (PsdDeflectionError, TimeoutError) as error:
             response.message = str(error)
             return response

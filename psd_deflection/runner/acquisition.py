@@ -159,7 +159,9 @@ class Acquisition:
         A reader that waits for its device is told to give up; one that does not come back is left behind.
         """
         self._stop.set()
-        if self._thread.ident is not None:
+        if self._thread.ident is None:
+            self.queue.put(Ended())
+        else:
             self._thread.join(2.0 * READ_TIMEOUT_S)
             for _ in range(GIVE_UP_TIMES):
                 if not self._thread.is_alive():

@@ -183,7 +183,9 @@ class HealthReporter:
             ('files deleted to make room', str(recorder.files_deleted)),
         )
         level, message = OK, 'recording' if folder else 'not recording'
-        if recorder.failure:
+        if recorder.opening:
+            level, message = WARN, 'a recording was asked for; the disk has not answered yet'
+        elif recorder.failure:
             level, message = ERROR, f'recording stopped: {recorder.failure}'
         elif recorder.dropped:
             level, message = WARN, f'{recorder.dropped} messages dropped: the disk is too slow'

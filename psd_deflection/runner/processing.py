@@ -1,7 +1,8 @@
 """The pipeline thread: takes chunks off the queue, runs the pipeline, gives its records to the sinks.
 
-It is the only thread that touches the pipeline. Requests from other threads (take the zero, start
-or stop a recording) are carried out between two blocks, so that none of them falls into one.
+It is the only thread that touches the pipeline. Requests from other threads (take the zero, attach
+or detach a recording) are carried out between two blocks, so that none of them falls into one. A
+request must not wait for anything: whatever it waits for, the estimates wait for too.
 """
 
 from __future__ import annotations
@@ -11,17 +12,21 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import Record
-from psd_deflection.runner.acquisition import Acquisition, Chunk, Restarted
+from psd_deflection.runner.acquisition import Chunk, Item, Restarted
 
 T = TypeVar('T')
 
 REQUEST_TIMEOUT_S = 2.0
-"""The end of a recording may take the recorder's ``JOIN_S`` of it."""
+"""How long a request waits for its turn, and then once more for its end."""
+
+LATENCY_NS = 1_000_000_000
+"""Latencies are told over this time."""
 
 INTERVAL_S = 1.0
 """Between two lines about estimates, at least."""
@@ -74,18 +79,27 @@ class Spokesman:
 
 
 class Processing:
-    """Runs ``pipeline`` over what ``acquisition`` reads; ``sinks`` take the records in their order."""
+    """Runs ``pipeline`` over ``items`` until one of them is Ended; ``sinks`` take the records in their order.
 
-    def __init__(self, acquisition: Acquisition, pipeline: Pipeline, say: Callable[[str], None]) -> None:
+    ``clock``: monotonic time, ns, the one that the chunks' ``read_ns`` are of.
+    """
+
+    def __init__(
+        self,
+        items: queue.SimpleQueue[Item],
+        pipeline: Pipeline,
+        say: Callable[[str], None],
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         self.pipeline = pipeline
         self.sinks: list[RecordSink] = []
         self.failed: BaseException | None = None
         self.beat = time.monotonic()
-        self._acquisition = acquisition
-        self._say = say
-        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._latencies: deque[float] = deque(maxlen=50)
-        self._heard_ns = time.monotonic_ns()
+        self._items = items
+        self._clock = clock
+        self._requests: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = queue.SimpleQueue()
+        self._latencies: deque[tuple[int, float]] = deque()
+        self._heard_ns = clock()
         self._thread = threading.Thread(target=self._run, name='pipeline', daemon=True)
         self._spokesman = Spokesman(say)
 
@@ -104,42 +118,31 @@ class Processing:
         return self._thread.is_alive()
 
     def latency(self) -> Latency | None:
-        """How long the last second's blocks took, or None before the first."""
-        taken = sorted(self._latencies)
+        """How long the blocks of the last second took, or None if there was none."""
+        since = self._clock() - LATENCY_NS
+        taken = sorted(seconds for at, seconds in tuple(self._latencies) if at >= since)
         return Latency(taken[len(taken) // 2], taken[-1]) if taken else None
 
     def silent_s(self) -> float:
         """Since the samples that were processed last came, s."""
-        return (time.monotonic_ns() - self._heard_ns) / 1e9
+        return (self._clock() - self._heard_ns) / 1e9
 
     def request(self, action: Callable[[], T]) -> T:
         """Run ``action`` between two blocks and return what it returns; its errors come through.
 
-        Raises TimeoutError where the thread does not come round within ``REQUEST_TIMEOUT_S``.
+        Raises TimeoutError if its turn does not come within ``REQUEST_TIMEOUT_S``: it is not run then,
+        ever. Raises TimeoutError with another message if it was begun and does not end in that time.
         """
-        box: queue.SimpleQueue[tuple[T | None, BaseException | None]] = queue.SimpleQueue()
-        cancelled = threading.Event()
-
-        def run() -> None:
-            if cancelled.is_set():
-                return
-            try:
-                box.put((action(), None))
-            except Exception as error:
-                box.put((None, error))
-
+        asked: Future[T] = Future()
+        self._requests.put((asked, action))
         if not self.alive:
-            run()
-        else:
-            self._requests.put(run)
-        try:
-            value, error = box.get(timeout=REQUEST_TIMEOUT_S)
-        except queue.Empty:
-            cancelled.set()
-            raise TimeoutError('no data flows') from None
-        if error is not None:
-            raise error
-        return value  # type: ignore[return-value]
+            self._carry_out()
+        if not wait((asked,), REQUEST_TIMEOUT_S).done:
+            if asked.cancel():
+                raise TimeoutError('no data flows')
+            if not wait((asked,), REQUEST_TIMEOUT_S).done:
+                raise TimeoutError('it was begun and has not ended: something holds up the pipeline')
+        return asked.result()
 
     def give(self, records: Iterable[Record]) -> int:
         """Hand each record to every sink as it comes; how many there were."""
@@ -155,14 +158,14 @@ class Processing:
             while True:
                 self.beat = time.monotonic()
                 try:
-                    item = self._acquisition.queue.get(timeout=0.1)
+                    item = self._items.get(timeout=0.1)
                 except queue.Empty:
                     self._carry_out()
                     continue
                 if isinstance(item, Chunk):
                     self._heard_ns = item.read_ns
                     if self.give(self.pipeline.process(item.raw)):
-                        self._latencies.append((time.monotonic_ns() - item.read_ns) / 1e9)
+                        self._note_latency(item.read_ns)
                         self._tell_refusals()
                 elif isinstance(item, Restarted):
                     self.give(self.pipeline.flush())
@@ -176,8 +179,24 @@ class Processing:
             raise
 
     def _carry_out(self) -> None:
-        while not self._requests.empty():
-            self._requests.get()()
+        while True:
+            try:
+                asked, action = self._requests.get_nowait()
+            except queue.Empty:
+                return
+            # Whoever gave up was told that it was not done.
+            if not asked.set_running_or_notify_cancel():
+                continue
+            try:
+                asked.set_result(action())
+            except Exception as error:
+                asked.set_exception(error)
+
+    def _note_latency(self, read_ns: int) -> None:
+        now = self._clock()
+        self._latencies.append((now, (now - read_ns) / 1e9))
+        while self._latencies[0][0] < now - LATENCY_NS:
+            self._latencies.popleft()
 
     def _tell_refusals(self) -> None:
         spots = self.pipeline.last_spots

@@ -1,6 +1,11 @@
 """The recorder thread: what was published, written to a bag without holding up what is to come.
 
-It takes encoded messages from a bounded queue; what does not fit is counted, never waited for. An
+Each recording has a thread of its own, which alone touches the disk: it opens the bag, asks the
+pipeline thread to attach it between two blocks, writes what comes, and closes the bag once it is
+detached. To attach and to detach is to swap one reference. Whoever asks for a start or an end gets a
+future, which is resolved when the disk has answered.
+
+Encoded messages come through a bounded queue; what does not fit is counted, never waited for. An
 error of the disk, or a disk with less room than the reserve, ends the recording with a message;
 acquisition and publishing go on. Once a chunk is on the disk a crash does not cost it any more; a
 chunk ends after half a second of log time, or of nothing to write.
@@ -14,6 +19,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from pathlib import Path
 
 from psd_deflection.config import AcquisitionConfig, Rig
@@ -25,6 +31,8 @@ MESSAGES_PER_BLOCK = 100
 """The recorder's queue holds this many messages for each block of ``queue_blocks``. A block makes about
 ten, so that a disk may stand still ten times as long as the pipeline may: 50 s by default, in 25 MB."""
 JOIN_S = 1.0
+"""How long the end of the program waits for recordings that are being written."""
+
 IDLE_S = 0.5
 LOOK_EVERY = 250
 """Messages between two looks at the file and the room on its disk: half a second's worth."""
@@ -54,119 +62,246 @@ class _GoneError(Exception):
     """Somebody deleted or moved the file: what is written into it from now on, nobody finds."""
 
 
+class Take:
+    """One recording.
+
+    ``opened``: its folder once it is attached, or why it is not. ``closed``: its folder once the bag
+    is closed, or why it ended without that. Nobody can cancel either.
+    """
+
+    def __init__(self, config: AcquisitionConfig) -> None:
+        self.config = config
+        self.folder: Path | None = None
+        self.attached = False
+        self.queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self.opened: Future[Path | None] = Future()
+        self.closed: Future[Path | None] = Future()
+        for answer in (self.opened, self.closed):
+            answer.set_running_or_notify_cancel()
+
+
 class Recorder:
     """One recording at a time; a wire like any other. ``say`` is told when one ends by itself.
 
+    ``between_blocks`` runs an action in the thread that records (``Processing.request``).
     ``failure``: why the last recording ended by itself, empty while all is well; for diagnostics.
     """
 
-    def __init__(self, queue_blocks: int, say: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        queue_blocks: int,
+        say: Callable[[str], None],
+        between_blocks: Callable[[Callable[[], None]], None],
+    ) -> None:
         self.dropped = 0
         self.written = 0
         self.files_deleted = 0
         self.failure = ''
         self._say = say
+        self._between_blocks = between_blocks
         self._limit = queue_blocks * MESSAGES_PER_BLOCK
-        self._bag: BagWriter | None = None
-        self._queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
-        self._thread: threading.Thread | None = None
+        # Held for the swapping of references and the counting, never while the disk is waited for.
+        self._lock = threading.Lock()
+        # Two openings in one second must not choose one name.
+        self._naming = threading.Lock()
+        self._opening: Take | None = None
+        self._take: Take | None = None
+        self._writing: dict[Take, threading.Thread] = {}
+        self._ended = False
 
     @property
     def folder(self) -> Path | None:
         """Where the recording goes, or None while none is made."""
-        bag = self._bag
-        return bag.folder if bag is not None else None
+        take = self._take
+        return take.folder if take is not None else None
+
+    @property
+    def opening(self) -> bool:
+        """Whether the disk is waited for at the start of a recording."""
+        return self._opening is not None
 
     @property
     def waiting(self) -> int:
         """Messages that wait for the disk."""
-        return self._queue.qsize() if self._bag is not None else 0
+        take = self._take
+        return take.queue.qsize() if take is not None else 0
 
-    def start(self, rig: Rig, hello: Mapping[str, object] | None) -> Path:
-        """Start a recording in ``bag_dir``; the one that runs, if one does.
+    def start(
+        self,
+        rig: Rig,
+        hello: Mapping[str, object] | None,
+        memory: Callable[[Rig], ParameterChange | None],
+    ) -> Future[Path | None]:
+        """Start a recording in ``bag_dir``; its folder once it runs. If one runs or starts, it is that one's.
 
-        Raises RecordingError where the folder cannot be made or the disk has no room.
+        ``memory``: called with ``rig`` as the recording is attached, and put first. The future raises
+        RecordingError if the folder cannot be made, the disk has no room, or the recording was ended
+        before the disk answered; TimeoutError if no data flows.
         """
-        if self._bag is not None:
-            return self._bag.folder
-        config = rig.acquisition
-        folder = new_folder(Path(config.bag_dir).expanduser())
-        missing = _missing_room(_nearest(folder), config.disk_reserve)
-        if missing:
-            raise RecordingError(f'{folder}: {missing}; {ELSEWHERE}')
-        try:
-            bag = BagWriter(
-                folder,
-                rig_values=rig.flat(),
-                device_hello=hello,
-                max_bytes=config.bag_max_bytes,
-                max_s=config.bag_max_duration,
-                durable=True,
-            )
-        except RecordingError as error:
-            raise RecordingError(f'{error}; {ELSEWHERE}') from None
-        self.failure = ''
-        self._queue = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, args=(bag, self._queue, config), name='recorder', daemon=True)
-        self._bag = bag
-        self._thread.start()
-        return folder
+        with self._lock:
+            take = self._take or self._opening
+            if take is None:
+                take = Take(rig.acquisition)
+                if self._ended:
+                    take.opened.set_exception(RecordingError('not recorded: the run has ended'))
+                    return take.opened
+                thread = threading.Thread(
+                    target=self._run, args=(take, rig, hello, memory), name='recorder', daemon=True
+                )
+                thread.start()
+                self._opening = take
+            return take.opened
 
     def put(self, topic: str, type_name: str, cdr: bytes, t_ns: int) -> None:
-        """Record one message; count it as dropped where the disk is too slow."""
-        if self._bag is not None:
-            self._enqueue((topic, type_name, cdr, t_ns))
+        """Record one message; count it as dropped if the disk is too slow."""
+        take = self._take
+        if take is None:
+            return
+        if take.queue.qsize() >= self._limit:
+            self.dropped += 1
+        else:
+            take.queue.put((topic, type_name, cdr, t_ns))
 
     def put_change(self, change: ParameterChange) -> None:
         """Note that parameters changed. Never dropped: without it no replay is the same."""
-        if self._bag is not None:
-            self._queue.put(change)
+        take = self._take
+        if take is not None:
+            take.queue.put(change)
 
-    def stop(self) -> Path | None:
-        """End the recording and return its folder; None where none was made."""
-        bag, thread = self._bag, self._thread
-        if bag is None or thread is None:
-            return None
-        self._bag = None
-        self._queue.put(None)
-        thread.join(JOIN_S)
-        if thread.is_alive():
-            self._say(f'{bag.folder}: the disk is slow; still writing in the background')
-        return bag.folder
+    def stop(self) -> Future[Path | None]:
+        """Detach the recording; its folder once it is closed, None if none was made.
 
-    def _enqueue(self, item: Message) -> None:
-        if self._queue.qsize() >= self._limit:
-            self.dropped += 1
-        else:
-            self._queue.put(item)
+        A recording that is being opened will not begin. To be called between two blocks, so that the
+        last one is whole. The future raises RecordingError if the recording could not be closed.
+        """
+        with self._lock:
+            opening, self._opening = self._opening, None
+            take, self._take = self._take, None
+        if opening is not None:
+            opening.opened.set_exception(
+                RecordingError('the recording was ended before the disk answered; nothing was recorded')
+            )
+        if take is not None:
+            take.queue.put(None)
+            return take.closed
+        none: Future[Path | None] = Future()
+        none.set_result(None)
+        return none
 
-    def _run(self, bag: BagWriter, items: queue.SimpleQueue[Item], config: AcquisitionConfig) -> None:
+    def close(self) -> Path | None:
+        """End for good: what still writes has ``JOIN_S``. The folder of the recording that ran, if one did."""
+        folder = self.folder
+        with self._lock:
+            self._ended = True
+        self.stop()
+        until = time.monotonic() + JOIN_S
+        for take, thread in tuple(self._writing.items()):
+            thread.join(max(until - time.monotonic(), 0.0))
+            if thread.is_alive():
+                self._say(
+                    f'{take.folder}: the disk is slow; it is not waited for. '
+                    f'If the end is missing, `psd-deflection recover {take.folder}` makes it whole'
+                )
+        return folder
+
+    def _run(
+        self,
+        take: Take,
+        rig: Rig,
+        hello: Mapping[str, object] | None,
+        memory: Callable[[Rig], ParameterChange | None],
+    ) -> None:
+        try:
+            bag = self._open(rig, hello)
+        except Exception as error:
+            self._refuse(take, error)
+            return
+        take.folder = bag.folder
+        thread = threading.current_thread()
+
+        def attach() -> None:
+            with self._lock:
+                if self._opening is not take:
+                    return
+                first = memory(rig)
+                if first is not None:
+                    take.queue.put(first)
+                self._writing[take] = thread
+                self._opening, self._take, take.attached, self.failure = None, take, True, ''
+
+        try:
+            self._between_blocks(attach)
+        except Exception as error:
+            self._refuse(take, error)
+        if not take.attached:
+            with contextlib.suppress(OSError, RecordingError):
+                bag.discard()
+            return
+        take.opened.set_result(bag.folder)
+        why = self._record(take, bag)
+        del self._writing[take]
+        if not why:
+            take.closed.set_result(bag.folder)
+            return
+        self.failure = why
+        self._say(f'recording stopped: {why}')
+        take.closed.set_exception(RecordingError(f'recording stopped: {why}'))
+
+    def _open(self, rig: Rig, hello: Mapping[str, object] | None) -> BagWriter:
+        config = rig.acquisition
+        with self._naming:
+            folder = new_folder(Path(config.bag_dir).expanduser())
+            missing = _missing_room(_nearest(folder), config.disk_reserve)
+            if missing:
+                raise RecordingError(f'{folder}: {missing}; {ELSEWHERE}')
+            try:
+                return BagWriter(
+                    folder,
+                    rig_values=rig.flat(),
+                    device_hello=hello,
+                    max_bytes=config.bag_max_bytes,
+                    max_s=config.bag_max_duration,
+                    durable=True,
+                )
+            except RecordingError as error:
+                raise RecordingError(f'{error}; {ELSEWHERE}') from None
+
+    def _refuse(self, take: Take, error: Exception) -> None:
+        """Answer that ``take`` does not begin, unless it has begun or that was answered already."""
+        with self._lock:
+            if self._opening is not take:
+                return
+            self._opening = None
+        take.opened.set_exception(error)
+
+    def _record(self, take: Take, bag: BagWriter) -> str:
+        """Write until the end, and close; '' or why it ended without that."""
         try:
             try:
-                self._write(bag, items, config)
+                try:
+                    self._write(bag, take.queue, take.config)
+                finally:
+                    # Before the disk is waited for again: a start must not be told that this one runs.
+                    with self._lock:
+                        if self._take is take:
+                            self._take = None
             except _FullError as error:
                 # There is room for index and summary: that is what the reserve is for.
                 bag.close()
-                self._ended(bag, f'{bag.folder}: {error}; it is complete up to here')
-            else:
-                bag.close()
+                return f'{bag.folder}: {error}; it is complete up to here'
+            bag.close()
         except _GoneError as error:
             with contextlib.suppress(RecordingError):
                 bag.close()
-            self._ended(bag, str(error))
+            return str(error)
         except RecordingError as error:
-            self._ended(bag, f'{error}; `psd-deflection recover {bag.folder}` makes it whole')
+            return f'{error}; `psd-deflection recover {bag.folder}` makes it whole'
         except Exception as error:
             # Whatever it was: a recorder that is dead and says nothing would be worse.
             with contextlib.suppress(Exception):
                 bag.close()
-            self._ended(bag, f'{bag.folder}: {type(error).__name__}: {error}')
-
-    def _ended(self, bag: BagWriter, why: str) -> None:
-        if self._bag is bag:
-            self._bag = None
-        self.failure = why
-        self._say(f'recording stopped: {why}')
+            return f'{bag.folder}: {type(error).__name__}: {error}'
+        return ''
 
     def _write(self, bag: BagWriter, items: queue.SimpleQueue[Item], config: AcquisitionConfig) -> None:
         since_look = 0
@@ -185,7 +320,8 @@ class Recorder:
                 bag.write(item)
             else:
                 bag.write_encoded(*item)
-                self.written += 1
+                with self._lock:
+                    self.written += 1
             unwritten = True
             since_look += 1
             if since_look >= LOOK_EVERY:

@@ -2,13 +2,15 @@
 
 The ROS node and the command line are two users of it; neither is needed. Threads: ``reader``
 (acquisition), ``pipeline`` (processing), ``recorder`` while recording; the caller's own thread
-opens, asks and closes.
+opens, asks and closes. No other thread waits for the disk:
+a zero is kept by a thread ``zero``, which ends when it is on the disk.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, wait
 from pathlib import Path
 
 from msg_adapters import TOPIC_TYPES
@@ -32,6 +34,12 @@ SILENT_S = 5.0
 
 JOIN_S = 0.5
 """How long the last blocks may take at the end."""
+
+KEEP_S = 0.2
+"""How long the last zero may take to be on the disk at the end."""
+
+OPEN_S = 2.0
+"""How long the start waits for the disk of a recording that is wanted from the start."""
 
 SIMULATED = ('serial', 'dataq', 'thorlabs', 'lines')
 """Sources for which a simulated rig is started where no port is named."""
@@ -81,8 +89,8 @@ class Session:
                     say(about)
                     pipeline = Pipeline(rig)
             say('; '.join(f'{name}: {what}' for name, what in self.acquisition.source.describe().items()))
-            self.processing = Processing(self.acquisition, pipeline, say)
-            self.recorder = Recorder(rig.acquisition.queue_blocks, say)
+            self.processing = Processing(self.acquisition.queue, pipeline, say)
+            self.recorder = Recorder(rig.acquisition.queue_blocks, say, self.processing.request)
             self.fanout = Fanout()
             self.fanout.change_wires.append(self.recorder)
             self.processing.sinks.append(self.fanout)
@@ -123,41 +131,51 @@ class Session:
         return all(now - beat < HUNG_S for beat in (self.acquisition.beat, self.processing.beat))
 
     def start(self) -> None:
-        """Start recording where the rig says so, and let samples flow.
+        """Start recording if the rig says so, and let samples flow.
 
-        The recorder is served last: what is published waits for no disk.
+        The disk has ``OPEN_S`` to answer, so that the recording has the first block. If it has not answered by then,
+        samples flow, and the recording begins when it does. Raises RecordingError if it refuses.
         """
         cdr.prepare(TOPIC_TYPES.values())
         if self.rig.acquisition.realtime:
             self._tell(lock_memory())
+        # The recorder is served last: what is published comes first.
         self.fanout.wires.append(self.recorder)
-        if self.rig.acquisition.record:
-            self.record(True)
         self.processing.start()
+        if self.rig.acquisition.record:
+            asked = self.record(True)
+            if wait((asked,), OPEN_S).done:
+                asked.result()
+            else:
+                self._tell('the disk does not answer; the recording begins when it does, samples flow meanwhile')
+                asked.add_done_callback(self._tell_refused)
         self.acquisition.start()
 
-    def record(self, wanted: bool) -> Path | None:
-        """Start or stop a recording between two blocks; its folder, or None where none was made.
+    def record(self, wanted: bool) -> Future[Path | None]:
+        """Start or stop a recording between two blocks; its folder, or None if none was made.
 
-        Raises RecordingError where it cannot start.
+        Waits for the pipeline at most, never for the disk: the future is resolved when the disk has
+        answered. For its errors see :meth:`Recorder.start` and :meth:`Recorder.stop`. Raises
+        TimeoutError if no data flows.
         """
-        hello = self.acquisition.hello.info if self.acquisition.hello is not None else None
 
-        def change() -> Path | None:
-            if not wanted:
-                return self.recorder.stop()
-            running = self.recorder.folder
-            folder = self.recorder.start(self.rig, hello)
-            # What the next block depends on besides itself: without it no replay would be the same.
-            memory = self.pipeline.memory()
-            if memory is not None and folder != running:
-                self.recorder.put_change(memory)
-            return folder
+        def tell(done: Future[Path | None]) -> None:
+            if done.exception() is None and (folder := done.result()) is not None:
+                self._tell(f'recording to {folder}' if wanted else f'recording ended: {folder}')
 
-        folder = self.processing.request(change)
-        if folder is not None:
-            self._tell(f'recording to {folder}' if wanted else f'recording ended: {folder}')
-        return folder
+        if wanted:
+            hello = self.acquisition.hello.info if self.acquisition.hello is not None else None
+            asked = self.recorder.start(self.rig, hello, self.pipeline.memory)
+        else:
+            asked = self.processing.request(self.recorder.stop)
+        asked.add_done_callback(tell)
+        return asked
+
+    def _tell_refused(self, done: Future[Path | None]) -> None:
+        error = done.exception()
+        if error is not None:
+            self.recorder.failure = str(error)
+            self._tell(f'not recorded: {error}')
 
     def temperature(self, celsius: float) -> None:
         """The ambient temperature, for the corrections that need it; from the next block on.
@@ -210,9 +228,8 @@ class Session:
             self._keep_zero()
 
     def _keep_zero(self) -> None:
-        trouble = self._store.save(self.rig) if self._store is not None else ''
-        if trouble:
-            self._tell(trouble)
+        if self._store is not None:
+            self._store.keep(self.rig, self._tell)
 
     def close(self) -> Path | None:
         """Stop reading, process what was read, end the recording; returns its folder.
@@ -227,8 +244,10 @@ class Session:
         self.acquisition.stop()
         self.processing.join(JOIN_S)
         if self.processing.alive:
-            self._tell('a subscriber or the disk holds up the last blocks; they are not waited for')
-        folder = self.recorder.stop()
+            self._tell('a subscriber holds up the last blocks; they are not waited for')
+        folder = self.recorder.close()
+        if self._store is not None and not self._store.join(KEEP_S):
+            self._tell(f'{self._store.path}: the disk is slow; the zero may not be kept')
         if self._simulated is not None:
             self._simulated.close()
         return folder

@@ -4,7 +4,7 @@ They are kept by the device's serial number below ``$XDG_STATE_HOME/psd_deflecti
 that ``zero_file`` names). The rig file has the last word: the zero that it had when the kept one was
 taken stands in the file beside it, and once the rig file says something else the kept one is passed
 over. What the file holds is checked like any parameter, and a bad file is passed over with a line in
-the log; it never stops a run.
+the log; it never stops a run. Whoever takes a zero does not wait for the disk: a thread writes the file.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from __future__ import annotations
 import json
 import os
 import re
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,9 @@ class ZeroStore:
         safe = re.sub(r'[^A-Za-z0-9._-]', '_', str(serial))[:64].strip('.') or 'unknown'
         self.path = Path(named).expanduser() if named else state_folder() / f'zero_{safe}.json'
         self._serial = str(serial)[:64]
+        self._saving = threading.Lock()
+        self._wanted: Rig | None = None
+        self._thread: threading.Thread | None = None
 
     def load(self, rig: Rig) -> tuple[Rig, str]:
         """The rig with the kept zero, where there is one, and a line to say about it, or ''."""
@@ -72,3 +77,23 @@ class ZeroStore:
         except OSError as error:
             return f'{self.path}: the zero cannot be kept ({error.strerror or error})'
         return ''
+
+    def keep(self, rig: Rig, say: Callable[[str], None]) -> None:
+        """Save the zero of ``rig`` in a thread of its own; ``say`` is told if that could not be. The last one wins."""
+        self._wanted = rig
+        self._thread = threading.Thread(target=self._keep, args=(say,), name='zero', daemon=True)
+        self._thread.start()
+
+    def join(self, timeout: float) -> bool:
+        """Wait until the last zero is saved; whether it is."""
+        if self._thread is None:
+            return True
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _keep(self, say: Callable[[str], None]) -> None:
+        with self._saving:
+            rig, self._wanted = self._wanted, None
+            trouble = self.save(rig) if rig is not None else ''
+        if trouble:
+            say(trouble)

@@ -1,7 +1,10 @@
-"""What an effect is, which there are, and how a rig file says that one is on.
+"""Which effects there are, how one is loaded, and how a rig file says that one is on.
 
-An effect is one file in ``effects/`` with one :class:`Effect` called ``EFFECT``: adding a file adds
-an effect. In a rig file the effects stand below ``effects:``, one map each, under any key::
+An effect is one file with one :class:`~psd_deflection.simulation.declaration.Effect` called
+``EFFECT``; the file has the effect's name. Adding a file to ``effects/`` or to a folder of
+``$PSD_DEFLECTION_EFFECTS`` adds an effect; so does an entry point of the group
+``psd_deflection.effects`` of another package. In a rig file the effects stand below ``effects:``,
+one map each, under any key::
 
     effects:
       sensor_rotation_2: {name: sensor_rotation, psd: 2, angle: 0.01}
@@ -13,163 +16,121 @@ from __future__ import annotations
 
 import difflib
 import functools
-import importlib
+import importlib.util
 import math
+import os
 import pkgutil
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError
-from psd_deflection.records import FloatArray
-from psd_deflection.simulation.chunk import Chunk
-from psd_deflection.simulation.physics import Physics
+from psd_deflection.simulation import effects as ours
+from psd_deflection.simulation.declaration import ActiveEffect, Effect
 
-Stage = Literal['link', 'load', 'optics', 'psd', 'electronics']
-Point = Literal['configure', 'load', 'static', 'pose', 'beam', 'dots', 'volts', 'output']
-State = dict[str, Any]
-Values = Mapping[str, float]
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
-STAGES: tuple[Stage, ...] = ('load', 'link', 'optics', 'psd', 'electronics')
+GROUP = 'psd_deflection.effects'
+FOLDERS = 'PSD_DEFLECTION_EFFECTS'
 
-
-Kind = Literal['amplitude', 'coupled', 'phase', 'shape', 'choice']
+Place: TypeAlias = 'EntryPoint | Path'
 
 
-@dataclass(frozen=True, slots=True)
-class EffectParameter:
-    """One parameter of an effect, with its bounds and what a search has to know of it.
+def effect_folders() -> list[Path]:
+    """Folders with the user's own effect files.
 
-    ``nominal``: the value at which the effect is off, or that a parameter takes when it is not
-    given; NaN means the rig file's own, the field ``of_rig`` of :class:`Physics`. ``scale``: the
-    size of a probe, about the prior's standard deviation. ``kind``: an ``amplitude`` switches the
-    effect on; ``coupled`` and ``phase`` mean nothing while the amplitudes are nominal; a ``shape``
-    likewise, and ``grid`` says where to look (``spectral``: at peaks of the residual's spectrum;
-    ``line``: at those that hum steadily;
-    ``highest``: at the largest voltage seen); a ``choice`` takes the values of ``choices``.
-    ``within``: narrower bounds that the rig sets, given the effect's values.
+    Those that ``$PSD_DEFLECTION_EFFECTS`` lists, separated like those of ``$PATH``; if it is not
+    set, ``psd_deflection/effects`` below ``$XDG_CONFIG_HOME`` (``~/.config``).
     """
-
-    name: str
-    unit: str
-    minimum: float
-    maximum: float
-    scale: float
-    description: str
-    nominal: float = 0.0
-    kind: Kind = 'amplitude'
-    choices: tuple[int, ...] = ()
-    grid: tuple[float, ...] = ()
-    propose: Literal['', 'spectral', 'line', 'highest', 'lattice'] = ''
-    of_rig: str = ''
-    required: bool = False
-    within: Callable[[Physics, Values], tuple[float, float]] | None = None
-
-    def off(self, physics: Physics) -> float:
-        """The nominal value on this rig."""
-        return float(getattr(physics, self.of_rig)) if self.of_rig else self.nominal
-
-    def bounds(self, physics: Physics, values: Values) -> tuple[float, float]:
-        """Least and greatest value that is physical on this rig."""
-        if self.within is None:
-            return self.minimum, self.maximum
-        low, high = self.within(physics, values)
-        return max(low, self.minimum), min(high, self.maximum)
+    listed = os.environ.get(FOLDERS)
+    if listed is None:
+        listed = str(Path(os.environ.get('XDG_CONFIG_HOME') or '~/.config') / 'psd_deflection' / 'effects')
+    try:
+        return [Path(folder).expanduser() for folder in listed.split(os.pathsep) if folder]
+    except RuntimeError:
+        # A service without a home has no effects there.
+        return []
 
 
-PSD = EffectParameter('psd', '', 1, 2, 1, 'which PSD', nominal=1, kind='choice', choices=(1, 2), required=True)
-"""The parameter of every effect that belongs to one detector."""
-MOVES_FREQUENCY = EffectParameter(
-    'moves_frequency',
-    '',
-    0,
-    1,
-    1,
-    '1: the mode moves with it, by sqrt(1 + scale); 0: the frequency was measured',
-    kind='choice',
-    choices=(0, 1),
-)
-"""The parameter of every effect on a stiffness."""
+def _places() -> dict[str, Place]:
+    """Where each effect is, by name; nothing is imported. Raises ConfigError if two have one name."""
+    # Not with the module: a rig without effects needs none of it, and it takes a while.
+    from importlib.metadata import EntryPoint, entry_points
+
+    names = [module.name for module in pkgutil.iter_modules(ours.__path__)]
+    places: dict[str, Place] = {name: EntryPoint(name, f'{ours.__name__}.{name}:EFFECT', GROUP) for name in names}
+    others: list[tuple[str, Place]] = []
+    for folder in dict.fromkeys(effect_folders()):
+        try:
+            files = sorted(f for f in folder.iterdir() if f.suffix == '.py')
+        except OSError as error:
+            # Few have the default one, and a service may not look into a home.
+            if FOLDERS in os.environ:
+                raise ConfigError(f'{FOLDERS}: {folder}: cannot be read ({error.strerror or error})') from None
+            continue
+        others += [(f.stem, f) for f in files if f.stem.isidentifier() and not f.stem.startswith('_')]
+    others += [(point.name, point) for point in entry_points(group=GROUP)]
+    for name, place in others:
+        if name in places:
+            raise ConfigError(f'{_words(place)}: the effect {name} is in {_words(places[name])} already; rename one')
+        places[name] = place
+    return places
 
 
-@dataclass(slots=True, eq=False)
-class Reading:
-    """n readings on their way back to what the PSDs would have shown: ``dots`` (4, n) m,
-    ``sums`` (2, n) V, ``warmer`` (n,) K, ``t`` (n,) s. Changed in place.
-    """
-
-    dots: FloatArray
-    sums: FloatArray
-    warmer: FloatArray
-    t: FloatArray
+def _words(place: Place) -> str:
+    return str(place) if isinstance(place, Path) else place.value
 
 
-@dataclass(frozen=True, slots=True)
-class Effect:
-    """One physical effect: what it is, where it acts, and how.
-
-    ``equation`` and ``source`` are for the reader. ``needs``: the excitation that shows it.
-    ``configure`` changes the constants before a run; ``apply`` changes a chunk at ``point``;
-    ``correct`` undoes it on a reading, where that is possible without the load. ``order``: among
-    the effects of one stage. ``finite``: the signature at the nominal value vanishes, so that
-    only the values of ``grid`` are probed, each as it is.
-    """
-
-    name: str
-    stage: Stage
-    summary: str
-    equation: str
-    source: str
-    needs: str
-    parameters: tuple[EffectParameter, ...]
-    point: Point
-    configure: Callable[[Physics, Values], None] | None = None
-    apply: Callable[[Chunk, Values, State], None] | None = None
-    correct: Callable[[Reading, Values], None] | None = None
-    finite: bool = False
-    order: int = 0
-
-    def parameter(self, name: str) -> EffectParameter:
-        """The declared parameter of that name (KeyError if there is none)."""
-        for p in self.parameters:
-            if p.name == name:
-                return p
-        raise KeyError(name)
-
-
-@dataclass(frozen=True, slots=True)
-class ActiveEffect:
-    """An effect that is on, with a value for every parameter."""
-
-    effect: Effect
-    values: Values
-
-    @property
-    def label(self) -> str:
-        """Name and discrete choices, for people: ``sensor_rotation (psd 2)``."""
-        choice = [f'{p.name} {self.values[p.name]:g}' for p in self.effect.parameters if p.kind == 'choice']
-        return self.effect.name + (f' ({", ".join(choice)})' if choice else '')
+def effect_names() -> list[str]:
+    """Every effect's name, without loading any. Raises ConfigError if two have one name."""
+    return sorted(_places())
 
 
 @functools.cache
+def _of_file(path: Path) -> object:
+    spec = importlib.util.spec_from_file_location(f'{__name__}.{path.stem}', path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f'{path} is not a Python file')
+    module = importlib.util.module_from_spec(spec)
+    # Dataclasses of the file look their module up.
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module.EFFECT
+
+
+def _load(name: str, place: Place) -> Effect:
+    try:
+        found = _of_file(place) if isinstance(place, Path) else place.load()
+    except (Exception, SystemExit) as error:
+        # Whatever a stranger's file raises, the user needs its name and the cause.
+        raise ConfigError(f'{_words(place)}: holds no effect ({type(error).__name__}: {error})') from error
+    if not isinstance(found, Effect):
+        raise ConfigError(f'{_words(place)}: EFFECT = {found!r}: must be an Effect')
+    if found.name != name:
+        raise ConfigError(f'{_words(place)}: name = {found.name!r}: must be {name!r}, like the file or entry point')
+    return found
+
+
 def catalogue() -> Mapping[str, Effect]:
-    """Every effect by name, in the order in which they act."""
-    package = importlib.import_module('psd_deflection.simulation.effects')
-    found: list[Effect] = []
-    for module in pkgutil.iter_modules(package.__path__):
-        found.append(importlib.import_module(f'{package.__name__}.{module.name}').EFFECT)
-    found.sort(key=lambda e: (STAGES.index(e.stage), e.order, e.name))
-    return {e.name: e for e in found}
+    """Every effect by name, in the order in which they act. Raises ConfigError if one cannot be loaded."""
+    found = [_load(name, place) for name, place in _places().items()]
+    return {e.name: e for e in sorted(found, key=lambda e: e.rank)}
 
 
 def make_active(name: str, values: Mapping[str, object], source: str) -> ActiveEffect:
-    """Check one effect's parameters; raises ConfigError naming source, key, value, bound."""
-    effect = catalogue().get(name)
-    if effect is None:
-        near = difflib.get_close_matches(name, catalogue(), n=1)
-        hint = f'; did you mean {near[0]}?' if near else f'; there are: {", ".join(catalogue())}'
+    """Load one effect, and only that, and check its parameters.
+
+    Raises ConfigError naming source, key, value, bound, or the file that cannot be loaded.
+    """
+    places = _places()
+    if name not in places:
+        near = difflib.get_close_matches(name, places, n=1)
+        hint = f'; did you mean {near[0]}?' if near else f'; there are: {", ".join(sorted(places))}'
         raise ConfigError(f'{source}: name = {name!r}: no effect of that name{hint}')
+    effect = _load(name, places[name])
     known = [p.name for p in effect.parameters]
     for key in values:
         if key not in known:
@@ -205,7 +166,7 @@ def effects_of_rig(rig: Rig) -> list[ActiveEffect]:
     for key, value in rig.effects.items():
         group, dot, name = key.partition('.')
         if not dot:
-            raise ConfigError(f'effects.{key} = {value!r}: must be a map like {{name: sensor_gain, psd: 1, x: 0.001}}')
+            raise ConfigError(f'effects.{key} = {value!r}: must be a map with the name and the parameters of an effect')
         groups.setdefault(group, {})[name] = value
     found = []
     for group, body in groups.items():
@@ -216,8 +177,7 @@ def effects_of_rig(rig: Rig) -> list[ActiveEffect]:
 
 def sort_effects(effects: Sequence[ActiveEffect]) -> list[ActiveEffect]:
     """In the order in which they act."""
-    order = {name: i for i, name in enumerate(catalogue())}
-    return sorted(effects, key=lambda a: order[a.effect.name])
+    return sorted(effects, key=lambda a: a.effect.rank)
 
 
 def effects_to_values(effects: Sequence[ActiveEffect]) -> dict[str, dict[str, object]]:

@@ -50,12 +50,12 @@ def _seconds(text: str, source: str) -> float:
     return value
 
 
-def load_history(words: str, rate: float) -> LoadHistory:
+def load_history(words: str, rate: float, parameter: str = 'loads') -> LoadHistory:
     """The history that ``words`` describe (see ``HELP``) at ``rate`` Hz.
 
-    Raises ConfigError naming the words and what is wrong, RecordingError for a bad file.
+    Raises ConfigError naming the ``parameter``, the words and what is wrong, RecordingError for a bad file.
     """
-    source = f'--loads {words}'
+    source = f'{parameter} {words}'
     if words.endswith('.csv'):
         return loads.from_csv(words, rate)
     kind, *rest = words.split(':')
@@ -77,12 +77,15 @@ def load_history(words: str, rate: float) -> LoadHistory:
         if not (0.0 <= f0 < rate / 2.0 and 0.0 <= f1 < rate / 2.0):
             raise ConfigError(f'{source}: frequencies must be at least 0 and below {rate / 2.0:g} Hz')
         return loads.chirp(_load(rest[0], source), f0, f1, _seconds(rest[2], source), rate)
-    raise ConfigError(f'{source}: not a load history; psd-deflection simulate --help lists them')
+    raise ConfigError(f'{source}: not a load history: thesis, identification, constant, steps, ramp, chirp or a .csv')
 
 
-def temperature_history(words: str, n: int) -> FloatArray:
-    """``T0[,T1,...]`` in degrees Celsius: straight lines through these, evenly over n samples."""
-    knots = _numbers(words, None, f'--temperature {words}')
+def temperature_history(words: str, n: int, parameter: str = 'temperature') -> FloatArray:
+    """``T0[,T1,...]`` in degrees Celsius: straight lines through these, evenly over n samples.
+
+    Raises ConfigError naming the ``parameter``.
+    """
+    knots = _numbers(words, None, f'{parameter} {words}')
     if len(knots) == 1:
         return np.full(n, knots[0])
     return np.asarray(np.interp(np.linspace(0.0, 1.0, n), np.linspace(0.0, 1.0, len(knots)), knots))

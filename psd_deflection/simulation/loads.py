@@ -30,19 +30,9 @@ class LoadHistory:
     def __len__(self) -> int:
         return len(self.loads)
 
-    @property
-    def duration(self) -> float:
-        """s."""
-        return len(self.loads) / self.sample_rate_hz
-
     def then(self, *others: LoadHistory) -> LoadHistory:
         """This one, then the others (all at this one's rate)."""
         return LoadHistory(np.concatenate([self.loads, *(o.loads for o in others)]), self.sample_rate_hz)
-
-    def plus(self, other: LoadHistory) -> LoadHistory:
-        """Both at once, as long as the shorter."""
-        n = min(len(self), len(other))
-        return LoadHistory(self.loads[:n] + other.loads[:n], self.sample_rate_hz)
 
 
 def sidebar(force: float) -> tuple[float, float, float]:

@@ -2,7 +2,7 @@
 
 q'' + 2 zeta w q' + w^2 q = w^2 u with u constant over each sample period T has the exact pulse
 transfer function (b1 z^-1 + b2 z^-2)/(1 + a1 z^-1 + a2 z^-2): the sample at t sees the loads
-applied before t, so there is no direct term (contract section 2).
+applied before t, so there is no direct term.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ def dots_on_plate(pose: FloatArray, beams: FloatArray, physics: Physics) -> Floa
     """Dots x1 y1 x2 y2 (4, n), m, from the PSD centres; ``pose`` (3, n), ``beams`` (4, n).
 
     The plate point q_i under beam l_i has d + R (q_i, h_i) = l_i in X and Y, with
-    R = Ry(omega) Rx(phi) Rz(theta), phi = -k dY/L, omega = k dX/L (contract section 1). The upper
+    R = Ry(omega) Rx(phi) Rz(theta), phi = -k dY/L, omega = k dX/L (docs/methods.md). The upper
     left of Ry Rx is triangular, so that the system solves in closed form; without tilt it is
     q = Rz(-theta)(l - d).
     """

@@ -45,7 +45,7 @@ class Physics:
 
     @classmethod
     def of(cls, rig: Rig) -> Physics:
-        """The nominal constants of a rig file (contract section 2): no effect is in them."""
+        """The nominal constants of a rig file: no effect is in them."""
         return cls(
             period=1.0 / rig.converter.sample_rate_hz,
             length=rig.link.length,

@@ -4,7 +4,7 @@ Theory of operation. A :class:`Chunk` holds consecutive samples, one row a quant
 stages in order. What must be remembered between chunks (modes, hysteresis, delays) lives in the
 simulator, so that a history cut anywhere gives the same samples bit for bit; for this everything
 is elementwise or a recursive filter, and the noise is drawn sample by sample. Effects hook in at
-named points (:data:`~psd_deflection.simulation.catalogue.Point`).
+named points (:data:`~psd_deflection.simulation.declaration.Point`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ import numpy.typing as npt
 
 from psd_deflection.config import Rig
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import ActiveEffect, State, effects_of_rig
+from psd_deflection.simulation.catalogue import effects_of_rig
 from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import ActiveEffect, State
 from psd_deflection.simulation.modes import Filter, mode_coefficients
 from psd_deflection.simulation.optics import dots_on_plate
 from psd_deflection.simulation.physics import Physics
@@ -131,11 +132,6 @@ class RigSimulator:
     def __init__(self, rig: Rig, seed: int = 0) -> None:
         self._model = ForwardModel(rig)
         self._noise = np.random.default_rng(seed)
-
-    @property
-    def physics(self) -> Physics:
-        """The constants in use, effects included."""
-        return self._model.physics
 
     def step(self, loads: FloatArray, temperature: FloatArray | None = None) -> SimulatedChunk:
         """The next n samples: ``loads`` (n, 3) Fx N, Fy N, Tz N m at the tip centroid.

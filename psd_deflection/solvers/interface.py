@@ -23,7 +23,6 @@ import numpy.typing as npt
 
 from psd_deflection.records import FloatArray
 
-
 _STEP = 1e-8
 """m. Of differences: far above rounding, far below what bends the answer."""
 

@@ -34,6 +34,9 @@ ORDER = 4
 _FORGET = 1.0 / 24.0
 """Share of the newest block in the running mean of c_k^2."""
 
+_BIAS = 0.1
+"""Times v_k, taken off tau_k^2: a mean that cannot be negative is too large by about that where there is no motion."""
+
 _SUDDEN = 12.0
 """c_k^2 over what is expected of it, above which this block alone says how much motion there is."""
 
@@ -65,8 +68,9 @@ def basis(size: int) -> FloatArray:
     orders = min(ORDER, (size - 1) // 4) + 1
     u = (np.arange(size) - 0.5 * (size - 1)) / max(0.5 * (size - 1), 0.5)
     columns: list[FloatArray] = []
+    column: FloatArray
     for k in range(orders):
-        column = u**k
+        column = np.asarray(u**k, dtype=np.float64)
         # Twice: once leaves rounding that shows.
         for _ in range(2):
             for q in columns:
@@ -79,7 +83,8 @@ def combinations(beams: FloatArray) -> FloatArray:
     """Orthogonal (4, 4): x and y of the middle, twist, base line, each of (x1, y1, x2, y2). ``beams`` (2, 2), m."""
     along = (beams[0] - beams[1]) / np.hypot(*(beams[0] - beams[1]))
     x, y = float(along[0]), float(along[1])
-    return np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0], [-y, x, y, -x], [x, y, -x, -y]]) * 0.5**0.5
+    rows = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0], [-y, x, y, -x], [x, y, -x, -y]])
+    return np.asarray(rows * 0.5**0.5)
 
 
 class BlockFit:
@@ -219,7 +224,9 @@ class BlockFit:
         p = self._precision
         cross = p[:, slots[:, None], gone]
         inner = inverse(p[:, gone[:, None], gone])
-        return np.asarray(p[:, slots[:, None], slots] - np.einsum('asg,agh,ath->ast', cross, inner, cross))
+        return np.asarray(
+            p[:, slots[:, None], slots] - np.einsum('asg,atg->ast', np.einsum('asg,agh->ash', cross, inner), cross)
+        )
 
     def _motion(self, c: FloatArray, v: FloatArray) -> FloatArray:
         """tau^2 (4, K) after this block; infinite for order 0, of which nothing is known beforehand."""
@@ -228,7 +235,7 @@ class BlockFit:
         sure = np.minimum(self._v / v, 1.0) ** 2
         self._squares += _FORGET * (sure * excess - self._squares)
         self._weight += _FORGET * (sure - self._weight)
-        tau = np.maximum(self._squares, 0.0) / np.maximum(self._weight, 1e-3)
+        tau = np.maximum(self._squares / np.maximum(self._weight, 1e-3) - _BIAS * self._v, 0.0)
         tau = np.where(c * c > _SUDDEN * (v + tau), np.maximum(excess, tau), tau)
         tau[:, 0] = _ANY
         return np.maximum(tau, self._v * 1e-9)
@@ -274,4 +281,5 @@ def _at_middle(q: FloatArray) -> FloatArray:
     u = (np.arange(size) - 0.5 * (size - 1)) / max(0.5 * (size - 1), 0.5)
     # Each is a combination of powers of u; the middle is u = 0, its constant term.
     powers = np.stack([u**k for k in range(orders)], axis=1)
-    return np.asarray(np.linalg.solve(powers.T @ powers, powers.T @ q)[0])
+    middle: FloatArray = np.linalg.solve(powers.T @ powers, powers.T @ q)[0]
+    return middle

@@ -24,8 +24,8 @@ from math import exp, pi
 
 import numpy as np
 
-from psd_deflection.uncertainty.block_fit import basis, combinations
 from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.uncertainty.block_fit import basis, combinations
 
 SEGMENT_BLOCKS = 50
 """Blocks of one segment: a second at 50 blocks a second."""
@@ -63,6 +63,7 @@ class StreamNoise:
     def __init__(self, size: int, centers: FloatArray, beams: FloatArray, variance: float, step: float) -> None:
         """``size``: N. ``centers``, ``beams`` (2, 2) m. ``variance`` m^2 of a sample by the rig file; ``step`` m."""
         self._size = size
+        self._wanted = 4 + 16 * size
         self._stated = variance
         self._step = step
         self.set_geometry(centers, beams)
@@ -121,8 +122,8 @@ class StreamNoise:
 
     def set_state(self, values: tuple[float, ...]) -> None:
         """Go on from :meth:`state` of another one. Raises ValueError where it is not of this block size."""
-        if len(values) not in (4, 4 + 16 * self._size):
-            raise ValueError(f'noise of {self._size} samples a block has {4 + 16 * self._size} values, not {len(values)}')
+        if len(values) not in (4, self._wanted):
+            raise ValueError(f'noise of {self._size} samples a block has {self._wanted} values, not {len(values)}')
         self._seen, self._count, self._louder = (int(v) for v in values[:3])
         self.at_rest = bool(values[3])
         self._average = np.array(values[4:]).reshape(4, 4, self._size) if len(values) > 4 else None

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-
-from psd_deflection.uncertainty.block_fit import BlockFit, Fitted
 from psd_deflection.calibration import dot_noise_variances
 from psd_deflection.config import Rig
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.uncertainty.block_fit import BlockFit, Fitted
 from psd_deflection.uncertainty.consistency import NAMES, Checked, Consistency, Suspect
 from psd_deflection.uncertainty.noise import StreamNoise
-from psd_deflection.records import FloatArray, IntArray
 
 NOISE, FIT, HELD_RESIDUAL = 'state.noise', 'state.block_fit', 'state.residual'
 """Names under which :meth:`StampedDots.memory` tells what is remembered."""
@@ -101,7 +99,10 @@ class StampedDots:
         stated = self._stated_sd * 1e6
         mean = stated / self._size**0.5
         return tuple(
-            (f'noise of {name} (um)', f'{a * 1e6:.3f} a sample (rig file {stated:.3f}), {b * 1e6:.3f} a block ({mean:.3f})')
+            (
+                f'noise of {name} (um)',
+                f'{a * 1e6:.3f} a sample (rig file {stated:.3f}), {b * 1e6:.3f} a block ({mean:.3f})',
+            )
             for name, a, b in zip(NAMES, self.noise.sample_sd(), self.noise.mean_sd(), strict=True)
         )
 

@@ -16,7 +16,7 @@ from blind.arm import Arm
 from blind.cases import Case, all_cases, designs, gap_of, scaled, short_cases
 from psd_deflection.config import load_rig
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import EffectParameter
+from psd_deflection.simulation.declaration import EffectParameter
 from psd_deflection.simulation.simulator import ForwardModel
 
 

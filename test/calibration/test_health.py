@@ -163,7 +163,7 @@ def test_a_recording_that_begins_in_an_outage_replays_bit_for_bit(start: int) ->
     counts[14 * SIZE : 24 * SIZE, 0:3] = counts[14 * SIZE, 0:3]
     live = Pipeline(rig)
     records_of(live, counts[: start * SIZE])
-    memory = live.memory()
+    memory = live.memory(live.rig)
     assert memory is not None
     assert memory.block == start
     after = records_of(live, counts[start * SIZE :], start * SIZE)
@@ -180,15 +180,15 @@ def test_a_recording_that_begins_in_an_outage_replays_bit_for_bit(start: int) ->
 def test_what_is_remembered_says_only_what_matters() -> None:
     pipeline = Pipeline(load_rig())
     records_of(pipeline, moving(5))
-    assert pipeline.memory() is None
+    assert pipeline.memory(pipeline.rig) is None
     pipeline.change({'degraded': 'hold'})
-    memory = pipeline.memory()
+    memory = pipeline.memory(pipeline.rig)
     assert memory is not None
     assert [name for name, _ in memory.values] == [HELD]
     frozen = moving(5)
     frozen[:, 3:6] = frozen[0, 3:6]
     records_of(pipeline, frozen, 5 * SIZE)
-    memory = pipeline.memory()
+    memory = pipeline.memory(pipeline.rig)
     assert memory is not None
     assert dict(memory.values)[FROZEN] == (0, 5)
 

@@ -50,7 +50,7 @@ class StillSource:
         self.acted.set()
         return 'unloaded dots taken'
 
-    def record(self, wanted: bool) -> str:
+    async def record(self, wanted: bool) -> str:
         if self.refusal:
             raise RefusedError(self.refusal)
         self.recordings.append('recordings/test' if wanted else None)

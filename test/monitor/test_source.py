@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -48,7 +49,7 @@ def test_a_recording_is_shown_as_it_is_with_its_losses() -> None:
     with pytest.raises(RefusedError, match='has ended'):
         source.zero()
     with pytest.raises(RefusedError, match='replay REC --out'):
-        source.record(True)
+        asyncio.run(source.record(True))
     assert said == ['lost_samples: end of the recording']
 
 

@@ -55,12 +55,29 @@ sys.exit(main())
 """
 """Our program, which waits longer for a first answer of its device than any test does."""
 
+HANGING_DISK = """
+import sys
+from pathlib import Path
+from psd_deflection.cli.main import main
+from psd_deflection.runner import recorder
+new_folder = recorder.new_folder
+def hanging(parent):
+    answer = parent.parent / 'answer'
+    if answer.exists():
+        answer.read_text()
+        answer.unlink()
+    return new_folder(parent)
+recorder.new_folder = hanging
+sys.exit(main())
+"""
+"""Our program, whose disk hangs at the first recording until somebody writes to the named pipe ``answer``."""
+
 
 class Daemon:
     """``psd-deflection estimator`` as a process; its output line by line."""
 
-    def __init__(self, arguments: Sequence[str], patient: bool = False) -> None:
-        program = ['-c', PATIENT] if patient else ['-m', 'psd_deflection']
+    def __init__(self, arguments: Sequence[str], script: str = '') -> None:
+        program = ['-c', script] if script else ['-m', 'psd_deflection']
         self.process = subprocess.Popen(
             [sys.executable, *program, 'estimator', *arguments],
             cwd=Path(__file__).parent.parent.parent,
@@ -103,8 +120,8 @@ def start(domain: int) -> Iterator[Callable[..., Daemon]]:
     """Start a daemon; it ends with the test."""
     started: list[Daemon] = []
 
-    def begin(*arguments: str, patient: bool = False) -> Daemon:
-        daemon = Daemon(arguments, patient)
+    def begin(*arguments: str, script: str = '') -> Daemon:
+        daemon = Daemon(arguments, script)
         started.append(daemon)
         return daemon
 

@@ -32,7 +32,7 @@ from sensor_msgs.msg import PointCloud2  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
-from test.ros.conftest import BLOCK_NS, stamp  # noqa: E402
+from test.ros.conftest import BLOCK_NS, HANGING_DISK, stamp  # noqa: E402
 
 MS = 1_000_000
 
@@ -165,6 +165,43 @@ def test_zero_and_record(start: Callable[..., Any], peer: Any, tmp_path: Path, s
     assert len(found) >= 50
     assert all(found[t] == received[t] for t in found if t in received)
     assert len(set(found) & set(received)) >= 50
+
+
+def test_a_disk_that_hangs_holds_up_its_own_requests_alone(
+    start: Callable[..., Any], peer: Any, tmp_path: Path, simulated_port: str
+) -> None:
+    os.mkfifo(tmp_path / 'answer')
+    start('--port', simulated_port, '--ros-args', '-p', f'bag_dir:={tmp_path / "bags"}', script=HANGING_DISK)
+    poses = peer.collect(PoseStamped, '/link_tip/deflection')
+    health = peer.collect(DiagnosticArray, '/diagnostics')
+    peer.until(lambda: len(poses) >= 30, 'estimates')
+    client = peer.node.create_client(SetBool, '/estimator/record')
+    peer.until(client.service_is_ready, 'the service')
+
+    def told_of_recording() -> list[str]:
+        return [s.message for array in health for s in array.status if s.name == 'psd_deflection: recording']
+
+    # A start that is ended while it hangs, and one that is waited for.
+    begun = [client.call_async(SetBool.Request(data=True)) for _ in range(2)]
+    waits = 'a recording was asked for; the disk has not answered yet'
+    peer.until(lambda: told_of_recording()[-3:] == [waits] * 3, 'three reports')
+    assert peer.call(Trigger, '/estimator/zero', Trigger.Request()).success
+    peer.until_of_now(poses, 'estimates')
+    assert not any(future.done() for future in begun)
+    assert peer.call(SetBool, '/estimator/record', SetBool.Request(data=False)).message == 'no recording was made'
+    peer.until(lambda: all(future.done() for future in begun), 'the answers of the starts')
+    for future in begun:
+        assert not future.result().success
+        assert future.result().message == 'the recording was ended before the disk answered; nothing was recorded'
+    again = client.call_async(SetBool.Request(data=True))
+    peer.until_of_now(poses, 'estimates')
+    assert not again.done()
+    (tmp_path / 'answer').write_text('')
+    peer.until(again.done, 'the answer of the last start')
+    assert again.result().success
+    folder = Path(again.result().message.removeprefix('recording to '))
+    assert peer.call(SetBool, '/estimator/record', SetBool.Request(data=False)).message == f'recording ended: {folder}'
+    assert [f.name for f in (tmp_path / 'bags').iterdir()] == [folder.name]
 
 
 def test_parameters_have_units_and_ranges_and_are_refused_by_name(start: Callable[..., Any], peer: Any) -> None:

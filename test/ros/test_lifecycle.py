@@ -28,6 +28,7 @@ from psd_deflection.errors import ConfigError, DeviceError  # noqa: E402
 from psd_deflection.recordings.opening import open_recording  # noqa: E402
 from psd_deflection.ros import estimator  # noqa: E402
 from test.heard import WAIT_S  # noqa: E402
+from test.ros.conftest import PATIENT  # noqa: E402
 
 
 def change(peer: Any, transition: int) -> bool:
@@ -116,7 +117,7 @@ def test_a_device_that_is_not_there_leaves_the_node_unconfigured(start: Callable
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_waiting_for_a_device(start: Callable[..., Any], device: Any, number: signal.Signals) -> None:
     device.answer = b''
-    daemon = start('--port', str(device.link), patient=True)
+    daemon = start('--port', str(device.link), script=PATIENT)
     assert device.greeted.wait(WAIT_S)
     daemon.signal(number)
     assert daemon.wait() == 0, daemon.lines

@@ -54,16 +54,33 @@ def test_systemd_is_told_twice_in_its_interval(tmp_path: Path, monkeypatch: pyte
     systemd.socket.close()
 
 
-@pytest.mark.parametrize('environment', [{}, {'NOTIFY_SOCKET': '/nowhere/notify'}, {'WATCHDOG_USEC': 'x'}])
-def test_without_systemd_nothing_happens(environment: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    'environment',
+    [
+        {},
+        {'NOTIFY_SOCKET': '/nowhere/notify'},
+        {'WATCHDOG_USEC': 'x'},
+        {'NOTIFY_SOCKET': 'ours', 'WATCHDOG_USEC': 'x'},
+        {'NOTIFY_SOCKET': 'ours', 'WATCHDOG_USEC': '4000000', 'WATCHDOG_PID': '1'},
+    ],
+)
+def test_no_watchdog_is_fed_that_nobody_asked_for(
+    environment: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    systemd, clock = Systemd(tmp_path / 'notify'), Clock()
     for name in ('NOTIFY_SOCKET', 'WATCHDOG_USEC', 'WATCHDOG_PID'):
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():
-        monkeypatch.setenv(name, value)
-    watchdog = Watchdog()
+        monkeypatch.setenv(name, str(tmp_path / 'notify') if value == 'ours' else value)
+    watchdog = Watchdog(clock)
     watchdog.ready()
-    watchdog.alive()
+    for _ in range(100):
+        watchdog.alive()
+        clock.now += 0.1
     watchdog.stopping()
+    asked = environment.get('NOTIFY_SOCKET') == 'ours'
+    assert systemd.heard() == (['READY=1', 'STOPPING=1'] if asked else [])
+    systemd.socket.close()
 
 
 def test_what_the_system_refuses_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -42,12 +42,6 @@ class Disk:
         return shutil._ntuple_diskusage(100_000 * MB, 0, self.free)
 
 
-@pytest.fixture(autouse=True)
-def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The end of a recording is waited for, however busy the machine is."""
-    monkeypatch.setattr(module, 'JOIN_S', WAIT_S)
-
-
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
     return Disk(monkeypatch)
@@ -56,9 +50,17 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
 class Run:
     def __init__(self, rig: Rig, queue_blocks: int = 1000) -> None:
         self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self.recorder = Recorder(queue_blocks, self.said.put)
-        self.folder = self.recorder.start(rig, None)
+        self.recorder = Recorder(queue_blocks, self.said.put, lambda action: action())
+        self.folder = self.start(rig)
         self.count = 0
+
+    def start(self, rig: Rig) -> Path:
+        folder = self.recorder.start(rig, None, lambda _: None).result(WAIT_S)
+        assert folder is not None
+        return folder
+
+    def stop(self) -> Path | None:
+        return self.recorder.stop().result(WAIT_S)
 
     def put(self, blocks: int) -> None:
         for _ in range(blocks):
@@ -93,12 +95,12 @@ def test_a_disk_that_is_nearly_full_ends_the_recording_whole(tmp_path: Path, dis
     # What comes after is passed over; the next recording starts again where there is room.
     run.put(1)
     with pytest.raises(RecordingError, match=r'150 MB left, .*; make room, or record elsewhere'):
-        run.recorder.start(rig_for(tmp_path, disk_reserve=200 * MB), None)
+        run.start(rig_for(tmp_path, disk_reserve=200 * MB))
     disk.free = 300 * MB
-    second = run.recorder.start(rig_for(tmp_path, disk_reserve=200 * MB), None)
+    second = run.start(rig_for(tmp_path, disk_reserve=200 * MB))
     assert second != run.folder
     assert run.recorder.failure == ''
-    run.recorder.stop()
+    run.stop()
 
 
 @pytest.mark.parametrize('how', ['deleted', 'moved'])
@@ -117,8 +119,8 @@ def test_a_recording_that_is_taken_away_ends_with_one_line(tmp_path: Path, how: 
     if how == 'moved':
         assert [b.index for b in open_recording(tmp_path / 'elsewhere').blocks()][:1] == [0]
     # The next one starts in a folder of its own.
-    assert run.recorder.start(rig_for(tmp_path), None).is_dir()
-    run.recorder.stop()
+    assert run.start(rig_for(tmp_path)).is_dir()
+    run.stop()
 
 
 def test_no_error_ends_a_recording_in_silence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,7 +141,7 @@ def test_no_error_ends_a_recording_in_silence(tmp_path: Path, monkeypatch: pytes
 def test_a_folder_that_cannot_be_made_says_the_way_out(tmp_path: Path) -> None:
     (tmp_path / 'bags').write_text('a file')
     with pytest.raises(RecordingError, match=r'cannot be made \(Not a directory\); .*record elsewhere'):
-        Recorder(10, print).start(rig_for(tmp_path), None)
+        Run(rig_for(tmp_path))
 
 
 def test_the_oldest_file_is_deleted_where_that_was_asked_for(
@@ -160,7 +162,7 @@ def test_the_oldest_file_is_deleted_where_that_was_asked_for(
     disk.free = 150 * MB
     run.put(1)
     assert 'deleted, the disk has 150 MB left' in run.heard()
-    assert run.recorder.stop() == run.folder
+    assert run.stop() == run.folder
     assert run.recorder.files_deleted == 1
     assert mine.exists()
     assert run.indices() == list(range(50, module.LOOK_EVERY))
@@ -189,7 +191,7 @@ def test_a_disk_that_refuses_ends_the_recording_and_says_the_way_out(
     assert 'Input/output error' in said
     assert f'psd-deflection recover {run.folder}' in said
     monkeypatch.undo()
-    assert run.recorder.stop() is None
+    assert run.stop() is None
 
 
 def test_a_slow_disk_holds_up_nothing_and_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,7 +214,7 @@ def test_a_slow_disk_holds_up_nothing_and_is_counted(tmp_path: Path, monkeypatch
     assert run.recorder.dropped == 80
     run.recorder.put_change(ParameterChange(0, 7, (('sum_min', 1.0),)))
     go_on.set()
-    run.recorder.stop()
+    run.stop()
     recording = open_recording(run.folder)
     assert run.indices() == list(range(limit + 1))
     assert [c.block for c in recording.changes] == [7]
@@ -233,11 +235,11 @@ def test_what_was_written_survives_without_an_end(tmp_path: Path) -> None:
             break
         watch.wait(0.02)
     assert [b.index for b in found] == [0, 1, 2]
-    run.recorder.stop()
+    run.stop()
 
 
 def test_a_recording_stays_in_its_folder(tmp_path: Path) -> None:
     run = Run(rig_for(tmp_path))
     assert run.folder.parent == tmp_path / 'bags'
-    assert run.recorder.start(rig_for(tmp_path), None) == run.folder
-    run.recorder.stop()
+    assert run.start(rig_for(tmp_path)) == run.folder
+    run.stop()

@@ -42,7 +42,7 @@ class Running:
 def running(device: ScriptedDevice, sample: Sample, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
     # However busy the machine is: only what a test does makes a device silent or a request late.
     monkeypatch.setattr(module, 'SILENT_S', 1e3)
-    monkeypatch.setattr(processing, 'REQUEST_TIMEOUT_S', 60.0)
+    monkeypatch.setattr(processing, 'REQUEST_TIMEOUT_S', WAIT_S)
     one = Running(device, sample)
     yield one
     one.session.close()

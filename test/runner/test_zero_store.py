@@ -46,27 +46,38 @@ def test_no_serial_number_leads_out_of_the_folder(rig: Rig, tmp_path: Path, seri
 
 
 @pytest.mark.parametrize(
-    'content',
+    ('content', 'why'),
     [
-        b'',
-        b'[]',
-        b'{"configured": {}, "psd_1.zero": [9, 9], "psd_2.zero": [0, 0]}',
-        b'{"configured": {}, "psd_1.zero": "x", "psd_2.zero": [0, 0]}',
-        b'{"configured": {}}',
-        b'\xff\xfe',
-        b'[' * 5000,
-        b' ' * 20_000,
-        b'{"configured": {}, "psd_1.zero": [NaN, 0], "psd_2.zero": [0, 0]}',
+        (b'', 'Expecting value'),
+        (b'[]', 'not what ~/zero writes'),
+        (b'{"psd_1.zero": [0, 0], "psd_2.zero": [0, 0]}', 'not what ~/zero writes'),
+        (b'\xff\xfe', 'Expecting value'),
+        (b'[' * 5000, ''),
+        (b' ' * 20_000, 'more than 10000 bytes'),
     ],
 )
-def test_a_bad_file_never_stops_a_run(rig: Rig, content: bytes) -> None:
+def test_a_bad_file_never_stops_a_run(rig: Rig, content: bytes, why: str) -> None:
     store = ZeroStore(rig, 'A')
     store.path.parent.mkdir(parents=True)
     store.path.write_bytes(content)
     back, said = store.load(rig)
     assert back is rig
-    assert str(store.path) in said
-    assert 'the rig file holds' in said
+    assert f'{store.path}: the kept zero cannot be used (' in said
+    assert why in said
+    assert said.endswith('; the rig file holds')
+
+
+@pytest.mark.parametrize('zero', [[9, 9], 'x', [float('nan'), 0], [0], None, {}, [0, 0, 0], [True, 0]])
+def test_a_kept_zero_is_checked_like_any_parameter(rig: Rig, zero: object) -> None:
+    store = ZeroStore(rig, 'A')
+    assert store.save(replace_values(rig, ZERO)) == ''
+    kept = json.loads(store.path.read_text())
+    assert store.load(rig)[0] is not rig
+    store.path.write_text(json.dumps({**kept, 'psd_1.zero': zero}))
+    back, said = store.load(rig)
+    assert back is rig
+    assert f'{store.path}: the kept zero cannot be used (' in said
+    assert 'psd_1.zero' in said
 
 
 def test_a_place_that_cannot_be_written_is_told(tmp_path: Path) -> None:

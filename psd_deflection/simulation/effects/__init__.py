@@ -1,1 +1,1 @@
-"""One physical effect a file; each declares one ``EFFECT`` (contract section 7)."""
+"""One physical effect a file; each declares one ``EFFECT``."""

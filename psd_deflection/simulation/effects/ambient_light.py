@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from psd_deflection.simulation.catalogue import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.simulation.physics import Physics
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import Effect, EffectParameter, State, Values
 from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
 
 
 def _excess(v: FloatArray, sigma: float) -> FloatArray:
@@ -37,7 +37,16 @@ EFFECT = Effect(
     source='amplifier datasheets',
     needs='signals up to the limit',
     parameters=(
-        EffectParameter('limit', 'V', 0.05, 1e3, 0.01, 'largest output', nominal=1e3, propose='highest'),
+        EffectParameter(
+            'limit',
+            'V',
+            0.05,
+            1e3,
+            0.01,
+            'largest output',
+            nominal=1e3,
+            propose=lambda values: 'highest' if values['sums'] else 'highest_dots',
+        ),
         EffectParameter(
             'sums', '', 0, 1, 1, '1: the sum signals clip as well', nominal=1, kind='choice', choices=(1, 0)
         ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.catalogue import MOVES_FREQUENCY, Effect, EffectParameter, Values
+from psd_deflection.simulation.declaration import MOVES_FREQUENCY, Effect, EffectParameter, Values
 from psd_deflection.simulation.physics import Physics
 
 

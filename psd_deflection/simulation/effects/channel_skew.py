@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from psd_deflection.simulation.catalogue import PSD, Effect, EffectParameter, State, Values
 from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, State, Values
 
 
 def _apply(chunk: Chunk, values: Values, state: State) -> None:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import Effect, EffectParameter, State, Values
 from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
 
 
 def play(x: FloatArray, half_width: float, start: float) -> FloatArray:

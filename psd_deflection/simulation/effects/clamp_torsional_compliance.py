@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.catalogue import Effect, EffectParameter, Values
+from psd_deflection.simulation.declaration import Effect, EffectParameter, Values
 from psd_deflection.simulation.physics import Physics
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from psd_deflection.simulation.catalogue import Effect, EffectParameter, Values
+from psd_deflection.simulation.declaration import Effect, EffectParameter, Values
 from psd_deflection.simulation.physics import Physics
 
 
@@ -20,7 +20,7 @@ EFFECT = Effect(
     stage='link',
     summary='damping ratios differ',
     equation='zeta -> bending_ratio, torsion_ratio',
-    source='contract section 2',
+    source='second-order mode: zeta = c/(2 sqrt(k m))',
     needs='a step or a sweep through the modes',
     parameters=(
         EffectParameter(

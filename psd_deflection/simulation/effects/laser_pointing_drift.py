@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.catalogue import PSD, Effect, EffectParameter, State, Values
 from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, State, Values
 
 
 def _apply(chunk: Chunk, values: Values, state: State) -> None:
@@ -17,7 +17,7 @@ EFFECT = Effect(
     stage='optics',
     summary='one beam wanders linearly in time',
     equation='l_i += rate t',
-    source='contract section 7',
+    source='laser datasheets: pointing stability',
     needs='time; temperature that is not itself a ramp',
     parameters=(
         PSD,
@@ -26,4 +26,5 @@ EFFECT = Effect(
     ),
     point='beam',
     apply=_apply,
+    uses=frozenset({'time'}),
 )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from psd_deflection.simulation.catalogue import Effect, EffectParameter, State, Values
 from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
 
 
 def _apply(chunk: Chunk, values: Values, state: State) -> None:

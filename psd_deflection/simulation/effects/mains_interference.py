@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from psd_deflection.records import CHANNELS
-from psd_deflection.simulation.catalogue import Effect, EffectParameter, State, Values
 from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
 
 
 def _apply(chunk: Chunk, values: Values, state: State) -> None:
@@ -42,7 +42,16 @@ EFFECT = Effect(
         ),
         *(EffectParameter(f'amplitude_{c}', 'V', -10.0, 10.0, 1e-3, f'its size on {c}') for c in CHANNELS),
         *(
-            EffectParameter(f'phase_{c}', 'rad', -2.0 * math.pi, 2.0 * math.pi, 0.1, f'its phase on {c}', kind='phase')
+            EffectParameter(
+                f'phase_{c}',
+                'rad',
+                -2.0 * math.pi,
+                2.0 * math.pi,
+                0.1,
+                f'its phase on {c}',
+                kind='phase',
+                partner=f'amplitude_{c}',
+            )
             for c in CHANNELS
         ),
     ),

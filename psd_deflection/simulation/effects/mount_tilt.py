@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.catalogue import Effect, EffectParameter, Values
+from psd_deflection.simulation.declaration import Effect, EffectParameter, Values
 from psd_deflection.simulation.physics import Physics
 
 
@@ -16,7 +16,7 @@ EFFECT = Effect(
     stage='link',
     summary='the base is tilted against the beams',
     equation='dX += x L, dY += y L',
-    source='contract section 7',
+    source='geometry: a slope times the length',
     needs='recordings at two lengths, zeroed at one',
     parameters=(
         EffectParameter('x', 'rad', -0.5, 0.5, 1e-6, 'slope of the link toward +X'),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.catalogue import Effect, EffectParameter, Values
+from psd_deflection.simulation.declaration import Effect, EffectParameter, Values
 from psd_deflection.simulation.physics import Physics
 
 
@@ -19,7 +19,14 @@ EFFECT = Effect(
     needs='large deflection; an even effect',
     parameters=(
         EffectParameter(
-            'slope_ratio', '', 0.0, 20.0, 1.5, 'k of phi = -k dY/L: 3/2 for a force, 2 for a moment', grid=(1.5,)
+            'slope_ratio',
+            '',
+            0.0,
+            20.0,
+            1.5,
+            'k of phi = -k dY/L: 3/2 for a force, 2 for a moment',
+            grid=(1.5,),
+            power=2,
         ),
     ),
     point='configure',

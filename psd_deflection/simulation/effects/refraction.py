@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.catalogue import Effect, EffectParameter, State, Values
 from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
 
 
 def _apply(chunk: Chunk, values: Values, state: State) -> None:
@@ -25,4 +25,5 @@ EFFECT = Effect(
     ),
     point='beam',
     apply=_apply,
+    uses=frozenset({'temperature'}),
 )

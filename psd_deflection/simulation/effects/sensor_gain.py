@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.catalogue import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 
 
 def _apply(chunk: Chunk, values: Values, state: State) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 
 
 def _turn(dots: FloatArray, psd: float, angle: float) -> None:

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import PSD, Effect, EffectParameter, State, Values
 from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, State, Values
 
 
 def _cut_disc(distance: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:

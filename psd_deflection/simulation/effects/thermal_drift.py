@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.catalogue import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 
 
 def _apply(chunk: Chunk, values: Values, state: State) -> None:
@@ -34,4 +34,5 @@ EFFECT = Effect(
     apply=_apply,
     correct=_correct,
     order=6,
+    uses=frozenset({'temperature'}),
 )

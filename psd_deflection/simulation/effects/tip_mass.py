@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from psd_deflection.simulation.catalogue import Effect, EffectParameter, Values
+from psd_deflection.simulation.declaration import Effect, EffectParameter, Values
 from psd_deflection.simulation.physics import Physics
 
 

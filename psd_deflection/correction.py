@@ -1,0 +1,151 @@
+"""Undo what is known to be wrong with sensors and optics, so that the estimate gets better too.
+
+A solver takes the rig at its word. Where the rig file lists effects of the detectors and the
+optics, a measured reading is first walked back through them (background light, gain, cross-talk,
+non-linearity, rotation, temperature); then, with the pose these dots imply, the difference between
+the true and the nominal optics (places of PSDs and beams, wandering beams, tilt) is taken off. What
+remains are the dots that the nominal, flat, perfectly placed rig would have shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from psd_deflection.config import Rig
+from psd_deflection.errors import ConfigError
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.catalogue import effects_of_rig
+from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import ActiveEffect, Reading, Use, Values
+from psd_deflection.simulation.optics import dots_on_plate
+from psd_deflection.simulation.physics import Physics
+
+PASSES = 3
+"""Fixed-point passes for the pose; each gains the relative size of the optics effect (< 1 %)."""
+OPTICS = ('centers', 'beams', 'heights', 'slope_ratio')
+"""The constants that decide where the beams meet the plate (fields of :class:`Physics`)."""
+
+
+class Correction:
+    """Corrects dots for the effects that a rig file lists. Make it with :meth:`from_rig`.
+
+    Raises ConfigError if an effect fails on a reading, or reads time or temperature without
+    declaring it.
+    """
+
+    def __init__(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
+        self._nominal, self._true = Physics.of(rig), Physics.of(rig)
+        self._sensors: list[tuple[Callable[[Reading, Values], None], Values]] = []
+        self._beams: list[ActiveEffect] = []
+        self._moves_optics = False
+        uses: set[Use] = set()
+        for active in effects:
+            try:
+                corrects = self._add(active)
+            except Exception as error:
+                # The file may be a stranger's; it must not fail at the first block of a run.
+                raise ConfigError(
+                    f'effects: {active.label}: fails on a reading ({type(error).__name__}: {error}); '
+                    f'an effect that reads t or warmer must declare it in uses'
+                ) from error
+            uses |= active.effect.uses if corrects else frozenset()
+        self.uses_time = 'time' in uses
+        """Whether a corrected effect goes on with time."""
+        self.uses_temperature = 'temperature' in uses
+        """Whether a corrected effect goes with temperature."""
+
+    @classmethod
+    def from_rig(cls, rig: Rig) -> Correction:
+        """The correction for the effects of ``rig``; raises ConfigError where they are malformed."""
+        return cls(rig, effects_of_rig(rig))
+
+    @property
+    def active(self) -> bool:
+        """Whether there is anything to correct."""
+        return bool(self._sensors) or self._moves_optics
+
+    def _add(self, active: ActiveEffect) -> bool:
+        """Take an effect in and say whether there is something to correct for it.
+
+        It is run on two samples, on which time and temperature are missing if it does not declare
+        them: in a run they would silently be zeros.
+        """
+        effect, before = active.effect, _optics(self._true)
+        t, warmer = (np.zeros(2 if use in effect.uses else 0) for use in ('time', 'temperature'))
+        if effect.configure is not None:
+            effect.configure(self._true, active.values)
+        if effect.point == 'beam':
+            self._wandered([active], t, warmer, 2)
+            self._beams.append(active)
+        if effect.correct is not None:
+            sums = np.full((2, 2), self._nominal.sum_nominal)
+            effect.correct(Reading(np.full((4, 2), 1e-3), sums, warmer, t), active.values)
+            self._sensors.insert(0, (effect.correct, active.values))
+        moves = effect.point == 'beam' or _optics(self._true) != before
+        self._moves_optics |= moves
+        return moves or effect.correct is not None
+
+    def _wandered(self, effects: Sequence[ActiveEffect], t: FloatArray, warmer: FloatArray, n: int) -> FloatArray:
+        """The true beams (4, n), m."""
+        chunk = Chunk(t, warmer, np.empty((3, n)), self._true)
+        chunk.beams = np.repeat(self._true.beams.reshape(4, 1), n, axis=1)
+        for active in effects:
+            if active.effect.apply is not None:
+                active.effect.apply(chunk, active.values, {})
+        return chunk.beams
+
+    def apply(
+        self,
+        dots: FloatArray,
+        sums: FloatArray | None = None,
+        warmer: FloatArray | float = 0.0,
+        t: FloatArray | float = 0.0,
+    ) -> FloatArray:
+        """Corrected dots (n, 4), m, of measured ``dots`` (n, 4), m.
+
+        ``sums`` (n, 2) V, nominal where None; ``warmer`` (n,) K above the recording's first
+        temperature; ``t`` (n,) s since its first sample.
+        """
+        n = len(dots)
+        given = np.full((2, n), self._nominal.sum_nominal) if sums is None else np.array(sums.T, dtype=np.float64)
+        reading = Reading(
+            np.array(np.asarray(dots, dtype=np.float64).T, order='C'),
+            given,
+            np.broadcast_to(np.asarray(warmer, dtype=np.float64), (n,)),
+            np.broadcast_to(np.asarray(t, dtype=np.float64), (n,)),
+        )
+        for correct, values in self._sensors:
+            correct(reading, values)
+        if not self._moves_optics:
+            return np.ascontiguousarray(reading.dots.T)
+        nominal_beams = np.repeat(self._nominal.beams.reshape(4, 1), n, axis=1)
+        beams = self._wandered(self._beams, reading.t, reading.warmer, n)
+        corrected = reading.dots.copy()
+        for _ in range(PASSES):
+            pose = _flat_pose(corrected, nominal_beams, self._nominal)
+            shown = dots_on_plate(pose, beams, self._true)
+            wanted = dots_on_plate(pose, nominal_beams, self._nominal)
+            corrected = reading.dots - (shown - wanted)
+        return np.ascontiguousarray(corrected.T)
+
+
+def _optics(physics: Physics) -> list[object]:
+    return [np.array(getattr(physics, name)).tolist() for name in OPTICS]
+
+
+def _flat_pose(dots: FloatArray, beams: FloatArray, physics: Physics) -> FloatArray:
+    """Pose (3, n) of a flat plate from dots (4, n): twist from the line between the two dots,
+    translation from their mean (two-point Procrustes).
+    """
+    qx = [dots[2 * i] + physics.centers[i, 0] for i in range(2)]
+    qy = [dots[2 * i + 1] + physics.centers[i, 1] for i in range(2)]
+    ux, uy = qx[0] - qx[1], qy[0] - qy[1]
+    vx, vy = beams[0] - beams[2], beams[1] - beams[3]
+    theta = np.arctan2(ux * vy - uy * vx, ux * vx + uy * vy)
+    c, s = np.cos(theta), np.sin(theta)
+    mx, my = 0.5 * (qx[0] + qx[1]), 0.5 * (qy[0] + qy[1])
+    dx = 0.5 * (beams[0] + beams[2]) - (c * mx - s * my)
+    dy = 0.5 * (beams[1] + beams[3]) - (s * mx + c * my)
+    return np.stack((dx, dy, theta))

@@ -1,0 +1,210 @@
+"""What an effect is: the declaration that a file in ``effects/``, or one of yours, makes.
+
+It holds all that the simulation, the correction and the discovery know of an effect; none of them
+knows an effect by its name.
+"""
+
+from __future__ import annotations
+
+import itertools
+import typing
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.physics import Physics
+
+Stage = Literal['load', 'link', 'optics', 'psd', 'electronics']
+Point = Literal['configure', 'load', 'static', 'pose', 'beam', 'dots', 'volts', 'output']
+Kind = Literal['amplitude', 'coupled', 'phase', 'shape', 'choice']
+Proposal = Literal['', 'spectral', 'line', 'highest', 'highest_dots', 'lattice']
+Use = Literal['time', 'temperature']
+State = dict[str, Any]
+Values = Mapping[str, float]
+
+STAGES: tuple[Stage, ...] = typing.get_args(Stage)
+"""In the order in which they act."""
+
+
+@dataclass(frozen=True, slots=True)
+class EffectParameter:
+    """One parameter of an effect, with its bounds and what a search has to know of it.
+
+    ``nominal``: the value at which the effect is off, or that a parameter takes when it is not
+    given; NaN means the rig file's own, the field ``of_rig`` of :class:`Physics`. ``scale``: the
+    size of a probe, about the prior's standard deviation. ``within``: narrower bounds that the rig
+    sets, given the effect's values.
+
+    ``kind``: an ``amplitude`` switches the effect on; ``coupled`` means nothing while the amplitudes
+    are nominal; a ``phase`` (rad) belongs to the amplitude that ``partner`` names; a ``shape`` also
+    means nothing while they are, and ``grid`` says where to look; a ``choice`` takes the values of
+    ``choices``. A rig may have one such effect for each value of an ``each`` choice (one for each
+    PSD), otherwise one.
+
+    ``propose``: where the recordings themselves say what to try, or a function of the choices that
+    says it. ``spectral``: peaks of the residual's spectrum, and ``grid``; ``line``: those of steady amplitude and
+    phase; ``highest``: the largest voltage seen, ``highest_dots``: the same without the sums;
+    ``lattice``: the step on whose multiples all readings lie, and the effect is then named without a
+    search. ``power``: the signature of a ``finite`` effect grows with this power of the parameter;
+    0: it does not grow in proportion.
+    """
+
+    name: str
+    unit: str
+    minimum: float
+    maximum: float
+    scale: float
+    description: str
+    nominal: float = 0.0
+    kind: Kind = 'amplitude'
+    choices: tuple[int, ...] = ()
+    grid: tuple[float, ...] = ()
+    propose: Proposal | Callable[[Values], Proposal] = ''
+    power: int = 0
+    partner: str = ''
+    of_rig: str = ''
+    required: bool = False
+    each: bool = False
+    within: Callable[[Physics, Values], tuple[float, float]] | None = None
+
+    def off(self, physics: Physics) -> float:
+        """The nominal value on this rig."""
+        return float(getattr(physics, self.of_rig)) if self.of_rig else self.nominal
+
+    def bounds(self, physics: Physics, values: Values) -> tuple[float, float]:
+        """Least and greatest value that is physical on this rig."""
+        if self.within is None:
+            return self.minimum, self.maximum
+        low, high = self.within(physics, values)
+        return max(low, self.minimum), min(high, self.maximum)
+
+    def proposed_by(self, values: Values) -> Proposal:
+        """``propose``, given the effect's choices."""
+        return self.propose(values) if callable(self.propose) else self.propose
+
+
+PSD = EffectParameter(
+    'psd', '', 1, 2, 1, 'which PSD', nominal=1, kind='choice', choices=(1, 2), required=True, each=True
+)
+"""The parameter of every effect that belongs to one detector."""
+MOVES_FREQUENCY = EffectParameter(
+    'moves_frequency',
+    '',
+    0,
+    1,
+    1,
+    '1: the mode moves with it, by sqrt(1 + scale); 0: the frequency was measured',
+    kind='choice',
+    choices=(0, 1),
+)
+"""The parameter of every effect on a stiffness."""
+
+
+@dataclass(slots=True, eq=False)
+class Reading:
+    """n readings on their way back to what the PSDs would have shown: ``dots`` (4, n) m,
+    ``sums`` (2, n) V, ``warmer`` (n,) K, ``t`` (n,) s. Changed in place.
+    """
+
+    dots: FloatArray
+    sums: FloatArray
+    warmer: FloatArray
+    t: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """One physical effect: what it is, where it acts, and how.
+
+    ``equation`` and ``source`` are for the reader. ``needs``: the excitation that shows it.
+    ``configure`` changes the constants before a run; ``apply`` changes a chunk at ``point``;
+    ``correct`` undoes it on a reading, where that is possible without the load. What moves the
+    beams (``point`` is ``beam``) or the constants of the optics needs no ``correct``. ``uses``: what
+    the correction must know besides dots and sums. ``order``: among the effects of one stage.
+    ``finite``: the signature at the nominal value vanishes, so that only the values of ``grid`` are
+    probed, each as it is. Raises ValueError where the declaration contradicts itself.
+    """
+
+    name: str
+    stage: Stage
+    summary: str
+    equation: str
+    source: str
+    needs: str
+    parameters: tuple[EffectParameter, ...]
+    point: Point
+    configure: Callable[[Physics, Values], None] | None = None
+    apply: Callable[[Chunk, Values, State], None] | None = None
+    correct: Callable[[Reading, Values], None] | None = None
+    uses: frozenset[Use] = frozenset()
+    finite: bool = False
+    order: int = 0
+
+    def __post_init__(self) -> None:
+        names = [p.name for p in self.parameters]
+        amplitudes = [p.name for p in self.parameters if p.kind == 'amplitude']
+        if self.stage not in STAGES:
+            raise ValueError(f'stage = {self.stage!r}: must be one of {", ".join(STAGES)}')
+        if self.point not in typing.get_args(Point):
+            raise ValueError(f'point = {self.point!r}: must be one of {", ".join(typing.get_args(Point))}')
+        if (self.configure if self.point == 'configure' else self.apply) is None:
+            raise ValueError(f'point = {self.point!r} needs {"configure" if self.point == "configure" else "apply"}')
+        if not self.uses <= set(typing.get_args(Use)):
+            raise ValueError(f'uses = {set(self.uses)!r}: must be of {", ".join(typing.get_args(Use))}')
+        if len(set(names)) < len(names) or not amplitudes:
+            raise ValueError('parameters must have different names, and one must be an amplitude')
+        for p in self.parameters:
+            if p.kind == 'phase' and p.partner not in amplitudes:
+                raise ValueError(f'{p.name}: partner = {p.partner!r}: must name an amplitude')
+            if not p.minimum <= p.maximum or not p.scale > 0.0:
+                raise ValueError(f'{p.name}: minimum must be at most maximum, and scale above 0')
+            if (p.kind == 'choice') != bool(p.choices):
+                raise ValueError(f'{p.name}: a choice, and nothing else, has choices')
+
+    @property
+    def rank(self) -> tuple[int, int, str]:
+        """Sorts effects into the order in which they act."""
+        return STAGES.index(self.stage), self.order, self.name
+
+    @property
+    def lattice(self) -> str:
+        """The parameter that is the step on whose multiples all readings lie, or none."""
+        return next((p.name for p in self.parameters if p.propose == 'lattice'), '')
+
+    def parameter(self, name: str) -> EffectParameter:
+        """The declared parameter of that name (KeyError if there is none)."""
+        for p in self.parameters:
+            if p.name == name:
+                return p
+        raise KeyError(name)
+
+    def variants(self) -> Iterator[dict[str, float]]:
+        """Each combination of the choices, by parameter name."""
+        discrete = [p for p in self.parameters if p.kind == 'choice']
+        for combination in itertools.product(*(p.choices for p in discrete)):
+            yield {p.name: float(c) for p, c in zip(discrete, combination, strict=True)}
+
+    def off_values(self, physics: Physics, choice: Values) -> dict[str, float]:
+        """All parameters at the value where the effect is off."""
+        return {p.name: choice.get(p.name, p.off(physics)) for p in self.parameters}
+
+
+@dataclass(frozen=True, slots=True)
+class ActiveEffect:
+    """An effect that is on, with a value for every parameter."""
+
+    effect: Effect
+    values: Values
+
+    @property
+    def choices(self) -> tuple[float, ...]:
+        """The values of the discrete parameters."""
+        return tuple(self.values[p.name] for p in self.effect.parameters if p.kind == 'choice')
+
+    @property
+    def label(self) -> str:
+        """Name and discrete choices, for people: ``sensor_rotation (psd 2)``."""
+        choice = [f'{p.name} {self.values[p.name]:g}' for p in self.effect.parameters if p.kind == 'choice']
+        return self.effect.name + (f' ({", ".join(choice)})' if choice else '')

@@ -1,0 +1,175 @@
+"""The pipeline's thread: requests that come late, and how long blocks took."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Collection
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psd_deflection.config import load_rig
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import DeflectionEstimate, RawChunk, Record
+from psd_deflection.runner import processing as module
+from psd_deflection.runner.acquisition import Chunk, Ended, Item
+from psd_deflection.runner.processing import Processing
+from test.heard import WAIT_S
+
+MS = 1_000_000
+COUNTS = np.tile(np.array([0, 0, 16384, 0, 0, 16384], np.int16), (20, 1))
+
+
+def chunk(index: int, read_ns: int) -> Chunk:
+    seq = np.arange(20 * index, 20 * index + 20)
+    return Chunk(RawChunk(seq, seq * MS, COUNTS, np.zeros(20, np.uint8), 10.0 / 32768), read_ns)
+
+
+@pytest.fixture
+def items() -> queue.SimpleQueue[Item]:
+    return queue.SimpleQueue()
+
+
+class Held:
+    """A request that the pipeline's thread is in the middle of until ``go_on`` is set."""
+
+    def __init__(self) -> None:
+        self.begun, self.go_on = threading.Event(), threading.Event()
+
+    def __call__(self) -> str:
+        self.begun.set()
+        assert self.go_on.wait(WAIT_S)
+        return 'done'
+
+
+def test_a_request_that_was_given_up_is_never_carried_out(
+    items: queue.SimpleQueue[Item], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    processing, held, done = Processing(items, Pipeline(load_rig()), print), Held(), list[str]()
+    processing.start()
+    with ThreadPoolExecutor(1) as other:
+        first = other.submit(processing.request, held)
+        assert held.begun.wait(WAIT_S)
+        with monkeypatch.context() as hasty:
+            hasty.setattr(module, 'REQUEST_TIMEOUT_S', 0.01)
+            with pytest.raises(TimeoutError, match='no data flows'):
+                processing.request(lambda: done.append('too late'))
+        held.go_on.set()
+        assert first.result(WAIT_S) == 'done'
+    processing.request(lambda: done.append('in time'))
+    items.put(Ended())
+    processing.join(WAIT_S)
+    assert done == ['in time']
+
+
+def test_a_request_that_was_begun_is_waited_for(
+    items: queue.SimpleQueue[Item], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    processing, held = Processing(items, Pipeline(load_rig()), print), Held()
+
+    def impatient(asked: Collection[Future[Any]], timeout: float) -> Any:
+        if not held.go_on.is_set():
+            # The first time: its time is up in the middle of it.
+            assert held.begun.wait(WAIT_S)
+            held.go_on.set()
+            return wait((Future(),), 0.0)
+        return wait(asked, WAIT_S)
+
+    monkeypatch.setattr(module, 'wait', impatient)
+    processing.start()
+    assert processing.request(held) == 'done'
+    items.put(Ended())
+    processing.join(WAIT_S)
+
+
+def test_a_request_that_does_not_end_is_not_called_undone(
+    items: queue.SimpleQueue[Item], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    processing, held = Processing(items, Pipeline(load_rig()), print), Held()
+
+    def impatient(asked: Collection[Future[Any]], timeout: float) -> Any:
+        assert held.begun.wait(WAIT_S)
+        return wait(asked, 0.0)
+
+    monkeypatch.setattr(module, 'wait', impatient)
+    processing.start()
+    with pytest.raises(TimeoutError, match='it was begun and has not ended'):
+        processing.request(held)
+    held.go_on.set()
+    items.put(Ended())
+    processing.join(WAIT_S)
+
+
+def test_errors_of_a_request_come_through(items: queue.SimpleQueue[Item]) -> None:
+    def refuse() -> None:
+        raise TimeoutError('its own')
+
+    processing = Processing(items, Pipeline(load_rig()), print)
+    with pytest.raises(TimeoutError, match='its own'):
+        processing.request(refuse)
+    processing.start()
+    with pytest.raises(TimeoutError, match='its own'):
+        processing.request(refuse)
+    items.put(Ended())
+    processing.join(WAIT_S)
+
+
+class Clock:
+    """Stands at ``now`` but for the sinks: block i is with them at ``ends[i]``."""
+
+    def __init__(self, ends: list[int]) -> None:
+        self.now = 0
+        self._ends = iter(ends)
+
+    def __call__(self) -> int:
+        return self.now
+
+    def put(self, record: Record) -> None:
+        if isinstance(record, DeflectionEstimate) and record.primary:
+            self.now = next(self._ends)
+
+
+def after(items: queue.SimpleQueue[Item], read_and_end_ms: list[tuple[int, int]]) -> tuple[Processing, Clock]:
+    """Processing and its clock after blocks that were read and had gone to the sinks at these times."""
+    clock = Clock([end * MS for _, end in read_and_end_ms])
+    processing = Processing(items, Pipeline(load_rig()), print, clock)
+    processing.sinks.append(clock)
+    assert processing.latency() is None
+    for index, (read, _) in enumerate(read_and_end_ms):
+        items.put(chunk(index, read * MS))
+    items.put(Ended())
+    processing.start()
+    processing.join(WAIT_S)
+    assert processing.failed is None
+    return processing, clock
+
+
+def told(processing: Processing) -> tuple[float, float] | None:
+    latency = processing.latency()
+    return (round(latency.median * 1e3), round(latency.worst * 1e3)) if latency is not None else None
+
+
+def test_latency_is_from_the_last_byte_to_the_last_sink_of_the_last_second(items: queue.SimpleQueue[Item]) -> None:
+    processing, clock = after(items, [(100, 400), (600, 900), (1290, 1300), (1330, 1350)])
+    assert told(processing) == (300, 300)
+    clock.now = 1450 * MS
+    assert told(processing) == (20, 300)
+    clock.now = 2000 * MS
+    assert told(processing) == (20, 20)
+    clock.now = 3000 * MS
+    assert told(processing) is None
+
+
+@pytest.mark.parametrize('blocks', [10, 400])
+def test_a_second_is_a_second_however_many_blocks_it_has(items: queue.SimpleQueue[Item], blocks: int) -> None:
+    """The worst is the first: a fixed number of blocks would forget it, or remember it for too long."""
+    every = 2000 // blocks
+    ends = [5000 + every * i for i in range(blocks)]
+    slow = blocks // 2 + 1
+    processing, clock = after(items, [(end - (90 if i == slow else 3), end) for i, end in enumerate(ends)])
+    assert told(processing) == (3, 90)
+    clock.now = (ends[slow] + 1001) * MS
+    assert told(processing) == (3, 3)

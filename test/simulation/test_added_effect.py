@@ -1,0 +1,279 @@
+"""An effect from outside the package: simulated, corrected and discovered like one of ours.
+
+The effect is the one of docs/simulation.md, "Add an effect", so that the page is tried as well.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import psd_deflection
+from psd_deflection.cli.main import main
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.correction import Correction
+from psd_deflection.errors import ConfigError
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import DeflectionEstimate, FloatArray, RawChunk
+from psd_deflection.simulation import effects
+from psd_deflection.simulation.catalogue import FOLDERS, GROUP, catalogue, effect_names, effects_of_rig
+from psd_deflection.simulation.loads import sidebar
+from psd_deflection.simulation.simulator import RigSimulator
+
+PACKAGE = Path(psd_deflection.__file__).parent
+PAGE = (PACKAGE.parent / 'docs' / 'simulation.md').read_text(encoding='utf-8')
+NAME = 'warm_gain'
+(CODE,) = re.findall(r'```python\n(.*?)```', PAGE, re.S)
+EFFECT = {'effects.one.name': NAME, 'effects.one.psd': 2, 'effects.one.k': 2e-4}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of effects, empty so far."""
+    path = tmp_path / 'effects'
+    path.mkdir()
+    monkeypatch.setenv(FOLDERS, str(path))
+    return path
+
+
+@pytest.fixture
+def rig(folder: Path) -> Rig:
+    """The rig with the added effect on."""
+    (folder / f'{NAME}.py').write_text(CODE)
+    return load_rig(overrides=EFFECT)
+
+
+def poses(rig: Rig, counts: np.ndarray[tuple[int, ...], np.dtype[np.int16]]) -> FloatArray:
+    """Estimates (blocks, 3) of a link that was at 20 degrees Celsius first and is at 30 now."""
+    pipeline = Pipeline(rig)
+    pipeline.temperature(20.0)
+    pipeline.temperature(30.0)
+    n = len(counts)
+    seq = np.arange(n, dtype=np.int64)
+    chunk = RawChunk(seq, seq * 1_000_000, counts, np.zeros(n, np.uint8), rig.converter.volts_per_count)
+    records = [*pipeline.process(chunk), *pipeline.flush()]
+    return np.array([(r.dx, r.dy, r.theta) for r in records if isinstance(r, DeflectionEstimate) and r.primary])
+
+
+def test_it_is_in_the_catalogue(rig: Rig) -> None:
+    assert NAME in effect_names()
+    assert NAME in catalogue()
+    assert [a.label for a in effects_of_rig(rig)] == [f'{NAME} (psd 2)']
+
+
+def test_it_is_simulated_and_corrected(rig: Rig) -> None:
+    load = np.tile(sidebar(50.0), (8000, 1))
+    warm = np.full(len(load), 30.0)
+    warm[0] = 20.0
+    counts = RigSimulator(rig, 4).step(load, warm).counts
+    truth = poses(load_rig(), RigSimulator(load_rig(), 4).step(load, warm).counts)[-50:].mean(axis=0)
+    blind, corrected = (np.abs(poses(r, counts)[-50:].mean(axis=0) - truth) for r in (load_rig(), rig))
+    assert Pipeline(rig).needs_temperature
+    assert not Pipeline(load_rig()).needs_temperature
+    # A count is 0.08 um.
+    assert (corrected[:2] < 3e-8).all()
+    assert corrected.max() < 1e-6
+    assert (blind > 20.0 * corrected).any()
+    assert blind.max() > 1e-6
+
+
+def test_it_is_discovered_and_named(rig: Rig, tmp_path: Path) -> None:
+    run, out = tmp_path / 'run', tmp_path / 'found'
+    words = ['--loads', 'identification', '--temperature', '20,26,22', '--effect', f'{NAME},psd=2,k=2e-4']
+    assert main(['simulate', '--out', str(run), *words]) == 0
+    assert main(['discover', str(run), '--out', str(out), '--quiet']) == 0
+    answer = json.loads((out / 'result.json').read_text())
+    assert answer['verdict'] == 'effects_found'
+    (named,) = answer['effects']
+    assert (named['name'], named['parameters']['psd']) == (NAME, 2)
+    k = named['parameters']['k']
+    assert k['unit'] == '1/K'
+    assert abs(k['value'] - 2e-4) < 4.0 * k['sd']
+    # The model that discover leaves is one that the pipeline corrects with.
+    assert Pipeline(load_rig(out / 'model.yaml')).needs_temperature
+
+
+@pytest.mark.parametrize(('name', 'row'), [('temperature', 'warmer'), ('time', 't')])
+def test_a_correction_that_reads_what_it_does_not_declare_is_refused(folder: Path, name: str, row: str) -> None:
+    (folder / f'{NAME}.py').write_text(CODE.replace("{'temperature'}", '').replace('reading.warmer', f'reading.{row}'))
+    with pytest.raises(ConfigError, match=f'{NAME}.*fails on a reading.*uses'):
+        Pipeline(load_rig(overrides=EFFECT))
+    declared = CODE.replace("{'temperature'}", f"{{'{name}'}}").replace('reading.warmer', f'reading.{row}')
+    # Under another name: what is loaded once stays as it was.
+    (folder / 'other.py').write_text(declared.replace(NAME, 'other'))
+    correction = Correction.from_rig(load_rig(overrides={**EFFECT, 'effects.one.name': 'other'}))
+    assert (correction.uses_temperature, correction.uses_time) == (name == 'temperature', name == 'time')
+
+
+def test_a_beam_that_reads_what_it_does_not_declare_is_refused(folder: Path) -> None:
+    code = CODE.replace('chunk.dots', 'chunk.beams').replace("'dots'", "'beam'").replace('    correct=_correct,\n', '')
+    (folder / f'{NAME}.py').write_text(code.replace("{'temperature'}", ''))
+    with pytest.raises(ConfigError, match='fails on a reading'):
+        Pipeline(load_rig(overrides=EFFECT))
+
+
+def test_moved_heights_are_moved_optics(folder: Path) -> None:
+    code = """
+from psd_deflection.simulation.declaration import Effect, EffectParameter
+
+def _configure(physics, values):
+    physics.heights = physics.heights + values['by']
+
+EFFECT = Effect('taller', 'optics', 's', 'e', 's', 'n', (EffectParameter('by', 'm', -1.0, 1.0, 1e-3, 'd'),),
+                'configure', configure=_configure)
+"""
+    (folder / 'taller.py').write_text(code)
+    assert Correction.from_rig(load_rig(overrides={'effects.taller.by': 0.01})).active
+    assert not Correction.from_rig(load_rig(overrides={'effects.taller.by': 0.0})).active
+
+
+BROKEN = [
+    ('def', 'SyntaxError'),
+    ('import no_such_module', 'no_such_module'),
+    ('raise RuntimeError("out of order")', 'out of order'),
+    ('import sys; sys.exit("gone")', 'gone'),
+    ('', 'EFFECT'),
+    ('EFFECT = 3', 'must be an Effect'),
+    (CODE.replace(f"name='{NAME}'", "name='cold_gain'"), 'cold_gain'),
+    (CODE.replace("stage='psd'", "stage='pds'"), "stage = 'pds'"),
+    (CODE.replace("point='dots'", "point='dot'"), "point = 'dot'"),
+    (CODE.replace('    apply=_apply,\n', ''), 'needs apply'),
+    (CODE.replace("{'temperature'}", "{'weather'}"), 'weather'),
+    (CODE.replace("'relative growth per kelvin'", "'', kind='phase'"), 'amplitude'),
+]
+
+
+@pytest.mark.parametrize(('code', 'said'), BROKEN, ids=[said for _, said in BROKEN])
+def test_a_broken_file_is_named_with_the_cause(folder: Path, code: str, said: str) -> None:
+    file = folder / f'{NAME}.py'
+    file.write_text(code)
+    for load in (lambda: Pipeline(load_rig(overrides=EFFECT)), catalogue):
+        with pytest.raises(ConfigError) as error:
+            load()
+        assert str(file) in str(error.value)
+        assert said in str(error.value)
+    # Whoever does not use it is not disturbed.
+    Pipeline(load_rig())
+    Pipeline(load_rig(overrides={'effects.one.name': 'sensor_gain', 'effects.one.psd': 1, 'effects.one.x': 0.01}))
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(FOLDERS, str(tmp_path / 'efects'))
+    with pytest.raises(ConfigError, match=rf'{FOLDERS}: .*efects: cannot be read'):
+        effect_names()
+    # Nobody needs the default one, and a rig without effects none.
+    Pipeline(load_rig())
+    monkeypatch.delenv(FOLDERS)
+    monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path))
+    assert NAME not in effect_names()
+
+
+def test_two_effects_of_one_name_are_refused(folder: Path) -> None:
+    file = folder / 'creep.py'
+    file.write_text(CODE)
+    with pytest.raises(ConfigError) as error:
+        effect_names()
+    assert str(file) in str(error.value)
+    assert 'effects.creep' in str(error.value)
+
+
+def test_a_package_offers_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = tmp_path / 'some_package-1.0.dist-info'
+    told.mkdir()
+    (told / 'METADATA').write_text('Metadata-Version: 2.1\nName: some-package\nVersion: 1.0\n')
+    (told / 'entry_points.txt').write_text(f'[{GROUP}]\n{NAME} = some_package_with_an_effect:EFFECT\n')
+    (tmp_path / 'some_package_with_an_effect.py').write_text(CODE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv(FOLDERS, '')
+    assert Pipeline(load_rig(overrides=EFFECT)).needs_temperature
+
+
+def test_the_folder_by_default_is_in_the_users_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(FOLDERS, raising=False)
+    monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path))
+    folder = tmp_path / 'psd_deflection' / 'effects'
+    folder.mkdir(parents=True)
+    assert NAME not in effect_names()
+    (folder / f'{NAME}.py').write_text(CODE)
+    assert NAME in effect_names()
+
+
+LINK = {'bending_stiffness', 'torsional_stiffness', 'damping'}
+"""Effects that have the name of what they change; it is a word of mechanics and of the fit as well."""
+SEARCH = {'amplitude', 'gain'}
+"""Parameters that have the name of a kind of parameter, and of a column of the report."""
+
+
+def words_of(path: Path) -> list[tuple[int, str]]:
+    """Identifiers and the text of strings, with their lines, docstrings aside."""
+    tree = ast.parse(path.read_text(encoding='utf-8'))
+    prose = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)}
+    out: list[tuple[int, str]] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in prose:
+            out.append((node.lineno, node.value))
+        elif isinstance(node, ast.Name):
+            out.append((node.lineno, node.id))
+        elif isinstance(node, ast.Attribute):
+            out.append((node.lineno, node.attr))
+        elif isinstance(node, ast.keyword | ast.arg) and node.arg is not None:
+            out.append((node.lineno, node.arg))
+        elif isinstance(node, ast.ImportFrom):
+            out += [(node.lineno, f'{node.module} {alias.name}') for alias in node.names]
+    return out
+
+
+def test_no_other_file_names_an_effect() -> None:
+    places = Path(effects.__file__).parent
+    # The terms of the error budget are a list of their own; some have the name of the effect they are due to.
+    files = [f for f in PACKAGE.rglob('*.py') if places not in f.parents and PACKAGE / 'budget' not in f.parents]
+    assert len(files) > 100
+    names = {f.stem for f in places.glob('[a-z]*.py')} - LINK
+    assert len(names) >= 26
+    named = re.compile(rf'\b({"|".join(sorted(names))})\b')
+    assert [(str(f), *w) for f in files for w in words_of(f) if named.search(w[1])] == []
+
+
+def test_discovery_names_no_parameter_of_an_effect() -> None:
+    parameters = {p.name for e in catalogue().values() for p in e.parameters} - SEARCH
+    texts = [
+        (file.name, node.lineno, node.value)
+        for file in (PACKAGE / 'discovery').glob('*.py')
+        for node in ast.walk(ast.parse(file.read_text(encoding='utf-8')))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    ]
+    assert len(texts) > 100
+    assert [t for t in texts if t[2] in parameters] == []
+    assert [t for t in texts if t[2].startswith(('amplitude_', 'phase_'))] == []
+
+
+HEAVY = ('scipy.signal', 'scipy.special', 'scipy.optimize', 'scipy.stats', 'matplotlib', 'pandas')
+
+
+@pytest.mark.parametrize(('overrides', 'loaded'), [({}, []), (EFFECT | {'effects.one.name': 'x'}, ['x'])])
+def test_a_start_loads_the_effects_that_are_on_and_nothing_heavy(
+    folder: Path, overrides: dict[str, object], loaded: list[str]
+) -> None:
+    (folder / 'x.py').write_text(CODE.replace(NAME, 'x'))
+    program = f"""
+import json, sys
+from psd_deflection.config import load_rig
+from psd_deflection.pipeline import Pipeline
+Pipeline(load_rig(overrides=json.loads({json.dumps(overrides)!r})))
+print(json.dumps(sorted(sys.modules)))
+"""
+    done = subprocess.run(
+        [sys.executable, '-c', program], capture_output=True, text=True, check=True, cwd=PACKAGE.parent
+    )
+    modules = json.loads(done.stdout)
+    assert [m for m in modules if m.startswith(HEAVY)] == []
+    assert [m for m in modules if m.startswith(effects.__name__ + '.')] == []
+    assert [m.rsplit('.', 1)[1] for m in modules if m.startswith('psd_deflection.simulation.catalogue.')] == loaded
+    assert 'psd_deflection.simulation.simulator' not in modules
