@@ -185,7 +185,12 @@ class ReplaySource:
                 'psd_deflection: estimates',
                 level,
                 message,
-                (('rate (estimates/s)', str(new_estimates)), ('estimates', str(estimates)), *refused),
+                (
+                    ('rate (estimates/s)', str(new_estimates)),
+                    ('estimates', str(estimates)),
+                    *refused,
+                    *self._pipeline.stamped.words(),
+                ),
             )
         )
         return DiagnosticReport(t_ns, tuple(entries))

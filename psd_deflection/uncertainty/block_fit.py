@@ -238,7 +238,7 @@ class BlockFit:
         tau = np.maximum(self._squares / np.maximum(self._weight, 1e-3) - _BIAS * self._v, 0.0)
         tau = np.where(c * c > _SUDDEN * (v + tau), np.maximum(excess, tau), tau)
         tau[:, 0] = _ANY
-        return np.maximum(tau, self._v * 1e-9)
+        return np.asarray(np.maximum(tau, self._v * 1e-9))
 
     def _spread(self, weights: FloatArray) -> FloatArray:
         """Covariance (4, 4) of the weighted sums; ``weights`` (4, N)."""

@@ -28,6 +28,9 @@ LIMIT = 20.0
 
 NAMES = ('x1', 'y1', 'x2', 'y2')
 
+UNMEASURED = 16.0
+"""Times ``LIMIT`` while the noise is not measured yet: it may be four times what the rig file says."""
+
 _FADE = 0.98
 """What is left of a held r^2 after a block."""
 
@@ -63,11 +66,13 @@ class Consistency:
     def __init__(self) -> None:
         self.held = 0.0
 
-    def check(self, apart: tuple[float, float], residual: tuple[float, ...], covariance: FloatArray) -> Checked:
+    def check(
+        self, apart: tuple[float, float], residual: tuple[float, ...], covariance: FloatArray, *, limit: float = LIMIT
+    ) -> Checked:
         """Check one block.
 
         ``apart``: centre of PSD 1 and its dot less those of PSD 2, m. ``residual`` (4,): what the solver leaves of
-        the dots, m. ``covariance`` (4, 4) of the dots, m^2.
+        the dots, m. ``covariance`` (4, 4) of the dots, m^2. ``limit``: chi-square beyond which they contradict.
         """
         x, y = apart
         size = (2.0 * (x * x + y * y)) ** 0.5
@@ -80,9 +85,9 @@ class Consistency:
             p * sum(q * c for q, c in zip(a, row, strict=True)) for p, row in zip(a, covariance.tolist(), strict=True)
         )
         chi_square = r * r / variance if variance > 0.0 else 0.0
-        contradict = chi_square > LIMIT
+        contradict = chi_square > limit
         held = max(_FADE * self.held, r * r if contradict else 0.0)
-        self.held = held if held > LIMIT * variance else 0.0
+        self.held = held if held > limit * variance else 0.0
         one = tuple(1.0 / p if abs(p) > _UNSEEN else 0.0 for p in a)
         root = self.held**0.5
         return Checked(chi_square, self.held > 0.0, tuple(r * p for p in one), tuple(root * p for p in one))

@@ -25,7 +25,7 @@ from math import exp, pi
 import numpy as np
 
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.uncertainty.block_fit import basis, combinations
+from psd_deflection.uncertainty.block_fit import basis, combinations, inverse
 
 SEGMENT_BLOCKS = 50
 """Blocks of one segment: a second at 50 blocks a second."""
@@ -67,7 +67,8 @@ class StreamNoise:
         self._stated = variance
         self._step = step
         self.set_geometry(centers, beams)
-        self._mean_of, self._roughness_of = _lag_weights(size)
+        self._mean_of = _mean_weights(size)
+        self._q = basis(size)
         self._average: FloatArray | None = None
         self._count = 0
         self._seen = 0
@@ -161,28 +162,30 @@ class StreamNoise:
         dots = np.concatenate([d for _, _, d in blocks])
         apart = dots[:, :2] - dots[:, 2:] + self._apart
         fixed = (np.hypot(apart[:, 0], apart[:, 1]) - self._base_line) * 0.5**0.5
-        lags = _autocovariance(places, np.column_stack((dots, fixed)), SEGMENT_BLOCKS * size, size)
+        series = np.column_stack((dots, fixed))
+        lags = _autocovariance(places, series, SEGMENT_BLOCKS * size, size)
         # Mean and slope of the segment were taken off, and with them 2 of its 50 blocks' variance.
         lags += np.einsum('cdl,l->cd', lags, self._mean_of)[:, :, None] * (2.0 / (SEGMENT_BLOCKS - 2))
         self._seen += 1
-        self._judge(lags[:4, :4], lags[4, 4])
+        rough = _roughness(places, np.column_stack((np.einsum('sc,ac->sa', dots, self._turn[:3]), series)), self._q)
+        self._judge(lags[:4, :4], lags[4, 4], rough + self._step**2 / 12.0)
         self.gamma = self._in_use()
         return True
 
-    def _judge(self, gamma: FloatArray, fixed: FloatArray) -> None:
+    def _judge(self, gamma: FloatArray, fixed: FloatArray, rough: FloatArray) -> None:
+        """``rough`` (8,): of three combinations, four readings and the one that does not move, m^2."""
         turned = np.einsum('ac,cdl,ad->al', self._turn[:3], gamma, self._turn[:3])
         least = self._step**2 / 12.0
         means = turned @ self._mean_of + least / self._size
-        rough = turned @ self._roughness_of + least
         fixed_mean = float(fixed @ self._mean_of) + least / self._size
-        fixed_rough = float(fixed @ self._roughness_of) + least
-        still = bool((means * fixed_rough <= _MOTION * rough * fixed_mean).all())
+        fixed_rough = float(rough[7])
+        still = bool((means * fixed_rough <= _MOTION * rough[:3] * fixed_mean).all())
         if not self.at_rest:
             if still:
                 self._restart(gamma)
                 self.at_rest = True
             else:
-                self._into_average(self._guess(gamma, fixed, fixed_rough))
+                self._into_average(_guess(fixed, rough[3:7] / fixed_rough))
             return
         before = self._average if self._average is not None else gamma
         known = np.einsum('ac,cdl,ad,l->a', self._turn[:3], before, self._turn[:3], self._mean_of) + least / self._size
@@ -196,14 +199,6 @@ class StreamNoise:
         else:
             self._into_average(gamma)
 
-    def _guess(self, gamma: FloatArray, fixed: FloatArray, fixed_rough: float) -> FloatArray:
-        """In motion: each reading as rough as it is, coloured like the combination that does not move."""
-        out = np.zeros_like(gamma)
-        for c in range(4):
-            rough = float(gamma[c, c] @ self._roughness_of) + self._step**2 / 12.0
-            out[c, c] = fixed * (rough / fixed_rough)
-        return out
-
     def _restart(self, gamma: FloatArray) -> None:
         self._average, self._count, self._louder = gamma, 1, 0
 
@@ -214,17 +209,39 @@ class StreamNoise:
         self._average = before + (gamma - before) / self._count
 
 
-def _lag_weights(size: int) -> tuple[FloatArray, FloatArray]:
-    """Weights (N,) of gamma(l) that give the variance of a block's mean, and that of a sample about the fit."""
+def _guess(fixed: FloatArray, size: FloatArray) -> FloatArray:
+    """In motion: each reading ``size`` (4,) times the combination that does not move, coloured like it."""
+    out = np.zeros((4, 4, len(fixed)))
+    out[range(4), range(4)] = fixed * size[:, None]
+    return out
+
+
+def _mean_weights(size: int) -> FloatArray:
+    """Weights (N,) of gamma(l) that give the variance of a block's mean."""
     lags = np.arange(size)
-    twice = np.where(lags > 0, 2.0, 1.0)
-    mean = twice * (size - lags) / size**2
-    q = basis(size)
-    left = size - q.shape[1]
-    inside = np.array([(q[: size - lag] * q[lag:]).sum() for lag in range(size)])
-    rough = -twice * inside
-    rough[0] += size
-    return mean, rough / left if left else np.zeros(size)
+    return np.asarray(np.where(lags > 0, 2.0, 1.0) * (size - lags) / size**2)
+
+
+def _roughness(places: IntArray, series: FloatArray, q: FloatArray) -> FloatArray:
+    """Variance (c,) of ``series`` (n, c) about a polynomial in each block: the median over the blocks of a segment."""
+    size, orders = q.shape
+    blocks, slots = np.divmod(places, size)
+    whole = np.zeros((SEGMENT_BLOCKS, size, series.shape[1]))
+    here = np.zeros((SEGMENT_BLOCKS, size))
+    whole[blocks, slots] = series
+    here[blocks, slots] = 1.0
+    count = here.sum(axis=1)
+    enough = count >= orders + 2
+    whole, here, count = whole[enough], here[enough], count[enough]
+    whole = (whole - whole.sum(axis=1, keepdims=True) / count[:, None, None]) * here[:, :, None]
+    gram = np.einsum('bsk,sj->bkj', here[:, :, None] * q, q)
+    h = np.einsum('bsc,sk->bkc', whole, q)
+    left = np.einsum('bsc,bsc->bc', whole, whole) - np.einsum(
+        'bkc,bkc->bc', h, np.einsum('bkj,bjc->bkc', inverse(gram), h)
+    )
+    if not len(left):
+        return np.zeros(series.shape[1])
+    return np.asarray(np.median(left / (count - orders)[:, None], axis=0))
 
 
 def _autocovariance(places: IntArray, series: FloatArray, length: int, lags: int) -> FloatArray:

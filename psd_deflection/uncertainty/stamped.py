@@ -13,7 +13,7 @@ from psd_deflection.calibration import dot_noise_variances
 from psd_deflection.config import Rig
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.uncertainty.block_fit import BlockFit, Fitted
-from psd_deflection.uncertainty.consistency import NAMES, Checked, Consistency, Suspect
+from psd_deflection.uncertainty.consistency import LIMIT, NAMES, UNMEASURED, Checked, Consistency, Suspect
 from psd_deflection.uncertainty.noise import StreamNoise
 
 NOISE, FIT, HELD_RESIDUAL = 'state.noise', 'state.block_fit', 'state.residual'
@@ -24,7 +24,8 @@ class StampedDots:
     """Dots at the stamp of block after block.
 
     ``active``: whether it says more than the mean of the samples and the rig file's noise. ``contradictions``: blocks
-    whose readings contradict each other.
+    whose readings contradict each other. ``misfits``: blocks with motion that the fit cannot follow. ``chi_square``:
+    of the last block's readings.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -43,6 +44,7 @@ class StampedDots:
         self._suspect = Suspect(rig.centers, self._beams)
         self._size = config.block_size
         self.contradictions = 0
+        self.chi_square = 0.0
         self.misfits = 0
         (x1, y1), (x2, y2) = rig.centers.tolist()
         self._apart = (x1 - x2, y1 - y2)
@@ -54,6 +56,7 @@ class StampedDots:
         self._fit.set_geometry(rig.centers, self._beams)
         self._fit.set_noise(self.noise.gamma)
         self._suspect = Suspect(rig.centers, self._beams)
+        self._consistency = Consistency()
 
     def fit(self, slots: IntArray, samples: FloatArray) -> Fitted:
         """The dots at the middle of a block. ``slots`` (n,): which samples are present; ``samples`` (n, 4), m."""
@@ -70,8 +73,11 @@ class StampedDots:
         """Hold the four readings of a block against each other."""
         x1, y1, x2, y2 = dots
         ax, ay = self._apart
-        checked = self._consistency.check((ax + x1 - x2, ay + y1 - y2), residual, covariance)
+        sure = self.noise.measured or not self._measures
+        limit = LIMIT if sure else UNMEASURED * LIMIT
+        checked = self._consistency.check((ax + x1 - x2, ay + y1 - y2), residual, covariance, limit=limit)
         self.contradictions += checked.contradict
+        self.chi_square = checked.chi_square
         return checked
 
     def learn(self, index: int, slots: IntArray, samples: FloatArray) -> None:
@@ -91,8 +97,18 @@ class StampedDots:
     def noise_source(self) -> str:
         """Where the noise that covariances use comes from, in words."""
         if not self.noise.measured:
-            return 'rig file'
+            return 'of the rig file until it is measured'
         return 'measured at rest' if self.noise.at_rest else 'measured in motion'
+
+    def words(self) -> tuple[tuple[str, str], ...]:
+        """For /diagnostics: the check of the readings, and the noise against the rig file's."""
+        return (
+            ('chi-square of the readings', f'{self.chi_square:.2f}'),
+            ('blocks whose readings contradict each other', str(self.contradictions)),
+            ('blocks with motion that the fit cannot follow', str(self.misfits)),
+            ('covariance from', f'noise {self.noise_source()}' if self._measures else 'noise of the rig file'),
+            *(self.noise_words() if self._measures else ()),
+        )
 
     def noise_words(self) -> tuple[tuple[str, str], ...]:
         """Of each reading, the noise of a sample and of a block's mean against the rig file's, um."""
