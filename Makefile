@@ -1,4 +1,4 @@
-# make setup    a virtual environment in .venv with all that is needed
+# make setup    a virtual environment in .venv with all that is needed (Python 3.11 to 3.14)
 # make run      set-up, then the daemon on the simulated rig, recorded below recordings/
 #               (make run PORT=/dev/ttyACM0 ARGS='--params-file my_rig.yaml' for a real one)
 # make test     set-up, then lint, types, import contracts and every test
@@ -26,6 +26,8 @@ PORT ?=
 ARGS ?=
 # Further words for pytest, e.g. PYTEST='-m "not browser"'.
 PYTEST ?=
+# Tests that run at a time; many of them wait.
+WORKERS ?= 2
 BIN := $(VENV)/bin
 
 .PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware golden docs shots blind demo-discover colcon wheel rerun doc-commands clean
@@ -36,7 +38,7 @@ help:
 SOURCES := $(shell find psd_deflection msg_adapters config launch resource -type f -not -name '*.pyc') package.xml
 
 $(VENV)/.requirements: setup.cfg
-	$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info[:2] <= (3, 12) else f"Python 3.11 or 3.12 is needed, this is {sys.version.split()[0]}: make PYTHON=python3.12")'
+	$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info[:2] <= (3, 14) else f"Python 3.11 to 3.14 is needed, this is {sys.version.split()[0]}: make PYTHON=python3.12")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo 'setting up $(VENV), once: a minute or two, 0.9 GB'
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[ros,monitor,test]' $(if $(WITH),'$(WITH)')
@@ -62,7 +64,7 @@ contracts: $(VENV)/.installed
 	$(BIN)/lint-imports --no-cache
 
 unit: $(VENV)/.installed
-	$(BIN)/python -m pytest $(PYTEST)
+	$(BIN)/python -m pytest -n $(WORKERS) $(PYTEST)
 
 run: $(VENV)/.installed
 	$(BIN)/psd-deflection estimator --monitor --record recordings $(if $(PORT),--port $(PORT)) $(ARGS)
@@ -102,7 +104,7 @@ SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 firmware: $(VENV)/.installed
 	(command -v arm-none-eabi-gcc && command -v qemu-system-arm) || ($(SUDO) apt-get update -qq && $(SUDO) apt-get install -y -qq --no-install-recommends gcc-arm-none-eabi qemu-system-arm)
 	$(MAKE) -C docs/firmware OUT=$(CURDIR)/build/firmware
-	$(BIN)/python tools/check_firmware.py build/firmware/psd_synthetic.elf
+	$(BIN)/python -m tools.check_firmware build/firmware/psd_synthetic.elf
 
 golden: $(VENV)/.installed
 	$(BIN)/python bags/make.py
@@ -114,7 +116,7 @@ docs: $(VENV)/.installed
 
 SHOT_SECONDS ?= 40
 shots: $(VENV)/.installed
-	$(BIN)/python tools/shots.py --seconds $(SHOT_SECONDS)
+	$(BIN)/python -m tools.shots --seconds $(SHOT_SECONDS)
 
 # Each command of README and docs that the tests do not run themselves; ONLY='monitor' for those with that word, or on a page with it.
 doc-commands: $(VENV)/.installed
@@ -136,7 +138,7 @@ RERUN ?=
 rerun:
 	test -x build/rerun/use/bin/rerun || ($(PYTHON) -m venv build/rerun/use && build/rerun/use/bin/pip install --quiet --disable-pip-version-check '.[rerun]')
 	build/rerun/use/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall .
-	build/rerun/use/bin/python tools/check_rerun.py bags/clean bags/laser_off bags/lost_samples --out build/rerun $(RERUN)
+	build/rerun/use/bin/python -m tools.check_rerun bags/clean bags/laser_off bags/lost_samples --out build/rerun $(RERUN)
 
 # Truth hidden by a second generator: fresh seeds, both cores with JOBS=2; a run that was stopped goes on.
 JOBS ?= $(shell nproc)

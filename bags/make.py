@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from psd_deflection.config import Rig, load_rig
-from psd_deflection.devices.simulated_device import SimulatedDevice
+from psd_deflection.devices.contract_frames import SimulatedFrames
+from psd_deflection.devices.rig_feed import RigFeed
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.protocol.frames import FrameDecoder, HelloFrame, SampleFrame
 from psd_deflection.recordings.bag_writer import BagWriter
@@ -27,11 +28,14 @@ START_NS = 1_767_225_600_000_000_000
 
 SECONDS = 4
 
-RECORDINGS: dict[str, dict[str, object]] = {
-    'clean': {},
-    'lost_samples': {'lose': frozenset({45, 46, 200, *range(1003, 1030), *range(2000, 2145), 3999})},
-    'laser_off': {'dark': ((2, 1507, 2523),)},
+Dark = tuple[tuple[int, int, int], ...]
+
+RECORDINGS: dict[str, tuple[frozenset[int], Dark]] = {
+    'clean': (frozenset(), ()),
+    'lost_samples': (frozenset({45, 46, 200, *range(1003, 1030), *range(2000, 2145), 3999}), ()),
+    'laser_off': (frozenset(), ((2, 1507, 2523),)),
 }
+"""Name to the samples that the wire loses, and to when a laser is off."""
 
 
 def history() -> LoadHistory:
@@ -39,7 +43,7 @@ def history() -> LoadHistory:
     return steps([(0.0, 0.0, 0.0), sidebar(30.0), direct(50.0), (0.0, 0.0, 0.0)], 1.0)
 
 
-def record(rig: Rig, name: str, options: dict[str, object]) -> None:
+def record(rig: Rig, name: str, lose: frozenset[int], dark: Dark) -> None:
     """One recording ``bags/NAME`` and ``bags/NAME_truth.csv``."""
     loads = history().loads
 
@@ -47,8 +51,9 @@ def record(rig: Rig, name: str, options: dict[str, object]) -> None:
         index = np.minimum(np.arange(first, first + n), len(loads) - 1)
         return loads[index]
 
-    device = SimulatedDevice(rig, held, seed=2026, serial='GOLDEN', **options)  # type: ignore[arg-type]
-    device.poses = []
+    feed = RigFeed(rig, held, seed=2026, dark=dark)
+    feed.poses = []
+    device = SimulatedFrames(feed, serial='GOLDEN', lose=lose)
     frames = FrameDecoder().feed(b'\x00' + device.take(SECONDS * 1_000_000_000 - 1, room=1 << 30))
     hello = next(f for f in frames if isinstance(f, HelloFrame))
     samples = [f for f in frames if isinstance(f, SampleFrame)]
@@ -66,7 +71,7 @@ def record(rig: Rig, name: str, options: dict[str, object]) -> None:
         for step in (pipeline.process(chunk), pipeline.flush()):
             for item in step:
                 bag.write(item)
-    poses = np.concatenate(device.poses)[: SECONDS * 1000]
+    poses = np.concatenate(feed.poses)[: SECONDS * 1000]
     rows = poses.reshape(-1, rig.estimator.block_size, 3).mean(axis=1)
     with (HERE / f'{name}_truth.csv').open('w', encoding='ascii') as stream:
         stream.write('block,dx,dy,theta\n')
@@ -77,8 +82,8 @@ def record(rig: Rig, name: str, options: dict[str, object]) -> None:
 def main() -> int:
     """Make all of them."""
     rig = load_rig()
-    for name, options in RECORDINGS.items():
-        record(rig, name, options)
+    for name, (lose, dark) in RECORDINGS.items():
+        record(rig, name, lose, dark)
         print(f'bags/{name}: {sum(p.stat().st_size for p in (HERE / name).iterdir())} bytes')
     return 0
 

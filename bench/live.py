@@ -121,10 +121,12 @@ class Device:
 
     def __init__(self) -> None:
         from psd_deflection.config import load_rig
-        from psd_deflection.devices.simulated_device import PseudoTerminal, SimulatedDevice
+        from psd_deflection.devices.contract_frames import SimulatedFrames
+        from psd_deflection.devices.pseudo_terminal import PseudoTerminal
+        from psd_deflection.devices.rig_feed import RigFeed
 
         self.port = PseudoTerminal()
-        self.device = SimulatedDevice(load_rig(), lambda _, n: np.zeros((n, 3)))
+        self.device = SimulatedFrames(RigFeed(load_rig(), lambda _, n: np.zeros((n, 3))))
         self.written: list[int] = []
         self.stop = threading.Event()
         self.thread = threading.Thread(target=self._run, daemon=True)
@@ -272,9 +274,9 @@ def make_recording(folder: Path, minutes: float) -> tuple[Path, int]:
 def replay(minutes: float) -> None:
     from mcap.reader import make_reader
 
-    from psd_deflection.cli.replay import replayed, rig_of
     from psd_deflection.pipeline import Pipeline
-    from psd_deflection.recordings.opening import open_recording
+    from psd_deflection.recordings.readers import open_recording
+    from psd_deflection.recordings.replay_engine import replayed, rig_at_start
 
     with tempfile.TemporaryDirectory() as folder:
         path, n = make_recording(Path(folder), minutes)
@@ -286,8 +288,8 @@ def replay(minutes: float) -> None:
                 messages = sum(1 for _ in make_reader(stream).iter_messages())
             middle = time.perf_counter()
             recording = open_recording(path)
-            pipeline = Pipeline(rig_of(recording, None))
-            for _records in replayed(recording, pipeline, recording.blocks()):
+            pipeline = Pipeline(rig_at_start(recording))
+            for _records in replayed(recording, pipeline):
                 pass
             rounds.append((middle - began, time.perf_counter() - middle))
             if pipeline.counters.samples != n:

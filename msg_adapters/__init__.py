@@ -7,7 +7,8 @@ names of the ROS message definitions, so that nothing here needs ROS.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 from msg_adapters import (
@@ -19,6 +20,8 @@ from msg_adapters import (
     temperature,
     wrench_stamped,
 )
+from msg_adapters.header import Fields
+from msg_adapters.message_type import MessageType
 from psd_deflection.records import (
     AppliedLoad,
     BlockStatus,
@@ -33,32 +36,57 @@ from psd_deflection.records import (
     TipLoad,
 )
 
+Input = AppliedLoad | ReferencePose | TemperatureReading
+
 SAMPLES = '/psd/samples'
 SPOTS = ('/psd_1/spot', '/psd_2/spot')
 DEFLECTION = '/link_tip/deflection'
 DEFLECTION_WITH_COVARIANCE = '/link_tip/deflection_with_covariance'
-WRENCH = '/link_tip/wrench'
 DIAGNOSTICS = '/diagnostics'
 LOAD = '/link_tip/load'
 REFERENCE = '/reference/deflection'
 TEMPERATURE = '/environment/temperature'
 
-TOPIC_TYPES: Mapping[str, str] = {
-    SAMPLES: point_cloud2.TYPE,
-    SPOTS[0]: point_stamped.TYPE,
-    SPOTS[1]: point_stamped.TYPE,
-    DEFLECTION: pose_stamped.TYPE,
-    DEFLECTION_WITH_COVARIANCE: pose_with_covariance_stamped.TYPE,
-    WRENCH: wrench_stamped.TYPE,
-    DIAGNOSTICS: diagnostic_array.TYPE,
-    LOAD: wrench_stamped.TYPE,
-    REFERENCE: pose_stamped.TYPE,
-    TEMPERATURE: temperature.TYPE,
-}
-"""Every fixed topic and its type; each solver adds :func:`solver_topic`, a PoseStamped."""
 
-INPUTS = (LOAD, REFERENCE, TEMPERATURE)
+class Topic(NamedTuple):
+    """One topic: the message on it and the record that it is made of.
+
+    ``fields``: of a record. ``to_record``: back again, for a topic that the node subscribes to.
+    """
+
+    name: str
+    message: MessageType
+    record: type[Any]
+    fields: Callable[[Any], Fields]
+    to_record: Callable[[Mapping[str, Any]], Input] | None = None
+
+
+TOPICS = (
+    Topic(SAMPLES, point_cloud2.MESSAGE, SampleBlock, point_cloud2.from_block),
+    Topic(SPOTS[0], point_stamped.MESSAGE, SpotMeans, partial(point_stamped.from_spot, psd=1)),
+    Topic(SPOTS[1], point_stamped.MESSAGE, SpotMeans, partial(point_stamped.from_spot, psd=2)),
+    Topic(DEFLECTION, pose_stamped.MESSAGE, DeflectionEstimate, pose_stamped.from_estimate),
+    Topic(
+        DEFLECTION_WITH_COVARIANCE,
+        pose_with_covariance_stamped.MESSAGE,
+        DeflectionEstimate,
+        pose_with_covariance_stamped.from_estimate,
+    ),
+    Topic('/link_tip/wrench', wrench_stamped.MESSAGE, TipLoad, wrench_stamped.from_load),
+    Topic(DIAGNOSTICS, diagnostic_array.MESSAGE, DiagnosticReport, diagnostic_array.from_report),
+    Topic(LOAD, wrench_stamped.MESSAGE, AppliedLoad, wrench_stamped.from_load, wrench_stamped.to_applied_load),
+    Topic(REFERENCE, pose_stamped.MESSAGE, ReferencePose, pose_stamped.from_reference, pose_stamped.to_reference),
+    Topic(TEMPERATURE, temperature.MESSAGE, TemperatureReading, temperature.from_reading, temperature.to_reading),
+)
+"""Every fixed topic: a new message is one line here. Each solver adds :func:`solver_topic`, a PoseStamped."""
+
+TOPIC_TYPES: Mapping[str, str] = {t.name: t.message.name for t in TOPICS}
+MESSAGE_TYPES: Mapping[str, MessageType] = {t.message.name: t.message for t in TOPICS}
+INPUTS = tuple(t.name for t in TOPICS if t.to_record is not None)
 """The topics that the node subscribes to."""
+
+_BY_NAME = {t.name: t for t in TOPICS}
+_OF_RECORD = {kind: tuple(t for t in TOPICS if t.record is kind) for kind in {t.record for t in TOPICS}}
 
 _MEASURED = (BlockStatus.OK, BlockStatus.OUTSIDE_ACTIVE_AREA, BlockStatus.NOT_SOLVED)
 """The dots of these blocks were seen. With the laser lost or a channel saturated, the mean is not
@@ -93,48 +121,33 @@ def messages(record: Record) -> Iterator[Message]:
     fields = pose_stamped.from_estimate(record)
     if record.primary:
         # The one that a controller waits for goes first.
-        yield Message(DEFLECTION, pose_stamped.TYPE, t_ns, fields)
-    yield Message(solver_topic(record.solver), pose_stamped.TYPE, t_ns, fields)
+        yield Message(DEFLECTION, pose_stamped.MESSAGE.name, t_ns, fields)
+    yield Message(solver_topic(record.solver), pose_stamped.MESSAGE.name, t_ns, fields)
     if record.primary:
         with_covariance = pose_with_covariance_stamped.from_estimate(record)
-        yield Message(DEFLECTION_WITH_COVARIANCE, pose_with_covariance_stamped.TYPE, t_ns, with_covariance)
+        yield Message(DEFLECTION_WITH_COVARIANCE, pose_with_covariance_stamped.MESSAGE.name, t_ns, with_covariance)
 
 
 def _messages(record: Record) -> tuple[Message, ...]:
     if isinstance(record, SampleBlock):
         return tuple(
-            Message(SAMPLES, point_cloud2.TYPE, int(part.t_ns[0]), point_cloud2.from_block(part))
+            Message(SAMPLES, point_cloud2.MESSAGE.name, int(part.t_ns[0]), point_cloud2.from_block(part))
             for part in point_cloud2.parts(record)
         )
     if isinstance(record, ParameterChange):
         return ()
-    t_ns = record.t_ns
-    if isinstance(record, SpotMeans):
-        if record.status not in _MEASURED or not all(map(math.isfinite, record.dots)):
-            return ()
-        return tuple(
-            Message(topic, point_stamped.TYPE, t_ns, point_stamped.from_spot(record, psd))
-            for psd, topic in enumerate(SPOTS, 1)
-        )
-    if isinstance(record, TipLoad):
-        return (Message(WRENCH, wrench_stamped.TYPE, t_ns, wrench_stamped.from_load(record)),)
-    if isinstance(record, AppliedLoad):
-        return (Message(LOAD, wrench_stamped.TYPE, t_ns, wrench_stamped.from_load(record)),)
-    if isinstance(record, ReferencePose):
-        return (Message(REFERENCE, pose_stamped.TYPE, t_ns, pose_stamped.from_reference(record)),)
-    if isinstance(record, TemperatureReading):
-        return (Message(TEMPERATURE, temperature.TYPE, t_ns, temperature.from_reading(record)),)
-    if isinstance(record, DiagnosticReport):
-        return (Message(DIAGNOSTICS, diagnostic_array.TYPE, t_ns, diagnostic_array.from_report(record)),)
-    raise TypeError(f'no message for a {type(record).__name__}')
+    if isinstance(record, SpotMeans) and not (record.status in _MEASURED and all(map(math.isfinite, record.dots))):
+        return ()
+    try:
+        topics = _OF_RECORD[type(record)]
+    except KeyError:
+        raise TypeError(f'no message for a {type(record).__name__}') from None
+    return tuple(Message(t.name, t.message.name, record.t_ns, t.fields(record)) for t in topics)
 
 
-def from_fields(topic: str, fields: Mapping[str, Any]) -> AppliedLoad | ReferencePose | TemperatureReading:
+def from_fields(topic: str, fields: Mapping[str, Any]) -> Input:
     """The record of a message on one of ``INPUTS``. Raises ValueError for any other topic."""
-    if topic == LOAD:
-        return wrench_stamped.to_applied_load(fields)
-    if topic == REFERENCE:
-        return pose_stamped.to_reference(fields)
-    if topic == TEMPERATURE:
-        return temperature.to_reading(fields)
-    raise ValueError(f'{topic} is not an input')
+    found = _BY_NAME.get(topic)
+    if found is None or found.to_record is None:
+        raise ValueError(f'{topic} is not an input')
+    return found.to_record(fields)

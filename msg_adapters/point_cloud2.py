@@ -16,9 +16,21 @@ import numpy as np
 import numpy.typing as npt
 
 from msg_adapters.header import Fields, header, stamp_ns
+from msg_adapters.message_type import MessageType
 from psd_deflection.records import CHANNELS, SampleBlock
 
-TYPE = 'sensor_msgs/msg/PointCloud2'
+MESSAGE = MessageType(
+    'sensor_msgs/msg/PointCloud2',
+    'RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5',
+    'std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\n'
+    'bool is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense\n',
+    {
+        'sensor_msgs/PointField': (
+            'uint8 INT8=1\nuint8 UINT8=2\nuint8 INT16=3\nuint8 UINT16=4\nuint8 INT32=5\nuint8 UINT32=6\n'
+            'uint8 FLOAT32=7\nuint8 FLOAT64=8\nstring name\nuint32 offset\nuint8 datatype\nuint32 count\n'
+        )
+    },
+)
 FRAME = 'link_tip'
 
 UINT32 = 6

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from msg_adapters.header import Fields, header
+from msg_adapters.message_type import MessageType
 from psd_deflection.records import SpotMeans
 
-TYPE = 'geometry_msgs/msg/PointStamped'
+MESSAGE = MessageType(
+    'geometry_msgs/msg/PointStamped',
+    'RIHS01_4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897',
+    'std_msgs/Header header\ngeometry_msgs/Point point\n',
+)
 
 
 def from_spot(spots: SpotMeans, psd: int) -> Fields:

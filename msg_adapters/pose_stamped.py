@@ -5,11 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from msg_adapters.header import Fields, header, stamp_ns
-from msg_adapters.orientation import angles, quaternion
-from psd_deflection.records import DeflectionEstimate, ReferencePose
+import numpy as np
 
-TYPE = 'geometry_msgs/msg/PoseStamped'
+from msg_adapters.header import Fields, header, stamp_ns
+from msg_adapters.message_type import MessageType
+from msg_adapters.orientation import angles, quaternion
+from psd_deflection.records import DeflectionEstimate, FloatArray, ReferencePose
+
+MESSAGE = MessageType(
+    'geometry_msgs/msg/PoseStamped',
+    'RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8',
+    'std_msgs/Header header\ngeometry_msgs/Pose pose\n',
+)
 FRAME = 'link_tip_rest'
 
 
@@ -33,3 +40,12 @@ def to_reference(fields: Mapping[str, Any]) -> ReferencePose:
     position = fields['pose']['position']
     theta, _, _ = angles(fields['pose']['orientation'])
     return ReferencePose(stamp_ns(fields), float(position['x']), float(position['y']), theta)
+
+
+def to_poses(numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(dX m, dY m, theta rad) (n, 3) and (phi, omega) rad (n, 2) of n messages.
+
+    ``numbers`` (n, 7 or more): the message's float64 in order, that is position and orientation.
+    """
+    turned = np.array([angles(dict(zip('xyzw', q, strict=True))) for q in numbers[:, 3:7].tolist()])
+    return np.column_stack([numbers[:, 0], numbers[:, 1], turned[:, 0]]), turned[:, 1:]

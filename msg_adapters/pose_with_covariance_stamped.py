@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
-from msg_adapters.header import Fields, header
-from msg_adapters.pose_stamped import FRAME, pose
-from psd_deflection.records import DeflectionEstimate
+import numpy as np
 
-TYPE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+from msg_adapters.header import Fields, header
+from msg_adapters.message_type import MessageType
+from msg_adapters.pose_stamped import FRAME, pose
+from psd_deflection.records import DeflectionEstimate, FloatArray
+
+MESSAGE = MessageType(
+    'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e',
+    'std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose\n',
+    {'geometry_msgs/PoseWithCovariance': 'geometry_msgs/Pose pose\nfloat64[36] covariance\n'},
+)
 
 UNOBSERVED_VARIANCE = 1e6
 """On the diagonal of the axes that two flat PSDs do not see (z in m^2, roll and pitch in rad^2)."""
@@ -27,3 +35,11 @@ def from_estimate(e: DeflectionEstimate) -> Fields:
         'header': header(e.t_ns, FRAME),
         'pose': {'pose': pose(e.dx, e.dy, e.theta, e.phi, e.omega), 'covariance': covariance},
     }
+
+
+def to_covariances(numbers: FloatArray) -> FloatArray:
+    """Covariance (n, 3, 3) of (dX, dY, theta) of n messages.
+
+    ``numbers`` (n, 43): the message's float64 in order: position 3, orientation 4, covariance 6 x 6.
+    """
+    return numbers[:, 7:].reshape(-1, 6, 6)[np.ix_(range(len(numbers)), _OBSERVED, _OBSERVED)]

@@ -6,9 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from msg_adapters.header import Fields, header, stamp_ns
+from msg_adapters.message_type import MessageType
 from psd_deflection.records import TemperatureReading
 
-TYPE = 'sensor_msgs/msg/Temperature'
+MESSAGE = MessageType(
+    'sensor_msgs/msg/Temperature',
+    'RIHS01_72514a14126ab9f8a9abec974c78e5610a367b59db5da355ff1fb982d5bad4b8',
+    'std_msgs/Header header\nfloat64 temperature\nfloat64 variance\n',
+)
 FRAME = 'link_base'
 
 

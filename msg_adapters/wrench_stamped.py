@@ -6,9 +6,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from msg_adapters.header import Fields, header, stamp_ns
+from msg_adapters.message_type import MessageType
 from psd_deflection.records import AppliedLoad, TipLoad
 
-TYPE = 'geometry_msgs/msg/WrenchStamped'
+MESSAGE = MessageType(
+    'geometry_msgs/msg/WrenchStamped',
+    'RIHS01_8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77',
+    'std_msgs/Header header\ngeometry_msgs/Wrench wrench\n',
+    {'geometry_msgs/Wrench': 'geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque\n'},
+)
 FRAME = 'link_tip_rest'
 
 

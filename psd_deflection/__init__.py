@@ -24,7 +24,7 @@ def open(path: str | Path) -> Recording:
     Raises :class:`psd_deflection.errors.RecordingError` where it cannot be read.
     """
     # Only here, so that `import psd_deflection` stays light.
-    from psd_deflection.recordings.opening import open_recording
+    from psd_deflection.recordings.readers import open_recording
 
     return open_recording(path)
 

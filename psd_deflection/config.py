@@ -1,15 +1,18 @@
 """The rig: a parameter file or flat values in, frozen sections out; every bound checked.
 
+Each field of a section declares one parameter: its type, default, unit, bounds and a sentence.
+Everything else follows from there: :data:`PARAMETERS`, the checks, ``psd-deflection params``, the
+node's descriptors and the documentation. A new parameter is one more field.
+
 :func:`load_rig` reads a ROS 2 parameter file (``/**: ros__parameters:``) without ROS;
 :func:`rig_from_values` makes the frozen :class:`Rig` from flat values (``link.length``) and is what
-the node calls with the values that rclpy gives it. What can be set is listed in
-:mod:`psd_deflection.parameters`.
+the node calls with the values that rclpy gives it.
 """
 
 from __future__ import annotations
 
-import difflib
 import math
+import operator
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,8 +22,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from psd_deflection.errors import ConfigError
-from psd_deflection.parameters import BY_NAME, PARAMETERS, Value, check_value
+from psd_deflection.errors import ConfigError, did_you_mean
+from psd_deflection.parameters import Parameter, Section, Value, check_value, parameter, shown
 from psd_deflection.records import FloatArray
 
 MAX_FILE_BYTES = 1_000_000
@@ -30,18 +33,25 @@ EFFECTS_PREFIX = 'effects.'
 """Keys below it describe simulated effects; ``psd_deflection.simulation`` checks them."""
 ROS_OWN = ('use_sim_time', 'start_type_description_service')
 QOS_OVERRIDES_PREFIX = 'qos_overrides.'
+SENSOR_TYPES = ('duolateral', 'tetralateral', 'pincushion', 'quadrant')
 
 
 @dataclass(frozen=True, slots=True)
 class LinkConfig:
-    """The link: m, Pa."""
+    """The link."""
 
-    length: float
-    outer_radius: float
-    inner_radius: float
-    youngs_modulus: float
-    shear_modulus: float
-    slope_ratio: float
+    length: float = parameter(0.585, 'm', 'length L of the link', above=0.0, maximum=1000.0)
+    outer_radius: float = parameter(0.0159, 'm', 'outer radius of the tube', above=0.0, maximum=10.0)
+    inner_radius: float = parameter(0.0138, 'm', 'inner radius of the tube', minimum=0.0, maximum=10.0)
+    youngs_modulus: float = parameter(69e9, 'Pa', "Young's modulus E", above=0.0, maximum=1e13)
+    shear_modulus: float = parameter(24e9, 'Pa', 'shear modulus G', above=0.0, maximum=1e13)
+    slope_ratio: float = parameter(
+        1.5,
+        '',
+        'k of the tip slope, phi = -k dY/L: 3/2 for a tip force, 2 for a tip moment',
+        minimum=0.0,
+        maximum=10.0,
+    )
 
     @property
     def second_moment(self) -> float:
@@ -61,32 +71,42 @@ class LinkConfig:
 
 @dataclass(frozen=True, slots=True)
 class PsdConfig:
-    """One detector: places in m."""
+    """One detector."""
 
-    type: str
-    center: tuple[float, float]
-    height: float
-    active_area: tuple[float, float]
-    spot_radius: float
-    zero: tuple[float, float]
+    type: str = parameter('duolateral', '', 'sensor type', choices=SENSOR_TYPES)
+    center: tuple[float, float] = parameter(
+        (0.0, 0.0), 'm', 'centre of the PSD in link_tip (x, y)', minimum=-10.0, maximum=10.0
+    )
+    height: float = parameter(
+        0.0, 'm', 'sensitive surface above the tip section, along +Z', minimum=-10.0, maximum=10.0
+    )
+    active_area: tuple[float, float] = parameter(
+        (0.010, 0.010), 'm', 'active area (width, height)', above=0.0, maximum=1.0
+    )
+    spot_radius: float = parameter(
+        0.5e-3, 'm', 'radius of the laser spot on it, to 1/e^2 of the peak', above=0.0, maximum=0.1
+    )
+    zero: tuple[float, float] = parameter(
+        (0.0, 0.0), 'm', 'dot on the unloaded link (x, y); ~/zero sets it', minimum=-0.5, maximum=0.5, live=True
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class AmplifierConfig:
-    """``sensitivity`` m/V; ``sum_nominal`` V; ``noise`` V rms per sample and channel."""
+    """The amplifier of both detectors."""
 
-    sensitivity: float
-    sum_nominal: float
-    noise: float
+    sensitivity: float = parameter(0.5e-3, 'm/V', 'dot travel per volt on x and y', above=0.0, maximum=1.0)
+    sum_nominal: float = parameter(5.0, 'V', 'sum signal with the laser on', above=0.0, maximum=100.0)
+    noise: float = parameter(2e-3, 'V', 'noise, rms per sample and channel', above=0.0, maximum=10.0)
 
 
 @dataclass(frozen=True, slots=True)
 class ConverterConfig:
-    """``full_scale`` V (range +-); ``sample_rate_hz`` Hz."""
+    """The analogue-to-digital converter."""
 
-    bits: int
-    full_scale: float
-    sample_rate_hz: float
+    bits: int = parameter(16, '', 'bits of the converter', minimum=8, maximum=16)
+    full_scale: float = parameter(10.0, 'V', 'range is +- this', above=0.0, maximum=1000.0)
+    sample_rate_hz: float = parameter(1000.0, 'Hz', 'samples per second', minimum=1.0, maximum=10_000.0)
 
     @property
     def volts_per_count(self) -> float:
@@ -96,76 +116,245 @@ class ConverterConfig:
 
 @dataclass(frozen=True, slots=True)
 class DynamicsConfig:
-    """First bending (X and Y alike) and torsion mode: Hz and damping ratios."""
+    """The link's first bending mode (X and Y alike) and its first torsion mode; the simulation uses them."""
 
-    bending_frequency: float
-    bending_damping_ratio: float
-    torsion_frequency: float
-    torsion_damping_ratio: float
+    bending_frequency: float = parameter(14.0, 'Hz', 'first bending mode', above=0.0, maximum=1e4)
+    bending_damping_ratio: float = parameter(0.02, '', 'its damping ratio', minimum=0.0, maximum=0.99)
+    torsion_frequency: float = parameter(21.0, 'Hz', 'first torsion mode', above=0.0, maximum=1e4)
+    torsion_damping_ratio: float = parameter(0.02, '', 'its damping ratio', minimum=0.0, maximum=0.99)
 
 
 @dataclass(frozen=True, slots=True)
 class EstimatorConfig:
     """How samples become estimates."""
 
-    block_size: int
-    min_samples: int
-    sum_min: float
-    sum_max: float
-    block_fit: str
-    covariance: str
-    consistency: str
-    splitter: bool
-    degraded: str
-    frozen: str
-    twist_sd: float
-    twist_hold: float
-    solver: str
-    solvers: tuple[str, ...]
-    wls_weights: str
-    wls_row_scaling: tuple[float, float, float, float]
+    block_size: int = parameter(20, 'samples', 'samples averaged for one estimate', minimum=1, maximum=1000)
+    min_samples: int = parameter(10, 'samples', 'a block with fewer present has no estimate', minimum=1, maximum=1000)
+    sum_min: float = parameter(
+        2.5, 'V', 'a sum signal below this means that the laser is lost', minimum=0.0, maximum=100.0, live=True
+    )
+    sum_max: float = parameter(
+        7.5,
+        'V',
+        'a sum signal above this means that other light falls on the detector',
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    block_fit: str = parameter(
+        'poly',
+        '',
+        'what a block gives: its mean, or a polynomial at the stamp (poly), which follows motion inside the block',
+        choices=('mean', 'poly'),
+        before='mean',
+    )
+    covariance: str = parameter(
+        'measured',
+        '',
+        "noise behind the covariances: the rig file's, or measured in the stream after 100 blocks",
+        choices=('file', 'measured'),
+        before='file',
+    )
+    consistency: str = parameter(
+        'widen',
+        '',
+        'when the four readings contradict each other: widen the covariance, refuse the block, or only report it',
+        choices=('widen', 'refuse', 'report'),
+        before='report',
+    )
+    splitter: bool = parameter(
+        False, '', 'both detectors share two lasers over a beam splitter (thesis 5.4): one lost halves both sums'
+    )
+    degraded: str = parameter(
+        'off',
+        '',
+        'with one detector lost: off (no estimate), hold (translation with the last twist), zero (with no twist)',
+        choices=('off', 'hold', 'zero'),
+        live=True,
+    )
+    frozen: str = parameter(
+        'report',
+        '',
+        'a detector of which no bit moves: report it in /diagnostics, or refuse its blocks as well',
+        choices=('report', 'refuse'),
+        live=True,
+    )
+    twist_sd: float = parameter(
+        0.01,
+        'rad',
+        'standard deviation of the twist where it is not measured (degraded)',
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    )
+    twist_hold: float = parameter(
+        0.1,
+        's',
+        'time in which a held twist is forgotten: its variance grows to twist_sd^2 (degraded: hold)',
+        above=0.0,
+        maximum=1e6,
+        live=True,
+    )
+    solver: str = parameter('exact', '', 'the solver whose answer is /link_tip/deflection')
+    solvers: tuple[str, ...] = parameter(
+        ('exact', 'wls', 'iterative'), '', 'solvers that run; each has a topic /link_tip/SOLVER/deflection'
+    )
+    wls_weights: str = parameter(
+        'inverse_variance',
+        '',
+        'weights of wls: from the noise, or the row scaling of the thesis',
+        name='wls.weights',
+        choices=('inverse_variance', 'thesis'),
+    )
+    wls_row_scaling: tuple[float, float, float, float] = parameter(
+        (0.03, 0.5, 10.0, 0.1),
+        '',
+        "the thesis's row scaling of x1, y1, x2, y2 (weights are its squares), used when wls.weights is thesis",
+        name='wls.row_scaling',
+        above=0.0,
+        maximum=1e6,
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class AcquisitionConfig:
-    """Where samples come from and where they are kept."""
+    """Where samples come from, how the node runs, and where samples are kept."""
 
-    source: str
-    port: str
-    baud: int
-    latency_offset: float
-    queue_blocks: int
-    serial_number: str
-    keep_zero: bool
-    zero_file: str
-    realtime: bool
-    record: bool
-    bag_dir: str
-    bag_max_bytes: int
-    bag_max_duration: float
-    disk_reserve: int
-    disk_full: str
+    source: str = parameter(
+        'serial',
+        '',
+        'what the device speaks: serial for our own frames; `psd-deflection devices --help` lists the others',
+    )
+    port: str = parameter(
+        '',
+        '',
+        'serial port (two with a comma between, if the device has two) or recording; empty starts the simulated rig',
+    )
+    baud: int = parameter(921_600, 'baud', 'line speed (USB-CDC devices ignore it)', minimum=1200, maximum=12_000_000)
+    latency_offset: float = parameter(
+        0.0, 's', 'constant delay of the link to take off every stamp', minimum=-1.0, maximum=1.0
+    )
+    queue_blocks: int = parameter(250, 'blocks', 'blocks that may wait for a slow consumer', minimum=2, maximum=100_000)
+    serial_number: str = parameter(
+        '',
+        '',
+        'serial number that the device must say (HELLO); with it the device is found again under another port name',
+    )
+    autostart: bool = parameter(True, '', 'configure and activate at start; false: wait for lifecycle transitions')
+    keep_zero: bool = parameter(True, '', '~/zero holds for later runs with the same device as well')
+    zero_file: str = parameter(
+        '',
+        '',
+        'file in which the zero is kept; empty: by serial number below $XDG_STATE_HOME/psd_deflection',
+    )
+    realtime: bool = parameter(True, '', 'ask for SCHED_FIFO (reader) and locked memory; the log says what was granted')
+    thorlabs_x_sign: float = parameter(
+        1.0,
+        '',
+        'sign of x of both aligners, 1 or -1: which it is shows when a dot is moved',
+        name='thorlabs.x_sign',
+        minimum=-1.0,
+        maximum=1.0,
+    )
+    replay_stamps: str = parameter(
+        'now',
+        '',
+        'times of replayed samples: of now in the recorded rhythm, or as recorded',
+        name='replay.stamps',
+        choices=('now', 'recorded'),
+    )
+    record: bool = parameter(False, '', 'record from the start')
+    bag_dir: str = parameter('recordings', '', 'folder in which recordings are made')
+    bag_max_bytes: int = parameter(
+        0,
+        'bytes',
+        'a file of a recording that is as large is ended and the next begun; 0: never',
+        minimum=0,
+        maximum=1_000_000_000_000,
+    )
+    bag_max_duration: float = parameter(
+        0.0,
+        's',
+        'a file of a recording that is as long is ended and the next begun; 0: never',
+        minimum=0.0,
+        maximum=1e7,
+    )
+    disk_reserve: int = parameter(
+        500_000_000,
+        'bytes',
+        'recording stops before the disk has less room than this',
+        minimum=1_000_000,
+        maximum=1_000_000_000_000,
+    )
+    disk_full: str = parameter(
+        'stop',
+        '',
+        "when the reserve is reached: stop, or delete the oldest file of this recording (never another's)",
+        choices=('stop', 'delete_oldest'),
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class MonitorConfig:
-    """The live page: whether, where, and whether its buttons work; markers for RViz, and how much magnified."""
+    """What is shown: markers for RViz, and the live page."""
 
-    enabled: bool
-    address: str
-    port: int
-    control: bool
-    markers: bool
-    markers_magnify: float
+    markers: bool = parameter(False, '', 'publish link, plate, beams and dots for RViz (/link_tip/markers)')
+    markers_magnify: float = parameter(10.0, '', 'how much larger they show displacements', above=0.0, maximum=1e4)
+    enabled: bool = parameter(False, '', 'serve the live page', name='monitor')
+    address: str = parameter(
+        '127.0.0.1', '', 'address it is served on; 0.0.0.0 shows it to the network', name='monitor_address'
+    )
+    port: int = parameter(
+        8790, '', 'port it is served on; 0 takes any free one', name='monitor_port', minimum=0, maximum=65535
+    )
+    control: bool = parameter(False, '', 'let the page take the zero and record', name='monitor_control')
+
+
+LINK = Section(LinkConfig, 'link.')
+PSDS = (
+    Section(PsdConfig, 'psd_1.', center=(0.0, 0.070)),
+    Section(PsdConfig, 'psd_2.', center=(-0.100, 0.0)),
+)
+AMPLIFIER = Section(AmplifierConfig, 'amplifier.')
+CONVERTER = Section(ConverterConfig, 'converter.')
+DYNAMICS = Section(DynamicsConfig, 'dynamics.')
+ESTIMATOR = Section(EstimatorConfig)
+ACQUISITION = Section(AcquisitionConfig)
+MONITOR = Section(MonitorConfig)
+
+SECTIONS: tuple[Section[Any], ...] = (
+    LINK,
+    *PSDS,
+    AMPLIFIER,
+    CONVERTER,
+    DYNAMICS,
+    ESTIMATOR,
+    ACQUISITION,
+    MONITOR,
+)
+PARAMETERS: tuple[Parameter, ...] = tuple(p for section in SECTIONS for p in section.parameters.values())
+"""Everything that can be set, in the order in which it is listed."""
+BY_NAME: Mapping[str, Parameter] = MappingProxyType({p.name: p for p in PARAMETERS})
+ZEROS = tuple(section.parameters['zero'].name for section in PSDS)
+"""The parameters that ``~/zero`` sets, one for each detector."""
+
+_ORDERED = (
+    ('link.inner_radius', 'less than', 'link.outer_radius'),
+    ('min_samples', 'at most', 'block_size'),
+    ('sum_min', 'less than', 'sum_max'),
+)
+_COMPARE = {'less than': operator.lt, 'at most': operator.le}
 
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """The whole parameter set. ``values`` is what it was made of, flat, defaults included."""
+    """The whole parameter set. ``values`` is what it was made of, flat, defaults included.
+
+    ``effects``: the keys below ``effects.``, without that prefix.
+    """
 
     link: LinkConfig
-    psd_1: PsdConfig
-    psd_2: PsdConfig
+    psds: tuple[PsdConfig, ...]
     amplifier: AmplifierConfig
     converter: ConverterConfig
     dynamics: DynamicsConfig
@@ -180,23 +369,18 @@ class Rig:
         return {**self.values, **{EFFECTS_PREFIX + key: value for key, value in self.effects.items()}}
 
     @property
-    def psds(self) -> tuple[PsdConfig, PsdConfig]:
-        """Both detectors, in order."""
-        return (self.psd_1, self.psd_2)
-
-    @property
     def centers(self) -> FloatArray:
-        """c_i, (2, 2), m."""
+        """c_i, (number of PSDs, 2), m."""
         return np.array([p.center for p in self.psds], dtype=np.float64)
 
     @property
     def zeros(self) -> FloatArray:
-        """m_i0, (2, 2), m."""
+        """m_i0, (number of PSDs, 2), m."""
         return np.array([p.zero for p in self.psds], dtype=np.float64)
 
     @property
     def heights(self) -> FloatArray:
-        """h_i, (2,), m."""
+        """h_i, (number of PSDs,), m."""
         return np.array([p.height for p in self.psds], dtype=np.float64)
 
 
@@ -207,97 +391,7 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
     an unknown key (with the nearest known one), a wrong type, a value out of bounds, or values that contradict each
     other.
     """
-    effects: dict[str, Any] = {}
-    got: dict[str, Value] = {p.name: p.default for p in PARAMETERS}
-    for key, value in values.items():
-        if key.startswith(EFFECTS_PREFIX):
-            effects[key[len(EFFECTS_PREFIX) :]] = value
-            continue
-        if key in ROS_OWN or key.startswith(QOS_OVERRIDES_PREFIX):
-            continue
-        parameter = BY_NAME.get(key)
-        if parameter is None:
-            near = difflib.get_close_matches(key, BY_NAME, n=1)
-            hint = f'; did you mean {near[0]}?' if near else ''
-            raise ConfigError(f'{source}: {key} = {value!r}: no parameter of that name{hint}')
-        got[key] = check_value(parameter, value, source)
-    v: dict[str, Any] = dict(got)
-    if v['link.inner_radius'] >= v['link.outer_radius']:
-        raise ConfigError(
-            f'{source}: link.inner_radius = {v["link.inner_radius"]} m: must be less than '
-            f'link.outer_radius = {v["link.outer_radius"]} m'
-        )
-    if v['min_samples'] > v['block_size']:
-        raise ConfigError(f'{source}: min_samples = {v["min_samples"]}: must be at most block_size = {v["block_size"]}')
-    if v['sum_min'] >= v['sum_max']:
-        raise ConfigError(f'{source}: sum_min = {v["sum_min"]} V: must be less than sum_max = {v["sum_max"]} V')
-    if v['solver'] not in v['solvers']:
-        v['solvers'] = [v['solver'], *v['solvers']]
-        got['solvers'] = v['solvers']
-    if len(set(v['solvers'])) != len(v['solvers']):
-        raise ConfigError(f'{source}: solvers = {v["solvers"]!r}: a name is there twice')
-
-    def section(prefix: str) -> dict[str, Any]:
-        out = {}
-        for p in PARAMETERS:
-            if p.name.startswith(prefix + '.'):
-                item = v[p.name]
-                out[p.name[len(prefix) + 1 :]] = tuple(item) if isinstance(item, list) else item
-        return out
-
-    return Rig(
-        link=LinkConfig(**section('link')),
-        psd_1=PsdConfig(**section('psd_1')),
-        psd_2=PsdConfig(**section('psd_2')),
-        amplifier=AmplifierConfig(**section('amplifier')),
-        converter=ConverterConfig(**section('converter')),
-        dynamics=DynamicsConfig(**section('dynamics')),
-        estimator=EstimatorConfig(
-            block_size=v['block_size'],
-            min_samples=v['min_samples'],
-            sum_min=v['sum_min'],
-            sum_max=v['sum_max'],
-            block_fit=v['block_fit'],
-            covariance=v['covariance'],
-            consistency=v['consistency'],
-            splitter=v['splitter'],
-            degraded=v['degraded'],
-            frozen=v['frozen'],
-            twist_sd=v['twist_sd'],
-            twist_hold=v['twist_hold'],
-            solver=v['solver'],
-            solvers=tuple(v['solvers']),
-            wls_weights=v['wls.weights'],
-            wls_row_scaling=tuple(v['wls.row_scaling']),
-        ),
-        acquisition=AcquisitionConfig(
-            source=v['source'],
-            port=v['port'],
-            baud=v['baud'],
-            latency_offset=v['latency_offset'],
-            queue_blocks=v['queue_blocks'],
-            serial_number=v['serial_number'],
-            keep_zero=v['keep_zero'],
-            zero_file=v['zero_file'],
-            realtime=v['realtime'],
-            record=v['record'],
-            bag_dir=v['bag_dir'],
-            bag_max_bytes=v['bag_max_bytes'],
-            bag_max_duration=v['bag_max_duration'],
-            disk_reserve=v['disk_reserve'],
-            disk_full=v['disk_full'],
-        ),
-        monitor=MonitorConfig(
-            enabled=v['monitor'],
-            address=v['monitor_address'],
-            port=v['monitor_port'],
-            control=v['monitor_control'],
-            markers=v['markers'],
-            markers_magnify=v['markers_magnify'],
-        ),
-        values=MappingProxyType(got),
-        effects=MappingProxyType(effects),
-    )
+    return _rig({p.name: p.default for p in PARAMETERS}, {}, values, source)
 
 
 def rig_as_recorded(values: Mapping[str, object], source: str) -> Rig:
@@ -311,8 +405,48 @@ def rig_as_recorded(values: Mapping[str, object], source: str) -> Rig:
 
 
 def replace_values(rig: Rig, changes: Mapping[str, object], source: str = 'override') -> Rig:
-    """The same rig with some values changed, checked like any others."""
-    return rig_from_values({**rig.flat(), **changes}, source)
+    """The same rig with some values changed; they are checked like any others. Raises ConfigError."""
+    return _rig(rig.values, rig.effects, changes, source)
+
+
+def _rig(values: Mapping[str, Value], effects: Mapping[str, Any], changes: Mapping[str, object], source: str) -> Rig:
+    """The rig of ``values``, which are checked already, and ``changes``, which are checked here."""
+    v = dict(values)
+    effects = dict(effects)
+    for key, value in changes.items():
+        if key.startswith(EFFECTS_PREFIX):
+            effects[key.removeprefix(EFFECTS_PREFIX)] = value
+        elif key in BY_NAME:
+            v[key] = check_value(BY_NAME[key], value, source)
+        elif key not in ROS_OWN and not key.startswith(QOS_OVERRIDES_PREFIX):
+            raise ConfigError(
+                f'{source}: {key} = {shown(value)}: no parameter of that name{did_you_mean(key, BY_NAME)}'
+            )
+    _check_together(v, source)
+    return Rig(
+        link=LINK.of(v),
+        psds=tuple(psd.of(v) for psd in PSDS),
+        amplifier=AMPLIFIER.of(v),
+        converter=CONVERTER.of(v),
+        dynamics=DYNAMICS.of(v),
+        estimator=ESTIMATOR.of(v),
+        acquisition=ACQUISITION.of(v),
+        monitor=MONITOR.of(v),
+        values=MappingProxyType(v),
+        effects=MappingProxyType(effects),
+    )
+
+
+def _check_together(v: dict[str, Any], source: str) -> None:
+    """Raise ConfigError if values contradict each other; let ``solver`` run even if ``solvers`` does not name it."""
+    for lower, relation, upper in _ORDERED:
+        if not _COMPARE[relation](v[lower], v[upper]):
+            low, high = (BY_NAME[name].with_value(v[name]) for name in (lower, upper))
+            raise ConfigError(f'{source}: {low}: must be {relation} {high}')
+    if v['solver'] not in v['solvers']:
+        v['solvers'] = [v['solver'], *v['solvers']]
+    if len(set(v['solvers'])) != len(v['solvers']):
+        raise ConfigError(f'{source}: solvers = {v["solvers"]!r}: a name is there twice')
 
 
 def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[str, object]:
@@ -322,24 +456,7 @@ def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[
     missing, too large, not YAML, or not a parameter file.
     """
     path = Path(path)
-    try:
-        size = path.stat().st_size
-        if size > MAX_FILE_BYTES:
-            raise ConfigError(f'{path}: {size} bytes: a parameter file has at most {MAX_FILE_BYTES}')
-        text = path.read_text(encoding='utf-8')
-    except FileNotFoundError:
-        raise ConfigError(f'{path}: no such parameter file') from None
-    except OSError as error:
-        raise ConfigError(f'{path}: cannot be read as a parameter file ({error.strerror or error})') from None
-    except UnicodeDecodeError:
-        raise ConfigError(f'{path}: cannot be read as a parameter file (it is no text)') from None
-    try:
-        tree = yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        mark = getattr(error, 'problem_mark', None)
-        where = f':{mark.line + 1}:{mark.column + 1}' if mark is not None else ''
-        problem = getattr(error, 'problem', None) or 'not YAML'
-        raise ConfigError(f'{path}{where}: malformed YAML: {problem}') from None
+    tree = _read_yaml(path)
     if not isinstance(tree, dict):
         raise ConfigError(f'{path}: not a ROS 2 parameter file: expected "/**:" then "ros__parameters:"')
     flat: dict[str, object] = {}
@@ -352,6 +469,27 @@ def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[
     if not any(name in wanted for name in tree):
         raise ConfigError(f'{path}: has no parameters for /** or {node_name} (found: {", ".join(map(str, tree))})')
     return flat
+
+
+def _read_yaml(path: Path) -> object:
+    try:
+        size = path.stat().st_size
+        if size > MAX_FILE_BYTES:
+            raise ConfigError(f'{path}: {size} bytes: a parameter file has at most {MAX_FILE_BYTES}')
+        text = path.read_text(encoding='utf-8')
+    except FileNotFoundError:
+        raise ConfigError(f'{path}: no such parameter file') from None
+    except OSError as error:
+        raise ConfigError(f'{path}: cannot be read as a parameter file ({error.strerror or error})') from None
+    except UnicodeDecodeError:
+        raise ConfigError(f'{path}: cannot be read as a parameter file (it is no text)') from None
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        mark = getattr(error, 'problem_mark', None)
+        where = f':{mark.line + 1}:{mark.column + 1}' if mark is not None else ''
+        problem = getattr(error, 'problem', None) or 'not YAML'
+        raise ConfigError(f'{path}{where}: malformed YAML: {problem}') from None
 
 
 def _flatten(tree: Mapping[Any, Any], prefix: str, out: dict[str, object], path: Path, depth: int) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError
+from psd_deflection.geometry.plate import flat_poses
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.catalogue import effects_of_rig
 from psd_deflection.simulation.chunk import Chunk
@@ -136,16 +137,6 @@ def _optics(physics: Physics) -> list[object]:
 
 
 def _flat_pose(dots: FloatArray, beams: FloatArray, physics: Physics) -> FloatArray:
-    """Pose (3, n) of a flat plate from dots (4, n): twist from the line between the two dots,
-    translation from their mean (two-point Procrustes).
-    """
-    qx = [dots[2 * i] + physics.centers[i, 0] for i in range(2)]
-    qy = [dots[2 * i + 1] + physics.centers[i, 1] for i in range(2)]
-    ux, uy = qx[0] - qx[1], qy[0] - qy[1]
-    vx, vy = beams[0] - beams[2], beams[1] - beams[3]
-    theta = np.arctan2(ux * vy - uy * vx, ux * vx + uy * vy)
-    c, s = np.cos(theta), np.sin(theta)
-    mx, my = 0.5 * (qx[0] + qx[1]), 0.5 * (qy[0] + qy[1])
-    dx = 0.5 * (beams[0] + beams[2]) - (c * mx - s * my)
-    dy = 0.5 * (beams[1] + beams[3]) - (s * mx + c * my)
-    return np.stack((dx, dy, theta))
+    """Pose (3, n) of a flat plate from dots (4, n)."""
+    n = dots.shape[1]
+    return flat_poses(dots.T.reshape(n, 2, 2) + physics.centers, beams.T.reshape(n, 2, 2)).T

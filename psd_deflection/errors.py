@@ -2,22 +2,26 @@
 
 Every message is one line that names what was wrong, where, and the way out. Anything else that
 is raised is a defect of ours and ends with a traceback.
-
-========  =======================================================================
-status    meaning
-========  =======================================================================
-0         done (``replay --compare``: no bit differs)
-1         done, and the answer is "differs" (``replay --compare``)
-2         the command line was not understood (argparse), or ``UsageError``
-3         ``ConfigError``: parameter file, value in it, or package that is missing
-4         ``RecordingError``: a recording cannot be read, an output cannot be written
-5         ``DeviceError``: port missing, in use, silent, or of another protocol
-6         ``SolverError``: the geometry cannot be solved
-130       Ctrl-C before it was done
-========  =======================================================================
 """
 
 from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+
+INTERRUPTED = 130
+
+EXIT_STATUSES: Mapping[int, str] = {
+    0: 'done',
+    1: 'done, and the recording differs (replay --compare)',
+    2: 'the command line: an option, its value, or two that do not fit',
+    3: 'a parameter, a parameter file, or a package that is not installed',
+    4: 'a recording or an output that cannot be read or written',
+    5: 'the device: missing, in use, silent, or of another protocol',
+    6: 'the geometry of the rig cannot be solved',
+    INTERRUPTED: 'Ctrl-C before it was done (estimator and monitor then end with 0)',
+}
+"""What each exit status of ``psd-deflection`` means; its help and the documentation are made from this table."""
 
 
 class PsdDeflectionError(Exception):
@@ -69,3 +73,9 @@ class SolverError(PsdDeflectionError):
     """
 
     exit_status = 6
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """``; did you mean X?`` for a name that is nearly one of ``known``, else nothing."""
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f'; did you mean {near[0]}?' if near else ''

@@ -22,8 +22,9 @@ import numpy.typing as npt
 from psd_deflection.averaging import BlockCutter, block_middle_ns, covariance
 from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_variances
 from psd_deflection.calibration.health import OpticsHealth, Verdict
-from psd_deflection.config import Rig, replace_values
+from psd_deflection.config import ZEROS, Rig, replace_values
 from psd_deflection.correction import Correction
+from psd_deflection.geometry import Geometry
 from psd_deflection.mechanics import LinkStatics
 from psd_deflection.records import (
     ENVIRONMENT,
@@ -38,7 +39,6 @@ from psd_deflection.records import (
     TipLoad,
 )
 from psd_deflection.solvers import solver_from_rig
-from psd_deflection.solvers.from_rig import geometry_from_rig
 from psd_deflection.solvers.interface import Solution, SolverStatus
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 from psd_deflection.solvers.one_psd import OnePsd
@@ -108,7 +108,7 @@ class Pipeline:
         self._calibration = Calibration.from_rig(rig)
         self._correction = Correction.from_rig(rig)
         self._optics = OpticsHealth(rig)
-        self._one_psd = OnePsd(geometry_from_rig(rig))
+        self._one_psd = OnePsd(Geometry.from_rig(rig))
         config = rig.estimator
         names = [config.solver, *(name for name in config.solvers if name != config.solver)]
         self._solvers = [(name, solver_from_rig(name, rig), name == config.solver) for name in names]
@@ -153,7 +153,7 @@ class Pipeline:
         if not self._recent or self.last_spots is None:
             return None
         x1, y1, x2, y2 = (sum(column) / len(self._recent) for column in zip(*self._recent, strict=True))
-        return self.change({'psd_1.zero': (x1, y1), 'psd_2.zero': (x2, y2)})
+        return self.change(dict(zip(ZEROS, ((x1, y1), (x2, y2)), strict=True)))
 
     def change(self, values: Mapping[str, float | str | tuple[float, ...]]) -> ParameterChange:
         """Change parameters from the next block on; the change as a record.
@@ -259,7 +259,7 @@ class Pipeline:
             if failure is not None:
                 status, reason = failure
             elif best is not None:
-                self._held = _Held(t_ns, best.theta, best.covariance[8])
+                self._held = _Held(t_ns, best.theta, best.variances[2])
         elif verdict.faulty:
             if self.rig.estimator.covariance == 'measured':
                 variances = self.stamped.mean_variances(present)

@@ -21,6 +21,9 @@ IntArray = npt.NDArray[np.int64]
 CHANNELS = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
 """The order of the six channels everywhere: on the wire, in recordings, in arrays."""
 
+DOT_CHANNELS = (0, 1, 3, 4)
+"""Which of ``CHANNELS`` are coordinates of the dots: x1, y1, x2, y2."""
+
 FLAG_OVER_RANGE = 1
 """SAMPLE flags, bit 0: the device saw a channel over range."""
 
@@ -118,6 +121,16 @@ class DeflectionEstimate(NamedTuple):
     residual_rms: float
     primary: bool
     chi_square: float = math.nan
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """(dx, dy, theta)."""
+        return self.dx, self.dy, self.theta
+
+    @property
+    def variances(self) -> tuple[float, float, float]:
+        """The diagonal of ``covariance``: of dx m^2, dy m^2, theta rad^2."""
+        return self.covariance[0], self.covariance[4], self.covariance[8]
 
 
 class TipLoad(NamedTuple):

@@ -10,9 +10,9 @@ import numpy.typing as npt
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.replay_engine import replayed, rig_at_start
 from psd_deflection.records import DeflectionEstimate, SpotMeans
 
 BAGS = Path(__file__).parent.parent / 'bags'
@@ -41,9 +41,9 @@ def test_a_golden_recording_gives_its_estimates_and_they_are_true(name: str) -> 
     assert recording.complete
     assert recording.hello is not None
     assert recording.hello['serial'] == 'GOLDEN'
-    rig = rig_of(recording, None)
+    rig = rig_at_start(recording)
     pipeline = Pipeline(rig)
-    records = [r for step in replayed(recording, pipeline, recording.blocks()) for r in step]
+    records = [r for step in replayed(recording, pipeline) for r in step]
     best = {r.block: r for r in records if isinstance(r, DeflectionEstimate) and r.primary}
     spots = {r.index: r for r in records if isinstance(r, SpotMeans)}
     assert {i: s.status.name for i, s in spots.items() if s.reason} == WITHOUT_ESTIMATE[name]
@@ -99,7 +99,7 @@ def test_a_zero_that_was_taken_while_recording_is_taken_again(
     from psd_deflection.records import RawChunk
 
     recording = open_recording(BAGS / 'clean')
-    rig = rig_of(recording, None)
+    rig = rig_at_start(recording)
     pipeline = Pipeline(rig)
     folder = tmp_path / 'zeroed'
     with BagWriter(folder, rig_values=dict(rig.values)) as bag:

@@ -13,7 +13,8 @@ import yaml
 
 from msg_adapters import DIAGNOSTICS, INPUTS, TOPIC_TYPES
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.ros import names
 
 ROOT = Path(__file__).parent.parent
 CONFIG = ROOT / 'config'
@@ -72,19 +73,16 @@ def test_plotjuggler(recorded: dict[str, Any]) -> None:
 
 
 def test_rviz() -> None:
-    # Read as text: the node's room imports rclpy, which need not be here.
-    source = (ROOT / 'psd_deflection' / 'ros' / 'markers.py').read_text()
-    there = dict(re.findall(r"^(MOVING|AT_REST) = '(\S+)'", source, re.M))
     tree = yaml.safe_load((CONFIG / 'link_tip.rviz').read_text())
     displays = [d for d in tree['Visualization Manager']['Displays'] if d['Class'].endswith('MarkerArray')]
-    assert {d['Topic']['Value'] for d in displays} == set(there.values())
-    latched = [d['Topic']['Value'] for d in displays if d['Topic']['Durability Policy'] == 'Transient Local']
-    assert latched == [there['AT_REST']]
-    (base,) = re.findall(r"^BASE, REST, TIP = '(\w+)'", source, re.M)
-    assert tree['Visualization Manager']['Global Options']['Fixed Frame'] == base
-    # All that the node publishes is reliable; asked of a best-effort publisher, that would be no connection at all.
-    assert {d['Topic']['Reliability Policy'] for d in displays} == {'Reliable'}
-    assert '_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE' in source
+    assert {d['Topic']['Value'] for d in displays} == {names.MARKERS, names.MARKERS_AT_REST}
+    assert tree['Visualization Manager']['Global Options']['Fixed Frame'] == names.BASE
+    # A subscriber that asks for more than the publisher gives is not connected at all.
+    for topic in (d['Topic'] for d in displays):
+        given = names.delivery(topic['Value'])
+        assert topic['Durability Policy'] == ('Transient Local' if given.latched else 'Volatile')
+        assert topic['Reliability Policy'] == 'Reliable'
+        assert given.reliable
 
 
 def test_the_sros2_policy() -> None:
@@ -95,8 +93,7 @@ def test_the_sros2_policy() -> None:
     topics = {t.text for t in root.iter('topic')} - of_every_node - {'*', '/link_tip/*'}
     assert topics <= set(TOPIC_TYPES)
     assert topics >= set(INPUTS)
-    source = (ROOT / 'psd_deflection' / 'ros' / 'estimator.py').read_text()
-    served = {f'/estimator/{name}' for name in re.findall(r"create_service\(\w+, '~/(\w+)'", source)}
+    served = {name.replace('~', '/estimator') for name in names.SERVICES}
     requested = {
         path: {s.text for g in e.iter('services') if 'request' in g.attrib for s in g} for path, e in enclaves.items()
     }

@@ -13,10 +13,14 @@ import pytest
 
 from psd_deflection import __version__
 from psd_deflection.cli.main import COMMANDS
-from psd_deflection.config import read_parameter_file, rig_from_values
-from tools.ros2 import launched
 
 ROOT = Path(__file__).parent.parent
+BESIDE_THE_PACKAGE = {'bench', 'blind', 'data', 'docs'}
+"""Folders of test/ that are no room of the package: what they test, or use, lies beside it."""
+
+TESTED_ELSEWHERE = {'correction', 'errors', 'files', 'parameters', 'records'}
+"""Rooms without a test file of their own: declarations; and the correction, of which the effects' tests are."""
+
 EXECUTABLES = ('estimator', 'replay', 'simulate', 'discover')
 
 
@@ -52,19 +56,6 @@ def test_the_executable_that_ros2_run_starts_runs(name: str, tmp_path: Path) -> 
     assert f'usage: psd-deflection {name}' in done.stdout
 
 
-def test_a_launch_leaves_to_the_file_what_it_is_not_told(tmp_path: Path) -> None:
-    installed_files()
-    prefix = Path(sys.prefix)
-    plain = launched('ros2 launch psd_deflection estimator.launch.py params_file:=rig.yaml', prefix, tmp_path)
-    program = str(prefix / 'lib/psd_deflection/estimator')
-    assert plain == [program, '--ros-args', '--params-file', 'rig.yaml', '-r', '__node:=estimator']
-    told = launched('ros2 launch psd_deflection estimator.launch.py record:=true port:=7', prefix, tmp_path)
-    assert told[3] == str(prefix / 'share/psd_deflection/config/thesis_rig.yaml')
-    given = read_parameter_file(told[-1])
-    assert given == {'record': True, 'port': '7'}
-    rig_from_values(given)
-
-
 def test_type_hints_are_shipped() -> None:
     names = [f for f in installed_files() if f.endswith('py.typed')]
     assert any('psd_deflection/py.typed' in n for n in names)
@@ -75,3 +66,22 @@ def test_the_version_is_the_same_everywhere() -> None:
     root = xml.etree.ElementTree.parse(ROOT / 'package.xml').getroot()
     assert root.findtext('version') == __version__
     assert f'## {__version__}' in (ROOT / 'CHANGELOG.md').read_text()
+
+
+def rooms(package: Path) -> set[str]:
+    """Folders and modules of the package, without ``__init__`` and ``__main__``."""
+    return {p.stem for p in package.iterdir() if p.stem.isidentifier() and not p.stem.startswith('__')}
+
+
+def test_the_tests_mirror_the_package() -> None:
+    ours = rooms(ROOT / 'psd_deflection') - {'py'}
+    folders = {p.name for p in (ROOT / 'test').iterdir() if p.is_dir() and p.name != '__pycache__'}
+    assert folders - ours == BESIDE_THE_PACKAGE
+    untested = {room for room in ours - folders if not (ROOT / 'test' / f'test_{room}.py').exists()}
+    assert untested == TESTED_ELSEWHERE
+
+
+def test_importing_the_package_is_light() -> None:
+    code = 'import sys, psd_deflection; print([m for m in ("numpy", "mcap", "yaml") if m in sys.modules])'
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == '[]'

@@ -14,7 +14,7 @@ from psd_deflection.cli.main import main
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.mechanics import LinkStatics
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,

@@ -7,8 +7,6 @@ counts are a function of the sample's number, so that each is checked, not only 
 from __future__ import annotations
 
 import argparse
-import re
-import subprocess
 import sys
 import threading
 import time
@@ -32,6 +30,7 @@ from psd_deflection.protocol.frames import (
 )
 from psd_deflection.records import Record, SampleBlock
 from psd_deflection.runner.session import Session
+from tools.program import Program
 
 COMMAND = [
     'qemu-system-arm',
@@ -116,6 +115,7 @@ class Checked:
         self._first_ns = 0
 
     def put(self, record: Record) -> None:
+        """Take a record, as a sink does."""
         if not isinstance(record, SampleBlock):
             return
         self._first_ns = self._first_ns or int(record.t_ns[0])
@@ -133,15 +133,9 @@ def main() -> int:
     parser.add_argument('elf', type=Path)
     parser.add_argument('--seconds', type=float, default=20.0)
     args = parser.parse_args()
-    qemu = subprocess.Popen(
-        [*COMMAND, '-serial', 'chardev:uart', '-kernel', str(args.elf)], stdout=subprocess.PIPE, text=True
-    )
+    qemu = Program([*COMMAND, '-serial', 'chardev:uart', '-kernel', str(args.elf.resolve())])
     try:
-        port = ''
-        for line in qemu.stdout or ():
-            if found := re.search(r'redirected to (\S+)', line):
-                port = found[1]
-                break
+        port = qemu.until(r'redirected to (\S+)')[1]
         bad, trip = dialogue(port)
         session = Session(load_rig(overrides={'port': port}), lambda text: print(f'  {text}', file=sys.stderr))
         checked = Checked(args.seconds)
@@ -151,8 +145,7 @@ def main() -> int:
         clock = session.acquisition.clock_state()
         session.close()
     finally:
-        qemu.kill()
-        qemu.wait()
+        qemu.end()
     wire = session.acquisition.counters
     print(
         f'firmware in qemu: {checked.samples} samples in {checked.span_s:.1f} s, {wire.lost} lost '

@@ -3,8 +3,8 @@
 Poses, bands, dots, sums and losses must be the recording's own, and nothing may stand where nothing was measured. Where
 there is no screen, the viewer gets a virtual one (xvfb-run, a software Vulkan: apt install xvfb mesa-vulkan-drivers).
 
-  python tools/check_rerun.py bags/lost_samples --out build/rerun
-  python tools/check_rerun.py bags/lost_samples --out build/rerun --figure docs/figures/rerun.png
+  python -m tools.check_rerun bags/lost_samples --out build/rerun
+  python -m tools.check_rerun bags/lost_samples --out build/rerun --figure docs/figures/rerun.png
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -28,6 +27,7 @@ from psd_deflection.config import Rig, rig_from_values
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.rerun_writer import APPLICATION, POSE, TIMELINE, blueprint
 from psd_deflection.records import FloatArray, IntArray
+from tools.program import Program
 
 BIN = Path(sys.executable).parent
 WINDOW = '1500x900'
@@ -74,8 +74,8 @@ class Written:
 def check_poses(written: Written, recording: Recording) -> int:
     """Each recorded estimate is there and no other; a line breaks wherever one is missing. The number of breaks."""
     series = recording.estimates()['/link_tip/deflection_with_covariance']
-    need(series.covariance is not None, 'the recording has no covariance')
-    assert series.covariance is not None
+    if series.covariance is None:
+        raise SystemExit('FAILED: the recording has no covariance')
     breaks = 0
     step = float(np.median(np.diff(series.t_ns)))
     gone = np.flatnonzero(np.diff(series.t_ns) > 1.5 * step)
@@ -135,21 +135,10 @@ def picture(files: list[Path], target: Path) -> bool:
         command = ['xvfb-run', '-a', '-s', '-screen 0 1600x1000x24', str(BIN / 'rerun'), '--port', 'auto']
         command += ['--bind', '127.0.0.1', '--renderer', 'vulkan', '--screenshot-to', str(target)]
         command += ['--window-size', WINDOW, *map(str, files)]
-        # In a session of its own, so that screen and viewer end with it.
-        viewer = subprocess.Popen(
-            command,
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,
-        )
-        try:
-            said, _ = viewer.communicate(timeout=VIEWER_S)
-        except subprocess.TimeoutExpired:
-            os.killpg(viewer.pid, signal.SIGKILL)
-            said, _ = viewer.communicate()
-    need(viewer.returncode == 0 and target.exists(), f'the viewer made no picture\n{said[-3000:]}')
+        # Screen and viewer end together: they are one session.
+        viewer = Program(command, Path.cwd(), env=environment, wait_s=VIEWER_S)
+        status = viewer.wait()
+    need(status == 0 and target.exists(), f'the viewer made no picture\n{viewer.text[-3000:]}')
     return True
 
 

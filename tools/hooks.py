@@ -1,7 +1,7 @@
 """What the pages get from the program itself when the site is built, so that they cannot disagree.
 
 ``<!-- messages -->``: every error message, by exit status. ``<!-- commands -->``: every command's
-help. ``<!-- parameters -->``: every parameter.
+help. ``<!-- parameters -->``: every parameter. ``<!-- exit statuses -->``: what each one means.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 from psd_deflection import errors
 from psd_deflection.cli.main import COMMANDS, main, make_parser
-from psd_deflection.parameters import PARAMETERS
+from psd_deflection.config import PARAMETERS
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ('psd_deflection', 'msg_adapters')
@@ -34,7 +34,7 @@ WITHOUT_STATUS = ('DamagedError', 'RefusedError', 'SourceEndedError', '_FullErro
 
 READERS = (
     'msg_adapters',
-    'psd_deflection.recordings.message_decode',
+    'psd_deflection.recordings.clouds',
     'psd_deflection.recordings.cdr',
     'psd_deflection.recordings.bag_reader',
 )
@@ -133,12 +133,13 @@ def message_tables() -> str:
         rows = sorted({(text, module) for kind, text, module in found if kind in names})
         if rows:
             out.append(f'### {heading}\n\n| message | from |\n|---|---|')
-            out += [f'| {_cell(text)} | `{module}` |' for text, module in rows]
+            out += [f'| {cell(text)} | `{module}` |' for text, module in rows]
             out.append('')
     return '\n'.join(out)
 
 
-def _cell(text: str) -> str:
+def cell(text: str) -> str:
+    """``text`` as the tables show it."""
     text = re.sub(r'…+', '…', re.sub(r'\s+', ' ', text))
     return '`' + text.replace('|', '\\|').replace('`', "'") + '`'
 
@@ -160,13 +161,23 @@ def parameter_table() -> str:
     """Every parameter with unit, bounds and default."""
     rows = ['| parameter | default | unit | bounds | |', '|---|---|---|---|---|']
     for p in PARAMETERS:
-        bounds = p.bound_text() or (', '.join(p.choices) if p.choices else '')
         live = ' (may change while running)' if p.live else ''
-        rows.append(f'| `{p.name}` | `{p.default}` | {p.unit} | {bounds} | {p.description}{live} |')
+        rows.append(f'| `{p.name}` | `{p.default}` | {p.unit} | {p.bound_text()} | {p.description}{live} |')
     return '\n'.join(rows)
 
 
-FILLED = {'messages': message_tables, 'commands': command_help, 'parameters': parameter_table}
+def exit_statuses() -> str:
+    """Each exit status and its meaning."""
+    rows = [f'| {status} | {meaning} |' for status, meaning in errors.EXIT_STATUSES.items()]
+    return '\n'.join(['| status | meaning |', '|---|---|', *rows])
+
+
+FILLED = {
+    'exit statuses': exit_statuses,
+    'messages': message_tables,
+    'commands': command_help,
+    'parameters': parameter_table,
+}
 
 
 def on_page_markdown(markdown: str, **kwargs: Any) -> str:

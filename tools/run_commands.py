@@ -2,9 +2,10 @@
 
 What ends in a moment is run by test/docs/test_docs.py; what CI runs anyway is looked up in .ci/run. The rest is run
 here, block by block, in a copy of the checkout: a daemon or a page is started on the simulated device, seen to
-work by what it says, and ended by Ctrl-C; a campaign runs in its shortest form; what ``ros2`` would do is done with
-rclpy (tools/ros2.py); what is typed as root, or from one machine to another, is typed on a machine made for it
-(tools/machine.py). Nothing is left out; an entry of the tables below that the documents no longer have is an error.
+work by what it says, and ended by Ctrl-C; a campaign runs in its shortest form. Lines that cannot be run here are
+printed with the reason: ``ros2`` lines need a ROS 2 from apt (the ``apt`` job of .github/workflows/ci.yml has one and
+runs them), and nothing is typed as root or to another machine. An entry of the tables below that the documents no
+longer have is an error.
 """
 
 from __future__ import annotations
@@ -26,10 +27,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from tools import machine, ros2
-from tools.terminal import WAIT_S, Terminal
+from tools.program import PSD_DEFLECTION, ROOT, Program
 
-ROOT = Path(__file__).resolve().parent.parent
+WAIT_S = 400.0
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 FENCE = re.compile(r'^```(?P<kind>\w*)\n(?P<text>.*?)^```', re.M | re.S)
 INLINE = re.compile(r'`((?:make|psd-deflection|python|python3|pip|apt|sudo|colcon|ros2) [^`\n]+)`')
@@ -55,7 +55,7 @@ CI_RUNS = (
     (r'^make wheel$|^pip install dist/\*\.whl', '.ci/run', 'make wheel '),
     (r'^make rerun$', '.ci/run', 'make rerun '),
     (r"^pip install '\.\[rerun\]'$", 'Makefile', "'.[rerun]'"),
-    (r'^psd-deflection convert .*\.rrd$|^rerun ', 'Makefile', 'python tools/check_rerun.py bags/'),
+    (r'^psd-deflection convert .*\.rrd$|^rerun ', 'Makefile', 'python -m tools.check_rerun bags/'),
     (
         r"^pip install '\.\[ros,monitor\]'$",
         'Makefile',
@@ -79,7 +79,10 @@ SHORTEST = {
 }
 """Variables with which a ``make`` target is over in seconds."""
 
-SHORTER = {r'^python -m blind\.run\b': '--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation'}
+SHORTER = {
+    r'^python -m blind\.run\b': '--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation',
+    r'^ros2 topic echo\b': '--once',
+}
 """Arguments that, put behind those of a command, have it over in seconds."""
 
 VERDICTS = {
@@ -94,17 +97,23 @@ TOOLS = {
     r'^make firmware': ('arm-none-eabi-gcc', 'qemu-system-arm'),
     r'^make shots|first_look': ('chromium', 'chromedriver'),
     r'^curl ': ('curl',),
+    r'^ros2 ': ('ros2',),
 }
 """Programs without which a command is passed over, and said to be."""
 
-ON_A_MACHINE = re.compile(r'/opt/psd_deflection|^(apt|install|journalctl|ssh|sudo|systemctl|udevadm|useradd) ')
-"""What is typed on a machine made for it (tools/machine.py): as root, or from one machine to another."""
+ADMINISTRATION = re.compile(r'/opt/psd_deflection|^(apt|install|journalctl|ssh|sudo|systemctl|udevadm|useradd) ')
+"""Lines for root or for another machine: never typed here. test/docs/test_deploy.py checks the files they install."""
+
+NEVER_HERE = ('a machine to administer', 'ros2')
+"""Needs that NEED_TOOLS=1 (any other missing program is a failure) does not ask for."""
 
 QUICK = re.compile(
     r'^psd-deflection (info|replay|convert|plot|budget|design|params|completion|compare-methods)\b'
     r'|^psd-deflection simulate .*--(out|help)\b'
 )
-LIVE = re.compile(r'^psd-deflection (estimator|monitor)\b|--serve\b|^make run\b|^ros2 run psd_deflection estimator\b')
+LIVE = re.compile(
+    r'^psd-deflection (estimator|monitor)\b|--serve\b|^make run\b|^ros2 (run|launch) psd_deflection estimator\b'
+)
 
 
 class Command(NamedTuple):
@@ -187,9 +196,9 @@ def blocks_to_run() -> list[list[Command]]:
 
 
 def what_is_missing(line: str) -> str:
-    """What ``line`` needs, and this machine has not."""
-    if ON_A_MACHINE.search(line):
-        return '' if machine.wanted() else 'root and MACHINE=1'
+    """What ``line`` needs and this machine does not have, or what is not done here; '' if it can be run."""
+    if ADMINISTRATION.search(line):
+        return NEVER_HERE[0]
     return ', '.join(t for p, tools in TOOLS.items() if re.search(p, line) for t in tools if not shutil.which(t))
 
 
@@ -197,7 +206,7 @@ def stale() -> list[str]:
     """Entries of the tables that no command of the documents needs any more."""
     lines = [c.line for c in commands()]
     patterns = [p for p, *_ in CI_RUNS] + [f'^make {name}\\b' for name in SHORTEST]
-    patterns += [*TOOLS, *SHORTER, ON_A_MACHINE.pattern]
+    patterns += [*TOOLS, *SHORTER, ADMINISTRATION.pattern]
     return [p for p in patterns if not any(re.search(p, line) for line in lines)]
 
 
@@ -206,10 +215,8 @@ class Reader:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._device: Terminal | None = None
-        self._background: list[Terminal] = []
-        self._machine: machine.Machine | None = None
-        self._no_machine = False
+        self._device: Program | None = None
+        self._background: list[Program] = []
         self._served = ''
 
     def block(self, lines: list[str], ran: Callable[[str, float, str], None]) -> None:
@@ -232,17 +239,9 @@ class Reader:
         """One command; raises RuntimeError where it does not do what it should."""
         line = line.replace('/dev/ttyACM0', 'ttyACM0').replace('/dev/pts/3', self._served)
         if 'ttyACM0' in line and self._device is None:
-            self._device = Terminal('psd-deflection simulate --serve --link ttyACM0', self._folder)
+            self._device = self._start('psd-deflection simulate --serve --link ttyACM0')
             self._device.until('port: ')
-        if ON_A_MACHINE.search(line):
-            self._on_a_machine(line)
-        elif line.startswith('ros2 launch '):
-            words = ros2.launched(line, Path(os.environ['VIRTUAL_ENV']), self._folder)
-            self._live(shlex.join(words), record='record:=true' in line, page='monitor:=true' in line)
-        elif line.startswith(('ros2 topic ', 'ros2 service ', 'ros2 lifecycle ')):
-            self._node()
-            self._to_the_end(f'python -m tools.ros2 {shlex.quote(line)}')
-        elif line.startswith('curl '):
+        if line.startswith('curl '):
             self._press(line)
         elif LIVE.search(line):
             self._live(line)
@@ -250,49 +249,35 @@ class Reader:
             target = line.split()[1]
             self._to_the_end(f'{line} {SHORTEST.get(target, "")}', VERDICTS.get(target, ''))
         else:
+            if line.startswith(('ros2 topic ', 'ros2 service ', 'ros2 lifecycle ')) and not self._background:
+                self._background.append(self._start('psd-deflection estimator'))
+                self._background[-1].until(r'θ +[-+]\d')
             more = next((arguments for pattern, arguments in SHORTER.items() if re.search(pattern, line)), '')
-            self._to_the_end(f'{line} {more}', VERDICTS['blind'] if more else '')
+            self._to_the_end(f'{line} {more}', VERDICTS['blind'] if 'blind' in line else '')
 
-    def _on_a_machine(self, line: str) -> None:
-        if self._no_machine:
-            raise RuntimeError('there is no machine to type it on')
-        if self._machine is None:
-            # Tried once: what keeps it from starting keeps on.
-            self._no_machine = True
-            self._machine = machine.Machine(self._folder, Path(os.environ['VIRTUAL_ENV']))
-            self._no_machine = False
-        if line.startswith('ssh '):
-            self._machine.tunnel(line)
-        elif line.startswith('journalctl -f'):
-            journal = Terminal(self._machine.typed(line), self._folder)
-            try:
-                journal.until(r'θ +[-+]\d+\.\d\d ± \d')
-            finally:
-                journal.end()
-            machine.check_service(self._machine)
-        else:
-            self._machine.run(line)
+    def _start(self, line: str) -> Program:
+        """The line in a terminal, as a person types it."""
+        words = line.replace('psd-deflection', shlex.join(PSD_DEFLECTION), 1) if line.startswith('psd-') else line
+        return Program(['bash', '-c', f'exec {words}'], self._folder, terminal=True, wait_s=WAIT_S)
 
     def _to_the_end(self, line: str, verdict: str = '') -> None:
-        program = Terminal(line, self._folder)
-        status = program.finish()
+        program = self._start(line)
+        status = program.wait()
         judged = verdict != '' and re.search(verdict, program.text) and 'Traceback' not in program.text
         if status != 0 and not judged:
             raise RuntimeError(f'exit status {status}\n{program.text[-2000:]}')
 
-    def _live(self, line: str, record: bool = False, page: bool = False) -> None:
-        # What `ros2 run` does: it looks the executable up and becomes it.
-        line = re.sub(r'^ros2 run psd_deflection ', f'{os.environ["VIRTUAL_ENV"]}/lib/psd_deflection/', line)
-        record = record or '--record' in line or line == 'make run'
-        page = page or ' monitor' in line or '--monitor' in line or line == 'make run'
-        program = Terminal(line, self._folder)
+    def _live(self, line: str) -> None:
+        record = re.search(r'--record|record:=true|^make run$', line) is not None
+        page = re.search(r' monitor|--monitor|monitor:=true|^make run$', line) is not None
+        program = self._start(line)
         try:
             if '--serve' in line:
-                self._served = program.until(r'port: (\S+)\s')[1]
+                self._served = program.until(r'port: (\S+)')[1]
                 self._background.append(program)
                 return
             if page:
-                url = program.until(r'monitor: (http://[^\s#]+)[\s#]')[1]
+                url = program.until(r'monitor: (http://[^\s#]+)')[1]
                 with urllib.request.urlopen(url, timeout=WAIT_S) as answer:
                     if b'psd_deflection monitor' not in answer.read():
                         raise RuntimeError('the address that it prints has another page')
@@ -302,20 +287,15 @@ class Reader:
         except RuntimeError as error:
             program.end()
             raise RuntimeError(f'{error}\n{program.text[-2000:]}') from None
-        # make itself is ended by Ctrl-C too.
-        if (status != 0 and not line.startswith('make')) or 'Traceback' in program.text:
+        # make and launch themselves are ended by Ctrl-C too.
+        if (status != 0 and not line.startswith(('make', 'ros2 launch'))) or 'Traceback' in program.text:
             raise RuntimeError(f'exit status {status} after Ctrl-C\n{program.text[-2000:]}')
         if record and 'replay it:' not in program.text:
             raise RuntimeError(f'no recording was made\n{program.text[-2000:]}')
 
-    def _node(self) -> None:
-        if not self._background:
-            self._background.append(Terminal('psd-deflection estimator', self._folder))
-            self._background[-1].until(r'θ +[-+]\d')
-
     def _press(self, line: str) -> None:
         if not self._background:
-            self._background.append(Terminal('psd-deflection monitor --control', self._folder))
+            self._background.append(self._start('psd-deflection monitor --control'))
             self._background[-1].until(r'θ +[-+]\d')
         url = self._background[-1].until(r'monitor: (http://[^\s#]+)/')[1]
         line = line.replace('http://127.0.0.1:8790', url)
@@ -326,11 +306,9 @@ class Reader:
             raise RuntimeError(done.stdout)
 
     def close(self) -> None:
-        """Pull the plugs."""
+        """Pull the plug."""
         if self._device is not None:
             self._device.end()
-        if self._machine is not None:
-            self._machine.close()
 
 
 @contextlib.contextmanager
@@ -392,18 +370,21 @@ def main() -> int:
             if failed:
                 print(failed, flush=True)
 
+        passed_over: dict[str, list[str]] = {}
         try:
             for block in blocks_to_run():
                 lines = [c.line for c in block if only in f'{c.page}: {c.line}']
                 for line in [*lines]:
                     if missing := what_is_missing(line):
                         lines.remove(line)
-                        # Where a machine may be made, nothing else is missing either.
-                        failures += machine.wanted()
-                        print(f'passed over, for want of {missing}: {line}')
+                        passed_over.setdefault(missing, []).append(line)
+                        failures += os.environ.get('NEED_TOOLS') == '1' and missing not in NEVER_HERE
                 reader.block(lines, ran)
         finally:
             reader.close()
+        for missing, lines in passed_over.items():
+            where = ', run by the apt job of .github/workflows/ci.yml' if missing == 'ros2' else ''
+            print(f'not run here, for want of {missing}{where}: {"; ".join(lines)}')
     for pattern in stale():
         failures += 1
         print(f'FAILED: nothing in the documents is like {pattern} any more')

@@ -14,7 +14,6 @@ import os
 import random
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -23,12 +22,12 @@ from pathlib import Path
 from rosbags.rosbag2 import Reader
 
 from psd_deflection.config import Rig, load_rig
-from psd_deflection.recordings.opening import open_recording
-from psd_deflection.recordings.recover import recover
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.repair import recover
 from psd_deflection.runner.session import Session
+from tools.program import PSD_DEFLECTION, WAIT_S, Program
 
 ALLOWED_S = 1.0
-WAIT_S = 60.0
 
 
 def daemon(rig: Rig) -> None:
@@ -81,14 +80,8 @@ def main() -> int:
     chance = random.Random(args.seed)
     with tempfile.TemporaryDirectory() as name:
         bags = Path(name) / 'bags'
-        rig_process = subprocess.Popen(
-            [sys.executable, '-m', 'psd_deflection', 'simulate', '--serve'],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
-        assert rig_process.stdout is not None
-        port = rig_process.stdout.readline().removeprefix('port: ').strip()
+        rig_process = Program([*PSD_DEFLECTION, 'simulate', '--serve'])
+        port = rig_process.until('port: (.+)')[1]
         rotating = {'bag_max_duration': 0.7}
         lost = []
         try:
@@ -99,8 +92,7 @@ def main() -> int:
                 lost.append(judge(folder, killed_ns))
                 shutil.rmtree(bags)
         finally:
-            rig_process.send_signal(signal.SIGINT)
-            rig_process.wait(WAIT_S)
+            rig_process.end()
     worst = max(lost)
     print(
         f'{len(lost)} kills: all opened, all recovered, all read by rosbags; '

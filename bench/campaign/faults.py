@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -29,10 +27,10 @@ from sensor_msgs.msg import PointCloud2
 
 from bench.campaign.kinds import FAULTS, Fault
 from bench.campaign.line import DIGIT, VOLTS_PER_COUNT, Line, identities
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
+from tools.program import PSD_DEFLECTION, Program
 
 START_S = 300.0
-END_S = 60.0
 RECOVER_S = 5.0
 BACK_S = 1.0
 """A device that is back is read again within this."""
@@ -180,33 +178,28 @@ def main() -> int:
         os.environ['XDG_STATE_HOME'] = os.environ['ROS_LOG_DIR'] = str(folder)
         line = Line(folder)
         arguments = ['--port', f'{folder}/port*', '--record', str(folder / 'bags')]
-        node = subprocess.Popen(
-            [sys.executable, '-m', 'psd_deflection', 'estimator', *arguments],
-            stderr=(folder / 'said').open('w'),
-            start_new_session=True,
-        )
+        node = Program([*PSD_DEFLECTION, 'estimator', *arguments])
         witness = Witness()
         rows = [Row(f) for f in chosen]
         try:
             if not witness.spin_until(lambda: witness.newest > 2000 and witness.reports > 2, START_S):
-                raise SystemExit((folder / 'said').read_text())
+                raise SystemExit(node.text)
             start = line.next_identity()
             for number in range(args.times):
                 for row in rows:
-                    inject(row, line, witness, node.pid)
+                    inject(row, line, witness, node.process.pid)
                 print(f'round {number + 1} of {args.times}', file=sys.stderr, flush=True)
             end = line.next_identity()
             witness.spin_until(lambda: witness.newest > end + 100, 10.0)
             counters = witness.next_report()
             print({k: v for k, v in counters.items() if 'drop' in k or 'lost' in k or k == 'disconnects'})
         finally:
-            node.send_signal(signal.SIGINT)
-            node.wait(END_S)
+            node.end()
             line.close()
         (recording,) = (folder / 'bags').iterdir()
         good = report(rows, lost_samples(rows, line, recording, start, end))
         if not good:
-            print((folder / 'said').read_text()[-6000:], file=sys.stderr)
+            print(node.text[-6000:], file=sys.stderr)
     rclpy.shutdown()
     return 0 if good else 1
 

@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import serial
@@ -17,6 +17,9 @@ from cobs import cobs
 
 from bench.campaign.line import Line, hello_of
 from psd_deflection.protocol.frames import encode
+
+Act = Callable[[Line, int], None]
+"""What a fault does to the line, or to the node with that process id."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +31,7 @@ class Fault:
     """
 
     name: str
-    act: Callable[[Line, int], None]
+    act: Act
     seen: tuple[str, ...]
     estimates: bool = False
     back: bool = False
@@ -45,27 +48,51 @@ def pause(seconds: float) -> None:
     time.sleep(seconds)
 
 
-def _wire(line: Line, wire: Callable[[int, bytes], bytes | None], seconds: float) -> None:
-    with line.lock:
-        line.wire = wire
-    pause(seconds)
-    with line.lock:
-        line.wire = None
+def _while(seconds: float, **attributes: object) -> Act:
+    """The line has these attributes for that long."""
+
+    def act(line: Line, pid: int) -> None:
+        with line.lock:
+            before = {name: getattr(line, name) for name in attributes}
+            _set(line, attributes)
+        pause(seconds)
+        with line.lock:
+            _set(line, before)
+
+    return act
 
 
-def _once(change: Callable[[Line, bytes], bytes], seconds: float = 0.03) -> Callable[[Line, int], None]:
+def _set(line: Line, attributes: Mapping[str, object]) -> None:
+    for name, value in attributes.items():
+        setattr(line, name, value)
+
+
+def _changed(change: Callable[[Line, bytes], bytes | None], seconds: float) -> Act:
+    """Each frame goes through ``change``; None leaves it as it is."""
+    return lambda line, pid: _while(seconds, wire=lambda identity, frame: change(line, frame))(line, pid)
+
+
+def _once(change: Callable[[Line, bytes], bytes]) -> Act:
     """Change one frame."""
 
     def act(line: Line, pid: int) -> None:
-        done: list[int] = []
+        first = iter((change,))
 
-        def wire(identity: int, frame: bytes) -> bytes | None:
-            if done:
-                return None
-            done.append(identity)
-            return change(line, frame)
+        def wire(line: Line, frame: bytes) -> bytes | None:
+            todo = next(first, None)
+            return todo(line, frame) if todo is not None else None
 
-        _wire(line, wire, seconds)
+        _changed(wire, 0.03)(line, pid)
+
+    return act
+
+
+def _injected(make: Callable[[Line], bytes], seconds: float = 0.03) -> Act:
+    """Bytes between two frames."""
+
+    def act(line: Line, pid: int) -> None:
+        line.inject(make(line))
+        pause(seconds)
 
     return act
 
@@ -84,24 +111,34 @@ def _flip(line: Line, frame: bytes) -> bytes:
     return bytes(out)
 
 
-def _body(line: Line, payload: bytes) -> bytes:
+def _flip_a_tenth(line: Line, frame: bytes) -> bytes | None:
+    return _flip(line, frame) if line.random.random() < 0.1 else None
+
+
+def _noise(line: Line) -> bytes:
+    return b'\x00' + bytes(line.random.getrandbits(8) for _ in range(64)) + b'\x00'
+
+
+def _sealed(payload: bytes) -> bytes:
+    """A frame of any content, with the right CRC."""
     sealed: bytes = cobs.encode(payload + zlib.crc32(payload).to_bytes(4, 'little')) + b'\x00'
     return sealed
 
 
-def _replug(line: Line, pid: int) -> None:
-    line.unplug()
-    pause(0.1)
-    line.plug(line.name)
+def _replugged(after_s: float = 0.1, names: tuple[str, str] | None = None, restart: bool = False) -> Act:
+    """Unplugged for ``after_s``; then under its name, or under that of ``names`` which it had not."""
+
+    def act(line: Line, pid: int) -> None:
+        line.unplug()
+        if restart:
+            line.restart()
+        pause(after_s)
+        line.plug(line.name if names is None else names[line.name == names[0]])
+
+    return act
 
 
-def _replug_elsewhere(line: Line, pid: int) -> None:
-    line.unplug()
-    pause(0.1)
-    line.plug('port_b' if line.name == 'port' else 'port')
-
-
-def _replug_beside_another(line: Line, pid: int) -> None:
+def _replugged_beside_another(line: Line, pid: int) -> None:
     old = line.name
     line.unplug()
     other = Line(line.folder, old)
@@ -115,19 +152,6 @@ def _replug_beside_another(line: Line, pid: int) -> None:
 
     # The time to recover counts from here, with the other one still there.
     threading.Thread(target=leave, daemon=True).start()
-
-
-def _replug_late(line: Line, pid: int) -> None:
-    line.unplug()
-    pause(1.5)
-    line.plug(line.name)
-
-
-def _replug_restarted(line: Line, pid: int) -> None:
-    line.unplug()
-    line.restart()
-    pause(0.1)
-    line.plug(line.name)
 
 
 def _held_by_another(line: Line, pid: int) -> None:
@@ -158,41 +182,14 @@ def _stolen_bytes(line: Line, pid: int) -> None:
 
 
 def _wrong_baud(line: Line, pid: int) -> None:
-    _wire(line, lambda identity, frame: bytes(line.random.getrandbits(8) or 1 for _ in frame), 0.3)
+    _changed(lambda line, frame: bytes(line.random.getrandbits(8) or 1 for _ in frame), 0.3)(line, pid)
     line.inject(b'\x00')
-
-
-def _flips(line: Line, pid: int) -> None:
-    _wire(line, lambda identity, frame: _flip(line, frame) if line.random.random() < 0.1 else None, 0.2)
-
-
-def _garbage(line: Line, pid: int) -> None:
-    line.inject(b'\x00' + bytes(line.random.getrandbits(8) for _ in range(64)) + b'\x00')
-    pause(0.03)
-
-
-def _endless(line: Line, pid: int) -> None:
-    line.inject(b'\x55' * 2000 + b'\x00')
-    pause(0.03)
-
-
-def _zeros(line: Line, pid: int) -> None:
-    line.inject(b'\x00' * 200)
-    _garbage(line, pid)
-
-
-def _duplicate(line: Line, frame: bytes) -> bytes:
-    return frame * 2
 
 
 def _duplicates(line: Line, pid: int) -> None:
     kept: list[bytes] = []
-
-    def wire(identity: int, frame: bytes) -> bytes | None:
-        kept.append(frame)
-        return None
-
-    _wire(line, wire, 0.03)
+    # append() returns None: the frames go on as they are.
+    _changed(lambda line, frame: kept.append(frame), 0.03)(line, pid)
     line.inject(b''.join(kept[-30:]))
     pause(0.02)
 
@@ -212,32 +209,22 @@ def _swapped(line: Line, pid: int) -> None:
             line.taken_by_fault.discard(identity)
         return None
 
-    with line.lock:
-        line.wire = wire
-    pause(0.02)
-    with line.lock:
-        line.wire = None
+    _while(0.02, wire=wire)(line, pid)
     line.inject(waiting[0] if waiting else b'')
     pause(0.01)
 
 
-def _jump(samples: int, seconds: float = 0.05) -> Callable[[Line, int], None]:
+def _jump(samples: int, us: int) -> Act:
+    """The device's numbers and its clock go on elsewhere."""
+
     def act(line: Line, pid: int) -> None:
-        line.jump(samples, samples * 1000)
-        pause(seconds)
-
-    return act
-
-
-def _clock(us: int) -> Callable[[Line, int], None]:
-    def act(line: Line, pid: int) -> None:
-        line.jump(0, us)
+        line.jump(samples, us)
         pause(0.05)
 
     return act
 
 
-def _restart(seq: int = 0) -> Callable[[Line, int], None]:
+def _restart(seq: int = 0) -> Act:
     def act(line: Line, pid: int) -> None:
         line.restart(seq, 0)
         line.inject(encode(hello_of()))
@@ -248,27 +235,9 @@ def _restart(seq: int = 0) -> Callable[[Line, int], None]:
 
 def _overrun(line: Line, pid: int) -> None:
     with line.lock:
-        line.mute = True
+        # The first sample after the silence carries the flag.
+        line.mute, line.flags = True, 2
     pause(0.03)
-    with line.lock:
-        line.mute, line.flags = False, 2
-
-
-def _stall(seconds: float) -> Callable[[Line, int], None]:
-    def act(line: Line, pid: int) -> None:
-        with line.lock:
-            line.hold = True
-        pause(seconds)
-        with line.lock:
-            line.hold = False
-
-    return act
-
-
-def _silent(line: Line, pid: int) -> None:
-    with line.lock:
-        line.mute = True
-    pause(2.4)
     with line.lock:
         line.mute = False
 
@@ -287,73 +256,54 @@ def _frozen_node(line: Line, pid: int) -> None:
     os.kill(pid, signal.SIGCONT)
 
 
-def _optics(channels: dict[int, int], seconds: float = 0.15) -> Callable[[Line, int], None]:
-    def act(line: Line, pid: int) -> None:
-        with line.lock:
-            line.optics = channels
-        pause(seconds)
-        with line.lock:
-            line.optics = {}
-
-    return act
-
-
-def _frozen_psd(line: Line, pid: int) -> None:
-    # PSD 2 stands still, but for the identity that it carries: keep that constant by its slow digit.
-    with line.lock:
-        line.freeze = True
-    pause(0.25)
-    with line.lock:
-        line.freeze = False
-
-
-def _frame(payload: bytes) -> Callable[[Line, int], None]:
-    def act(line: Line, pid: int) -> None:
-        line.inject(_body(line, payload))
-        pause(0.03)
-
-    return act
+def _dark(channel: int, counts: int) -> Act:
+    return _while(0.15, optics={channel: counts})
 
 
 FAULTS: tuple[Fault, ...] = (
-    Fault('unplugged, back under its name', _replug, AWAY, back=True),
-    Fault('unplugged, back under another name', _replug_elsewhere, AWAY, back=True),
-    Fault('unplugged, another device on its port, back elsewhere', _replug_beside_another, AWAY, back=True),
-    Fault('unplugged for 1.5 s', _replug_late, AWAY, back=True),
-    Fault('unplugged and restarted', _replug_restarted, AWAY, back=True),
+    Fault('unplugged, back under its name', _replugged(), AWAY, back=True),
+    Fault('unplugged, back under another name', _replugged(names=('port', 'port_b')), AWAY, back=True),
+    Fault('unplugged, another device on its port, back elsewhere', _replugged_beside_another, AWAY, back=True),
+    Fault('unplugged for 1.5 s', _replugged(1.5), AWAY, back=True),
+    Fault('unplugged and restarted', _replugged(restart=True), AWAY, back=True),
     Fault('back while another program has the port', _held_by_another, AWAY, back=True),
     Fault('another program reads from the port', _stolen_bytes, ('lost', 'bad frames')),
     Fault('wrong baud rate for 0.3 s', _wrong_baud, BAD),
-    Fault('64 bytes of garbage', _garbage, BAD),
-    Fault('2000 bytes without an end', _endless, BAD),
-    Fault('zeros and garbage', _zeros, BAD),
+    Fault('64 bytes of garbage', _injected(_noise), BAD),
+    Fault('2000 bytes without an end', _injected(lambda line: b'\x55' * 2000 + b'\x00'), BAD),
+    Fault('zeros and garbage', _injected(lambda line: b'\x00' * 200 + _noise(line)), BAD),
     Fault('frame truncated', _once(lambda line, f: f[: line.random.randrange(2, len(f) - 1)] + b'\x00'), BAD),
     Fault('frame without its closing zero', _once(_merged), BAD),
     Fault('frame split by a zero', _once(lambda line, f: f[:9] + b'\x00' + f[9:]), BAD),
     Fault('one bit flipped', _once(_flip), BAD),
-    Fault('a tenth of the frames flipped for 0.2 s', _flips, BAD),
-    Fault('frame duplicated', _once(_duplicate), ('repeated',)),
+    Fault('a tenth of the frames flipped for 0.2 s', _changed(_flip_a_tenth, 0.2), BAD),
+    Fault('frame duplicated', _once(lambda line, f: f * 2), ('repeated',)),
     Fault('30 frames duplicated', _duplicates, ('repeated',)),
     Fault('frame late, out of order', _swapped, ('repeated', 'lost')),
     Fault('frame lost without a trace', _once(lambda line, f: b''), ('lost',)),
-    Fault('numbers jump by 7', _jump(7), ('lost',)),
-    Fault('numbers jump by 100,000', _jump(100_000), ('lost',)),
+    Fault('numbers jump by 7', _jump(7, 7_000), ('lost',)),
+    Fault('numbers jump by 100,000', _jump(100_000, 100_000_000), ('lost',)),
     Fault('device restarts', _restart(), ('device restarts',)),
     Fault('device restarts 50 before 2^32', _restart(2**32 - 50), ('device restarts',)),
-    Fault('device clock jumps ahead 10 s', _clock(10_000_000), ('device clock jumps',)),
-    Fault('device clock jumps back 10 s', _clock(-10_000_000), ('device clock jumps', 'device restarts')),
+    Fault('device clock jumps ahead 10 s', _jump(0, 10_000_000), ('device clock jumps',)),
+    Fault('device clock jumps back 10 s', _jump(0, -10_000_000), ('device clock jumps', 'device restarts')),
     Fault('device overrun of 30 samples', _overrun, ('lost: dropped by the device',)),
-    Fault('port stalled for 0.3 s', _stall(0.3), ()),
-    Fault('port stalled for 1 s', _stall(1.0), ()),
-    Fault('device silent for 2.4 s', _silent, ('silences',)),
+    Fault('port stalled for 0.3 s', _while(0.3, hold=True), ()),
+    Fault('port stalled for 1 s', _while(1.0, hold=True), ()),
+    Fault('device silent for 2.4 s', _while(2.4, mute=True), ('silences',)),
     Fault('device stopped until it is woken', _stopped, ('silences',)),
     Fault('node stopped for 0.3 s (SIGSTOP)', _frozen_node, ()),
-    Fault('unknown frame type', _frame(b'\x7fhello'), BAD),
-    Fault('sample of a wrong length, right CRC', _frame(b'\x01' + b'\x00' * 11), BAD),
-    Fault('HELLO that is no JSON', _frame(b'\x10\x01{not json'), BAD),
+    Fault('unknown frame type', _injected(lambda line: _sealed(b'\x7fhello')), BAD),
+    Fault('sample of a wrong length, right CRC', _injected(lambda line: _sealed(b'\x01' + b'\x00' * 11)), BAD),
+    Fault('HELLO that is no JSON', _injected(lambda line: _sealed(b'\x10\x01{not json')), BAD),
     Fault('HELLO of another rate', lambda line, pid: line.inject(encode(hello_of(rate=500.0))), ()),
-    Fault('laser 1 off', _optics({2: 3}), ('refused: laser_lost',), estimates=True),
-    Fault('laser 2 off', _optics({5: -2}), ('refused: laser_lost',), estimates=True),
-    Fault('y1 saturated', _optics({1: 32767}), ('refused: saturated',), estimates=True),
-    Fault('psd_2 stands still', _frozen_psd, ('refused: frozen', 'found: psd_2 stands still'), estimates=True),
+    Fault('laser 1 off', _dark(2, 3), ('refused: laser_lost',), estimates=True),
+    Fault('laser 2 off', _dark(5, -2), ('refused: laser_lost',), estimates=True),
+    Fault('y1 saturated', _while(0.15, optics={1: 32767}), ('refused: saturated',), estimates=True),
+    Fault(
+        'psd_2 stands still',
+        _while(0.25, freeze=True),
+        ('refused: frozen', 'found: psd_2 stands still'),
+        estimates=True,
+    ),
 )

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.devices.simulated_device import PseudoTerminal
+from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.protocol.frames import (
     FrameDecoder,
     HelloFrame,

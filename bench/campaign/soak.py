@@ -17,8 +17,6 @@ import math
 import os
 import random
 import resource
-import signal
-import subprocess
 import sys
 import tempfile
 import threading
@@ -30,7 +28,7 @@ import numpy as np
 
 from bench.campaign.line import hello_of
 from psd_deflection.config import load_rig
-from psd_deflection.devices.simulated_device import PseudoTerminal
+from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.protocol.frames import (
     FrameDecoder,
@@ -42,14 +40,14 @@ from psd_deflection.protocol.frames import (
     StatusFrame,
     encode,
 )
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import IntArray
-from psd_deflection.runner.acquisition import Acquisition, Chunk
+from psd_deflection.runner.acquisition import Acquisition, Arrival
+from tools.program import PSD_DEFLECTION, Program
 
 SKEW = 30e-6
 MS = 1_000_000
 START_S = 300.0
-END_S = 60.0
 SETTLED_S = 180
 ALLOWED_STD_NS = 50_000
 ALLOWED_GROWTH = 2_000_000
@@ -189,11 +187,7 @@ def real_time(minutes: float) -> bool:
         os.environ['XDG_STATE_HOME'] = os.environ['ROS_LOG_DIR'] = name
         device = PolledDevice(folder)
         arguments = ['--port', f'{folder}/port', '--record', str(folder / 'bags')]
-        node = subprocess.Popen(
-            [sys.executable, '-m', 'psd_deflection', 'estimator', *arguments],
-            stderr=(folder / 'said').open('w'),
-            start_new_session=True,
-        )
+        node = Program([*PSD_DEFLECTION, 'estimator', *arguments])
         rclpy.init()
         witness = rclpy.create_node('soak')
         poses = [0]
@@ -208,16 +202,15 @@ def real_time(minutes: float) -> bool:
             deadline = time.monotonic() + START_S
             while not poses[0]:
                 rclpy.spin_once(witness, timeout_sec=0.5)
-                if node.poll() is not None or time.monotonic() > deadline:
-                    raise SystemExit((folder / 'said').read_text())
+                if node.process.poll() is not None or time.monotonic() > deadline:
+                    raise SystemExit(node.text)
             began = time.monotonic()
-            while (passed := time.monotonic() - began) < minutes * 60.0 and node.poll() is None:
+            while (passed := time.monotonic() - began) < minutes * 60.0 and node.process.poll() is None:
                 rclpy.spin_once(witness, timeout_sec=0.5)
                 if passed > warm_up and (not memory or passed - memory[-1][0] > 5.0):
-                    memory.append((passed, resident(node.pid)))
+                    memory.append((passed, resident(node.process.pid)))
         finally:
-            node.send_signal(signal.SIGINT)
-            node.wait(END_S)
+            node.end()
             device.close()
         rclpy.shutdown()
         (bag,) = (folder / 'bags').iterdir()
@@ -266,10 +259,10 @@ def simulated_time(hours: float) -> bool:
             arrival = -(-true_last // MS) * MS + 200_000 + read
             size = 20 * (FRAME.itemsize + 2)
             piece = wire[number * size : (number + 1) * size]
-            acquisition.feed(decoder.feed(piece + (once_a_second if number == 0 else b'')), arrival)  # type: ignore[arg-type]
+            acquisition.feed(decoder.feed(piece + (once_a_second if number == 0 else b'')), arrival)
             while not acquisition.queue.empty():
                 item = acquisition.queue.get()
-                if isinstance(item, Chunk):
+                if isinstance(item, Arrival):
                     blocks += 1
                     present += len(item.raw.seq)
                     for _ in pipeline.process(item.raw):

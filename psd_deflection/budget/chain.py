@@ -18,7 +18,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from psd_deflection.config import Rig
-from psd_deflection.mechanics.dots import tied_pose
+from psd_deflection.geometry.plate import tied_pose
+from psd_deflection.geometry.rays import hit, lifted, rotation
 from psd_deflection.records import FloatArray
 
 
@@ -76,46 +77,20 @@ class Chain:
         return cls(rig.centers, rig.heights, rig.zeros, half_area, rig.link.length, slope_ratio)
 
 
-def _turn(phi: FloatArray, omega: FloatArray, theta: FloatArray) -> FloatArray:
-    """Ry(omega) Rx(phi) Rz(theta), (..., 3, 3)."""
-    phi, omega, theta = np.broadcast_arrays(phi, omega, theta)
-    cp, sp, co, so = np.cos(phi), np.sin(phi), np.cos(omega), np.sin(omega)
-    ct, st = np.cos(theta), np.sin(theta)
-    rows = [
-        [co * ct + so * sp * st, so * sp * ct - co * st, so * cp],
-        [cp * st, cp * ct, -sp],
-        [co * sp * st - so * ct, co * sp * ct + so * st, co * cp],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def _lift(across: FloatArray, z: FloatArray | float) -> FloatArray:
-    """(..., 3) from (..., 2) and z (...)."""
-    shape = np.broadcast_shapes(across.shape[:-1], np.shape(z))
-    return np.concatenate(
-        [np.broadcast_to(across, (*shape, 2)), np.broadcast_to(z, shape)[..., None]], axis=-1, dtype=np.float64
-    )
-
-
 def dots(chain: Chain, pose: FloatArray, dz: float = 0.0) -> FloatArray:
     """(n, P, 2), m: where the dots lie in each sensor's own axes at ``pose`` (3,): dX, dY, theta.
 
     ``dz``: the tip's shortening, m; matters to inclined beams only.
     """
     tilted = tied_pose(pose, chain.slope_ratio, chain.link_length)
-    plate = _turn(tilted[..., 3], tilted[..., 4], tilted[..., 2])[:, None]
-    own = _turn(chain.tilt[..., 0], chain.tilt[..., 1], chain.rotation)
-    centre = _lift(chain.centers + chain.center_error, chain.heights + chain.height_error)
+    plate = rotation(tilted[..., 2], tilted[..., 3], tilted[..., 4])[:, None]
+    own = rotation(chain.rotation, chain.tilt[..., 0], chain.tilt[..., 1])
+    centre = lifted(chain.centers + chain.center_error, chain.heights + chain.height_error)
     start = centre + np.einsum('...ij,...j->...i', own[..., :2], chain.zeros)
-    start = start + _lift(chain.beam_shift, 0.0)
-    along = _lift(chain.beam_slope, 1.0)
-    moved = centre + _lift(chain.center_shift, 0.0)
+    start = start + lifted(chain.beam_shift, 0.0)
+    moved = centre + lifted(chain.center_shift, 0.0)
     origin = np.einsum('...ij,...j->...i', plate, moved) + np.array([pose[0], pose[1], dz])
-    sensor = plate @ own
-    normal = sensor[..., 2]
-    reach = np.sum(normal * (origin - start), axis=-1) / np.sum(normal * along, axis=-1)
-    hit = start + reach[..., None] * along - origin
-    return np.asarray(np.einsum('...ji,...j->...i', sensor, hit)[..., :2])
+    return hit(start, lifted(chain.beam_slope, 1.0), origin, plate @ own)
 
 
 def clipped(places: FloatArray, diameter: FloatArray, half_area: FloatArray) -> FloatArray:

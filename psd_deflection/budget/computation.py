@@ -1,4 +1,4 @@
-"""E_C, what the method itself gets wrong on perfect readings (last row of Table 3.1; 3.9 ... 3.18 corrected).
+"""E_C, what the method itself gets wrong on perfect readings (last row of Table 3.1; 3.9, 3.10 corrected).
 
 An exact method: nothing. Least squares of chapter 4 linearises: theta comes out as its sine and d
 unturned, d^ - d = -theta z x d + theta^2 l/2. The iteration of section 2.2 stops at the first trial angle
@@ -16,24 +16,6 @@ from psd_deflection.budget.chain import Chain, measure
 from psd_deflection.budget.term import Cause, Contribution, Kind, Situation
 from psd_deflection.errors import ConfigError
 from psd_deflection.records import FloatArray
-
-
-def twist_of_residuals(
-    points: FloatArray, beams: FloatArray, residual_x: float = 0.0, residual_y: float = 0.0
-) -> float:
-    """The angle at which the two sensors disagree by the given residuals, rad (3.16 with its sign put right).
-
-    ``points`` and ``beams`` (2, 2) m: q_i, l_i; residuals m: of R(theta)(q_1 - q_2) - (l_1 - l_2). With
-    D = q_1 - q_2 and E = l_1 - l_2 + residual, sin theta = (D x E)/D^2. The residuals are not
-    independent of each other near the truth (T_x = -E_y delta, T_y = E_x delta), so as a bound on the
-    stop window this averages them: see :func:`stop_window`. Raises ConfigError where the points coincide.
-    """
-    across = points[0] - points[1]
-    target = beams[0] - beams[1] + np.array([residual_x, residual_y])
-    square = float(across @ across)
-    if square == 0.0:
-        raise ConfigError('the two dots coincide: the twist cannot be seen')
-    return math.asin(max(-1.0, min(1.0, float(across[0] * target[1] - across[1] * target[0]) / square)))
 
 
 def stop_window(beams: FloatArray, tolerance: float) -> float:
@@ -95,6 +77,6 @@ COMPUTATION = Computation()
 
 
 def perfect_answer(at: Situation) -> FloatArray:
-    """(3,): the estimator's answer where the chain is as the estimator models it."""
+    """(3,): the estimator's answer if the chain is as the estimator models it."""
     chain = replace(at.chain, slope_ratio=np.array([at.estimator.slope_ratio]))
     return np.asarray(at.estimator.estimate(*measure(chain, at.pose))[0])

@@ -2,7 +2,7 @@
 
 Each takes readings and stored zeros, (n, P, 2) m, and gives (n, 3): dX, dY, theta. Its ``response`` is
 the Jacobian of that answer by readings and by zeros at a true pose, (3, 2P) each: for the exact
-methods S = (J^T J)^-1 J^T with J the Jacobian of the exact model, and -S M^-1 for the zeros, because
+methods S = (J^T J)^-1 J^T with J the Jacobian of the exact model, and -S dq/dl for the zeros, because
 a zero moves the beam that it stands for.
 """
 
@@ -12,12 +12,14 @@ import abc
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError
-from psd_deflection.mechanics.dots import beam_jacobian, plate_jacobian, plate_points, tie_matrix, tied_pose
-from psd_deflection.mechanics.placement import design_matrix, gain_matrix
+from psd_deflection.geometry.linear import design_matrix, gain_matrix
+from psd_deflection.geometry.plate import crossings, flat_poses, tie_matrix, tied_pose
 from psd_deflection.records import FloatArray
+from psd_deflection.solvers.registry import solver_class
 
 
 class Estimator(abc.ABC):
@@ -50,15 +52,15 @@ class ExactEstimator(Estimator):
     def estimate(self, readings: FloatArray, zeros: FloatArray) -> FloatArray:
         """As declared."""
         points, beams = self.centers + readings, self.centers + zeros
-        pose = _register(points, beams)
+        pose = flat_poses(points, beams)
         if self.slope_ratio == 0.0:
             return pose
         tie = tie_matrix(self.slope_ratio, self.link_length)
         # Six steps take any pose in a sensor's range to rounding: the start is off by the tilt alone.
         for _ in range(6):
             full = tied_pose(pose, self.slope_ratio, self.link_length)
-            model = plate_points(full, beams, self.heights)
-            jacobian = _rows(plate_jacobian(full, model, self.heights)) @ tie
+            model, slopes = crossings(full, beams, self.heights)
+            jacobian = slopes.reshape(len(pose), -1, 5) @ tie
             residual = (points - model).reshape(len(pose), -1, 1)
             transposed = np.swapaxes(jacobian, -1, -2)
             pose = pose + np.linalg.solve(transposed @ jacobian, transposed @ residual)[..., 0]
@@ -67,10 +69,11 @@ class ExactEstimator(Estimator):
     def response(self, pose: FloatArray, zeros: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As declared."""
         full = tied_pose(pose, self.slope_ratio, self.link_length)
-        model = plate_points(full, self.centers + zeros, self.heights)
-        jacobian = _rows(plate_jacobian(full, model, self.heights)) @ tie_matrix(self.slope_ratio, self.link_length)
+        _, slopes = crossings(full, self.centers + zeros, self.heights)
+        jacobian = slopes.reshape(-1, 5) @ tie_matrix(self.slope_ratio, self.link_length)
         by_readings: FloatArray = np.asarray(np.linalg.pinv(jacobian), dtype=np.float64)
-        by_zeros = -by_readings @ np.kron(np.eye(len(self.centers)), beam_jacobian(full))
+        # A zero moves its beam, and beam and translation enter as their difference.
+        by_zeros = by_readings @ block_diag(*slopes[..., :2])
         return by_readings, np.asarray(by_zeros, dtype=np.float64)
 
 
@@ -78,7 +81,7 @@ class ExactEstimator(Estimator):
 class LinearEstimator(Estimator):
     """The thesis's direct method (4.24, 4.27) with the corrected A: linear in the displacement of the dots.
 
-    ``gain`` (3, 2P): what ``placement.gain_matrix`` gives.
+    ``gain`` (3, 2P): what ``geometry.linear.gain_matrix`` gives.
     """
 
     gain: FloatArray
@@ -96,19 +99,30 @@ class LinearEstimator(Estimator):
 METHODS = ('exact', 'beam', 'wls', 'thesis_iteration')
 """``exact``, ``beam``, ``wls``: the solvers of these names; ``thesis_iteration``: section 2.2 with its stop rule."""
 
-METHOD_OF_SOLVER = {'beam': 'beam', 'wls': 'wls', 'ols': 'wls'}
-"""The method by which a configured solver is budgeted; all others are exact on a flat plate."""
+
+def method_of(rig: Rig) -> str:
+    """The method by which the rig's own solver is budgeted, as that solver's class declares it.
+
+    Raises ConfigError for an unknown solver and for one whose errors no method has.
+    """
+    name = rig.estimator.solver
+    method = solver_class(name).budgeted_as
+    if method not in METHODS:
+        raise ConfigError(
+            f'solver = {name!r}: the budget has no model of its errors; name a method: {", ".join(METHODS)}'
+        )
+    return method
 
 
 def estimator_of(rig: Rig, method: str) -> Estimator:
     """The estimator of one of ``METHODS``.
 
     ``thesis_iteration`` gives the exact angle less what its stop rule leaves (``budget.computation``), so
-    it responds to errors as ``exact`` does. Raises ConfigError for another name, or where the two
+    it responds to errors as ``exact`` does. Raises ConfigError for another name, or if the two
     centres coincide.
     """
     if method not in METHODS:
-        raise ConfigError(f'--method = {method!r}: must be one of {", ".join(METHODS)}')
+        raise ConfigError(f'method = {method!r}: must be one of {", ".join(METHODS)}')
     if not np.any(rig.centers[0] != rig.centers[1]):
         raise ConfigError('psd_1.center and psd_2.center coincide: the twist cannot be seen')
     if method == 'wls':
@@ -116,20 +130,3 @@ def estimator_of(rig: Rig, method: str) -> Estimator:
         return LinearEstimator(gain_matrix(design_matrix(rig.centers + rig.zeros), scaling))
     slope_ratio = rig.link.slope_ratio if method == 'beam' else 0.0
     return ExactEstimator(rig.centers, rig.heights, rig.link.length, slope_ratio)
-
-
-def _rows(jacobian: FloatArray) -> FloatArray:
-    """(..., P, 2, 5) to (..., 2P, 5)."""
-    out: FloatArray = jacobian.reshape(*jacobian.shape[:-3], -1, jacobian.shape[-1])
-    return out
-
-
-def _register(points: FloatArray, beams: FloatArray) -> FloatArray:
-    points_mean, beams_mean = points.mean(axis=-2), beams.mean(axis=-2)
-    p, b = points - points_mean[..., None, :], beams - beams_mean[..., None, :]
-    cross = np.sum(p[..., 0] * b[..., 1] - p[..., 1] * b[..., 0], axis=-1)
-    theta = np.arctan2(cross, np.sum(p * b, axis=(-2, -1)))
-    c, s = np.cos(theta), np.sin(theta)
-    x, y = points_mean[..., 0], points_mean[..., 1]
-    moved = np.stack([c * x - s * y, s * x + c * y], axis=-1)
-    return np.concatenate([beams_mean - moved, theta[..., None]], axis=-1)

@@ -7,7 +7,6 @@ it is the first thing to replace by what is known of a real rig.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import cast
 import yaml
 
 from psd_deflection.config import MAX_FILE_BYTES
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.parameters import Parameter, check_value
 
 
@@ -123,22 +122,25 @@ INPUTS: tuple[Input, ...] = (
 INPUT_BY_NAME: Mapping[str, Input] = MappingProxyType({i.parameter.name: i for i in INPUTS})
 
 
-def read_inputs(path: str | Path | None = None, settings: Mapping[str, object] | None = None) -> dict[str, float]:
+def read_inputs(
+    path: str | Path | None = None, settings: Mapping[str, object] | None = None, source: str = 'settings'
+) -> dict[str, float]:
     """All inputs: the defaults, under those of a YAML file (``name: value`` lines), under ``settings``.
+
+    ``source``: where ``settings`` come from, for messages.
 
     Raises ConfigError naming the source, the input, the value and the bound.
     """
     values = {i.parameter.name: float(i.parameter.default) for i in INPUTS}
-    for source, given in ((str(path), _read(Path(path)) if path is not None else {}), ('--set', settings or {})):
+    for place, given in ((str(path), _read(Path(path)) if path is not None else {}), (source, settings or {})):
         for name, value in given.items():
             found = INPUT_BY_NAME.get(str(name))
             if found is None:
-                near = difflib.get_close_matches(str(name), INPUT_BY_NAME, n=1)
-                hint = f'; did you mean {near[0]}?' if near else ''
+                hint = did_you_mean(str(name), INPUT_BY_NAME)
                 raise ConfigError(
-                    f'{source}: {name} = {value!r}: no such input{hint} (`psd-deflection budget --explain` has all)'
+                    f'{place}: {name} = {value!r}: no such input{hint} (`psd-deflection budget --explain` has all)'
                 )
-            values[str(name)] = cast(float, check_value(found.parameter, value, source))
+            values[str(name)] = cast(float, check_value(found.parameter, value, place))
     return values
 
 

@@ -25,7 +25,7 @@ def beam_diameter(initial_diameter: float, wavelength: float, distance: float) -
 def refracted_angle(angle: float, index_1: float, index_2: float) -> float:
     """Snell's law (3.2): the angle to the normal in medium 2, rad, of a beam at ``angle`` in medium 1.
 
-    Raises ConfigError where the beam is reflected totally.
+    Raises ConfigError if the beam is reflected totally.
     """
     sine = math.sin(angle) * index_1 / index_2
     if abs(sine) > 1.0:
@@ -46,16 +46,6 @@ def gradient_shift(index_gradient: float, distance: float) -> float:
     What a beam along the link really meets; 3.4 gives nothing at normal incidence.
     """
     return index_gradient * distance**2 / 2.0
-
-
-def air_index_short(pressure: float, temperature: float, humidity: float, co2: float) -> float:
-    """Refractive index of air by the thesis's short form (3.3), corrected.
-
-    ``pressure`` Pa, ``temperature`` K, ``humidity`` %, ``co2`` ppm. In print the CO2 term is divided
-    by 1e-6 where it must be multiplied: n = 14678 at 400 ppm. Within 2e-7 of :func:`air_index`.
-    """
-    carbon = 1.0 + 0.54e-6 * (co2 - 300.0)
-    return 1.0 + 271.8e-6 * pressure / STANDARD_PRESSURE * 293.15 / temperature * carbon - 1e-8 * humidity
 
 
 def saturation_pressure(temperature: float) -> float:

@@ -59,11 +59,11 @@ class Situation:
 
     @classmethod
     def at_load(cls, rig: Rig, inputs: Mapping[str, float], load: tuple[float, float, float], method: str) -> Situation:
-        """At the pose of a tip load (Fx N, Fy N, Tz N m). Raises ConfigError where a dot leaves its sensor."""
+        """At the pose of a tip load (Fx N, Fy N, Tz N m). Raises ConfigError if a dot leaves its sensor."""
         pose = np.array(LinkStatics.from_rig(rig).deflection(*load))
         if not np.all(np.abs(pose) <= [rig.link.length, rig.link.length, math.pi]):
             raise ConfigError(
-                f'--load {load[0]:g} {load[1]:g} {load[2]:g}: the tip would move by more than the link is long '
+                f'load = {load[0]:g} {load[1]:g} {load[2]:g}: the tip would move by more than the link is long '
                 'or turn by more than half a turn: take a smaller load'
             )
         chain = Chain.of(rig)
@@ -73,7 +73,7 @@ class Situation:
         if not np.all(over <= 0.0):
             psd, axis = (int(i) for i in np.unravel_index(int(np.argmax(over)), over.shape))
             raise ConfigError(
-                f'--load {load[0]:g} {load[1]:g} {load[2]:g}: the dot of psd_{psd + 1} would lie at '
+                f'load = {load[0]:g} {load[1]:g} {load[2]:g}: the dot of psd_{psd + 1} would lie at '
                 f'{"xy"[axis]} = {places[0, psd, axis] * 1e3:.2f} mm, outside its '
                 f'+-{chain.half_area[psd, axis] * 1e3:g} mm: take a smaller load'
             )
@@ -116,7 +116,7 @@ class Cause(abc.ABC):
 
     @abc.abstractmethod
     def contribution(self, at: Situation) -> Contribution:
-        """What it does, to first and, where that is nothing, second order."""
+        """What it does, to first and, if that is nothing, second order."""
 
     @abc.abstractmethod
     def without(self, chain: Chain, at: Situation) -> Chain:
@@ -136,7 +136,7 @@ class Term(Cause):
     """A cause that acts on the measuring chain.
 
     ``deviations``: of its k error parameters, at a situation. ``apply``: the chain with values (n, k)
-    of them; for a known term the value is 1 where it is present and 0 where not.
+    of them; for a known term the value is 1 if it is present and 0 if not.
     """
 
     name: str

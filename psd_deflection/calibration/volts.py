@@ -10,10 +10,7 @@ import numpy.typing as npt
 
 from psd_deflection.calibration.sensors import Quadrant, Sensor, make_sensor
 from psd_deflection.config import Rig
-from psd_deflection.records import FloatArray
-
-_DOT_CHANNELS = (0, 1, 3, 4)
-"""Where x1, y1, x2, y2 are in ``records.CHANNELS``."""
+from psd_deflection.records import DOT_CHANNELS, FloatArray
 
 
 class SensorFlag(IntFlag):
@@ -57,7 +54,7 @@ class Calibration:
         """What the rig's parameters say."""
         return cls(
             sensitivity=rig.amplifier.sensitivity,
-            sensors=(make_sensor(rig.psd_1), make_sensor(rig.psd_2)),
+            sensors=(make_sensor(rig.psds[0]), make_sensor(rig.psds[1])),
             sum_min=rig.estimator.sum_min,
             full_scale=rig.converter.full_scale,
             step=rig.converter.volts_per_count,
@@ -69,7 +66,7 @@ class Calibration:
         Volts are those of an amplifier that divides by the sum: place over ``sensitivity``. A
         segmented sensor's bend is undone.
         """
-        dots = np.multiply(volts[:, _DOT_CHANNELS], self.sensitivity, dtype=np.float64)
+        dots = np.multiply(volts[:, DOT_CHANNELS], self.sensitivity, dtype=np.float64)
         for i, sensor in enumerate(self.sensors):
             if isinstance(sensor, Quadrant):
                 dots[:, 2 * i : 2 * i + 2] = sensor.from_linear(dots[:, 2 * i : 2 * i + 2])
@@ -88,7 +85,7 @@ class Calibration:
 
     def flags(self, volts: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
         """:class:`SensorFlag` of each sample and PSD, (n, 2); ``volts`` (n, 6) float32."""
-        dots = np.abs(np.multiply(volts[:, _DOT_CHANNELS], self.sensitivity, dtype=np.float64))
+        dots = np.abs(np.multiply(volts[:, DOT_CHANNELS], self.sensitivity, dtype=np.float64))
         # A converter at its end gives its last step, a little less than the full scale on one side.
         at_end = np.abs(volts) >= self.full_scale - 1.5 * self.step
         out = np.zeros((len(volts), 2), dtype=np.uint8)

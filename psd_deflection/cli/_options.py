@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+from psd_deflection.config import BY_NAME
 from psd_deflection.errors import ConfigError, RecordingError, UsageError
 
 _FOREIGN = """
@@ -54,6 +56,33 @@ def number(option: str, least: float, most: float) -> Callable[[str], float]:
     return read
 
 
+def parameter_option(parser: argparse._ActionsContainer, option: str, name: str) -> None:
+    """Add ``option``, which sets the parameter ``name``; its declaration says what it is, its type and its default.
+
+    :func:`given_parameters` has what was given.
+    """
+    p = BY_NAME[name]
+    text = p.description + (f' (default {p.default})' if p.default != '' else '')
+    parser.add_argument(
+        option,
+        dest=name,
+        type=int if p.kind == 'integer' else str,
+        metavar='N' if p.kind == 'integer' else option.strip('-').upper(),
+        help=text.replace('%', '%%'),
+    )
+
+
+def given_parameters(args: argparse.Namespace) -> dict[str, object]:
+    """What was given for options that bear a parameter's name; ``--record FOLDER`` sets ``bag_dir`` as well."""
+    values = {name: v for name, v in vars(args).items() if name in BY_NAME and v is not None and v is not False}
+    folder = values.get('record')
+    if folder is not None:
+        values['record'] = True
+    if folder:
+        values['bag_dir'] = folder
+    return values
+
+
 def recording_name(*, rerun: bool = False) -> Callable[[str], str]:
     """Reads the --out of a recording (an .rrd where ``rerun``) by its ending; what it gives raises UsageError."""
 
@@ -85,12 +114,18 @@ def need_folder(out: Path) -> None:
 
 
 @contextlib.contextmanager
-def given_as_option() -> Iterator[None]:
-    """A value that is refused within came as an option: a mistake of the command line (2), not of a file (3)."""
+def given_as_option(*parameters: str) -> Iterator[None]:
+    """A value that is refused within came as an option: a mistake of the command line (2), not of a file (3).
+
+    ``parameters`` have an option of their own: where the message says ``keep_out = ...`` it says ``--keep-out = ...``.
+    """
     try:
         yield
     except ConfigError as error:
-        raise UsageError(str(error)) from None
+        text = str(error)
+        for name in parameters:
+            text = re.sub(rf'\b{name}(?= = )', f'--{name.replace("_", "-")}', text)
+        raise UsageError(text) from None
 
 
 def refuse(args: argparse.Namespace, defaults: Mapping[str, object], why: str) -> None:

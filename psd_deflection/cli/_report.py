@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import math
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from psd_deflection.errors import RecordingError
+from psd_deflection.files import replace_file
 
 
 def columns(rows: Sequence[Sequence[str]], left: int = 1) -> str:
@@ -46,13 +46,7 @@ def save_figure(figure: Any, path: Path, **options: Any) -> None:
 
 def save(content: bytes, path: Path) -> None:
     """Write ``path`` whole or not at all; raises RecordingError where the disk refuses."""
-    # Where it leads, so that a symbolic link stays one.
-    place = path.resolve()
-    partial = place.with_name(place.name + '.partial')
     try:
-        partial.write_bytes(content)
-        partial.replace(place)
+        replace_file(path, content)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
         raise RecordingError(f'--out {path}: cannot be written ({error.strerror or error})') from None

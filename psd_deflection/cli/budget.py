@@ -26,7 +26,7 @@ from tqdm import tqdm
 from psd_deflection.budget import optics
 from psd_deflection.budget.computation import stop_window
 from psd_deflection.budget.environment import averaging_gain
-from psd_deflection.budget.estimate import METHOD_OF_SOLVER, METHODS
+from psd_deflection.budget.estimate import METHODS, method_of
 from psd_deflection.budget.evaluate import CAUSES, Budget, evaluate, monte_carlo
 from psd_deflection.budget.inputs import INPUTS, read_inputs
 from psd_deflection.budget.term import Contribution, Kind, Situation
@@ -92,17 +92,17 @@ def run(args: argparse.Namespace) -> int:
     # Of the file alone first, so that what is wrong in it is not laid to the options.
     read_inputs(args.inputs, {})
     with given_as_option():
-        inputs = read_inputs(args.inputs, _settings(args.set))
+        inputs = read_inputs(args.inputs, _settings(args.set), '--set')
     if args.explain:
         print(explain(rig, inputs))
         return 0
-    method = args.method or METHOD_OF_SOLVER.get(rig.estimator.solver, 'exact')
+    method = args.method or method_of(rig)
     load = tuple(args.load) if args.load else (0.0, -SIDEBAR_FORCE, -SIDEBAR_FORCE * rig.link.length)
     finite('--load', load)
     out = Path(args.out or 'budget.png')
     if args.out is not None or not args.json:
         need_folder(out)
-    with given_as_option() if args.load or args.set else contextlib.nullcontext():
+    with given_as_option('load') if args.load or args.set else contextlib.nullcontext():
         budget = evaluate(Situation.at_load(rig, inputs, load, method))
     draws = args.monte_carlo
     sampled = None

@@ -15,21 +15,21 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from psd_deflection.cli._report import print_json
+from psd_deflection.cli._report import print_json, save_figure
 from psd_deflection.errors import RecordingError
-from psd_deflection.records import FloatArray
-from psd_deflection.solvers import Geometry, make_solver
-from psd_deflection.solvers._linear import condition_number, design_matrix, error_bound
+from psd_deflection.geometry import Geometry
+from psd_deflection.geometry.linear import condition_number, design_matrix, error_bound
+from psd_deflection.solvers import make_solver
 from psd_deflection.thesis.comparison import (
     CAUSES,
     CONDITIONS,
     DIRECT,
-    METHODS,
     REPORTED,
     SIDEBAR,
     SIDEBAR_POSE,
@@ -38,6 +38,9 @@ from psd_deflection.thesis.comparison import (
     dots_of,
     errors,
     grid,
+    methods,
+    printed_bound,
+    refused,
     table_5_1,
     thesis_geometry,
 )
@@ -65,9 +68,12 @@ def run(args: argparse.Namespace) -> int:
         print('\n'.join([*error_table(), '', *linear_table(), '', *cause_table()]))
     if args.out is not None:
         # matplotlib takes a second to import; who only reads the tables need not wait for it.
-        from psd_deflection.thesis.figures import draw_all
+        from psd_deflection.thesis.figures import drawn
 
-        for path in draw_all(Path(args.out)):
+        for name, figure in drawn():
+            path = Path(args.out) / f'{name}.png'
+            # No date or version in the file: the same figure is the same bytes.
+            save_figure(figure, path, metadata={'Software': None})
             print(f'wrote {path}', file=sys.stderr if args.json else sys.stdout)
     return 0
 
@@ -80,7 +86,7 @@ def figures() -> dict[str, dict[str, dict[str, object]]]:
             for condition in CONDITIONS
             for e in [errors(method, condition)]
         }
-        for method in METHODS
+        for method in methods()
     }
 
 
@@ -88,8 +94,8 @@ def error_table() -> list[str]:
     """Lines of the table method by condition: first the rms, then the largest."""
     geometry = thesis_geometry()
     titles = [f'{c} ({len(grid(c, geometry))})' for c in CONDITIONS]
-    width = max(len(m.label) for m in METHODS)
-    cells = {m.label: [errors(m, c) for c in CONDITIONS] for m in METHODS}
+    width = max(len(m.label) for m in methods())
+    cells = {m.label: [errors(m, c) for c in CONDITIONS] for m in methods()}
     lines = [
         'Error on exact readings, dX um / dY um / theta mdeg. The rig of the thesis; dX, dY within 5 mm, theta within',
         '3 deg; tilts of -1, 0, 1 deg about each axis, or those of a cantilever, k = 1.5.',
@@ -101,6 +107,8 @@ def error_table() -> list[str]:
             lines.append(
                 f'{label:{width}}  ' + ''.join(f'{_cell(c, largest):25}' for c in row) + f'{100.0 * silent:.1f} %'
             )
+    for name, why in refused().items():
+        lines += textwrap.wrap(f'{name} is not in the table: {why}', 118, subsequent_indent='  ')
     return lines
 
 
@@ -134,33 +142,28 @@ def linear_table() -> list[str]:
         lines.append(f'{label:38} ' + ' / '.join(f'{v:.2f}' for v in deviations))
     lines += ['', 'What the least squares of Appendix D make of a twist of 1 mdeg, both counter-clockwise']
     dots = dots_of(geometry, np.array([[0.0, 0.0, 1.0 / _MDEG_PER_RAD, 0.0, 0.0]]))
-    for method in METHODS:
+    for method in methods():
         if method.name in ('appendix_d_ols', 'appendix_d_wls'):
             solver = make_solver(method.name, geometry, **method.options)
             found = float(solver.solve_many(dots, VARIANCES).pose[0, 2]) * _MDEG_PER_RAD
             lines.append(f'{method.label:38} {found:.3f} mdeg')
-    design = design_matrix(geometry)
+    design = design_matrix(geometry.beams)
     lines += ['', 'Condition number of A (4.28), Frobenius (2-norm)']
     for label, length in (('A in mm', 1e-3), ('A in m', 1.0), ('theta times 0.1 m', 0.1)):
         number = condition_number(design, length)
         lines.append(f'{label:38} {number.frobenius:.2f} ({number.two:.2f})')
     design_error = np.zeros((4, 3))
     design_error[0, 2] = design_error[3, 2] = 1e-3
-    bound = error_bound(design, SIDEBAR_POSE, design_error, np.full(4, 2e-6)) * (1e6, 1e6, 1e3)
+    reading_error = np.full(4, 2e-6)
+    bound = error_bound(design, SIDEBAR_POSE, design_error, reading_error) * (1e6, 1e6, 1e3)
+    printed = printed_bound(design, SIDEBAR_POSE, design_error, reading_error)
     lines += [
         '',
         'Error bound at 50 N, R1 and R2 off by 1 mm, readings by 2 um',
         f'{"for each component":38} {bound[0]:.1f} um, {bound[1]:.1f} um, {bound[2]:.2f} mrad',
-        f'{"4.33, mm and rad in one norm":38} {_printed_bound(design):.3f}',
+        f'{"4.33, mm and rad in one norm":38} {printed:.3f}',
     ]
     return lines
-
-
-def _printed_bound(design: FloatArray) -> float:
-    """4.33 as printed, with A in mm."""
-    inverse = float(np.linalg.norm(np.linalg.pinv(design * (1.0, 1.0, 1e3))))
-    pose = SIDEBAR_POSE * (1e3, 1e3, 1.0)
-    return inverse * float(np.linalg.norm(np.full(4, 2e-3)) + np.sqrt(2.0) * np.linalg.norm(pose))
 
 
 def cause_table() -> list[str]:

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Sequence
+from typing import Any
 
 from psd_deflection.errors import ConfigError
 
@@ -36,22 +37,25 @@ def run(args: argparse.Namespace) -> int:
     # Only here: the parser of all commands, which imports all of them.
     from psd_deflection.cli.main import COMMANDS, make_parser
 
-    parser = make_parser(COMMANDS)
-    for action in _actions(parser):
-        name = action.metavar or action.dest.upper()
-        if name in FOLDERS:
-            action.complete = shtab.DIRECTORY  # type: ignore[attr-defined]
-        elif name in FILES:
-            action.complete = shtab.FILE  # type: ignore[attr-defined]
-    print(shtab.complete(parser, shell=args.shell))
+    print(shtab.complete(make_parser(COMMANDS, _Completed), shell=args.shell))
     return 0
 
 
-def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
-    """Every argument of every command."""
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for sub in action.choices.values():
-                yield from _actions(sub)
-        elif action.nargs != 0:
-            yield action
+class _Completed(argparse.Action):
+    """An argument that takes a value; shtab reads from ``complete`` how the value is completed."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **named: Any) -> None:
+        super().__init__(option_strings, dest, **named)
+        import shtab
+
+        name = self.metavar or dest.upper()
+        if name in FOLDERS:
+            self.complete = shtab.DIRECTORY
+        elif name in FILES:
+            self.complete = shtab.FILE
+
+    def __call__(
+        self, parser: object, namespace: argparse.Namespace, values: Any, option_string: object = None
+    ) -> None:
+        """Keep the value, as argparse does itself."""
+        setattr(namespace, self.dest, values)

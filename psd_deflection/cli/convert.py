@@ -17,21 +17,19 @@ import contextlib
 import heapq
 import itertools
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from psd_deflection.cli._options import recording_name
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json
-from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.config import load_rig
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.bag_writer import BagWriter, McapFile
-from psd_deflection.recordings.csv_writer import CsvSampleSink
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.rerun_writer import RerunFile
-from psd_deflection.records import AppliedLoad, ParameterChange, ReferencePose, SampleBlock, TemperatureReading
+from psd_deflection.recordings.replay_engine import open_for_replay, replayed
+from psd_deflection.recordings.sinks import is_csv, open_sink
+from psd_deflection.records import AppliedLoad, ParameterChange, Record, ReferencePose, SampleBlock, TemperatureReading
 
 Convertible = SampleBlock | ParameterChange | AppliedLoad | ReferencePose | TemperatureReading
 
@@ -65,15 +63,17 @@ def convert(recording: Recording, out: Path, parameters: dict[str, object], quie
         references, temperatures = recording.references(), recording.temperatures()
     blocks = progress_of(recording.blocks(), quiet=quiet)
     records: Iterable[Convertible] = heapq.merge(changes, loads, references, temperatures, blocks, key=_time)
-    sink: CsvSampleSink | McapFile | BagWriter
-    if out.suffix.lower() == '.csv':
-        sink = CsvSampleSink(out, loads=bool(loads), references=bool(references), temperatures=bool(temperatures))
+    if is_csv(out):
         # A row takes what is waiting, and a block's last row what came during the block.
         records = itertools.chain(loads, references, temperatures, blocks)
-    elif out.suffix.lower() == '.mcap':
-        sink = McapFile(out, rig_values=parameters, device_hello=recording.hello)
-    else:
-        sink = BagWriter(out, rig_values=parameters, device_hello=recording.hello)
+    beside: dict[type[Record], Sequence[Record]] = {
+        AppliedLoad: loads,
+        ReferencePose: references,
+        TemperatureReading: temperatures,
+    }
+    sink = open_sink(
+        out, parameters, device_hello=recording.hello, samples_with=[k for k, found in beside.items() if found]
+    )
     samples = 0
     with contextlib.closing(sink), blocks:
         for record in records:
@@ -84,9 +84,9 @@ def convert(recording: Recording, out: Path, parameters: dict[str, object], quie
 
 def run(args: argparse.Namespace) -> int:
     """Convert and say what was written."""
-    recording = open_recording(Path(args.recording))
     if Path(args.out).suffix.lower() == '.rrd':
-        return _to_rerun(recording, Path(args.out), args.params_file, args.json)
+        return _to_rerun(args.recording, Path(args.out), args.params_file, args.json)
+    recording = open_recording(args.recording)
     parameters: dict[str, object] = dict(recording.parameters)
     if args.params_file is not None:
         rig = load_rig(args.params_file)
@@ -100,12 +100,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _to_rerun(recording: Recording, out: Path, params_file: str | None, in_json: bool) -> int:
-    rig = rig_of(recording, params_file)
-    recording = open_recording(recording.path, block_size=rig.estimator.block_size)
+def _to_rerun(path: str, out: Path, params_file: str | None, in_json: bool) -> int:
+    recording, rig = open_for_replay(path, params_file)
     pipeline = Pipeline(rig)
     bar = progress_of(recording.blocks(), quiet=in_json)
-    with contextlib.closing(RerunFile(out, rig, recording.path.stem)) as sink, bar:
+    with contextlib.closing(open_sink(out, rig.flat(), title=recording.path.stem)) as sink, bar:
         for records in replayed(recording, pipeline, bar):
             for record in records:
                 sink.put(record)

@@ -22,7 +22,9 @@ from psd_deflection.cli._options import PICTURES, given_as_option, need_folder, 
 from psd_deflection.cli._report import columns, print_json, save_figure
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import UsageError
-from psd_deflection.mechanics import LinkStatics, placement
+from psd_deflection.geometry import placement
+from psd_deflection.geometry.linear import condition_number, design_matrix
+from psd_deflection.mechanics import LinkStatics
 from psd_deflection.mechanics.section import TubeSection
 from psd_deflection.records import FloatArray
 from psd_deflection.thesis import scaling
@@ -73,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     radius = float(np.max(np.hypot(*rig.centers.T))) if args.radius is None else args.radius
     if args.out is not None:
         need_folder(Path(args.out))
-    with given_as_option():
+    with given_as_option('radius', 'keep_out', 'box'):
         room = placement.Room(radius, args.keep_out, tuple(args.box) if args.box else None)
         candidates = placements(rig, room)
     if args.out is not None:
@@ -220,8 +222,8 @@ def placement_text(candidates: list[Candidate], sigma: float) -> str:
         if not math.isfinite(s.theta):
             rows.append([name, *_places(centers), *['unseen'] * 3, 'inf', 'inf'])
             continue
-        design = placement.design_matrix(centers)
-        in_metres, scaled = placement.condition(design, 1.0).two, placement.condition(design).two
+        design = design_matrix(centers)
+        in_metres, scaled = (condition_number(design, length).two for length in (1.0, placement.SCALE))
         theta = f'{math.degrees(s.theta) * 1e3:.3f}'
         deviations = [f'{s.dx * 1e6:.3f}', f'{s.dy * 1e6:.3f}', theta]
         rows.append([name, *_places(centers), *deviations, f'{scaled:.3f}', f'{in_metres:.3f}'])

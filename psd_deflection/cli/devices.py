@@ -12,26 +12,35 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json
-from psd_deflection.devices.survey import Port, survey
+from psd_deflection.devices.device import Device
+from psd_deflection.devices.registry import known_devices
+from psd_deflection.devices.survey import Port, suggestions, survey
 from psd_deflection.errors import DeviceError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
+    devices, _ = known_devices()
+    parser.epilog = epilog(devices)
     parser.add_argument('ports', nargs='*', metavar='PORT', help='only these, e.g. /dev/ttyACM0 or /dev/pts/3')
     parser.add_argument('--json', action='store_true', help='for programs: one JSON object')
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the survey; the exit status is 0 whatever was found, unless a port that was named could not be asked."""
+    devices, refusals = known_devices()
+    for refusal in refusals:
+        print(f'psd-deflection devices: not asked for: {refusal}', file=sys.stderr)
     with told('asking; a port that stays silent takes some seconds', quiet=args.json):
-        ports = survey(args.ports)
+        ports = survey(devices, args.ports)
     if args.json:
-        print_json({'ports': [asdict(p) for p in ports], 'suggested': suggestions(ports)}, indent=2)
+        print_json({'ports': [asdict(p) for p in ports], 'suggested': suggestions(devices, ports)}, indent=2)
         _refuse_unasked(args.ports, ports)
         return 0
     if not ports:
@@ -42,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
             continue
         about = f' ({port.description})' if port.description and port.description != 'n/a' else ''
         print(f'{port.port}{about}\n  {port.answer}')
-    for suggested in suggestions(ports):
+    for suggested in suggestions(devices, ports):
         print('\n' + parameter_lines(suggested))
     _refuse_unasked(args.ports, ports)
     return 0
@@ -54,21 +63,14 @@ def _refuse_unasked(named: list[str], ports: list[Port]) -> None:
         raise DeviceError('; '.join(f'{p.port}: {p.answer}' for p in unasked))
 
 
-def suggestions(ports: list[Port]) -> list[dict[str, object]]:
-    """One parameter set a device; two Thorlabs aligners are one device."""
-    aligners = [p for p in ports if p.source == 'thorlabs']
-    out: list[dict[str, object]] = [p.suggested for p in ports if p.source and p.source != 'thorlabs']
-    out += [
-        {
-            'source': 'thorlabs',
-            'port': f'{one.suggested["port"]},{two.suggested["port"]}',
-            'converter.sample_rate_hz': 200.0,
-            'block_size': 10,
-            'min_samples': 5,
-        }
-        for one, two in zip(aligners[::2], aligners[1::2], strict=False)
-    ]
-    return out
+def epilog(devices: Sequence[Device]) -> str:
+    """What each name means that ``source:`` takes."""
+    width = max(len(device.name) for device in devices)
+    lines = []
+    for device in devices:
+        remark = '' if device.probe is not None else ' (not asked for)'
+        lines.append(f'  {device.name:{width}}  {device.help}{remark}')
+    return '\n'.join(['what source: may say, and which devices the ports are asked for:', *lines])
 
 
 def parameter_lines(values: dict[str, object]) -> str:

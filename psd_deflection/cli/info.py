@@ -17,8 +17,8 @@ from typing import Any
 from msg_adapters import DEFLECTION, LOAD, SAMPLES
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json
-from psd_deflection.parameters import BY_NAME
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.config import BY_NAME
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 
 _EPOCH_FROM_NS = 10**18

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import difflib
 import errno
 import importlib
 import itertools
@@ -22,7 +21,14 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from psd_deflection import __version__
-from psd_deflection.errors import PsdDeflectionError, RecordingError, UsageError
+from psd_deflection.errors import (
+    EXIT_STATUSES,
+    INTERRUPTED,
+    PsdDeflectionError,
+    RecordingError,
+    UsageError,
+    did_you_mean,
+)
 
 COMMANDS: dict[str, str] = {
     'estimator': 'acquire, estimate, publish on ROS 2 and record (the daemon)',
@@ -53,18 +59,7 @@ where to begin:
   psd-deflection COMMAND --help               each command explains itself
 
 exit status:
-  0    done
-  1    done, and the recording differs (replay --compare)
-  2    the command line: an option, its value, or what does not go together
-  3    a parameter, a parameter file, or a package that is not installed
-  4    a recording or an output that cannot be read or written
-  5    the device: missing, in use, silent, or of another protocol
-  6    the geometry of the rig cannot be solved
-  130  Ctrl-C before it was done
-"""
-
-INTERRUPTED = 130
-"""What a shell gives a program that Ctrl-C ended."""
+""" + '\n'.join(f'  {status:<5}{meaning}' for status, meaning in EXIT_STATUSES.items())
 
 _NEGATIVE = re.compile(r'^-[\d.][\d.,eE+-]*$')
 _WIDEST = 100
@@ -89,7 +84,7 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         return '\n'.join(out)
 
 
-def make_parser(chosen: Collection[str]) -> argparse.ArgumentParser:
+def make_parser(chosen: Collection[str], value: type[argparse.Action] | None = None) -> argparse.ArgumentParser:
     """The whole command line; the arguments of the commands ``chosen`` only, since the others' modules stay unread."""
     parser = argparse.ArgumentParser(
         prog='psd-deflection',
@@ -101,8 +96,10 @@ def make_parser(chosen: Collection[str]) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
     for name, summary in COMMANDS.items():
         sub = commands.add_parser(name, help=summary, description=summary, formatter_class=_Help)
-        # `-5,20` and `-2.9e1` are values, which argparse takes for options.
-        sub._negative_number_matcher = _NEGATIVE
+        # `-5,20` and `-2.9e1` are values, which argparse takes for options; it has no public way to be told.
+        sub._negative_number_matcher = _NEGATIVE  # noqa: SLF001
+        if value is not None:
+            sub.register('action', None, value)
         if name in chosen:
             module = importlib.import_module('psd_deflection.cli.' + name.replace('-', '_'))
             sub.description = module.__doc__
@@ -112,7 +109,7 @@ def make_parser(chosen: Collection[str]) -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status (``psd_deflection.errors`` lists them; 130: Ctrl-C)."""
+    """Run one command; returns the exit status (``psd_deflection.errors`` lists them)."""
     status = 0
     if sys.stderr is None:
         # `2>&-`: print() would put on stdout what is for the standard error.
@@ -164,9 +161,8 @@ def _run(argv: list[str]) -> int:
     try:
         _refuse_empty(own)
         if chosen and chosen[0] not in COMMANDS:
-            close = difflib.get_close_matches(chosen[0], COMMANDS, 1)
-            hint = f'did you mean {close[0]}?' if close else '`psd-deflection --help` lists them'
-            raise UsageError(f'no command {chosen.pop()!r}; {hint}')
+            hint = did_you_mean(chosen[0], COMMANDS) or '; `psd-deflection --help` lists them'
+            raise UsageError(f'no command {chosen.pop()!r}{hint}')
         args, unknown = make_parser(chosen).parse_known_args(own)
     except UsageError as error:
         _tell(f'{" ".join(["psd-deflection", *chosen])}: {error}')

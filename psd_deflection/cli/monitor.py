@@ -16,26 +16,23 @@ from __future__ import annotations
 
 import argparse
 import math
-import shlex
 import signal
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 
-from psd_deflection.cli._options import given_as_option, refuse
-from psd_deflection.cli._program import program
-from psd_deflection.cli.estimator import Display, run_without_ros, simulates
-from psd_deflection.cli.replay import replayed, rig_of
+from psd_deflection.cli._display import Display
+from psd_deflection.cli._options import given_as_option, given_parameters, parameter_option, refuse
 from psd_deflection.config import read_parameter_file, replace_values, rig_from_values
 from psd_deflection.errors import UsageError
 from psd_deflection.monitor.feed import Feed
-from psd_deflection.monitor.source import ReplaySource
-from psd_deflection.monitor.start import need_server
+from psd_deflection.monitor.shown import ShownRecording
+from psd_deflection.monitor.start import need_server, start_monitor
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.replay_engine import open_for_replay, replayed
 from psd_deflection.records import Record
-from psd_deflection.runner.session import Session
-from psd_deflection.runner.simulated_rig import started_early
+from psd_deflection.runner.headless import run_headless
+from psd_deflection.runner.simulated_rig import simulates, started_early
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,37 +40,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('recording', nargs='?', metavar='REC', help='a bag folder, an .mcap or a .csv to play')
     parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig')
     page = parser.add_argument_group('the page')
-    page.add_argument('--http-port', type=int, metavar='N', help='port of the page (default 8790; 0: any free one)')
-    page.add_argument('--address', help='address to serve on (default 127.0.0.1; 0.0.0.0 shows it to the network)')
-    page.add_argument('--control', action='store_true', help='let the page take the zero and record')
+    parameter_option(page, '--http-port', 'monitor_port')
+    parameter_option(page, '--address', 'monitor_address')
+    page.add_argument(
+        '--control', dest='monitor_control', action='store_true', help='let the page take the zero and record'
+    )
     live = parser.add_argument_group('the rig (without REC)')
-    live.add_argument('--port', help='serial port of the device; without it a simulated rig is started')
-    live.add_argument('--baud', type=int, help='line speed (default 921600)')
+    parameter_option(live, '--port', 'port')
+    parameter_option(live, '--baud', 'baud')
     live.add_argument(
         '--record', nargs='?', const='', metavar='FOLDER', help='record from the start, below FOLDER (recordings/)'
     )
     play = parser.add_argument_group('a recording (with REC)')
     play.add_argument('--speed', type=float, default=1.0, metavar='X', help='times as fast as recorded (default 1)')
     play.add_argument('--loop', action='store_true', help='start anew at its end')
-
-
-def overrides_of(args: argparse.Namespace) -> dict[str, object]:
-    """The parameters that the arguments give."""
-    values: dict[str, object] = {'monitor': True}
-    if args.http_port is not None:
-        values['monitor_port'] = args.http_port
-    if args.address is not None:
-        values['monitor_address'] = args.address
-    if args.control:
-        values['monitor_control'] = True
-    for name in ('port', 'baud'):
-        if getattr(args, name) is not None:
-            values[name] = getattr(args, name)
-    if args.record is not None:
-        values['record'] = True
-        if args.record:
-            values['bag_dir'] = args.record
-    return values
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -89,7 +69,7 @@ def _check(args: argparse.Namespace) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     _check(args)
-    overrides = overrides_of(args)
+    overrides = {'monitor': True, **given_parameters(args)}
     with given_as_option():
         rig_from_values(overrides, 'command line')
     need_server()
@@ -99,30 +79,22 @@ def run(args: argparse.Namespace) -> int:
     if args.params_file:
         rig_from_values({**values, **overrides}, args.params_file)
     display = Display()
-    recorded: list[Path] = []
-
-    def watch(session: Session) -> None:
-        folder = session.recorder.folder
-        if folder is not None and folder not in recorded:
-            recorded.append(folder)
-        display.update(session)
-
-    with started_early(simulates({**values, **overrides})):
-        status = run_without_ros({**values, **overrides}, display, watch)
-    for folder in recorded:
-        display.say(f'recorded {folder}\n  replay it:  {program()} replay {shlex.quote(str(folder))} --compare')
+    values |= overrides
+    with started_early(simulates(values)):
+        status = run_headless(values, display.say, display.watch, start_monitor)
+    display.tell_recorded()
     return status
 
 
 def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     from psd_deflection.monitor.server import MonitorServer
 
-    rig = replace_values(rig_of(open_recording(args.recording), args.params_file), overrides, 'command line')
+    rig = replace_values(open_for_replay(args.recording, args.params_file)[1], overrides, 'command line')
 
     def open_steps() -> tuple[Pipeline, Iterator[list[Record]]]:
         recording = open_recording(args.recording, block_size=rig.estimator.block_size)
         pipeline = Pipeline(rig)
-        return pipeline, replayed(recording, pipeline, recording.blocks())
+        return pipeline, replayed(recording, pipeline)
 
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -136,16 +108,16 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
         if server is not None:
             server.tell(text)
 
-    source = ReplaySource(str(args.recording), open_steps, feed, say, speed=args.speed, loop=args.loop)
-    server = MonitorServer(source, feed, rig.monitor, display.say)
+    shown = ShownRecording(str(args.recording), open_steps, feed, say, speed=args.speed, loop=args.loop)
+    server = MonitorServer(shown, feed, rig.monitor, display.say)
     server.start()
     try:
-        source.start()
-        while not stop.wait(0.1) and source.failed is None:
+        shown.start()
+        while not stop.wait(0.1) and shown.failed is None:
             pass
     finally:
-        source.close()
+        shown.close()
         server.close()
-    if source.failed is not None:
-        raise source.failed
+    if shown.failed is not None:
+        raise shown.failed
     return 0

@@ -11,8 +11,7 @@ from __future__ import annotations
 import argparse
 
 from psd_deflection.cli._report import print_json
-from psd_deflection.config import load_rig
-from psd_deflection.parameters import PARAMETERS
+from psd_deflection.config import PARAMETERS, load_rig
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
         print_json(dict(rig.values), indent=2)
         return 0
     for p in PARAMETERS:
-        bounds = p.bound_text() or (', '.join(p.choices) if p.choices else '')
+        bounds = p.bound_text()
         unit = f' {p.unit}' if p.unit else ''
         print(f'{p.name} = {rig.values[p.name]}{unit}')
         print(f'    {p.description}' + (f' ({bounds})' if bounds else ''))

@@ -25,12 +25,11 @@ from psd_deflection import __version__
 from psd_deflection.cli._options import PICTURES, need_folder, picture_name
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, save, save_figure
-from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.config import Rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.monitor.spectrum import Spectrum
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.replay_engine import open_for_replay, replayed
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, Record, SampleBlock, SpotMeans
 
 SPECTRUM_S = 600.0
@@ -93,9 +92,7 @@ class Drawn:
                     rows.append((before + k * step, *nothing, *(np.nan,) * 7, 0.0))
             index = s.index
             e = self.estimates.get(s.index)
-            pose = (
-                nothing if e is None else (e.dx, e.dy, e.theta, *(max(e.covariance[i], 0.0) ** 0.5 for i in (0, 4, 8)))
-            )
+            pose = nothing if e is None else (*e.pose, *(max(v, 0.0) ** 0.5 for v in e.variances))
             lost = self._lost(s)
             unfinished = s.status is BlockStatus.TOO_FEW_SAMPLES and lost == 0
             rows.append(((s.t_ns - start) / 1e9, *pose, *s.dots, *s.sums, float(lost), float(unfinished)))
@@ -127,8 +124,7 @@ def run(args: argparse.Namespace) -> int:
     )
     out = Path(args.out) if args.out is not None else default_out(args.recording)
     need_folder(out)
-    rig = rig_of(open_recording(args.recording), args.params_file)
-    recording = open_recording(args.recording, block_size=rig.estimator.block_size)
+    recording, rig = open_for_replay(args.recording, args.params_file)
     drawn, spectrum = Drawn(), Spectrum(rig, SPECTRUM_S)
     for records in replayed(recording, Pipeline(rig), progress_of(recording.blocks(), quiet=args.json)):
         for record in records:

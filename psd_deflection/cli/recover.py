@@ -18,7 +18,7 @@ from typing import Any
 
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json
-from psd_deflection.recordings.recover import Recovered, recover
+from psd_deflection.recordings.repair import Recovered, recover
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

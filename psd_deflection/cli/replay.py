@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,13 +22,13 @@ import numpy as np
 from psd_deflection.cli._options import recording_name
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json
-from psd_deflection.config import Rig, load_rig, rig_as_recorded
+from psd_deflection.config import Rig
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.comparison import Comparison
-from psd_deflection.recordings.opening import open_recording
 from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.replay_engine import open_for_replay, replayed
 from psd_deflection.recordings.sinks import Sink, open_sink
-from psd_deflection.records import ENVIRONMENT, DeflectionEstimate, RawChunk, Record, SampleBlock
+from psd_deflection.records import DeflectionEstimate, Record, SampleBlock
 
 DIFFERS = 1
 
@@ -79,45 +78,15 @@ class Totals:
         return self.last_seq - self.first_seq + 1 - self.samples if self.first_seq is not None else 0
 
 
-def replayed(recording: Recording, pipeline: Pipeline, blocks: Iterable[SampleBlock]) -> Iterator[list[Record]]:
-    """The records of each step; recorded changes of parameters apply at their own block."""
-    changes = list(recording.changes)
-    # What our own recorder noted says when a temperature took effect; of others' recordings, the stamps do.
-    noted = any(name in ENVIRONMENT for change in changes for name, _ in change.values)
-    temperatures = [] if noted or not pipeline.needs_temperature else recording.temperatures()
-    for block in blocks:
-        while temperatures and temperatures[0].t_ns <= block.t_ns[0]:
-            warmer = pipeline.temperature(temperatures.pop(0).celsius)
-            if warmer is not None:
-                yield [warmer]
-        while changes and changes[0].block <= block.index:
-            # What is unfinished belongs to the time before the change.
-            yield list(pipeline.flush())
-            change = changes.pop(0)
-            pipeline.apply(change)
-            yield [change]
-        yield list(pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags)))
-    yield list(pipeline.flush())
-
-
-def rig_of(recording: Recording, params_file: str | None) -> Rig:
-    """The rig to use: of the file, else of the recording, else the thesis rig's."""
-    if params_file is not None:
-        return load_rig(params_file)
-    return rig_as_recorded(recording.parameters, f'{recording.path} (recorded parameters)')
-
-
 def run(args: argparse.Namespace) -> int:
     """Replay."""
-    recording = open_recording(args.recording)
-    rig = rig_of(recording, args.params_file)
-    recording = open_recording(args.recording, block_size=rig.estimator.block_size)
+    recording, rig = open_for_replay(args.recording, args.params_file)
     pipeline = Pipeline(rig)
     with told('looking for what was recorded', quiet=args.json):
         comparison = Comparison(recording) if args.compare else None
     sink: Sink | None = None
     if args.out is not None:
-        sink = open_sink(args.out, rig_values=rig.flat(), solvers=rig.estimator.solvers, device_hello=recording.hello)
+        sink = open_sink(args.out, rig.flat(), device_hello=recording.hello)
     totals = Totals()
     began = time.perf_counter()
     bar = progress_of(recording.blocks(), quiet=args.json)

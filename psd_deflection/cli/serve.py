@@ -4,38 +4,21 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
-import os
 import shlex
-import signal
 import sys
-import threading
-from collections.abc import Callable, Sequence
 
 from psd_deflection.cli._options import given_as_option, number, whole
 from psd_deflection.cli._program import program
-from psd_deflection.config import Rig, load_rig, rig_from_values
-from psd_deflection.devices.simulated_dataq import SimulatedDataq
-from psd_deflection.devices.simulated_device import LineDevice, PseudoTerminal, SimulatedDevice, serve
-from psd_deflection.devices.simulated_lines import SimulatedLines
-from psd_deflection.devices.simulated_thorlabs import SharedRig, SimulatedAligner
-from psd_deflection.errors import ConfigError
-from psd_deflection.records import FloatArray
-from psd_deflection.runner.session import SIMULATED
-from psd_deflection.runner.simulated_rig import PORT_LINE
-from psd_deflection.simulation.loads import CyclicLoads, thesis_load_cases
-
-DEVICES = SIMULATED
-"""What can be simulated, named as the sources that read it."""
+from psd_deflection.config import load_rig
+from psd_deflection.devices.device import PowerUp
+from psd_deflection.devices.pseudo_terminal import PORT_LINE, link_names, open_terminals
+from psd_deflection.devices.registry import SIMULATED
+from psd_deflection.devices.serve import serve_all, simulated_devices, stopped_by_signals
 
 OF_A_DEVICE = {'device': None, 'link': None, 'skew_ppm': 0.0, 'first_seq': 0}
-"""Options of a device, and what they are where they are not given."""
+"""Options of a device, and what they are if they are not given."""
 
 MAX_SKEW_PPM = 100_000.0
-
-DWELL_S = 4.0
-FIRST_LOAD_S = 1.0
-"""Unloaded after power-up, s: long enough for a zero, short enough that whoever looks on sees it move at once."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,9 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         '--device',
-        choices=DEVICES,
-        help='what it speaks: our own frames (serial), a DATAQ converter, a pair of Thorlabs aligners (two ports), '
-        'lines of text; default: what source: of the rig says',
+        choices=SIMULATED,
+        metavar='NAME',
+        help='what it speaks, named as source: names it: %(choices)s (default: what source: of the rig says)',
     )
     group.add_argument('--link', metavar='PATH', help='a symbolic link to the port, for a name that stays')
     group.add_argument(
@@ -65,89 +48,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=0,
         help='sample number at power-up (default 0)',
     )
-    # How the daemon starts one: the parameters come as a line of JSON, the end of the input ends it.
-    group.add_argument('--attached', action='store_true', help=argparse.SUPPRESS)
 
 
 def run_device(args: argparse.Namespace) -> int:
-    """Serve until Ctrl-C, or until the daemon that started it is gone."""
-    stop = threading.Event()
-    rig = _attached_rig(stop) if args.attached else load_rig(args.params_file)
-    for one in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(one, lambda *_: stop.set())
-    loads = served_loads(rig.converter.sample_rate_hz)
+    """Serve until Ctrl-C."""
+    rig = load_rig(args.params_file)
+    stop = stopped_by_signals()
     name = args.device or rig.acquisition.source
-    if name not in DEVICES:
-        raise ConfigError(f'source = {name!r}: cannot be simulated; --device takes one of {", ".join(DEVICES)}')
-    devices = make_devices(name, rig, lambda _, n: loads.take(n), args)
-    links = [args.link] if len(devices) == 1 or args.link is None else [f'{args.link}_{i}' for i in (1, 2)]
-    with given_as_option():
-        ports = [PseudoTerminal(link) for link in (links if args.link else [None] * len(devices))]
-    names = ','.join(port.name for port in ports)
-    try:
+    devices = simulated_devices(name, rig, args.seed, PowerUp(args.skew_ppm, args.first_seq))
+    links = link_names(args.link, len(devices))
+    with contextlib.ExitStack() as stack:
+        with given_as_option():
+            ports = stack.enter_context(open_terminals(links))
+        names = ','.join(port.name for port in ports)
         print(f'{PORT_LINE}{names}', flush=True)
-        if not args.attached:
-            source = '' if name == 'serial' else f' --source {name}'
-            reached = shlex.quote(','.join(map(str, links))) if args.link else names
-            print(
-                f'a simulated rig answers there; try:  {program()} estimator --port {reached}{source}\nCtrl-C ends it',
-                file=sys.stderr,
-            )
+        source = '' if name == 'serial' else f' --source {name}'
+        reached = shlex.quote(','.join(link or port.name for link, port in zip(links, ports, strict=True)))
+        print(
+            f'a simulated rig answers there; try:  {program()} estimator --port {reached}{source}\nCtrl-C ends it',
+            file=sys.stderr,
+        )
         serve_all(devices, ports, stop.is_set)
-    finally:
-        for port in ports:
-            port.close()
     return 0
-
-
-def served_loads(rate: float) -> CyclicLoads:
-    """The thesis's load cases over and over, of which the first, unloaded, has almost gone by at power-up."""
-    return CyclicLoads(thesis_load_cases(DWELL_S, rate), start=round((DWELL_S - FIRST_LOAD_S) * rate))
-
-
-def make_devices(
-    name: str, rig: Rig, loads: Callable[[int, int], FloatArray], args: argparse.Namespace
-) -> list[LineDevice]:
-    """The device, or the two of a pair."""
-    options = {'seed': args.seed, 'skew_ppm': args.skew_ppm}
-    if name == 'dataq':
-        return [SimulatedDataq(rig, loads, **options)]
-    if name == 'lines':
-        return [SimulatedLines(rig, loads, first_seq=args.first_seq, **options)]
-    if name == 'thorlabs':
-        shared = SharedRig(rig, loads, args.seed)
-        return [SimulatedAligner(shared, psd) for psd in (1, 2)]
-    return [SimulatedDevice(rig, loads, first_seq=args.first_seq, **options)]
-
-
-def serve_all(devices: Sequence[LineDevice], ports: Sequence[PseudoTerminal], stopped: Callable[[], bool]) -> None:
-    """Serve each on its port until ``stopped()``, the first in this thread."""
-    others = [
-        threading.Thread(target=serve, args=(device, port, stopped), name=port.name, daemon=True)
-        for device, port in zip(devices[1:], ports[1:], strict=True)
-    ]
-    for thread in others:
-        thread.start()
-    serve(devices[0], ports[0], stopped)
-    for thread in others:
-        thread.join()
-
-
-def _attached_rig(stop: threading.Event) -> Rig:
-    line = sys.stdin.buffer.readline()
-    if not line:
-        # The daemon that started us early has gone before it came to us.
-        raise SystemExit(0)
-    try:
-        values = json.loads(line)
-    except ValueError:
-        raise ConfigError('--attached: expected the parameters as a line of JSON') from None
-
-    def until_the_end() -> None:
-        with contextlib.suppress(OSError, ValueError):
-            while os.read(sys.stdin.fileno(), 4096):
-                pass
-        stop.set()
-
-    threading.Thread(target=until_the_end, name='parent', daemon=True).start()
-    return rig_from_values(values, 'parameters of the daemon')

@@ -1,1 +1,36 @@
-"""Devices: where samples come from, and their simulated twins."""
+"""Devices: where samples come from, and their simulated twins.
+
+What a plug-in needs is here; ``docs/devices/README.md`` shows how to write one. Nothing that opens a port
+or computes is imported.
+"""
+
+from psd_deflection.devices.device import Answer, Device, Ear, LineDevice, PowerUp, Probe
+from psd_deflection.devices.source import (
+    BadFrame,
+    Clock,
+    Event,
+    HelloFrame,
+    PortClosedError,
+    Received,
+    Sample,
+    Source,
+    SourceEndedError,
+)
+
+__all__ = [
+    'Answer',
+    'BadFrame',
+    'Clock',
+    'Device',
+    'Ear',
+    'Event',
+    'HelloFrame',
+    'LineDevice',
+    'PortClosedError',
+    'PowerUp',
+    'Probe',
+    'Received',
+    'Sample',
+    'Source',
+    'SourceEndedError',
+]

@@ -7,40 +7,52 @@ the device's own.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
+from psd_deflection import __version__
 from psd_deflection.config import Rig
-from psd_deflection.devices.finding import candidates, is_pattern, matching
+from psd_deflection.devices.device import OUTPUT_LIMIT, Answer, Device, PowerUp, Probe, converter_parameters
+from psd_deflection.devices.port_search import candidates, is_pattern, matching
+from psd_deflection.devices.port_source import PortSource
 from psd_deflection.devices.serial_port import SerialPort
-from psd_deflection.devices.source import REOPEN_S, Event, Reading, Source
+from psd_deflection.devices.source import REOPEN_S, Event, Received
 from psd_deflection.errors import DeviceError
 from psd_deflection.protocol.frames import (
+    PROTOCOL_VERSION,
     BadFrame,
     FrameDecoder,
     HelloFrame,
     HelloRequestFrame,
     PingFrame,
+    PongFrame,
+    SampleFrame,
     StartFrame,
+    StatusFrame,
+    StopFrame,
     encode,
 )
+from psd_deflection.records import CHANNELS, FLAG_DEVICE_DROPPED, FLAG_OVER_RANGE
+
+if TYPE_CHECKING:
+    from psd_deflection.devices.rig_feed import RigFeed
 
 # The zero ends whatever the device may have heard half of.
-_WAKE = b'\x00' + encode(HelloRequestFrame()) + encode(StartFrame())
-_NOTHING: list[Event] = []
+_QUESTION = b'\x00' + encode(HelloRequestFrame())
+_WAKE = _QUESTION + encode(StartFrame())
 
 SCAN_S = 0.25
 """How long a port is heard out on which the device may be or not: it answers within milliseconds."""
 
 
-class ContractFrames(Source):
+class ContractFrames(PortSource):
     """``source: serial``."""
 
     def __init__(self, rig: Rig) -> None:
-        self.name = rig.acquisition.port
+        super().__init__(rig.acquisition.port)
         self._wanted = rig.acquisition.serial_number
         self._given = rig.acquisition.port
         self._baud = rig.acquisition.baud
-        self._port: SerialPort | None = None
         self._decoder = FrameDecoder()
         self._early: list[Event] = []
         self._next_candidate = 0
@@ -129,19 +141,17 @@ class ContractFrames(Source):
                 self.name = name
                 raise
 
-    def read(self, timeout: float) -> Reading:
+    def read(self, timeout: float) -> Received:
         """The frames that have come."""
-        if self._port is None:
-            raise DeviceError(f'{self.name}: not open')
+        port = self._opened()
         if self._early:
             events, self._early = self._early, []
-            return Reading(events, time.monotonic_ns(), 1)
-        received = self._port.read(timeout)
+            return Received(events, time.monotonic_ns(), 1)
+        received = port.read(timeout)
         now = time.monotonic_ns()
         if not received:
-            return Reading(_NOTHING, now, 0)
-        frames: list[Event] = self._decoder.feed(received)  # type: ignore[assignment]
-        return Reading(frames, now, len(received))
+            return Received((), now, 0)
+        return Received(self._decoder.feed(received), now, len(received))
 
     def ping(self, cookie: int) -> bool:
         """Send PING."""
@@ -155,18 +165,6 @@ class ContractFrames(Source):
         if self._port is not None:
             self._port.write(_WAKE)
 
-    def give_up(self) -> None:
-        """Wait for the device no longer."""
-        port = self._port
-        if port is not None:
-            port.give_up()
-
-    def close(self) -> None:
-        """Give the port back."""
-        if self._port is not None:
-            self._port.close()
-            self._port = None
-
     def describe(self) -> Mapping[str, str]:
         """Port and line speed."""
         return {
@@ -174,3 +172,127 @@ class ContractFrames(Source):
             'sample numbers': 'of the device',
             'sample times': 'of the device',
         }
+
+
+class SimulatedFrames:
+    """A device that speaks our frames. When the host does not read it drops samples, counts them (STATUS)
+    and says so in the next one (flags, bit 1), as firmware with a full buffer does.
+
+    ``lose``: sample numbers that the wire loses, for demonstrations and golden recordings.
+    """
+
+    def __init__(
+        self,
+        feed: RigFeed,
+        power_up: PowerUp | None = None,
+        *,
+        serial: str = 'SIM-0001',
+        lose: frozenset[int] = frozenset(),
+    ) -> None:
+        skew_ppm, self._first_seq = power_up or PowerUp()
+        self._feed = feed
+        self._rate = feed.rig.converter.sample_rate_hz
+        self._period_device_us = 1e6 / self._rate
+        self._period_host_ns = 1e9 / self._rate / (1.0 + skew_ppm * 1e-6)
+        self._lose = lose
+        self._decoder = FrameDecoder()
+        self._streaming = True
+        self._overruns = 0
+        self._dropped = False
+        self.hello = HelloFrame(
+            PROTOCOL_VERSION,
+            {
+                'serial': serial,
+                'firmware': f'psd_deflection simulated rig {__version__}',
+                'sample_rate_hz': self._rate,
+                'channels': list(CHANNELS),
+                'volts_per_count': feed.rig.converter.volts_per_count,
+            },
+        )
+
+    def greeting(self) -> bytes:
+        """What it sends when someone opens its port: the end of what was half sent, and HELLO."""
+        return b'\x00' + encode(self.hello)
+
+    @property
+    def taken(self) -> int:
+        """Samples taken since power-up."""
+        return self._feed.taken
+
+    def due_in_ns(self, since_power_up_ns: int) -> int:
+        """Host nanoseconds until the next sample; 0 or less: it is due."""
+        return int(self._feed.taken * self._period_host_ns) - since_power_up_ns
+
+    def receive(self, received: bytes, since_power_up_ns: int) -> bytes:
+        """Replies to what the host sent; what is no frame is passed over."""
+        replies = b''
+        for frame in self._decoder.feed(received):
+            match frame:
+                case HelloRequestFrame():
+                    replies += encode(self.hello)
+                case PingFrame(cookie):
+                    # The clock of the samples, which a device that has run for long has from its first one.
+                    elapsed = (self._first_seq + since_power_up_ns / self._period_host_ns) * self._period_device_us
+                    replies += encode(PongFrame(cookie, int(elapsed)))
+                case StartFrame():
+                    self._streaming = True
+                case StopFrame():
+                    self._streaming = False
+                case _:
+                    pass
+        return replies
+
+    def take(self, since_power_up_ns: int, room: int = OUTPUT_LIMIT) -> bytes:
+        """Take every sample that is due; the frames to send, at most about ``room`` bytes.
+
+        With no room left a sample is taken and dropped.
+        """
+        out = bytearray()
+        while self.due_in_ns(since_power_up_ns) <= 0:
+            number = self._feed.taken
+            x1, y1, sum1, x2, y2, sum2 = row = self._feed.next()
+            seq = (self._first_seq + number) % (1 << 32)
+            if len(out) >= room:
+                self._overruns += 1
+                self._dropped = True
+            elif self._streaming and number not in self._lose:
+                over = any(c in (-32768, 32767) for c in row)
+                flags = (FLAG_OVER_RANGE if over else 0) | (FLAG_DEVICE_DROPPED if self._dropped else 0)
+                self._dropped = False
+                t_us = round((self._first_seq + number) * self._period_device_us)
+                out += encode(SampleFrame(flags, seq, t_us, (x1, y1, sum1, x2, y2, sum2)))
+            if number % round(self._rate) == 0 and len(out) < room:
+                out += encode(self.hello) + encode(StatusFrame(self._overruns, 2150))
+        return bytes(out)
+
+
+class FramesEar:
+    """Hears a HELLO. ``baud``: the speed at which it listens, to be suggested."""
+
+    def __init__(self, baud: int) -> None:
+        self.promising = False
+        self._baud = baud
+        self._decoder = FrameDecoder()
+
+    def hear(self, piece: bytes) -> Answer | None:
+        """What the HELLO says."""
+        for frame in self._decoder.feed(piece):
+            if isinstance(frame, HelloFrame):
+                info = frame.info
+                who = f'PSD device {info.get("serial", "?")}, firmware {info.get("firmware", "?")}'
+                return Answer(f'{who}, protocol {frame.version}', {'baud': self._baud, **converter_parameters(info)})
+            self.promising = self.promising or isinstance(frame, SampleFrame)
+        return None
+
+
+def _simulate(feed: RigFeed, power_up: PowerUp) -> Sequence[SimulatedFrames]:
+    return [SimulatedFrames(feed, power_up)]
+
+
+DEVICE = Device(
+    'serial',
+    'our own frames: firmware of ours, the simulated rig',
+    ContractFrames,
+    _simulate,
+    Probe(FramesEar, _QUESTION, baud=921_600),
+)

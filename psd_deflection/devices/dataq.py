@@ -7,15 +7,23 @@ of whole scans cannot be seen. Times are the count of scans, regressed on the ho
 
 from __future__ import annotations
 
+import contextlib
+import struct
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
+from psd_deflection import __version__
 from psd_deflection.config import Rig
-from psd_deflection.devices.serial_port import PortClosedError, SerialPort
-from psd_deflection.devices.source import Clock, Event, Reading, Sample, Source
+from psd_deflection.devices.device import OUTPUT_LIMIT, Answer, Device, PowerUp, Probe
+from psd_deflection.devices.port_source import PortSource
+from psd_deflection.devices.serial_port import SerialPort
+from psd_deflection.devices.source import Clock, Event, PortClosedError, Received, Sample
 from psd_deflection.errors import ConfigError, DeviceError
 from psd_deflection.protocol.dataq import (
     ANALOG,
+    CLOCK_HZ,
+    COUNTER,
     MODELS,
     STRIDE,
     VOLTS_PER_COUNT,
@@ -30,6 +38,9 @@ from psd_deflection.protocol.dataq import (
 from psd_deflection.protocol.frames import PROTOCOL_VERSION, BadFrame, HelloFrame
 from psd_deflection.records import CHANNELS, FLAG_OVER_RANGE
 
+if TYPE_CHECKING:
+    from psd_deflection.devices.rig_feed import RigFeed
+
 BAUD = 115_200
 REPLY_S = 0.5
 STOP_S = 2.5
@@ -42,21 +53,23 @@ does not agree with what was set: a busy host may have been late to read."""
 TRIAL_TOLERANCE = 0.1
 RAILS = (-32768, 32767)
 
+FITTING = 'DI-1110, DI-2108, DI-4108'
+IDLE_NS = 100_000_000
 
-class Dataq(Source):
+
+class Dataq(PortSource):
     """``source: dataq``: inputs 1 to 6 are x1 y1 sum1 x2 y2 sum2, +-10 V; nothing on the counter input."""
 
     clock = Clock.COUNTED
     numbered = False
 
     def __init__(self, rig: Rig) -> None:
-        self.name = rig.acquisition.port
+        super().__init__(rig.acquisition.port)
         self._wanted = rig.converter.sample_rate_hz
         if abs(rig.converter.volts_per_count - VOLTS_PER_COUNT) > 1e-3 * VOLTS_PER_COUNT:
             raise ConfigError(
                 'source = dataq: reads 16 bits over +-10 V; set converter.bits = 16 and converter.full_scale = 10.0'
             )
-        self._port: SerialPort | None = None
         self._decoder = ScanDecoder()
         self._count = 0
         self._rate = Rate(0, 1, self._wanted)
@@ -82,10 +95,10 @@ class Dataq(Source):
         model = MODELS.get(self._model)
         if model is None:
             raise DeviceError(f'{self.name}: a DATAQ model {self._model!r}; known are {", ".join(MODELS)}')
-        if model.analog < ANALOG or not model.counter:
+        if not _measures(model):
             raise DeviceError(
                 f'{self.name}: the DI-{self._model} has {model.analog} analog inputs and '
-                f'{"a" if model.counter else "no"} counter; six and a counter are needed (DI-1110, DI-2108, DI-4108)'
+                f'{"a" if model.counter else "no"} counter; six and a counter are needed ({FITTING})'
             )
         firmware, serial = self._ask('info 2', REPLY_S), self._ask('info 6', REPLY_S)
         self._must('encode 0', STOP_S)
@@ -172,11 +185,6 @@ class Dataq(Source):
         if self._ask(text, timeout) is None:
             raise DeviceError(f'{self.name}: the DI-{self._model} did not confirm {text!r}; unplug it and try again')
 
-    def _opened(self) -> SerialPort:
-        if self._port is None:
-            raise DeviceError(f'{self.name}: not open')
-        return self._port
-
     def start(self) -> None:
         """Start scanning; scans are numbered from 0. ``start`` is not echoed: all that follows is scans."""
         port = self._opened()
@@ -185,7 +193,7 @@ class Dataq(Source):
         self._decoder, self._count = ScanDecoder(), 0
         port.write(command('start'))
 
-    def read(self, timeout: float) -> Reading:
+    def read(self, timeout: float) -> Received:
         """The scans that have come."""
         received = self._opened().read(timeout)
         now = time.monotonic_ns()
@@ -200,7 +208,7 @@ class Dataq(Source):
                 Sample(FLAG_OVER_RANGE if over else 0, self._count % 2**32, round(self._count * period_us), scan)
             )
             self._count += 1
-        return Reading(events, now, len(received))
+        return Received(events, now, len(received))
 
     def reopen(self) -> HelloFrame | None:
         """Configure it anew: a DATAQ device forgets its scan list when it is unplugged."""
@@ -212,22 +220,12 @@ class Dataq(Source):
         """Silence means that it was stopped or has forgotten its scan list: it is to be configured anew."""
         raise PortClosedError(f'{self.name}: no scans come')
 
-    def give_up(self) -> None:
-        """Wait for the device no longer."""
-        port = self._port
-        if port is not None:
-            port.give_up()
-
     def close(self) -> None:
         """Stop the device and give the port back."""
         if self._port is not None:
-            try:
+            with contextlib.suppress(DeviceError):
                 self._port.write(command('stop'))
-            except DeviceError:
-                pass
-            finally:
-                self._port.close()
-                self._port = None
+        super().close()
 
     def describe(self) -> Mapping[str, str]:
         """Model, rates set and measured, and what cannot be seen."""
@@ -238,3 +236,129 @@ class Dataq(Source):
             'sample numbers': 'counted by the host; torn scans are seen, lost whole scans are not',
             'sample times': 'counted scans, regressed on the host clock',
         }
+
+
+def _measures(model: Model) -> bool:
+    return model.analog >= ANALOG and model.counter
+
+
+class SimulatedDataq:
+    """A DI-2108 or like one. ``per_channel``: takes srate as conversions a second, as some do.
+
+    It sends nothing before ``start``, echoes commands while it does not scan, and does not echo
+    ``start``. Inputs past the sixth read zero.
+    """
+
+    def __init__(
+        self,
+        feed: RigFeed,
+        power_up: PowerUp | None = None,
+        *,
+        model: str = '2108',
+        per_channel: bool = False,
+        serial: str = '5D2A0001',
+    ) -> None:
+        self._feed = feed
+        self._fast = 1.0 + (power_up or PowerUp()).skew_ppm * 1e-6
+        self._info = {'0': 'DATAQ', '1': model, '2': f'SIM {__version__}', '6': serial, '9': str(CLOCK_HZ)}
+        self._per_channel = per_channel
+        self._list: dict[int, int] = {0: 0}
+        self._srate, self._dec = 6000, 1
+        self._scanning = False
+        self._started_ns = 0
+        self._sent = 0
+        self._line = b''
+
+    def greeting(self) -> bytes:
+        """Nothing: it speaks when it is spoken to."""
+        return b''
+
+    def due_in_ns(self, since_power_up_ns: int) -> int:
+        """Host nanoseconds until the next scan."""
+        if not self._scanning:
+            return IDLE_NS
+        return self._started_ns + int(self._sent * self._period_ns()) - since_power_up_ns
+
+    def _period_ns(self) -> float:
+        ticks = self._srate * self._dec * (len(self._list) if self._per_channel else 1)
+        return ticks * 1e9 / CLOCK_HZ / self._fast
+
+    def receive(self, received: bytes, since_power_up_ns: int) -> bytes:
+        """Replies to whole command lines."""
+        *lines, self._line = (self._line + received)[-4096:].split(b'\r')
+        replies = b''
+        for line in lines:
+            replies += self._obey(line.decode('ascii', 'replace').strip(), since_power_up_ns)
+        return replies
+
+    def _obey(self, text: str, now: int) -> bytes:
+        scanning = self._scanning
+        words = text.split()
+        answer = text
+        match words:
+            case ['stop']:
+                # It echoes even while it scans.
+                self._scanning = scanning = False
+            case ['start', *_]:
+                self._scanning, self._started_ns, self._sent = True, now, 0
+                return b''
+            case ['info', number]:
+                answer = f'{text} {self._info.get(number, "0")}'
+            case ['slist', position, word] if position.isdigit() and word.isdigit():
+                if position == '0':
+                    self._list = {}
+                self._list[int(position)] = int(word)
+            case ['srate', number] if number.isdigit() and int(number) > 0:
+                self._srate = int(number)
+            case ['dec', number] if number.isdigit() and int(number) > 0:
+                self._dec = int(number)
+            case _:
+                pass
+        # Replies come padded with a zero now and then.
+        return b'' if scanning or not text else answer.encode('ascii', 'replace') + b'\r\x00'
+
+    def take(self, since_power_up_ns: int, room: int = OUTPUT_LIMIT) -> bytes:
+        """The scans that are due. With no room left they are lost, unsaid: that is how these devices are."""
+        out = bytearray()
+        while self._scanning and self.due_in_ns(since_power_up_ns) <= 0:
+            row = self._feed.next()
+            self._sent += 1
+            if len(out) < room:
+                words = [self._list[p] & 15 for p in sorted(self._list)]
+                values = [-32768 if w == COUNTER else row[w] if w < ANALOG else 0 for w in words]
+                out += struct.pack(f'<{len(values)}h', *values)
+        return bytes(out)
+
+
+class DataqEar:
+    """Hears the replies to ``info 0`` and ``info 1``."""
+
+    promising = False
+
+    def __init__(self, baud: int) -> None:
+        self._received = b''
+
+    def hear(self, piece: bytes) -> Answer | None:
+        """Which model answers."""
+        self._received = (self._received + piece)[-4096:]
+        name = find_reply(self._received, 'info 1')
+        if find_reply(self._received, 'info 0') is None or name is None:
+            return None
+        model = MODELS.get(name)
+        if model is None or not _measures(model):
+            return Answer(f'DATAQ DI-{name}: six analog inputs and a counter are needed ({FITTING})', usable=False)
+        return Answer(f'DATAQ DI-{name}', {'converter.bits': 16, 'converter.full_scale': 10.0})
+
+
+def _simulate(feed: RigFeed, power_up: PowerUp) -> Sequence[SimulatedDataq]:
+    return [SimulatedDataq(feed, power_up)]
+
+
+DEVICE = Device(
+    'dataq',
+    'a DATAQ DI-1110, DI-2108 or DI-4108',
+    Dataq,
+    _simulate,
+    # The carriage return ends what the converter took for the beginning of a command.
+    Probe(DataqEar, b'\r' + command('info 0') + command('info 1')),
+)

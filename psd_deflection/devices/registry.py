@@ -1,7 +1,8 @@
-"""Names to sources: what ``source:`` of a rig file may say, plug-ins of other packages included.
+"""Names to devices: what ``source:`` of a rig file may say, plug-ins of other packages included.
 
-A plug-in declares an entry point of the group ``psd_deflection.sources`` whose object is a class
-derived from :class:`~psd_deflection.devices.source.Source`, made with the rig alone::
+A plug-in declares an entry point of the group ``psd_deflection.sources``. Its object is a
+:class:`~psd_deflection.devices.device.Device`, or only a class derived from
+:class:`~psd_deflection.devices.source.Source`, made with the rig alone::
 
     [options.entry_points]
     psd_deflection.sources =
@@ -10,60 +11,94 @@ derived from :class:`~psd_deflection.devices.source.Source`, made with the rig a
 
 from __future__ import annotations
 
-import difflib
 import importlib
-from collections.abc import Callable
+from collections.abc import Iterator
 from importlib.metadata import entry_points
 from types import MappingProxyType
 
 from psd_deflection.config import Rig
+from psd_deflection.devices.device import Device
 from psd_deflection.devices.source import Source
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, did_you_mean
 
 GROUP = 'psd_deflection.sources'
 
-SOURCES: MappingProxyType[str, str] = MappingProxyType(
+DEVICES: MappingProxyType[str, str] = MappingProxyType(
     {
-        'serial': 'psd_deflection.devices.contract_frames:ContractFrames',
-        'dataq': 'psd_deflection.devices.dataq:Dataq',
-        'thorlabs': 'psd_deflection.devices.thorlabs:ThorlabsPair',
-        'lines': 'psd_deflection.devices.text_lines:TextLines',
-        'replay': 'psd_deflection.devices.replay:Replay',
+        'serial': 'psd_deflection.devices.contract_frames',
+        'dataq': 'psd_deflection.devices.dataq',
+        'thorlabs': 'psd_deflection.devices.thorlabs',
+        'lines': 'psd_deflection.devices.text_lines',
+        'replay': 'psd_deflection.devices.replay',
     }
 )
-"""Name to ``module:class``, the default first; a module is imported when its source is asked for."""
+"""Name to the module with its ``DEVICE``, the default first; a module is imported when its device is asked for."""
+
+
+def find_device(name: str) -> Device:
+    """The device of that name.
+
+    Raises ConfigError for a name that is neither ours nor a plug-in's, and for a plug-in that cannot be loaded.
+    """
+    if name in DEVICES:
+        ours: Device = importlib.import_module(DEVICES[name]).DEVICE
+        return ours
+    points = [e for e in entry_points(group=GROUP) if e.name == name]
+    if not points:
+        known = source_names()
+        raise ConfigError(f'source = {name!r}: must be one of {", ".join(known)}{did_you_mean(name, known)}')
+    try:
+        found: object = points[0].load()
+    except Exception as error:
+        # Whatever a stranger's module raises on import, the user needs its name and its cause.
+        raise ConfigError(f'source = {name!r}: {points[0].value} cannot be loaded ({error!r})') from error
+    if isinstance(found, type) and issubclass(found, Source):
+        return Device(name, f'plug-in {points[0].value}', found)
+    if not isinstance(found, Device):
+        raise ConfigError(
+            f'source = {name!r}: {found!r} is neither a psd_deflection.devices.Device nor derived from Source there'
+        )
+    if found.name != name:
+        raise ConfigError(f'source = {name!r}: {points[0].value} declares itself as {found.name!r}; name both alike')
+    return found
 
 
 def make_source(rig: Rig) -> Source:
     """The source that ``source:`` of the rig names, not yet opened.
 
-    Raises ConfigError for a name that is neither ours nor a plug-in's, for a plug-in that cannot be
-    loaded, and where the rig cannot be for that source.
+    Raises ConfigError as :func:`find_device`, and if the rig does not suit that source.
     """
-    return _find(rig.acquisition.source)(rig)
+    return find_device(rig.acquisition.source).make(rig)
 
 
 def source_names() -> list[str]:
     """Ours, then those of plug-ins."""
-    return [*SOURCES, *sorted(e.name for e in entry_points(group=GROUP) if e.name not in SOURCES)]
+    return [*DEVICES, *sorted(e.name for e in entry_points(group=GROUP) if e.name not in DEVICES)]
 
 
-def _find(name: str) -> Callable[[Rig], Source]:
-    if name in SOURCES:
-        module, _, attribute = SOURCES[name].partition(':')
-        found: object = getattr(importlib.import_module(module), attribute)
-    else:
-        points = [e for e in entry_points(group=GROUP) if e.name == name]
-        if not points:
-            known = source_names()
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f'; did you mean {near[0]}?' if near else ''
-            raise ConfigError(f'source = {name!r}: must be one of {", ".join(known)}{hint}')
+def known_devices() -> tuple[list[Device], list[str]]:
+    """Every device, and why plug-ins are missing among them that cannot be loaded."""
+    devices: list[Device] = []
+    refusals: list[str] = []
+    for name in source_names():
         try:
-            found = points[0].load()
-        except Exception as error:
-            # Whatever a stranger's module raises on import, the user needs its name and its cause.
-            raise ConfigError(f'source = {name!r}: {points[0].value} cannot be loaded ({error!r})') from error
-    if not (isinstance(found, type) and issubclass(found, Source)):
-        raise ConfigError(f'source = {name!r}: {found!r} is not derived from psd_deflection.devices Source')
-    return found
+            devices.append(find_device(name))
+        except ConfigError as error:
+            refusals.append(str(error))
+    return devices, refusals
+
+
+class SimulatedNames:
+    """The names of the devices that can be simulated, as a container; a module is imported when it is looked at."""
+
+    def __contains__(self, name: object) -> bool:
+        try:
+            return find_device(str(name)).simulate is not None
+        except ConfigError:
+            return False
+
+    def __iter__(self) -> Iterator[str]:
+        return (device.name for device in known_devices()[0] if device.simulate is not None)
+
+
+SIMULATED = SimulatedNames()

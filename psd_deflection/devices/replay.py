@@ -13,10 +13,11 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from psd_deflection.config import Rig
-from psd_deflection.devices.source import Clock, Event, Reading, Sample, Source, SourceEndedError
+from psd_deflection.devices.device import Device
+from psd_deflection.devices.source import Clock, Event, Received, Sample, Source, SourceEndedError
 from psd_deflection.errors import ConfigError, DeviceError, RecordingError
 from psd_deflection.protocol.frames import PROTOCOL_VERSION, HelloFrame
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import CHANNELS, SampleBlock
 
@@ -53,7 +54,7 @@ class Replay(Source):
         self.name = rig.acquisition.port
         if not self.name:
             raise ConfigError("source = replay: port = '': name the recording (a bag folder, an .mcap or a .csv)")
-        self._stamps = str(rig.values['replay.stamps'])
+        self._stamps = rig.acquisition.replay_stamps
         self._rate = rig.converter.sample_rate_hz
         self._block_size = rig.estimator.block_size
         self.clock = Clock.RECORDED if self._stamps == 'recorded' else Clock.HOST
@@ -90,7 +91,7 @@ class Replay(Source):
         self._blocks = self._recording.blocks()
         self._next = None
 
-    def read(self, timeout: float) -> Reading:
+    def read(self, timeout: float) -> Received:
         """The next block, once its last sample is due."""
         try:
             block = self._next if self._next is not None else next(self._blocks, None)
@@ -100,7 +101,7 @@ class Replay(Source):
             raise SourceEndedError('the recording is at its end')
         self._next = block
         if not self._pacer.until(int(block.t_ns[-1]), timeout):
-            return Reading([], time.monotonic_ns(), 0)
+            return Received([], time.monotonic_ns(), 0)
         self._next = None
         times = block.t_ns.tolist()
         if self.clock is Clock.HOST:
@@ -111,7 +112,7 @@ class Replay(Source):
                 block.flags.tolist(), block.seq.tolist(), times, block.volts.tolist(), strict=True
             )
         ]
-        return Reading(events, time.monotonic_ns(), max(1, block.volts.nbytes))
+        return Received(events, time.monotonic_ns(), max(1, block.volts.nbytes))
 
     def close(self) -> None:
         """Nothing is held; a read that waits comes back."""
@@ -125,3 +126,6 @@ class Replay(Source):
             'sample numbers': 'as recorded',
             'sample times': 'as recorded' if self._stamps == 'recorded' else 'of now, in the recorded rhythm',
         }
+
+
+DEVICE = Device('replay', 'a recording, in real time', Replay)

@@ -1,7 +1,7 @@
 """A serial port as a source of bytes: opened by pyserial, read with select and ``os.read``.
 
 pyserial opens, locks and configures the port; reading one byte at a time through it would cost a
-quarter of a core at 1 kHz (field notes), so the bytes are read from the descriptor.
+quarter of a core at 1 kHz, so the bytes are read from the descriptor.
 """
 
 from __future__ import annotations
@@ -16,19 +16,12 @@ from pathlib import Path
 
 import serial
 
+from psd_deflection.devices.source import PortClosedError
 from psd_deflection.errors import DeviceError
 
 READ_SIZE = 4096
 MAX_EMPTY_READS = 1000
 """Reads in a row without a byte, though there was one to read, after which a port counts as gone."""
-
-
-class PortClosedError(DeviceError):
-    """The port went away while it was open: unplugged, or the device restarted.
-
-    Example: ``/dev/ttyACM0: the device is gone``.
-    """
-
 
 SLICE_S = 0.1
 """A read waits no longer at a time, so that whoever gives the port up is heard."""

@@ -7,18 +7,19 @@ say what its numbers and times are worth.
 
 One source's life: made from the rig; ``open`` (the device is heard out and made ready), ``start``
 (samples flow), ``read`` again and again, ``close``. When ``read`` says that the device is gone, the
-reader closes it and calls ``reopen`` four times a second until it succeeds. ``open``, ``start``,
-``read``, ``ping`` and ``reopen`` are called by one thread at a time; ``describe`` and ``give_up`` by any.
+reader closes it and calls ``reopen`` until it succeeds, with a pause of 0.2 s before each try. ``open``,
+``start``, ``read``, ``ping`` and ``reopen`` are called by one thread at a time; ``describe`` and ``give_up``
+by any.
 """
 
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import NamedTuple
 
-from psd_deflection.devices.serial_port import PortClosedError as PortClosedError
+from psd_deflection.errors import DeviceError
 from psd_deflection.protocol.frames import BadFrame, Frame, HelloFrame
 
 
@@ -55,15 +56,24 @@ class Sample(NamedTuple):
 
 
 Event = Sample | Frame
-"""What a read gives: samples, HELLO, STATUS, PONG, and :class:`BadFrame` with a reason for what is none."""
+"""What a read gives: samples, HELLO, STATUS, PONG, and :class:`BadFrame` (with a reason) for bytes that are not a valid
+frame."""
 
 
-class Reading(NamedTuple):
-    """``events`` in their order, when the last of their bytes was read (CLOCK_MONOTONIC, ns), and how many bytes."""
+class Received(NamedTuple):
+    """What one read gave: ``events`` in their order, when their last byte was read (CLOCK_MONOTONIC, ns), and the
+    number of bytes."""
 
-    events: list[Event]
+    events: Sequence[Event]
     read_ns: int
     size: int
+
+
+class PortClosedError(DeviceError):
+    """The port went away while it was open: unplugged, or the device restarted.
+
+    Example: ``/dev/ttyACM0: the device is gone``.
+    """
 
 
 class SourceEndedError(Exception):
@@ -71,10 +81,10 @@ class SourceEndedError(Exception):
 
 
 class Source(abc.ABC):
-    """One device. Made with the rig (``Source(rig)``); raises ConfigError where the rig cannot be for it.
+    """One device. Made with the rig (``Source(rig)``); raises ConfigError if the rig does not suit it.
 
     ``name``: its port or file, for messages. ``clock``: what a sample's time is. ``numbered``: whether
-    the device numbers its samples, so that a loss on the way is seen; where it does not, the source
+    the device numbers its samples, so that a loss on the way is seen; if it does not, the source
     numbers what came, and starts from 0 after each ``open``.
     """
 
@@ -96,7 +106,7 @@ class Source(abc.ABC):
         """Let samples flow from now on; what came before is forgotten. Raises DeviceError where it is gone."""
 
     @abc.abstractmethod
-    def read(self, timeout: float) -> Reading:
+    def read(self, timeout: float) -> Received:
         """What has come; no events after ``timeout`` s.
 
         Garbage is a ``BadFrame``, never an exception. Raises PortClosedError where the device is
@@ -145,7 +155,7 @@ __all__ = [
     'Event',
     'HelloFrame',
     'PortClosedError',
-    'Reading',
+    'Received',
     'Sample',
     'Source',
     'SourceEndedError',

@@ -1,4 +1,4 @@
-"""Which port has what on it: asks politely in every language we read, and listens.
+"""Which port has what on it: asks politely in the language of every device that has a probe, and listens.
 
 Nothing is started, stopped or set: only questions are asked that each of these devices answers from
 where it stands (an Arduino starts anew all the same, whenever its port is opened). A port that another
@@ -16,14 +16,10 @@ from typing import Any
 
 from serial.tools import list_ports
 
+from psd_deflection.devices.device import Answer, Device, Probe
 from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.errors import DeviceError
-from psd_deflection.protocol.apt import INFO_REQUEST, AptDecoder, HardwareInfo
-from psd_deflection.protocol.dataq import MODELS, command, find_reply
-from psd_deflection.protocol.frames import FrameDecoder, HelloFrame, HelloRequestFrame, SampleFrame, encode
-from psd_deflection.protocol.text_lines import Description, Line, LineDecoder, positive
 
-FRAMES_BAUD = 921_600
 COMMON_BAUD = 115_200
 ANSWER_S = 0.4
 ONCE_A_SECOND_S = 1.3
@@ -36,7 +32,7 @@ BY_ID = Path('/dev/serial/by-id')
 
 @dataclass(slots=True)
 class Port:
-    """A port. ``source``: the name for ``source:``, '' where nothing that we know answers.
+    """A port. ``source``: the name for ``source:``, '' if nothing that we know answers.
 
     ``answer``: what answered, or why nothing could. ``suggested``: parameters for it.
     ``asked``: False where the port is missing, in use or cannot be opened.
@@ -51,83 +47,36 @@ class Port:
     asked: bool = True
 
 
-class _Ear:
-    """Hears every language at once; ``found`` is the first that made sense."""
+class _Ears:
+    """Hears every language at once on ``port``; the first answer that makes sense is taken."""
 
-    def __init__(self, port: Port, baud: int) -> None:
-        self.port = port
-        self.baud = baud
-        self.received = b''
+    def __init__(self, port: Port, baud: int, probes: Sequence[tuple[str, Probe]]) -> None:
         self.bytes = 0
-        self._frames, self._lines, self._apt = FrameDecoder(), LineDecoder(), AptDecoder()
-        self.promising = False
+        self.answered = False
+        self._port = port
+        self._ears = [(name, probe.listen(baud)) for name, probe in probes]
+
+    @property
+    def promising(self) -> bool:
+        """Whether samples of some device have come."""
+        return any(ear.promising for _, ear in self._ears)
 
     def hear(self, piece: bytes) -> bool:
         """Whether it is known now what is there."""
         self.bytes += len(piece)
-        self.received = (self.received + piece)[-4096:]
-        for frame in self._frames.feed(piece):
-            if isinstance(frame, HelloFrame):
-                self._ours(frame)
+        for name, ear in self._ears:
+            answer = ear.hear(piece)
+            if answer is not None:
+                self._note(name, answer)
                 return True
-            self.promising = self.promising or isinstance(frame, SampleFrame)
-        for item in self._lines.feed(piece):
-            if isinstance(item, Description) and 'sample_rate_hz' in item.info:
-                self._text(item.info)
-                return True
-            self.promising = self.promising or isinstance(item, Line)
-        for message in self._apt.feed(piece):
-            if isinstance(message, HardwareInfo):
-                self._aligner(message)
-                return True
-        return self._converter()
+        return False
 
-    def _ours(self, hello: HelloFrame) -> None:
-        info = hello.info
-        self.port.source = 'serial'
-        self.port.answer = (
-            f'PSD device {info.get("serial", "?")}, firmware {info.get("firmware", "?")}, protocol {hello.version}'
-        )
-        self._suggest('serial', info, self.baud)
-
-    def _text(self, info: dict[str, object]) -> None:
-        self.port.source = 'lines'
-        self.port.answer = f'text lines, {info.get("serial", "no serial number")}'
-        self._suggest('lines', info, self.baud)
-
-    def _suggest(self, source: str, info: dict[str, object], baud: int) -> None:
-        out: dict[str, Any] = {'source': source, 'port': stable_name(self.port.port), 'baud': baud}
-        rate, volts = positive(info.get('sample_rate_hz')), positive(info.get('volts_per_count'))
-        if rate is not None:
-            out['converter.sample_rate_hz'] = rate
-        if volts is not None:
-            out['converter.full_scale'] = round(volts * 32768, 6)
-        self.port.suggested = out
-
-    def _aligner(self, info: HardwareInfo) -> None:
-        self.port.source = 'thorlabs'
-        self.port.answer = f'Thorlabs {info.model} {info.serial}, firmware {info.firmware}'
-        self.port.suggested = {'source': 'thorlabs', 'port': stable_name(self.port.port)}
-
-    def _converter(self) -> bool:
-        if find_reply(self.received, 'info 0') is None:
-            return False
-        model = find_reply(self.received, 'info 1')
-        if model is None:
-            return False
-        known = MODELS.get(model)
-        self.port.answer = f'DATAQ DI-{model}'
-        if known is None or known.analog < 6 or not known.counter:
-            self.port.answer += ': six analog inputs and a counter are needed (DI-1110, DI-2108, DI-4108)'
-            return True
-        self.port.source = 'dataq'
-        self.port.suggested = {
-            'source': 'dataq',
-            'port': stable_name(self.port.port),
-            'converter.bits': 16,
-            'converter.full_scale': 10.0,
-        }
-        return True
+    def _note(self, name: str, answer: Answer) -> None:
+        self.answered = True
+        self._port.answer = answer.text
+        if answer.usable:
+            self._port.source = name
+            self._port.suggested = {'source': name, 'port': stable_name(self._port.port), **answer.parameters}
 
 
 def stable_name(port: str) -> str:
@@ -149,56 +98,71 @@ def serial_ports() -> list[Port]:
     return found
 
 
-def identify(port: Port) -> Port:
-    """Fill in what answers on it; takes up to about five seconds."""
+def identify(port: Port, devices: Sequence[Device]) -> Port:
+    """Fill in which of ``devices`` answers on it; takes up to about five seconds a line speed."""
+    probes = [(d.name, d.probe) for d in devices if d.probe is not None]
+    # Stable: among the others the order stays.
+    probes.sort(key=lambda named: not named[1].first)
+    speeds = dict.fromkeys([COMMON_BAUD, *(probe.baud for _, probe in probes)])
     try:
-        ear = _ask(port, COMMON_BAUD)
-        if not port.source and ear.bytes and not ear.promising and not port.suggested:
+        for baud in speeds:
+            ears = _ask(port, baud, probes)
+            if ears.answered or ears.promising or not ears.bytes:
+                break
             # Something talks, but not at this speed.
-            _ask(port, FRAMES_BAUD)
     except DeviceError as error:
         port.answer = str(error).removeprefix(f'{port.port}: ')
         port.asked = False
     return port
 
 
-def _ask(port: Port, baud: int) -> _Ear:
+def _ask(port: Port, baud: int, probes: Sequence[tuple[str, Probe]]) -> _Ears:
     line = SerialPort(port.port, baud)
-    ear = _Ear(port, baud)
+    ears = _Ears(port, baud, probes)
     try:
-        # The aligner first: it has no way to find out that it was spoken to in another language.
-        questions = (
-            (INFO_REQUEST, ANSWER_S),
-            (b'\x00' + encode(HelloRequestFrame()), ANSWER_S),
-            # The carriage return ends what a converter took for the beginning of a command.
-            (b'\r' + command('info 0') + command('info 1'), ANSWER_S),
-        )
-        for question, wait in questions:
-            line.write(question)
-            if _listen(line, ear, wait):
-                return ear
-        _listen(line, ear, ONCE_A_SECOND_S if ear.bytes else BOOT_S)
-        if not port.source and ear.promising:
+        for _, probe in probes:
+            if probe.question:
+                line.write(probe.question)
+                if _listen(line, ears, ANSWER_S):
+                    return ears
+        if _listen(line, ears, ONCE_A_SECOND_S if ears.bytes else BOOT_S):
+            return ears
+        if ears.promising:
             port.answer = 'samples come, but the device does not say what it is'
-        elif not port.source and ear.bytes:
-            port.answer = f'{ear.bytes} bytes that we cannot read at {baud} baud'
+        elif ears.bytes:
+            port.answer = f'{ears.bytes} bytes that we cannot read at {baud} baud'
     finally:
         line.close()
-    return ear
+    return ears
 
 
-def _listen(line: SerialPort, ear: _Ear, seconds: float) -> bool:
+def _listen(line: SerialPort, ears: _Ears, seconds: float) -> bool:
     deadline = time.monotonic() + seconds
     while (left := deadline - time.monotonic()) > 0:
-        if ear.hear(line.read(left)):
+        if ears.hear(line.read(left)):
             return True
     return False
 
 
-def survey(names: Sequence[str] = ()) -> list[Port]:
-    """Every port with what answers on it, or only those named (a pseudo-terminal is in no list)."""
+def survey(devices: Sequence[Device], names: Sequence[str] = ()) -> list[Port]:
+    """Every port with which of ``devices`` answers on it, or only those named (a pseudo-terminal is in no list)."""
     ports = [Port(name) for name in names] or serial_ports()
     if not ports:
         return []
     with ThreadPoolExecutor(max_workers=len(ports)) as pool:
-        return list(pool.map(identify, ports))
+        return list(pool.map(lambda port: identify(port, devices), ports))
+
+
+def suggestions(devices: Sequence[Device], ports: Sequence[Port]) -> list[dict[str, Any]]:
+    """One parameter set a device; ports of which several make one device are put together in their order."""
+    single = {d.name for d in devices if d.probe is not None and d.probe.ports == 1}
+    out: list[dict[str, Any]] = [p.suggested for p in ports if p.source in single]
+    for device in devices:
+        if device.probe is None or device.probe.ports == 1:
+            continue
+        found = [p.suggested for p in ports if p.source == device.name]
+        n = device.probe.ports
+        for first in range(0, len(found) - n + 1, n):
+            names = ','.join(s['port'] for s in found[first : first + n])
+            out.append({**found[first], 'port': names, **device.probe.together})
+    return out

@@ -7,12 +7,17 @@ true, the device cannot be asked anything, and 115200 baud carry about 250 lines
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
+from psd_deflection import __version__
 from psd_deflection.config import Rig
+from psd_deflection.devices.device import OUTPUT_LIMIT, Answer, Device, PowerUp, Probe, converter_parameters
+from psd_deflection.devices.port_source import PortSource
 from psd_deflection.devices.serial_port import SerialPort
-from psd_deflection.devices.source import Event, Reading, Sample, Source
+from psd_deflection.devices.source import Event, Received, Sample
 from psd_deflection.errors import DeviceError
 from psd_deflection.protocol.frames import PROTOCOL_VERSION, BadFrame, HelloFrame
 from psd_deflection.protocol.text_lines import (
@@ -22,20 +27,23 @@ from psd_deflection.protocol.text_lines import (
     LineDecoder,
     TimeExtender,
     positive,
+    with_check,
 )
 from psd_deflection.records import CHANNELS, FLAG_OVER_RANGE
+
+if TYPE_CHECKING:
+    from psd_deflection.devices.rig_feed import RigFeed
 
 BOOT_S = 4.0
 """An Arduino starts anew when its port is opened, and its boot loader takes two seconds."""
 
 
-class TextLines(Source):
+class TextLines(PortSource):
     """``source: lines``."""
 
     def __init__(self, rig: Rig) -> None:
-        self.name = rig.acquisition.port
+        super().__init__(rig.acquisition.port)
         self._baud = rig.acquisition.baud
-        self._port: SerialPort | None = None
         self._decoder = LineDecoder()
         self._time = TimeExtender()
         self._counts = False
@@ -87,11 +95,9 @@ class TextLines(Source):
         if self._port is not None:
             self._port.discard_input()
 
-    def read(self, timeout: float) -> Reading:
+    def read(self, timeout: float) -> Received:
         """The lines that have come."""
-        if self._port is None:
-            raise DeviceError(f'{self.name}: not open')
-        received = self._port.read(timeout)
+        received = self._opened().read(timeout)
         now = time.monotonic_ns()
         events: list[Event] = []
         for item in self._decoder.feed(received) if received else ():
@@ -99,7 +105,7 @@ class TextLines(Source):
                 events.append(self._sample(item))
             elif isinstance(item, BadFrame):
                 events.append(item)
-        return Reading(events, now, len(received))
+        return Received(events, now, len(received))
 
     def _sample(self, line: Line) -> Event:
         if not self._counts:
@@ -112,18 +118,6 @@ class TextLines(Source):
         over = max(counts) == 32767 or min(counts) == -32768
         return Sample(FLAG_OVER_RANGE if over else 0, line.seq, self._time.extend(line), counts)
 
-    def give_up(self) -> None:
-        """Wait for the device no longer."""
-        port = self._port
-        if port is not None:
-            port.give_up()
-
-    def close(self) -> None:
-        """Give the port back."""
-        if self._port is not None:
-            self._port.close()
-            self._port = None
-
     def describe(self) -> Mapping[str, str]:
         """Port and line speed."""
         return {
@@ -131,3 +125,72 @@ class TextLines(Source):
             'sample numbers': 'of the device',
             'sample times': 'of the device',
         }
+
+
+class SimulatedLines:
+    """Sends from power-up, with checks; describes itself at power-up and once a second."""
+
+    def __init__(self, feed: RigFeed, power_up: PowerUp | None = None) -> None:
+        skew_ppm, self._first_seq = power_up or PowerUp()
+        self._feed = feed
+        self._rate = feed.rig.converter.sample_rate_hz
+        self._period_host_ns = 1e9 / self._rate / (1.0 + skew_ppm * 1e-6)
+        self._description = {
+            'serial': 'SIM-LINES-1',
+            'firmware': f'psd_deflection simulated lines {__version__}',
+            'sample_rate_hz': self._rate,
+            'volts_per_count': feed.rig.converter.volts_per_count,
+        }
+
+    def greeting(self) -> bytes:
+        """The end of whatever was half sent, and what it says of itself."""
+        return b'\n# ' + json.dumps(self._description).encode() + b'\n'
+
+    def due_in_ns(self, since_power_up_ns: int) -> int:
+        """Host nanoseconds until the next sample."""
+        return int(self._feed.taken * self._period_host_ns) - since_power_up_ns
+
+    def receive(self, received: bytes, since_power_up_ns: int) -> bytes:
+        """It does not listen."""
+        return b''
+
+    def take(self, since_power_up_ns: int, room: int = OUTPUT_LIMIT) -> bytes:
+        """The lines that are due; with no room left they are lost, and the number shows it."""
+        out = bytearray()
+        while self.due_in_ns(since_power_up_ns) <= 0:
+            number = self._feed.taken
+            row = self._feed.next()
+            if len(out) >= room:
+                continue
+            if number % round(self._rate) == 0:
+                out += self.greeting()
+            t_us = round((self._first_seq + number) * 1e6 / self._rate) % 2**32
+            out += with_check(','.join(map(str, ((self._first_seq + number) % 2**32, t_us, *row))))
+        return bytes(out)
+
+
+class LinesEar:
+    """Hears a line that describes the device. ``baud``: the speed at which it listens, to be suggested."""
+
+    def __init__(self, baud: int) -> None:
+        self.promising = False
+        self._baud = baud
+        self._decoder = LineDecoder()
+
+    def hear(self, piece: bytes) -> Answer | None:
+        """What the description says."""
+        for item in self._decoder.feed(piece):
+            if isinstance(item, Description) and 'sample_rate_hz' in item.info:
+                return Answer(
+                    f'text lines, {item.info.get("serial", "no serial number")}',
+                    {'baud': self._baud, **converter_parameters(item.info)},
+                )
+            self.promising = self.promising or isinstance(item, Line)
+        return None
+
+
+def _simulate(feed: RigFeed, power_up: PowerUp) -> Sequence[SimulatedLines]:
+    return [SimulatedLines(feed, power_up)]
+
+
+DEVICE = Device('lines', 'a line of text a sample, as an Arduino sends it', TextLines, _simulate, Probe(LinesEar))

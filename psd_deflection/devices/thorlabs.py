@@ -13,23 +13,35 @@ from __future__ import annotations
 import contextlib
 import math
 import select
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from psd_deflection.config import Rig
+from psd_deflection.devices.device import OUTPUT_LIMIT, Answer, Device, PowerUp, Probe
 from psd_deflection.devices.serial_port import SerialPort
-from psd_deflection.devices.source import Clock, Event, Reading, Sample, Source
+from psd_deflection.devices.source import Clock, Event, Received, Sample, Source
 from psd_deflection.errors import ConfigError, DeviceError
 from psd_deflection.protocol.apt import (
+    DEVICE_ADDRESS,
+    FULL_SCALE,
+    HOST_ADDRESS,
     INFO_REQUEST,
     READINGS_REQUEST,
+    SUM_VOLTS,
     AptDecoder,
     HardwareInfo,
     Message,
     Readings,
+    encode_info,
+    encode_readings,
 )
 from psd_deflection.protocol.frames import PROTOCOL_VERSION, BadFrame, HelloFrame
 from psd_deflection.records import CHANNELS
+
+if TYPE_CHECKING:
+    from psd_deflection.devices.rig_feed import RigFeed
 
 BAUD = 115_200
 ANSWER_S = 0.1
@@ -40,6 +52,10 @@ HEADROOM = 0.8
 """Share of the rate measured at the start that may be asked for."""
 
 SECOND_NS = 1_000_000_000
+ANSWER_NS = 2_100_000
+"""How long a simulated aligner takes to answer, as real ones do."""
+
+IDLE_NS = 20_000_000
 
 
 class ThorlabsPair(Source):
@@ -58,7 +74,7 @@ class ThorlabsPair(Source):
         self._rate = rig.converter.sample_rate_hz
         self._period_ns = round(SECOND_NS / self._rate)
         # Two drivers of other people found x to come with its sign turned; a parameter says it here.
-        self._x_sign = float(rig.values['thorlabs.x_sign'])  # type: ignore[arg-type]
+        self._x_sign = rig.acquisition.thorlabs_x_sign
         if abs(self._x_sign) != 1.0:
             raise ConfigError(f'thorlabs.x_sign = {self._x_sign:g}: must be 1 or -1')
         self._ports: list[SerialPort] = []
@@ -156,7 +172,7 @@ class ThorlabsPair(Source):
         if self._origin_ns is None:
             self._origin_ns = time.monotonic_ns()
 
-    def read(self, timeout: float) -> Reading:
+    def read(self, timeout: float) -> Received:
         """Wait for the next slot, ask both, and give the sample of that slot."""
         origin = self._origin_ns or 0
         now = time.monotonic_ns()
@@ -164,7 +180,7 @@ class ThorlabsPair(Source):
         wait = origin + slot * self._period_ns - now
         if wait > timeout * 1e9:
             time.sleep(timeout)
-            return Reading([], time.monotonic_ns(), 0)
+            return Received([], time.monotonic_ns(), 0)
         if wait > 0:
             time.sleep(wait * 1e-9)
         self._slot = slot
@@ -182,7 +198,7 @@ class ThorlabsPair(Source):
             self._first_ns = self._first_ns or t_ns
             self._last_ns = t_ns
             self._taken += 1
-        return Reading(events, time.monotonic_ns(), max(size, 1))
+        return Received(events, time.monotonic_ns(), max(size, 1))
 
     def give_up(self) -> None:
         """Wait for the devices no longer."""
@@ -227,3 +243,108 @@ def _floor(rate: float) -> str:
     with contextlib.suppress(OverflowError):
         return f'{math.floor(rate / digits) * digits:g}'
     return f'{rate:g}'
+
+
+class SharedRig:
+    """One rig that two devices look at, each from its own thread; the rig moves on with their time."""
+
+    def __init__(self, feed: RigFeed) -> None:
+        self._feed = feed
+        self._rate = feed.rig.converter.sample_rate_hz
+        self._volts = feed.rig.converter.volts_per_count
+        self._lock = threading.Lock()
+
+    def volts(self, since_power_up_ns: int, psd: int) -> tuple[float, float, float]:
+        """x, y and sum of one PSD as the rig's amplifier would give them, V."""
+        with self._lock:
+            row = self._feed.at(int(since_power_up_ns * 1e-9 * self._rate))
+        x, y, total = row[3 * psd - 3 : 3 * psd]
+        return x * self._volts, y * self._volts, total * self._volts
+
+
+class SimulatedAligner:
+    """One KPA101. ``psd``: 1 or 2."""
+
+    def __init__(self, shared: SharedRig, psd: int, *, answer_ns: int = ANSWER_NS) -> None:
+        self._shared = shared
+        self._psd = psd
+        self._serial = 69_000_000 + psd
+        self._answer_ns = answer_ns
+        self._input = b''
+        self._queue: list[tuple[int, bytes]] = []
+
+    def greeting(self) -> bytes:
+        """Nothing: it speaks when it is spoken to."""
+        return b''
+
+    def due_in_ns(self, since_power_up_ns: int) -> int:
+        """Host nanoseconds until the next answer goes out."""
+        return self._queue[0][0] - since_power_up_ns if self._queue else IDLE_NS
+
+    def receive(self, received: bytes, since_power_up_ns: int) -> bytes:
+        """Take questions; the answers come later, through :meth:`take`."""
+        self._input = (self._input + received)[-256:]
+        while len(self._input) >= 6:
+            if self._input[4] != DEVICE_ADDRESS or self._input[5] != HOST_ADDRESS:
+                self._input = self._input[1:]
+                continue
+            question, self._input = self._input[:6], self._input[6:]
+            at = since_power_up_ns + self._answer_ns
+            if question == READINGS_REQUEST:
+                x, y, total = self._shared.volts(since_power_up_ns, self._psd)
+                # The device gives differences, not quotients.
+                scale = total / FULL_SCALE * 32767.0 / 10.0
+                sum_count = min(max(round(total / SUM_VOLTS), 0), 65535)
+                self._queue.append((at, encode_readings(_int16(x * scale), _int16(y * scale), sum_count)))
+            elif question == INFO_REQUEST:
+                self._queue.append((at, encode_info(self._serial, 'KPA101')))
+        return b''
+
+    def take(self, since_power_up_ns: int, room: int = OUTPUT_LIMIT) -> bytes:
+        """The answers that are due."""
+        out = b''
+        while self._queue and self._queue[0][0] <= since_power_up_ns:
+            out += self._queue.pop(0)[1]
+        return out[:room]
+
+
+def _int16(value: float) -> int:
+    return min(max(round(value), -32768), 32767)
+
+
+class AlignerEar:
+    """Hears the hardware info of one aligner."""
+
+    promising = False
+
+    def __init__(self, baud: int) -> None:
+        self._decoder = AptDecoder()
+
+    def hear(self, piece: bytes) -> Answer | None:
+        """Which aligner answers."""
+        for message in self._decoder.feed(piece):
+            if isinstance(message, HardwareInfo):
+                return Answer(f'Thorlabs {message.model} {message.serial}, firmware {message.firmware}')
+        return None
+
+
+def _simulate(feed: RigFeed, power_up: PowerUp) -> Sequence[SimulatedAligner]:
+    del power_up
+    shared = SharedRig(feed)
+    return [SimulatedAligner(shared, psd) for psd in (1, 2)]
+
+
+DEVICE = Device(
+    'thorlabs',
+    'a pair of Thorlabs KPA101 or TQD001, two ports',
+    ThorlabsPair,
+    _simulate,
+    Probe(
+        AlignerEar,
+        INFO_REQUEST,
+        # It has no way to find out that it was spoken to in another language.
+        first=True,
+        ports=2,
+        together={'converter.sample_rate_hz': 200.0, 'block_size': 10, 'min_samples': 5},
+    ),
+)

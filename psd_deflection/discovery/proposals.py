@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from psd_deflection.discovery.observation import Observation
-from psd_deflection.records import FloatArray
+from psd_deflection.records import DOT_CHANNELS, FloatArray
 
 PEAK = 40.0
 """A spectral line counts from this many times the median power around it (one in 1e12 bins by chance)."""
@@ -87,7 +87,7 @@ def persistent(
 
 def highest_voltages(observations: Sequence[Observation], with_sums: bool, noise: float) -> list[float]:
     """Limits, V, at which the outputs may have clipped: the largest reading and a little less."""
-    rows = [0, 1, 2, 3, 4, 5] if with_sums else [0, 1, 3, 4]
+    rows = [0, 1, 2, 3, 4, 5] if with_sums else list(DOT_CHANNELS)
     top = max(float(np.nanmax(np.abs(o.volts[:, rows]))) for o in observations)
     return [v for v in (top - 2.0 * noise, top - 4.0 * noise, top - 12.0 * noise, 0.98 * top) if v > 0.1]
 

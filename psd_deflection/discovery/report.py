@@ -18,7 +18,7 @@ from psd_deflection.discovery.discover import Discovery, NamedEffect
 from psd_deflection.discovery.localise import BANDS
 from psd_deflection.discovery.result import parameters_of, provenance, sentence
 from psd_deflection.discovery.screen import Score
-from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 
 BEFORE, AFTER, HELD, FLOOR = '#c44e52', '#4c72b0', '#55a868', '#8c8c8c'
 DOTS = ('x1', 'y1', 'x2', 'y2')
@@ -91,7 +91,7 @@ def _spectrum_figure(discovery: Discovery) -> Figure:
     figure = Figure(figsize=(10, 3.2), layout='constrained')
     axis = figure.subplots()
     o, size = ws.observations[0], ws.fine[0]
-    rows = [0, 1, 3, 4]
+    rows = list(DOT_CHANNELS)
     for fit, color, name in (
         (discovery.search.null, BEFORE, 'before'),
         (discovery.fit, AFTER, 'after'),

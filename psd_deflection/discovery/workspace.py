@@ -13,7 +13,7 @@ import numpy as np
 
 from psd_deflection.discovery.noise import NoiseModel, estimate_noise
 from psd_deflection.discovery.observation import Observation, load_cases
-from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
 from psd_deflection.simulation.catalogue import sort_effects
 from psd_deflection.simulation.declaration import ActiveEffect
 from psd_deflection.simulation.physics import Physics
@@ -22,7 +22,6 @@ from psd_deflection.simulation.simulator import ForwardModel
 FINE_SECONDS = 0.004
 MAX_FINE = 60_000
 """Fine blocks of all recordings together, about; long ones get longer blocks, so that memory stays bounded."""
-DOT_ROWS = (0, 1, 3, 4)
 
 
 def fine_means(rows: FloatArray, size: int) -> FloatArray:
@@ -126,7 +125,7 @@ class Workspace:
         """Block means of the dots (4, blocks), m, of fine-block volts; NaN where a sample is lost."""
         out = []
         for f, v, s, o in zip(fine, self.valid, self.fine, self.observations, strict=True):
-            rows = np.where(v, f[list(DOT_ROWS)], np.nan)
+            rows = np.where(v, f[list(DOT_CHANNELS)], np.nan)
             out.append(fine_means(rows, o.rig.estimator.block_size // s) * o.rig.amplifier.sensitivity)
         return out
 
@@ -145,7 +144,7 @@ class Workspace:
         total, count = 0.0, 0.0
         for w, o, v in zip(self.noise, self.observations, self.valid, strict=True):
             n = float(v.sum())
-            total += n * float(np.mean(w.block_sigma[list(DOT_ROWS)] ** 2)) * o.rig.amplifier.sensitivity**2
+            total += n * float(np.mean(w.block_sigma[list(DOT_CHANNELS)] ** 2)) * o.rig.amplifier.sensitivity**2
             count += n
         return float(np.sqrt(total / max(count, 1.0)))
 

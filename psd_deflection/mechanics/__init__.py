@@ -1,6 +1,6 @@
-"""The link as a beam: load to deflection and back, tube sections, scaling, sensor placement.
+"""The link as a beam: load to deflection and back, tube sections.
 
-What the real-time path needs is :class:`LinkStatics` alone; the rest serves ``psd-deflection design``.
+What the real-time path needs is :class:`LinkStatics` alone; ``section`` serves ``psd-deflection design``.
 """
 
 from psd_deflection.mechanics.statics import LinkStatics

@@ -47,11 +47,6 @@ class TubeSection:
         return math.pi * (self.outer_radius**2 - self.inner_radius**2)
 
     @property
-    def bore_area(self) -> float:
-        """Area of the bore, m^2."""
-        return math.pi * self.inner_radius**2
-
-    @property
     def second_moment(self) -> float:
         """I = pi/4 (Ro^4 - Ri^4), m^4, about any diameter (A-13, B-1)."""
         return math.pi / 4.0 * (self.outer_radius**4 - self.inner_radius**4)
@@ -60,11 +55,3 @@ class TubeSection:
     def polar_moment(self) -> float:
         """J = Ix + Iy = 2 I, m^4 (A-15, B-3, B-7)."""
         return 2.0 * self.second_moment
-
-    def shear_stress(self, torque: float, radius: float) -> float:
-        """tau = T r / J, Pa, at ``radius`` (m) under ``torque`` (N m) (A-18)."""
-        return torque * radius / self.polar_moment
-
-    def shear_strain(self, torque: float, radius: float, shear_modulus: float) -> float:
-        """gamma = tau / G (A-17 corrected: the thesis prints G = tau gamma)."""
-        return self.shear_stress(torque, radius) / shear_modulus

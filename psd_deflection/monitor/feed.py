@@ -86,8 +86,7 @@ def row_json(result: BlockResult) -> str:
     spots, estimate = result
     values: list[float] = [*spots.dots, *spots.sums]
     if estimate is not None:
-        c = estimate.covariance
-        values += [estimate.dx, estimate.dy, estimate.theta, *(math.sqrt(max(c[i], 0.0)) for i in (0, 4, 8))]
+        values += [*estimate.pose, *(math.sqrt(max(v, 0.0)) for v in estimate.variances)]
     numbers = [f'{v:.7g}' if math.isfinite(v) else 'null' for v in values]
     numbers += ['null'] * (12 - len(numbers))
     # Microseconds are all that a double can hold of a time since the epoch.

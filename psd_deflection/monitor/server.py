@@ -32,7 +32,7 @@ from psd_deflection.config import MonitorConfig
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor import access
 from psd_deflection.monitor.feed import COLUMNS, BlockResult, Feed, row_json
-from psd_deflection.monitor.source import RefusedError, Source
+from psd_deflection.monitor.shown import RefusedError, Shown
 from psd_deflection.monitor.spectrum import Spectrum, density_json
 from psd_deflection.records import BlockStatus, DiagnosticReport
 
@@ -71,17 +71,17 @@ _UNHEARD.disabled = True
 
 
 class MonitorServer:
-    """Serves ``source``, fed by ``feed``, from :meth:`start` to :meth:`close`. ``say``: where it tells its address."""
+    """Serves ``shown``, fed by ``feed``, from :meth:`start` to :meth:`close`. ``say``: where it tells its address."""
 
-    def __init__(self, source: Source, feed: Feed, config: MonitorConfig, say: Callable[[str], None]) -> None:
+    def __init__(self, shown: Shown, feed: Feed, config: MonitorConfig, say: Callable[[str], None]) -> None:
         self.token = ''
         self.url = ''
-        self._source = source
+        self._shown = shown
         self._feed = feed
         self._config = config
         self._say = say
         self._instance = secrets.token_hex(8)
-        rate = source.rig.converter.sample_rate_hz / source.rig.estimator.block_size
+        rate = shown.rig.converter.sample_rate_hz / shown.rig.estimator.block_size
         self._rows: deque[str] = deque(maxlen=max(100, round(HISTORY_S * rate)))
         self._row_count = 0
         self._messages: deque[tuple[int, float, str]] = deque(maxlen=MESSAGES)
@@ -89,7 +89,7 @@ class MonitorServer:
         self._health: tuple[int, str] = (0, 'null')
         self._report: DiagnosticReport | None = None
         self._report_at = 0.0
-        self._spectrum = Spectrum(source.rig)
+        self._spectrum = Spectrum(shown.rig)
         self._density: tuple[int, str] = (0, 'null')
         self._browsers: dict[web.WebSocketResponse, asyncio.Event] = {}
         self._looked_through: set[web.RequestHandler] = set()
@@ -215,7 +215,7 @@ class MonitorServer:
         now = time.monotonic()
         if self._report is None or now - self._report_at >= HEALTH_S:
             # A report tells of the time since the last one: of a moment, it would say that nothing came.
-            self._report, self._report_at = self._source.health(time.time_ns()), now
+            self._report, self._report_at = self._shown.health(time.time_ns()), now
         self._health = (self._health[0] + 1, self._health_json(self._report))
         self._wake()
 
@@ -239,8 +239,8 @@ class MonitorServer:
                 'entries': entries,
                 'dropped': self._feed.dropped,
                 'browsers': len(self._browsers),
-                'sum_min': self._source.rig.estimator.sum_min,
-                **self._source.describe(),
+                'sum_min': self._shown.rig.estimator.sum_min,
+                **self._shown.describe(),
             }
         )
 
@@ -318,7 +318,7 @@ class MonitorServer:
             event.clear()
 
     def _hello(self) -> dict[str, Any]:
-        rig = self._source.rig
+        rig = self._shown.rig
         frequencies = self._spectrum.frequencies
         return {
             'instance': self._instance,
@@ -339,18 +339,18 @@ class MonitorServer:
             'solver': rig.estimator.solver,
             'control': self._config.control,
             'needs_token': bool(self.token),
-            **self._source.describe(),
+            **self._shown.describe(),
         }
 
     async def _zero(self, request: web.Request) -> web.StreamResponse:
-        return await self._act(request, lambda wanted: asyncio.to_thread(self._source.zero))
+        return await self._act(request, lambda wanted: asyncio.to_thread(self._shown.zero))
 
     async def _record(self, request: web.Request) -> web.StreamResponse:
-        return await self._act(request, self._source.record)
+        return await self._act(request, self._shown.record)
 
     async def _act(self, request: web.Request, action: Callable[[bool], Awaitable[str]]) -> web.StreamResponse:
         if not self._config.control:
-            return _answer(403, 'refused: the buttons are off; monitor_control:=true (--control) allows them')
+            return _answer(403, 'refused: the buttons are off; the parameter monitor_control allows them')
         if self.token and not access.is_token(request.headers.get(TOKEN_HEADER), self.token):
             return _answer(401, 'refused: the token is missing or wrong; the address printed at the start has it')
         # A type that no foreign form can send.

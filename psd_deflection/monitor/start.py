@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor.feed import Feed
-from psd_deflection.monitor.source import LiveSource
+from psd_deflection.monitor.shown import ShownSession
 from psd_deflection.runner.session import Session
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def start_monitor(session: Session, say: Callable[[str], None]) -> MonitorServer
     from psd_deflection.monitor.server import MonitorServer
 
     feed = Feed()
-    server = MonitorServer(LiveSource(session), feed, session.rig.monitor, say)
+    server = MonitorServer(ShownSession(session), feed, session.rig.monitor, say)
     server.start()
     # Behind what is published and recorded.
     session.processing.sinks.append(feed)

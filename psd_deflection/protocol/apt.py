@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 from psd_deflection.protocol.frames import BadFrame
 
-HOST, DEVICE, LONG = 0x01, 0x50, 0x80
-READINGS_REQUEST = bytes((0x71, 0x08, 0x03, 0x00, DEVICE, HOST))
-INFO_REQUEST = bytes((0x05, 0x00, 0x00, 0x00, DEVICE, HOST))
+HOST_ADDRESS, DEVICE_ADDRESS, LONG = 0x01, 0x50, 0x80
+READINGS_REQUEST = bytes((0x71, 0x08, 0x03, 0x00, DEVICE_ADDRESS, HOST_ADDRESS))
+INFO_REQUEST = bytes((0x05, 0x00, 0x00, 0x00, DEVICE_ADDRESS, HOST_ADDRESS))
 READINGS_REPLY, INFO_REPLY = 0x0872, 0x0006
 READINGS_SUBMESSAGE = 0x03
 
@@ -74,13 +74,13 @@ def readings_of(x_difference: int, y_difference: int, total: int) -> Readings:
 def encode_readings(x_difference: int, y_difference: int, total: int) -> bytes:
     """The reply of a device (for the simulated one)."""
     body = READINGS.pack(READINGS_SUBMESSAGE, x_difference, y_difference, total, x_difference, y_difference)
-    return HEADER.pack(READINGS_REPLY, len(body), HOST | LONG, DEVICE) + body
+    return HEADER.pack(READINGS_REPLY, len(body), HOST_ADDRESS | LONG, DEVICE_ADDRESS) + body
 
 
 def encode_info(serial: int, model: str) -> bytes:
     """The hardware info of a device (for the simulated one)."""
     body = INFO.pack(serial, model.encode('ascii')[:8], 16, bytes((0, 0, 1, 0)), b'simulated', 1, 0, 1)
-    return HEADER.pack(INFO_REPLY, len(body), HOST | LONG, DEVICE) + body
+    return HEADER.pack(INFO_REPLY, len(body), HOST_ADDRESS | LONG, DEVICE_ADDRESS) + body
 
 
 class AptDecoder:
@@ -97,7 +97,7 @@ class AptDecoder:
         while len(stream) - at >= HEADER.size:
             kind, length, destination, origin = HEADER.unpack_from(stream, at)
             long = bool(destination & LONG)
-            if destination & ~LONG != HOST or origin != DEVICE or (long and length > MAX_DATA):
+            if destination & ~LONG != HOST_ADDRESS or origin != DEVICE_ADDRESS or (long and length > MAX_DATA):
                 at += 1
                 self._skipped += 1
                 continue

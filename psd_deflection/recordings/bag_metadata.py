@@ -6,13 +6,14 @@ that compare them skip a topic where they differ, so both are made here from one
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
+
+from psd_deflection.files import replace_file
 
 METADATA_VERSION = 9
 
@@ -60,6 +61,15 @@ class TopicCount:
     qos: Qos | list[Qos]
     type_hash: str
     messages: int = 0
+
+
+def totals(counts: Iterable[TopicCount]) -> list[TopicCount]:
+    """One count a topic, of all files together."""
+    topics: dict[str, TopicCount] = {}
+    for t in counts:
+        known = topics.setdefault(t.name, TopicCount(t.name, t.type, t.qos, t.type_hash))
+        known.messages += t.messages
+    return list(topics.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,11 +129,5 @@ def bag_information(
 
 def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:
     """``metadata.yaml`` as a whole or not at all. Raises OSError."""
-    partial = folder / 'metadata.yaml.partial'
-    try:
-        partial.write_text(to_yaml({'rosbag2_bagfile_information': information}), encoding='utf-8')
-        partial.replace(folder / 'metadata.yaml')
-    except OSError:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-        raise
+    text = to_yaml({'rosbag2_bagfile_information': information})
+    replace_file(folder / 'metadata.yaml', text.encode())

@@ -6,7 +6,6 @@ writer cut them (2^32 is no multiple of 20).
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -30,17 +29,18 @@ from msg_adapters import (
     wrench_stamped,
 )
 from msg_adapters.header import header, stamp_ns
-from msg_adapters.orientation import angles
 from psd_deflection.errors import RecordingError
+from psd_deflection.protocol.sequence import WRAP
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.bag_writer import META_CHANGE, META_HELLO, META_PARAMETERS, META_SOFTWARE
-from psd_deflection.recordings.mcap_records import McapSource, RawMessage
-from psd_deflection.recordings.message_decode import CloudDecoder, Samples, header_and_doubles, joined_points
+from psd_deflection.recordings.clouds import CloudDecoder, Samples, joined_points
+from psd_deflection.recordings.mcap_reader import McapReader, RawMessage
 from psd_deflection.recordings.recording import EstimateSeries, Recording, from_json
 from psd_deflection.records import (
     AppliedLoad,
     IntArray,
     ParameterChange,
+    RawChunk,
     ReferencePose,
     SampleBlock,
     TemperatureReading,
@@ -61,7 +61,7 @@ class BagRecording(Recording):
         super().__init__(path, block_size)
         self._own_warnings: list[str] = []
         files = self._files_of(path) if path.is_dir() else [path]
-        self._sources = [McapSource(f) for f in files]
+        self._sources = [McapReader(f) for f in files]
         metadata: dict[str, dict[str, str]] = {}
         for source in self._sources:
             metadata.update(source.metadata)
@@ -73,7 +73,7 @@ class BagRecording(Recording):
     def _files_of(self, folder: Path) -> list[Path]:
         """The bag's files in order: as ``metadata.yaml`` names them, else by their number."""
         meta_file = folder / 'metadata.yaml'
-        found = sorted(folder.glob('*.mcap'), key=_file_number)
+        found = files_in(folder)
         if not meta_file.is_file():
             if not found:
                 raise RecordingError(f'{folder}: is no bag: it holds neither metadata.yaml nor an .mcap file')
@@ -139,28 +139,18 @@ class BagRecording(Recording):
         return counts
 
     def blocks(self) -> Iterator[SampleBlock]:
-        """The samples, cut into blocks at seq // block_size."""
-        size = self.block_size
-        waiting: SampleBlock | None = None
-        for seq, t_ns, volts, flags in self._samples_in_order():
-            edges = [0, *(np.flatnonzero(np.diff(seq // size)) + 1).tolist(), len(seq)]
-            for a, b in itertools.pairwise(edges):
-                block = SampleBlock(int(seq[a]) // size, seq[a:b], t_ns[a:b], volts[a:b], flags[a:b])
-                if waiting is not None and waiting.index == block.index:
-                    waiting = _joined(waiting, block)
-                    continue
-                if waiting is not None:
-                    yield waiting
-                waiting = block
-        if waiting is None:
+        """The samples, cut into blocks at seq // block_size. Raises RecordingError if there is none."""
+        blocks = super().blocks()
+        first = next(blocks, None)
+        if first is None:
             cut = '' if self.complete else ' before the cut'
             raise RecordingError(
                 f'{self.path}: holds no samples{cut} (topic {SAMPLES}); `psd-deflection info` lists what it holds'
             )
-        yield waiting
+        yield first
+        yield from blocks
 
-    def _samples_in_order(self) -> Iterator[tuple[IntArray, IntArray, npt.NDArray[np.float32], npt.NDArray[np.uint8]]]:
-        """(seq, t_ns, volts, flags), many messages at once; seq extended, so that it rises throughout."""
+    def _chunks(self) -> Iterator[RawChunk]:
         count = _SequenceCounter(self.block_size, self._warn)
         for log_time, messages in self._clouds():
             together = joined_points(messages)
@@ -171,14 +161,12 @@ class BagRecording(Recording):
                 except ValueError as error:
                     raise RecordingError(f'{self.path}: {SAMPLES} at log time {log_time} ns: {error}') from None
                 _, _, t_ns, volts, flags = part
-                finite = np.isfinite(volts)
+                finite = np.isfinite(volts).all(axis=1)
                 if finite.all():
-                    yield seq, t_ns, volts, flags
+                    yield RawChunk(seq, t_ns, volts, flags)
                     continue
                 self._warn('samples that are not numbers (NaN or infinite) are left out as lost')
-                keep = finite.all(axis=1)
-                if keep.any():
-                    yield seq[keep], t_ns[keep], volts[keep], flags[keep]
+                yield RawChunk(seq[finite], t_ns[finite], volts[finite], flags[finite])
 
     def _clouds(self) -> Iterator[tuple[int, list[tuple[int, npt.NDArray[np.void]]]]]:
         """(log time, messages as (stamp, points)); those of one yield are alike in layout."""
@@ -237,14 +225,14 @@ class BagRecording(Recording):
         for channel, log_time, message in self.messages():
             topic = channel.topic
             if topic == DEFLECTION_WITH_COVARIANCE:
-                count, wanted = 43, pose_with_covariance_stamped.TYPE
+                wanted = pose_with_covariance_stamped.MESSAGE.name
             elif topic.startswith('/link_tip/') and topic.endswith('/deflection'):
-                count, wanted = 7, pose_stamped.TYPE
+                wanted = pose_stamped.MESSAGE.name
             else:
                 continue
             self._check_type(channel.type, channel.encoding, topic, wanted)
             try:
-                rows.setdefault(topic, []).append(header_and_doubles(message, count))
+                rows.setdefault(topic, []).append(cdr.numbers(wanted, message))
             except ValueError as error:
                 raise RecordingError(f'{self.path}: {topic} at log time {log_time}: {error}') from None
         return {topic: _series(topic, found) for topic, found in rows.items()}
@@ -283,7 +271,7 @@ class _SequenceCounter:
         """Numbers that rise from call to call. Raises ValueError where they do not rise within one."""
         seq, t_ns = samples.seq.copy(), samples.t_ns
         if seq[-1] < seq[0] and not samples.whole:
-            seq[seq < seq[0]] += 2**32
+            seq[seq < seq[0]] += WRAP
         if bool((np.diff(seq) <= 0).any()):
             raise ValueError('seq does not rise within the message')
         if bool((np.diff(t_ns) <= 0).any()):
@@ -291,7 +279,7 @@ class _SequenceCounter:
         base = self._base_of(samples)
         first = int(seq[0]) + base
         if self._last is not None and first <= self._last:
-            self._go_on_from(first, int(t_ns[0]), samples.whole)
+            self._go_on(self._last, first, int(t_ns[0]), samples.whole)
             base = self._base_of(samples)
         if t_ns[0] <= self._last_t:
             self._warn(f'time goes back in {SAMPLES} to {t_ns[0]} ns')
@@ -299,26 +287,15 @@ class _SequenceCounter:
         self._last, self._last_t = int(seq[-1]), int(t_ns[-1])
         return seq
 
-    def _go_on_from(self, first: int, t_ns: int, whole: bool) -> None:
-        """Take up counting at ``first``, which is not above the last number."""
-        assert self._last is not None
-        step = (first - self._last) % 2**32
+    def _go_on(self, last: int, first: int, t_ns: int, whole: bool) -> None:
+        """Take up counting after ``last`` at ``first``, which is not above it."""
+        step = (first - last) % WRAP
         if not whole and 0 < step <= 1000 + (t_ns - self._last_t) * self._FASTEST_HZ // 1_000_000_000:
-            self._wrapped += self._last + step - first
+            self._wrapped += last + step - first
             return
-        self._warn(f'sample numbers start anew after {self._last}')
+        self._warn(f'sample numbers start anew after {last}')
         size = self._block_size
-        self._moved += (self._last // size + 1 - first // size) * size
-
-
-def _joined(a: SampleBlock, b: SampleBlock) -> SampleBlock:
-    return SampleBlock(
-        a.index,
-        np.concatenate([a.seq, b.seq]),
-        np.concatenate([a.t_ns, b.t_ns]),
-        np.concatenate([a.volts, b.volts]),
-        np.concatenate([a.flags, b.flags]),
-    )
+        self._moved += (last // size + 1 - first // size) * size
 
 
 def _to_change(entry: Mapping[str, str]) -> ParameterChange:
@@ -338,24 +315,21 @@ def _to_change(entry: Mapping[str, str]) -> ParameterChange:
 
 
 def _series(topic: str, rows: list[tuple[int, tuple[float, ...]]]) -> EstimateSeries:
-    values = np.array([v for _, v in rows], dtype=np.float64)
-    turned = np.array([angles(dict(zip('xyzw', q, strict=True))) for q in values[:, 3:7].tolist()])
-    covariance = None
-    if values.shape[1] == 43:
-        axes = np.ix_(range(len(values)), [0, 1, 5], [0, 1, 5])
-        covariance = values[:, 7:].reshape(-1, 6, 6)[axes]
-    return EstimateSeries(
-        topic,
-        np.array([t for t, _ in rows], dtype=np.int64),
-        np.column_stack([values[:, 0], values[:, 1], turned[:, 0]]),
-        turned[:, 1:],
-        covariance,
-    )
+    t_ns = np.array([t for t, _ in rows], dtype=np.int64)
+    numbers = np.array([v for _, v in rows], dtype=np.float64)
+    pose, tilt = pose_stamped.to_poses(numbers)
+    covariance = pose_with_covariance_stamped.to_covariances(numbers) if topic == DEFLECTION_WITH_COVARIANCE else None
+    return EstimateSeries(topic, t_ns, pose, tilt, covariance)
 
 
-def _file_number(path: Path) -> tuple[int, str]:
-    number = re.search(r'_([0-9]{1,9})$', path.stem)
-    return (int(number[1]) if number else -1, path.name)
+def files_in(folder: Path) -> list[Path]:
+    """The ``.mcap`` files of a folder in the order of their numbers."""
+
+    def number(path: Path) -> tuple[int, str]:
+        found = re.search(r'_([0-9]{1,9})$', path.stem)
+        return (int(found[1]) if found else -1, path.name)
+
+    return sorted(folder.glob('*.mcap'), key=number)
 
 
 def read_information(path: Path) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 A crash must cost at most a second: chunks span less than half a second of log time and are handed
 to the operating system as they end (``durable``: to the disk); parameters, version and hello are at
 the front of every file. What a crash leaves is read up to the cut by
-:mod:`psd_deflection.recordings.bag_reader` and made whole again by :mod:`psd_deflection.recordings.recover`.
+:mod:`psd_deflection.recordings.bag_reader` and made whole again by :mod:`psd_deflection.recordings.repair`.
 """
 
 from __future__ import annotations
@@ -15,14 +15,13 @@ import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 
 from mcap.data_stream import RecordBuilder
 from mcap.records import ChunkIndex
 from mcap.writer import CompressionType, Writer
 
-from msg_adapters import to_messages
+from msg_adapters import MESSAGE_TYPES, to_messages
 from psd_deflection import __version__
 from psd_deflection.errors import RecordingError
 from psd_deflection.recordings import cdr
@@ -33,9 +32,9 @@ from psd_deflection.recordings.bag_metadata import (
     bag_information,
     qos_text,
     to_yaml,
+    totals,
     write_metadata,
 )
-from psd_deflection.recordings.ros2msg import TYPE_HASHES, definition
 from psd_deflection.records import ParameterChange, Record
 
 CHUNK_NS = 500_000_000
@@ -49,7 +48,8 @@ META_CHANGE = 'psd_deflection.change.'
 
 
 _CHUNK_INDICES = '_Writer__chunk_indices'
-"""Where mcap's writer keeps them; it has no public place for them."""
+"""Where mcap's writer keeps them; it has no public place for them. Under another name in a later mcap they would
+stay in memory, and the tests fail."""
 
 CUSTOM = {'psd_deflection_version': __version__}
 
@@ -94,7 +94,20 @@ class _IndexSpool:
         self._file.close()
 
 
-class McapFile:
+class _Closing:
+    """What ``with`` closes."""
+
+    def close(self) -> None:
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class McapFile(_Closing):
     """One MCAP file being written; the part that a bag and a lone file share.
 
     ``write`` takes the records of one thread. Raises RecordingError where the file exists, cannot
@@ -183,11 +196,6 @@ class McapFile:
                 with contextlib.suppress(OSError):
                     one.close()
 
-    def write_hello(self, device_hello: Mapping[str, object]) -> None:
-        """Note the device's hello when it comes after the start of the recording; the last one counts."""
-        with self._guard():
-            self._writer.add_metadata(META_HELLO, _json_values(device_hello))
-
     def write(self, record: Record) -> None:
         """Write all messages of one record; the log time is the record's own stamp."""
         if isinstance(record, ParameterChange):
@@ -204,7 +212,7 @@ class McapFile:
     def write_encoded(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
         """Write one message that is CDR already, at log time ``t_ns``.
 
-        Raises KeyError for a type that :mod:`psd_deflection.recordings.ros2msg` does not define.
+        Raises KeyError for a type that no adapter of :mod:`msg_adapters` declares.
         """
         with self._guard():
             channel = self._channels.get(topic)
@@ -225,16 +233,16 @@ class McapFile:
         entry.messages += 1
 
     def _register(self, topic: str, type_name: str) -> int:
+        message = MESSAGE_TYPES[type_name]
         schema = self._schemas.get(type_name)
         if schema is None:
-            schema = self._writer.register_schema(type_name, 'ros2msg', definition(type_name).encode())
+            schema = self._writer.register_schema(type_name, 'ros2msg', message.definition.encode())
             self._schemas[type_name] = schema
-        type_hash = TYPE_HASHES[type_name]
         channel: int = self._writer.register_channel(
-            topic, 'cdr', schema, {'offered_qos_profiles': qos_text(DEFAULT_QOS), 'topic_type_hash': type_hash}
+            topic, 'cdr', schema, {'offered_qos_profiles': qos_text(DEFAULT_QOS), 'topic_type_hash': message.type_hash}
         )
         self._channels[topic] = channel
-        self.topics[topic] = TopicCount(topic, type_name, DEFAULT_QOS, type_hash)
+        self.topics[topic] = TopicCount(topic, type_name, DEFAULT_QOS, message.type_hash)
         return channel
 
     def count(self) -> FileCount:
@@ -261,16 +269,8 @@ class McapFile:
     # A recorder is a sink like any other.
     put = write
 
-    def __enter__(self) -> McapFile:
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-
-class BagWriter:
+class BagWriter(_Closing):
     """A rosbag2 bag being written: ``NAME/NAME_0.mcap`` and so on, ``NAME/metadata.yaml`` at the end.
 
     ``rig_values``: the flat parameter set, effects included.
@@ -323,11 +323,6 @@ class BagWriter:
         self._number += 1
         return file
 
-    def write_hello(self, device_hello: Mapping[str, object]) -> None:
-        """Note the device's hello when it comes after the start of the recording; the last one counts."""
-        self._hello = device_hello
-        self._file.write_hello(device_hello)
-
     def write(self, record: Record) -> None:
         """Write all messages of one record; the log time is the record's own stamp."""
         if isinstance(record, ParameterChange):
@@ -372,12 +367,8 @@ class BagWriter:
     def information(self) -> dict[str, Any]:
         """The tree of ``metadata.yaml`` for what was written so far."""
         parts = [*self._ended, (self._file.count(), list(self._file.topics.values()))]
-        topics: dict[str, TopicCount] = {}
-        for _, counts in parts:
-            for t in counts:
-                known = topics.setdefault(t.name, TopicCount(t.name, t.type, t.qos, t.type_hash))
-                known.messages += t.messages
-        return bag_information([count for count, _ in parts], list(topics.values()), CUSTOM)
+        topics = totals(t for _, counts in parts for t in counts)
+        return bag_information([count for count, _ in parts], topics, CUSTOM)
 
     def close(self) -> None:
         """Close the file, then write ``metadata.yaml``; does nothing the second time.
@@ -402,11 +393,3 @@ class BagWriter:
 
     # A recorder is a sink like any other.
     put = write
-
-    def __enter__(self) -> BagWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

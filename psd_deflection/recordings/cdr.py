@@ -1,9 +1,9 @@
-"""Message field dicts <-> CDR bytes: the one place that knows the encoder.
+"""Message field dicts <-> CDR bytes: the one place that knows the encoding.
 
 The node publishes and the recorder writes the very same bytes (XCDR1, little-endian, header
-``00 01 00 00``), so a message is encoded once. The library's encoder walks the definition anew for
-each message, which was the dearest part of a block; messages that are a header and numbers, seven
-of a block's eight, are packed in one go here, to the same bytes.
+``00 01 00 00``), so a message is encoded once, by encoders that are made from the definitions.
+Messages that are a header and numbers, seven of a block's eight, are packed in one go, and read so
+where only the numbers count. All else is read by ``mcap_ros2``.
 """
 
 from __future__ import annotations
@@ -15,38 +15,124 @@ from functools import cache
 from operator import itemgetter
 from typing import Any
 
-from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
+from mcap.records import Schema
+from mcap_ros2.decoder import DecoderFactory
 
-from psd_deflection.recordings.ros2msg import definition, members
+from msg_adapters import MESSAGE_TYPES
+from msg_adapters.message_type import MessageType
 
 Encoder = Callable[[Mapping[str, Any]], bytes]
+_Writer = Callable[[bytearray, Any], None]
 
 _ENCAPSULATION = b'\x00\x01\x00\x00'
+_LITTLE = b'\x00\x01'
+_STAMP = struct.Struct('<iI')
+_U32 = struct.Struct('<I')
 _FLOAT64 = re.compile(r'float64(?:\[(\d+)\])?')
+_ARRAY = re.compile(r'(.+)\[(\d*)\]')
+_FORMATS = {
+    'bool': '?', 'byte': 'B', 'char': 'B', 'int8': 'b', 'uint8': 'B', 'int16': 'h', 'uint16': 'H',
+    'int32': 'i', 'uint32': 'I', 'int64': 'q', 'uint64': 'Q', 'float32': 'f', 'float64': 'd',
+}  # fmt: skip
 
 
 @cache
 def _encoder(type_name: str) -> Encoder:
-    text = definition(type_name)
-    (first, _), *others = members(type_name)
-    if first == 'std_msgs/Header' and all(_only_numbers(kind) for kind, _ in others):
-        return _packer([part for kind, name in others for part in _numbers(kind, (name,))])
-    encoder: Encoder = serialize_dynamic(type_name, text)[type_name]
-    return encoder
+    return encoder_of(MESSAGE_TYPES[type_name])
 
 
-def _only_numbers(kind: str) -> bool:
-    inside = members(kind)
-    return bool(_FLOAT64.fullmatch(kind)) or (bool(inside) and all(_only_numbers(k) for k, _ in inside))
+def encoder_of(message: MessageType) -> Encoder:
+    """What makes CDR of the fields of such messages."""
+    fields = _number_fields(message)
+    if fields is not None:
+        return _packer(fields)
+    write = _writer(message, '')
+
+    def encode(values: Mapping[str, Any]) -> bytes:
+        # Alignment counts from behind the encapsulation.
+        out = bytearray()
+        write(out, values)
+        return _ENCAPSULATION + out
+
+    return encode
 
 
-def _numbers(kind: str, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], int]]:
+def _writer(message: MessageType, kind: str) -> _Writer:
+    """What appends a ``kind``, a type or an array of one, to bytes; '' is the message itself."""
+    array = _ARRAY.fullmatch(kind)
+    if array is not None:
+        return _array_writer(_writer(message, array[1]), array[1], array[2])
+    if kind == 'string':
+        return _write_text
+    if kind in _FORMATS:
+        pack = struct.Struct(f'<{_FORMATS[kind]}')
+        size = pack.size
+
+        def write_number(out: bytearray, value: Any) -> None:
+            if len(out) % size:
+                out += bytes(-len(out) % size)
+            out += pack.pack(value)
+
+        return write_number
+    fields = [(name, _writer(message, inner)) for inner, name in message.members(kind)]
+    if not fields:
+        raise KeyError(f'{message.name}: {kind} is not defined')
+
+    def write_fields(out: bytearray, value: Any) -> None:
+        for name, write in fields:
+            write(out, value[name])
+
+    return write_fields
+
+
+def _write_size(out: bytearray, size: int) -> None:
+    out += bytes(-len(out) % 4) + _U32.pack(size)
+
+
+def _write_text(out: bytearray, value: str) -> None:
+    text = value.encode() + b'\0'
+    _write_size(out, len(text))
+    out += text
+
+
+def _array_writer(write_one: _Writer, kind: str, length: str) -> _Writer:
+    """``length``: of an array of fixed length, else ''."""
+
+    def write(out: bytearray, values: Any) -> None:
+        if not length:
+            _write_size(out, len(values))
+        elif len(values) != int(length):
+            raise ValueError(f'{len(values)} values in an array of {length}')
+        if kind in ('uint8', 'byte'):
+            out += bytes(values)
+            return
+        for value in values:
+            write_one(out, value)
+
+    return write
+
+
+def _number_fields(message: MessageType) -> list[tuple[tuple[str, ...], int]] | None:
+    """Where each float64 of a message that is a header and float64 is; None for another message."""
+    (first, _), *others = message.members()
+    if first != 'std_msgs/Header' or not all(_only_numbers(message, kind) for kind, _ in others):
+        return None
+    return [part for kind, name in others for part in _numbers(message, kind, (name,))]
+
+
+def _only_numbers(message: MessageType, kind: str) -> bool:
+    inside = message.members(kind)
+    return bool(_FLOAT64.fullmatch(kind)) or (bool(inside) and all(_only_numbers(message, k) for k, _ in inside))
+
+
+def _numbers(message: MessageType, kind: str, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], int]]:
     """Where each float64 of a ``kind`` is, and how many are there: 0 for a lone one."""
     array = _FLOAT64.fullmatch(kind)
     if array is not None:
         yield path, int(array[1] or 0)
-    for inner, name in members(kind):
-        yield from _numbers(inner, (*path, name))
+        return
+    for inner, name in message.members(kind):
+        yield from _numbers(message, inner, (*path, name))
 
 
 def _packer(fields: list[tuple[tuple[str, ...], int]]) -> Encoder:
@@ -93,8 +179,17 @@ def _taker(names: list[str]) -> Callable[[Any], Iterable[float]]:
 
 @cache
 def _decoder(type_name: str) -> Callable[[bytes], Any]:
-    decoder: Callable[[bytes], Any] = generate_dynamic(type_name, definition(type_name))[type_name]
+    schema = Schema(id=1, name=type_name, encoding='ros2msg', data=MESSAGE_TYPES[type_name].definition.encode())
+    decoder: Callable[[bytes], Any] = DecoderFactory().decoder_for('cdr', schema)
     return decoder
+
+
+@cache
+def _doubles(type_name: str) -> struct.Struct:
+    fields = _number_fields(MESSAGE_TYPES[type_name])
+    if fields is None:
+        raise TypeError(f'{type_name} is more than a header and numbers')
+    return struct.Struct(f'<{sum(max(size, 1) for _, size in fields)}d')
 
 
 def encode(type_name: str, fields: Mapping[str, Any]) -> bytes:
@@ -120,6 +215,23 @@ def decode(type_name: str, cdr: bytes) -> dict[str, Any]:
     except Exception as error:  # the decoder lets struct, index and unicode errors through
         raise ValueError(f'not a {type_name} ({error})') from None
     return fields
+
+
+def numbers(type_name: str, cdr: bytes) -> tuple[int, tuple[float, ...]]:
+    """(stamp in ns, every number) of a message that is a header and float64, in the order of its definition.
+
+    A tenth of the time of :func:`decode`. Raises ValueError if the message is too short or big-endian.
+    """
+    if cdr[:2] != _LITTLE:
+        raise ValueError('is not little-endian CDR')
+    try:
+        sec, nanosec = _STAMP.unpack_from(cdr, 4)
+        (length,) = _U32.unpack_from(cdr, 12)
+        # Alignment counts from behind the encapsulation.
+        at = 4 + (12 + length + 7) // 8 * 8
+        return sec * 1_000_000_000 + nanosec, _doubles(type_name).unpack_from(cdr, at)
+    except struct.error:
+        raise ValueError('is shorter than its type') from None
 
 
 def _plain(value: Any) -> Any:

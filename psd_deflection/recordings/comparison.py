@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 
-from msg_adapters import DIAGNOSTICS, INPUTS, SAMPLES, to_messages
-from msg_adapters.orientation import angles
+import numpy as np
+
+from msg_adapters import DIAGNOSTICS, INPUTS, SAMPLES, pose_stamped, to_messages
 from psd_deflection.errors import RecordingError
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.message_decode import header_and_doubles
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import ParameterChange, Record
 
@@ -154,19 +154,15 @@ class Comparison:
         if not topic.endswith('/deflection'):
             return
         try:
-            old, new = (header_and_doubles(side, 7)[1] for side in (a, b))
+            sides = np.array([cdr.numbers(pose_stamped.MESSAGE.name, side)[1] for side in (a, b)])
         except ValueError:
             return
-        for axis, name in enumerate(('ΔX', 'ΔY')):
-            self._worsen(f'{topic} {name} (m)', abs(old[axis] - new[axis]))
-        self._worsen(f'{topic} θ (rad)', abs(_theta(old) - _theta(new)))
+        (old, new), _ = pose_stamped.to_poses(sides)
+        for name, difference in zip(('ΔX (m)', 'ΔY (m)', 'θ (rad)'), np.abs(old - new).tolist(), strict=True):
+            self._worsen(f'{topic} {name}', difference)
 
     def _worsen(self, name: str, difference: float) -> None:
         self._worst[name] = max(self._worst.get(name, 0.0), difference)
-
-
-def _theta(doubles: tuple[float, ...]) -> float:
-    return angles(dict(zip('xyzw', doubles[3:], strict=True)))[0]
 
 
 def _stamp(encoded: bytes, log_time: int) -> int:

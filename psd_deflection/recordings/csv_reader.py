@@ -6,9 +6,11 @@ have no nanoseconds left in one. The file is read in passes and never held whole
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Collection, Iterator, Sequence
 from decimal import Decimal, InvalidOperation
+from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,9 +18,9 @@ import numpy as np
 
 from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
 from psd_deflection.errors import RecordingError
-from psd_deflection.recordings.mcap_records import RawMessage
+from psd_deflection.recordings.mcap_reader import RawMessage
 from psd_deflection.recordings.recording import EstimateSeries, Recording
-from psd_deflection.records import CHANNELS, AppliedLoad, ReferencePose, SampleBlock, TemperatureReading
+from psd_deflection.records import CHANNELS, AppliedLoad, RawChunk, ReferencePose, TemperatureReading
 
 LOAD_COLUMNS = ('load_fx', 'load_fy', 'load_tz')
 TEMPERATURE_COLUMN = 'temperature'
@@ -35,6 +37,9 @@ MAX_SECONDS = 2**31
 MAX_VOLTS = 1e6
 
 _RATE_ROWS = 10_000
+
+_BATCH = 500
+"""Rows that become arrays at once: numpy's cost is by the call."""
 
 
 class _Row(NamedTuple):
@@ -69,8 +74,7 @@ class CsvRecording(Recording):
     def _refuse(self, why: str, line: int | None = None) -> RecordingError:
         return RecordingError(f'{self.path}{"" if line is None else f":{line}"}: {why}')
 
-    def _lines(self) -> Iterator[tuple[int, str]]:
-        """(line number, text) of every line that is not blank."""
+    def _lines(self) -> Iterator[str]:
         try:
             with self.path.open(encoding='utf-8-sig', newline=None) as stream:
                 number = 0
@@ -78,16 +82,25 @@ class CsvRecording(Recording):
                     number += 1
                     if len(text) > MAX_LINE:
                         raise self._refuse(f'is longer than {MAX_LINE} characters', number)
-                    if text.strip():
-                        yield number, text
+                    yield text
         except OSError as error:
             raise self._refuse(f'cannot be read ({error.strerror or error})') from None
         except UnicodeDecodeError:
             raise self._refuse('is not text in UTF-8') from None
 
+    def _cells(self) -> Iterator[tuple[int, list[str]]]:
+        """(line number, cells) of every line that is not blank."""
+        reader = csv.reader(self._lines(), strict=True, skipinitialspace=True)
+        try:
+            for cells in reader:
+                if len(cells) > 1 or (cells and cells[0].strip()):
+                    yield reader.line_num, cells
+        except csv.Error as error:
+            raise self._refuse(f'is no row of a CSV ({error})', reader.line_num) from None
+
     def _read_header(self) -> tuple[list[str], dict[str, int]]:
-        for number, text in self._lines():
-            names = [n.strip() for n in text.split(',')]
+        for number, cells in self._cells():
+            names = [n.strip() for n in cells]
             columns = {name: i for i, name in enumerate(names)}
             missing = [n for n in REQUIRED if n not in columns]
             if missing:
@@ -112,11 +125,10 @@ class CsvRecording(Recording):
     def _rows(self) -> Iterator[_Row]:
         at = self._columns['t']
         width = len(self._header)
-        lines = self._lines()
-        next(lines, None)
+        rows = self._cells()
+        next(rows, None)
         last = -1
-        for number, text in lines:
-            cells = text.split(',')
+        for number, cells in rows:
             if len(cells) != width:
                 raise self._refuse(f'has {len(cells)} cells, the header has {width}', number)
             t_ns = self._nanoseconds(cells[at], number)
@@ -179,42 +191,48 @@ class CsvRecording(Recording):
         # Between steps of very different length the median may be near to none of them.
         return float(near.mean()) if len(near) else float(steps.min())
 
-    def blocks(self) -> Iterator[SampleBlock]:
-        """The samples, cut into blocks at seq // block_size; the first sample has seq 0.
+    def _chunks(self) -> Iterator[RawChunk]:
+        """The samples; the first has seq 0.
 
         A row's number is that of the row before plus the whole number of steps between them. What
         is left over is carried on and forgotten slowly, so that neither jitter of less than half a
         step nor a clock that runs a little fast makes a loss where there is none.
         """
-        size = self.block_size
-        at = [self._columns[c] for c in CHANNELS]
+        take = itemgetter(*(self._columns[c] for c in CHANNELS))
         seqs: list[int] = []
         times: list[int] = []
         volts: list[list[float]] = []
-        index = seq = 0
+        seq = 0
         left_over = 0.0
         last_t: int | None = None
-        for row in self._rows():
-            if last_t is not None:
-                passed = (row.t_ns - last_t) / self._step_ns + left_over
-                steps = max(1, round(passed))
-                left_over = 0.9 * (passed - steps)
-                seq += steps
-            last_t = row.t_ns
-            if seq // size != index:
-                yield _block(index, seqs, times, volts)
-                seqs, times, volts = [], [], []
-                index = seq // size
-            seqs.append(seq)
-            times.append(row.t_ns)
-            try:
-                values = [float(row.cells[i]) for i in at]
-            except ValueError:
-                values = [math.nan]
-            if not all(-MAX_VOLTS <= v <= MAX_VOLTS for v in values):
-                values = [self._number(row, c, MAX_VOLTS) for c in CHANNELS]
-            volts.append(values)
-        yield _block(index, seqs, times, volts)
+        try:
+            for row in self._rows():
+                if last_t is not None:
+                    passed = (row.t_ns - last_t) / self._step_ns + left_over
+                    steps = max(1, round(passed))
+                    left_over = 0.9 * (passed - steps)
+                    seq += steps
+                last_t = row.t_ns
+                try:
+                    values = list(map(float, take(row.cells)))
+                except ValueError:
+                    values = [math.nan]
+                # NaN and what is beyond the bound come through the sum; which cell it was is looked up then.
+                if not sum(map(abs, values)) <= MAX_VOLTS:
+                    values = [self._number(row, c, MAX_VOLTS) for c in CHANNELS]
+                seqs.append(seq)
+                times.append(row.t_ns)
+                volts.append(values)
+                if len(seqs) == _BATCH:
+                    yield _chunk(seqs, times, volts)
+                    seqs, times, volts = [], [], []
+        except RecordingError:
+            # What stands before the bad row is good.
+            if seqs:
+                yield _chunk(seqs, times, volts)
+            raise
+        if seqs:
+            yield _chunk(seqs, times, volts)
 
     def topics(self) -> dict[str, int]:
         """As a bag of the same samples would have them."""
@@ -265,9 +283,8 @@ class CsvRecording(Recording):
         return {}
 
 
-def _block(index: int, seqs: list[int], times: list[int], volts: list[list[float]]) -> SampleBlock:
-    return SampleBlock(
-        index,
+def _chunk(seqs: list[int], times: list[int], volts: list[list[float]]) -> RawChunk:
+    return RawChunk(
         np.array(seqs, dtype=np.int64),
         np.array(times, dtype=np.int64),
         np.array(volts, dtype=np.float32),

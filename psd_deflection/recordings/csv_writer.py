@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -77,26 +77,27 @@ class _CsvFile:
         self._stream = None
 
 
+_BESIDE: Mapping[type[Record], Sequence[str]] = {
+    AppliedLoad: LOAD_COLUMNS,
+    TemperatureReading: (TEMPERATURE_COLUMN,),
+    ReferencePose: REFERENCE_COLUMNS,
+}
+
+
 class CsvSampleSink(_CsvFile):
     """Samples as a CSV recording.
 
-    ``loads``, ``references``, ``temperatures``: whether it has their columns. A record of these
-    kinds goes into the first row at or after its time and must come before that row's block; loads
-    and temperatures are held, a reference stands once.
+    ``kinds``: the kinds of records that have columns beside the samples: AppliedLoad, ReferencePose,
+    TemperatureReading. Such a record goes into the first row at or after its time and must come before
+    that row's block; loads and temperatures are held, a reference stands once.
     """
 
-    def __init__(
-        self, path: str | Path, *, loads: bool = False, references: bool = False, temperatures: bool = False
-    ) -> None:
+    def __init__(self, path: str | Path, kinds: Collection[type[Record]] = ()) -> None:
         self._waiting: dict[type[Record], deque[AppliedLoad | ReferencePose | TemperatureReading]] = {}
         self._held: dict[type[Record], str] = {}
         header = list(REQUIRED)
-        for wanted, kind, columns in (
-            (loads, AppliedLoad, LOAD_COLUMNS),
-            (temperatures, TemperatureReading, (TEMPERATURE_COLUMN,)),
-            (references, ReferencePose, REFERENCE_COLUMNS),
-        ):
-            if wanted:
+        for kind, columns in _BESIDE.items():
+            if kind in kinds:
                 header += columns
                 self._waiting[kind] = deque()
                 self._held[kind] = ',' * (len(columns) - 1)
@@ -151,9 +152,8 @@ class CsvEstimateSink(_CsvFile):
         if primary is None:
             cells += [''] * 6
         else:
-            variances = [primary.covariance[i] for i in (0, 4, 8)]
-            deviations = [math.sqrt(v) if v >= 0.0 else math.nan for v in variances]
-            cells += map(repr, (primary.dx, primary.dy, primary.theta, *deviations))
+            deviations = [math.sqrt(v) if v >= 0.0 else math.nan for v in primary.variances]
+            cells += map(repr, (*primary.pose, *deviations))
         by_solver = {e.solver: e for e in self._block}
         for solver in self._solvers:
             e = by_solver.get(solver)

@@ -9,27 +9,14 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from psd_deflection.config import Rig, replace_values, rig_as_recorded
+from psd_deflection.config import Rig, replace_values
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.errors import ConfigError, RecordingError
-from psd_deflection.recordings.opening import open_recording
-from psd_deflection.recordings.recording import Recording
-from psd_deflection.records import CHANNELS, ENVIRONMENT, FloatArray, IntArray
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.replay_engine import rig_at_end
+from psd_deflection.records import CHANNELS, FloatArray, IntArray
 
 MAX_SAMPLES = 20_000_000
-
-
-def recorded_rig(recording: Recording) -> Rig:
-    """The rig that the recording itself tells of; the thesis rig where it tells of none.
-
-    What was changed while it ran (a zero taken) is what the rig was all along, only known better.
-    """
-    rig = rig_as_recorded(recording.parameters, f'{recording.path} (recorded parameters)')
-    for change in recording.changes:
-        values = {name: value for name, value in change.values if name not in ENVIRONMENT}
-        if values:
-            rig = replace_values(rig, values, f'{recording.path} (changed at block {change.block})')
-    return rig
 
 
 def read_observation(
@@ -44,7 +31,7 @@ def read_observation(
     """
     path = Path(path)
     if rig is None:
-        rig = recorded_rig(open_recording(path))
+        rig = rig_at_end(open_recording(path))
     if overrides:
         rig = replace_values(rig, overrides, source)
     recording = open_recording(path, block_size=rig.estimator.block_size)

@@ -13,13 +13,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.recordings.mcap_records import RawMessage
+from psd_deflection.averaging import BlockCutter
+from psd_deflection.recordings.mcap_reader import RawMessage
 from psd_deflection.records import (
     CHANNELS,
     AppliedLoad,
     FloatArray,
     IntArray,
     ParameterChange,
+    RawChunk,
     ReferencePose,
     SampleBlock,
     TemperatureReading,
@@ -83,12 +85,19 @@ class Recording(abc.ABC):
     def warnings(self) -> Sequence[str]:
         """What is wrong with it and did not stop the reading."""
 
-    @abc.abstractmethod
     def blocks(self) -> Iterator[SampleBlock]:
         """The samples, cut into blocks at seq // block_size.
 
-        Raises RecordingError where there is none, or where what is there is not readable.
+        Raises RecordingError if there is none, or if what is there is not readable.
         """
+        cutter = BlockCutter(self.block_size)
+        for chunk in self._chunks():
+            yield from cutter.add(chunk, chunk.readings.astype(np.float32, copy=False))
+        yield from cutter.flush()
+
+    @abc.abstractmethod
+    def _chunks(self) -> Iterator[RawChunk]:
+        """The samples in order, any number at a time, in volts; ``seq`` rises throughout."""
 
     @abc.abstractmethod
     def topics(self) -> dict[str, int]:

@@ -127,7 +127,7 @@ class RerunFile:
             if e is None or pose is None:
                 value = band = None
             else:
-                sd = 2.0 * max(e.covariance[4 * i], 0.0) ** 0.5
+                sd = 2.0 * max(e.variances[i], 0.0) ** 0.5
                 value, band = (pose[i] * scale,), ((pose[i] - sd) * scale, (pose[i] + sd) * scale)
             self._add(f'tip/{name}', t_ns, value)
             self._add(f'tip/{name}/band', t_ns, band)

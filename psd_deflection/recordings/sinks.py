@@ -8,13 +8,13 @@ from typing import Protocol
 
 from psd_deflection.config import rig_from_values
 from psd_deflection.recordings.bag_writer import BagWriter, McapFile
-from psd_deflection.recordings.csv_writer import CsvEstimateSink
+from psd_deflection.recordings.csv_writer import CsvEstimateSink, CsvSampleSink
 from psd_deflection.recordings.rerun_writer import RerunFile
 from psd_deflection.records import Record
 
 
 class Sink(Protocol):
-    """Takes records, one thread at a time. Both calls raise RecordingError where the disk refuses."""
+    """Takes records, one thread at a time. Both calls raise RecordingError if the disk refuses."""
 
     def put(self, record: Record) -> None:
         """Take one record; a sink passes over the kinds it has no place for."""
@@ -23,20 +23,33 @@ class Sink(Protocol):
         """Write what is held back and close; does nothing the second time."""
 
 
+def is_csv(path: str | Path) -> bool:
+    """Whether :func:`open_sink` writes a CSV there."""
+    return Path(path).suffix.lower() == '.csv'
+
+
 def open_sink(
     path: str | Path,
-    *,
     rig_values: Mapping[str, object],
-    solvers: Collection[str],
+    *,
     device_hello: Mapping[str, object] | None = None,
+    samples_with: Collection[type[Record]] | None = None,
+    title: str = '',
 ) -> Sink:
-    """The sink for ``path``: ``.csv`` (estimates), ``.rrd`` (for Rerun), ``.mcap`` (a lone file), else a bag folder."""
+    """The sink for ``path``: a ``.csv``, an ``.rrd`` (for Rerun), an ``.mcap`` (a lone file), else a bag folder.
+
+    ``rig_values``: the flat parameter set. ``samples_with``: a CSV has the samples, with columns for these
+    kinds of records beside them; None: it has the estimates. ``title``: how an ``.rrd`` is called.
+    Raises RecordingError if ``path`` exists or cannot be made, ConfigError if rerun is not installed.
+    """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix == '.csv':
-        return CsvEstimateSink(path, solvers)
+    if is_csv(path):
+        if samples_with is not None:
+            return CsvSampleSink(path, samples_with)
+        return CsvEstimateSink(path, rig_from_values(rig_values, str(path)).estimator.solvers)
     if suffix == '.rrd':
-        return RerunFile(path, rig_from_values(rig_values, str(path)))
+        return RerunFile(path, rig_from_values(rig_values, str(path)), title)
     if suffix == '.mcap':
         return McapFile(path, rig_values=rig_values, device_hello=device_hello)
     return BagWriter(path, rig_values=rig_values, device_hello=device_hello)

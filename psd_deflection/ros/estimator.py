@@ -33,9 +33,10 @@ from psd_deflection.errors import ConfigError, PsdDeflectionError
 from psd_deflection.monitor.start import start_monitor
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
+from psd_deflection.ros.names import RECORD, ZERO
 from psd_deflection.ros.parameters import LiveParameters, rig_of_node
 from psd_deflection.ros.wires import InputRecorder, PublisherWire, say_on_rosout
-from psd_deflection.runner.health import STALE, HealthReporter
+from psd_deflection.runner.diagnostics import STALE, HealthReporter
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import Session, why_no_zero, zero_text
 from psd_deflection.runner.signals import Signals, StopRequestedError
@@ -108,11 +109,11 @@ class EstimatorNode:
         self.node.owner = self
         try:
             self._say = say_on_rosout(self.node, say) if say is not None else self.node.get_logger().info
-            self.rig = rig_of_node(self.node, {})
+            self.rig = rig_of_node(self.node)
             self._live = LiveParameters(self.node)
-            self.node.create_service(Trigger, '~/zero', self._zero)
+            self.node.create_service(Trigger, ZERO, self._zero)
             # In a group of its own: while one request waits for the disk, the node serves everything else.
-            self.node.create_service(SetBool, '~/record', self._record, callback_group=ReentrantCallbackGroup())
+            self.node.create_service(SetBool, RECORD, self._record, callback_group=ReentrantCallbackGroup())
             self._survive_requests()
             self._wire, self._inputs = self._wires()
             # Neither a simulated clock that stands still nor a system clock that is set keeps health from being told.
@@ -185,7 +186,7 @@ class EstimatorNode:
         """Configure and activate, where ``autostart`` says so. Raises what stands in the way."""
         if self.node.get_parameter('use_sim_time').value:
             self._say('use_sim_time is true: what is measured is stamped by the system clock all the same')
-        if not self.rig.values['autostart']:
+        if not self.rig.acquisition.autostart:
             self._say(f'waiting to be configured: ros2 lifecycle set {self.node.get_fully_qualified_name()} configure')
             return
         self._starting = True

@@ -18,28 +18,24 @@ from typing import Any
 from geometry_msgs.msg import Point, Quaternion, TransformStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from visualization_msgs.msg import Marker, MarkerArray
 
 from msg_adapters.orientation import quaternion
 from psd_deflection.config import Rig
 from psd_deflection.records import DeflectionEstimate, SpotMeans
-from psd_deflection.ros.wires import relative
+from psd_deflection.ros.names import BASE, MARKERS, MARKERS_AT_REST, REST, TIP
+from psd_deflection.ros.wires import qos, relative
 from psd_deflection.runner.session import Session
 
-MOVING = '/link_tip/markers'
-AT_REST = '/link_tip/markers_at_rest'
 PERIOD_S = 0.1
 LIFETIME_S = 1.0
 
-BASE, REST, TIP = 'link_base', 'link_tip_rest', 'link_tip'
 _METAL, _PLATE, _SENSOR, _LASER = (
     (0.6, 0.65, 0.7, 0.9),
     (0.2, 0.3, 0.4, 0.6),
     (0.1, 0.1, 0.12, 1.0),
     (1.0, 0.2, 0.15, 1.0),
 )
-_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 Vector = tuple[float, float, float]
 
@@ -79,7 +75,7 @@ def at_rest(rig: Rig) -> Any:
 def moving(rig: Rig, estimate: DeflectionEstimate | None, spots: SpotMeans, magnify: float) -> Any:
     """The MarkerArray of bent link, plate, detectors and dots; without ``estimate`` all of them are taken away."""
     length = rig.link.length
-    dx, dy, theta = (magnify * v for v in estimate[3:6]) if estimate is not None else (0.0, 0.0, 0.0)
+    dx, dy, theta = (magnify * v for v in estimate.pose) if estimate is not None else (0.0, 0.0, 0.0)
     c, s = math.cos(theta), math.sin(theta)
 
     def placed(x: float, y: float, z: float) -> Vector:
@@ -141,8 +137,8 @@ class RigMarkers:
         self.session: Session | None = None
         self._magnify = rig.monitor.markers_magnify
         self._seen = 0
-        self._at_rest = node.create_publisher(MarkerArray, relative(AT_REST), _LATCHED)
-        self._moving = node.create_publisher(MarkerArray, relative(MOVING), 10)
+        self._at_rest = node.create_publisher(MarkerArray, relative(MARKERS_AT_REST), qos(MARKERS_AT_REST))
+        self._moving = node.create_publisher(MarkerArray, relative(MARKERS), qos(MARKERS))
         self._at_rest.publish(at_rest(rig))
         self._rest_of = rig
         self._tf: Any = None
@@ -152,7 +148,7 @@ class RigMarkers:
 
             self._tf_message = TFMessage
             self._tf = node.create_publisher(TFMessage, '/tf', 10)
-            self._tf_static = node.create_publisher(TFMessage, '/tf_static', _LATCHED)
+            self._tf_static = node.create_publisher(TFMessage, '/tf_static', qos(MARKERS_AT_REST))
             now = time.time_ns()
             upright = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
             self._tf_static.publish(

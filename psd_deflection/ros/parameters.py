@@ -1,51 +1,55 @@
-"""The parameters of ``parameters.PARAMETERS`` as ROS parameters, with types, ranges and units.
+"""The rig's parameters as ROS parameters, with types, ranges and units.
 
 What is given on the command line, in a launch file or in a parameter file reaches the node as
-overrides. They are checked by the same code as everywhere else, so that ``0`` for a length is
-refused by name, and a whole number will do for a ``double``.
+overrides. :func:`rig_from_values` validates them, as it does everywhere else: ``0`` for a length is
+refused by name, and a whole number will do for a ``double``. A change while the node runs is
+validated by the pipeline, which knows the values that must fit together. The descriptors come from
+the declarations; by them rclpy refuses read-only parameters, other types and what is out of range.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from psd_deflection.config import Rig, rig_from_values
+from psd_deflection.config import BY_NAME, PARAMETERS, Rig, rig_from_values
 from psd_deflection.errors import ConfigError
-from psd_deflection.parameters import BY_NAME, PARAMETERS, Parameter, check_value
+from psd_deflection.parameters import Parameter
 from psd_deflection.runner.session import Session
 
 SOURCE = 'ROS parameters'
 
 
-def rig_of_node(node: Node, extra: Mapping[str, object]) -> Rig:
-    """The rig that the node's overrides describe, with ``extra`` on top, and declare it.
+def rig_of_node(node: Node) -> Rig:
+    """The rig that the node's overrides describe; its parameters are declared.
 
     The node was made with ``automatically_declare_parameters_from_overrides``. Raises ConfigError
     for an unknown parameter, a wrong type or a value out of bounds.
     """
-    given: dict[str, object] = {}
-    for name, parameter in node.get_parameters_by_prefix('').items():
-        value = parameter.value
-        given[name] = list(value) if not isinstance(value, (str, bool, int, float)) and value is not None else value
-    rig = rig_from_values({**given, **extra}, SOURCE)
+    given = {name: _plain(parameter) for name, parameter in node.get_parameters_by_prefix('').items()}
+    rig = rig_from_values(given, SOURCE)
     for parameter in PARAMETERS:
-        if node.has_parameter(parameter.name):
+        # rclpy tells of overrides that nobody declares (a mistyped name) only by declaring them, and then without
+        # descriptor and with the type as it was typed.
+        if parameter.name in given:
             node.undeclare_parameter(parameter.name)
         node.declare_parameter(parameter.name, rig.values[parameter.name], _descriptor(parameter), ignore_override=True)
     return rig
 
 
+def _plain(parameter: RosParameter) -> Any:
+    value = parameter.value
+    return value if value is None or isinstance(value, (str, bool, int, float)) else list(value)
+
+
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    unit = f' [{parameter.unit}]' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         name=parameter.name,
-        description=parameter.description + unit,
-        additional_constraints=parameter.bound_text()
-        or (f'one of {", ".join(parameter.choices)}' if parameter.choices else ''),
+        description=parameter.description + (f' [{parameter.unit}]' if parameter.unit else ''),
+        additional_constraints=parameter.bound_text(),
         read_only=not parameter.live,
     )
     low = parameter.minimum if parameter.minimum is not None else parameter.above
@@ -71,7 +75,7 @@ class LiveParameters:
         changed = [
             RosParameter(p.name, value=rig.values[p.name])
             for p in PARAMETERS
-            if p.live and self._node.get_parameter(p.name).value != rig.values[p.name]
+            if p.live and _plain(self._node.get_parameter(p.name)) != rig.values[p.name]
         ]
         self._showing = True
         try:
@@ -82,24 +86,11 @@ class LiveParameters:
     def _change(self, changed: list[RosParameter]) -> SetParametersResult:
         if self._showing:
             return SetParametersResult(successful=True)
-        values: dict[str, float | str | tuple[float, ...]] = {}
+        values: dict[str, Any] = {}
         for parameter in changed:
-            declared = BY_NAME.get(parameter.name)
-            if declared is None:
-                continue
-            value = parameter.value
-            if not isinstance(value, (str, bool, int, float)) and value is not None:
-                value = list(value)
-            try:
-                checked = check_value(declared, value, SOURCE)
-            except ConfigError as error:
-                return SetParametersResult(successful=False, reason=str(error))
-            if not declared.live:
-                return SetParametersResult(successful=False, reason=f'{parameter.name}: cannot change while it runs')
-            if isinstance(checked, list):
-                values[parameter.name] = tuple(float(v) for v in checked)
-            else:
-                values[parameter.name] = checked
+            if parameter.name in BY_NAME:
+                value = _plain(parameter)
+                values[parameter.name] = tuple(value) if isinstance(value, list) else value
         if not values:
             return SetParametersResult(successful=True)
         if self.session is None:
@@ -107,6 +98,8 @@ class LiveParameters:
         try:
             # All of them or none, between two blocks.
             self.session.change(values)
-        except (TimeoutError, ConfigError) as error:
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        except TimeoutError as error:
             return SetParametersResult(successful=False, reason=f'not changed: {error}')
         return SetParametersResult(successful=True)

@@ -15,14 +15,11 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from msg_adapters import DIAGNOSTICS, INPUTS, SAMPLES, TEMPERATURE, TOPIC_TYPES, from_fields
+from msg_adapters import DIAGNOSTICS, INPUTS, TEMPERATURE, TOPIC_TYPES, from_fields
 from psd_deflection.recordings import cdr
 from psd_deflection.records import TemperatureReading
+from psd_deflection.ros.names import delivery
 from psd_deflection.runner.session import Session
-
-DEPTH = 10
-SAMPLES_DEPTH = 50
-"""A second of raw blocks: a subscriber that stutters misses none."""
 
 MAX_INPUT_BYTES = 4096
 """Of one message that others publish and we record: the longest of ours has some hundred bytes."""
@@ -42,6 +39,16 @@ def relative(topic: str) -> str:
     return topic if topic == DIAGNOSTICS else topic.removeprefix('/')
 
 
+def qos(topic: str) -> QoSProfile:
+    """How ``topic`` is delivered."""
+    depth, reliable, latched = delivery(topic)
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
 class PublisherWire:
     """Publishes encoded messages: a wire of the fan-out. While it is not ``active``, diagnostics alone."""
 
@@ -50,10 +57,8 @@ class PublisherWire:
         options = QoSOverridingOptions.with_default_policies()
         self._publishers: dict[str, Publisher] = {}
         for topic, type_name in topics.items():
-            depth = SAMPLES_DEPTH if topic == SAMPLES else DEPTH
-            qos = QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
             self._publishers[topic] = node.create_publisher(
-                message_class(type_name), relative(topic), qos, qos_overriding_options=options
+                message_class(type_name), relative(topic), qos(topic), qos_overriding_options=options
             )
 
     def names(self, topics: Iterable[str]) -> list[str]:
@@ -68,8 +73,8 @@ class PublisherWire:
 
 def say_on_rosout(node: Node, say: Callable[[str], None]) -> Callable[[str], None]:
     """``say``, and a line on ``/rosout`` each time: the terminal's own lines do not go through the ROS log."""
-    qos = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    publisher = node.create_publisher(Log, '/rosout', qos)
+    as_every_node = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = node.create_publisher(Log, '/rosout', as_every_node)
     name = node.get_logger().name
 
     def both(text: str) -> None:
@@ -98,7 +103,7 @@ class InputRecorder:
                 message_class(TOPIC_TYPES[topic]),
                 relative(topic),
                 lambda message, topic=topic: self._received(topic, message),
-                QoSProfile(depth=SAMPLES_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT),
+                qos(topic),
                 raw=True,
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )

@@ -11,64 +11,46 @@ known: the device said so, frames around it were damaged, the port was away, or 
 from __future__ import annotations
 
 import queue
-import random
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from psd_deflection.config import Rig
 from psd_deflection.devices.registry import make_source
-from psd_deflection.devices.source import (
-    Clock,
-    Event,
-    Sample,
-    Source,
-    SourceEndedError,
-)
+from psd_deflection.devices.source import Clock, Event, Sample, Source, SourceEndedError
 from psd_deflection.errors import DeviceError
-from psd_deflection.protocol.frames import (
-    BadFrame,
-    BadReason,
-    HelloFrame,
-    PongFrame,
-    SampleFrame,
-    StatusFrame,
-)
-from psd_deflection.protocol.sequence import NEARBY, WRAP, SequenceExtender, Step
+from psd_deflection.protocol.frames import BadFrame, BadReason, HelloFrame, PongFrame, SampleFrame, StatusFrame
+from psd_deflection.protocol.sequence import SequenceExtender, Step
 from psd_deflection.records import FLAG_DEVICE_DROPPED, IntArray, RawChunk
-from psd_deflection.runner.arrivals import AWAY, BY_DEVICE, DAMAGED, UNSEEN, AcquisitionCounters, check_hello
+from psd_deflection.runner.clock_watch import ClockWatch
+from psd_deflection.runner.counters import AWAY, BY_DEVICE, DAMAGED, UNSEEN, AcquisitionCounters
+from psd_deflection.runner.hello import check_hello
+from psd_deflection.runner.pinger import Pinger
 from psd_deflection.runner.realtime import prefer_reader
-from psd_deflection.timing import ClockMap, ClockState
+from psd_deflection.timing import ClockState
 
 SILENCE_S = 2.0
 """A device that sends no sample for this long is reported, and asked for samples once more."""
 
 RETRY_S = 0.2
+"""Pause between two tries to reopen a device that is away."""
+
 READ_TIMEOUT_S = 0.1
 READY_S = 10.0
 GIVE_UP_TIMES = 5
-"""How often, a read's time apart, a reader is asked to give up waiting for its device."""
-
-TORN_US = 50_000
-"""Device time that disagrees with the sample numbers by more: the clock jumped, or the device paused."""
-
-PING_S = (0.1, 0.4)
-"""Bounds of the random time between two pings: their phase to the samples must not repeat."""
+"""Number of give_up() calls at stop, READ_TIMEOUT_S apart."""
 
 GATHER_S = 0.004
 """Longest that the reader lets samples gather: to wake costs more than a sample does."""
-
-UNANSWERED = 20
-"""A device that has left so many pings unanswered in a row does not know them: it is asked no more."""
 
 Say = Callable[[str], None]
 
 
 @dataclass(slots=True)
-class Chunk:
+class Arrival:
     """A RawChunk on its way, with the monotonic time at which its last byte was read, ns."""
 
     raw: RawChunk
@@ -83,13 +65,32 @@ class Ended:
     """On the queue: nothing follows."""
 
 
-Item = Chunk | Restarted | Ended
+Item = Arrival | Restarted | Ended
+
+
+@dataclass(slots=True)
+class Gathered:
+    """Samples that wait to be handed over, a row each: extended number, time and readings as the source gives them."""
+
+    seq: list[int] = field(default_factory=list)
+    t: list[int] = field(default_factory=list)
+    readings: list[tuple[float, ...]] = field(default_factory=list)
+    flags: list[int] = field(default_factory=list)
+
+    def add(self, number: int, t: int, readings: tuple[float, ...], flags: int) -> None:
+        """One more."""
+        self.seq.append(number)
+        self.t.append(t)
+        self.readings.append(readings)
+        self.flags.append(flags)
 
 
 class Acquisition:
     """Reads one device until stopped. ``say``: told of every change of state, one line each.
 
-    Raises ConfigError where there is no source of the name that the rig has.
+    For all: ``source``, ``counters``, ``hello`` (the device's last that fits), ``queue``, ``to_ros_ns``.
+    Of the thread: ``beat`` (monotonic time, s, of its last round), ``failed`` (what ended it).
+    Raises ConfigError if there is no source of the name that the rig has.
     """
 
     def __init__(self, rig: Rig, say: Say) -> None:
@@ -97,40 +98,44 @@ class Acquisition:
         self.counters = AcquisitionCounters()
         self.hello: HelloFrame | None = None
         self.queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        # Monotonic time is mapped to ROS time by one constant: a step of the wall clock while
+        # running must not tear the stamps apart.
+        self.to_ros_ns = time.time_ns() - time.monotonic_ns()
+        self.beat = time.monotonic()
+        self.failed: BaseException | None = None
+
+        # The rig, and what it means here.
         self._rig = rig
         self._name = self.source.name
         self._say = say
         self._block_size = rig.estimator.block_size
-        self._latency_ns = round(rig.acquisition.latency_offset * 1e9)
-        self._clock = ClockMap()
-        self._regressed = self.source.clock in (Clock.DEVICE, Clock.COUNTED)
-        # Monotonic time is mapped to ROS time by one constant: a step of the wall clock while
-        # running must not tear the stamps apart.
-        self.to_ros_ns = time.time_ns() - time.monotonic_ns()
-        self._sequence = SequenceExtender(self._block_size)
-        self._last_t_ns = 0
-        self._first_number = 0
         self._period_us = 1e6 / rig.converter.sample_rate_hz
-        self._observed: tuple[int, int] | None = None
-        self._previous = (-1, 0)
+        self._latency_ns = round(rig.acquisition.latency_offset * 1e9)
+        # None: the readings are volts.
+        self._volts_per_count: float | None = rig.converter.volts_per_count
+
+        # Numbers and times of samples.
+        self._sequence = SequenceExtender(self._block_size)
+        self._clock = ClockWatch(self._period_us, regressed=self.source.clock in (Clock.DEVICE, Clock.COUNTED))
+        self._pinger = Pinger()
+
+        # The stream: the first number that is taken, the last one that was, the last stamp that was given, ns.
+        self._gathered = Gathered()
+        self._first_number = 0
+        self._last_number = -1
+        self._last_t_ns = 0
+
+        # What tells the cause of the next gap.
         self._bad_since_sample = 0
         self._was_away = False
-        self._refusal = ''
-        self._random = random.Random()
-        self._next_ping = 0.0
-        self._sent: dict[int, int] = {}
-        self._unanswered = 0
-        self._volts_per_count: float | None = rig.converter.volts_per_count
+
+        # The connection: whether there is one, and why the last try to have it back failed.
         self._connected = False
-        self.failed: BaseException | None = None
-        self.beat = time.monotonic()
+        self._refusal = ''
+
         self._stop = threading.Event()
         self._ready = threading.Event()
         self._thread = threading.Thread(target=self._run, name='reader', daemon=True)
-        self._seq: list[int] = []
-        self._t: list[int] = []
-        self._readings: list[tuple[float, ...]] = []
-        self._flags: list[int] = []
 
     def open(self) -> None:
         """Open the source and hear the device out.
@@ -217,13 +222,13 @@ class Acquisition:
                         if self.feed(events, now):
                             silent_since = now / 1e9
                             self._gather()
-                    elif self._seq:
+                    elif self._gathered.seq:
                         self._hand_over(now)
                     if now / 1e9 - silent_since > SILENCE_S:
                         silent_since = now / 1e9
                         self._silent(size)
-                    if now / 1e9 >= self._next_ping:
-                        self._ping(now)
+                    if self._pinger.is_due(now / 1e9):
+                        self.counters.pings += self._pinger.ask(self.source, now / 1e9, time.monotonic_ns())
                 except DeviceError as error:
                     self._disconnected(error)
                 except SourceEndedError as end:
@@ -241,10 +246,10 @@ class Acquisition:
 
         The clock map lives on the samples that are read as they come, and the estimate waits for the last.
         """
-        if not self._regressed:
+        if not self._clock.regressed:
             # The time of the read is the time of the sample.
             return
-        to_come = -(self._previous[0] + 1) % self._block_size or self._block_size
+        to_come = -(self._last_number + 1) % self._block_size or self._block_size
         period_s = self._period_us / 1e6
         rest = min(GATHER_S, (to_come - 2) * period_s)
         if rest >= 2 * period_s:
@@ -256,19 +261,6 @@ class Acquisition:
         self._say(f'{self._name}: {what} for {SILENCE_S:g} s; still listening')
         # It may have been stopped, by itself or by another program.
         self.source.wake()
-
-    def _ping(self, now: int) -> None:
-        self._next_ping = now / 1e9 + self._random.uniform(*PING_S)
-        if self._unanswered >= UNANSWERED:
-            return
-        cookie = self._random.getrandbits(63)
-        sent = time.monotonic_ns()
-        if not self.source.ping(cookie):
-            self._unanswered = UNANSWERED
-            return
-        self.counters.pings += 1
-        self._unanswered += 1
-        self._sent = {cookie: sent}
 
     def _disconnected(self, error: DeviceError) -> None:
         if self._stop.is_set():
@@ -308,15 +300,15 @@ class Acquisition:
             self._restarted()
         self._say(f'{self._name}: the device is back')
 
-    def feed(self, events: list[Event], now: int) -> bool:
+    def feed(self, events: Sequence[Event], now: int) -> bool:
         """Sort the frames of one read at ``now`` (CLOCK_MONOTONIC, ns); True where one was a sample.
 
         The reader thread calls it; without one, whoever has a clock of his own may (a test, a simulation).
         """
         counters = self.counters
         good = False
-        if self._regressed:
-            self._observe_newest(events, now)
+        if self._clock.newest(events, now):
+            self._jumped()
         for frame in events:
             if type(frame) is SampleFrame or type(frame) is Sample:
                 good = True
@@ -330,16 +322,16 @@ class Acquisition:
                     continue
                 if flags & FLAG_DEVICE_DROPPED:
                     counters.device_dropped += 1
-                if self._regressed and self._torn(number, t):
+                waiting = self._gathered.seq
+                self._last_number = number
+                if self._clock.torn(number, t):
                     # What came before the clock jumped is stamped by the map that held then.
                     self._hand_over(now)
-                    self._observe(seq, t, now)
-                elif self._seq and number // self._block_size != self._seq[0] // self._block_size:
+                    if self._clock.observe(seq, t, now):
+                        self._jumped()
+                elif waiting and number // self._block_size != waiting[0] // self._block_size:
                     self._hand_over(now)
-                self._seq.append(number)
-                self._t.append(t)
-                self._readings.append(readings)
-                self._flags.append(flags)
+                self._gathered.add(number, t, readings, flags)
                 counters.samples += 1
                 if number % self._block_size == self._block_size - 1:
                     self._hand_over(now)
@@ -351,37 +343,9 @@ class Acquisition:
                 self._other(frame, now)
         return good
 
-    def _observe_newest(self, events: list[Event], now: int) -> None:
-        """Only the newest sample of a read says how late the line is; before any of them is stamped."""
-        newest = next((e for e in reversed(events) if type(e) is SampleFrame or type(e) is Sample), None)
-        if newest is None:
-            return
-        _, seq, t_us, _ = newest
-        if self._observed is not None:
-            last_seq, last_t = self._observed
-            if (last_seq - seq) % WRAP < NEARBY and t_us <= last_t:
-                # Repeated: it says nothing.
-                return
-            passed = (seq - last_seq) % WRAP * self._period_us
-            if abs(t_us - last_t - passed) > TORN_US:
-                # The clock may have jumped within this read: that is seen sample by sample.
-                return
-        self._observe(seq, t_us, now)
-
-    def _observe(self, seq: int, t_us: int, now: int) -> None:
-        passed = None
-        if self._observed is not None:
-            passed = (seq - self._observed[0]) % WRAP * self._period_us
-        self._observed = (seq, t_us)
-        if self._clock.observe(t_us, now, passed):
-            self.counters.clock_jumps += 1
-            self._say(f"{self._name}: the device's clock jumped; times are laid anew")
-
-    def _torn(self, number: int, t_us: int) -> bool:
-        """Whether device time does not agree with the numbers since the sample before."""
-        last_number, last_t = self._previous
-        self._previous = (number, t_us)
-        return last_number >= 0 and abs(t_us - last_t - (number - last_number) * self._period_us) > TORN_US
+    def _jumped(self) -> None:
+        self.counters.clock_jumps += 1
+        self._say(f"{self._name}: the device's clock jumped; times are laid anew")
 
     def _unusual(self, number: int, step: Step, missing: int, flags: int) -> bool:
         """Count a sample that does not simply follow; False where it is to be passed over."""
@@ -411,12 +375,10 @@ class Acquisition:
 
     def _other(self, frame: Event, now: int) -> None:
         if isinstance(frame, PongFrame):
-            sent = self._sent.pop(frame.cookie, None)
+            sent = self._pinger.answered(frame.cookie)
             if sent is not None:
                 self.counters.pongs += 1
-                self._unanswered = 0
-                if self._regressed:
-                    self._clock.observe_reply(frame.t_device_us, sent, now)
+                self._clock.reply(frame.t_device_us, sent, now)
         elif isinstance(frame, StatusFrame):
             self.counters.device_overruns = frame.overruns
             if frame.temperature_centi is not None:
@@ -429,31 +391,32 @@ class Acquisition:
                 self._say(f'{error}; kept to the first HELLO')
 
     def _hand_over(self, now: int) -> None:
-        if not self._seq:
+        gathered = self._gathered
+        if not gathered.seq:
             return
-        seq, t, readings, flags = self._seq, self._t, self._readings, self._flags
-        self._seq, self._t, self._readings, self._flags = [], [], [], []
-        t_ns = self._ros_time_ns(np.array(t, np.int64))
+        self._gathered = Gathered()
+        t_ns = self._ros_time_ns(np.array(gathered.t, np.int64))
         # A clock laid anew may point before what was already stamped: time does not go back.
         if t_ns[0] <= self._last_t_ns or bool((t_ns[1:] <= t_ns[:-1]).any()):
             steps = np.arange(1, len(t_ns) + 1)
             t_ns = np.maximum.accumulate(np.maximum(t_ns - steps, self._last_t_ns)) + steps
         self._last_t_ns = int(t_ns[-1])
         if self.queue.qsize() >= self._rig.acquisition.queue_blocks:
-            self.counters.queue_dropped += len(seq)
+            self.counters.queue_dropped += len(gathered.seq)
             return
         raw = RawChunk(
-            np.array(seq, np.int64),
+            np.array(gathered.seq, np.int64),
             t_ns,
-            np.array(readings, np.float32) if self._volts_per_count is None else np.array(readings, np.int16),
-            np.array(flags, np.uint8),
+            np.array(gathered.readings, np.float32)
+            if self._volts_per_count is None
+            else np.array(gathered.readings, np.int16),
+            np.array(gathered.flags, np.uint8),
             self._volts_per_count,
         )
-        self.queue.put(Chunk(raw, now))
+        self.queue.put(Arrival(raw, now))
 
     def _ros_time_ns(self, t: IntArray) -> IntArray:
         """``t``: as the source gives it."""
         if self.source.clock is Clock.RECORDED:
             return t
-        host = self._clock.to_host_ns(t) if self._regressed else t
-        return host + (self.to_ros_ns - self._latency_ns)
+        return self._clock.to_host_ns(t) + (self.to_ros_ns - self._latency_ns)

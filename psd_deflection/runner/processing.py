@@ -18,7 +18,7 @@ from typing import Any, Protocol, TypeVar
 
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import Record
-from psd_deflection.runner.acquisition import Chunk, Item, Restarted
+from psd_deflection.runner.acquisition import Arrival, Item, Restarted
 
 T = TypeVar('T')
 
@@ -162,7 +162,7 @@ class Processing:
                 except queue.Empty:
                     self._carry_out()
                     continue
-                if isinstance(item, Chunk):
+                if isinstance(item, Arrival):
                     self._heard_ns = item.read_ns
                     if self.give(self.pipeline.process(item.raw)):
                         self._note_latency(item.read_ns)

@@ -14,7 +14,7 @@ from concurrent.futures import Future, wait
 from pathlib import Path
 
 from msg_adapters import TOPIC_TYPES
-from psd_deflection.config import Rig, replace_values
+from psd_deflection.config import ZEROS, Rig, replace_values
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings import cdr
 from psd_deflection.records import ParameterChange
@@ -23,8 +23,9 @@ from psd_deflection.runner.fanout import Fanout
 from psd_deflection.runner.processing import Processing
 from psd_deflection.runner.realtime import lock_memory
 from psd_deflection.runner.recorder import Recorder
-from psd_deflection.runner.simulated_rig import SimulatedRigProcess
-from psd_deflection.runner.zero_store import ZEROS, ZeroStore
+from psd_deflection.runner.simulated_rig import SimulatedRigProcess, simulates
+from psd_deflection.runner.zero_store import ZeroStore
+from psd_deflection.solvers.registry import check_live
 
 HUNG_S = 5.0
 """A thread that has not come round for this long hangs: the watchdog is not fed any more."""
@@ -40,9 +41,6 @@ KEEP_S = 0.2
 
 OPEN_S = 2.0
 """How long the start waits for the disk of a recording that is wanted from the start."""
-
-SIMULATED = ('serial', 'dataq', 'thorlabs', 'lines')
-"""Sources for which a simulated rig is started where no port is named."""
 
 
 def zero_text(rig: Rig) -> str:
@@ -69,9 +67,10 @@ class Session:
         self._closed = False
         self.listeners: list[Callable[[str], None]] = [say]
         say = self._tell
+        check_live(rig.estimator.solver)
         # The geometry first: a rig that cannot be solved must not open a port.
         pipeline = Pipeline(rig)
-        if not rig.acquisition.port and rig.acquisition.source in SIMULATED:
+        if simulates(rig.values):
             self._simulated = SimulatedRigProcess(rig)
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)

@@ -7,21 +7,26 @@ import json
 import select
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from psd_deflection.config import Rig
+from psd_deflection.devices.pseudo_terminal import PORT_LINE
+from psd_deflection.devices.registry import SIMULATED
 from psd_deflection.errors import DeviceError
 
 START_S = 60.0
-PORT_LINE = 'port: '
-
 
 _waiting: list[subprocess.Popen[bytes]] = []
 
 
+def simulates(values: Mapping[str, object]) -> bool:
+    """Whether a session of a rig with these parameters starts a simulated rig: it can, and no port is named."""
+    return not values.get('port') and values.get('source', 'serial') in SIMULATED
+
+
 @contextlib.contextmanager
 def started_early(wanted: bool) -> Iterator[None]:
-    """Start the process of the next rig now, where one is ``wanted``; ends it where none took it.
+    """Start the process of the next rig now, if one is ``wanted``; ends it if none took it.
 
     It imports while its daemon does, and waits for its parameters: whoever types the command sees the dots sooner.
     """
@@ -39,7 +44,7 @@ def started_early(wanted: bool) -> Iterator[None]:
 def _start() -> subprocess.Popen[bytes]:
     # A session of its own: Ctrl-C in the terminal is for the daemon, which ends the rig itself.
     return subprocess.Popen(
-        [sys.executable, '-m', 'psd_deflection', 'simulate', '--serve', '--attached'],
+        [sys.executable, '-m', 'psd_deflection.devices.serve'],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         start_new_session=True,
@@ -63,7 +68,7 @@ class SimulatedRigProcess:
         line = self._process.stdout.readline().decode() if ready else ''
         if not line.startswith(PORT_LINE):
             self.close()
-            raise DeviceError('the simulated rig did not start; try `psd-deflection simulate --serve`')
+            raise DeviceError('the simulated rig did not start; try `psd-deflection simulate --serve`, which says why')
         self.port = line[len(PORT_LINE) :].strip()
 
     def hang_up(self) -> None:

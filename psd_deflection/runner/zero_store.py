@@ -17,11 +17,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.config import Rig, replace_values
+from psd_deflection.config import BY_NAME, ZEROS, Rig, replace_values
 from psd_deflection.errors import ConfigError
-from psd_deflection.parameters import BY_NAME, check_value
+from psd_deflection.files import replace_file
+from psd_deflection.parameters import check_value
 
-ZEROS = ('psd_1.zero', 'psd_2.zero')
 MAX_BYTES = 10_000
 
 
@@ -66,14 +66,9 @@ class ZeroStore:
     def save(self, rig: Rig) -> str:
         """Keep the zero of ``rig``; '' or why that could not be."""
         kept = {'serial': self._serial, **{name: rig.values[name] for name in ZEROS}, 'configured': self._configured}
-        partial = self.path.with_name(self.path.name + '.partial')
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            with partial.open('w', encoding='utf-8') as stream:
-                json.dump(kept, stream, indent=1)
-                stream.flush()
-                os.fsync(stream.fileno())
-            partial.replace(self.path)
+            replace_file(self.path, json.dumps(kept, indent=1).encode())
         except OSError as error:
             return f'{self.path}: the zero cannot be kept ({error.strerror or error})'
         return ''

@@ -14,7 +14,6 @@ so that the file remains a ROS 2 parameter file.
 
 from __future__ import annotations
 
-import difflib
 import functools
 import importlib.util
 import math
@@ -26,7 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.simulation import effects as ours
 from psd_deflection.simulation.declaration import ActiveEffect, Effect
 
@@ -127,8 +126,7 @@ def make_active(name: str, values: Mapping[str, object], source: str) -> ActiveE
     """
     places = _places()
     if name not in places:
-        near = difflib.get_close_matches(name, places, n=1)
-        hint = f'; did you mean {near[0]}?' if near else f'; there are: {", ".join(sorted(places))}'
+        hint = did_you_mean(name, places) or f'; there are: {", ".join(sorted(places))}'
         raise ConfigError(f'{source}: name = {name!r}: no effect of that name{hint}')
     effect = _load(name, places[name])
     known = [p.name for p in effect.parameters]

@@ -24,12 +24,12 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from psd_deflection.errors import ConfigError, SolverError
+from psd_deflection.geometry.layout import SMALLEST_BASE_LINE, Geometry, check_twist
+from psd_deflection.geometry.plate import Row
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._gauss_newton import fit, fit_many
-from psd_deflection.solvers._geometry import SMALLEST_BASE_LINE, check_twist
-from psd_deflection.solvers._tilted_plate import Row
 from psd_deflection.solvers.beam import slope_per_metre
-from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.gauss_newton import fit, fit_many
+from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
 
 Assume = Literal['beam', 'no_twist', 'nothing']
 
@@ -46,11 +46,12 @@ class BasePairSolver(Solver):
     """
 
     name: ClassVar[str] = 'base_pair'
+    budgeted_as: ClassVar[str] = ''
 
     def __init__(self, geometry: Geometry, assume: Assume = 'beam') -> None:
         """Bind to ``geometry`` under the assumption ``assume`` (see the module).
 
-        Raises ConfigError for another assumption, SolverError with the reason where that leaves
+        Raises ConfigError for another assumption, SolverError with the reason if that leaves
         something unseen.
         """
         self._count = check_twist(geometry)
@@ -139,10 +140,7 @@ class BasePairSolver(Solver):
         for i, (cx, cy, _, _, _) in enumerate(self._rows):
             measured.append(cx + dots[2 * i])
             measured.append(cy + dots[2 * i + 1])
-        try:
-            found = fit(self._model, (0.0,) * self._unknowns, measured, variances)
-        except ZeroDivisionError:
-            raise SolverError('solve: variances must be above 0 m^2') from None
+        found = fit(self._model, (0.0,) * self._unknowns, measured, variances)
         full = [sum([a * x for a, x in zip(row, found.parameters, strict=True)]) for row in self._spread]
         spread = self._spread[:3]
         half = [
@@ -189,19 +187,6 @@ class BasePairSolver(Solver):
         covariance = spread[:3] @ found.covariance @ spread[:3].T
         status = np.where(found.converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED).astype(np.int8)
         return Solutions(full[:, :3].copy(), full[:, 3:].copy(), covariance, found.residual, status)
-
-
-def small_angle(geometry: Geometry, dots: tuple[float, ...]) -> tuple[float, float, float, float]:
-    """5.4-5.7 put right, for two PSDs and no twist: (dX, dY, tan of the slope toward +X, toward +Y).
-
-    Good to the square of the angles; ``no_twist`` solves the exact equations.
-    """
-    (x01, y01), (x02, y02) = np.asarray(geometry.zeros).tolist()
-    h1, h2 = np.asarray(geometry.heights).tolist()
-    x1, y1, x2, y2 = dots
-    slope_x = ((x2 - x02) - (x1 - x01)) / (h2 - h1)
-    slope_y = ((y2 - y02) - (y1 - y01)) / (h2 - h1)
-    return (x1 - x01) - h1 * slope_x, (y1 - y01) - h1 * slope_y, slope_x, slope_y
 
 
 def _landing(

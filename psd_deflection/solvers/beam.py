@@ -10,32 +10,31 @@ height of 20 mm makes dY of a 50 N load 115 um wrong in a flat model.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import atan2, cos, sin
 from typing import ClassVar
 
 import numpy as np
 
 from psd_deflection.errors import SolverError
+from psd_deflection.geometry.layout import Geometry, check_twist
+from psd_deflection.geometry.plate import crossing, crossings, flat_pose, flat_poses
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._gauss_newton import fit, fit_many
-from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._plane import split, turn_onto
-from psd_deflection.solvers._tilted_plate import crossing, crossings
-from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus, flat_gain
+from psd_deflection.solvers.gauss_newton import fit, fit_many
+from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus, flat_gain
 
 
 class BeamSolver(Solver):
     """Tilts tied to the deflection by ``Geometry.slope_ratio``; heights in the model; P >= 2 PSDs."""
 
     name: ClassVar[str] = 'beam'
+    budgeted_as: ClassVar[str] = 'beam'
 
     def __init__(self, geometry: Geometry) -> None:
         """Bind to ``geometry``.
 
-        Raises SolverError where the beams coincide, or where a surface stands so high that the
+        Raises SolverError if the beams coincide, or if a surface stands so high that the
         plate's turning takes back what its translation does (1 + k h/L = 0).
         """
-        self._count = check_twist(geometry)
+        check_twist(geometry)
         self._tie = slope_per_metre(geometry)
         for i, height in enumerate(np.asarray(geometry.heights).tolist()):
             if abs(1.0 + self._tie * height) < 1e-3:
@@ -46,7 +45,6 @@ class BeamSolver(Solver):
                 )
         self._centers = np.asarray(geometry.centers, dtype=np.float64)
         self._beams = np.asarray(geometry.beams, dtype=np.float64)
-        self._places = tuple(self._centers.ravel().tolist())
         self._heights = np.asarray(geometry.heights, dtype=np.float64)
         self._rows = tuple(
             (cx, cy, lx, ly, h)
@@ -54,31 +52,15 @@ class BeamSolver(Solver):
                 self._centers.tolist(), self._beams.tolist(), self._heights.tolist(), strict=True
             )
         )
+        self._places = [(lx, ly) for _, _, lx, ly, _ in self._rows]
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
-        count = self._count
         q: list[float] = []
         for i, (cx, cy, _, _, _) in enumerate(self._rows):
             q.append(cx + dots[2 * i])
             q.append(cy + dots[2 * i + 1])
-        mx = sum(q[0::2]) / count
-        my = sum(q[1::2]) / count
-        nx = sum([r[2] for r in self._rows]) / count
-        ny = sum([r[3] for r in self._rows]) / count
-        along = across = 0.0
-        for i, (_, _, lx, ly, _) in enumerate(self._rows):
-            qx = q[2 * i] - mx
-            qy = q[2 * i + 1] - my
-            along += qx * (lx - nx) + qy * (ly - ny)
-            across += qx * (ly - ny) - qy * (lx - nx)
-        theta = atan2(across, along)
-        c = cos(theta)
-        s = sin(theta)
-        try:
-            found = fit(self._model, (nx - c * mx + s * my, ny - s * mx - c * my, theta), q, variances)
-        except ZeroDivisionError:
-            raise SolverError('solve: variances must be above 0 m^2') from None
+        found = fit(self._model, flat_pose(q, self._places), q, variances)
         dx, dy, theta = found.parameters
         (vxx, vxy, vxt), (_, vyy, vyt), (_, _, vtt) = found.covariance
         return Solution(
@@ -108,14 +90,13 @@ class BeamSolver(Solver):
 
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
         """As of a flat plate: the tilts change it by their own size, some thousandths. See :class:`Solver`."""
-        return flat_gain(self._places, dots, variances, solution)
+        return flat_gain(tuple(self._centers.ravel().tolist()), dots, variances, solution)
 
     def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
         """N blocks. See :class:`Solver`."""
-        x, y, _, _ = split(dots, variances)
-        start = turn_onto(self._centers[:, 0] + x, self._centers[:, 1] + y, self._beams)
-        measured = np.asarray(dots, dtype=np.float64) + self._centers.ravel()
-        found = fit_many(self._model_many, start, measured, variances)
+        points = np.asarray(dots, dtype=np.float64).reshape(len(dots), -1, 2) + self._centers
+        start = flat_poses(points, self._beams)
+        found = fit_many(self._model_many, start, points.reshape(len(points), -1), variances)
         tilt = np.column_stack((-self._tie * found.parameters[:, 1], self._tie * found.parameters[:, 0]))
         status = np.where(found.converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED).astype(np.int8)
         return Solutions(found.parameters, tilt, found.covariance, found.residual, status)
@@ -123,11 +104,11 @@ class BeamSolver(Solver):
     def _model_many(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         tie = self._tie
         full = np.column_stack((x, -tie * x[:, 1], tie * x[:, 0]))
-        q, j = crossings(self._beams, self._heights, full)
-        rows = j[:, :, :3].copy()
-        rows[:, :, 0] += tie * j[:, :, 4]
-        rows[:, :, 1] -= tie * j[:, :, 3]
-        return q, rows
+        points, j = crossings(full, self._beams, self._heights)
+        rows = j[..., :3].copy()
+        rows[..., 0] += tie * j[..., 4]
+        rows[..., 1] -= tie * j[..., 3]
+        return points.reshape(len(x), -1), rows.reshape(len(x), -1, 3)
 
 
 def slope_per_metre(geometry: Geometry) -> float:

@@ -24,9 +24,10 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.errors import SolverError
+from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._plane import (
+from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus, flat_gain
+from psd_deflection.solvers.plane import (
     interleave,
     positive,
     split,
@@ -34,7 +35,6 @@ from psd_deflection.solvers._plane import (
     turn_covariance_many,
     weighted_covariance,
 )
-from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus, flat_gain
 
 _MAX_STEPS = 30
 _LAST_STEP = 1e-10
@@ -52,9 +52,10 @@ class ExactSolver(Solver):
     """
 
     name: ClassVar[str] = 'exact'
+    budgeted_as: ClassVar[str] = 'exact'
 
     def __init__(self, geometry: Geometry) -> None:
-        """Bind to ``geometry``. Raises SolverError where the beams coincide."""
+        """Bind to ``geometry``. Raises SolverError if the beams coincide."""
         self._count = check_twist(geometry)
         self._centers = np.asarray(geometry.centers, dtype=np.float64)
         self._beams = np.asarray(geometry.beams, dtype=np.float64)

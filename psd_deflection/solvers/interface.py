@@ -16,11 +16,13 @@ import abc
 from dataclasses import dataclass
 from enum import IntEnum
 from math import cos, sin
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.config import Rig
+from psd_deflection.geometry.layout import Geometry
 from psd_deflection.records import FloatArray
 
 _STEP = 1e-8
@@ -38,31 +40,10 @@ class SolverStatus(IntEnum):
     """The readings contradict the model (for example a base line longer than the plate's)."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Geometry:
-    """Where the PSDs, the beams and the link are.
-
-    ``centers`` (P, 2): c_i, m, in ``link_tip``. ``zeros`` (P, 2): m_i0, the dots before load, m.
-    ``heights`` (P,): h_i, the sensitive surface above the reference section, m (``base_pair``: -L_i).
-    ``link_length``: L, m. ``slope_ratio``: k of phi = -k dY/L, omega = +k dX/L.
-    """
-
-    centers: FloatArray
-    zeros: FloatArray
-    heights: FloatArray
-    link_length: float
-    slope_ratio: float = 1.5
-
-    @property
-    def beams(self) -> FloatArray:
-        """l_i = c_i + m_i0, (P, 2), m."""
-        return self.centers + self.zeros
-
-
 class Solution(NamedTuple):
     """One block's answer.
 
-    ``dx``, ``dy`` m; ``theta``, ``phi``, ``omega`` rad, right-hand positive (tilts are 0 where the
+    ``dx``, ``dy`` m; ``theta``, ``phi``, ``omega`` rad, right-hand positive (tilts are 0 if the
     method has none). ``covariance``: 3 x 3 of (dx, dy, theta), row by row; NaN of a printed threshold
     method, which has none. ``residual``:
     (x1, y1, x2, y2, ...) measured minus modelled dots, m. ``iterations``: 0 for a closed form.
@@ -95,9 +76,23 @@ class Solutions:
 
 
 class Solver(abc.ABC):
-    """One method, bound to one geometry; holds no state between blocks."""
+    """One method, bound to one geometry; holds no state between blocks.
+
+    ``name``: as in the registry. ``budgeted_as``: the model of the error budget (``budget.estimate.METHODS``)
+    whose errors the method has; '' if there is none.
+    """
 
     name: ClassVar[str]
+    budgeted_as: ClassVar[str]
+
+    @abc.abstractmethod
+    def __init__(self, geometry: Geometry) -> None:
+        """Bind to ``geometry``. Raises SolverError if the method cannot solve it."""
+
+    @classmethod
+    def options_from_rig(cls, rig: Rig) -> dict[str, Any]:
+        """What the method takes from the rig file beside the geometry: keyword arguments of the class."""
+        return {}
 
     @abc.abstractmethod
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:

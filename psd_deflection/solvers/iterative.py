@@ -19,10 +19,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._plane import Covariance, interleave, split, turn_covariance, turn_covariance_many
-from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.plane import Covariance, interleave, split, turn_covariance, turn_covariance_many
 
 _MAX_TRIALS = 50
 _LAST_STEP = 1e-8
@@ -40,9 +40,10 @@ class IterativeSolver(Solver):
     """
 
     name: ClassVar[str] = 'iterative'
+    budgeted_as: ClassVar[str] = 'exact'
 
     def __init__(self, geometry: Geometry) -> None:
-        """Bind to ``geometry``. Raises SolverError where the beams coincide."""
+        """Bind to ``geometry``. Raises SolverError if the beams coincide."""
         self._count = check_twist(geometry)
         self._centers = np.asarray(geometry.centers, dtype=np.float64)
         self._beams = np.asarray(geometry.beams, dtype=np.float64)

@@ -2,7 +2,7 @@
 
 Section 2.3 looks for two tilts beside dX, dY and theta. Four readings cannot give five unknowns: one
 dot fixes the translation, and M(q_1 - q_2) = l_1 - l_2 is two equations for three angles. Put right
-(:func:`tilt_branches`), its chain reproduces all four readings for *any* admissible trial angle, so
+(``thesis.tilt_branches``), its chain reproduces all four readings for *any* admissible trial angle, so
 that its stopping test (2.46-2.49) says nothing.
 
 What can be seen: the azimuth of the base line, which is theta to within phi omega / 2, and by how much
@@ -14,79 +14,20 @@ PSD 1 towards the base; dX, dY and theta are the same for both.
 
 from __future__ import annotations
 
-from math import acos, asin, atan2, cos, hypot, nan, pi, remainder, sin, sqrt
-from typing import ClassVar, NamedTuple
+from math import asin, atan2, cos, hypot, sin, sqrt
+from typing import ClassVar
 
 import numpy as np
 
 from psd_deflection.errors import SolverError
+from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._plane import Covariance, split, turn_covariance
 from psd_deflection.solvers.exact import ExactSolver
-from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.plane import Covariance, split, turn_covariance
 
 _TOO_SHORT = 3.0
 """Standard deviations by which the base line may be shorter than the beams' before we say so."""
-
-
-class TiltBranch(NamedTuple):
-    """One of the tilts that explain the dots at a given twist: m and rad."""
-
-    dx: float
-    dy: float
-    phi: float
-    omega: float
-
-
-def tilt_branches(geometry: Geometry, dots: tuple[float, ...], theta: float) -> tuple[TiltBranch, ...]:
-    """All (dX, dY, phi, omega) that give exactly these dots at twist ``theta``: none, or four.
-
-    The thesis's 2.32-2.43 put right, for two PSDs at height 0:
-
-    - 2.32: (X^_i, Y^_i) = R(theta) q_i, signs kept;
-    - 2.34, 2.35: Y_T,i = l_iy - dY; so 2.36: cos phi = (l_1y - l_2y)/(Y^_1 - Y^_2), dY = l_2y - Y^_2 cos phi;
-    - 2.37: Pr_i = +- Y^_i sin |phi|, the sign is not to be had;
-    - 2.38: DT^2 = (Pr_1 - Pr_2)^2 + (X^_1 - X^_2)^2, a sum;
-    - 2.40, 2.41: omega = atan2(Pr_1 - Pr_2, X^_1 - X^_2) +- acos((l_1x - l_2x)/DT);
-    - 2.42: dX = l_1x - X^_1 cos omega - Pr_1 sin omega.
-
-    Raises SolverError where the beams stand side by side or one above the other (l_1y = l_2y loses
-    phi, l_1x = l_2x loses omega).
-    """
-    if check_twist(geometry) != 2:
-        raise SolverError('tilt branches are those of two PSDs')
-    (l1x, l1y), (l2x, l2y) = geometry.beams.tolist()
-    (c1x, c1y), (c2x, c2y) = np.asarray(geometry.centers).tolist()
-    for axis, angle, apart in (('y', 'phi', l1y - l2y), ('x', 'omega', l1x - l2x)):
-        if abs(apart) < 1e-6:
-            raise SolverError(f'both beams have the same {axis}: {angle} has no part in their base line')
-    c = cos(theta)
-    s = sin(theta)
-    x1 = c * (c1x + dots[0]) - s * (c1y + dots[1])
-    y1 = s * (c1x + dots[0]) + c * (c1y + dots[1])
-    x2 = c * (c2x + dots[2]) - s * (c2y + dots[3])
-    y2 = s * (c2x + dots[2]) + c * (c2y + dots[3])
-    # Rounding may carry an untilted plate past 1 by a few digits; more is a contradiction.
-    cos_phi = (l1y - l2y) / (y1 - y2) if y1 != y2 else nan
-    if not abs(cos_phi) <= 1.0 + 1e-12:
-        return ()
-    cos_phi = min(1.0, cos_phi)
-    phi = acos(cos_phi)
-    dy = l2y - y2 * cos_phi
-    found = []
-    for signed in (phi, -phi):
-        p1 = y1 * sin(signed)
-        p2 = y2 * sin(signed)
-        cosine = (l1x - l2x) / hypot(p1 - p2, x1 - x2)
-        if not abs(cosine) <= 1.0 + 1e-12:
-            return ()
-        apart = acos(max(-1.0, min(1.0, cosine)))
-        middle = atan2(p1 - p2, x1 - x2)
-        for sum_ in (middle + apart, middle - apart):
-            omega = remainder(sum_, 2.0 * pi)
-            found.append(TiltBranch(l1x - x1 * cos(omega) - p1 * sin(omega), dy, signed, omega))
-    return tuple(found)
 
 
 class MinimumTiltSolver(Solver):
@@ -99,9 +40,10 @@ class MinimumTiltSolver(Solver):
     """
 
     name: ClassVar[str] = 'minimum_tilt'
+    budgeted_as: ClassVar[str] = 'exact'
 
     def __init__(self, geometry: Geometry) -> None:
-        """Bind to ``geometry``. Raises SolverError where the beams coincide or there are not two."""
+        """Bind to ``geometry``. Raises SolverError if the beams coincide or there are not two."""
         if check_twist(geometry) != 2:
             raise SolverError('minimum_tilt takes two PSDs; with three at different heights use pose')
         if np.any(geometry.heights):

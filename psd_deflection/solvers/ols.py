@@ -1,6 +1,6 @@
 """``ols``: ordinary least squares on the linearised plate, with the design matrix put right.
 
-The thesis's section 4.2 (4.24, x = A+ b) with the corrected rows of ``_linear`` and the pre-load
+The thesis's section 4.2 (4.24, x = A+ b) with the corrected rows of ``geometry.linear`` and the pre-load
 readings subtracted. On exact data of a flat plate it gives theta' = sin theta and
 d' = R(-theta) d + (1 - cos theta) lbar, lbar the mean of the l_i: the turn of d that it leaves out,
 not the sine, is its largest error (43 um at 1 degree and 2 mm).
@@ -12,21 +12,23 @@ from typing import ClassVar
 
 import numpy as np
 
+from psd_deflection.geometry.layout import Geometry, check_twist
+from psd_deflection.geometry.linear import design_matrix
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._linear import FixedGain, design_matrix
-from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver
+from psd_deflection.solvers.fixed_gain import FixedGain
+from psd_deflection.solvers.interface import Solution, Solutions, Solver
 
 
 class OlsSolver(Solver):
     """Unweighted linear least squares, P >= 2 PSDs; covariance G V G^T with V the dots' own."""
 
     name: ClassVar[str] = 'ols'
+    budgeted_as: ClassVar[str] = 'wls'
 
     def __init__(self, geometry: Geometry) -> None:
-        """Bind to ``geometry``. Raises SolverError where the beams coincide."""
+        """Bind to ``geometry``. Raises SolverError if the beams coincide."""
         count = check_twist(geometry)
-        self._linear = FixedGain(design_matrix(geometry), np.asarray(geometry.zeros), np.ones(2 * count))
+        self._linear = FixedGain(design_matrix(geometry.beams), np.asarray(geometry.zeros), np.ones(2 * count))
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""

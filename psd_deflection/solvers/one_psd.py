@@ -12,7 +12,7 @@ from math import cos, sin
 
 import numpy as np
 
-from psd_deflection.solvers.interface import Geometry
+from psd_deflection.geometry.layout import Geometry
 
 NAME = 'one_psd'
 

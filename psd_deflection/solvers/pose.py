@@ -14,27 +14,26 @@ from typing import ClassVar
 import numpy as np
 
 from psd_deflection.errors import SolverError
+from psd_deflection.geometry.layout import SMALLEST_BASE_LINE, Geometry, check_twist
+from psd_deflection.geometry.plate import crossing, crossings, flat_poses
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._gauss_newton import fit, fit_many
-from psd_deflection.solvers._geometry import SMALLEST_BASE_LINE, check_twist
-from psd_deflection.solvers._plane import split, turn_onto
-from psd_deflection.solvers._tilted_plate import crossing, crossings
-from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.gauss_newton import fit, fit_many
+from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
 
 
 class PoseSolver(Solver):
     """dX, dY, theta, phi and omega, all free; P >= 3 PSDs whose surfaces are not in one plane."""
 
     name: ClassVar[str] = 'pose'
+    budgeted_as: ClassVar[str] = ''
 
     def __init__(self, geometry: Geometry) -> None:
         """Bind to ``geometry``.
 
-        Raises SolverError with the reason where the tilts cannot be seen: two PSDs, surfaces at one
+        Raises SolverError with the reason if the tilts cannot be seen: two PSDs, surfaces at one
         height, or surfaces on one line in space.
         """
-        self._count = check_twist(geometry)
-        if self._count == 2:
+        if check_twist(geometry) == 2:
             raise SolverError(
                 'two PSDs give 4 readings for 5 unknowns (dX, dY, theta, phi, omega): a tilt about their base line '
                 'changes nothing; use a third PSD, or the beam solver, which ties the tilts to the deflection'
@@ -61,12 +60,9 @@ class PoseSolver(Solver):
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block. See :class:`Solver`."""
-        q = np.asarray(dots) + self._centers.ravel()
-        start = turn_onto(q[None, 0::2], q[None, 1::2], self._beams)[0].tolist()
-        try:
-            found = fit(self._model, [*start, 0.0, 0.0], q.tolist(), variances)
-        except ZeroDivisionError:
-            raise SolverError('solve: variances must be above 0 m^2') from None
+        points = np.asarray(dots).reshape(-1, 2) + self._centers
+        start = flat_poses(points, self._beams).tolist()
+        found = fit(self._model, [*start, 0.0, 0.0], points.ravel().tolist(), variances)
         dx, dy, theta, phi, omega = found.parameters
         v = found.covariance
         return Solution(
@@ -95,11 +91,9 @@ class PoseSolver(Solver):
 
     def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
         """N blocks. See :class:`Solver`."""
-        x, y, _, _ = split(dots, variances)
-        flat = turn_onto(self._centers[:, 0] + x, self._centers[:, 1] + y, self._beams)
-        start = np.column_stack((flat, np.zeros((len(flat), 2))))
-        measured = np.asarray(dots, dtype=np.float64) + self._centers.ravel()
-        found = fit_many(lambda p: crossings(self._beams, self._heights, p), start, measured, variances)
+        points = np.asarray(dots, dtype=np.float64).reshape(len(dots), -1, 2) + self._centers
+        start = np.column_stack((flat_poses(points, self._beams), np.zeros((len(points), 2))))
+        found = fit_many(self._model_many, start, points.reshape(len(points), -1), variances)
         status = np.where(found.converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED).astype(np.int8)
         return Solutions(
             found.parameters[:, :3].copy(),
@@ -108,3 +102,7 @@ class PoseSolver(Solver):
             found.residual,
             status,
         )
+
+    def _model_many(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        points, jacobian = crossings(x, self._beams, self._heights)
+        return points.reshape(len(x), -1), jacobian.reshape(len(x), -1, 5)

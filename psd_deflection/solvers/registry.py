@@ -1,55 +1,83 @@
-"""Names to methods: the one list of what ``solver:`` and ``solvers:`` of a rig file may say."""
+"""Names to methods: the one list of what ``solver:`` and ``solvers:`` of a rig file may say.
+
+A method joins by its class (see :class:`~psd_deflection.solvers.interface.Solver`: it says itself which parameters
+are its options and how its errors are budgeted) and by a line here. Its module is imported when the method is
+asked for.
+"""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Callable
+import importlib
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
-from psd_deflection.errors import ConfigError
-from psd_deflection.solvers.base_pair import BasePairSolver
-from psd_deflection.solvers.beam import BeamSolver
-from psd_deflection.solvers.exact import ExactSolver
-from psd_deflection.solvers.interface import Geometry, Solver
-from psd_deflection.solvers.iterative import IterativeSolver
-from psd_deflection.solvers.minimum_tilt import MinimumTiltSolver
-from psd_deflection.solvers.ols import OlsSolver
-from psd_deflection.solvers.pose import PoseSolver
-from psd_deflection.solvers.wls import WlsSolver
-from psd_deflection.solvers.wls_exact import WlsExactSolver
-from psd_deflection.thesis.appendix_d import AppendixDSolver
-from psd_deflection.thesis.appendix_d_least_squares import AppendixDOlsSolver, AppendixDWlsSolver
-from psd_deflection.thesis.iterative_printed import IterativePrintedSolver
+from psd_deflection.config import Rig
+from psd_deflection.errors import ConfigError, did_you_mean
+from psd_deflection.geometry.layout import Geometry
+from psd_deflection.solvers.interface import Solver
 
-_CLASSES: tuple[type[Solver], ...] = (
-    ExactSolver,
-    WlsSolver,
-    IterativeSolver,
-    BeamSolver,
-    WlsExactSolver,
-    OlsSolver,
-    MinimumTiltSolver,
-    PoseSolver,
-    BasePairSolver,
-    IterativePrintedSolver,
-    AppendixDSolver,
-    AppendixDOlsSolver,
-    AppendixDWlsSolver,
+
+class Entry(NamedTuple):
+    """``path``: ``module:class``. ``instead``: of a method that is for comparison only, what a live run takes."""
+
+    path: str
+    instead: str = ''
+
+
+SOLVERS: MappingProxyType[str, Entry] = MappingProxyType(
+    {
+        'exact': Entry('psd_deflection.solvers.exact:ExactSolver'),
+        'wls': Entry('psd_deflection.solvers.wls:WlsSolver'),
+        'iterative': Entry('psd_deflection.solvers.iterative:IterativeSolver'),
+        'beam': Entry('psd_deflection.solvers.beam:BeamSolver'),
+        'wls_exact': Entry('psd_deflection.solvers.wls_exact:WlsExactSolver'),
+        'ols': Entry('psd_deflection.solvers.ols:OlsSolver'),
+        'minimum_tilt': Entry('psd_deflection.solvers.minimum_tilt:MinimumTiltSolver'),
+        'pose': Entry('psd_deflection.solvers.pose:PoseSolver'),
+        'base_pair': Entry('psd_deflection.solvers.base_pair:BasePairSolver'),
+        'iterative_printed': Entry('psd_deflection.thesis.iterative_printed:IterativePrintedSolver', 'iterative'),
+        'appendix_d': Entry('psd_deflection.thesis.appendix_d:AppendixDSolver', 'iterative'),
+        'appendix_d_ols': Entry('psd_deflection.thesis.appendix_d_least_squares:AppendixDOlsSolver', 'ols'),
+        'appendix_d_wls': Entry('psd_deflection.thesis.appendix_d_least_squares:AppendixDWlsSolver', 'wls'),
+    }
 )
+"""The default first."""
 
-SOLVERS: MappingProxyType[str, Callable[..., Solver]] = MappingProxyType({cls.name: cls for cls in _CLASSES})
-"""Name to class, the default first."""
+
+def solver_class(name: str) -> type[Solver]:
+    """The class of the method ``name``. Raises ConfigError for an unknown name."""
+    entry = SOLVERS.get(name)
+    if entry is None:
+        raise ConfigError(f'solver = {name!r}: must be one of {", ".join(SOLVERS)}{did_you_mean(name, SOLVERS)}')
+    module, _, attribute = entry.path.partition(':')
+    found: type[Solver] = getattr(importlib.import_module(module), attribute)
+    return found
 
 
 def make_solver(name: str, geometry: Geometry, **options: Any) -> Solver:
     """The method ``name`` bound to ``geometry``; ``options`` as its class documents them.
 
-    Raises ConfigError for an unknown name, SolverError where the method cannot solve the geometry.
+    Raises ConfigError for an unknown name, SolverError if the method cannot solve the geometry.
     """
-    cls = SOLVERS.get(name)
-    if cls is None:
-        near = difflib.get_close_matches(name, SOLVERS, n=1)
-        hint = f'; did you mean {near[0]}?' if near else ''
-        raise ConfigError(f'solver = {name!r}: must be one of {", ".join(SOLVERS)}{hint}')
-    return cls(geometry, **options)
+    return solver_class(name)(geometry, **options)
+
+
+def solver_from_rig(name: str, rig: Rig) -> Solver:
+    """The method ``name`` for this rig, with the options that the rig file has for it.
+
+    Raises ConfigError for an unknown name, SolverError if the method cannot solve the rig.
+    """
+    return make_solver(name, Geometry.from_rig(rig), **solver_class(name).options_from_rig(rig))
+
+
+def check_live(name: str) -> None:
+    """Raise ConfigError if ``name`` is for comparison only: its answer must not be ``/link_tip/deflection``.
+
+    Replay and ``compare-methods`` take it, and so does a live run's list ``solvers``, on a topic of its own.
+    """
+    entry = SOLVERS.get(name)
+    if entry is not None and entry.instead:
+        raise ConfigError(
+            f'solver = {name!r}: a method as printed, for comparison only: for a live run take {entry.instead!r}, '
+            f'its corrected form (`solvers` may list {name!r} beside it, and replay takes it)'
+        )

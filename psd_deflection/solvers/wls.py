@@ -1,6 +1,6 @@
 """``wls``: weighted least squares on the linearised plate, with the design matrix put right.
 
-The thesis's section 4.3 with the corrected rows of ``_linear`` and the pre-load readings
+The thesis's section 4.3 with the corrected rows of ``geometry.linear`` and the pre-load readings
 subtracted. The weights are the inverse variances. The thesis's own choice, rows scaled by
 Po = [0.03, 0.5, 10, 0.1], makes W = Po^2 (its 4.25 and its code differ on that); it is kept under
 the name ``thesis``. It is no statement about noise: it takes dX from x2 and dY from y1 alone and
@@ -12,16 +12,18 @@ theta; no matrix is inverted. Linear still means that d comes out unturned; ``wl
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, SolverError
+from psd_deflection.geometry.layout import Geometry, check_twist
+from psd_deflection.geometry.linear import design_matrix
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._linear import FixedGain, design_matrix, status_of
-from psd_deflection.solvers._plane import interleave, split, weighted_covariance
-from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.fixed_gain import FixedGain, status_of
+from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.plane import interleave, split, weighted_covariance
 
 THESIS_ROW_SCALING = (0.03, 0.5, 10.0, 0.1)
 """Po of x1, y1, x2, y2 for the thesis's loads on the sidebar (section 5.5, Figs 5.12-5.20)."""
@@ -37,6 +39,7 @@ class WlsSolver(Solver):
     """
 
     name: ClassVar[str] = 'wls'
+    budgeted_as: ClassVar[str] = 'wls'
 
     def __init__(
         self,
@@ -47,7 +50,7 @@ class WlsSolver(Solver):
         """Bind to ``geometry``.
 
         ``weights``: from the variances that ``solve`` is given, or ``thesis``: the squares of
-        ``row_scaling`` (2P,), each above 0. Raises SolverError where the beams coincide and
+        ``row_scaling`` (2P,), each above 0. Raises SolverError if the beams coincide and
         ConfigError for a row scaling of another length.
         """
         self._count = check_twist(geometry)
@@ -57,6 +60,11 @@ class WlsSolver(Solver):
             (lx, ly, x0, y0) for (lx, ly), (x0, y0) in zip(self._beams.tolist(), self._zeros.tolist(), strict=True)
         )
         self._fixed = fixed_weights(geometry, weights, row_scaling)
+
+    @classmethod
+    def options_from_rig(cls, rig: Rig) -> dict[str, Any]:
+        """``wls.weights`` and ``wls.row_scaling``."""
+        return {'weights': rig.estimator.wls_weights, 'row_scaling': rig.estimator.wls_row_scaling}
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
@@ -145,7 +153,7 @@ class WlsSolver(Solver):
 
 
 def fixed_weights(geometry: Geometry, weights: Weights, row_scaling: tuple[float, ...]) -> FixedGain | None:
-    """The gain of the ``thesis`` weights; None where the weights follow the noise.
+    """The gain of the ``thesis`` weights; None if the weights follow the noise.
 
     Raises ConfigError for other weights and for a row scaling of another length or not above 0.
     """
@@ -159,4 +167,4 @@ def fixed_weights(geometry: Geometry, weights: Weights, row_scaling: tuple[float
             f'wls.row_scaling = {list(row_scaling)}: must have {count} elements above 0, '
             'one for x and one for y of each PSD'
         )
-    return FixedGain(design_matrix(geometry), np.asarray(geometry.zeros), np.array(row_scaling, dtype=np.float64))
+    return FixedGain(design_matrix(geometry.beams), np.asarray(geometry.zeros), np.array(row_scaling, dtype=np.float64))

@@ -15,13 +15,15 @@ readings are combined as ``wls`` combines them, ``thesis`` weights included.
 from __future__ import annotations
 
 from math import asin, atan, cos, hypot, sin
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
+from psd_deflection.config import Rig
+from psd_deflection.geometry.layout import Geometry
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._plane import split, turn_covariance, turn_covariance_many
-from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.plane import split, turn_covariance, turn_covariance_many
 from psd_deflection.solvers.wls import THESIS_ROW_SCALING, Weights, WlsSolver
 
 
@@ -33,6 +35,7 @@ class WlsExactSolver(Solver):
     """
 
     name: ClassVar[str] = 'wls_exact'
+    budgeted_as: ClassVar[str] = 'exact'
 
     def __init__(
         self,
@@ -49,6 +52,11 @@ class WlsExactSolver(Solver):
         if weights == 'thesis':
             self._weights = np.square(np.array([row_scaling], dtype=np.float64))
             self._fixed = tuple(self._weights[0].tolist())
+
+    @classmethod
+    def options_from_rig(cls, rig: Rig) -> dict[str, Any]:
+        """As of ``wls``."""
+        return WlsSolver.options_from_rig(rig)
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""

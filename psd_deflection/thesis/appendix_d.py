@@ -20,10 +20,11 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 
 from psd_deflection.errors import SolverError
+from psd_deflection.geometry.layout import Geometry, check_twist
+from psd_deflection.geometry.plate import flat_points
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._plane import interleave, split
-from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.plane import interleave, split
 from psd_deflection.thesis.iterative_printed import NO_COVARIANCE
 
 Branch = Literal['A', 'B', 'none']
@@ -86,9 +87,10 @@ class AppendixDSolver(Solver):
     """
 
     name: ClassVar[str] = 'appendix_d'
+    budgeted_as: ClassVar[str] = ''
 
     def __init__(self, geometry: Geometry) -> None:
-        """Bind to ``geometry``. Raises SolverError where the code's arctangents have no meaning."""
+        """Bind to ``geometry``. Raises SolverError if the code's arctangents have no meaning."""
         if check_twist(geometry) != 2:
             raise SolverError(f'{self.name} takes two PSDs')
         self._centers = np.asarray(geometry.centers, dtype=np.float64)
@@ -113,11 +115,7 @@ class AppendixDSolver(Solver):
         return Solution(dx, dy, theta, 0.0, 0.0, NO_COVARIANCE, tuple(residual), status, got.trials)
 
     def _residual(self, dots: FloatArray, pose: FloatArray) -> FloatArray:
-        c = np.cos(pose[:, 2:])
-        s = np.sin(pose[:, 2:])
-        ux = self._beams[:, 0] - pose[:, :1]
-        uy = self._beams[:, 1] - pose[:, 1:2]
-        return dots + self._centers.ravel() - interleave(c * ux + s * uy, c * uy - s * ux)
+        return dots + self._centers.ravel() - flat_points(pose, self._beams).reshape(len(pose), -1)
 
     def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
         """N blocks: the trials one after the other, all blocks at each. See :class:`Solver`."""

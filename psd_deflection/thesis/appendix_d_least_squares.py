@@ -14,10 +14,10 @@ from typing import ClassVar
 import numpy as np
 
 from psd_deflection.errors import SolverError
+from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._linear import FixedGain
-from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver
+from psd_deflection.solvers.fixed_gain import FixedGain
+from psd_deflection.solvers.interface import Solution, Solutions, Solver
 from psd_deflection.solvers.wls import THESIS_ROW_SCALING
 
 
@@ -35,6 +35,7 @@ class AppendixDOlsSolver(Solver):
     """Appendix D, "Simple Least Squares". theta is the code's angle, clockwise, with its sign changed."""
 
     name: ClassVar[str] = 'appendix_d_ols'
+    budgeted_as: ClassVar[str] = ''
 
     def __init__(self, geometry: Geometry, row_scaling: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)) -> None:
         """Bind to ``geometry``; ``row_scaling`` (4,): Po. Raises SolverError unless there are two PSDs."""

@@ -11,9 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from psd_deflection.errors import SolverError
+from psd_deflection.geometry import Geometry
+from psd_deflection.geometry.plate import plate_points, tied_pose
+from psd_deflection.geometry.rays import hit, lifted, rotation
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._tilted_plate import crossings
-from psd_deflection.solvers.interface import Geometry, Solutions, SolverStatus
+from psd_deflection.solvers import registry
+from psd_deflection.solvers.interface import Solutions, SolverStatus
 from psd_deflection.solvers.registry import make_solver
 
 SIDEBAR = (0.03, 0.5, 10.0, 0.1)
@@ -35,7 +39,7 @@ class Method(NamedTuple):
     sign: float = 1.0
 
 
-METHODS: tuple[Method, ...] = (
+VARIANTS: tuple[Method, ...] = (
     Method('section 2.2 as printed', 'iterative_printed', {}),
     Method('section 2.2 with magnitudes', 'iterative_printed', {'criterion': 'absolute'}),
     Method('section 2.2 least on the grid', 'iterative_printed', {'criterion': 'argmin'}),
@@ -53,6 +57,8 @@ METHODS: tuple[Method, ...] = (
     Method('minimum_tilt', 'minimum_tilt', {}),
     Method('beam, k = 1.5', 'beam', {}),
 )
+
+"""The printed methods and their corrected ones, with the options that the thesis has for them."""
 
 CONDITIONS = ('flat', 'independent tilts', 'cantilever tilts')
 
@@ -74,6 +80,30 @@ def thesis_geometry() -> Geometry:
     return Geometry(np.array([[0.0, 0.070], [-0.100, 0.0]]), np.zeros((2, 2)), np.zeros(2), 0.585, 1.5)
 
 
+def methods() -> tuple[Method, ...]:
+    """The rows of the table: ``VARIANTS``, then every other method that solves the thesis's rig."""
+    return (*VARIANTS, *(Method(name, name, {}) for name, why in _others().items() if not why))
+
+
+def refused() -> dict[str, str]:
+    """The methods that cannot solve the thesis's rig, and why."""
+    return {name: why for name, why in _others().items() if why}
+
+
+def _others() -> dict[str, str]:
+    """Methods that ``VARIANTS`` does not name: name to the reason of a refusal, '' if there is none."""
+    reasons = {}
+    for name in registry.SOLVERS:
+        if any(name == variant.name for variant in VARIANTS):
+            continue
+        try:
+            make_solver(name, thesis_geometry())
+            reasons[name] = ''
+        except SolverError as error:
+            reasons[name] = str(error)
+    return reasons
+
+
 def grid(condition: str, geometry: Geometry) -> FloatArray:
     """Poses (n, 5) dX, dY, theta, phi, omega of one of ``CONDITIONS``.
 
@@ -88,16 +118,13 @@ def grid(condition: str, geometry: Geometry) -> FloatArray:
     axes = np.meshgrid(places + 17e-6, places + 23e-6, twists, leans, leans, indexing='ij')
     poses = np.column_stack([a.ravel() for a in axes])
     if condition == 'cantilever tilts':
-        tie = geometry.slope_ratio / geometry.link_length
-        poses[:, 3] = -tie * poses[:, 1]
-        poses[:, 4] = tie * poses[:, 0]
+        poses = tied_pose(poses[:, :3], geometry.slope_ratio, geometry.link_length)
     return poses
 
 
 def dots_of(geometry: Geometry, poses: FloatArray) -> FloatArray:
     """Exact readings (n, 2P), m, of tilted poses (n, 5)."""
-    q, _ = crossings(np.asarray(geometry.beams), np.asarray(geometry.heights), poses)
-    return q - np.asarray(geometry.centers).ravel()
+    return (plate_points(poses, geometry.beams, geometry.heights) - geometry.centers).reshape(len(poses), -1)
 
 
 def solve(method: Method, geometry: Geometry, dots: FloatArray) -> Solutions:
@@ -115,6 +142,14 @@ def errors(method: Method, condition: str) -> Errors:
     spoke = found.status == SolverStatus.OK
     off = (found.pose - poses[:, :3])[spoke]
     return Errors(np.sqrt(np.mean(off**2, axis=0)), np.abs(off).max(axis=0), 1.0 - float(spoke.mean()))
+
+
+def printed_bound(design: FloatArray, pose: FloatArray, design_error: FloatArray, reading_error: FloatArray) -> float:
+    """4.33 as printed, with A in mm and mm added to rad; arguments as of ``geometry.linear.error_bound``."""
+    units = np.array([1e3, 1e3, 1.0])
+    inverse = np.linalg.norm(np.linalg.pinv(1e3 * design / units))
+    change = np.linalg.norm(1e3 * design_error / units)
+    return float(inverse * (1e3 * np.linalg.norm(reading_error) + change * np.linalg.norm(units * pose)))
 
 
 # Table 5.1: 50 N on the sidebar.
@@ -175,8 +210,7 @@ def table_5_1(cause: Cause) -> tuple[FloatArray, FloatArray]:
     """Relative errors (3,) of theta, dX, dY: Appendix D's iteration, and least squares with the sidebar's Po."""
     nominal = thesis_geometry()
     dx, dy, theta = cause.pose
-    tie = cause.slope_ratio / nominal.link_length
-    pose = np.array([dx, dy, theta, -tie * dy, tie * dx])
+    pose = tied_pose(cause.pose, cause.slope_ratio, nominal.link_length)
     offsets = np.repeat(np.array(cause.offset)[:, None], 2, axis=1)
     dots = _project(nominal, pose, cause, offsets)
     iterative_geometry = Geometry(nominal.centers, offsets, np.zeros(2), nominal.link_length)
@@ -191,24 +225,11 @@ def table_5_1(cause: Cause) -> tuple[FloatArray, FloatArray]:
 
 def _project(geometry: Geometry, pose: FloatArray, cause: Cause, offsets: FloatArray) -> FloatArray:
     """Readings (4,) of a rig with that cause: the crossing of each beam's line with the plate's plane."""
-    dx, dy, theta, phi, omega = pose
-    ct, st, cp, sp, co, so = (f(a) for a in (theta, phi, omega) for f in (np.cos, np.sin))
-    turn_z = np.array([[ct, -st, 0.0], [st, ct, 0.0], [0.0, 0.0, 1.0]])
-    turn_x = np.array([[1.0, 0.0, 0.0], [0.0, cp, -sp], [0.0, sp, cp]])
-    turn_y = np.array([[co, 0.0, so], [0.0, 1.0, 0.0], [-so, 0.0, co]])
-    r = turn_y @ turn_x @ turn_z
-    readings = []
-    for i, (center, slope) in enumerate(zip(geometry.centers, (cause.beam_1, (0.0, 0.0)), strict=True)):
-        cg, sg = np.cos(cause.rotation), np.sin(cause.rotation)
-        axes = np.array([[cg, sg], [-sg, cg]])
-        place = center + np.asarray(cause.center)
-        aimed = place + axes.T @ offsets[i] / cause.gain
-        start = np.array([*aimed, cause.height])
-        direction = np.array([*slope, 1.0])
-        origin = np.array([dx, dy, 0.0])
-        # In plate axes: go along the beam until the height of the surface is reached.
-        start_b = r.T @ (start - origin)
-        direction_b = r.T @ direction
-        q = start_b + direction_b * (cause.height - start_b[2]) / direction_b[2]
-        readings.append(cause.gain * axes @ (q[:2] - place))
-    return np.concatenate(readings)
+    plate = rotation(*pose[2:])
+    own = rotation(cause.rotation, 0.0, 0.0)
+    places = geometry.centers + np.asarray(cause.center)
+    aimed = places + offsets @ own[:2, :2].T / cause.gain
+    slopes = np.array([cause.beam_1, (0.0, 0.0)])
+    origins = lifted(places, cause.height) @ plate.T + [pose[0], pose[1], 0.0]
+    dots = hit(lifted(aimed, cause.height), lifted(slopes, 1.0), origins, np.stack([plate @ own] * 2))
+    return cause.gain * dots.ravel()

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import matplotlib as mpl
@@ -16,19 +15,19 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Circle, Ellipse, FancyArrowPatch, Rectangle
 
 from psd_deflection.calibration.sensors import Duolateral, Quadrant
-from psd_deflection.cli._report import save_figure
-from psd_deflection.solvers._linear import design_matrix, gain_matrix
+from psd_deflection.geometry import Geometry
+from psd_deflection.geometry.linear import design_matrix, gain_matrix
+from psd_deflection.geometry.plate import tied_pose
 from psd_deflection.solvers.base_pair import landings
-from psd_deflection.solvers.interface import Geometry
 from psd_deflection.solvers.registry import make_solver
 from psd_deflection.thesis.comparison import (
     CONDITIONS,
     DIRECT,
-    METHODS,
     SIDEBAR,
     VARIANCES,
     dots_of,
     errors,
+    methods,
     thesis_geometry,
 )
 
@@ -46,18 +45,13 @@ _BLUE, _ORANGE, _GREEN, _RED, _GREY = '#1f6fb4', '#e07b1a', '#2f9455', '#c23b3b'
 _MDEG = 1e3 * 180.0 / np.pi
 
 
-def draw_all(folder: Path) -> list[Path]:
-    """Draw every figure into ``folder``; returns the files. Raises RecordingError where one cannot be written."""
-    written = []
+def drawn() -> Iterator[tuple[str, Figure]]:
+    """Every figure and its name, one after the other; it is closed when the next is asked for."""
     with plt.rc_context(_STYLE):
         for name, draw in FIGURES.items():
             figure = draw()
-            path = folder / f'{name}.png'
-            # No date or version in the file: the same figure is the same bytes.
-            save_figure(figure, path, metadata={'Software': None})
+            yield name, figure
             plt.close(figure)
-            written.append(path)
-    return written
 
 
 def _arrow(ax: Any, start: tuple[float, float], end: tuple[float, float], color: str, **options: Any) -> None:
@@ -128,7 +122,7 @@ def sign_convention() -> Figure:
 def comparison() -> Figure:
     """The table of ``compare-methods`` as a picture."""
     figure, axes = plt.subplots(1, 2, figsize=(9.6, 5.0), sharey=True, layout='constrained')
-    shown = METHODS[::-1]
+    shown = methods()[::-1]
     rows = np.arange(len(shown))
     for k, (condition, color) in enumerate(zip(CONDITIONS, (_BLUE, _ORANGE, _GREEN), strict=True)):
         cells = [errors(m, condition) for m in shown]
@@ -192,7 +186,7 @@ def linear() -> Figure:
         left.plot(np.degrees(theta), 1e6 * (found[:, 0] - 2e-3), color=color, ls=dash, label=label)
     left.set(xlabel='twist, deg', ylabel='error of dX, um', title='tip at (2, -2) mm, no noise')
     left.legend(fontsize=8)
-    design = design_matrix(geometry)
+    design = design_matrix(geometry.beams)
     for k, (label, scaling, color) in enumerate(
         (
             ('equal', (1.0,) * 4, _BLUE),
@@ -309,7 +303,7 @@ def beam() -> Figure:
             poses = np.zeros((len(force), 5))
             poses[:, 0], poses[:, 1] = 0.12e-3 * force / 50.0, -2.2272e-3 * force / 50.0
             poses[:, 2] = np.radians(-0.9407) * force / 50.0
-            poses[:, 3], poses[:, 4] = -k * poses[:, 1] / 0.585, k * poses[:, 0] / 0.585
+            poses = tied_pose(poses[:, :3], k, nominal.link_length)
             dots = dots_of(geometry, poses)
             for name, dash in (('exact', '--'), ('beam', '-')):
                 off = make_solver(name, geometry).solve_many(dots, VARIANCES).pose - poses[:, :3]
@@ -366,7 +360,7 @@ def base_pair() -> Figure:
     theta = np.radians(np.linspace(-1, 1, 81))
     poses = np.zeros((len(theta), 5))
     poses[:, 0], poses[:, 1], poses[:, 2] = 1e-3, -2e-3, theta
-    poses[:, 3], poses[:, 4] = 1.5 * 2e-3 / 0.585, 1.5 * 1e-3 / 0.585
+    poses = tied_pose(poses[:, :3], 1.5, nominal.link_length)
     places, _ = landings(geometry.beams, geometry.heights, poses)
     dots = places - geometry.centers.ravel()
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.4), layout='constrained')

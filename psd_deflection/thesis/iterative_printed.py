@@ -22,10 +22,11 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from psd_deflection.errors import ConfigError, SolverError
+from psd_deflection.geometry.layout import Geometry, check_twist
+from psd_deflection.geometry.plate import flat_points
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers._geometry import check_twist
-from psd_deflection.solvers._plane import interleave, split
-from psd_deflection.solvers.interface import Geometry, Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.plane import split
 
 Criterion = Literal['printed', 'absolute', 'argmin']
 
@@ -43,15 +44,16 @@ _CHUNK = 4096
 
 
 class IterativePrintedSolver(Solver):
-    """Section 2.2 with its threshold; two PSDs. ``NO_HIT``, and no number, where no trial passes.
+    """Section 2.2 with its threshold; two PSDs. ``NO_HIT``, and no number, if no trial passes.
 
     The covariance is NaN: the answer is a step function of the readings.
     """
 
     name: ClassVar[str] = 'iterative_printed'
+    budgeted_as: ClassVar[str] = 'thesis_iteration'
 
     def __init__(self, geometry: Geometry, criterion: Criterion = 'printed') -> None:
-        """Bind to ``geometry``. Raises SolverError where the beams coincide or there are not two."""
+        """Bind to ``geometry``. Raises SolverError if the beams coincide or there are not two."""
         if check_twist(geometry) != 2:
             raise SolverError(f'{self.name} takes two PSDs')
         if criterion not in get_args(Criterion):
@@ -116,11 +118,8 @@ class IterativePrintedSolver(Solver):
         for start in range(0, n, _CHUNK):
             part = slice(start, start + _CHUNK)
             self._search(self._centers[:, 0] + x[part], self._centers[:, 1] + y[part], pose[part])
-        c = np.cos(pose[:, 2:])
-        s = np.sin(pose[:, 2:])
-        ux = self._beams[:, 0] - pose[:, :1]
-        uy = self._beams[:, 1] - pose[:, 1:2]
-        residual = interleave(x + self._centers[:, 0] - (c * ux + s * uy), y + self._centers[:, 1] - (c * uy - s * ux))
+        points = np.stack((x, y), axis=-1) + self._centers
+        residual = (points - flat_points(pose, self._beams)).reshape(n, -1)
         status = np.where(np.isfinite(pose[:, 2]), SolverStatus.OK, SolverStatus.NO_HIT).astype(np.int8)
         return Solutions(pose, np.zeros((n, 2)), np.full((n, 3, 3), np.nan), residual, status)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import configparser
 import contextlib
 import random
 import threading
@@ -16,7 +15,7 @@ import serial
 from bench.campaign import fuzz, soak
 from bench.campaign.crash import judge, left_by_a_kill
 from bench.campaign.faults import Row, report
-from bench.campaign.fuzz import TARGETS, corrupted, within_a_second
+from bench.campaign.fuzz import TARGETS, corrupted, judged
 from bench.campaign.kinds import FAULTS
 from bench.campaign.line import DIGIT, VOLTS_PER_COUNT, Line, identities
 from psd_deflection.config import Rig, load_rig
@@ -156,36 +155,28 @@ def test_simulated_minutes_lose_nothing_and_keep_time(capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize('name', TARGETS)
-def test_fuzz_targets_take_what_is_good_and_what_was_found_bad(name: str) -> None:
+def test_fuzz_targets_take_what_is_good_and_refuse_what_was_found_bad(name: str) -> None:
     target, seeds = TARGETS[name]()
+    assert judged(target, seeds[0]) == []
+    assert judged(target, b'\x00\x03nonsense\x00') != []
     chance = random.Random(5)
     for seed in [*seeds, b'', *(p.read_bytes() for p in FOUND if p.name.startswith(name))]:
-        target(seed)
+        judged(target, seed)
         for _ in range(5):
             spoiled = bytearray(seed or b'\x00')
             spoiled[chance.randrange(len(spoiled))] ^= 1 << chance.randrange(8)
-            target(bytes(spoiled))
+            judged(target, bytes(spoiled))
 
 
-def test_a_hang_is_an_error_by_the_time_it_works(monkeypatch: pytest.MonkeyPatch) -> None:
-    within_a_second(lambda content: None, b'')
+def test_a_hang_and_a_refusal_of_two_lines_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert judged(lambda content: ['refused'], b'') == ['refused']
+    with pytest.raises(AssertionError, match='more than one line'):
+        judged(lambda content: ['refused\nat length'], b'')
     monkeypatch.setattr(fuzz, 'HANG_S', -1.0)
     with pytest.raises(AssertionError, match='for one input'):
-        within_a_second(lambda content: None, b'')
+        judged(lambda content: [], b'')
 
 
 def test_damaged_frames_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert corrupted(20_000) == 0
     assert ' 0 accepted with a wrong content' in capsys.readouterr().out
-
-
-def test_the_unit_file_asks_for_what_the_daemon_uses() -> None:
-    unit = configparser.ConfigParser(strict=False, interpolation=None)
-    unit.optionxform = str  # type: ignore[assignment, method-assign]
-    unit.read(ROOT / 'docs' / 'deploy' / 'psd-deflection.service')
-    service = unit['Service']
-    assert service['Type'] == 'notify'
-    assert int(service['WatchdogSec']) > 5
-    assert service['LimitRTPRIO'] == '50'
-    assert service['LimitMEMLOCK'] == 'infinity'
-    assert 'psd-deflection estimator' in service['ExecStart']

@@ -14,7 +14,7 @@ from psd_deflection.budget.chain import Chain, clipped, dots, measure
 from psd_deflection.budget.estimate import estimator_of
 from psd_deflection.config import load_rig, replace_values
 from psd_deflection.errors import ConfigError
-from psd_deflection.mechanics.dots import plate_points, tied_pose
+from psd_deflection.geometry.plate import plate_points, tied_pose
 
 GOLDEN: dict[str, Any] = json.loads((Path(__file__).parent.parent / 'data' / 'golden.json').read_text(encoding='utf-8'))
 CASES = {c['name']: c for c in GOLDEN['cases']}

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.budget.chain import measure
-from psd_deflection.budget.computation import COMPUTATION, stop_window, twist_of_residuals
+from psd_deflection.budget.computation import COMPUTATION, stop_window
 from psd_deflection.budget.evaluate import CAUSES, TABLE_3_1, evaluate, monte_carlo
 from psd_deflection.budget.inputs import INPUTS, read_inputs
 from psd_deflection.budget.installation import CENTER_POSITION, PLANE_TILT, SENSOR_HEIGHT, SENSOR_ROTATION
@@ -20,8 +20,8 @@ from psd_deflection.budget.sensor import AMPLIFIER_NOISE, QUANTISATION, SENSOR_G
 from psd_deflection.budget.term import Cause, Kind, Situation
 from psd_deflection.config import Rig, load_rig, replace_values
 from psd_deflection.errors import ConfigError
-from psd_deflection.mechanics import placement
-from psd_deflection.mechanics.dots import plate_points
+from psd_deflection.geometry import placement
+from psd_deflection.geometry.linear import design_matrix, gain_matrix
 from psd_deflection.records import FloatArray
 
 GOLDEN: dict[str, Any] = json.loads((Path(__file__).parent.parent / 'data' / 'golden.json').read_text(encoding='utf-8'))
@@ -154,7 +154,7 @@ def test_a_gain_error_scales_the_dots() -> None:
     # Without twist both dots move by -d, so each coordinate of d is off by the mean of two scale errors.
     got = SENSOR_GAIN.contribution(_at((0.0, -50.0, 0.0), gain_tolerance=0.01, method='wls'))
     deviation = 0.01 / math.sqrt(3.0)
-    gain = placement.gain_matrix(placement.design_matrix(RIG.centers))
+    gain = gain_matrix(design_matrix(RIG.centers))
     by_hand = deviation * 2.2271675e-3 * np.hypot(gain[:, 1], gain[:, 3])
     # The cosine of the tip's tilt is 1.6e-5 off 1, and its lever on the dots a little more.
     assert got.rms == pytest.approx(by_hand, rel=1e-3)
@@ -163,7 +163,7 @@ def test_a_gain_error_scales_the_dots() -> None:
 def test_a_turned_sensor_turns_what_it_reads() -> None:
     # Figure 3.3: with d along Y alone the turned sensor reads some of it on X.
     got = SENSOR_ROTATION.contribution(_at((0.0, -50.0, 0.0), method='wls', rotation_tolerance=0.01))
-    gain = placement.gain_matrix(placement.design_matrix(RIG.centers))
+    gain = gain_matrix(design_matrix(RIG.centers))
     by_hand = 0.01 / math.sqrt(3.0) * 2.2271675e-3 * np.hypot(gain[0, 0], gain[0, 2])
     assert got.rms[0] == pytest.approx(by_hand, rel=1e-3)
 
@@ -247,47 +247,6 @@ def test_a_twist_inside_the_window_is_missed_whole() -> None:
 def test_a_window_that_may_be_stepped_over_is_refused() -> None:
     with pytest.raises(ConfigError, match='iteration_step'):
         COMPUTATION.contribution(_at(method='thesis_iteration', iteration_tolerance=1e-6))
-
-
-@pytest.mark.parametrize(
-    ('residual', 'error'),
-    [
-        ((0.0, 0.0), 0.0),
-        ((1e-4, 1e-4), 12.677143),
-        ((1e-4, -1e-4), -65.169028),
-        ((-1e-4, 1e-4), 65.170320),
-        ((-1e-4, -1e-4), -12.677094),
-    ],
-)
-def test_the_angle_of_given_residuals(residual: tuple[float, float], error: float) -> None:
-    # 3.16 with its sign put right: as printed it gives -1 degree here.
-    pose = np.array([0.001, -0.002, math.radians(1.0), 0.0, 0.0])
-    points = plate_points(pose, RIG.centers, np.zeros(2))
-    got = math.degrees(twist_of_residuals(points, RIG.centers, *residual))
-    assert 1e3 * (got - 1.0) == pytest.approx(error, abs=5e-6)
-    # 3.11 and 3.12, corrected: at the angle found the two sensors disagree by just that, along the base line.
-    if residual == (0.0, 0.0):
-        c, s = math.cos(math.radians(got)), math.sin(math.radians(got))
-        across = points[0] - points[1]
-        turned = np.array([c * across[0] - s * across[1], s * across[0] + c * across[1]])
-        assert turned - (RIG.centers[0] - RIG.centers[1]) == pytest.approx(0.0, abs=1e-15)
-
-
-def test_dots_in_one_place_tell_no_angle() -> None:
-    with pytest.raises(ConfigError, match='coincide'):
-        twist_of_residuals(np.zeros((2, 2)), RIG.centers)
-
-
-def test_the_bound_of_chapter_4_and_what_happens() -> None:
-    # 4.33 at 50 N in mm: R1, R2 off by 1 mm, 2 um on each reading.
-    design = placement.design_matrix(RIG.centers) * [1.0, 1.0, 1e3]
-    change = placement.design_matrix(RIG.centers + np.array([[0.0, 1e-3], [-1e-3, 0.0]])) * [1.0, 1.0, 1e3] - design
-    answer, readings = np.array([0.12, -2.2272, -0.016418]), np.full(4, 2e-3)
-    assert placement.error_bound(design, change, readings, answer) == pytest.approx(3.868396, abs=5e-7)
-    assert placement.error_bound(design, change, readings, answer, 2) == pytest.approx(3.158496, abs=5e-7)
-    # 4.32, what really happens, is a thousand times less.
-    actual = placement.gain_matrix(design) @ (readings - change @ answer)
-    assert np.linalg.norm(actual) == pytest.approx(0.003753514, abs=5e-10)
 
 
 # ---- Where the budget cannot be drawn up ----

@@ -7,9 +7,9 @@ import numpy.typing as npt
 import pytest
 
 from psd_deflection.config import Rig, load_rig
+from psd_deflection.geometry import Geometry
 from psd_deflection.pipeline import FROZEN, HELD, Pipeline
 from psd_deflection.records import BlockStatus, DeflectionEstimate, ParameterChange, Record, SpotMeans, TipLoad
-from psd_deflection.solvers.from_rig import geometry_from_rig
 from psd_deflection.solvers.one_psd import OnePsd
 from test.test_pipeline import STEP, chunk_of, still
 
@@ -51,7 +51,7 @@ def test_the_translation_of_one_psd_is_exact_where_the_twist_is(psd: int) -> Non
     c, s = np.cos(theta), np.sin(theta)
     x, y = rig.centers[psd - 1]
     dot = (c * (x - dx) + s * (y - dy) - x, -s * (x - dx) + c * (y - dy) - y)
-    got = OnePsd(geometry_from_rig(rig)).solve(psd - 1, dot, (1e-12, 1e-12), theta, 1e-6)
+    got = OnePsd(Geometry.from_rig(rig)).solve(psd - 1, dot, (1e-12, 1e-12), theta, 1e-6)
     assert got[0] == pytest.approx(dx, abs=1e-15)
     assert got[1] == pytest.approx(dy, abs=1e-15)
 
@@ -59,7 +59,7 @@ def test_the_translation_of_one_psd_is_exact_where_the_twist_is(psd: int) -> Non
 @pytest.mark.parametrize('psd', [1, 2])
 def test_its_covariance_is_what_a_draw_shows(psd: int) -> None:
     rig = load_rig()
-    solver = OnePsd(geometry_from_rig(rig))
+    solver = OnePsd(Geometry.from_rig(rig))
     rng = np.random.default_rng(1)
     variances, sd = (4e-12, 1e-12), 2e-3
     answers = []

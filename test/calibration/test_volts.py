@@ -18,9 +18,8 @@ from psd_deflection.calibration import (
     dot_noise_variances,
     make_sensor,
 )
-from psd_deflection.config import PsdConfig, rig_from_values
+from psd_deflection.config import SENSOR_TYPES, PsdConfig, rig_from_values
 from psd_deflection.errors import ConfigError
-from psd_deflection.parameters import SENSOR_TYPES
 from psd_deflection.records import CHANNELS
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from psd_deflection.cli.main import main
 from psd_deflection.solvers import SOLVERS
-from psd_deflection.thesis.comparison import CAUSES, METHODS
+from psd_deflection.thesis.comparison import CAUSES, methods
 from psd_deflection.thesis.figures import FIGURES
 
 DOCS = Path(__file__).parents[2] / 'docs'
@@ -21,7 +21,7 @@ def test_tables(capsys: pytest.CaptureFixture[str]) -> None:
     lines = capsys.readouterr().out.splitlines()
     assert max(len(line) for line in lines) <= 120
     end = next(i for i, line in enumerate(lines) if line.startswith('Standard deviations'))
-    rows = {m.label: [line for line in lines[:end] if line.startswith(m.label + '  ')] for m in METHODS}
+    rows = {m.label: [line for line in lines[:end] if line.startswith(m.label + '  ')] for m in methods()}
     assert all(len(found) == 2 for found in rows.values())
     rms, largest = rows['exact (default)']
     assert '0 / 0 / 0' in rms
@@ -47,7 +47,7 @@ def test_tables(capsys: pytest.CaptureFixture[str]) -> None:
 def test_programs_get_the_errors_in_si_units(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['compare-methods', '--json']) == 0
     found = json.loads(capsys.readouterr().out)
-    assert list(found) == [m.label for m in METHODS]
+    assert list(found) == [m.label for m in methods()]
     cantilever = found['exact (default)']['cantilever tilts']
     assert cantilever['rms'] == pytest.approx([3.34e-6, 2.67e-6, math.radians(1.83e-3)], rel=2e-3)
     assert cantilever['largest'] == pytest.approx([8.98e-6, 6.30e-6, math.radians(3.32e-3)], rel=2e-3)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection.cli.estimator import simulates
+from psd_deflection.cli.estimator import simulates_at_once
 from psd_deflection.config import load_rig
 from psd_deflection.runner import simulated_rig
 from psd_deflection.runner.simulated_rig import SimulatedRigProcess, started_early
@@ -23,6 +23,7 @@ ROOT = Path(__file__).parent.parent.parent
         ({'source': 'dataq'}, ('--ros-args', '-p', 'record:=true'), True),
         ({'port': '/dev/ttyACM0'}, (), False),
         ({'source': 'replay'}, (), False),
+        ({'source': 'nonsense'}, (), False),
         ({}, ('--ros-args', '-p', 'port:=/dev/ttyACM0'), False),
         ({}, ('--ros-args', '--params-file', 'rig.yaml'), False),
     ],
@@ -30,7 +31,7 @@ ROOT = Path(__file__).parent.parent.parent
 def test_it_is_started_where_no_port_is_known(
     overrides: dict[str, object], ros_arguments: tuple[str, ...], wanted: bool
 ) -> None:
-    assert simulates(overrides, ros_arguments) is wanted
+    assert simulates_at_once(overrides, ros_arguments) is wanted
 
 
 def test_the_first_that_needs_one_takes_it_and_no_one_leaves_it_behind() -> None:
@@ -50,6 +51,6 @@ def test_the_first_that_needs_one_takes_it_and_no_one_leaves_it_behind() -> None
 
 
 def test_it_ends_without_a_word_when_its_daemon_is_gone_before() -> None:
-    command = [sys.executable, '-m', 'psd_deflection', 'simulate', '--serve', '--attached']
+    command = [sys.executable, '-m', 'psd_deflection.devices.serve']
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=ROOT, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')

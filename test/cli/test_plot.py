@@ -39,13 +39,13 @@ def test_the_page_is_whole(tmp_path: Path) -> None:
 
 def test_losses_and_missing_estimates_are_marked() -> None:
     from psd_deflection.cli.plot import Drawn
-    from psd_deflection.cli.replay import replayed, rig_of
     from psd_deflection.pipeline import Pipeline
-    from psd_deflection.recordings.opening import open_recording
+    from psd_deflection.recordings.readers import open_recording
+    from psd_deflection.recordings.replay_engine import replayed, rig_at_start
 
     recording = open_recording(BAGS / 'lost_samples')
     drawn = Drawn()
-    for records in replayed(recording, Pipeline(rig_of(recording, None)), recording.blocks()):
+    for records in replayed(recording, Pipeline(rig_at_start(recording)), recording.blocks()):
         for record in records:
             drawn.add(record)
     # As `info` and `replay` count them.
@@ -64,9 +64,9 @@ def test_blocks_cut_by_start_and_stop_have_lost_nothing(tmp_path: Path, capsys: 
     from matplotlib.figure import Figure
 
     from psd_deflection.cli.plot import Drawn, _mark_losses
-    from psd_deflection.cli.replay import replayed, rig_of
     from psd_deflection.pipeline import Pipeline
-    from psd_deflection.recordings.opening import open_recording
+    from psd_deflection.recordings.readers import open_recording
+    from psd_deflection.recordings.replay_engine import replayed, rig_at_start
     from psd_deflection.records import SampleBlock
 
     recording = open_recording(BAGS / 'clean')
@@ -77,7 +77,7 @@ def test_blocks_cut_by_start_and_stop_have_lost_nothing(tmp_path: Path, capsys: 
             kept = np.isin(b.seq, numbers)
             blocks.append(SampleBlock(b.index, b.seq[kept], b.t_ns[kept], b.volts[kept], b.flags[kept]))
         drawn = Drawn()
-        for records in replayed(recording, Pipeline(rig_of(recording, None)), blocks):
+        for records in replayed(recording, Pipeline(rig_at_start(recording)), blocks):
             for record in records:
                 drawn.add(record)
         table = drawn.table()

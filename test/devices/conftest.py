@@ -18,13 +18,14 @@ import numpy as np
 import pytest
 
 from psd_deflection.config import Rig
-from psd_deflection.devices import dataq, text_lines, thorlabs
-from psd_deflection.devices.serial_port import PortClosedError
-from psd_deflection.devices.simulated_device import LineDevice, PseudoTerminal, serve
+from psd_deflection.devices import LineDevice, PortClosedError, dataq, text_lines, thorlabs
+from psd_deflection.devices.pseudo_terminal import PseudoTerminal
+from psd_deflection.devices.rig_feed import RigFeed
+from psd_deflection.devices.serve import serve
 from psd_deflection.errors import DeviceError
 from psd_deflection.records import FloatArray
 from psd_deflection.runner import acquisition
-from psd_deflection.runner.acquisition import Acquisition, Chunk
+from psd_deflection.runner.acquisition import Acquisition, Arrival
 from test.heard import WAIT_S
 
 
@@ -154,14 +155,19 @@ class Run:
         self.acquisition.open()
         self.acquisition.start()
 
-    def take(self, n: int) -> list[Chunk]:
+    def take(self, n: int) -> list[Arrival]:
         """The next chunks until ``n`` samples have come."""
-        chunks: list[Chunk] = []
+        chunks: list[Arrival] = []
         while sum(len(c.raw.seq) for c in chunks) < n:
             item = self.acquisition.queue.get(timeout=WAIT_S)
-            if isinstance(item, Chunk):
+            if isinstance(item, Arrival):
                 chunks.append(item)
         return chunks
+
+    def forget(self) -> None:
+        """Take what has come so far off the queue."""
+        while not self.acquisition.queue.empty():
+            self.acquisition.queue.get(timeout=WAIT_S)
 
     def heard(self, text: str) -> str:
         while True:
@@ -171,8 +177,9 @@ class Run:
 
 
 @pytest.fixture(scope='session')
-def unloaded() -> Callable[[int, int], FloatArray]:
-    return no_load
+def unloaded() -> Callable[[Rig], RigFeed]:
+    """A feed of that rig, on which nothing pulls."""
+    return lambda rig: RigFeed(rig, no_load)
 
 
 @pytest.fixture
@@ -231,8 +238,8 @@ def run() -> Iterator[Callable[[Rig], Run]]:
 
 
 @pytest.fixture
-def volts() -> Callable[[list[Chunk]], Any]:
-    def of(chunks: list[Chunk]) -> Any:
+def volts() -> Callable[[list[Arrival]], Any]:
+    def of(chunks: list[Arrival]) -> Any:
         raws = [c.raw for c in chunks]
         scale = [1.0 if r.volts_per_count is None else r.volts_per_count for r in raws]
         return np.concatenate([r.readings * s for r, s in zip(raws, scale, strict=True)])

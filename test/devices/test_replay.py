@@ -14,7 +14,7 @@ from psd_deflection.devices.registry import make_source
 from psd_deflection.devices.replay import Pacer, Replay
 from psd_deflection.devices.source import Sample, SourceEndedError
 from psd_deflection.errors import ConfigError, DeviceError
-from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended
+from psd_deflection.runner.acquisition import Acquisition, Arrival, Ended
 from test.heard import WAIT_S
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
@@ -97,7 +97,7 @@ def test_the_reader_ends_with_the_recording(tmp_path: Path) -> None:
     while not items or not isinstance(items[-1], Ended):
         items.append(acquisition.queue.get(timeout=WAIT_S))
     acquisition.stop()
-    assert sum(len(i.raw.seq) for i in items if isinstance(i, Chunk)) == 100
+    assert sum(len(i.raw.seq) for i in items if isinstance(i, Arrival)) == 100
     assert any('at its end' in s for s in said)
 
 

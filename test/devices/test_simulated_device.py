@@ -12,8 +12,12 @@ import numpy as np
 import pytest
 
 from psd_deflection.config import load_rig
-from psd_deflection.devices import simulated_device as module
-from psd_deflection.devices.simulated_device import PseudoTerminal, SimulatedDevice, serve
+from psd_deflection.devices import PowerUp
+from psd_deflection.devices import serve as module
+from psd_deflection.devices.contract_frames import SimulatedFrames
+from psd_deflection.devices.pseudo_terminal import PseudoTerminal, link_names, open_terminals
+from psd_deflection.devices.rig_feed import RigFeed
+from psd_deflection.devices.serve import serve
 from psd_deflection.errors import ConfigError
 from psd_deflection.protocol.frames import (
     Frame,
@@ -37,8 +41,15 @@ def no_load(_: int, n: int) -> FloatArray:
     return np.zeros((n, 3))
 
 
-def device(**options: object) -> SimulatedDevice:
-    return SimulatedDevice(load_rig(), no_load, **options)  # type: ignore[arg-type]
+def device(
+    seed: int = 0,
+    skew_ppm: float = 0.0,
+    first_seq: int = 0,
+    lose: frozenset[int] = frozenset(),
+    dark: tuple[tuple[int, int, int], ...] = (),
+) -> SimulatedFrames:
+    feed = RigFeed(load_rig(), no_load, seed=seed, dark=dark)
+    return SimulatedFrames(feed, PowerUp(skew_ppm, first_seq), lose=lose)
 
 
 def frames(stream: bytes) -> list[Frame]:
@@ -145,3 +156,16 @@ def test_a_link_replaces_a_link_and_nothing_else(tmp_path: Path) -> None:
     assert str((tmp_path / 'port').readlink()) == second.name
     second.close()
     assert not (tmp_path / 'port').is_symlink()
+
+
+def test_the_ports_of_a_pair_have_links_of_their_own_and_all_go_when_one_cannot_be_made(tmp_path: Path) -> None:
+    assert link_names('rig', 1) == ['rig']
+    assert link_names(None, 2) == [None, None]
+    links = link_names(str(tmp_path / 'rig'), 2)
+    with open_terminals(links) as ports:
+        assert [str(Path(str(link)).readlink()) for link in links] == [port.name for port in ports]
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / 'rig_2').write_text('precious')
+    with pytest.raises(ConfigError, match='rig_2: no link'), open_terminals(links):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ['rig_2']

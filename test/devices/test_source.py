@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -16,13 +17,13 @@ import pytest
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.devices import registry as _registry
 from psd_deflection.devices.contract_frames import ContractFrames
+from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.devices.registry import make_source, source_names
-from psd_deflection.devices.simulated_device import PseudoTerminal
-from psd_deflection.devices.source import Clock, PortClosedError, Reading, Sample, Source, SourceEndedError
+from psd_deflection.devices.source import Clock, PortClosedError, Received, Sample, Source, SourceEndedError
 from psd_deflection.errors import ConfigError, DeviceError
 from psd_deflection.protocol.frames import BadFrame, HelloFrame
 from psd_deflection.records import CHANNELS
-from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Item
+from psd_deflection.runner.acquisition import Acquisition, Arrival, Ended, Item
 from test.heard import WAIT_S
 
 VOLTS = (0.1, 0.2, 5.0, 0.3, 0.4, 5.0)
@@ -44,13 +45,13 @@ class Scripted(Source):
     def start(self) -> None:
         self.calls.append('start')
 
-    def read(self, timeout: float) -> Reading:
+    def read(self, timeout: float) -> Received:
         if not self.script:
             raise SourceEndedError('at its end')
         step = self.script.pop(0)
         if isinstance(step, Exception):
             raise step
-        return Reading(step, time.monotonic_ns(), len(step))
+        return Received(step, time.monotonic_ns(), len(step))
 
     def close(self) -> None:
         self.calls.append('close')
@@ -83,12 +84,10 @@ def plug_ins(monkeypatch: pytest.MonkeyPatch) -> None:
 def acquisition_of(
     script: list[list[Any] | Exception], clock: Clock = Clock.HOST, numbered: bool = True
 ) -> Acquisition:
-    acquisition = Acquisition(load_rig(overrides={'source': 'scripted'}), lambda _: None)
-    source = acquisition.source
-    assert isinstance(source, Scripted)
+    source = Scripted(load_rig())
     source.script, source.clock, source.numbered = script, clock, numbered
-    acquisition._regressed = clock in (Clock.DEVICE, Clock.COUNTED)
-    return acquisition
+    with patch('psd_deflection.runner.acquisition.make_source', lambda rig: source):
+        return Acquisition(load_rig(), lambda _: None)
 
 
 def run(acquisition: Acquisition) -> list[Item]:
@@ -101,8 +100,8 @@ def run(acquisition: Acquisition) -> list[Item]:
     return items
 
 
-def chunks(items: list[Item]) -> list[Chunk]:
-    return [i for i in items if isinstance(i, Chunk)]
+def chunks(items: list[Item]) -> list[Arrival]:
+    return [i for i in items if isinstance(i, Arrival)]
 
 
 def test_our_own_name_makes_our_own_source() -> None:
@@ -120,7 +119,7 @@ def test_a_plug_in_is_found_by_its_entry_point() -> None:
     [
         ('serail', 'did you mean serial'),
         ('broken', 'cannot be loaded'),
-        ('odd', 'not derived from'),
+        ('odd', 'neither a psd_deflection.devices.Device nor derived from Source'),
     ],
 )
 def test_a_name_that_makes_no_source_is_refused(name: str, said: str) -> None:

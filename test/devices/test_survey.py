@@ -13,12 +13,13 @@ import yaml
 from psd_deflection.cli.main import main
 from psd_deflection.config import load_rig, read_parameter_file
 from psd_deflection.devices import survey as port_survey
+from psd_deflection.devices.contract_frames import SimulatedFrames
+from psd_deflection.devices.dataq import SimulatedDataq
+from psd_deflection.devices.registry import known_devices
 from psd_deflection.devices.serial_port import SerialPort
-from psd_deflection.devices.simulated_dataq import SimulatedDataq
-from psd_deflection.devices.simulated_device import SimulatedDevice
-from psd_deflection.devices.simulated_lines import SimulatedLines
-from psd_deflection.devices.simulated_thorlabs import SharedRig, SimulatedAligner
 from psd_deflection.devices.survey import serial_ports, survey
+from psd_deflection.devices.text_lines import SimulatedLines
+from psd_deflection.devices.thorlabs import SharedRig, SimulatedAligner
 
 
 @pytest.fixture(autouse=True)
@@ -37,14 +38,14 @@ def test_each_is_known_by_its_answer(
     monkeypatch.setattr(port_survey, 'ONCE_A_SECOND_S', 60.0)
     monkeypatch.setattr(port_survey, 'BOOT_S', 60.0)
     rig = load_rig()
-    shared = SharedRig(rig, unloaded, 0)
+    shared = SharedRig(unloaded(rig))
     devices = [
-        SimulatedDevice(rig, unloaded),
-        SimulatedDataq(rig, unloaded),
-        SimulatedLines(load_rig(overrides={'converter.sample_rate_hz': 200.0}), unloaded),
+        SimulatedFrames(unloaded(rig)),
+        SimulatedDataq(unloaded(rig)),
+        SimulatedLines(unloaded(load_rig(overrides={'converter.sample_rate_hz': 200.0}))),
         SimulatedAligner(shared, 1),
         SimulatedAligner(shared, 2),
-        SimulatedDataq(rig, unloaded, model='1100'),
+        SimulatedDataq(unloaded(rig), model='1100'),
     ]
     names = [str(served(d).link) for d in devices]
     assert main(['devices', '--json', *names]) == 0
@@ -71,9 +72,9 @@ def test_each_is_known_by_its_answer(
 def test_a_port_in_use_or_missing_is_named_and_left_alone(
     served: Any, unloaded: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    name = str(served(SimulatedDevice(load_rig(), unloaded)).link)
+    name = str(served(SimulatedFrames(unloaded(load_rig()))).link)
     mine = SerialPort(name, 921_600)
-    busy, missing = survey([name, str(tmp_path / 'none')])
+    busy, missing = survey(known_devices()[0], [name, str(tmp_path / 'none')])
     assert main(['devices', name]) == 5
     mine.close()
     assert main(['devices', name]) == 0
@@ -102,7 +103,7 @@ def test_something_else_is_said_to_be_something_else(served: Any, monkeypatch: p
         def take(self, since_power_up_ns: int, room: int = 4096) -> bytes:
             return b'$GPGGA,123519\r\n'
 
-    (found,) = survey([str(served(Other()).link)])
+    (found,) = survey(known_devices()[0], [str(served(Other()).link)])
     assert found.source == ''
     assert 'bytes that we cannot read at 921600 baud' in found.answer
 

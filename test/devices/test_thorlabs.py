@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.devices.registry import make_source
-from psd_deflection.devices.serial_port import PortClosedError
-from psd_deflection.devices.simulated_thorlabs import SharedRig, SimulatedAligner
+from psd_deflection.devices.source import PortClosedError
+from psd_deflection.devices.thorlabs import SharedRig, SimulatedAligner
 from psd_deflection.errors import ConfigError, DeviceError
 from psd_deflection.protocol.apt import (
     INFO_REQUEST,
@@ -107,7 +107,7 @@ SLOW: dict[str, object] = {
 @pytest.fixture
 def pair(wired: Any, unloaded: Any) -> Callable[..., tuple[Any, Any, Rig]]:
     def make(**options: object) -> tuple[Any, Any, Rig]:
-        shared = SharedRig(load_rig(overrides=SLOW), unloaded, 0)
+        shared = SharedRig(unloaded(load_rig(overrides=SLOW)))
         ports = [wired(SimulatedAligner(shared, psd, answer_ns=500_000)) for psd in (1, 2)]
         rig = load_rig(overrides={**SLOW, 'port': ','.join(str(p.link) for p in ports), **options})
         return ports[0], ports[1], rig
@@ -147,7 +147,7 @@ def test_one_that_is_pulled_out_is_lost_time_not_lost_order(pair: Any, run: Any,
     last = max(int(s) for c in running.take(10) for s in c.raw.seq)
     second.unplug()
     running.heard('waiting for it to come back')
-    second.plug(SimulatedAligner(SharedRig(load_rig(overrides=SLOW), unloaded, 0), 2, answer_ns=500_000))
+    second.plug(SimulatedAligner(SharedRig(unloaded(load_rig(overrides=SLOW))), 2, answer_ns=500_000))
     running.heard('the device is back')
     later = [int(s) for c in running.take(10) for s in c.raw.seq]
     assert min(later) > last
@@ -158,7 +158,7 @@ def test_one_that_is_pulled_out_is_lost_time_not_lost_order(pair: Any, run: Any,
 
 
 def test_a_port_where_nothing_answers_is_named(wired: Any, unloaded: Any) -> None:
-    shared = SharedRig(load_rig(), unloaded, 0)
+    shared = SharedRig(unloaded(load_rig()))
     good = wired(SimulatedAligner(shared, 1))
     mute = wired(SimulatedAligner(shared, 2, answer_ns=10**12))
     rig = load_rig(overrides={**SLOW, 'port': f'{good.link},{mute.link}'})

@@ -10,7 +10,7 @@ import numpy as np
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.monitor.server import MonitorServer
-from psd_deflection.monitor.source import RefusedError
+from psd_deflection.monitor.shown import RefusedError
 from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
@@ -23,7 +23,7 @@ START_NS = 1_700_000_000_000_000_000
 BLOCK_NS = 20_000_000
 
 
-class StillSource:
+class StillShown:
     """Remembers what was asked of it; ``refusal`` is what it answers, where there is one."""
 
     def __init__(self, rig: Rig) -> None:
@@ -97,10 +97,10 @@ class Serving:
 
     def __init__(self, overrides: dict[str, object]) -> None:
         self.rig = load_rig(overrides={'monitor_port': 0, **overrides})
-        self.source = StillSource(self.rig)
+        self.shown = StillShown(self.rig)
         self.feed = Feed()
         self.said: list[str] = []
-        self.server = MonitorServer(self.source, self.feed, self.rig.monitor, self.said.append)
+        self.server = MonitorServer(self.shown, self.feed, self.rig.monitor, self.said.append)
         self.url = self.server.start()
         self.port = int(self.url.rstrip('/').rpartition(':')[2])
 

@@ -18,10 +18,14 @@ pytest.importorskip('selenium', reason='the browser tests need selenium: pip ins
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
-from .browsing import Page, Program, Start
+from tools.program import PSD_DEFLECTION, ROOT, Program
+
+from .browsing import Page
 from .serving import Serving
 
 pytestmark = pytest.mark.browser
+
+Start = Callable[..., Program]
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
 HOUR_BLOCKS = 180_000
@@ -40,13 +44,20 @@ def start(tmp_path: Path) -> Iterator[Start]:
     started: list[Program] = []
 
     def begin(*arguments: str) -> Program:
-        program = Program(arguments, tmp_path)
+        program = Program(
+            [*PSD_DEFLECTION, *arguments], tmp_path, env={'PYTHONPATH': str(ROOT), 'XDG_STATE_HOME': str(tmp_path)}
+        )
         started.append(program)
         return program
 
     yield begin
     for program in started:
         program.end()
+
+
+def address_of(program: Program) -> str:
+    """Of the page that it serves."""
+    return program.until(r'monitor: (http://\S+)')[1]
 
 
 def parameter_file(folder: Path, **values: object) -> str:
@@ -109,7 +120,7 @@ def test_the_daemon_on_the_simulated_rig_shows_moving_dots_and_traces(
     arguments = ['--params-file', parameter_file(tmp_path, monitor=True, monitor_port=0)]
     # As `make run` starts it, but for the port, which others may have.
     program = start('estimator', *arguments, *([] if how == 'node' else ['--no-ros']))
-    page.open(program.url())
+    page.open(address_of(program))
     page.live()
     first = [picture(page, f'#detector_{n} canvas') for n in (1, 2)]
     # The rig's loads come and go every few seconds; noise alone moves the dot by less than a pixel.
@@ -134,12 +145,12 @@ def test_the_daemon_on_the_simulated_rig_shows_moving_dots_and_traces(
 
 def test_zero_and_record_work_where_they_are_allowed(page: Page, start: Start, tmp_path: Path) -> None:
     # Taken as unloaded: dots 0.5 mm off those that the device has at rest. Its loads act along Y.
-    port = start('simulate', '--serve').said('port: (.+)')
+    port = start('simulate', '--serve').until('port: (.+)')[1]
     zeros = {'psd_1.zero': [5e-4, 0.0], 'psd_2.zero': [5e-4, 0.0]}
     # Neither takes over nor leaves behind a zero that a user of this machine has taken.
     rig = parameter_file(tmp_path, keep_zero=False, **zeros)
     program = start('monitor', '--port', port, '--params-file', rig, '--http-port', '0', '--control')
-    page.open(program.url())
+    page.open(address_of(program))
     page.live()
     dx = 'Number(document.getElementById("dx").textContent.replace("\\u2212", "-"))'
     page.until(f'{dx} > 400')
@@ -173,7 +184,7 @@ def test_another_site_cannot_press_the_button_nor_look_on(page: Page, serve: Cal
         events = 's.onopen = () => ok("open"); s.onclose = () => ok("closed");'
         opened = page.later(f'new Promise((ok) => {{ const s = {socket_of}; {events} }})')
         assert opened == 'closed'
-        assert serving.source.zeros == 0
+        assert serving.shown.zeros == 0
     finally:
         server.shutdown()
         thread.join()
@@ -188,7 +199,7 @@ def test_the_token_of_the_printed_address_opens_the_buttons(page: Page, serve: C
     page.until('document.getElementById("zero").disabled === false')
     page.driver.find_element(By.ID, 'zero').click()
     page.until('document.getElementById("notice").textContent.includes("token is missing or wrong")')
-    assert serving.source.zeros == 0
+    assert serving.shown.zeros == 0
     page.driver.find_element(By.ID, 'zero').click()
     page.until('document.getElementById("ask").open')
     page.driver.find_element(By.ID, 'cancel').click()
@@ -197,16 +208,16 @@ def test_the_token_of_the_printed_address_opens_the_buttons(page: Page, serve: C
     page.until('document.getElementById("ask").open')
     page.driver.find_element(By.ID, 'token').send_keys(serving.server.token + Keys.ENTER)
     page.until('document.getElementById("notice").textContent === "unloaded dots taken"')
-    assert serving.source.zeros == 1
+    assert serving.shown.zeros == 1
     assert serving.server.token not in str(page.js('location.href'))
 
 
 def test_the_page_outlives_an_unplugged_device(page: Page, start: Start, tmp_path: Path) -> None:
     link = str(tmp_path / 'port')
     device = start('simulate', '--serve', '--link', link)
-    device.said('(port: )')
+    device.until('port: ')
     program = start('monitor', '--port', link, '--http-port', '0', '--control')
-    page.open(program.url())
+    page.open(address_of(program))
     page.live()
     faded = 'Number(getComputedStyle(document.querySelector(".numbers")).opacity) < 0.6'
     page.until(f'document.body.dataset.state === "live" && !({faded})')
@@ -219,7 +230,7 @@ def test_the_page_outlives_an_unplugged_device(page: Page, start: Start, tmp_pat
     page.until('document.getElementById("notice").textContent === "not zeroed: no data flows"')
     before = page.rows()
     again = start('simulate', '--serve', '--link', link)
-    again.said('(port: )')
+    again.until('port: ')
     page.live()
     page.until(f'document.body.dataset.rows > {before + 50}')
     page.until('document.querySelector("#messages").textContent.includes("the device is back")')
@@ -230,14 +241,14 @@ def test_the_page_outlives_an_unplugged_device(page: Page, start: Start, tmp_pat
 def test_the_page_finds_a_daemon_that_was_started_anew(page: Page, start: Start) -> None:
     port = str(free_port())
     first = start('monitor', str(BAGS / 'clean'), '--loop', '--http-port', port, '--control')
-    page.open(first.url())
+    page.open(address_of(first))
     page.until('document.body.dataset.rows > 20')
     instance = page.js('document.body.dataset.instance')
     assert first.end() == 0
     page.until('document.body.dataset.state === "offline"')
     page.until('document.getElementById("zero").disabled')
     before = page.rows()
-    start('monitor', str(BAGS / 'clean'), '--loop', '--http-port', port).url()
+    address_of(start('monitor', str(BAGS / 'clean'), '--loop', '--http-port', port))
     page.live()
     page.until(f'document.body.dataset.rows > {before + 20}')
     assert page.js('document.body.dataset.instance') != instance
@@ -245,7 +256,7 @@ def test_the_page_finds_a_daemon_that_was_started_anew(page: Page, start: Start)
 
 
 def test_a_lost_laser_is_seen(page: Page, start: Start) -> None:
-    page.open(start('monitor', str(BAGS / 'laser_off'), '--loop', '--http-port', '0').url())
+    page.open(address_of(start('monitor', str(BAGS / 'laser_off'), '--loop', '--http-port', '0')))
     page.until('document.getElementById("state").textContent === "laser lost"')
     page.until('document.getElementById("detector_2").classList.contains("low")')
     page.until('document.getElementById("dx").textContent === "–"')
@@ -267,7 +278,7 @@ def test_the_bands_show_two_standard_deviations(page: Page, serve: Callable[...,
 @pytest.mark.parametrize('width', [390, 844, 1024, 1440])
 def test_nothing_is_cut_off_or_laid_over_its_neighbour(page: Page, serve: Callable[..., Serving], width: int) -> None:
     serving = serve(monitor_control=True)
-    serving.source.recordings.append('recordings/test')
+    serving.shown.recordings.append('recordings/test')
     serving.give(0, 20)
     metrics = {'width': width, 'height': 800, 'deviceScaleFactor': 1, 'mobile': width < 800}
     page.driver.execute_cdp_cmd('Emulation.setDeviceMetricsOverride', metrics)

@@ -19,7 +19,7 @@ from psd_deflection.monitor.server import BROWSERS, CONNECTIONS, MonitorServer
 from psd_deflection.records import BlockStatus
 from test.heard import WAIT_S
 
-from .serving import Serving, StillSource
+from .serving import Serving, StillShown
 
 Serve = Callable[..., Serving]
 
@@ -126,20 +126,20 @@ def test_the_buttons_are_off_unless_allowed(serve: Serve) -> None:
         status, text, _ = ask(serving.url + path)
         assert status == 403
         assert 'monitor_control' in text
-    assert serving.source.zeros == 0
-    assert not serving.source.recordings
+    assert serving.shown.zeros == 0
+    assert not serving.shown.recordings
 
 
 def test_allowed_buttons_work_and_say_what_they_did(serve: Serve) -> None:
     serving = serve(monitor_control=True)
     assert ask(serving.url + 'api/zero')[:2] == (200, '{"ok": true, "message": "unloaded dots taken"}')
-    assert serving.source.zeros == 1
+    assert serving.shown.zeros == 1
     assert ask(serving.url + 'api/record', body={'record': True})[0] == 200
-    assert serving.source.recordings == ['recordings/test']
+    assert serving.shown.recordings == ['recordings/test']
     assert ask(serving.url + 'api/record', body={'record': False})[0] == 200
-    assert serving.source.recordings == ['recordings/test', None]
+    assert serving.shown.recordings == ['recordings/test', None]
     assert any('unloaded dots taken' in line for line in serving.said)
-    serving.source.refusal = 'no good block yet'
+    serving.shown.refusal = 'no good block yet'
     status, text, _ = ask(serving.url + 'api/zero')
     assert (status, json.loads(text)) == (409, {'ok': False, 'message': 'no good block yet'})
 
@@ -163,8 +163,8 @@ def test_what_another_site_sends_is_refused(serve: Serve, headers: dict[str, str
     serving = serve(monitor_control=True)
     for path in ('api/zero', 'api/record'):
         assert ask(serving.url + path, body=body, headers=headers)[0] == status
-    assert serving.source.zeros == 0
-    assert not serving.source.recordings
+    assert serving.shown.zeros == 0
+    assert not serving.shown.recordings
 
 
 @pytest.mark.parametrize('headers', [{'Origin': 'http://evil.example'}, {'Host': 'evil.example'}])
@@ -251,7 +251,7 @@ def test_a_browser_that_comes_between_two_reports_is_shown_the_last(
         assert messages[-1]['health']['entries'][0]['message'] == 'samples flow'
         assert ask(serving.url + 'api/record', body={'record': True})[0] == 200
     assert messages[-1]['health']['recording'] == 'recordings/test'
-    assert serving.source.reports == 1
+    assert serving.shown.reports == 1
 
 
 def test_on_the_network_the_buttons_need_the_token(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,9 +261,9 @@ def test_on_the_network_the_buttons_need_the_token(serve: Serve, monkeypatch: py
     assert len(serving.server.token) >= 20
     assert ask(url + 'api/zero')[0] == 401
     assert ask(url + 'api/zero', headers={'X-Monitor-Token': serving.server.token[:-1]})[0] == 401
-    assert serving.source.zeros == 0
+    assert serving.shown.zeros == 0
     assert ask(url + 'api/zero', headers={'X-Monitor-Token': serving.server.token})[0] == 200
-    assert serving.source.zeros == 1
+    assert serving.shown.zeros == 1
     hello = listen(url, lambda m: 'hello' in m)[0]['hello']
     assert hello['needs_token'] is True
     assert serving.server.token not in json.dumps(hello)
@@ -281,7 +281,7 @@ def test_a_port_in_use_is_told_and_another_taken(serve: Serve) -> None:
 
 def test_an_address_of_another_machine_is_refused() -> None:
     rig = load_rig(overrides={'monitor_address': '192.0.2.1', 'monitor_port': 0})
-    server = MonitorServer(StillSource(rig), Feed(), rig.monitor, lambda text: None)
+    server = MonitorServer(StillShown(rig), Feed(), rig.monitor, lambda text: None)
     with pytest.raises(ConfigError, match=r"monitor_address = '192\.0\.2\.1'"):
         server.start()
     server.close()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from psd_deflection.recordings.bag_writer import McapFile
+from psd_deflection.config import load_rig
+from psd_deflection.recordings.bag_writer import BagWriter, McapFile
 from psd_deflection.records import (
     AppliedLoad,
     BlockStatus,
@@ -86,3 +87,11 @@ def write_mcap(path: Path, records: Sequence[Record], **kwargs: Any) -> Path:
         for r in records:
             out.write(r)
     return path
+
+
+def write_bag(folder: Path, changed: Mapping[str, object]) -> Path:
+    """A bag of 60 blocks of every kind of record, of a rig with these parameters ``changed``."""
+    with BagWriter(folder, rig_values=load_rig(None, changed).values, device_hello=HELLO) as out:
+        for r in run(60):
+            out.put(r)
+    return folder

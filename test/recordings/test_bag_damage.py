@@ -11,11 +11,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
-from msg_adapters import to_messages
+from msg_adapters import MESSAGE_TYPES, to_messages
 from psd_deflection.errors import RecordingError
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.bag_reader import BagRecording
-from psd_deflection.recordings.ros2msg import definition
 from psd_deflection.records import SampleBlock
 
 from .making import HELLO, assert_same, run, write_mcap
@@ -117,7 +116,7 @@ def test_no_damage_ends_in_a_traceback(tmp_path: Path, changes: list[tuple[float
             for record in run(12):
                 for m in to_messages(record):
                     if m.topic not in channels:
-                        schema = writer.register_schema(m.type, 'ros2msg', definition(m.type).encode())
+                        schema = writer.register_schema(m.type, 'ros2msg', MESSAGE_TYPES[m.type].definition.encode())
                         channels[m.topic] = writer.register_channel(m.topic, 'cdr', schema)
                     writer.add_message(channels[m.topic], m.t_ns, cdr.encode(m.type, m.fields), m.t_ns)
             writer.finish()

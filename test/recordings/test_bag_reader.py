@@ -16,13 +16,12 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
 
 import psd_deflection
-from msg_adapters import LOAD, SAMPLES, to_messages
+from msg_adapters import LOAD, MESSAGE_TYPES, SAMPLES, to_messages
 from psd_deflection.config import load_rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.bag_writer import META_CHANGE, BagWriter, McapFile
-from psd_deflection.recordings.opening import open_recording
-from psd_deflection.recordings.ros2msg import definition
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import (
     CHANNELS,
     AppliedLoad,
@@ -284,7 +283,7 @@ def test_other_layouts_compressions_and_no_chunks(
     with (tmp_path / 'a.mcap').open('wb') as stream:
         writer = Writer(stream, compression=compression, use_chunking=chunked, index_types=IndexType.NONE)
         writer.start('ros2')
-        schema = writer.register_schema('sensor_msgs/PointCloud2', 'ros2msg', definition(CLOUD).encode())
+        schema = writer.register_schema('sensor_msgs/PointCloud2', 'ros2msg', MESSAGE_TYPES[CLOUD].definition.encode())
         channel = writer.register_channel(SAMPLES, 'cdr', schema)
         for b in expected:
             message = cdr.encode(CLOUD, cloud(b, names, formats, 64, big))

@@ -157,13 +157,6 @@ def test_parameters_version_and_hello_are_inside(tmp_path: Path) -> None:
     assert {k: json.loads(v) for k, v in metadata[META_HELLO].items()} == HELLO
 
 
-def test_a_hello_may_come_later(tmp_path: Path) -> None:
-    with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
-        out.write(block(0))
-        out.write_hello(HELLO)
-    assert json.loads(metadata_of(tmp_path / 'a.mcap')[META_HELLO]['serial']) == 'A1'
-
-
 def test_an_empty_bag_opens(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'empty', rig_values={}):
         pass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from decimal import Decimal
 from pathlib import Path
@@ -14,8 +15,9 @@ from hypothesis import strategies as st
 from psd_deflection.errors import RecordingError
 from psd_deflection.recordings.csv_reader import CsvRecording
 from psd_deflection.recordings.csv_writer import CsvEstimateSink, CsvSampleSink, seconds
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import (
+    CHANNELS,
     AppliedLoad,
     DeflectionEstimate,
     Record,
@@ -117,7 +119,7 @@ def test_samples_with_all_columns_come_back(tmp_path: Path) -> None:
     loads = [AppliedLoad(T0, 0.0, 0.0, 0.0), AppliedLoad(T0 + 25 * STEP, 1.0, -2.0, 0.1)]
     references = [ReferencePose(T0 + 7 * STEP, 1e-3, 2e-3, 0.1), ReferencePose(T0 + 30 * STEP, 1.5e-3, 2e-3, 0.2)]
     temperatures = [TemperatureReading(T0 + 10 * STEP, 21.5)]
-    sink = CsvSampleSink(tmp_path / 'a.csv', loads=True, references=True, temperatures=True)
+    sink = CsvSampleSink(tmp_path / 'a.csv', [AppliedLoad, ReferencePose, TemperatureReading])
     records: list[Record] = [*loads, *references, *temperatures, TipLoad(T0, 9.0, 9.0, 9.0), *blocks]
     for record in records:
         sink.put(record)
@@ -131,7 +133,7 @@ def test_samples_with_all_columns_come_back(tmp_path: Path) -> None:
 
 
 def test_what_comes_between_two_samples_goes_to_the_later(tmp_path: Path) -> None:
-    sink = CsvSampleSink(tmp_path / 'a.csv', loads=True)
+    sink = CsvSampleSink(tmp_path / 'a.csv', [AppliedLoad])
     sink.put(AppliedLoad(T0 + 3 * STEP + 1, 1.0, 0.0, 0.0))
     sink.put(block(0))
     sink.close()
@@ -263,3 +265,25 @@ def test_files_are_not_overwritten_and_errors_are_one_line(tmp_path: Path) -> No
     sink.close()
     with pytest.raises(RecordingError, match='is closed'):
         sink.put(block(0))
+
+
+def test_cells_may_be_quoted(tmp_path: Path) -> None:
+    path = tmp_path / 'q.csv'
+    head = ['t', *CHANNELS, 'note, of the operator']
+    rows = [[0.001 * i, *(0.5 * i + c for c in range(6)), 'said "go", and went'] for i in range(40)]
+    with path.open('w', newline='') as stream:
+        csv.writer(stream, quoting=csv.QUOTE_ALL).writerows([head, *rows])
+    recording = open_recording(path)
+    assert [s['x1'] for s in recording.samples] == [0.5 * i for i in range(40)]
+    assert recording.warnings == [f'{path}:1: columns that are not read: note, of the operator']
+
+
+@pytest.mark.parametrize(
+    ('row', 'why'), [('0.004,1,2,3,4,5,"6', 'no row of a CSV'), ('0.004,1,2,3,4,5,"6"7', 'no row')]
+)
+def test_a_quote_that_does_not_end_is_told(tmp_path: Path, row: str, why: str) -> None:
+    path = tmp_path / 'q.csv'
+    rows = [f'{0.001 * i:.3f},1,2,3,4,5,6' for i in range(4)]
+    path.write_text('\n'.join([','.join(['t', *CHANNELS]), *rows, row]) + '\n')
+    with pytest.raises(RecordingError, match=r'q\.csv:6: is no row of a CSV'):
+        open_recording(path).samples  # noqa: B018

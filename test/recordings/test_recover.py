@@ -17,8 +17,8 @@ from psd_deflection.cli.main import main
 from psd_deflection.config import load_rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.recordings.bag_writer import BagWriter, McapFile
-from psd_deflection.recordings.opening import open_recording
-from psd_deflection.recordings.recover import recover
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.repair import recover
 from psd_deflection.records import ParameterChange
 
 from .making import STEP, block, run
@@ -268,7 +268,7 @@ def test_a_repair_that_fails_leaves_the_file_as_it_was(tmp_path: Path, monkeypat
     def full(self: object) -> None:
         raise OSError(28, 'No space left on device')
 
-    monkeypatch.setattr('psd_deflection.recordings.recover._Copy.finish', full)
+    monkeypatch.setattr('psd_deflection.recordings.repair._Copy.finish', full)
     with pytest.raises(RecordingError, match='No space left on device'):
         recover(folder)
     assert [p.name for p in folder.iterdir()] == ['run_0.mcap']

@@ -15,9 +15,9 @@ import pytest
 
 import psd_deflection
 from psd_deflection.cli.main import main
-from psd_deflection.cli.replay import replayed, rig_of
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings import rerun_writer
+from psd_deflection.recordings.replay_engine import replayed, rig_at_start
 from psd_deflection.recordings.rerun_writer import POSE, RerunFile, Row
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
@@ -41,9 +41,9 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
 
 def rows_of(name: str, out: Path) -> dict[str, list[tuple[int, Row]]]:
     recording = psd_deflection.open(BAGS / name)
-    rig = rig_of(recording, None)
+    rig = rig_at_start(recording)
     sink = RerunFile(out, rig)
-    for records in replayed(recording, Pipeline(rig), recording.blocks()):
+    for records in replayed(recording, Pipeline(rig)):
         for record in records:
             sink.put(record)
     return sink._rows
@@ -156,7 +156,7 @@ def test_times_of_a_csv_are_since_its_start(stand_in: MagicMock, tmp_path: Path)
 
 
 def test_it_ends_once(stand_in: MagicMock, tmp_path: Path) -> None:
-    sink = RerunFile(tmp_path / 'a.rrd', rig_of(psd_deflection.open(BAGS / 'clean'), None))
+    sink = RerunFile(tmp_path / 'a.rrd', rig_at_start(psd_deflection.open(BAGS / 'clean')))
     sink.close()
     sink.close()
     stand_in.RecordingStream.return_value.disconnect.assert_called_once_with()

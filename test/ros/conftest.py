@@ -5,18 +5,17 @@ from __future__ import annotations
 import fcntl
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from test.heard import WAIT_S, Heard
 from test.runner.conftest import ScriptedDevice
+from tools.program import PSD_DEFLECTION, WAIT_S, Program
 
 rclpy = pytest.importorskip('rclpy', reason='the ROS tests need rclpy: pip install .[ros]')
 
@@ -73,61 +72,19 @@ sys.exit(main())
 """Our program, whose disk hangs at the first recording until somebody writes to the named pipe ``answer``."""
 
 
-class Daemon:
-    """``psd-deflection estimator`` as a process; its output line by line."""
-
-    def __init__(self, arguments: Sequence[str], script: str = '') -> None:
-        program = ['-c', script] if script else ['-m', 'psd_deflection']
-        self.process = subprocess.Popen(
-            [sys.executable, *program, 'estimator', *arguments],
-            cwd=Path(__file__).parent.parent.parent,
-            stderr=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            text=True,
-            start_new_session=True,
-            env={**os.environ, 'PYTHONWARNINGS': WARNINGS, 'PYTHONUNBUFFERED': '1'},
-        )
-        assert self.process.stderr is not None
-        self._heard = Heard(self.process.stderr)
-        self.lines = self._heard.lines
-
-    def said(self, pattern: str) -> str:
-        """Wait for a line that matches; it is returned."""
-        return self._heard.until(pattern).string
-
-    def signal(self, number: int) -> None:
-        os.killpg(self.process.pid, number)
-
-    def wait(self) -> int:
-        """Its exit status; all its lines are there then."""
-        status = self.process.wait(WAIT_S)
-        self._heard.close()
-        return status
-
-    def end(self) -> None:
-        if self.process.poll() is None:
-            self.signal(signal.SIGTERM)
-            try:
-                self.process.wait(WAIT_S)
-            except subprocess.TimeoutExpired:
-                self.process.kill()
-                self.process.wait()
-        self._heard.close()
-
-
 @pytest.fixture
-def start(domain: int) -> Iterator[Callable[..., Daemon]]:
+def start(domain: int) -> Iterator[Callable[..., Program]]:
     """Start a daemon; it ends with the test."""
-    started: list[Daemon] = []
+    started: list[Program] = []
 
-    def begin(*arguments: str, script: str = '') -> Daemon:
-        daemon = Daemon(arguments, script)
-        started.append(daemon)
-        return daemon
+    def begin(*arguments: str, script: str = '') -> Program:
+        command = (sys.executable, '-c', script) if script else PSD_DEFLECTION
+        started.append(Program([*command, 'estimator', *arguments], env={'PYTHONWARNINGS': WARNINGS}))
+        return started[-1]
 
     yield begin
     for daemon in started:
-        daemon.end()
+        daemon.end(signal.SIGTERM)
 
 
 def stamp(message: Any) -> int:
@@ -187,18 +144,9 @@ def peer(domain: int) -> Iterator[Peer]:
 @pytest.fixture
 def simulated_port(domain: int) -> Iterator[str]:
     """The port of ``psd-deflection simulate --serve``, run alone."""
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'psd_deflection', 'simulate', '--serve'],
-        cwd=Path(__file__).parent.parent.parent,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
-    assert process.stdout is not None
-    yield process.stdout.readline().removeprefix('port: ').strip()
-    process.send_signal(signal.SIGINT)
-    assert process.wait(WAIT_S) == 0
-    process.stdout.close()
+    rig = Program([*PSD_DEFLECTION, 'simulate', '--serve'])
+    yield rig.until('port: (.+)')[1]
+    assert rig.end() == 0
 
 
 @pytest.fixture

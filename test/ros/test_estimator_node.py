@@ -88,7 +88,13 @@ def test_what_is_published_and_how_often(start: Callable[..., Any], peer: Any) -
     names = {s.name for s in health[-1].status}
     assert 'psd_deflection: acquisition' in names
     values = {v.key: v.value for s in health[-1].status for v in s.values}
-    assert values['lost'] == values.get('lost: dropped by the device', '0')
+    # On a busy machine the simulated device drops samples, and says so; there is no other cause here.
+    causes = {key: int(value) for key, value in values.items() if key.startswith('lost: ')}
+    assert set(causes) <= {'lost: dropped by the device'}
+    assert int(values['lost']) == sum(causes.values())
+    missing = int((blocks - 1).sum())
+    # A block is left out if more than half of its 20 samples are lost.
+    assert int(values['lost']) + int(values['dropped by a full queue']) >= 10 * missing
     assert values['bad frames'] == '0'
     assert float(values['rate (samples/s)']) > 0
 
@@ -226,6 +232,10 @@ def test_parameters_have_units_and_ranges_and_are_refused_by_name(start: Callabl
 
     assert not put('sum_min', -1.0).successful
     assert not put('link.length', 2.0).successful
+    # The same words as for a file, with what must fit together as well; then nothing has changed.
+    assert "degraded = 'sideways': must be one of off, hold, zero" in put('degraded', 'sideways').reason
+    assert 'psd_1.zero = [9.0, 0.0] m: must be at least -0.5 and at most 0.5' in put('psd_1.zero', [9.0, 0.0]).reason
+    assert 'sum_min = 9.0 V: must be less than sum_max = 7.5 V' in put('sum_min', 9.0).reason
     # A level above what the lasers give: they count as lost, and the estimates stop.
     assert put('sum_min', 6.0).successful
     health = peer.collect(DiagnosticArray, '/diagnostics')
@@ -261,9 +271,9 @@ def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start:
     peer.until(lambda: any(m.name == 'left.estimator' and m.msg.startswith(said) for m in log), 'its log')
     # Whose estimates would be mixed with somebody else's hears of it.
     peer.node.create_publisher(PoseStamped, '/left/link_tip/deflection', 10)
-    assert daemon.said('another node publishes on /left/link_tip/deflection too')
+    daemon.until('another node publishes on /left/link_tip/deflection too')
     # A zero that the page takes can be read where one that ROS takes can.
-    url = daemon.said('monitor: http').split()[1]
+    url = daemon.until(r'monitor: (http\S+)')[1]
     headers = {'Content-Type': 'application/json'}
     with urllib.request.urlopen(urllib.request.Request(url + 'api/zero', b'{}', headers), timeout=60.0) as answer:
         assert json.load(answer)['ok']
@@ -283,7 +293,7 @@ def test_signals_end_it_and_leave_a_whole_recording(
     poses = peer.collect(PoseStamped, '/link_tip/deflection')
     peer.until(lambda: len(poses) >= 25, 'estimates')
     for number in signals:
-        daemon.signal(number)
+        daemon.send(number)
     assert daemon.wait() == 0, daemon.lines
     (folder,) = tmp_path.glob('psd_*')
     assert f' replay {folder} --compare' in daemon.lines[-1]
@@ -302,6 +312,7 @@ def test_signals_end_it_and_leave_a_whole_recording(
         ),
         (['--ros-args', '-p', 'amplifier.noise:=-1.0'], 3, 'amplifier.noise = -1.0 V: must be above 0'),
         (['--ros-args', '-p', 'solver:=magic'], 3, 'magic'),
+        (['--ros-args', '-p', 'solver:=appendix_d'], 3, "solver = 'appendix_d': a method as printed"),
         (['--ros-args', '-p', 'solvers:=[]'], 3, 'is an empty list'),
         (
             ['--ros-args', '-p', 'qos_overrides./psd/samples.publisher.reliability:=best_efort'],

@@ -25,7 +25,7 @@ from visualization_msgs.msg import MarkerArray  # noqa: E402
 
 from psd_deflection.devices.serial_port import SerialPort  # noqa: E402
 from psd_deflection.errors import ConfigError, DeviceError  # noqa: E402
-from psd_deflection.recordings.opening import open_recording  # noqa: E402
+from psd_deflection.recordings.readers import open_recording  # noqa: E402
 from psd_deflection.ros import estimator  # noqa: E402
 from test.heard import WAIT_S  # noqa: E402
 from test.ros.conftest import PATIENT  # noqa: E402
@@ -53,7 +53,7 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
         '--ros-args',
         *('-p', 'autostart:=false', '-p', f'bag_dir:={bags}', '-p', 'record:=true', '-p', 'markers:=true'),
     )
-    daemon.said('waiting to be configured')
+    daemon.until('waiting to be configured')
     assert state(peer) == State.PRIMARY_STATE_UNCONFIGURED
     poses = peer.collect(PoseStamped, '/link_tip/deflection')
     markers = peer.collect(MarkerArray, '/link_tip/markers')
@@ -72,11 +72,11 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
     assert not poses
     assert not markers
     assert change(peer, Transition.TRANSITION_ACTIVATE)
-    assert 'publishing on ROS domain' in daemon.said('publishing on ROS domain')
+    daemon.until('publishing on ROS domain')
     # What this state does not have is refused, and measuring goes on.
     for wrong in (Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_CONFIGURE, 77):
         assert not change(peer, wrong)
-    assert daemon.said('change_state: refused')
+    daemon.until('change_state: refused')
     strange = ParameterMessage(name='sum_min', value=ParameterValue(type=42))
     assert (
         peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[strange])).results == []
@@ -100,17 +100,17 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
     assert change(peer, Transition.TRANSITION_CONFIGURE)
     assert change(peer, Transition.TRANSITION_ACTIVATE)
     peer.until(lambda: len(poses) >= stopped + 10, 'estimates once more')
-    daemon.signal(signal.SIGINT)
+    daemon.send(signal.SIGINT)
     assert daemon.wait() == 0, daemon.lines
 
 
 def test_a_device_that_is_not_there_leaves_the_node_unconfigured(start: Callable[..., Any], peer: Any) -> None:
     daemon = start('--port', '/dev/nothing_here', '--ros-args', '-p', 'autostart:=false')
-    daemon.said('waiting to be configured')
+    daemon.until('waiting to be configured')
     assert not change(peer, Transition.TRANSITION_CONFIGURE)
-    assert daemon.said('no such port')
+    daemon.until('no such port')
     assert state(peer) == State.PRIMARY_STATE_UNCONFIGURED
-    daemon.signal(signal.SIGTERM)
+    daemon.send(signal.SIGTERM)
     assert daemon.wait() == 0, daemon.lines
 
 
@@ -119,7 +119,7 @@ def test_a_signal_ends_the_waiting_for_a_device(start: Callable[..., Any], devic
     device.answer = b''
     daemon = start('--port', str(device.link), script=PATIENT)
     assert device.greeted.wait(WAIT_S)
-    daemon.signal(number)
+    daemon.send(number)
     assert daemon.wait() == 0, daemon.lines
     assert not any('Traceback' in line for line in daemon.lines)
 
@@ -135,32 +135,32 @@ def test_the_zero_holds_for_the_next_run(
     put = Parameter('psd_1.zero', value=[0.0002, 0.0001]).to_parameter_msg()
     answer = peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[put]))
     assert answer.results[0].successful
-    assert first.said(r'changed: psd_1.zero = \[0.0002, 0.0001\]')
+    first.until(r'changed: psd_1.zero = \[0.0002, 0.0001\]')
     peer.until_of_now(poses, 'estimates after the change')
     assert abs(poses[-1].pose.position.x) > 5e-5
     assert peer.call(Trigger, '/estimator/zero', Trigger.Request()).success
     taken = parameters(peer, 'psd_1.zero', 'psd_2.zero')
     assert taken[0] != [0.0002, 0.0001]
     assert taken != [[0.0, 0.0], [0.0, 0.0]]
-    first.signal(signal.SIGINT)
+    first.send(signal.SIGINT)
     assert first.wait() == 0, first.lines
     second = start(*arguments)
-    assert 'zero of the last run' in second.said('zero of the last run')
-    second.said('publishing on ROS domain')
+    second.until('zero of the last run')
+    second.until('publishing on ROS domain')
     assert parameters(peer, 'psd_1.zero', 'psd_2.zero') == taken
-    second.signal(signal.SIGINT)
+    second.send(signal.SIGINT)
     assert second.wait() == 0, second.lines
     # Switched off, the rig file holds.
     third = start(*arguments, '-p', 'keep_zero:=false')
-    third.said('publishing on ROS domain')
+    third.until('publishing on ROS domain')
     assert parameters(peer, 'psd_1.zero', 'psd_2.zero') == [[0.0, 0.0], [0.0, 0.0]]
 
 
 def test_a_shutdown_ends_the_daemon(start: Callable[..., Any], peer: Any, simulated_port: str) -> None:
     daemon = start('--port', simulated_port)
-    daemon.said('publishing on ROS domain')
+    daemon.until('publishing on ROS domain')
     assert change(peer, Transition.TRANSITION_ACTIVE_SHUTDOWN)
-    assert daemon.said('shut down by change_state')
+    daemon.until('shut down by change_state')
     assert daemon.wait() == 0, daemon.lines
     SerialPort(simulated_port, 921_600).close()
 

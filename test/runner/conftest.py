@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.config import Rig, load_rig
-from psd_deflection.devices.simulated_device import PseudoTerminal
+from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.protocol.frames import (
     FrameDecoder,
     GoodFrame,

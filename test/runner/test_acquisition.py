@@ -17,11 +17,12 @@ from hypothesis import strategies as st
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.devices import contract_frames
 from psd_deflection.devices.serial_port import SerialPort
-from psd_deflection.devices.source import Clock, Event, Reading, Sample, Source, SourceEndedError
+from psd_deflection.devices.source import Clock, Event, Received, Sample, Source, SourceEndedError
 from psd_deflection.errors import DeviceError
-from psd_deflection.protocol.frames import HelloFrame, encode
+from psd_deflection.protocol.frames import HelloFrame, PongFrame, encode
 from psd_deflection.runner import acquisition as module
-from psd_deflection.runner.acquisition import Acquisition, Chunk, Ended, Item, Restarted
+from psd_deflection.runner.acquisition import Acquisition, Arrival, Ended, Item, Restarted
+from psd_deflection.runner.pinger import UNANSWERED
 from test.heard import WAIT_S
 
 HELLO_INFO: dict[str, object] = {
@@ -36,13 +37,13 @@ HELLO_INFO: dict[str, object] = {
 def take(acquisition: Acquisition, n: int) -> list[Item]:
     """The next items until ``n`` samples have come."""
     items: list[Item] = []
-    while sum(len(i.raw.seq) for i in items if isinstance(i, Chunk)) < n:
+    while sum(len(i.raw.seq) for i in items if isinstance(i, Arrival)) < n:
         items.append(acquisition.queue.get(timeout=WAIT_S))
     return items
 
 
 def numbers(items: list[Item]) -> list[int]:
-    return [int(s) for i in items if isinstance(i, Chunk) for s in i.raw.seq]
+    return [int(s) for i in items if isinstance(i, Arrival) for s in i.raw.seq]
 
 
 class Run:
@@ -71,7 +72,7 @@ def test_samples_come_as_blocks_with_their_own_times(device: Any, run: Run, samp
     device.send_frames(*[sample(s) for s in range(40)])
     items = take(run.acquisition, 40)
     assert numbers(items) == list(range(40))
-    chunks = [i.raw for i in items if isinstance(i, Chunk)]
+    chunks = [i.raw for i in items if isinstance(i, Arrival)]
     assert {int(s) // 20 for s in chunks[0].seq} == {0}
     t = [int(t) for c in chunks for t in c.t_ns]
     assert all(abs(b - a - 1_000_000) < 3000 for a, b in itertools.pairwise(t))
@@ -100,7 +101,7 @@ def test_a_restart_of_the_device_goes_on_with_a_new_block(device: Any, run: Run,
     assert numbers(items) == [*range(4000, 4030), *range(4040, 4060)]
     assert any(isinstance(i, Restarted) for i in items)
     assert run.acquisition.counters.restarts == 1
-    t = [int(t) for i in items if isinstance(i, Chunk) for t in i.raw.t_ns]
+    t = [int(t) for i in items if isinstance(i, Arrival) for t in i.raw.t_ns]
     assert all(b > a for a, b in itertools.pairwise(t))
 
 
@@ -309,19 +310,6 @@ def test_a_silent_device_is_woken(device: Any, run: Run, short_wait: ModuleType,
     assert run.acquisition.counters.silences >= 1
 
 
-def test_pings_are_answered_and_a_device_that_knows_none_is_left_in_peace(
-    device: Any, rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, 'PING_S', (0.0, 0.001))
-    monkeypatch.setattr(module, 'READ_TIMEOUT_S', 0.001)
-    run = Run(rig)
-    while run.acquisition.counters.pings < module.UNANSWERED:
-        device.greeted.wait(0.001)
-    run.acquisition.stop()
-    assert run.acquisition.counters.pings == module.UNANSWERED
-    assert run.acquisition.counters.pongs == 0
-
-
 @pytest.mark.parametrize(('at', 'jump_us'), [(40, 10**9), (47, 10**9), (40, -(10**7)), (53, -(10**7))])
 def test_a_clock_jump_of_the_device_is_told_and_time_goes_on(
     device: Any, run: Run, sample: Any, at: int, jump_us: int
@@ -332,7 +320,7 @@ def test_a_clock_jump_of_the_device_is_told_and_time_goes_on(
     device.send_frames(*[sample(s, t_us=clock[s]) for s in range(40, 80)])
     run.heard("the device's clock jumped")
     items = before + take(run.acquisition, 40)
-    t = [int(t) for i in items if isinstance(i, Chunk) for t in i.raw.t_ns]
+    t = [int(t) for i in items if isinstance(i, Arrival) for t in i.raw.t_ns]
     assert all(b > a for a, b in itertools.pairwise(t))
     # The jump itself is 10 or 1000 s; what passes between the two halves is the machine's.
     assert t[-1] - t[0] < 8 * 10**9
@@ -359,7 +347,7 @@ class Clockwork(Source):
 
     def start(self) -> None: ...
 
-    def read(self, timeout: float) -> Reading:
+    def read(self, timeout: float) -> Received:
         if self.given >= 40:
             raise SourceEndedError('forty are enough')
         self.passed_s = max(self.passed_s, 1e-3 * (self.given + 1))
@@ -367,7 +355,7 @@ class Clockwork(Source):
         events: list[Event] = [Sample(0, n, n * 1000, (0, 0, 16384, 0, 0, 16384)) for n in range(self.given, there)]
         self.reads.append(there - self.given)
         self.given = there
-        return Reading(events, round(self.passed_s * 1e9), len(events))
+        return Received(events, round(self.passed_s * 1e9), len(events))
 
     def close(self) -> None: ...
 
@@ -387,5 +375,78 @@ def test_samples_gather_except_the_last_of_a_block(rig: Rig, monkeypatch: pytest
         # Whose samples are as old as their reading.
         assert source.reads == [1] * 40
         return
-    assert source.reads == [1, 4, 4, 4, 4, 1, 1, 1, 4, 4, 4, 4, 2, 1, 1]
-    assert max(source.rests) == module.GATHER_S
+    assert len(source.reads) <= 20
+    assert max(source.rests) <= module.GATHER_S
+    # The estimate waits for the last sample of a block: it is read as it comes, alone.
+    read_with = [size for size in source.reads for _ in range(size)]
+    assert (read_with[19], read_with[39]) == (1, 1)
+
+
+class Asked(Source):
+    """A sample and a ping's turn every half second, by its own clock. ``knows``: it answers pings."""
+
+    def __init__(self, reads: int, *, knows: bool, can_be_asked: bool = True) -> None:
+        self.name, self.clock = 'asked', Clock.DEVICE
+        self.now_ns = 0
+        self.asked = 0
+        self._reads, self._knows, self._can_be_asked = reads, knows, can_be_asked
+        self._given = 0
+        self._cookies: list[int] = []
+
+    def open(self, timeout: float) -> HelloFrame:
+        return HelloFrame(1, HELLO_INFO)
+
+    def start(self) -> None: ...
+
+    def read(self, timeout: float) -> Received:
+        if self._given == self._reads:
+            raise SourceEndedError('enough')
+        self.now_ns += 500_000_000
+        t_us = self.now_ns // 1000
+        events: list[Event] = [Sample(0, 500 * self._given, t_us, (0, 0, 16384, 0, 0, 16384))]
+        events += [PongFrame(cookie, t_us) for cookie in self._cookies if self._knows]
+        self._cookies.clear()
+        self._given += 1
+        return Received(events, self.now_ns, len(events))
+
+    def ping(self, cookie: int) -> bool:
+        self.asked += 1
+        self._cookies.append(cookie)
+        return self._can_be_asked
+
+    def close(self) -> None: ...
+
+    def describe(self) -> dict[str, str]:
+        return {}
+
+
+def pinged(source: Asked, monkeypatch: pytest.MonkeyPatch) -> Acquisition:
+    """After the source has ended."""
+    monkeypatch.setattr(module, 'make_source', lambda rig: source)
+    own = {'monotonic': lambda: source.now_ns / 1e9, 'monotonic_ns': lambda: source.now_ns}
+    monkeypatch.setattr(module, 'time', SimpleNamespace(**{**vars(time), **own}))
+    acquisition = Acquisition(load_rig(), lambda _: None)
+    acquisition.open()
+    acquisition.start()
+    while not isinstance(acquisition.queue.get(timeout=WAIT_S), Ended):
+        pass
+    acquisition.stop()
+    return acquisition
+
+
+def test_a_ping_is_answered_and_bounds_the_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+    acquisition = pinged(Asked(30, knows=True), monkeypatch)
+    # The last one was asked when nothing more came.
+    assert (acquisition.counters.pings, acquisition.counters.pongs) == (30, 29)
+    assert acquisition.clock_state().round_trip_ns == 500_000_000
+
+
+def test_a_device_that_answers_no_ping_is_left_in_peace(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Asked(UNANSWERED + 30, knows=False)
+    counters = pinged(source, monkeypatch).counters
+    assert (source.asked, counters.pings, counters.pongs) == (UNANSWERED, UNANSWERED, 0)
+
+
+def test_a_device_that_cannot_be_asked_is_not_asked_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Asked(30, knows=False, can_be_asked=False)
+    assert (pinged(source, monkeypatch).counters.pings, source.asked) == (0, 1)

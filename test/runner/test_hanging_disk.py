@@ -19,11 +19,11 @@ from psd_deflection.cli.main import main
 from psd_deflection.config import load_rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.protocol.frames import SampleFrame
-from psd_deflection.recordings.opening import open_recording
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import DeflectionEstimate, Record
 from psd_deflection.runner import recorder as recorder_module
 from psd_deflection.runner import session as session_module
-from psd_deflection.runner.health import WARN, HealthReporter
+from psd_deflection.runner.diagnostics import WARN, HealthReporter
 from psd_deflection.runner.recorder import Recorder
 from psd_deflection.runner.session import Session
 from test.heard import WAIT_S

@@ -15,7 +15,7 @@ from psd_deflection.config import load_rig
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import DeflectionEstimate, RawChunk, Record
 from psd_deflection.runner import processing as module
-from psd_deflection.runner.acquisition import Chunk, Ended, Item
+from psd_deflection.runner.acquisition import Arrival, Ended, Item
 from psd_deflection.runner.processing import Processing
 from test.heard import WAIT_S
 
@@ -23,9 +23,9 @@ MS = 1_000_000
 COUNTS = np.tile(np.array([0, 0, 16384, 0, 0, 16384], np.int16), (20, 1))
 
 
-def chunk(index: int, read_ns: int) -> Chunk:
+def chunk(index: int, read_ns: int) -> Arrival:
     seq = np.arange(20 * index, 20 * index + 20)
-    return Chunk(RawChunk(seq, seq * MS, COUNTS, np.zeros(20, np.uint8), 10.0 / 32768), read_ns)
+    return Arrival(RawChunk(seq, seq * MS, COUNTS, np.zeros(20, np.uint8), 10.0 / 32768), read_ns)
 
 
 @pytest.fixture

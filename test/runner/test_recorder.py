@@ -17,8 +17,8 @@ from msg_adapters import to_messages
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.opening import open_recording
-from psd_deflection.recordings.recover import recover
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.repair import recover
 from psd_deflection.records import ParameterChange, SampleBlock
 from psd_deflection.runner import recorder as module
 from psd_deflection.runner.recorder import Recorder

@@ -12,7 +12,7 @@ from psd_deflection.config import load_rig
 from psd_deflection.protocol.frames import SampleFrame
 from psd_deflection.runner import processing
 from psd_deflection.runner import session as module
-from psd_deflection.runner.health import STALE, HealthReporter
+from psd_deflection.runner.diagnostics import STALE, HealthReporter
 from psd_deflection.runner.session import Session
 from test.heard import WAIT_S
 from test.runner.conftest import Estimates, ScriptedDevice

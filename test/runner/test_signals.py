@@ -12,7 +12,9 @@ from typing import Any, cast
 
 import pytest
 
-from psd_deflection.cli.estimator import Display, live_line, run_without_ros
+from psd_deflection.cli._display import Display, live_line
+from psd_deflection.monitor.start import start_monitor
+from psd_deflection.runner.headless import run_headless
 from psd_deflection.runner.session import Session
 from psd_deflection.runner.signals import Signals, StopRequestedError
 
@@ -30,7 +32,7 @@ def test_a_signal_ends_the_waiting_for_a_silent_device(
         os.kill(os.getpid(), number)
 
     threading.Thread(target=end, daemon=True).start()
-    assert run_without_ros({'port': str(device.link)}, Display(), lambda session: None) == 0
+    assert run_headless({'port': str(device.link)}, Display().say, lambda session: None, start_monitor) == 0
     assert signal.getsignal(number) is before
 
 
@@ -58,7 +60,7 @@ def test_a_signal_ends_the_waiting_for_one_that_is_away(device: Any, sample: Any
     away: list[bool] = []
     shown: list[str] = []
     values: dict[str, object] = {'port': str(device.link), 'keep_zero': False, 'realtime': False}
-    assert run_without_ros(values, Display(), look) == 0
+    assert run_headless(values, Display().say, look, start_monitor) == 0
     assert away
     assert 'no samples: the device is away' in shown[0]
 
@@ -109,8 +111,8 @@ def test_a_session_made_anew_counts_from_nought(monkeypatch: pytest.MonkeyPatch)
         rates.append(rate)
         return ''
 
-    monkeypatch.setattr('psd_deflection.cli.estimator.time', SimpleNamespace(monotonic=lambda: now[0]))
-    monkeypatch.setattr('psd_deflection.cli.estimator.live_line', line)
+    monkeypatch.setattr('psd_deflection.cli._display.time', SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr('psd_deflection.cli._display.live_line', line)
     display = Display()
     session = cast(Session, SimpleNamespace(acquisition=SimpleNamespace(counters=counters)))
     for counters.samples in (0, 50_000, 10, 10_010):
@@ -122,8 +124,8 @@ def test_a_session_made_anew_counts_from_nought(monkeypatch: pytest.MonkeyPatch)
 def test_a_journal_gets_a_line_a_minute_in_the_long_run(monkeypatch: pytest.MonkeyPatch) -> None:
     heard, now = io.StringIO(), [100.0]
     monkeypatch.setattr('sys.stderr', heard)
-    monkeypatch.setattr('psd_deflection.cli.estimator.time', SimpleNamespace(monotonic=lambda: now[0]))
-    monkeypatch.setattr('psd_deflection.cli.estimator.live_line', lambda session, rate: f'{now[0] - 100.0:.0f} s')
+    monkeypatch.setattr('psd_deflection.cli._display.time', SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr('psd_deflection.cli._display.live_line', lambda session, rate: f'{now[0] - 100.0:.0f} s')
     display = Display()
     session = cast(Session, SimpleNamespace(acquisition=SimpleNamespace(counters=SimpleNamespace(samples=0))))
     while now[0] < 400.0:

@@ -24,7 +24,7 @@ def test_what_was_kept_comes_back_for_the_same_device_alone(rig: Rig) -> None:
     back, said = ZeroStore(rig, 'A-1').load(rig)
     assert 'zero of the last run' in said
     assert {name: back.values[name] for name in ZERO} == ZERO
-    assert back.psd_1.zero == (1e-4, -2e-4)
+    assert back.psds[0].zero == (1e-4, -2e-4)
     assert ZeroStore(rig, 'B-2').load(rig) == (rig, '')
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from psd_deflection.cli.serve import served_loads
 from psd_deflection.config import load_rig
+from psd_deflection.devices.serve import served_loads
 from psd_deflection.errors import RecordingError
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation import loads
@@ -62,7 +62,7 @@ def test_settled_pose_is_the_beam_formula() -> None:
 def test_dots_obey_the_contract_equation() -> None:
     rig = load_rig()
     chunk = ForwardModel(rig).run(loads.identification().loads)
-    for i, (c, m) in enumerate(((rig.psd_1.center, chunk.dots[:2]), (rig.psd_2.center, chunk.dots[2:]))):
+    for i, (c, m) in enumerate(zip(rig.centers, (chunk.dots[:2], chunk.dots[2:]), strict=True)):
         turn = np.array(
             [[np.cos(chunk.pose[2]), -np.sin(chunk.pose[2])], [np.sin(chunk.pose[2]), np.cos(chunk.pose[2])]]
         )

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.solvers import Geometry, make_solver
+from psd_deflection.geometry import Geometry
+from psd_deflection.solvers import make_solver
 from psd_deflection.thesis.comparison import VARIANCES, dots_of, grid, thesis_geometry
 
 UNITS = np.array([1e6, 1e6, 1e3 * 180.0 / np.pi])

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from psd_deflection.errors import SolverError
-from psd_deflection.solvers import SOLVERS, Geometry, make_solver
-from psd_deflection.solvers.minimum_tilt import tilt_branches
+from psd_deflection.geometry import Geometry
+from psd_deflection.solvers import SOLVERS, make_solver
 
 
 def rig(centers: Any, heights: Any = None, k: float = 1.5, length: float = 0.585) -> Geometry:
@@ -85,20 +85,3 @@ def test_the_refusal_under_torsion_says_how_bad_it_is(rays: Any) -> None:
     geometry = rig(CORNER, [-0.585, -0.485])
     with pytest.raises(SolverError, match=r'one degree of twist looks like 10\.2 mm of dY'):
         make_solver('base_pair', geometry, assume='nothing')
-
-
-def test_tilt_branches_name_their_degenerate_rigs() -> None:
-    for centers, said in (
-        ([[0.0, 0.05], [-0.1, 0.05]], 'same y: phi'),
-        ([[0.1, 0.05], [0.1, -0.05]], 'same x: omega'),
-        (THREE, 'two PSDs'),
-    ):
-        with pytest.raises(SolverError, match=said):
-            tilt_branches(rig(centers), (0.0,) * (2 * len(centers)), 0.0)
-
-
-def test_no_tilt_lengthens_the_base_line_beyond_the_beams(golden: Any) -> None:
-    """Dots closer together than the beams, along y and along x: no branch."""
-    geometry = golden.geometry()
-    assert tilt_branches(geometry, (0.0, -1e-4, 0.0, 0.0), 0.0) == ()
-    assert tilt_branches(geometry, (-1e-4, 0.0, 0.0, 0.0), 0.0) == ()

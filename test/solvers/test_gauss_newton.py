@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.solvers._gauss_newton import MAX_STEPS, fit, fit_many
+from psd_deflection.solvers.gauss_newton import MAX_STEPS, fit, fit_many
 
 Array = np.ndarray[Any, Any]
 

@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.solvers import SolverStatus, make_solver
-from psd_deflection.solvers._linear import condition_number, design_matrix, gain_matrix
-from psd_deflection.solvers.minimum_tilt import tilt_branches
 from psd_deflection.thesis.appendix_d import appendix_d_iterative
-from psd_deflection.thesis.appendix_d_least_squares import printed_design_matrix
 
 CASES = [f'G{i}' for i in range(1, 13)]
 PARALLEL_BEAMS = CASES[:11]
@@ -116,37 +113,6 @@ def test_minimum_tilt(golden: Any, case: str) -> None:
     want = golden.cases[case]['min_tilt_beta']
     # An arccosine near 1 turns the last digit of a length into 1.5e-8 rad.
     assert abs(beta - want) < (1e-9 if want > 1e-6 else 3e-8)
-
-
-@pytest.mark.parametrize('case', [c for c in CASES if c != 'G4'])
-def test_tilt_branches(golden: Any, case: str) -> None:
-    """G4 lies on the edge, where rounding alone decides whether a branch exists; its list is empty."""
-    theta = golden.cases[case]['pose'][3]
-    got = np.array(tilt_branches(golden.geometry(case), golden.dots(case), theta))
-    want = np.array(golden.cases[case]['tilt_branches_at_true_theta'])
-    assert got.shape == (4, 4)
-    at_rest = np.abs(want[:, 2:]) < 1e-7
-    np.testing.assert_allclose(got[:, :2], want[:, :2], rtol=0.0, atol=1e-9)
-    np.testing.assert_allclose(got[:, 2:][~at_rest], want[:, 2:][~at_rest], rtol=0.0, atol=1e-9)
-    assert np.abs(got[:, 2:][at_rest]).max(initial=0.0) < 1e-7
-
-
-@pytest.mark.parametrize(('unit', 'length'), [('mm', 1e-3), ('m', 1.0), ('scaled_0.1m', 0.1)])
-def test_condition_number_in_stated_units(golden: Any, unit: str, length: float) -> None:
-    want = golden.constants['cond'][unit]
-    for design in (design_matrix(golden.geometry()), printed_design_matrix(golden.geometry())):
-        got = condition_number(design, length)
-        np.testing.assert_allclose([got.frobenius, got.two], [want['fro'], want['two']], rtol=1e-12)
-        assert got.angle_length == length
-
-
-@pytest.mark.parametrize(('which', 'key'), [('true', 'gain_true_mm'), ('printed', 'gain_code_mm')])
-@pytest.mark.parametrize(('name', 'scaling'), [('ols', (1.0,) * 4), ('sidebar', SIDEBAR), ('direct', DIRECT)])
-def test_gain_matrices(golden: Any, which: str, key: str, name: str, scaling: tuple[float, ...]) -> None:
-    geometry = golden.geometry()
-    design = design_matrix(geometry) if which == 'true' else printed_design_matrix(geometry)
-    got = gain_matrix(design, np.array(scaling)) * np.array([[1.0], [1.0], [1e-3]])
-    np.testing.assert_allclose(got, golden.constants[key][name], rtol=0.0, atol=1e-11)
 
 
 def test_covariance_of_beam(golden: Any) -> None:

@@ -9,14 +9,8 @@ import pytest
 
 from psd_deflection.config import rig_from_values
 from psd_deflection.errors import ConfigError, SolverError
-from psd_deflection.solvers import (
-    SOLVERS,
-    Geometry,
-    SolverStatus,
-    geometry_from_rig,
-    make_solver,
-    solver_from_rig,
-)
+from psd_deflection.geometry import Geometry
+from psd_deflection.solvers import SOLVERS, SolverStatus, make_solver, solver_from_rig
 
 VARIANCES = {
     'equal': (4e-12, 4e-12, 4e-12, 4e-12),
@@ -210,7 +204,7 @@ def test_a_variance_of_zero_is_refused_elsewhere_too() -> None:
 
 def test_the_rig_file_reaches_geometry_and_weights() -> None:
     rig = rig_from_values({'psd_2.center': [0.06, 0.01], 'psd_1.zero': [1e-4, 2e-4], 'wls.weights': 'thesis'})
-    geometry = geometry_from_rig(rig)
+    geometry = Geometry.from_rig(rig)
     np.testing.assert_allclose(geometry.beams, [[1e-4, 0.0702], [0.06, 0.01]], rtol=1e-15)
     dots = (1e-3, -2e-3, 5e-4, 1e-3)
     for name in ('wls', 'wls_exact'):

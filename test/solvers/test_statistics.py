@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.solvers import Geometry, make_solver
+from psd_deflection.geometry import Geometry
+from psd_deflection.solvers import make_solver
 
 DRAWS = 20_000
 VARIANCES = np.array([4e-12, 1e-12, 9e-12, 2e-12, 3e-12, 6e-12])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtr
 
-from psd_deflection.records import FloatArray
+from psd_deflection.records import DOT_CHANNELS, FloatArray
 from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
 
@@ -23,7 +23,7 @@ def _excess(v: FloatArray, sigma: float) -> FloatArray:
 
 
 def _apply(chunk: Chunk, values: Values, state: State) -> None:
-    rows = range(6) if values['sums'] else (0, 1, 3, 4)
+    rows = range(6) if values['sums'] else DOT_CHANNELS
     for row in rows:
         v = chunk.volts[row]
         chunk.volts[row] = v - _excess(v - values['limit'], chunk.noise) + _excess(-v - values['limit'], chunk.noise)

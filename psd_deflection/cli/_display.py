@@ -1,0 +1,99 @@
+"""What a session looks like to whoever started it: one live line, and messages above it."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import shlex
+import sys
+import threading
+import time
+from pathlib import Path
+
+from psd_deflection.cli._program import program
+from psd_deflection.runner.session import Session
+
+REFRESH_S = 0.25
+PLAIN_REFRESH_S = 5.0
+PLAIN_REFRESH_LATER_S = 60.0
+
+
+class Display:
+    """One live line on a terminal; lines elsewhere, soon one a minute. Its methods may be called by any thread."""
+
+    def __init__(self) -> None:
+        self._live = sys.stderr.isatty()
+        self._wait = REFRESH_S if self._live else PLAIN_REFRESH_S
+        self._lock = threading.Lock()
+        self._last = 0.0
+        self._shown = False
+        self._samples = 0
+        self._recorded: list[Path] = []
+
+    def watch(self, session: Session) -> None:
+        """Look at a session that runs: show where it stands, and remember what it records."""
+        folder = session.recorder.folder
+        if folder is not None and folder not in self._recorded:
+            self._recorded.append(folder)
+        self.update(session)
+
+    def tell_recorded(self) -> None:
+        """Say which recordings were made, and how to replay them."""
+        for folder in (f for f in self._recorded if f.is_dir()):
+            self.say(f'recorded {folder}\n  replay it:  {program()} replay {shlex.quote(str(folder))} --compare')
+
+    def say(self, text: str) -> None:
+        """A message of its own line, above the live one."""
+        with self._lock:
+            self._put(text + '\n', shown=False)
+
+    def update(self, session: Session) -> None:
+        """Show where things stand, when it is time to."""
+        now = time.monotonic()
+        passed = now - self._last
+        if passed < self._wait:
+            return
+        if self._last and not self._live:
+            # A journal is read for what changed; each change says so itself.
+            self._wait = min(2.0 * self._wait, PLAIN_REFRESH_LATER_S)
+        samples = session.acquisition.counters.samples
+        rate = (samples - self._samples) / passed if self._last else math.nan
+        if samples < self._samples:
+            # Another session, which counts from nought.
+            rate = math.nan
+        self._last, self._samples = now, samples
+        text = live_line(session, rate)
+        with self._lock:
+            self._put(text + ('' if self._live else '\n'), shown=self._live)
+
+    def _put(self, text: str, shown: bool) -> None:
+        clear = '\r\x1b[K' if self._shown else ''
+        self._shown = shown
+        # The terminal may be gone, and whoever speaks here reads or records: that goes on unheard.
+        with contextlib.suppress(OSError, ValueError):
+            print(clear + text, end='', file=sys.stderr, flush=True)
+
+
+def live_line(session: Session, rate: float) -> str:
+    """Rate, dX, dY in um, theta in mdeg with their standard deviations, losses."""
+    counters = session.acquisition.counters
+    estimate, spots = session.pipeline.last_estimate, session.pipeline.last_spots
+    head = f'{rate:6.0f} samples/s' if rate == rate else '     ? samples/s'
+    dropped = counters.queue_dropped + session.recorder.dropped
+    tail = f'lost {counters.lost + dropped}, bad frames {counters.bad}'
+    if session.recorder.folder is not None:
+        tail += '  ● rec'
+    if rate == 0.0:
+        # An old estimate beside a device that sends nothing would look like a new one.
+        body = 'no samples: the device is away' if session.acquisition.away else 'no samples come'
+    elif estimate is not None:
+        sd = [math.sqrt(v) for v in estimate.variances]
+        mdeg = 1e3 * 180.0 / math.pi
+        body = (
+            f'ΔX {estimate.dx * 1e6:+9.2f} ± {sd[0] * 1e6:.2f} µm  '
+            f'ΔY {estimate.dy * 1e6:+9.2f} ± {sd[1] * 1e6:.2f} µm  '
+            f'θ {estimate.theta * mdeg:+9.2f} ± {sd[2] * mdeg:.2f} mdeg'
+        )
+    else:
+        body = f'no estimate: {spots.reason}' if spots is not None and spots.reason else 'no estimate yet'
+    return f'{head}  {body}  {tail}'

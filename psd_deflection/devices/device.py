@@ -1,0 +1,115 @@
+"""What a device declares of itself: how it is made, simulated and recognised on a port.
+
+A device is one file with its :class:`~psd_deflection.devices.source.Source`, its simulated twin and a
+``DEVICE``, and one line in ``registry``. Everything that lists devices reads the declarations: ``source:``,
+``simulate --serve --device``, the rig that starts where no port is named, ``psd-deflection devices``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from psd_deflection.protocol.text_lines import positive
+
+if TYPE_CHECKING:
+    from psd_deflection.config import Rig
+    from psd_deflection.devices.rig_feed import RigFeed
+    from psd_deflection.devices.source import Source
+
+OUTPUT_LIMIT = 4096
+"""Bytes that a simulated device keeps for a host that does not read: about 0.12 s of our own frames."""
+
+
+class LineDevice(Protocol):
+    """A simulated device without its line and clock; times are host nanoseconds since power-up."""
+
+    def greeting(self) -> bytes:
+        """What it sends when someone opens its port."""
+
+    def due_in_ns(self, since_power_up_ns: int) -> int:
+        """Time until it has something to send; 0 or less: it has something now."""
+
+    def receive(self, received: bytes, since_power_up_ns: int) -> bytes:
+        """Replies to what the host sent."""
+
+    def take(self, since_power_up_ns: int, room: int = OUTPUT_LIMIT) -> bytes:
+        """What is due, at most about ``room`` bytes."""
+
+
+class PowerUp(NamedTuple):
+    """How a simulated device starts. ``skew_ppm``: its clock is too fast by this much, 1e-6.
+
+    ``first_seq``: its first sample number, for a device that has run for long. A device without a
+    clock or without numbers has no use for them.
+    """
+
+    skew_ppm: float = 0.0
+    first_seq: int = 0
+
+
+class Answer(NamedTuple):
+    """What a device on a port said of itself.
+
+    ``text``: for a person. ``parameters``: those that fit it, besides ``source`` and ``port``.
+    ``usable``: False for a model that cannot measure; ``text`` says why.
+    """
+
+    text: str
+    parameters: Mapping[str, object] = {}
+    usable: bool = True
+
+
+class Ear(Protocol):
+    """Listens on one port in one device's language. ``promising``: samples of the device have come."""
+
+    promising: bool
+
+    def hear(self, piece: bytes) -> Answer | None:
+        """The device's answer, once ``piece`` completes it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """How ``psd-deflection devices`` recognises a device. Nothing may be started, stopped or set by it.
+
+    ``listen``: makes an :class:`Ear`, given the line speed. ``question``: what the device answers to,
+    empty if it speaks unasked. ``baud``: the speed that the device may need instead of 115200.
+    ``first``: it must be asked before the others, since it is lost once it was asked in another language.
+    ``ports``: how many ports make one device; ``together``: the parameters that such a set needs in addition.
+    """
+
+    listen: Callable[[int], Ear]
+    question: bytes = b''
+    baud: int = 115_200
+    first: bool = False
+    ports: int = 1
+    together: Mapping[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    """One kind of device. ``name``: for ``source:``. ``help``: what it is, in a few words.
+
+    ``make``: its source, not yet opened, from a rig; raises ConfigError if the rig does not suit it.
+    ``simulate``: its twins, one a port, that show the rig of the feed; None if it cannot be simulated.
+    ``probe``: None if it cannot be recognised on a port.
+    """
+
+    name: str
+    help: str
+    make: Callable[[Rig], Source]
+    simulate: Callable[[RigFeed, PowerUp], Sequence[LineDevice]] | None = None
+    probe: Probe | None = None
+
+
+def converter_parameters(info: Mapping[str, object]) -> dict[str, object]:
+    """The ``converter.*`` parameters that a device's description ``info`` gives; what it does not say is left out."""
+    out: dict[str, object] = {}
+    rate, volts = positive(info.get('sample_rate_hz')), positive(info.get('volts_per_count'))
+    if rate is not None:
+        out['converter.sample_rate_hz'] = rate
+    if volts is not None:
+        out['converter.full_scale'] = round(volts * 32768, 6)
+    return out

@@ -1,0 +1,63 @@
+"""A port that pyserial can open and that a program of ours answers on."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+from psd_deflection.errors import ConfigError
+
+PORT_LINE = 'port: '
+"""How a program that serves a simulated device begins the line that names its port."""
+
+
+class PseudoTerminal:
+    """The device's side of a port that pyserial can open: ``name`` is the host's side.
+
+    ``link``: a symbolic link to it, which replaces an older link and nothing else; ConfigError if it cannot be made.
+    """
+
+    def __init__(self, link: str | Path | None = None) -> None:
+        self.master, slave = os.openpty()
+        tty.setraw(slave)
+        self.name = os.ttyname(slave)
+        # Only once it was opened and closed does the kernel report that no one has it open.
+        os.close(slave)
+        os.set_blocking(self.master, False)
+        self._link = Path(link) if link is not None else None
+        if self._link is not None:
+            try:
+                if self._link.is_symlink():
+                    self._link.unlink()
+                self._link.symlink_to(self.name)
+            except OSError as error:
+                os.close(self.master)
+                raise ConfigError(f'{self._link}: no link can be made there ({error.strerror})') from None
+
+    def close(self) -> None:
+        """Take the port away, as a pulled cable does."""
+        os.close(self.master)
+        # The link may already belong to another process: delete only our own.
+        if self._link is not None and self._link.is_symlink() and str(self._link.readlink()) == self.name:
+            self._link.unlink()
+
+
+def link_names(link: str | None, count: int) -> list[str | None]:
+    """The links of ``count`` ports: ``link`` itself for one, ``link_1``, ``link_2`` for several."""
+    if link is None or count == 1:
+        return [link] * count
+    return [f'{link}_{i}' for i in range(1, count + 1)]
+
+
+@contextlib.contextmanager
+def open_terminals(links: list[str | None]) -> Iterator[list[PseudoTerminal]]:
+    """One port a link, None for one without; closed at the end. Raises ConfigError as :class:`PseudoTerminal`."""
+    with contextlib.ExitStack() as stack:
+        ports: list[PseudoTerminal] = []
+        for link in links:
+            ports.append(PseudoTerminal(link))
+            stack.callback(ports[-1].close)
+        yield ports

@@ -1,0 +1,66 @@
+"""The simulated rig's converter readings one by one, for every device that is simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from psd_deflection.config import Rig
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.simulator import RigSimulator
+
+BATCH = 50
+
+LoadSource = Callable[[int, int], FloatArray]
+"""``loads(first_sample, n)`` -> (n, 3): Fx, Fy N and Tz N m held before each sample."""
+
+
+class RigFeed:
+    """One row of counts a sample period; made in batches, which the simulation is quick at.
+
+    ``taken``: rows given so far. ``dark``: (PSD 1 or 2, first, end) of the samples without laser light,
+    for demonstrations and golden recordings. ``poses``: a list to which the true poses (n, 3) of each
+    batch are added, if there is one.
+    """
+
+    def __init__(
+        self, rig: Rig, loads: LoadSource, *, seed: int = 0, dark: Sequence[tuple[int, int, int]] = ()
+    ) -> None:
+        self.rig = rig
+        self.taken = 0
+        self.poses: list[FloatArray] | None = None
+        self._simulator = RigSimulator(rig, seed)
+        self._loads = loads
+        self._dark = dark
+        self._batch: Iterator[list[int]] = iter(())
+        self._row: list[int] = []
+
+    def next(self) -> list[int]:
+        """The next sample: x1 y1 sum1 x2 y2 sum2, counts."""
+        row = next(self._batch, None)
+        if row is None:
+            self._batch = self._make()
+            row = next(self._batch)
+        self.taken += 1
+        self._row = row
+        return row
+
+    def at(self, number: int) -> list[int]:
+        """Sample ``number``, not before the last one asked for: what a device that is polled sees."""
+        while self.taken <= number:
+            self.next()
+        return self._row
+
+    def _make(self) -> Iterator[list[int]]:
+        chunk = self._simulator.step(self._loads(self.taken, BATCH))
+        counts = np.array(chunk.counts)
+        numbers = np.arange(self.taken, self.taken + BATCH)
+        for psd, start, stop in self._dark:
+            off = (numbers >= start) & (numbers < stop)
+            columns = slice(0, 3) if psd == 1 else slice(3, 6)
+            # Without light the divider has nothing to divide: only the noise is left.
+            counts[off, columns] = counts[off, columns] % 13 - 6
+        if self.poses is not None:
+            self.poses.append(chunk.pose)
+        return iter(counts.tolist())

@@ -1,0 +1,150 @@
+"""Serves a simulated device on pseudo-terminals, in real time.
+
+Like a USB device it sends nothing while no one has its port open. ``python -m psd_deflection.devices.serve``
+is the process that a daemon starts when no port is named: it reads the parameters as a line of JSON, prints
+its ports, and ends when its standard input does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+from psd_deflection.config import Rig, rig_from_values
+from psd_deflection.devices.device import OUTPUT_LIMIT, LineDevice, PowerUp
+from psd_deflection.devices.pseudo_terminal import PORT_LINE, PseudoTerminal, link_names, open_terminals
+from psd_deflection.devices.registry import SIMULATED, find_device
+from psd_deflection.devices.rig_feed import RigFeed
+from psd_deflection.errors import ConfigError, PsdDeflectionError
+from psd_deflection.simulation.loads import CyclicLoads, thesis_load_cases
+
+CATCH_UP_NS = 20_000_000
+
+DWELL_S = 4.0
+FIRST_LOAD_S = 1.0
+"""Unloaded after power-up, s: long enough for a zero, short enough that whoever looks on sees it move at once."""
+
+
+def served_loads(rate: float) -> CyclicLoads:
+    """The thesis's load cases over and over; the first, unloaded, ends ``FIRST_LOAD_S`` after power-up."""
+    return CyclicLoads(thesis_load_cases(DWELL_S, rate), start=round((DWELL_S - FIRST_LOAD_S) * rate))
+
+
+def simulated_devices(name: str, rig: Rig, seed: int = 0, power_up: PowerUp | None = None) -> Sequence[LineDevice]:
+    """The twins of the device ``name``, one a port, that show ``rig`` under :func:`served_loads`.
+
+    Raises ConfigError if there is no such device, or it cannot be simulated.
+    """
+    simulate = find_device(name).simulate
+    if simulate is None:
+        raise ConfigError(f'source = {name!r}: cannot be simulated; {", ".join(SIMULATED)} can')
+    loads = served_loads(rig.converter.sample_rate_hz)
+    return simulate(RigFeed(rig, lambda _, n: loads.take(n), seed=seed), power_up or PowerUp())
+
+
+def serve(device: LineDevice, port: PseudoTerminal, stopped: Callable[[], bool]) -> None:
+    """Run the device in real time until ``stopped()``."""
+    poll = select.poll()
+    poll.register(port.master, select.POLLIN)
+    start = time.monotonic_ns()
+    pending = b''
+    listening = False
+    while not stopped():
+        wait_ms = max(device.due_in_ns(time.monotonic_ns() - start), 0) / 1e6
+        events = poll.poll(wait_ms)
+        mask = events[0][1] if events else 0
+        now = time.monotonic_ns() - start
+        if mask & select.POLLHUP:
+            listening, pending = False, b''
+            device.take(now, room=1 << 30)
+            # A hung-up line is always "ready": wait for the next sample by the clock instead.
+            time.sleep(1e-3)
+            continue
+        if not listening:
+            listening = True
+            pending = device.greeting()
+        try:
+            if mask & select.POLLIN:
+                pending += device.receive(os.read(port.master, 4096), now)
+            until = now + min(device.due_in_ns(now), 0)
+            caught_up = False
+            while not caught_up:
+                # A device is never late; this process may be, on a busy machine. What fell due
+                # meanwhile is sent piece by piece: only a host that does not read makes it drop.
+                until = min(until + CATCH_UP_NS, now)
+                caught_up = until == now
+                pending += device.take(until, room=OUTPUT_LIMIT - len(pending))
+                if pending:
+                    pending = pending[os.write(port.master, pending) :]
+        except BlockingIOError:
+            pass
+        except OSError:
+            # The host closed the port between poll and write.
+            listening, pending = False, b''
+
+
+def serve_all(devices: Sequence[LineDevice], ports: Sequence[PseudoTerminal], stopped: Callable[[], bool]) -> None:
+    """Serve each on its port until ``stopped()``, the first in this thread."""
+    others = [
+        threading.Thread(target=serve, args=(device, port, stopped), name=port.name, daemon=True)
+        for device, port in zip(devices[1:], ports[1:], strict=True)
+    ]
+    for thread in others:
+        thread.start()
+    serve(devices[0], ports[0], stopped)
+    for thread in others:
+        thread.join()
+
+
+def stopped_by_signals() -> threading.Event:
+    """Set by SIGINT and SIGTERM from now on."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+def main() -> int:
+    """Serve what the daemon on standard input asks for, until that ends; the exit status."""
+    line = sys.stdin.buffer.readline()
+    if not line:
+        # The daemon that started us early has gone before it came to us.
+        return 0
+    stop = stopped_by_signals()
+
+    def until_the_end() -> None:
+        with contextlib.suppress(OSError, ValueError):
+            while os.read(sys.stdin.fileno(), 4096):
+                pass
+        stop.set()
+
+    threading.Thread(target=until_the_end, name='parent', daemon=True).start()
+    try:
+        rig = _rig_of(line)
+        devices = simulated_devices(rig.acquisition.source, rig)
+        with open_terminals(link_names(None, len(devices))) as ports:
+            print(f'{PORT_LINE}{",".join(port.name for port in ports)}', flush=True)
+            serve_all(devices, ports, stop.is_set)
+    except PsdDeflectionError as error:
+        print(f'simulated rig: {error}', file=sys.stderr)
+        return error.exit_status
+    return 0
+
+
+def _rig_of(line: bytes) -> Rig:
+    try:
+        values = json.loads(line)
+    except ValueError:
+        raise ConfigError('standard input: must be the parameters as a line of JSON') from None
+    return rig_from_values(values, 'parameters of the daemon')
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,178 @@
+"""The tip plate under parallel beams: pose -> dots with derivatives, and flat dots -> pose.
+
+Theory of operation. The beams are parallel to Z, beam i at l_i. PSD i has its surface at height h_i over the
+reference section, so that R (q_ix, q_iy, h_i) + (dX, dY, .) lies on beam i; dZ drops out. With
+R = Ry(omega) Rx(phi) Rz(theta),
+
+    u = l_x - dX - h sin(omega) cos(phi),      v = l_y - dY + h sin(phi),
+    y' = v / cos(phi),      x' = (u - y' sin(omega) sin(phi)) / cos(omega),      q = Rz(-theta)(x', y').
+
+The reading is q_i - c_i. The derivatives are those of these lines, in the order dX, dY, theta, phi, omega;
+at rest the first three are the rows [-1, 0, l_y], [0, -1, -l_x] of the design matrix (``linear``). Beam and
+translation enter as l - d alone, so that dq/dl = -dq/d(dX, dY).
+
+``crossing`` and ``flat_pose`` take floats: a solver calls them once a block in real time, where numpy's cost per
+call would dominate. ``crossings`` and ``flat_poses`` are their twins for arrays, with the same formulas.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import atan2, cos, sin
+from typing import TypeVar
+
+import numpy as np
+
+from psd_deflection.records import FloatArray
+
+Number = TypeVar('Number', float, FloatArray)
+
+Turns = tuple[Number, Number, Number, Number, Number, Number]
+"""Cosine and sine of theta, of phi, of omega."""
+
+Five = tuple[Number, Number, Number, Number, Number]
+"""Derivatives of one coordinate by dX, dY (m/m), theta, phi, omega (m/rad)."""
+
+Row = Five[float]
+
+
+def _point(
+    lx: Number, ly: Number, height: Number, dx: Number, dy: Number, turns: Turns[Number]
+) -> tuple[Number, Number, Number, Number]:
+    """x', y', q_x, q_y of the module's text."""
+    ct, st, cp, sp, co, so = turns
+    y = (ly - dy + height * sp) / cp
+    x = (lx - dx - height * so * cp - y * so * sp) / co
+    return x, y, ct * x + st * y, ct * y - st * x
+
+
+def _rows(
+    x: Number, y: Number, qx: Number, qy: Number, height: Number, turns: Turns[Number]
+) -> tuple[Five[Number], Five[Number]]:
+    """Derivatives of q_x and of q_y."""
+    ct, st, cp, sp, co, so = turns
+    # (x', y') by dX: (-1/co, 0); by dY: (y_dx, y_dy); by phi; by omega: (o, 0).
+    y_dy = -1.0 / cp
+    y_dx = so * sp / (co * cp)
+    p_dy = height + y * sp / cp
+    p_dx = (height * so * sp - y * so * cp - so * sp * p_dy) / co
+    o_dx = (x * so - height * co * cp - y * co * sp) / co
+    return (
+        (-ct / co, ct * y_dx + st * y_dy, qy, ct * p_dx + st * p_dy, ct * o_dx),
+        (st / co, ct * y_dy - st * y_dx, -qx, ct * p_dy - st * p_dx, -st * o_dx),
+    )
+
+
+def crossing(
+    lx: float, ly: float, height: float, dx: float, dy: float, theta: float, phi: float, omega: float
+) -> tuple[float, float, Row, Row]:
+    """(q_x, q_y, dq_x, dq_y) of one beam: m; m/m for dX, dY and m/rad for the angles."""
+    turns = cos(theta), sin(theta), cos(phi), sin(phi), cos(omega), sin(omega)
+    x, y, qx, qy = _point(lx, ly, height, dx, dy, turns)
+    row_x, row_y = _rows(x, y, qx, qy, height, turns)
+    return qx, qy, row_x, row_y
+
+
+def _turns(theta: FloatArray, phi: FloatArray, omega: FloatArray) -> Turns[FloatArray]:
+    return np.cos(theta), np.sin(theta), np.cos(phi), np.sin(phi), np.cos(omega), np.sin(omega)
+
+
+def crossings(poses: FloatArray, beams: FloatArray, heights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The plate points under the beams, (..., P, 2) m, and their derivatives by the pose, (..., P, 2, 5).
+
+    ``poses`` (..., 5): dX, dY m, theta, phi, omega rad; ``beams`` (P, 2) or (..., P, 2) m; ``heights`` (P,) m.
+    """
+    dx, dy, theta, phi, omega = (poses[..., i, None] for i in range(5))
+    turns = _turns(theta, phi, omega)
+    x, y, qx, qy = _point(beams[..., 0], beams[..., 1], heights, dx, dy, turns)
+    points = np.stack((qx, qy), axis=-1)
+    jacobian = np.empty((*points.shape, 5))
+    for axis, row in enumerate(_rows(x, y, qx, qy, heights, turns)):
+        for i, derivative in enumerate(row):
+            jacobian[..., axis, i] = derivative
+    return points, jacobian
+
+
+def plate_points(poses: FloatArray, beams: FloatArray, heights: FloatArray) -> FloatArray:
+    """The points of :func:`crossings` alone, (..., P, 2) m."""
+    dx, dy, theta, phi, omega = (poses[..., i, None] for i in range(5))
+    qx, qy = points_under(beams[..., 0], beams[..., 1], heights, dx, dy, theta, phi, omega)
+    return np.stack((qx, qy), axis=-1)
+
+
+def points_under(
+    lx: FloatArray,
+    ly: FloatArray,
+    height: FloatArray,
+    dx: FloatArray,
+    dy: FloatArray,
+    theta: FloatArray,
+    phi: FloatArray,
+    omega: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """q_x and q_y, m, one coordinate an array, of any shapes that broadcast: for long runs of samples."""
+    return _point(lx, ly, height, dx, dy, _turns(theta, phi, omega))[2:]
+
+
+def flat_points(poses: FloatArray, beams: FloatArray) -> FloatArray:
+    """q_i = R(-theta)(l_i - d), (..., P, 2) m: the points of a plate that does not tilt; ``poses`` (..., 3)."""
+    c = np.cos(poses[..., 2, None])
+    s = np.sin(poses[..., 2, None])
+    ux = beams[..., 0] - poses[..., 0, None]
+    uy = beams[..., 1] - poses[..., 1, None]
+    return np.stack((c * ux + s * uy, c * uy - s * ux), axis=-1)
+
+
+def flat_pose(points: Sequence[float], beams: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
+    """(dX, dY, theta) of a flat plate whose ``points`` (q_1x, q_1y, q_2x, ...) are under ``beams``; m, rad.
+
+    Unweighted: theta from the cross and dot products about the centroids, d from the centroids (the orthogonal
+    Procrustes problem: Schoenemann 1966; Arun, Huang & Blostein 1987).
+    """
+    count = len(beams)
+    mx = sum(points[0::2]) / count
+    my = sum(points[1::2]) / count
+    nx = sum([lx for lx, _ in beams]) / count
+    ny = sum([ly for _, ly in beams]) / count
+    along = across = 0.0
+    for i, (lx, ly) in enumerate(beams):
+        qx = points[2 * i] - mx
+        qy = points[2 * i + 1] - my
+        along += qx * (lx - nx) + qy * (ly - ny)
+        across += qx * (ly - ny) - qy * (lx - nx)
+    theta = atan2(across, along)
+    c = cos(theta)
+    s = sin(theta)
+    return nx - c * mx + s * my, ny - s * mx - c * my, theta
+
+
+def flat_poses(points: FloatArray, beams: FloatArray) -> FloatArray:
+    """:func:`flat_pose` for arrays: (..., 3) of ``points`` and ``beams``, (..., P, 2) each."""
+    middle = beams.mean(axis=-2)
+    mean = points.mean(axis=-2)
+    lx = beams[..., 0] - middle[..., 0, None]
+    ly = beams[..., 1] - middle[..., 1, None]
+    ux = points[..., 0] - mean[..., 0, None]
+    uy = points[..., 1] - mean[..., 1, None]
+    theta = np.arctan2((ux * ly - uy * lx).sum(axis=-1), (ux * lx + uy * ly).sum(axis=-1))
+    c = np.cos(theta)
+    s = np.sin(theta)
+    mx, my = mean[..., 0], mean[..., 1]
+    return np.stack((middle[..., 0] - c * mx + s * my, middle[..., 1] - s * mx - c * my, theta), axis=-1)
+
+
+def tied_pose(pose: FloatArray, slope_ratio: FloatArray | float, link_length: float) -> FloatArray:
+    """(..., 5) from (..., 3): the tilts of a cantilever, phi = -k dY/L, omega = +k dX/L.
+
+    ``slope_ratio`` k: one, or (...,) of its own for each pose.
+    """
+    tilt = np.asarray(slope_ratio)[..., None] / link_length * np.stack([-pose[..., 1], pose[..., 0]], axis=-1)
+    return np.concatenate([np.broadcast_to(pose, (*tilt.shape[:-1], 3)), tilt], axis=-1)
+
+
+def tie_matrix(slope_ratio: float, link_length: float) -> FloatArray:
+    """(5, 3): d(dX, dY, theta, phi, omega)/d(dX, dY, theta) of a cantilever with slope ratio k."""
+    out = np.eye(5, 3)
+    out[3, 1] = -slope_ratio / link_length
+    out[4, 0] = slope_ratio / link_length
+    return out

@@ -1,0 +1,108 @@
+"""Reads the point clouds that hold the samples, without the generic decoder's cost.
+
+The clouds of one recording differ in stamp, width and points alone, so what stands between is parsed
+once and compared afterwards. What does not fit is read by the generic decoder.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from msg_adapters import point_cloud2
+from psd_deflection.recordings import cdr
+from psd_deflection.records import CHANNELS, IntArray
+
+_LITTLE = b'\x00\x01'
+_STAMP = struct.Struct('<iI')
+_U32 = struct.Struct('<I')
+
+
+class _Layout(NamedTuple):
+    """What the messages of one kind have in common, and where the rest lies."""
+
+    width_at: int
+    row_step_at: int
+    before_width: bytes
+    after_width: bytes
+    points: np.dtype[np.void]
+
+
+class CloudDecoder:
+    """PointCloud2 messages of one topic, one after the other."""
+
+    _MOST = 8
+
+    def __init__(self) -> None:
+        # Ours come in two kinds, with and without flags.
+        self._layouts: list[_Layout] = []
+
+    def decode(self, message: bytes) -> tuple[int, npt.NDArray[np.void]]:
+        """(header.stamp in ns, the points). Raises ValueError where it is no such message."""
+        for width_at, row_step_at, before_width, after_width, dtype in self._layouts:
+            if message[12:width_at] == before_width and message[width_at + 4 : row_step_at] == after_width:
+                try:
+                    sec, nanosec = _STAMP.unpack_from(message, 4)
+                    (width,) = _U32.unpack_from(message, width_at)
+                    (size,) = _U32.unpack_from(message, row_step_at + 4)
+                    if width * dtype.itemsize != size:
+                        break
+                    return sec * 1_000_000_000 + nanosec, np.frombuffer(message, dtype, width, row_step_at + 8)
+                except (struct.error, ValueError):
+                    raise ValueError('is shorter than it declares') from None
+        stamp, points = point_cloud2.to_points(cdr.decode(point_cloud2.MESSAGE.name, message))
+        if message[:2] == _LITTLE and len(self._layouts) < self._MOST:
+            self._layouts.append(_learn(message, points.dtype))
+        return stamp, points
+
+
+def _learn(message: bytes, dtype: np.dtype[np.void]) -> _Layout:
+    """Where the parts lie that change from one message to the next; ``message`` is a sound one."""
+
+    def after_text(at: int) -> int:
+        (length,) = _U32.unpack_from(message, at)
+        return at + 4 + (int(length) + 3) // 4 * 4
+
+    width_at = after_text(12) + 4
+    (count,) = _U32.unpack_from(message, width_at + 4)
+    at = width_at + 8
+    for _ in range(count):
+        at = after_text(at) + 12
+    row_step_at = at + 8
+    return _Layout(width_at, row_step_at, message[12:width_at], message[width_at + 4 : row_step_at], dtype)
+
+
+class Samples(NamedTuple):
+    """Samples in order: ``seq`` int64 (n,), ``t_ns`` (n,), ``volts`` (n, 6), ``flags`` (n,).
+
+    ``whole``: False where ``seq`` is modulo 2^32.
+    """
+
+    whole: bool
+    seq: IntArray
+    t_ns: IntArray
+    volts: npt.NDArray[np.float32]
+    flags: npt.NDArray[np.uint8]
+
+
+def joined_points(messages: Sequence[tuple[int, npt.NDArray[np.void]]]) -> Samples:
+    """The samples of messages of one layout, given as (stamp, points)."""
+    points = np.concatenate([p for _, p in messages])
+    stamps = np.repeat([stamp for stamp, _ in messages], [len(p) for _, p in messages])
+    names = points.dtype.names or ()
+    seq = points['seq'].astype(np.uint32).astype(np.int64)
+    whole = 'seq_high' in names
+    if whole:
+        # 31 bits more are enough for ever, and no file can make them negative.
+        seq += (points['seq_high'].astype(np.int64) & 0x3FFFFFFF) << 32
+    return Samples(
+        whole,
+        seq,
+        stamps + points['dt'].astype(np.int64),
+        np.stack([points[c] for c in CHANNELS], axis=1).astype(np.float32),
+        points['flags'].astype(np.uint8) if 'flags' in names else np.zeros(len(points), np.uint8),
+    )

@@ -1,0 +1,299 @@
+"""Reads one MCAP file from front to back, whatever state it is in.
+
+Two things keep this apart from the ``mcap`` package's own readers. A file that lost its tail, or a
+chunk that lost its bits, gives everything else, with a warning. And no size that a file declares is
+believed before it has been compared with the file's own size or a bound. What is inside a record
+is parsed by ``mcap.records``. The format: https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import zlib
+from collections.abc import Callable, Collection, Iterator, Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO, NamedTuple, TypeVar
+
+import lz4.frame  # type: ignore[import-untyped]
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
+
+from psd_deflection.errors import RecordingError
+
+MAGIC = b'\x89MCAP0\r\n'
+
+MAX_CHUNK_BYTES = 256 * 2**20
+"""Bound of one chunk, uncompressed; writers make chunks of 1 to 4 MiB."""
+
+MAX_METADATA_BYTES = 16 * 2**20
+
+_RECORD = struct.Struct('<BQ')
+_MESSAGE_HEAD = struct.Struct('<HIQQ')
+
+
+class RecordedChannel(NamedTuple):
+    """A topic as the file has it. ``type`` as ``pkg/msg/Name``."""
+
+    topic: str
+    type: str
+    encoding: str
+
+
+class RawMessage(NamedTuple):
+    """One message as it lies in the file."""
+
+    channel: RecordedChannel
+    log_time: int
+    cdr: bytes
+
+
+class DamagedError(Exception):
+    """What was read contradicts itself."""
+
+
+class _WholeFields(ReadDataStream):
+    """The library's field reader, which takes a field that its record cuts short for a whole one."""
+
+    def read(self, length: int) -> bytes:
+        """The next ``length`` bytes. Raises DamagedError if the record ends before them."""
+        try:
+            piece = super().read(length)
+        except EndOfFile:
+            piece = b''
+        if len(piece) != length:
+            raise DamagedError('a field is longer than its record')
+        return piece
+
+
+T = TypeVar('T')
+
+
+def _read(read: Callable[[ReadDataStream], T], content: bytes) -> T:
+    try:
+        return read(_WholeFields(BytesIO(content)))
+    except UnicodeDecodeError:
+        raise DamagedError('a text is not UTF-8') from None
+
+
+_READ: Mapping[int, Callable[[ReadDataStream], McapRecord]] = {
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.METADATA: Metadata.read,
+}
+
+
+def _parsed(opcode: int, content: bytes) -> McapRecord:
+    """A schema, channel, metadata record or message. Raises DamagedError if it contradicts itself."""
+    if opcode == Opcode.MESSAGE:
+        message: Message = _read(lambda fields: Message.read(fields, len(content)), content)
+        return message
+    return _read(_READ[opcode], content)
+
+
+class McapReader:
+    """One file. ``metadata``: MCAP metadata records by name, the last of a name counts.
+
+    ``cut_at``: the byte where the file ends before its end, None where it is whole. ``warnings``
+    grow as chunks are read. Raises RecordingError where the file cannot be opened or is no MCAP.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.cut_at: int | None = None
+        self.warnings: list[str] = []
+        self._types: dict[int, str] = {}
+        self._channels: dict[int, RecordedChannel] = {}
+        try:
+            self._size = path.stat().st_size
+            with path.open('rb') as stream:
+                self._scan(stream)
+        except OSError as error:
+            raise self._refuse(f'cannot be read ({error.strerror or error})') from None
+
+    def _refuse(self, why: str) -> RecordingError:
+        return RecordingError(f'{self.path}: {why}')
+
+    def _warn(self, text: str) -> None:
+        line = f'{self.path}: {text}'
+        if line not in self.warnings:
+            self.warnings.append(line)
+
+    def _records(self, stream: BinaryIO) -> Iterator[tuple[int, int, int]]:
+        """(opcode, offset of the content, its length) of every record that is whole."""
+        at = len(MAGIC)
+        while True:
+            stream.seek(at)
+            head = stream.read(_RECORD.size)
+            if len(head) < _RECORD.size:
+                self._cut(at)
+                return
+            opcode, length = _RECORD.unpack(head)
+            at += _RECORD.size
+            if length > self._size - at:
+                self._cut(at - _RECORD.size)
+                return
+            yield opcode, at, length
+            at += length
+            if opcode == Opcode.FOOTER:
+                stream.seek(at)
+                if stream.read(len(MAGIC)) != MAGIC:
+                    self._cut(at)
+                return
+
+    def _cut(self, at: int) -> None:
+        if self.cut_at is None:
+            self.cut_at = at
+            self._warn(f'ends at byte {at} before its end (a recorder that was stopped hard?); all before is read')
+
+    def _scan(self, stream: BinaryIO) -> None:
+        """Look at every record's head; read those that say what is in the file."""
+        magic = stream.read(len(MAGIC))
+        if not magic:
+            raise self._refuse('is empty')
+        if magic != MAGIC[: len(magic)]:
+            raise self._refuse('is not an MCAP file')
+        if len(magic) < len(MAGIC):
+            self._cut(len(magic))
+            return
+        for opcode, at, length in self._records(stream):
+            if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
+                continue
+            if length > MAX_METADATA_BYTES:
+                self._warn(f'the record at byte {at} has {length} bytes and is left out')
+                continue
+            stream.seek(at)
+            try:
+                self._note(_parsed(opcode, stream.read(length)))
+            except DamagedError as error:
+                self._warn(f'the record at byte {at} is damaged ({error}) and is left out')
+
+    def _note(self, record: McapRecord) -> None:
+        if isinstance(record, Metadata):
+            self.metadata[record.name] = record.metadata
+        elif isinstance(record, Schema):
+            self._types[record.id] = record.name
+        elif isinstance(record, Channel):
+            type_name = self._types.get(record.schema_id, '')
+            if type_name.count('/') == 1:
+                type_name = type_name.replace('/', '/msg/')
+            self._channels[record.id] = RecordedChannel(record.topic, type_name, record.message_encoding)
+
+    def _parts(self, opcodes: Collection[int]) -> Iterator[tuple[int, bytes]]:
+        """(offset, records) of each chunk, unpacked, and of each record outside of any, as in a chunk."""
+        try:
+            with self.path.open('rb') as stream:
+                for opcode, at, length in self._records(stream):
+                    if opcode == Opcode.DATA_END:
+                        return
+                    if opcode not in opcodes:
+                        continue
+                    stream.seek(at)
+                    content = stream.read(length)
+                    if opcode != Opcode.CHUNK:
+                        yield at, _RECORD.pack(opcode, length) + content
+                        continue
+                    with self._damage_told(at):
+                        yield at, _unpacked(content)
+        except OSError as error:
+            raise self._refuse(f'cannot be read ({error.strerror or error})') from None
+
+    @contextlib.contextmanager
+    def _damage_told(self, at: int) -> Iterator[None]:
+        try:
+            yield
+        except DamagedError as error:
+            self._warn(f'the chunk at byte {at} is damaged ({error}); what it held is missing')
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Messages in the order of the file, of ``topics`` or of all.
+
+        A damaged chunk is left out with a warning. Raises RecordingError if the disk fails.
+        """
+        for at, records in self._parts((Opcode.CHUNK, Opcode.MESSAGE)):
+            with self._damage_told(at):
+                yield from self._messages_in(records, topics)
+
+    def _messages_in(self, records: bytes, topics: Collection[str] | None) -> Iterator[RawMessage]:
+        wanted = self._wanted(topics)
+        # The library's Message takes ten times as long, and this loop sees every message of a replay.
+        unpack, head = _MESSAGE_HEAD.unpack_from, _MESSAGE_HEAD.size
+        for opcode, at, end in _records_in(records):
+            if opcode == Opcode.MESSAGE:
+                if end - at < head:
+                    raise DamagedError('a message in it has no head')
+                number, _, log_time, _ = unpack(records, at)
+                channel = wanted.get(number)
+                if channel is not None:
+                    yield RawMessage(channel, log_time, records[at + head : end])
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._note(_parsed(opcode, records[at:end]))
+                wanted = self._wanted(topics)
+
+    def _wanted(self, topics: Collection[str] | None) -> dict[int, RecordedChannel]:
+        return {n: c for n, c in self._channels.items() if topics is None or c.topic in topics}
+
+    def contents(self) -> Iterator[McapRecord]:
+        """Every schema, channel, metadata record and message that lies whole in the file, in its order.
+
+        Damage is left out with a warning. Raises RecordingError if the disk fails.
+        """
+        kinds = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.MESSAGE)
+        for at, records in self._parts((*kinds, Opcode.CHUNK)):
+            with self._damage_told(at):
+                for opcode, start, end in _records_in(records):
+                    if opcode in kinds:
+                        yield _parsed(opcode, records[start:end])
+
+
+def _records_in(records: bytes) -> Iterator[tuple[int, int, int]]:
+    """(opcode, offset of the content, its end) of each record of a chunk. Raises DamagedError."""
+    at, size = 0, len(records)
+    unpack, head = _RECORD.unpack_from, _RECORD.size
+    while at < size:
+        if at + head > size:
+            raise DamagedError('it ends within a record')
+        opcode, length = unpack(records, at)
+        at += head
+        if length > size - at:
+            raise DamagedError('a record in it is longer than the chunk')
+        yield opcode, at, at + length
+        at += length
+
+
+def _unpacked(content: bytes) -> bytes:
+    """The records of a chunk record's content. Raises DamagedError if it contradicts itself."""
+    chunk: Chunk = _read(Chunk.read, content)
+    size = chunk.uncompressed_size
+    if size > MAX_CHUNK_BYTES:
+        raise DamagedError(f'it declares {size} bytes, more than {MAX_CHUNK_BYTES}')
+    plain = _decompress(chunk.data, chunk.compression, size)
+    if len(plain) != size:
+        raise DamagedError(f'it holds {len(plain)} bytes and declares {size}')
+    if chunk.uncompressed_crc and zlib.crc32(plain) != chunk.uncompressed_crc:
+        raise DamagedError('its CRC does not match')
+    return plain
+
+
+def _decompress(packed: bytes, compression: str, size: int) -> bytes:
+    if compression == '':
+        return packed
+    if size == 0:
+        return b''
+    try:
+        if compression == 'zstd':
+            declared = zstandard.frame_content_size(packed)
+            if declared > size:
+                raise DamagedError(f'its frame declares {declared} bytes and the chunk {size}')
+            return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+        if compression == 'lz4':
+            plain: bytes = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size)
+            return plain
+    except (zstandard.ZstdError, RuntimeError, EOFError, ValueError) as error:
+        raise DamagedError(str(error)) from None
+    raise DamagedError(f'compression {compression!r} is not known')

@@ -1,0 +1,40 @@
+"""Opens a recording of any kind: every command that reads one takes a bag folder, ``.mcap`` or ``.csv``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from psd_deflection.errors import RecordingError
+from psd_deflection.recordings.bag_reader import BagRecording
+from psd_deflection.recordings.csv_reader import CsvRecording
+from psd_deflection.recordings.mcap_reader import MAGIC
+from psd_deflection.recordings.recording import Recording
+
+
+def open_recording(
+    path: str | Path, *, block_size: int | None = None, sample_rate_hz: float | None = None
+) -> Recording:
+    """Open ``path``: a bag folder, a lone ``.mcap`` or a ``.csv``.
+
+    ``block_size``: samples a block, where it shall not be that of the recording's own parameters
+    (20 where it has none). ``sample_rate_hz``: for a CSV, where its times do not tell.
+    Raises RecordingError where it is none of the three, or none that can be read.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    try:
+        if path.is_dir():
+            return BagRecording(path, block_size)
+        if not path.exists():
+            raise RecordingError(f'{path}: no such recording')
+        if suffix == '.csv':
+            return CsvRecording(path, block_size, sample_rate_hz)
+        with path.open('rb') as stream:
+            is_mcap = stream.read(len(MAGIC)) == MAGIC
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
+    if is_mcap or suffix == '.mcap':
+        return BagRecording(path, block_size)
+    if path.name == 'metadata.yaml':
+        return BagRecording(path.parent, block_size)
+    raise RecordingError(f'{path}: is no recording: a bag folder, an .mcap or a .csv is read')

@@ -1,0 +1,234 @@
+"""Makes a recording whole that a crash cut: index and summary for each file, ``metadata.yaml`` for the bag.
+
+Everything that lies whole in a file is copied, byte for byte, into a new one beside it; only then
+does the new one take the name, and the old one becomes ``NAME.mcap.cut``: nothing is lost by
+trying. Files that have their end already are not touched.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from dataclasses import dataclass, field
+from pathlib import Path, PurePath
+
+import yaml
+from mcap.records import Channel, McapRecord, Message, Metadata, Schema
+from mcap.writer import CompressionType, Writer
+
+from psd_deflection import __version__
+from psd_deflection.errors import RecordingError
+from psd_deflection.recordings.bag_metadata import (
+    DEFAULT_QOS,
+    FileCount,
+    Qos,
+    TopicCount,
+    bag_information,
+    totals,
+    write_metadata,
+)
+from psd_deflection.recordings.bag_reader import files_in, read_information
+from psd_deflection.recordings.bag_writer import CHUNK_NS, CUSTOM
+from psd_deflection.recordings.mcap_reader import MAGIC, DamagedError, McapReader
+
+_MAX_QOS_TEXT = 100_000
+
+
+@dataclass(slots=True)
+class RecoveredFile:
+    """One file: what it holds now; ``repaired`` where it had to be; ``warnings`` of the reading."""
+
+    path: Path
+    repaired: bool
+    count: FileCount
+    topics: list[TopicCount]
+    warnings: list[str] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class Recovered:
+    """``files`` in order; ``metadata_written``: ``metadata.yaml`` was made anew; ``set_aside``: held nothing."""
+
+    files: list[RecoveredFile]
+    metadata_written: bool
+    set_aside: list[Path]
+
+
+def _qos_of(metadata: dict[str, str]) -> Qos | list[Qos]:
+    """The profile of a channel, so that ``metadata.yaml`` and the channel say the same."""
+    text = metadata.get('offered_qos_profiles', '')
+    if not text or len(text) > _MAX_QOS_TEXT:
+        return DEFAULT_QOS if not text else []
+    with contextlib.suppress(yaml.YAMLError, RecursionError, ValueError):
+        found = yaml.safe_load(text)
+        if isinstance(found, list) and all(isinstance(q, dict) for q in found):
+            return found
+    return []
+
+
+class _Copy:
+    """Counts what it is given, and writes it where ``target`` is given."""
+
+    def __init__(self, target: Path | None) -> None:
+        self.topics: dict[str, TopicCount] = {}
+        self.times: list[int] = []
+        self._stream = target.open('xb') if target is not None else None
+        self._writer: Writer | None = None
+        if self._stream is not None:
+            self._writer = Writer(self._stream, compression=CompressionType.ZSTD, enable_crcs=True)
+            self._writer.start(profile='ros2', library=f'psd_deflection {__version__} recover')
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._numbers: dict[int, int] = {}
+        self._schema_numbers: dict[tuple[str, str, bytes], int] = {}
+        self._first: int | None = None
+        self.messages = 0
+        self.start = self.end = 0
+
+    def add(self, record: McapRecord) -> None:
+        if isinstance(record, Message):
+            self._add_message(record)
+        elif isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self._channels[record.id] = record
+        elif isinstance(record, Metadata) and self._writer is not None and record.name != 'rosbag2':
+            self._writer.add_metadata(record.name, record.metadata)
+
+    def _add_message(self, m: Message) -> None:
+        channel = self._channels.get(m.channel_id)
+        if channel is None:
+            raise DamagedError('a message belongs to no channel')
+        schema = self._schemas.get(channel.schema_id, Schema(0, b'', '', ''))
+        topic = self.topics.get(channel.topic)
+        if topic is None:
+            type_hash = channel.metadata.get('topic_type_hash', '')
+            topic = TopicCount(channel.topic, schema.name, _qos_of(channel.metadata), type_hash)
+            self.topics[channel.topic] = topic
+        topic.messages += 1
+        self.start = min(self.start, m.log_time) if self.messages else m.log_time
+        self.end = max(self.end, m.log_time)
+        self.messages += 1
+        writer = self._writer
+        if writer is None:
+            return
+        if m.channel_id not in self._numbers:
+            key = (schema.name, schema.encoding, schema.data)
+            if key not in self._schema_numbers:
+                self._schema_numbers[key] = writer.register_schema(*key)
+            self._numbers[m.channel_id] = writer.register_channel(
+                channel.topic, channel.message_encoding, self._schema_numbers[key], channel.metadata
+            )
+        if self._first is not None and abs(m.log_time - self._first) >= CHUNK_NS:
+            writer.flush()
+            self._first = None
+        self._first = m.log_time if self._first is None else self._first
+        writer.add_message(self._numbers[m.channel_id], m.log_time, m.data, m.publish_time, m.sequence)
+
+    def finish(self) -> None:
+        if self._writer is None or self._stream is None:
+            return
+        self._writer.finish()
+        self._stream.flush()
+        os.fsync(self._stream.fileno())
+        self._stream.close()
+
+    def abandon(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+
+
+def _recover_file(path: Path) -> RecoveredFile:
+    source = McapReader(path)
+    if path.stat().st_size <= len(MAGIC):
+        return RecoveredFile(path, False, FileCount(path.name, 0, 0, 0), [], [*source.warnings])
+    cut = source.cut_at is not None
+    partial = path.with_name(path.name + '.partial')
+    partial.unlink(missing_ok=True)
+    copy = _Copy(partial if cut else None)
+    try:
+        for record in source.contents():
+            try:
+                copy.add(record)
+            except DamagedError as error:
+                source.warnings.append(f'{path}: {error}; it is left out')
+        copy.finish()
+    except BaseException:
+        copy.abandon()
+        partial.unlink(missing_ok=True)
+        raise
+    count = FileCount(path.name, copy.start, copy.end, copy.messages)
+    if cut:
+        aside = path.with_name(path.name + '.cut')
+        if aside.exists():
+            partial.unlink()
+            raise RecordingError(f'{aside}: is there already, from an earlier repair; move it away first')
+        path.rename(aside)
+        partial.rename(path)
+    return RecoveredFile(path, cut, count, list(copy.topics.values()), list(source.warnings))
+
+
+def _refuse_if_written(path: Path) -> None:
+    with path.open('rb') as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RecordingError(f'{path}: is being recorded at this moment; end the recording first') from None
+
+
+def recover(path: str | Path) -> Recovered:
+    """Repair ``path``, a bag folder or a lone ``.mcap``, in its place.
+
+    Raises RecordingError where nothing of it can be read, where it is being recorded, or where the
+    disk refuses.
+    """
+    path = Path(path)
+    try:
+        if path.is_dir():
+            return _recover_folder(path)
+        if not path.is_file():
+            raise RecordingError(f'{path}: no such recording')
+        _refuse_if_written(path)
+        file = _recover_file(path)
+        if path.stat().st_size <= len(MAGIC):
+            raise RecordingError(f'{path}: has no more than its first bytes; there is nothing to recover')
+        return Recovered([file], False, [])
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be repaired ({error.strerror or error})') from None
+
+
+def _describes(metadata: Path, files: list[RecoveredFile]) -> bool:
+    """Whether ``metadata.yaml`` can be read and names the files that are there; what rosbag2 compressed is its own."""
+    try:
+        information = read_information(metadata)
+    except RecordingError:
+        return False
+    named = information.get('relative_file_paths')
+    names = {PurePath(str(n)).name for n in named} if isinstance(named, list) else set()
+    return bool(information.get('compression_mode')) or names == {f.path.name for f in files}
+
+
+def _recover_folder(folder: Path) -> Recovered:
+    paths = files_in(folder)
+    if not paths:
+        raise RecordingError(f'{folder}: is no bag: it holds no .mcap file')
+    for file in paths:
+        _refuse_if_written(file)
+    files, set_aside = [], []
+    for file in paths:
+        # A file that the crash left without its first bytes has nothing to give.
+        if file.stat().st_size <= len(MAGIC) and len(paths) > 1:
+            aside = file.with_name(file.name + '.cut')
+            file.rename(aside)
+            set_aside.append(aside)
+            continue
+        files.append(_recover_file(file))
+    metadata = folder / 'metadata.yaml'
+    if metadata.is_file() and not set_aside and not any(f.repaired for f in files):
+        if _describes(metadata, files):
+            return Recovered(files, False, set_aside)
+        metadata.replace(metadata.with_name(metadata.name + '.cut'))
+    topics = totals(t for f in files for t in f.topics)
+    write_metadata(folder, bag_information([f.count for f in files], topics, CUSTOM))
+    return Recovered(files, True, set_aside)

@@ -1,0 +1,77 @@
+"""A simulated recording: what the rig would have measured, and the estimates that the daemon would have made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from psd_deflection.config import Rig
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import (
+    AppliedLoad,
+    FloatArray,
+    RawChunk,
+    Record,
+    ReferencePose,
+    TemperatureReading,
+)
+from psd_deflection.simulation.simulator import RigSimulator
+
+CHUNK_SECONDS = 1.0
+
+BAG_START_NS = 1_000_000_000
+"""A bag's stamps start here: zero means "no stamp" to many tools."""
+
+
+@dataclass(frozen=True)
+class SimulatedRun:
+    """One run. ``rig``: as it is. ``known``: as the daemon takes it to be; only its effects are corrected.
+
+    ``loads`` (n, 3): N, N, N m, one row a sample. ``temperature`` (n,): degrees Celsius, or None.
+    ``reference``: whether the true pose is recorded, once a block.
+    """
+
+    rig: Rig
+    known: Rig
+    loads: FloatArray
+    temperature: FloatArray | None = None
+    seed: int = 0
+    reference: bool = False
+
+    def records(self, start_ns: int = BAG_START_NS) -> Iterator[Record]:
+        """Everything in the order of time; the first sample is at ``start_ns``."""
+        rig, loads, temperature = self.rig, self.loads, self.temperature
+        simulator, pipeline = RigSimulator(rig, self.seed), Pipeline(self.known)
+        period = 1e9 / rig.converter.sample_rate_hz
+        block = rig.estimator.block_size
+        # A temperature takes effect with the block that follows it: then block by block.
+        size = max(1, round(CHUNK_SECONDS * rig.converter.sample_rate_hz)) if temperature is None else block
+        last: tuple[float, ...] | None = None
+        last_temperature: float | None = None
+        for start in range(0, len(loads), size):
+            stop = min(start + size, len(loads))
+            seq = np.arange(start, stop, dtype=np.int64)
+            t_ns = start_ns + np.rint(seq * period).astype(np.int64)
+            for i in range(start, stop):
+                load = (float(loads[i, 0]), float(loads[i, 1]), float(loads[i, 2]))
+                if load != last:
+                    last = load
+                    yield AppliedLoad(int(t_ns[i - start]), *load)
+                # The thermometer reads as often as an estimate comes: it is slow, and so is the air.
+                if temperature is not None and i % block == 0 and float(temperature[i]) != last_temperature:
+                    last_temperature = float(temperature[i])
+                    yield TemperatureReading(int(t_ns[i - start]), last_temperature)
+                    warmer = pipeline.temperature(last_temperature)
+                    if warmer is not None:
+                        yield warmer
+            part = simulator.step(loads[start:stop], None if temperature is None else temperature[start:stop])
+            if self.reference:
+                for i in range(0, stop - start, block):
+                    # The middle of the block is where the estimate stands.
+                    k = min(i + block // 2, stop - start - 1)
+                    yield ReferencePose(int(t_ns[k]), *(float(v) for v in part.pose[k]))
+            flags = np.zeros(stop - start, dtype=np.uint8)
+            yield from pipeline.process(RawChunk(seq, t_ns, part.counts, flags, rig.converter.volts_per_count))
+        yield from pipeline.flush()

@@ -1,0 +1,43 @@
+"""What the node is called by on the graph, and how each topic is delivered. Anything may read it: it needs no rclpy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from msg_adapters import INPUTS, SAMPLES
+
+
+class Delivery(NamedTuple):
+    """QoS of a topic: messages kept for a slow subscriber, and whether a late one gets the last message."""
+
+    depth: int
+    reliable: bool = True
+    latched: bool = False
+
+
+MARKERS = '/link_tip/markers'
+MARKERS_AT_REST = '/link_tip/markers_at_rest'
+LATCHED = Delivery(depth=1, latched=True)
+
+_SAMPLES_DEPTH = 50
+"""A second of raw blocks: a subscriber that stutters misses none."""
+
+_DELIVERY: Mapping[str, Delivery] = {
+    SAMPLES: Delivery(_SAMPLES_DEPTH),
+    MARKERS_AT_REST: LATCHED,
+    **{topic: Delivery(_SAMPLES_DEPTH, reliable=False) for topic in INPUTS},
+}
+
+
+def delivery(topic: str) -> Delivery:
+    """How ``topic`` is published, or subscribed to if it is an input."""
+    return _DELIVERY.get(topic, Delivery(depth=10))
+
+
+ZERO, RECORD = '~/zero', '~/record'
+SERVICES = (ZERO, RECORD)
+"""What the node serves; ``~`` stands for the node's name."""
+
+BASE, REST, TIP = 'link_base', 'link_tip_rest', 'link_tip'
+"""Frames: the clamp, the unloaded tip, the tip."""

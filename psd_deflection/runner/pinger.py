@@ -1,0 +1,53 @@
+"""Asks the device for its time now and then, at random phase to its samples.
+
+Owns no clock: every time comes from the caller.
+"""
+
+from __future__ import annotations
+
+import random
+
+from psd_deflection.devices.source import Source
+
+PING_S = (0.1, 0.4)
+"""Bounds of the random time between two pings: their phase to the samples must not repeat."""
+
+UNANSWERED = 20
+"""A device that has left so many pings unanswered in a row does not know them: it is asked no more."""
+
+
+class Pinger:
+    """One ping is under way at most; a new one forgets the one before."""
+
+    def __init__(self) -> None:
+        self._random = random.Random()
+        self._next_s = 0.0
+        self._unanswered = 0
+        self._cookie: int | None = None
+        self._sent_ns = 0
+
+    def is_due(self, now_s: float) -> bool:
+        """Whether it is time to ask."""
+        return self._unanswered < UNANSWERED and now_s >= self._next_s
+
+    def ask(self, source: Source, now_s: float, sent_ns: int) -> bool:
+        """Ping ``source``; False if it cannot be asked. ``sent_ns``: CLOCK_MONOTONIC.
+
+        Raises PortClosedError.
+        """
+        self._next_s = now_s + self._random.uniform(*PING_S)
+        cookie = self._random.getrandbits(63)
+        if not source.ping(cookie):
+            self._unanswered = UNANSWERED
+            return False
+        self._unanswered += 1
+        self._cookie, self._sent_ns = cookie, sent_ns
+        return True
+
+    def answered(self, cookie: int) -> int | None:
+        """When the ping with this cookie was sent, ns; None if it is not the one under way."""
+        if cookie != self._cookie:
+            return None
+        self._cookie = None
+        self._unanswered = 0
+        return self._sent_ns

@@ -1,0 +1,167 @@
+"""Gauss-Newton, once in floats for a block and once vectorised for n: the driver of several methods.
+
+A model gives predicted readings and their derivatives; the driver repeats x <- x + (J^T W J)^-1 J^T W r
+until a step no longer matters. Residuals of some micrometres on a rig of decimetres make each step
+some thousand times smaller than the one before, so that four or five suffice. The covariance is
+(J^T W J)^-1 at the last step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from psd_deflection.errors import SolverError
+from psd_deflection.records import FloatArray
+from psd_deflection.solvers.plane import positive
+
+Model = Callable[[Sequence[float]], tuple[list[float], list[Sequence[float]]]]
+"""Parameters (p) to predicted readings (m) and rows of derivatives (m of p)."""
+
+ModelMany = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+"""Parameters (n, p) to predicted readings (n, m) and derivatives (n, m, p)."""
+
+MAX_STEPS = 50
+LAST_STEP = 1e-12
+"""m and rad. The step after it would be below the last digit that matters."""
+
+CHUNK = 4096
+"""Blocks worked on at once: their arrays stay in the processor's cache."""
+
+
+class Fit(NamedTuple):
+    """``covariance`` (p x p) rows; ``residual``: measured minus predicted."""
+
+    parameters: list[float]
+    covariance: list[list[float]]
+    residual: list[float]
+    converged: bool
+    steps: int
+
+
+class Fits(NamedTuple):
+    """(n, p), (n, p, p), (n, m), (n,) bool."""
+
+    parameters: FloatArray
+    covariance: FloatArray
+    residual: FloatArray
+    converged: npt.NDArray[np.bool_]
+
+
+def fit(model: Model, start: Sequence[float], measured: Sequence[float], variances: Sequence[float]) -> Fit:
+    """One block. Raises SolverError if a variance is 0."""
+    x = list(start)
+    p = len(x)
+    try:
+        weights = [1.0 / v for v in variances]
+    except ZeroDivisionError:
+        raise SolverError('solve: variances must be above 0 m^2') from None
+    steps = 0
+    while True:
+        predicted, rows = model(x)
+        residual = [m - q for m, q in zip(measured, predicted, strict=True)]
+        normal = [[0.0] * p for _ in range(p)]
+        right = [0.0] * p
+        for row, w, r in zip(rows, weights, residual, strict=True):
+            for i in range(p):
+                wi = w * row[i]
+                right[i] += wi * r
+                line = normal[i]
+                for j in range(i + 1):
+                    line[j] += wi * row[j]
+        inverse = _invert(normal)
+        if inverse is None:
+            nan = float('nan')
+            return Fit(x, [[nan] * p for _ in range(p)], residual, False, steps)
+        largest = 0.0
+        step = []
+        for i in range(p):
+            change = 0.0
+            for a, b in zip(inverse[i], right, strict=True):
+                change += a * b
+            step.append(change)
+            x[i] += change
+            largest = max(largest, abs(change))
+        steps += 1
+        if largest < LAST_STEP:
+            # So small a step moves the residual along the derivatives, to the last digit.
+            residual = [
+                r - sum([a * b for a, b in zip(row, step, strict=True)]) for r, row in zip(residual, rows, strict=True)
+            ]
+            return Fit(x, inverse, residual, True, steps)
+        if not largest < float('inf') or steps == MAX_STEPS:
+            return Fit(x, inverse, residual, False, steps)
+
+
+def _invert(lower: list[list[float]]) -> list[list[float]] | None:
+    """The inverse of a symmetric positive matrix of which the lower half is given (Cholesky)."""
+    p = len(lower)
+    for i in range(p):
+        line = lower[i]
+        for j in range(i + 1):
+            other = lower[j]
+            total = line[j]
+            for k in range(j):
+                total -= line[k] * other[k]
+            if i == j:
+                if not total > 0.0:
+                    return None
+                line[i] = total**0.5
+            else:
+                line[j] = total / other[j]
+    # The inverse of the factor, below the diagonal; then its product with itself.
+    factor = [[0.0] * p for _ in range(p)]
+    for i in range(p):
+        factor[i][i] = 1.0 / lower[i][i]
+        for j in range(i):
+            total = 0.0
+            for k in range(j, i):
+                total -= lower[i][k] * factor[k][j]
+            factor[i][j] = total * factor[i][i]
+    out = [[0.0] * p for _ in range(p)]
+    for i in range(p):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, p):
+                total += factor[k][i] * factor[k][j]
+            out[i][j] = out[j][i] = total
+    return out
+
+
+def fit_many(model: ModelMany, start: FloatArray, measured: FloatArray, variances: FloatArray) -> Fits:
+    """N blocks: ``start`` (n, p), ``measured`` (n, m), ``variances`` (m,) or (n, m), above 0 (SolverError)."""
+    n, p = start.shape
+    weights = np.broadcast_to(1.0 / positive(variances), measured.shape)
+    out = Fits(start.copy(), np.empty((n, p, p)), np.empty(measured.shape), np.zeros(n, dtype=bool))
+    for first in range(0, n, CHUNK):
+        # A block that has converged is left alone: its answer does not depend on its neighbours.
+        active = np.arange(first, min(first + CHUNK, n))
+        for _ in range(MAX_STEPS):
+            predicted, rows = model(out.parameters[active])
+            residual = measured[active] - predicted
+            weighted = rows * weights[active][:, :, None]
+            inverse = _invert_many(np.einsum('nmi,nmj->nij', weighted, rows))
+            step = np.einsum('nij,nj->ni', inverse, np.einsum('nmi,nm->ni', weighted, residual))
+            out.parameters[active] += step
+            out.covariance[active] = inverse
+            out.residual[active] = residual - np.einsum('nmi,ni->nm', rows, step)
+            largest = np.abs(step).max(axis=1)
+            out.converged[active] = largest < LAST_STEP
+            active = active[(largest >= LAST_STEP) & (largest < np.inf)]
+            if not active.size:
+                break
+    return out
+
+
+def _invert_many(normal: FloatArray) -> FloatArray:
+    """Inverses (n, p, p); NaN if a block is singular, so that it does not spoil its neighbours."""
+    try:
+        return np.asarray(np.linalg.inv(normal))
+    except np.linalg.LinAlgError:
+        singular = np.linalg.matrix_rank(normal, hermitian=True) < normal.shape[1]
+        out = np.full(normal.shape, np.nan)
+        out[~singular] = np.linalg.inv(normal[~singular])
+        return out

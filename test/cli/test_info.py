@@ -1,0 +1,84 @@
+"""``psd-deflection info``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psd_deflection.cli.main import main
+from psd_deflection.recordings.bag_writer import BagWriter
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.records import SampleBlock
+from test.recordings.making import HELLO, T0, block, write_bag
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    return write_bag(tmp_path / 'run', {'sum_min': 1.5})
+
+
+def test_info_says_what_is_in_it(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['info', str(bag), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found['samples'], found['lost'], found['blocks'], found['flagged']) == (1182, 18, 60, 9)
+    assert found['duration_s'] == pytest.approx(1.199)
+    assert found['sample_rate_hz'] == pytest.approx(1000.0)
+    assert found['device_hello'] == HELLO
+    assert found['changed_parameters'] == {'sum_min': 1.5}
+    assert found['topics']['/psd/samples'] == 60
+    assert found['complete'] is True
+    assert main(['info', str(bag)]) == 0
+    text = capsys.readouterr().out
+    for part in ('complete', '18 lost', 'serial A1', 'sum_min = 1.5', '/link_tip/wls/deflection', '2025-10-09'):
+        assert part in text
+
+
+def test_info_reads_a_cut_file_and_says_so(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = bag / 'run_0.mcap'
+    path.write_bytes(path.read_bytes()[:-3000])
+    assert main(['info', str(path)]) == 0
+    text = capsys.readouterr().out
+    assert 'INCOMPLETE' in text
+    assert 'before its end' in text
+
+
+def test_info_of_what_has_no_samples(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    BagWriter(tmp_path / 'empty', rig_values={}).close()
+    assert main(['info', str(tmp_path / 'empty')]) == 0
+    text = capsys.readouterr().out
+    for part in (
+        'samples      none',
+        'lacks        samples (/psd/samples)',
+        ' parameters: the nominal',
+        'what the device says of itself',
+        ' known loads',
+    ):
+        assert part in text
+    assert main(['info', str(tmp_path / 'empty'), '--json']) == 0
+    assert len(json.loads(capsys.readouterr().out)['lacks']) == 5
+
+
+def test_info_takes_the_rate_over_the_whole_and_a_pause_for_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # The clock's map settles in the first second, and the device was off for two seconds on the way.
+    with BagWriter(tmp_path / 'run', rig_values={'block_size': 20}) as bag:
+        for i in range(200):
+            whole = block(i, t0=T0 + (2_000_000_000 if i >= 100 else 0))
+            late = np.clip(1_000_000 - whole.seq * 1000, 0, None)
+            bag.put(SampleBlock(i, whole.seq, whole.t_ns - late, whole.volts, whole.flags))
+    assert main(['info', str(tmp_path / 'run'), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert open_recording(tmp_path / 'run').sample_rate_hz == pytest.approx(999.0, rel=1e-4)
+    assert found['sample_rate_hz'] == pytest.approx(1000.0, rel=3e-4)
+    assert found['lost'] == 0
+
+
+def test_an_unreadable_recording_is_status_4_and_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['info', str(tmp_path / 'none.csv')]) == 4
+    said = capsys.readouterr().err
+    assert said.count('\n') == 1
+    assert 'no such recording' in said

@@ -1,0 +1,123 @@
+"""Sensor placement: condition numbers, gains, spreads in closed form and by the matrix, and the search."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from psd_deflection.errors import ConfigError
+from psd_deflection.geometry import placement
+from psd_deflection.geometry.linear import condition_number, design_matrix
+from psd_deflection.geometry.placement import Room
+from psd_deflection.records import FloatArray
+
+THESIS = np.array([[0.0, 0.070], [-0.100, 0.0]])
+SIGMA = 2e-6
+MICRO_MILLIDEGREE = np.array([1e6, 1e6, math.degrees(1e3)])
+
+
+@pytest.mark.parametrize(
+    ('centers', 'expected', 'cond'),
+    [
+        (THESIS, (1.63, 1.83, 1.33), 2.45),
+        (placement.opposite(0.061), (1.41, 1.41, 1.33), 1.64),
+        (placement.opposite(0.100), (1.41, 1.41, 0.81), 1.00),
+    ],
+)
+def test_spreads_of_the_placements_compared(
+    centers: FloatArray, expected: tuple[float, float, float], cond: float
+) -> None:
+    closed = np.array(placement.spread_of_pair(centers, SIGMA))
+    assert closed * MICRO_MILLIDEGREE == pytest.approx(expected, abs=5e-3)
+    design = design_matrix(centers)
+    by_matrix = SIGMA * np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
+    assert closed == pytest.approx(by_matrix, rel=1e-12)
+    assert condition_number(design_matrix(centers), 0.1).two == pytest.approx(cond, abs=5e-3)
+
+
+def test_frobenius_condition_is_at_least_three() -> None:
+    # The thesis's 4.28 says 1. Reached by the opposite pair at the scaling length.
+    assert condition_number(design_matrix(placement.opposite(0.1)), 0.1).frobenius == pytest.approx(3.0)
+
+
+def test_three_sensors_see_tilt_only_when_staggered() -> None:
+    ring = placement.ring(3, 0.100)
+    tilted = np.array([0.0, 0.0, 0.0, math.radians(0.3), math.radians(0.1)])
+    mdeg = math.degrees(1e3)
+    coplanar = placement.pose_spread(tilted, ring, np.zeros(3), SIGMA)
+    assert coplanar[3:] * mdeg == pytest.approx([178.0, 234.0], abs=0.5)
+    staggered = placement.pose_spread(tilted, ring, np.array([0.100, -0.050, -0.050]), SIGMA)
+    assert staggered[3:] * mdeg == pytest.approx([0.93, 1.32], abs=5e-3)
+    at_rest = placement.pose_spread(np.zeros(5), ring, np.zeros(3), SIGMA)
+    assert np.isfinite(at_rest).tolist() == [True, True, True, False, False]
+
+
+def test_two_sensors_leave_a_direction_unseen() -> None:
+    tilted = np.array([0.001, 0.002, 0.01, 0.004, 0.003])
+    assert not np.any(np.isfinite(placement.pose_spread(tilted, THESIS, np.array([0.05, -0.05]), SIGMA)))
+
+
+def test_the_slope_ratio_is_seen_by_the_height_between_opposite_sensors() -> None:
+    # Along the bending direction y1 - y2 = (h1 - h2) k dY/L, so sigma(k) = sqrt(2) sigma L/(0.1 m |dY|).
+    pose = np.array([0.0, -2.2271675e-3, 0.016418222])
+    got = placement.slope_ratio_spread(pose, 1.5, 0.585, placement.opposite(0.1), np.array([0.05, -0.05]), SIGMA)
+    by_hand = math.sqrt(2.0) * SIGMA * 0.585 / (0.1 * 2.2271675e-3)
+    assert got[3] == pytest.approx(by_hand, rel=5e-3)
+    # In one plane it is useless; across the bending direction, no better.
+    assert placement.slope_ratio_spread(pose, 1.5, 0.585, THESIS, np.zeros(2), SIGMA)[3] > 1.0
+
+
+@pytest.mark.parametrize(
+    ('room', 'expected'),
+    [
+        (Room(0.100), 1.0),
+        (Room(0.100, keep_out=0.030), 1.0),
+        (Room(0.080, box=(-0.2, -0.2, 0.2, 0.2)), 1.25),
+    ],
+)
+def test_a_round_room_wants_its_sensors_opposite(room: Room, expected: float) -> None:
+    pair = placement.best_pair(room)
+    assert pair[0] == pytest.approx(-pair[1], abs=1e-9)
+    assert np.hypot(*pair.T) == pytest.approx(room.radius, rel=1e-9)
+    assert condition_number(design_matrix(pair), 0.1).two == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_search_beats_every_pair_of_a_finer_grid() -> None:
+    # A corner only: base line and midpoint pull in different directions.
+    room = Room(0.100, keep_out=0.030, box=(0.0, 0.0, 0.080, 0.090))
+    pair = placement.best_pair(room)
+    assert np.all(room.holds(pair))
+    grid = np.stack(np.meshgrid(np.linspace(0.0, 0.080, 41), np.linspace(0.0, 0.090, 46)), axis=-1).reshape(-1, 2)
+    grid = grid[room.holds(grid)]
+    first, second = grid[:, None], grid[None, ::3]
+    base_square = np.sum((first - second) ** 2, axis=-1)
+    base_square[base_square == 0.0] = 1e-12
+    # var dX + var dY + (0.1 m)^2 var theta for sigma = 1, written out.
+    costs = 1.0 + 2.0 / base_square * (np.sum(((first + second) / 2.0) ** 2, axis=-1) + 0.1**2)
+    found = float(placement.cost(np.array(placement.spread_of_pair(pair, 1.0))))
+    assert found <= math.sqrt(float(np.min(costs)))
+    assert found == pytest.approx(math.sqrt(float(np.min(costs))), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ('radius', 'keep_out', 'box', 'said'),
+    [
+        (0.0, 0.0, None, '^radius = '),
+        (math.nan, 0.0, None, '^radius = '),
+        (0.1, 0.2, None, '^keep_out = '),
+        (0.1, -0.1, None, '^keep_out = '),
+        (0.1, 0.0, (0.1, 0.0, 0.0, 0.1), '^box = '),
+    ],
+)
+def test_an_impossible_room_is_refused(
+    radius: float, keep_out: float, box: tuple[float, float, float, float] | None, said: str
+) -> None:
+    with pytest.raises(ConfigError, match=said):
+        Room(radius, keep_out, box)
+
+
+def test_a_room_too_small_for_two_is_refused() -> None:
+    with pytest.raises(ConfigError, match='no room'):
+        placement.best_pair(Room(0.1, box=(0.2, 0.2, 0.3, 0.3)))

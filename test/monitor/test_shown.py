@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.cli.main import main
+from psd_deflection.monitor.feed import BlockResult, Feed
+from psd_deflection.monitor.shown import RefusedError, ShownRecording
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.replay_engine import replayed, rig_at_start
+from psd_deflection.records import Record
+
+BAGS = Path(__file__).parent.parent.parent / 'bags'
+
+
+def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event) -> ShownRecording:
+    rig = rig_at_start(open_recording(BAGS / name))
+
+    def open_steps() -> tuple[Pipeline, Iterator[list[Record]]]:
+        recording = open_recording(BAGS / name)
+        pipeline = Pipeline(rig)
+        return pipeline, replayed(recording, pipeline)
+
+    def say(text: str) -> None:
+        said.append(text)
+        ended.set()
+
+    return ShownRecording(name, open_steps, feed, say, speed=1e6)
+
+
+def test_a_recording_is_shown_as_it_is_with_its_losses() -> None:
+    feed, said, ended = Feed(), list[str](), threading.Event()
+    source = source_of('lost_samples', feed, said, ended)
+    source.start()
+    assert ended.wait(60.0)
+    source.close()
+    results = [r for r in feed.take() if isinstance(r, BlockResult)]
+    recorded = open_recording(BAGS / 'lost_samples').estimates()['/link_tip/deflection']
+    assert [r.estimate.t_ns for r in results if r.estimate is not None] == recorded.t_ns.tolist()
+    # 175 between the first and the last present one, and the last, which its block tells of.
+    report = source.health(0)
+    assert ('lost', '176') in report.entries[0].values
+    assert report.entries[0].message == 'end of the recording'
+    with pytest.raises(RefusedError, match='has ended'):
+        source.zero()
+    with pytest.raises(RefusedError, match='replay REC --out'):
+        asyncio.run(source.record(True))
+    assert said == ['lost_samples: end of the recording']
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'status', 'told'),
+    [
+        (['no_such_bag'], 4, 'no such recording'),
+        ([str(BAGS / 'clean'), '--speed', '0'], 2, '--speed 0: must be above 0'),
+        (['--speed', '0'], 2, '--speed 0: must be above 0'),
+        ([str(BAGS / 'clean'), '--port', '/dev/ttyACM0'], 2, '--port is for a rig'),
+        (['--http-port', '70000'], 2, 'monitor_port = 70000'),
+        ([str(BAGS / 'clean'), '--address', '192.0.2.1', '--http-port', '0'], 3, 'cannot be served there'),
+    ],
+)
+def test_what_cannot_be_is_one_line(
+    arguments: list[str], status: int, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(['monitor', *arguments]) == status
+    err = capsys.readouterr().err
+    assert told in err
+    assert err.strip().count('\n') == 0
+
+
+def test_without_aiohttp_the_way_out_is_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr('psd_deflection.monitor.start.importlib.util.find_spec', lambda name: None)
+    assert main(['monitor']) == 3
+    assert "pip install 'psd_deflection[monitor]'" in capsys.readouterr().err

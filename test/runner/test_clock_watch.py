@@ -1,0 +1,105 @@
+"""What the clock map is shown of a stream, with times that the test owns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psd_deflection.devices.source import Sample
+from psd_deflection.protocol.frames import BadFrame, SampleFrame
+from psd_deflection.runner.clock_watch import ClockWatch
+
+COUNTS = (0, 0, 16384, 0, 0, 16384)
+MS = 1_000_000
+BOOT = 5_000 * MS
+"""The host's clock when the device's is at zero, ns."""
+
+
+def sample(seq: int, t_us: int | None = None) -> SampleFrame:
+    return SampleFrame(0, seq % 2**32, seq * 1000 if t_us is None else t_us, COUNTS)
+
+
+def watch() -> ClockWatch:
+    return ClockWatch(1000.0, regressed=True)
+
+
+def host_of(watched: ClockWatch, t_us: int) -> int:
+    return int(watched.to_host_ns(np.array([t_us], np.int64))[0])
+
+
+def test_only_the_newest_sample_of_a_read_says_how_late_the_line_is() -> None:
+    watched = watch()
+    assert not watched.newest([sample(0), sample(1), BadFrame('x', 3), sample(2), BadFrame('y', 1)], BOOT + 2 * MS)
+    assert host_of(watched, 0) == BOOT
+    assert host_of(watched, 2000) == BOOT + 2 * MS
+
+
+def test_a_read_without_a_sample_says_nothing() -> None:
+    watched = watch()
+    assert not watched.newest([BadFrame('x', 3)], BOOT)
+    assert not watched.newest([], BOOT)
+    assert watched.state().points == 0
+    watched.newest([sample(7)], BOOT + 7 * MS)
+    assert host_of(watched, 7000) == BOOT + 7 * MS
+
+
+def test_samples_of_a_plug_in_count_as_frames_do() -> None:
+    watched = watch()
+    watched.newest([Sample(0, 3, 3000, COUNTS)], BOOT + 3 * MS)
+    assert host_of(watched, 3000) == BOOT + 3 * MS
+
+
+def test_a_repeated_sample_and_one_whose_time_does_not_fit_its_number_are_not_shown() -> None:
+    watched = watch()
+    watched.newest([sample(100)], BOOT + 100 * MS)
+    before = watched.state()
+    # Shown, both would be a jump of the clock.
+    assert not watched.newest([sample(99)], BOOT + 101 * MS)
+    assert not watched.newest([sample(101, t_us=10**9)], BOOT + 101 * MS)
+    assert watched.state() == before
+
+
+def test_a_jump_is_seen_sample_by_sample() -> None:
+    watched = watch()
+    for k in range(5):
+        assert not watched.torn(k, k * 1000)
+        assert not watched.observe(k, k * 1000, BOOT + k * MS)
+    assert watched.torn(5, 10**9)
+    assert watched.observe(5, 10**9, BOOT + 5 * MS)
+    assert host_of(watched, 10**9) == BOOT + 5 * MS
+    assert watched.state().resets == 1
+    assert not watched.torn(6, 10**9 + 1000)
+
+
+def test_a_gap_in_the_numbers_is_no_jump() -> None:
+    watched = watch()
+    assert not watched.torn(0, 0)
+    assert not watched.torn(5000, 5_000_000)
+    assert watched.torn(5001, 5_001_000 + 60_000)
+
+
+def test_numbers_may_wrap() -> None:
+    watched = watch()
+    last = 2**32 - 1
+    assert not watched.newest([sample(last, t_us=1000)], BOOT)
+    assert not watched.newest([sample(0, t_us=2000)], BOOT + MS)
+    assert host_of(watched, 2000) == BOOT + MS
+    assert watched.state().resets == 0
+
+
+def test_an_answer_to_a_ping_bounds_the_delay() -> None:
+    watched = watch()
+    watched.newest([sample(0)], BOOT + 3 * MS)
+    watched.reply(1000, BOOT + 3 * MS, BOOT + 4 * MS)
+    assert watched.state().round_trip_ns == MS
+
+
+@pytest.mark.parametrize('t', [0, 123_456_789])
+def test_times_that_need_no_map_go_through_as_they_are(t: int) -> None:
+    watched = ClockWatch(1000.0, regressed=False)
+    assert not watched.newest([sample(5)], BOOT)
+    assert not watched.torn(5, 5000)
+    assert not watched.torn(6, 10**9)
+    watched.reply(1000, BOOT, BOOT + MS)
+    assert host_of(watched, t) == t
+    assert watched.state().round_trip_ns is None

@@ -1,0 +1,46 @@
+"""Headless Chromium, driven by its own driver: for the page's tests, its pictures and its timing."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from selenium import webdriver
+from selenium.webdriver.chrome.service import Service
+
+FLAGS = (
+    '--headless',
+    '--no-sandbox',
+    '--disable-gpu',
+    '--disable-quic',
+    '--no-first-run',
+    '--disable-background-networking',
+    '--disable-component-update',
+    '--disable-sync',
+    # A page that nobody looks at is drawn all the same.
+    '--disable-background-timer-throttling',
+    '--disable-renderer-backgrounding',
+    '--js-flags=--expose-gc',
+)
+WHAT_IS_NEEDED = 'Chromium and its driver are needed: apt install chromium chromium-driver'
+
+
+def find_browser() -> tuple[str, str] | None:
+    """The paths of Chromium and its driver; None if one of them is missing."""
+    chromium = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
+    driver = shutil.which('chromedriver') or shutil.which('chromium.chromedriver')
+    return (chromium, driver) if chromium and driver else None
+
+
+def open_browser(profile: Path, *flags: str) -> webdriver.Chrome:
+    """A browser with an empty page, whose console is logged; its profile is a new folder. SystemExit without one."""
+    found = find_browser()
+    if found is None:
+        raise SystemExit(WHAT_IS_NEEDED)
+    chromium, driver = found
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for flag in (*FLAGS, f'--user-data-dir={profile}', *flags):
+        options.add_argument(flag)
+    options.set_capability('goog:loggingPrefs', {'browser': 'ALL'})
+    return webdriver.Chrome(options=options, service=Service(driver))

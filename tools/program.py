@@ -1,0 +1,123 @@
+"""A program as a process, and what it says: for tests, campaigns and what runs the documents' commands.
+
+A thread reads whatever the program prints, so that it never waits for us. :meth:`Program.until` waits for a line, not
+for a time; a program that does not answer is an error that quotes what it said instead.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+WAIT_S = 60.0
+"""Longest wait for what will come; a busy machine takes its time."""
+
+ROOT = Path(__file__).resolve().parent.parent
+PSD_DEFLECTION = (sys.executable, '-m', 'psd_deflection')
+"""How our own program is started in this environment."""
+
+
+class Program:
+    """``command`` in a session of its own, without input; stdout and stderr are heard together.
+
+    ``terminal`` gives it a terminal, as a person has one; otherwise it writes into a pipe. ``wait_s`` limits each wait.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        cwd: Path = ROOT,
+        *,
+        terminal: bool = False,
+        env: Mapping[str, str] | None = None,
+        wait_s: float = WAIT_S,
+    ) -> None:
+        self._wait_s = wait_s
+        self._fd, theirs = pty.openpty() if terminal else os.pipe()
+        self.process = subprocess.Popen(
+            command,
+            cwd=cwd,
+            stdin=subprocess.DEVNULL,
+            stdout=theirs,
+            stderr=theirs,
+            start_new_session=True,
+            env={**os.environ, 'PYTHONUNBUFFERED': '1', **(env or {})},
+        )
+        os.close(theirs)
+        self._said = b''
+        self._ended = False
+        self._new = threading.Condition()
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        while True:
+            try:
+                new = os.read(self._fd, 65536)
+            except OSError:
+                # A terminal whose last program has ended reads as an error, a pipe as nothing.
+                new = b''
+            with self._new:
+                self._said += new
+                self._ended = not new
+                self._new.notify_all()
+            if not new:
+                break
+        os.close(self._fd)
+
+    @property
+    def text(self) -> str:
+        """All that it has said so far."""
+        return self._said.decode(errors='replace')
+
+    @property
+    def lines(self) -> list[str]:
+        """The lines that are complete; a live line is complete when the next one replaces it."""
+        lines = re.split(r'[\r\n]+', self.text)
+        return [line for line in (lines if self._ended else lines[:-1]) if line]
+
+    def until(self, pattern: str) -> re.Match[str]:
+        """The first match in a line. RuntimeError if the program ends, or the time is over, without one."""
+        found: list[re.Match[str]] = []
+
+        def look() -> bool:
+            found.extend(match for line in self.lines if (match := re.search(pattern, line)))
+            return bool(found) or self._ended
+
+        with self._new:
+            self._new.wait_for(look, self._wait_s)
+        if not found:
+            raise RuntimeError(f'{pattern!r} was not said, but:\n{self.text[-4000:]}')
+        return found[0]
+
+    def send(self, number: int) -> None:
+        """To the program and all that it started; nothing if they have ended."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, number)
+
+    def wait(self) -> int:
+        """Its exit status, with all that it said heard. RuntimeError, and it is killed, if it does not end in time."""
+        try:
+            status = self.process.wait(self._wait_s)
+        except subprocess.TimeoutExpired:
+            raise RuntimeError(f'it did not end, but said:\n{self.text[-4000:]}') from None
+        finally:
+            if self.process.poll() is None:
+                self.send(signal.SIGKILL)
+                self.process.wait()
+            self._thread.join(self._wait_s)
+        return status
+
+    def end(self, number: int = signal.SIGINT) -> int:
+        """Ctrl-C (or another signal) if it runs still; its exit status."""
+        if self.process.poll() is None:
+            self.send(number)
+        return self.wait()
