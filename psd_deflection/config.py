@@ -145,14 +145,14 @@ class EstimatorConfig:
         'poly',
         '',
         'what a block gives: its mean, or a polynomial at the stamp (poly), which follows motion inside the block',
-        choices=('mean', 'poly'),
+        choices=('poly', 'mean'),
         before='mean',
     )
     covariance: str = parameter(
         'measured',
         '',
         "noise behind the covariances: the rig file's, or measured in the stream after 100 blocks",
-        choices=('file', 'measured'),
+        choices=('measured', 'file'),
         before='file',
     )
     consistency: str = parameter(

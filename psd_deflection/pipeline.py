@@ -355,7 +355,7 @@ class Pipeline:
         name, solver, primary = self._solvers[number]
         rms = (sum(r * r for r in s.residual) / len(s.residual)) ** 0.5
         covariance: tuple[float, ...] = s.covariance
-        widen = checked is not None and checked.contradict and self.rig.estimator.consistency == 'widen'
+        widen = checked is not None and any(checked.possible) and self.rig.estimator.consistency == 'widen'
         # A printed threshold method has no covariance, and no slope either.
         if (spread is not None or widen) and covariance[0] == covariance[0]:
             gain = solver.gain(dots, variances, s)

@@ -9,7 +9,7 @@ cost more than a few standard deviations.
 
 If one reading i alone is wrong, it is wrong by e_i = r/a_i. Which one, a single block cannot tell; so
 ``widen`` adds the errors that each of them would cause, sum_i (K_i e_i)(K_i e_i)^T with the solver's
-gain K, and the truth stays inside. While the link rings, two wrong readings may cancel in r for a block;
+gain K and half as much again, and the truth stays inside. While the link rings, two wrong readings may cancel in r for a block;
 so r is held and forgotten over a second. Over many blocks and poses the wrong one can often be told:
 the true reading of i is m_i - r/a_i if the others are right, and what i says of it must then follow
 one law: nothing (dead or stuck), or the opposite (inverted). If two readings would do, none is named.
@@ -31,6 +31,12 @@ NAMES = ('x1', 'y1', 'x2', 'y2')
 UNMEASURED = 16.0
 """Times ``LIMIT`` while the noise is not measured yet: it may be four times what the rig file says."""
 
+WIDEN = 6.635
+"""Chi-square from which one block is widened: 1 % of sound blocks, by less than their own errors."""
+
+_MORE = 1.5
+"""Times the error of one reading alone: the errors of two exchanged readings cancel in part in r."""
+
 _FADE = 0.98
 """What is left of a held r^2 after a block."""
 
@@ -51,7 +57,8 @@ class Checked(NamedTuple):
     """One block's answer.
 
     ``chi_square`` of this block. ``contradict``: this block or one shortly before is beyond ``LIMIT``.
-    ``errors`` (4,): of each reading if it alone is wrong, m. ``possible`` (4,): the same with the r that is held, m.
+    ``errors`` (4,): of each reading if it alone is wrong, m. ``possible`` (4,): what the covariance is to
+    allow for, m: the same from ``WIDEN`` on, or with the r that is held.
     """
 
     chi_square: float
@@ -89,7 +96,9 @@ class Consistency:
         held = max(_FADE * self.held, r * r if contradict else 0.0)
         self.held = held if held > limit * variance else 0.0
         one = tuple(1.0 / p if abs(p) > _UNSEEN else 0.0 for p in a)
-        root = self.held**0.5
+        # The limit's share: below it an error is not sure enough to be held, and may still be many standard deviations.
+        doubtful = chi_square * LIMIT > WIDEN * limit
+        root = _MORE * max(self.held, r * r if doubtful else 0.0) ** 0.5
         return Checked(chi_square, self.held > 0.0, tuple(r * p for p in one), tuple(root * p for p in one))
 
 
