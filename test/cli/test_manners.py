@@ -161,8 +161,8 @@ def signals() -> Iterator[None]:
 @pytest.mark.parametrize(
     ('argv', 'sink'),
     [
-        (['simulate', '--loads', 'thesis'], 'psd_deflection.cli.simulate.CsvSampleSink.put'),
-        (['convert', CLEAN], 'psd_deflection.cli.convert.CsvSampleSink.put'),
+        (['simulate', '--loads', 'thesis'], 'psd_deflection.recordings.csv_writer.CsvSampleSink.put'),
+        (['convert', CLEAN], 'psd_deflection.recordings.csv_writer.CsvSampleSink.put'),
         (['replay', CLEAN], 'psd_deflection.cli.replay.Totals.add'),
     ],
     ids=lambda v: v[0] if isinstance(v, list) else '',
@@ -220,12 +220,10 @@ def test_a_picture_is_whole_or_as_it_was(folder: Path, monkeypatch: pytest.Monke
     assert place.read_bytes() == b'new'
     assert link.is_symlink()
 
-    def full(self: Path, content: bytes) -> int:
-        with self.open('wb') as stream:
-            stream.write(content[:1])
+    def full(number: int) -> None:
         raise OSError(28, 'No space left on device')
 
-    monkeypatch.setattr(Path, 'write_bytes', full)
+    monkeypatch.setattr(os, 'fsync', full)
     with pytest.raises(RecordingError, match=r'^--out .*a\.png: cannot be written \(No space left on device\)$'):
         _report.save(b'newer', place)
     assert sorted(folder.iterdir()) == [place, link]
