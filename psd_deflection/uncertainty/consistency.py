@@ -9,8 +9,9 @@ cost more than a few standard deviations.
 
 If one reading i alone is wrong, it is wrong by e_i = r/a_i. Which one, a single block cannot tell; so
 ``widen`` adds the errors that each of them would cause, sum_i (K_i e_i)(K_i e_i)^T with the solver's
-gain K and half as much again, and the truth stays inside. While the link rings, two wrong readings may cancel in r for a block;
-so r is held and forgotten over a second. Over many blocks and poses the wrong one can often be told:
+gain K and half as much again, and the truth stays inside. While the link rings, two wrong readings may
+cancel in r for a block; so r is held and forgotten over a second. Over many blocks and poses the wrong one
+can often be told:
 the true reading of i is m_i - r/a_i if the others are right, and what i says of it must then follow
 one law: nothing (dead or stuck), or the opposite (inverted). If two readings would do, none is named.
 """
