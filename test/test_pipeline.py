@@ -171,7 +171,7 @@ def test_fewer_samples_make_a_wider_covariance(rig: Rig) -> None:
         for r in run(Pipeline(rig).process, chunk_of(still(REST, 20, 0)))
         if isinstance(r, DeflectionEstimate) and r.primary
     )
-    np.testing.assert_allclose(np.array(half.covariance), 2.0 * np.array(full.covariance), rtol=1e-3, atol=1e-18)
+    np.testing.assert_allclose(np.array(half.covariance), 2.0 * np.array(full.covariance), rtol=0.03, atol=1e-18)
 
 
 def test_zero_takes_the_present_dots_and_applies_from_the_next_block_on(rig: Rig) -> None:

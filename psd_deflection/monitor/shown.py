@@ -187,7 +187,12 @@ class ShownRecording:
                 'psd_deflection: estimates',
                 level,
                 message,
-                (('rate (estimates/s)', str(new_estimates)), ('estimates', str(estimates)), *refused),
+                (
+                    ('rate (estimates/s)', str(new_estimates)),
+                    ('estimates', str(estimates)),
+                    *refused,
+                    *self._pipeline.stamped.words(),
+                ),
             )
         )
         return DiagnosticReport(t_ns, tuple(entries))
