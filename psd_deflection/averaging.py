@@ -92,7 +92,8 @@ def block_middle_ns(block: SampleBlock, block_size: int, period_ns: float) -> in
     """Time of the middle of the whole block, ns, from the samples that are present.
 
     Each sample gives an estimate of the time of slot (N-1)/2. The result is their mean, so a lost
-    sample moves the stamp by no more than the clock's jitter.
+    sample moves the stamp by no more than the clock's jitter. The mean of the remaining samples belongs to
+    another time: :mod:`psd_deflection.uncertainty.block_fit` gives the value at the stamp.
     """
     first = int(block.t_ns[0])
     slots = block.seq - block.index * block_size

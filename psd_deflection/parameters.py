@@ -42,7 +42,8 @@ _KINDS: Mapping[object, Kind] = {float: 'double', int: 'integer', bool: 'bool', 
 class Parameter:
     """One parameter. ``minimum`` and ``maximum`` apply to each element of an array.
 
-    ``above``: an exclusive lower bound. ``live``: the parameter may be changed while the node runs.
+    ``above``: an exclusive lower bound. ``live``: the parameter may be changed while the node runs. ``before``: the
+    value for recordings that were made before this parameter existed and do not name it; None: the default.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Parameter:
     length: int | None = None
     choices: tuple[str, ...] | None = None
     live: bool = False
+    before: Any = None
 
     def bound_text(self) -> str:
         """The bounds or the choices in words, for an error message or ``--help``; '' if there are none."""
@@ -82,6 +84,7 @@ def parameter(
     above: float | None = None,
     choices: tuple[str, ...] | None = None,
     live: bool = False,
+    before: T | None = None,
 ) -> T:
     """Declare a parameter as a field of a dataclass; the field's type is its type.
 
@@ -89,7 +92,7 @@ def parameter(
     field's name. :class:`Parameter` explains the rest.
     """
     declared = {'unit': unit, 'description': description, 'minimum': minimum, 'maximum': maximum, 'above': above}
-    metadata = {**declared, 'name': name, 'choices': choices, 'live': live}
+    metadata = {**declared, 'name': name, 'choices': choices, 'live': live, 'before': before}
     declaration: T = field(default=default, metadata=metadata)
     return declaration
 
