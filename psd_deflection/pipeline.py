@@ -100,10 +100,11 @@ class Pipeline:
         self._environment: dict[str, float] = {}
         self._held: _Held | None = None
         self._frozen = (0, 0)
-        self.stamped = StampedDots(rig)
         variances = dot_noise_variances(rig)
         self._variances = [tuple(float(v) / n for v in variances) for n in range(1, config.block_size + 1)]
         self._build(rig)
+        # After the solvers, which refuse a geometry that cannot be solved.
+        self.stamped = StampedDots(rig)
 
     def _build(self, rig: Rig) -> None:
         self.rig = rig
