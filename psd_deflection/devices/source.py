@@ -46,7 +46,7 @@ class Sample(NamedTuple):
 
     ``flags``, ``seq``: as in ``protocol.frames.SampleFrame``. ``t``: in the unit of the source's
     :class:`Clock`. ``readings``: x1 y1 sum1 x2 y2 sum2, converter counts (whole, -32768 to 32767)
-    where the source's HELLO has ``volts_per_count``, volts where that is None.
+    or volts if :attr:`Source.volts` says so.
     """
 
     flags: int
@@ -85,12 +85,14 @@ class Source(abc.ABC):
 
     ``name``: its port or file, for messages. ``clock``: what a sample's time is. ``numbered``: whether
     the device numbers its samples, so that a loss on the way is seen; if it does not, the source
-    numbers what came, and starts from 0 after each ``open``.
+    numbers what came, and starts from 0 after each ``open``. ``volts``: whether readings are volts; if not,
+    they are converter counts, whatever the device says. It holds from ``open`` on.
     """
 
     name: str
     clock: Clock = Clock.DEVICE
     numbered: bool = True
+    volts: bool = False
 
     @abc.abstractmethod
     def open(self, timeout: float) -> HelloFrame:
@@ -98,7 +100,7 @@ class Source(abc.ABC):
 
         The HELLO has ``serial``, ``firmware``, ``sample_rate_hz``, ``channels`` and
         ``volts_per_count`` (a number, or None for samples in volts); the reader holds it against
-        the rig and it is recorded. Raises DeviceError that names the way out; nothing is left open.
+        the rig, and it is recorded. Raises DeviceError that names the way out; nothing is left open.
         """
 
     @abc.abstractmethod
