@@ -1,6 +1,6 @@
 """Tip deflection and twist of a flexible link from two position sensing detectors.
 
-The rooms of the house, and which way the imports point, are in ``docs/architecture.md``.
+``docs/architecture.md`` lists the subpackages and the direction of the imports between them.
 """
 
 from __future__ import annotations
@@ -19,22 +19,23 @@ __version__ = '0.1.0'
 
 
 def open(path: str | Path) -> Recording:
-    """Open a recording: a bag folder, an ``.mcap`` or a ``.csv``; ``.samples`` is a numpy array of it.
+    """Open a recording: a bag folder, an ``.mcap`` or a ``.csv``. ``.samples`` is a numpy array of its samples.
 
-    Raises :class:`psd_deflection.errors.RecordingError` where it cannot be read.
+    Raises :class:`psd_deflection.errors.RecordingError` if it cannot be read.
     """
-    # Only here, so that `import psd_deflection` stays light.
+    # Imported here to keep `import psd_deflection` fast.
     from psd_deflection.recordings.readers import open_recording
 
     return open_recording(path)
 
 
 def discover(recordings: Sequence[str | Path], rig: Rig | str | Path | None = None, *, seed: int = 0) -> Discovery:
-    """Name what the simulation lacks to explain ``recordings``: files with loads, or ``.yaml`` lists of them.
+    """Name the effects that the simulation lacks to explain ``recordings``.
 
-    ``rig``: the rig as it is known, or its parameter file; by default what the recordings themselves
-    tell. The same ``seed`` gives the same answer. ``psd_deflection.discovery.result`` turns it into
-    ``result.json`` and ``model.yaml``. Raises :class:`psd_deflection.errors.RecordingError` where a
+    ``recordings``: files with loads, or ``.yaml`` lists of them.
+    ``rig``: the known rig, or its parameter file; by default the parameters in the recordings. The same
+    ``seed`` gives the same answer. ``psd_deflection.discovery.result`` turns the answer into
+    ``result.json`` and ``model.yaml``. Raises :class:`psd_deflection.errors.RecordingError` if a
     recording cannot be read or holds no loads, :class:`~psd_deflection.errors.ConfigError` for a bad
     parameter.
     """

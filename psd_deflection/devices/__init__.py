@@ -1,7 +1,7 @@
 """Devices: where samples come from, and their simulated twins.
 
-What a plug-in needs is here; ``docs/devices/README.md`` shows how to write one. Nothing that opens a port
-or computes is imported.
+Everything that a plug-in needs is exported here; ``docs/devices/README.md`` shows how to write one. Importing
+this package opens no port and computes nothing.
 """
 
 from psd_deflection.devices.device import Answer, Device, Ear, LineDevice, PowerUp, Probe

@@ -1,7 +1,7 @@
 """Devices that speak our own frames (``docs/protocol.md``): firmware of ours, the simulated rig.
 
-They number their samples and have a clock, so nothing is lost unseen and times are regressed from
-the device's own.
+They number their samples and have a clock. So every loss is detected, and times are regressed from the
+device's own clock.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from psd_deflection.records import CHANNELS, FLAG_DEVICE_DROPPED, FLAG_OVER_RANG
 if TYPE_CHECKING:
     from psd_deflection.devices.rig_feed import RigFeed
 
-# The zero ends whatever the device may have heard half of.
+# The zero byte ends any frame that the device has received in part.
 _QUESTION = b'\x00' + encode(HelloRequestFrame())
 _WAKE = _QUESTION + encode(StartFrame())
 
 SCAN_S = 0.25
-"""How long a port is heard out on which the device may be or not: it answers within milliseconds."""
+"""How long to listen on a port that may not be the device's: the device answers within milliseconds."""
 
 
 class ContractFrames(PortSource):
@@ -75,7 +75,7 @@ class ContractFrames(PortSource):
         raise DeviceError('; '.join(refusals))
 
     def _open(self, name: str, timeout: float) -> HelloFrame:
-        """Open ``name`` and hear it out; what comes before its HELLO is the first that is read."""
+        """Open ``name`` and wait for its HELLO; the first read returns the frames that came before it."""
         self.name = name
         port = self._port = SerialPort(name, self._baud)
         self._early = []
@@ -118,14 +118,14 @@ class ContractFrames(PortSource):
         self._wanted = serial
 
     def start(self) -> None:
-        """Forget what came while the device was heard out: it is older than it would look."""
+        """Discard the samples that came before the HELLO: they are older than their time of reading."""
         self._decoder = FrameDecoder()
         self._early = []
         if self._port is not None:
             self._port.discard_input()
 
     def reopen(self) -> HelloFrame | None:
-        """Try the port that it had, then one of those on which it may be now; another each time."""
+        """Try the port that the device had, then one other port where it may be now; a different one each time."""
         name = self.name
         try:
             return self._open(name, REOPEN_S)
@@ -137,12 +137,12 @@ class ContractFrames(PortSource):
             try:
                 return self._open(others[self._next_candidate], SCAN_S)
             except DeviceError:
-                # Not ours: the port that it had stays the one to ask first.
+                # Not our device: keep trying its previous port first.
                 self.name = name
                 raise
 
     def read(self, timeout: float) -> Received:
-        """The frames that have come."""
+        """Return the frames that have arrived."""
         port = self._opened()
         if self._early:
             events, self._early = self._early, []
@@ -161,7 +161,7 @@ class ContractFrames(PortSource):
         return True
 
     def wake(self) -> None:
-        """Ask for a HELLO and for samples once more."""
+        """Ask again for a HELLO and for samples."""
         if self._port is not None:
             self._port.write(_WAKE)
 
@@ -175,10 +175,10 @@ class ContractFrames(PortSource):
 
 
 class SimulatedFrames:
-    """A device that speaks our frames. When the host does not read it drops samples, counts them (STATUS)
-    and says so in the next one (flags, bit 1), as firmware with a full buffer does.
+    """A device that speaks our frames. If the host does not read, it drops samples, counts them (STATUS) and
+    marks the next one (flags, bit 1), like firmware with a full buffer.
 
-    ``lose``: sample numbers that the wire loses, for demonstrations and golden recordings.
+    ``lose``: numbers of samples to lose on the wire, for demonstrations and golden recordings.
     """
 
     def __init__(
@@ -211,7 +211,7 @@ class SimulatedFrames:
         )
 
     def greeting(self) -> bytes:
-        """What it sends when someone opens its port: the end of what was half sent, and HELLO."""
+        """Bytes sent when a host opens the port: the end of a frame that was sent in part, and HELLO."""
         return b'\x00' + encode(self.hello)
 
     @property
@@ -224,14 +224,14 @@ class SimulatedFrames:
         return int(self._feed.taken * self._period_host_ns) - since_power_up_ns
 
     def receive(self, received: bytes, since_power_up_ns: int) -> bytes:
-        """Replies to what the host sent; what is no frame is passed over."""
+        """Replies to the host's frames; other bytes are ignored."""
         replies = b''
         for frame in self._decoder.feed(received):
             match frame:
                 case HelloRequestFrame():
                     replies += encode(self.hello)
                 case PingFrame(cookie):
-                    # The clock of the samples, which a device that has run for long has from its first one.
+                    # The clock of the samples, which started with the first sample.
                     elapsed = (self._first_seq + since_power_up_ns / self._period_host_ns) * self._period_device_us
                     replies += encode(PongFrame(cookie, int(elapsed)))
                 case StartFrame():
@@ -243,9 +243,9 @@ class SimulatedFrames:
         return replies
 
     def take(self, since_power_up_ns: int, room: int = OUTPUT_LIMIT) -> bytes:
-        """Take every sample that is due; the frames to send, at most about ``room`` bytes.
+        """Take every sample that is due; return the frames to send, at most about ``room`` bytes.
 
-        With no room left a sample is taken and dropped.
+        If no room is left, a sample is taken and dropped.
         """
         out = bytearray()
         while self.due_in_ns(since_power_up_ns) <= 0:
@@ -267,7 +267,7 @@ class SimulatedFrames:
 
 
 class FramesEar:
-    """Hears a HELLO. ``baud``: the speed at which it listens, to be suggested."""
+    """Recognises a HELLO. ``baud``: the speed at which it listens, suggested as a parameter."""
 
     def __init__(self, baud: int) -> None:
         self.promising = False

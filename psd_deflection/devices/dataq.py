@@ -1,8 +1,8 @@
 """DATAQ DI-1110, DI-2108 and DI-4108 in CDC mode: converters with a command line, no framing.
 
-What is lost against our own frames, and said in ``describe``: the device numbers no samples and
-tells no time. A torn scan is found by the marker channel (``protocol.dataq``) and counted; the loss
-of whole scans cannot be seen. Times are the count of scans, regressed on the host's clock.
+Limits compared with our own frames, which ``describe`` reports too: the device neither numbers its samples
+nor sends times. A torn scan is detected by the marker channel (``protocol.dataq``) and counted; the loss of
+whole scans cannot be detected. Times are scan counts regressed on the host's clock.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ if TYPE_CHECKING:
 BAUD = 115_200
 REPLY_S = 0.5
 STOP_S = 2.5
-"""``stop`` and ``encode`` hold some models up for a second."""
+"""Some models need a second for ``stop`` and ``encode``."""
 
 TRIAL_SCANS = (250, 250, 500, 1000)
-"""Scans over which the rate is measured before the first sample is given; the next where the one before
-does not agree with what was set: a busy host may have been late to read."""
+"""Numbers of scans over which the rate is measured before the first sample. If a measurement disagrees with the
+set rate, the next number is tried: a busy host may have read late."""
 
 TRIAL_TOLERANCE = 0.1
 RAILS = (-32768, 32767)
@@ -77,7 +77,7 @@ class Dataq(PortSource):
         self._measured = 0.0
 
     def open(self, timeout: float) -> HelloFrame:
-        """Stop whatever runs, identify the device, lay out the scan, and measure what rate it does."""
+        """Stop a running scan, identify the device, set up the scan list, and measure the actual rate."""
         self._port = SerialPort(self.name, BAUD)
         try:
             return self._configure(timeout)
@@ -119,7 +119,7 @@ class Dataq(PortSource):
         )
 
     def _settle_rate(self, model: Model) -> None:
-        """Set the rate, and see that it is done; some devices take the number as conversions a second."""
+        """Set the rate and verify it; some devices take the number as conversions a second."""
         per_channel = False
         self._set_rate(model, per_channel)
         for scans in TRIAL_SCANS:
@@ -147,7 +147,7 @@ class Dataq(PortSource):
         self._must(f'srate {rate.srate}', REPLY_S)
 
     def _trial(self, scans: int) -> float:
-        """Scans a second as they come, by arrival over so many; the device is stopped again."""
+        """Measure scans per second from the arrival of so many scans; stop the device afterwards."""
         port = self._opened()
         port.discard_input()
         port.write(command('reset 1') + command('start'))
@@ -162,7 +162,7 @@ class Dataq(PortSource):
             last = time.monotonic_ns()
             received += len(piece)
             if first == 0:
-                # The clock starts with the end of the first piece, which may have waited.
+                # Time runs from the end of the first piece, which may have been buffered.
                 first, counted_from = last, received
         self._ask('stop', STOP_S)
         return (received - counted_from) / STRIDE / ((last - first) * 1e-9) if last > first else 0.0
@@ -186,7 +186,7 @@ class Dataq(PortSource):
             raise DeviceError(f'{self.name}: the DI-{self._model} did not confirm {text!r}; unplug it and try again')
 
     def start(self) -> None:
-        """Start scanning; scans are numbered from 0. ``start`` is not echoed: all that follows is scans."""
+        """Start scanning; scans are numbered from 0. ``start`` is not echoed: only scans follow."""
         port = self._opened()
         self._must('reset 1', REPLY_S)
         port.discard_input()
@@ -194,7 +194,7 @@ class Dataq(PortSource):
         port.write(command('start'))
 
     def read(self, timeout: float) -> Received:
-        """The scans that have come."""
+        """Return the scans that have arrived."""
         received = self._opened().read(timeout)
         now = time.monotonic_ns()
         events: list[Event] = []
@@ -211,13 +211,13 @@ class Dataq(PortSource):
         return Received(events, now, len(received))
 
     def reopen(self) -> HelloFrame | None:
-        """Configure it anew: a DATAQ device forgets its scan list when it is unplugged."""
+        """Configure the device again: it forgets its scan list when it is unplugged."""
         hello = self.open(REPLY_S)
         self.start()
         return hello
 
     def wake(self) -> None:
-        """Silence means that it was stopped or has forgotten its scan list: it is to be configured anew."""
+        """Raise PortClosedError: a silent device was stopped or forgot its scan list and must be configured again."""
         raise PortClosedError(f'{self.name}: no scans come')
 
     def close(self) -> None:
@@ -228,7 +228,7 @@ class Dataq(PortSource):
         super().close()
 
     def describe(self) -> Mapping[str, str]:
-        """Model, rates set and measured, and what cannot be seen."""
+        """Model, set and measured rates, and the losses that cannot be detected."""
         return {
             'source': f'DATAQ DI-{self._model or "?"} on {self.name}',
             'scan rate set (1/s)': f'{self._rate.hz:.3f}',
@@ -243,10 +243,10 @@ def _measures(model: Model) -> bool:
 
 
 class SimulatedDataq:
-    """A DI-2108 or like one. ``per_channel``: takes srate as conversions a second, as some do.
+    """A DI-2108 or a similar model. ``per_channel``: takes srate as conversions a second, as some models do.
 
     It sends nothing before ``start``, echoes commands while it does not scan, and does not echo
-    ``start``. Inputs past the sixth read zero.
+    ``start``. Inputs after the sixth read zero.
     """
 
     def __init__(
@@ -270,7 +270,7 @@ class SimulatedDataq:
         self._line = b''
 
     def greeting(self) -> bytes:
-        """Nothing: it speaks when it is spoken to."""
+        """Nothing: the device only answers commands."""
         return b''
 
     def due_in_ns(self, since_power_up_ns: int) -> int:
@@ -318,7 +318,7 @@ class SimulatedDataq:
         return b'' if scanning or not text else answer.encode('ascii', 'replace') + b'\r\x00'
 
     def take(self, since_power_up_ns: int, room: int = OUTPUT_LIMIT) -> bytes:
-        """The scans that are due. With no room left they are lost, unsaid: that is how these devices are."""
+        """The scans that are due. If no room is left they are lost without a report, as on the real devices."""
         out = bytearray()
         while self._scanning and self.due_in_ns(since_power_up_ns) <= 0:
             row = self._feed.next()
@@ -331,7 +331,7 @@ class SimulatedDataq:
 
 
 class DataqEar:
-    """Hears the replies to ``info 0`` and ``info 1``."""
+    """Recognises the replies to ``info 0`` and ``info 1``."""
 
     promising = False
 
@@ -359,6 +359,6 @@ DEVICE = Device(
     'a DATAQ DI-1110, DI-2108 or DI-4108',
     Dataq,
     _simulate,
-    # The carriage return ends what the converter took for the beginning of a command.
+    # The carriage return ends bytes that the converter took for the start of a command.
     Probe(DataqEar, b'\r' + command('info 0') + command('info 1')),
 )

@@ -1,8 +1,8 @@
-"""What a device declares of itself: how it is made, simulated and recognised on a port.
+"""The declaration of a device: how it is made, simulated and recognised on a port.
 
 A device is one file with its :class:`~psd_deflection.devices.source.Source`, its simulated twin and a
 ``DEVICE``, and one line in ``registry``. Everything that lists devices reads the declarations: ``source:``,
-``simulate --serve --device``, the rig that starts where no port is named, ``psd-deflection devices``.
+``simulate --serve --device``, the rig that starts if no port is named, ``psd-deflection devices``.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ if TYPE_CHECKING:
     from psd_deflection.devices.source import Source
 
 OUTPUT_LIMIT = 4096
-"""Bytes that a simulated device keeps for a host that does not read: about 0.12 s of our own frames."""
+"""Bytes that a simulated device buffers for a host that does not read: about 0.12 s of our own frames."""
 
 
 class LineDevice(Protocol):
-    """A simulated device without its line and clock; times are host nanoseconds since power-up."""
+    """A simulated device without a serial line or a clock of its own; times are host nanoseconds since power-up."""
 
     def greeting(self) -> bytes:
-        """What it sends when someone opens its port."""
+        """Bytes sent when a host opens the port."""
 
     def due_in_ns(self, since_power_up_ns: int) -> int:
-        """Time until it has something to send; 0 or less: it has something now."""
+        """Time until the next bytes are due, ns; 0 or less: they are due now."""
 
     def receive(self, received: bytes, since_power_up_ns: int) -> bytes:
-        """Replies to what the host sent."""
+        """Replies to the host's bytes."""
 
     def take(self, since_power_up_ns: int, room: int = OUTPUT_LIMIT) -> bytes:
-        """What is due, at most about ``room`` bytes."""
+        """Bytes that are due, at most about ``room``."""
 
 
 class PowerUp(NamedTuple):
     """How a simulated device starts. ``skew_ppm``: its clock is too fast by this much, 1e-6.
 
-    ``first_seq``: its first sample number, for a device that has run for long. A device without a
-    clock or without numbers has no use for them.
+    ``first_seq``: its first sample number, to simulate a device that has run for a long time. A device
+    without a clock or without sample numbers ignores them.
     """
 
     skew_ppm: float = 0.0
@@ -50,9 +50,9 @@ class PowerUp(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What a device on a port said of itself.
+    """A device's answer to a probe.
 
-    ``text``: for a person. ``parameters``: those that fit it, besides ``source`` and ``port``.
+    ``text``: for people. ``parameters``: values that fit the device, besides ``source`` and ``port``.
     ``usable``: False for a model that cannot measure; ``text`` says why.
     """
 
@@ -62,7 +62,7 @@ class Answer(NamedTuple):
 
 
 class Ear(Protocol):
-    """Listens on one port in one device's language. ``promising``: samples of the device have come."""
+    """Listens on one port for one device's protocol. ``promising``: samples of the device have come."""
 
     promising: bool
 
@@ -72,11 +72,11 @@ class Ear(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """How ``psd-deflection devices`` recognises a device. Nothing may be started, stopped or set by it.
+    """How ``psd-deflection devices`` recognises a device. A probe must not start, stop or set anything.
 
-    ``listen``: makes an :class:`Ear`, given the line speed. ``question``: what the device answers to,
-    empty if it speaks unasked. ``baud``: the speed that the device may need instead of 115200.
-    ``first``: it must be asked before the others, since it is lost once it was asked in another language.
+    ``listen``: makes an :class:`Ear`, given the line speed. ``question``: bytes that the device answers,
+    empty if it sends unasked. ``baud``: the speed that the device may need instead of 115200.
+    ``first``: it must be asked before the others, because a question in another protocol confuses it.
     ``ports``: how many ports make one device; ``together``: the parameters that such a set needs in addition.
     """
 
@@ -90,10 +90,10 @@ class Probe:
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """One kind of device. ``name``: for ``source:``. ``help``: what it is, in a few words.
+    """One kind of device. ``name``: its name for ``source:``. ``help``: a short description.
 
-    ``make``: its source, not yet opened, from a rig; raises ConfigError if the rig does not suit it.
-    ``simulate``: its twins, one a port, that show the rig of the feed; None if it cannot be simulated.
+    ``make``: makes its source, not yet opened, from a rig; raises ConfigError if the rig does not suit it.
+    ``simulate``: makes its twins, one per port, that measure the rig of the feed; None if it cannot be simulated.
     ``probe``: None if it cannot be recognised on a port.
     """
 
@@ -105,7 +105,7 @@ class Device:
 
 
 def converter_parameters(info: Mapping[str, object]) -> dict[str, object]:
-    """The ``converter.*`` parameters that a device's description ``info`` gives; what it does not say is left out."""
+    """The ``converter.*`` parameters that a device's description ``info`` contains."""
     out: dict[str, object] = {}
     rate, volts = positive(info.get('sample_rate_hz')), positive(info.get('volts_per_count'))
     if rate is not None:

@@ -1,8 +1,7 @@
-"""Which ports a device may be on: ttyACM0 becomes ttyACM1 when a cable is pulled and put back.
+"""Finds the ports where a device may be: ttyACM0 may become ttyACM1 when a cable is unplugged and plugged in again.
 
-``port`` may be a pattern (``/dev/ttyACM*``); otherwise, beside the port that was named, every USB
-serial port of the machine is a candidate. A device is known again by the serial number that it says
-itself, never by the port's name.
+``port`` may be a pattern (``/dev/ttyACM*``). Otherwise every USB serial port of the machine is a candidate,
+besides the named port. A device is recognised by the serial number that it reports, never by the port's name.
 """
 
 from __future__ import annotations
@@ -15,17 +14,17 @@ MAX_PORTS = 64
 
 
 def is_pattern(port: str) -> bool:
-    """Whether ``port`` may stand for several."""
+    """Whether ``port`` is a pattern, which may match several ports."""
     return glob.has_magic(port)
 
 
 def matching(pattern: str) -> list[str]:
-    """The ports that a pattern stands for now."""
+    """The ports that match the pattern now."""
     return sorted(glob.glob(pattern))[:MAX_PORTS]  # noqa: PTH207 - the pattern is a whole path
 
 
 def candidates(port: str, wanted_serial: str) -> list[str]:
-    """Other ports on which the device may have come back, the likeliest first.
+    """Other ports where the device may have come back, the likeliest first.
 
     A port whose USB descriptor has ``wanted_serial`` goes first.
     """

@@ -1,4 +1,4 @@
-"""What every source on one serial port does alike: refuse to work before it is open, give up, close."""
+"""Common base of the sources on one serial port: give up, close, and refuse use before the port is open."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class PortSource(Source):
         return self._port
 
     def give_up(self) -> None:
-        """Wait for the device no longer."""
+        """Stop waiting for the device."""
         # Another thread may close it meanwhile.
         port = self._port
         if port is not None:

@@ -1,4 +1,4 @@
-"""A port that pyserial can open and that a program of ours answers on."""
+"""A pseudo-terminal: a port that pyserial can open, with one of our programs at the other end."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from psd_deflection.errors import ConfigError
 
 PORT_LINE = 'port: '
-"""How a program that serves a simulated device begins the line that names its port."""
+"""Start of the line in which a program that serves a simulated device prints its port."""
 
 
 class PseudoTerminal:
@@ -24,7 +24,7 @@ class PseudoTerminal:
         self.master, slave = os.openpty()
         tty.setraw(slave)
         self.name = os.ttyname(slave)
-        # Only once it was opened and closed does the kernel report that no one has it open.
+        # The kernel reports that no one has it open only after it was opened and closed once.
         os.close(slave)
         os.set_blocking(self.master, False)
         self._link = Path(link) if link is not None else None
@@ -38,7 +38,7 @@ class PseudoTerminal:
                 raise ConfigError(f'{self._link}: no link can be made there ({error.strerror})') from None
 
     def close(self) -> None:
-        """Take the port away, as a pulled cable does."""
+        """Remove the port, as if the cable were unplugged."""
         os.close(self.master)
         # The link may already belong to another process: delete only our own.
         if self._link is not None and self._link.is_symlink() and str(self._link.readlink()) == self.name:
@@ -54,7 +54,7 @@ def link_names(link: str | None, count: int) -> list[str | None]:
 
 @contextlib.contextmanager
 def open_terminals(links: list[str | None]) -> Iterator[list[PseudoTerminal]]:
-    """One port a link, None for one without; closed at the end. Raises ConfigError as :class:`PseudoTerminal`."""
+    """One port per link (None: no link), closed at the end. Raises ConfigError like :class:`PseudoTerminal`."""
     with contextlib.ExitStack() as stack:
         ports: list[PseudoTerminal] = []
         for link in links:

@@ -1,4 +1,4 @@
-"""Names to devices: what ``source:`` of a rig file may say, plug-ins of other packages included.
+"""Maps the names that ``source:`` of a rig file may have to devices, including plug-ins of other packages.
 
 A plug-in declares an entry point of the group ``psd_deflection.sources``. Its object is a
 :class:`~psd_deflection.devices.device.Device`, or only a class derived from
@@ -32,7 +32,7 @@ DEVICES: MappingProxyType[str, str] = MappingProxyType(
         'replay': 'psd_deflection.devices.replay',
     }
 )
-"""Name to the module with its ``DEVICE``, the default first; a module is imported when its device is asked for."""
+"""Name to the module with its ``DEVICE``, the default first; a module is imported when its device is needed."""
 
 
 def find_device(name: str) -> Device:
@@ -50,7 +50,7 @@ def find_device(name: str) -> Device:
     try:
         found: object = points[0].load()
     except Exception as error:
-        # Whatever a stranger's module raises on import, the user needs its name and its cause.
+        # A plug-in may raise anything on import; the user needs its name and the cause.
         raise ConfigError(f'source = {name!r}: {points[0].value} cannot be loaded ({error!r})') from error
     if isinstance(found, type) and issubclass(found, Source):
         return Device(name, f'plug-in {points[0].value}', found)
@@ -72,12 +72,12 @@ def make_source(rig: Rig) -> Source:
 
 
 def source_names() -> list[str]:
-    """Ours, then those of plug-ins."""
+    """Names of our devices, then of those of plug-ins."""
     return [*DEVICES, *sorted(e.name for e in entry_points(group=GROUP) if e.name not in DEVICES)]
 
 
 def known_devices() -> tuple[list[Device], list[str]]:
-    """Every device, and why plug-ins are missing among them that cannot be loaded."""
+    """Every device, and the errors of plug-ins that cannot be loaded."""
     devices: list[Device] = []
     refusals: list[str] = []
     for name in source_names():
@@ -89,7 +89,7 @@ def known_devices() -> tuple[list[Device], list[str]]:
 
 
 class SimulatedNames:
-    """The names of the devices that can be simulated, as a container; a module is imported when it is looked at."""
+    """The names of the devices that can be simulated, as a container; a module is imported at the first look-up."""
 
     def __contains__(self, name: object) -> bool:
         try:

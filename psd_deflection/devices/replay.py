@@ -1,8 +1,8 @@
 """A recording as a device, in real time: ``source: replay`` with ``port`` naming a bag, .mcap or CSV.
 
-The node, its subscribers and a new parameter file can so be tried on what was measured. Samples
-keep their numbers, so a loss in the recording is a loss here. ``replay.stamps`` says what their times
-are: ``now`` (the recording's rhythm from the moment of starting) or ``recorded``.
+It lets you try the node, its subscribers and a new parameter file on measured data. Samples keep their
+numbers, so a loss in the recording is a loss here. ``replay.stamps`` sets their times: ``now`` (the
+recorded intervals, from the moment of starting) or ``recorded``.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import CHANNELS, SampleBlock
 
 RATE_TOLERANCE = 2e-3
-"""A recorded rate comes from stamps and is not round; nearer than this it is the rig's."""
+"""A recorded rate comes from stamps and is not round. If it differs by less than this, the rig's rate is used."""
 
 
 class Pacer:
-    """When things recorded at some time are due. ``now_ns`` and ``wait`` (s) can be a test's own."""
+    """Computes when recorded things are due. A test can pass its own ``now_ns`` and ``wait`` (s)."""
 
     def __init__(self, now_ns: Callable[[], int], wait: Callable[[float], object]) -> None:
         self._now_ns = now_ns
@@ -34,7 +34,7 @@ class Pacer:
         self._shift_ns: int | None = None
 
     def until(self, recorded_ns: int, timeout: float) -> bool:
-        """Wait until ``recorded_ns`` is due, at most ``timeout`` s; whether it is. The first starts the clock."""
+        """Wait until ``recorded_ns`` is due, at most ``timeout`` s; whether it is. The first call starts the clock."""
         if self._shift_ns is None:
             self._shift_ns = self._now_ns() - recorded_ns
         wait = (recorded_ns + self._shift_ns - self._now_ns()) * 1e-9
@@ -43,7 +43,7 @@ class Pacer:
         return wait <= timeout
 
     def host_ns(self, recorded_ns: int) -> int:
-        """When something recorded at that time is, or was, due."""
+        """Time at which something recorded at ``recorded_ns`` is or was due, ns."""
         return recorded_ns + (self._shift_ns or 0)
 
 
@@ -73,7 +73,7 @@ class Replay(Source):
             rate = recording.sample_rate_hz
         except RecordingError as error:
             raise DeviceError(str(error)) from None
-        # Stamps carry the clock's own skew: what is near the rig's rate is the rig's rate.
+        # Stamps include the clock's skew: a rate close to the rig's rate is the rig's rate.
         rate = self._rate if abs(rate - self._rate) < RATE_TOLERANCE * self._rate else rate
         self._recording = recording
         info = dict(recording.hello or {})
@@ -117,12 +117,12 @@ class Replay(Source):
         return Received(events, time.monotonic_ns(), max(1, block.volts.nbytes))
 
     def close(self) -> None:
-        """Nothing is held; a read that waits comes back."""
+        """End a read that waits; there is nothing else to close."""
         self._closed.set()
         self._blocks, self._next = iter(()), None
 
     def describe(self) -> Mapping[str, str]:
-        """Which recording, and whose times."""
+        """The recording, and the origin of its times."""
         return {
             'source': f'replay of {self.name}',
             'sample numbers': 'as recorded',

@@ -1,4 +1,4 @@
-"""The simulated rig's converter readings one by one, for every device that is simulated."""
+"""The simulated rig's converter readings one by one, for all simulated devices."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ LoadSource = Callable[[int, int], FloatArray]
 
 
 class RigFeed:
-    """One row of counts a sample period; made in batches, which the simulation is quick at.
+    """Gives one row of counts per sample period; computed in batches, which is faster.
 
     ``taken``: rows given so far. ``dark``: (PSD 1 or 2, first, end) of the samples without laser light,
-    for demonstrations and golden recordings. ``poses``: a list to which the true poses (n, 3) of each
-    batch are added, if there is one.
+    for demonstrations and golden recordings. ``poses``: a list that gets the true poses (n, 3) of each
+    batch, or None.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class RigFeed:
         return row
 
     def at(self, number: int) -> list[int]:
-        """Sample ``number``, not before the last one asked for: what a device that is polled sees."""
+        """Sample ``number``, for devices that are polled. Numbers must not decrease from call to call."""
         while self.taken <= number:
             self.next()
         return self._row
@@ -59,7 +59,7 @@ class RigFeed:
         for psd, start, stop in self._dark:
             off = (numbers >= start) & (numbers < stop)
             columns = slice(0, 3) if psd == 1 else slice(3, 6)
-            # Without light the divider has nothing to divide: only the noise is left.
+            # Without light the quotient is undefined: only noise is left.
             counts[off, columns] = counts[off, columns] % 13 - 6
         if self.poses is not None:
             self.poses.append(chunk.pose)

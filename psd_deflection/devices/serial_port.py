@@ -21,14 +21,14 @@ from psd_deflection.errors import DeviceError
 
 READ_SIZE = 4096
 MAX_EMPTY_READS = 1000
-"""Reads in a row without a byte, though there was one to read, after which a port counts as gone."""
+"""After this many reads in a row that are ready but return no byte, the port counts as gone."""
 
 SLICE_S = 0.1
-"""A read waits no longer at a time, so that whoever gives the port up is heard."""
+"""Longest single wait of a read, so that ``give_up`` takes effect soon."""
 
 
 class SerialPort:
-    """An open port. ``name`` as given; raises DeviceError naming it where it cannot be had."""
+    """An open port. ``name``: as given. Raises DeviceError with the name if it cannot be opened."""
 
     def __init__(self, name: str, baud: int, rtscts: bool = False) -> None:
         self.name = name
@@ -42,15 +42,15 @@ class SerialPort:
         self._fd = self._serial.fileno()
         self._empty_reads = 0
         if sys.platform == 'linux':
-            # Only some drivers have a latency timer to shorten; of the others pyserial makes a ValueError.
+            # Only some drivers have a latency timer to shorten; for the others pyserial raises ValueError.
             with contextlib.suppress(ValueError):
                 self._serial.set_low_latency_mode(True)
         self.discard_input()
 
     def read(self, timeout: float) -> bytes:
-        """What has come, at most 4096 bytes; empty after ``timeout`` s, or 0.1 s where that is less.
+        """Return the bytes that have arrived, at most 4096; empty after ``timeout`` s, but at most 0.1 s.
 
-        PortClosedError if it is gone, or given up.
+        Raises PortClosedError if the port is gone or was given up.
         """
         if self._given_up:
             raise PortClosedError(f'{self.name}: given up')
@@ -70,7 +70,7 @@ class SerialPort:
         return received
 
     def _is_gone(self) -> bool:
-        """A read that was promised bytes has none: hung up, or another program took them."""
+        """A read that was ready returned no bytes: the line hung up, or another program took them."""
         self._empty_reads += 1
         poll = select.poll()
         poll.register(self._fd, select.POLLIN)
@@ -78,7 +78,7 @@ class SerialPort:
         return hung_up or self._empty_reads > MAX_EMPTY_READS
 
     def give_up(self) -> None:
-        """Whoever waits for this port waits no longer; any thread may say so."""
+        """End every wait for this port. Any thread may call it."""
         self._given_up = True
 
     def fileno(self) -> int:
@@ -86,8 +86,8 @@ class SerialPort:
         return self._fd
 
     def discard_input(self) -> None:
-        """Forget what has come and was not read: it is older than it would look."""
-        # A terminal that is gone refuses with termios' own error, which is no OSError.
+        """Discard unread bytes: they are older than their time of reading."""
+        # A terminal that is gone raises termios.error, which is not an OSError.
         with contextlib.suppress(OSError, termios.error, serial.SerialException):
             self._serial.reset_input_buffer()
 

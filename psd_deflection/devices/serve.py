@@ -1,8 +1,8 @@
 """Serves a simulated device on pseudo-terminals, in real time.
 
-Like a USB device it sends nothing while no one has its port open. ``python -m psd_deflection.devices.serve``
-is the process that a daemon starts when no port is named: it reads the parameters as a line of JSON, prints
-its ports, and ends when its standard input does.
+Like a USB device it sends nothing while no one has its port open. A daemon starts
+``python -m psd_deflection.devices.serve`` if no port is named: this process reads the parameters as a line of
+JSON, prints its ports, and ends when its standard input closes.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ CATCH_UP_NS = 20_000_000
 
 DWELL_S = 4.0
 FIRST_LOAD_S = 1.0
-"""Unloaded after power-up, s: long enough for a zero, short enough that whoever looks on sees it move at once."""
+"""Time without load after power-up, s: long enough for a zero, short enough that the user soon sees it move."""
 
 
 def served_loads(rate: float) -> CyclicLoads:
-    """The thesis's load cases over and over; the first, unloaded, ends ``FIRST_LOAD_S`` after power-up."""
+    """The thesis's load cases, repeated; the first, unloaded, ends ``FIRST_LOAD_S`` after power-up."""
     return CyclicLoads(thesis_load_cases(DWELL_S, rate), start=round((DWELL_S - FIRST_LOAD_S) * rate))
 
 
 def simulated_devices(name: str, rig: Rig, seed: int = 0, power_up: PowerUp | None = None) -> Sequence[LineDevice]:
-    """The twins of the device ``name``, one a port, that show ``rig`` under :func:`served_loads`.
+    """The twins of the device ``name``, one per port, that measure ``rig`` under :func:`served_loads`.
 
     Raises ConfigError if there is no such device, or it cannot be simulated.
     """
@@ -64,7 +64,7 @@ def serve(device: LineDevice, port: PseudoTerminal, stopped: Callable[[], bool])
         if mask & select.POLLHUP:
             listening, pending = False, b''
             device.take(now, room=1 << 30)
-            # A hung-up line is always "ready": wait for the next sample by the clock instead.
+            # A closed line is always "ready": wait for the next sample by the clock instead.
             time.sleep(1e-3)
             continue
         if not listening:
@@ -76,8 +76,8 @@ def serve(device: LineDevice, port: PseudoTerminal, stopped: Callable[[], bool])
             until = now + min(device.due_in_ns(now), 0)
             caught_up = False
             while not caught_up:
-                # A device is never late; this process may be, on a busy machine. What fell due
-                # meanwhile is sent piece by piece: only a host that does not read makes it drop.
+                # Unlike a device, this process may be late on a busy machine. Then the overdue samples
+                # are sent piece by piece: they are dropped only if the host does not read.
                 until = min(until + CATCH_UP_NS, now)
                 caught_up = until == now
                 pending += device.take(until, room=OUTPUT_LIMIT - len(pending))
@@ -91,7 +91,7 @@ def serve(device: LineDevice, port: PseudoTerminal, stopped: Callable[[], bool])
 
 
 def serve_all(devices: Sequence[LineDevice], ports: Sequence[PseudoTerminal], stopped: Callable[[], bool]) -> None:
-    """Serve each on its port until ``stopped()``, the first in this thread."""
+    """Serve each device on its port until ``stopped()``, the first one in this thread."""
     others = [
         threading.Thread(target=serve, args=(device, port, stopped), name=port.name, daemon=True)
         for device, port in zip(devices[1:], ports[1:], strict=True)
@@ -104,7 +104,7 @@ def serve_all(devices: Sequence[LineDevice], ports: Sequence[PseudoTerminal], st
 
 
 def stopped_by_signals() -> threading.Event:
-    """Set by SIGINT and SIGTERM from now on."""
+    """An event that SIGINT and SIGTERM set from now on."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -112,10 +112,10 @@ def stopped_by_signals() -> threading.Event:
 
 
 def main() -> int:
-    """Serve what the daemon on standard input asks for, until that ends; the exit status."""
+    """Serve the rig that the daemon describes on standard input, until that closes; return the exit status."""
     line = sys.stdin.buffer.readline()
     if not line:
-        # The daemon that started us early has gone before it came to us.
+        # The daemon that started us ended before it sent parameters.
         return 0
     stop = stopped_by_signals()
 

@@ -1,12 +1,12 @@
-"""What the reader thread needs from a device, whatever it speaks.
+"""What the reader thread needs from a device, for any protocol.
 
-A source turns its device's bytes into events with sample numbers and times; the reader does the
-rest alike for all (numbers past 32 bits, blocks, host times, queue, waiting for a device to come
-back). What a device does not tell is not made up: :attr:`Source.clock` and :attr:`Source.numbered`
-say what its numbers and times are worth.
+A source turns its device's bytes into events with sample numbers and times. The reader does the rest, in
+the same way for all sources: numbers beyond 32 bits, blocks, host times, the queue, and reopening a device.
+A source invents nothing that its device does not send: :attr:`Source.clock` and :attr:`Source.numbered`
+tell where its times and numbers come from.
 
-One source's life: made from the rig; ``open`` (the device is heard out and made ready), ``start``
-(samples flow), ``read`` again and again, ``close``. When ``read`` says that the device is gone, the
+The life of a source: made from the rig; ``open`` (waits for the device's HELLO and prepares it), ``start``
+(samples flow), ``read`` repeatedly, ``close``. When ``read`` reports that the device is gone, the
 reader closes it and calls ``reopen`` until it succeeds, with a pause of 0.2 s before each try. ``open``,
 ``start``, ``read``, ``ping`` and ``reopen`` are called by one thread at a time; ``describe`` and ``give_up``
 by any.
@@ -24,29 +24,29 @@ from psd_deflection.protocol.frames import BadFrame, Frame, HelloFrame
 
 
 class Clock(Enum):
-    """What the time of a sample is."""
+    """The kind of time that a sample carries."""
 
     DEVICE = 'device'
     """Microseconds of a clock in the device. Host time comes by regression (``timing``)."""
 
     COUNTED = 'counted'
-    """The sample's number times the nominal period, in microseconds: the device has no clock that it
-    tells. The regression finds its true rate; a sample lost unseen shifts all later times by one
-    period until the regression has followed."""
+    """The sample's number times the nominal period, in microseconds: the device sends no time. The
+    regression finds its true rate; an undetected lost sample shifts all later times by one period until
+    the regression has adapted."""
 
     HOST = 'host'
-    """Nanoseconds of CLOCK_MONOTONIC, taken by the host: a device that answers when it is asked."""
+    """Nanoseconds of CLOCK_MONOTONIC, read by the host when it polls the device."""
 
     RECORDED = 'recorded'
-    """Nanoseconds of ROS time, as they were recorded."""
+    """Nanoseconds of ROS time, as recorded."""
 
 
 class Sample(NamedTuple):
-    """One sample of a source that does not speak the contract's frames.
+    """One sample of a source that does not speak the frames of ``docs/protocol.md``.
 
     ``flags``, ``seq``: as in ``protocol.frames.SampleFrame``. ``t``: in the unit of the source's
-    :class:`Clock`. ``readings``: x1 y1 sum1 x2 y2 sum2, converter counts (whole, -32768 to 32767)
-    or volts if :attr:`Source.volts` says so.
+    :class:`Clock`. ``readings``: x1 y1 sum1 x2 y2 sum2; volts if :attr:`Source.volts` is True, else
+    converter counts (whole, -32768 to 32767).
     """
 
     flags: int
@@ -77,16 +77,16 @@ class PortClosedError(DeviceError):
 
 
 class SourceEndedError(Exception):
-    """There is nothing more to read, and nothing went wrong: a recording is at its end."""
+    """The source ended without an error: a recording is at its end."""
 
 
 class Source(abc.ABC):
     """One device. Made with the rig (``Source(rig)``); raises ConfigError if the rig does not suit it.
 
-    ``name``: its port or file, for messages. ``clock``: what a sample's time is. ``numbered``: whether
-    the device numbers its samples, so that a loss on the way is seen; if it does not, the source
-    numbers what came, and starts from 0 after each ``open``. ``volts``: whether readings are volts; if not,
-    they are converter counts, whatever the device says. It holds from ``open`` on.
+    ``name``: its port or file, for messages. ``clock``: the kind of a sample's time. ``numbered``: whether
+    the device numbers its samples, so that losses on the wire are detected. If it does not, the source
+    numbers the samples that came, from 0 after each ``open``. ``volts``: whether readings are volts. If not,
+    they are converter counts, whatever the device says. It is valid once ``open`` has returned.
     """
 
     name: str
@@ -96,60 +96,61 @@ class Source(abc.ABC):
 
     @abc.abstractmethod
     def open(self, timeout: float) -> HelloFrame:
-        """Open the device and hear it out, for ``timeout`` s at most; what it says of itself.
+        """Open the device, wait for its description at most ``timeout`` s, and return it as a HELLO.
 
         The HELLO has ``serial``, ``firmware``, ``sample_rate_hz``, ``channels`` and
-        ``volts_per_count`` (a number, or None for samples in volts); the reader holds it against
-        the rig, and it is recorded. Raises DeviceError that names the way out; nothing is left open.
+        ``volts_per_count`` (a number, or None if :attr:`volts`). The reader compares it with the rig,
+        and it is recorded. Raises DeviceError that says what to do; then nothing is left open.
         """
 
     @abc.abstractmethod
     def start(self) -> None:
-        """Let samples flow from now on; what came before is forgotten. Raises DeviceError where it is gone."""
+        """Let samples flow from now on and discard older ones. Raises DeviceError if the device is gone."""
 
     @abc.abstractmethod
     def read(self, timeout: float) -> Received:
-        """What has come; no events after ``timeout`` s.
+        """Return what has arrived; no events after ``timeout`` s.
 
-        Garbage is a ``BadFrame``, never an exception. Raises PortClosedError where the device is
+        Malformed data is a ``BadFrame``, never an exception. Raises PortClosedError if the device is
         gone, SourceEndedError at the end of a recording.
         """
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Give the port back. May be called more than once, and on a device that is gone."""
+        """Close the port. May be called more than once, and if the device is gone."""
 
     def reopen(self) -> HelloFrame | None:
-        """Try to have a device back that went away; None where its HELLO comes later, as an event.
+        """Try to reopen a device that went away; None if its HELLO comes later, as an event.
 
-        Raises DeviceError where it is not back yet.
+        Raises DeviceError if it is not back yet.
         """
         hello = self.open(REOPEN_S)
         self.start()
         return hello
 
     def ping(self, cookie: int) -> bool:
-        """Ask the device for its time, to be answered by a PongFrame; False where it cannot be asked.
+        """Ask the device for its time; the answer is a PongFrame. False if the device has no such command.
 
-        Raises PortClosedError where it is gone.
+        Raises PortClosedError if it is gone.
         """
         del cookie
         return False
 
     def wake(self) -> None:  # noqa: B027 - most devices cannot be asked
-        """The device has been silent for long: ask it for samples once more. Raises PortClosedError."""
+        """Ask a device that has been silent for long to send samples again. Raises PortClosedError."""
 
     def give_up(self) -> None:  # noqa: B027 - a source that never waits long has nothing to do
-        """Called again and again, by another thread, while the run ends: let ``open``, ``reopen`` or ``read``
-        that waits for a device come back, with DeviceError. One that does not is left behind."""
+        """Make an ``open``, ``reopen`` or ``read`` that waits for the device return, with DeviceError.
+
+        Another thread calls it repeatedly while the run ends; a reader that still hangs is abandoned."""
 
     @abc.abstractmethod
     def describe(self) -> Mapping[str, str]:
-        """What it is and how it does, name to text, for the log and for diagnostics."""
+        """Description and state, name to text, for the log and for diagnostics."""
 
 
 REOPEN_S = 0.5
-"""How long a device that came back is heard out."""
+"""How long to wait for the HELLO of a device that came back, s."""
 
 __all__ = [
     'BadFrame',

@@ -1,8 +1,7 @@
-"""Which port has what on it: asks politely in the language of every device that has a probe, and listens.
+"""Finds which device is on which port: sends the question of every device that has a probe, and listens.
 
-Nothing is started, stopped or set: only questions are asked that each of these devices answers from
-where it stands (an Arduino starts anew all the same, whenever its port is opened). A port that another
-program has open is left alone.
+Nothing is started, stopped or set: the devices answer these questions in any state. (An Arduino restarts
+anyway, because opening its port resets it.) A port that another program has open is left alone.
 """
 
 from __future__ import annotations
@@ -25,17 +24,17 @@ ANSWER_S = 0.4
 ONCE_A_SECOND_S = 1.3
 """HELLO and the description of text lines come once a second."""
 BOOT_S = 3.5
-"""An Arduino starts anew when its port is opened."""
+"""An Arduino restarts when its port is opened."""
 
 BY_ID = Path('/dev/serial/by-id')
 
 
 @dataclass(slots=True)
 class Port:
-    """A port. ``source``: the name for ``source:``, '' if nothing that we know answers.
+    """A port. ``source``: the name for ``source:``, '' if no known device answers.
 
-    ``answer``: what answered, or why nothing could. ``suggested``: parameters for it.
-    ``asked``: False where the port is missing, in use or cannot be opened.
+    ``answer``: the device that answered, or why none could. ``suggested``: parameters for it.
+    ``asked``: False if the port is missing, in use or cannot be opened.
     """
 
     port: str
@@ -48,7 +47,7 @@ class Port:
 
 
 class _Ears:
-    """Hears every language at once on ``port``; the first answer that makes sense is taken."""
+    """Listens for all protocols at once on ``port``; takes the first valid answer."""
 
     def __init__(self, port: Port, baud: int, probes: Sequence[tuple[str, Probe]]) -> None:
         self.bytes = 0
@@ -58,11 +57,11 @@ class _Ears:
 
     @property
     def promising(self) -> bool:
-        """Whether samples of some device have come."""
+        """Whether samples of a known device have come."""
         return any(ear.promising for _, ear in self._ears)
 
     def hear(self, piece: bytes) -> bool:
-        """Whether it is known now what is there."""
+        """Whether the device is now known."""
         self.bytes += len(piece)
         for name, ear in self._ears:
             answer = ear.hear(piece)
@@ -80,7 +79,7 @@ class _Ears:
 
 
 def stable_name(port: str) -> str:
-    """The name of the port that stays when it is plugged in anew, where there is one."""
+    """A name of the port that does not change when the device is plugged in again; ``port`` if there is none."""
     try:
         return next((str(p) for p in sorted(BY_ID.iterdir()) if p.resolve() == Path(port).resolve()), port)
     except OSError:
@@ -88,20 +87,20 @@ def stable_name(port: str) -> str:
 
 
 def serial_ports() -> list[Port]:
-    """The machine's serial ports with something on them, as far as the system knows."""
+    """The machine's serial ports that have a device on them, as far as the system knows."""
     found = []
     for p in sorted(list_ports.comports(), key=lambda p: p.device):
         if p.hwid == 'n/a':
-            # The fixed ports of a PC's chip set, mostly without a plug.
+            # The built-in ports of a PC, mostly without a connector.
             continue
         found.append(Port(p.device, p.description or '', p.serial_number or ''))
     return found
 
 
 def identify(port: Port, devices: Sequence[Device]) -> Port:
-    """Fill in which of ``devices`` answers on it; takes up to about five seconds a line speed."""
+    """Fill in which of ``devices`` answers on ``port``; takes up to about five seconds per line speed."""
     probes = [(d.name, d.probe) for d in devices if d.probe is not None]
-    # Stable: among the others the order stays.
+    # A stable sort: the others keep their order.
     probes.sort(key=lambda named: not named[1].first)
     speeds = dict.fromkeys([COMMON_BAUD, *(probe.baud for _, probe in probes)])
     try:
@@ -109,7 +108,7 @@ def identify(port: Port, devices: Sequence[Device]) -> Port:
             ears = _ask(port, baud, probes)
             if ears.answered or ears.promising or not ears.bytes:
                 break
-            # Something talks, but not at this speed.
+            # A device sends, but not at this speed.
     except DeviceError as error:
         port.answer = str(error).removeprefix(f'{port.port}: ')
         port.asked = False
@@ -145,7 +144,10 @@ def _listen(line: SerialPort, ears: _Ears, seconds: float) -> bool:
 
 
 def survey(devices: Sequence[Device], names: Sequence[str] = ()) -> list[Port]:
-    """Every port with which of ``devices`` answers on it, or only those named (a pseudo-terminal is in no list)."""
+    """Every port, or only the named ones, with the one of ``devices`` that answers.
+
+    Pseudo-terminals must be named, since the system does not list them.
+    """
     ports = [Port(name) for name in names] or serial_ports()
     if not ports:
         return []
@@ -154,7 +156,7 @@ def survey(devices: Sequence[Device], names: Sequence[str] = ()) -> list[Port]:
 
 
 def suggestions(devices: Sequence[Device], ports: Sequence[Port]) -> list[dict[str, Any]]:
-    """One parameter set a device; ports of which several make one device are put together in their order."""
+    """One parameter set per device; if a device needs several ports, they are joined in order."""
     single = {d.name for d in devices if d.probe is not None and d.probe.ports == 1}
     out: list[dict[str, Any]] = [p.suggested for p in ports if p.source in single]
     for device in devices:

@@ -1,8 +1,8 @@
-"""Devices that send a line of text a sample (``protocol.text_lines``): a quick Arduino.
+"""Devices that send one line of text per sample (``protocol.text_lines``), such as an Arduino with a short sketch.
 
-They number their samples and tell their time, so losses are seen and times are the device's own.
-What is lost against our own frames: a line without a check takes a digit that the wire changed for
-true, the device cannot be asked anything, and 115200 baud carry about 250 lines a second.
+They number their samples and send their time, so losses are detected and times are the device's own.
+Limits compared with our own frames: without the checksum a corrupted digit goes unnoticed, the device accepts
+no commands, and 115200 baud carry about 250 lines a second.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from psd_deflection.devices.rig_feed import RigFeed
 
 BOOT_S = 4.0
-"""An Arduino starts anew when its port is opened, and its boot loader takes two seconds."""
+"""An Arduino restarts when its port is opened, and its boot loader takes two seconds."""
 
 
 class TextLines(PortSource):
@@ -77,13 +77,13 @@ class TextLines(PortSource):
         raise DeviceError(f'{self.name}: {why} (waited {timeout:g} s)')
 
     def start(self) -> None:
-        """Forget what came while the device was heard out."""
+        """Discard the lines that came before the description."""
         self._decoder = LineDecoder()
         if self._port is not None:
             self._port.discard_input()
 
     def read(self, timeout: float) -> Received:
-        """The lines that have come."""
+        """Return the lines that have arrived."""
         received = self._opened().read(timeout)
         now = time.monotonic_ns()
         events: list[Event] = []
@@ -145,7 +145,7 @@ class SimulatedLines:
         }
 
     def greeting(self) -> bytes:
-        """The end of whatever was half sent, and what it says of itself."""
+        """The end of a line that was sent in part, and the description."""
         return b'\n# ' + json.dumps(self._description).encode() + b'\n'
 
     def due_in_ns(self, since_power_up_ns: int) -> int:
@@ -157,7 +157,7 @@ class SimulatedLines:
         return b''
 
     def take(self, since_power_up_ns: int, room: int = OUTPUT_LIMIT) -> bytes:
-        """The lines that are due; with no room left they are lost, and the number shows it."""
+        """The lines that are due. If no room is left they are lost; the sample numbers show the gap."""
         out = bytearray()
         while self.due_in_ns(since_power_up_ns) <= 0:
             number = self._feed.taken
@@ -172,7 +172,7 @@ class SimulatedLines:
 
 
 class LinesEar:
-    """Hears a line that describes the device. ``baud``: the speed at which it listens, to be suggested."""
+    """Recognises a line that describes the device. ``baud``: the speed at which it listens, and which it suggests."""
 
     def __init__(self, baud: int) -> None:
         self.promising = False
@@ -180,7 +180,7 @@ class LinesEar:
         self._decoder = LineDecoder()
 
     def hear(self, piece: bytes) -> Answer | None:
-        """What the description says."""
+        """The device's answer from its description."""
         for item in self._decoder.feed(piece):
             if isinstance(item, Description) and 'sample_rate_hz' in item.info:
                 return Answer(

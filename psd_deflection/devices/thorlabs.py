@@ -1,11 +1,10 @@
-"""A pair of Thorlabs KPA101/TQD001 position aligners, one a PSD, each on a port of its own.
+"""A pair of Thorlabs KPA101/TQD001 position aligners, one per PSD, each on its own port.
 
-They answer when they are asked, about 2 ms later, so 1 kHz cannot be had: the source asks both at
-once in slots of ``converter.sample_rate_hz``, which has to be a rate that they can do (it is
-measured at the start, and a rate out of reach is refused with the one that is not). A slot in which
-no answer came, or for which the host was late, is a lost sample, and counted. A sample's time is
-half-way between asking and the answer, on the host's clock; the two devices are read within one
-answer time of each other, not at one instant. A sample whose time falls out of its slot is none.
+They answer a question after about 2 ms, so 1 kHz is out of reach. The source asks both at once, in time
+slots of ``converter.sample_rate_hz``. The reachable rate is measured at the start; a higher one is refused
+with the rate that can be reached. A slot without an answer, or for which the host was late, counts as a lost
+sample. A sample's time is half-way between question and answer, on the host's clock. The two devices are read
+within one answer time of each other, not at the same instant. A sample whose time is outside its slot is lost.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ IDLE_NS = 20_000_000
 
 
 class ThorlabsPair(Source):
-    """``source: thorlabs``; ``port`` names two ports with a comma between, PSD 1 first."""
+    """``source: thorlabs``; ``port`` names two ports separated by a comma, PSD 1 first."""
 
     clock = Clock.HOST
     volts = True
@@ -74,7 +73,7 @@ class ThorlabsPair(Source):
             )
         self._rate = rig.converter.sample_rate_hz
         self._period_ns = round(SECOND_NS / self._rate)
-        # Two drivers of other people found x to come with its sign turned; a parameter says it here.
+        # Two independent drivers found that x has the opposite sign; here a parameter sets it.
         self._x_sign = rig.acquisition.thorlabs_x_sign
         if abs(self._x_sign) != 1.0:
             raise ConfigError(f'thorlabs.x_sign = {self._x_sign:g}: must be 1 or -1')
@@ -88,7 +87,7 @@ class ThorlabsPair(Source):
         self._models = ('?', '?')
 
     def open(self, timeout: float) -> HelloFrame:
-        """Open both, ask who they are, and measure how many readings a second they give."""
+        """Open both, read their hardware info, and measure how many readings per second they give."""
         try:
             for name in self._names:
                 port = SerialPort(name, BAUD, rtscts=True)
@@ -144,7 +143,7 @@ class ThorlabsPair(Source):
         return good / ((time.monotonic_ns() - started) * 1e-9)
 
     def _ask(self, events: list[Event]) -> tuple[Readings | None, Readings | None, int, int]:
-        """Both readings, the instant half-way, and how many bytes came; what is none goes to ``events``."""
+        """Return both readings, the time half-way and the number of bytes; malformed data go to ``events``."""
         asked = time.monotonic_ns()
         for port, decoder in zip(self._ports, self._decoders, strict=True):
             port.discard_input()
@@ -169,12 +168,12 @@ class ThorlabsPair(Source):
         return found[0], found[1], (asked + now) // 2, size
 
     def start(self) -> None:
-        """The first slot begins now. After a reconnection the slots go on, so that the gap is seen."""
+        """Begin the first slot now. After a reconnection the slots continue, so that the gap is detected."""
         if self._origin_ns is None:
             self._origin_ns = time.monotonic_ns()
 
     def read(self, timeout: float) -> Received:
-        """Wait for the next slot, ask both, and give the sample of that slot."""
+        """Wait for the next slot, ask both devices, and return the sample of that slot."""
         origin = self._origin_ns or 0
         now = time.monotonic_ns()
         slot = max(self._slot + 1, (now - origin) // self._period_ns)
@@ -190,7 +189,7 @@ class ThorlabsPair(Source):
         if first is None or second is None:
             pass
         elif (t_ns - origin) // self._period_ns != slot:
-            # Between question and answer the next slot began: this is no sample of the one it was asked for.
+            # The next slot began between question and answer: the sample belongs to neither.
             events.append(BadFrame('answered too late for its slot', size))
         else:
             sign = self._x_sign
@@ -202,7 +201,7 @@ class ThorlabsPair(Source):
         return Received(events, time.monotonic_ns(), max(size, 1))
 
     def give_up(self) -> None:
-        """Wait for the devices no longer."""
+        """Stop waiting for the devices."""
         for port in tuple(self._ports):
             port.give_up()
 
@@ -215,7 +214,7 @@ class ThorlabsPair(Source):
             decoder.reset()
 
     def describe(self) -> Mapping[str, str]:
-        """Models, the rate asked for, the one that is done, and what the times are."""
+        """Models, requested and reached rate, and the kind of the times."""
         passed = (self._last_ns - self._first_ns) * 1e-9
         done = f'{(self._taken - 1) / passed:.1f}' if passed > 0 else 'not yet known'
         return {
@@ -239,7 +238,7 @@ def _reading(messages: list[Message], events: list[Event]) -> Readings | None:
 
 
 def _floor(rate: float) -> str:
-    """A rate that a person would type: two digits."""
+    """The rate rounded down to two digits, which are easy to type."""
     digits = 10.0 ** (math.floor(math.log10(max(rate, 1.0))) - 1)
     with contextlib.suppress(OverflowError):
         return f'{math.floor(rate / digits) * digits:g}'
@@ -247,7 +246,7 @@ def _floor(rate: float) -> str:
 
 
 class SharedRig:
-    """One rig that two devices look at, each from its own thread; the rig moves on with their time."""
+    """One rig that two devices measure, each from its own thread; it advances with their time."""
 
     def __init__(self, feed: RigFeed) -> None:
         self._feed = feed
@@ -275,7 +274,7 @@ class SimulatedAligner:
         self._queue: list[tuple[int, bytes]] = []
 
     def greeting(self) -> bytes:
-        """Nothing: it speaks when it is spoken to."""
+        """Nothing: the device only answers questions."""
         return b''
 
     def due_in_ns(self, since_power_up_ns: int) -> int:
@@ -283,7 +282,7 @@ class SimulatedAligner:
         return self._queue[0][0] - since_power_up_ns if self._queue else IDLE_NS
 
     def receive(self, received: bytes, since_power_up_ns: int) -> bytes:
-        """Take questions; the answers come later, through :meth:`take`."""
+        """Accept questions; the answers come later, through :meth:`take`."""
         self._input = (self._input + received)[-256:]
         while len(self._input) >= 6:
             if self._input[4] != DEVICE_ADDRESS or self._input[5] != HOST_ADDRESS:
@@ -314,7 +313,7 @@ def _int16(value: float) -> int:
 
 
 class AlignerEar:
-    """Hears the hardware info of one aligner."""
+    """Recognises the hardware info of one aligner."""
 
     promising = False
 
@@ -343,7 +342,7 @@ DEVICE = Device(
     Probe(
         AlignerEar,
         INFO_REQUEST,
-        # It has no way to find out that it was spoken to in another language.
+        # It cannot detect a question in another protocol.
         first=True,
         ports=2,
         together={'converter.sample_rate_hz': 200.0, 'block_size': 10, 'min_samples': 5},

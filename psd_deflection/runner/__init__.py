@@ -1,1 +1,1 @@
-"""Threads, bounded queues, shutdown: the only room that starts a thread."""
+"""Threads, bounded queues and shutdown of a run."""

@@ -1,11 +1,11 @@
-"""The reader thread: what a source gives, to chunks with host times, in a bounded queue.
+"""The reader thread turns a source's samples into chunks with host times and puts them in a bounded queue.
 
-The reader owns the source, the sequence numbers and the clock. It hands over a
-chunk as soon as a block's last sample came, so that an estimate waits for nothing. When the
-consumer is too slow the newest chunk is dropped and counted; the reader never waits.
+The reader owns the source, the sequence numbers and the clock. It hands over a chunk as soon as the
+last sample of a block has come, so that the estimate is not delayed. If the consumer is too slow, the
+newest chunk is dropped and counted; the reader never waits.
 
-Every sample that is missing is counted once, under its cause (``lost_by``), as far as it can be
-known: the device said so, frames around it were damaged, the port was away, or none of these.
+Every missing sample is counted once, under its cause (``lost_by``) if that is known: the device reported
+the loss, frames around it were damaged, the port was away, or none of these.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from psd_deflection.runner.repeats import Repeats
 from psd_deflection.timing import ClockState
 
 SILENCE_S = 2.0
-"""A device that sends no sample for this long is reported, and asked for samples once more."""
+"""A device that sends no sample for this long is reported, and asked for samples again."""
 
 RETRY_S = 0.2
 """Pause between two tries to reopen a device that is away."""
@@ -48,7 +48,7 @@ NEWS = 3
 """Events of one kind that are told one by one, before they are counted and told together."""
 
 GATHER_S = 0.004
-"""Longest that the reader lets samples gather: to wake costs more than a sample does."""
+"""Longest time that the reader lets samples gather: waking up costs more than reading a sample."""
 
 Say = Callable[[str], None]
 
@@ -62,7 +62,7 @@ class Arrival:
 
 
 class Restarted:
-    """On the queue: the device started anew; the unfinished block is all there will be of it."""
+    """On the queue: the device restarted; the unfinished block gets no more samples."""
 
 
 class Ended:
@@ -74,7 +74,7 @@ Item = Arrival | Restarted | Ended
 
 @dataclass(slots=True)
 class Gathered:
-    """Samples that wait to be handed over, a row each: extended number, time and readings as the source gives them."""
+    """Samples that wait to be handed over, one row each: extended number, time and readings as in the source."""
 
     seq: list[int] = field(default_factory=list)
     t: list[int] = field(default_factory=list)
@@ -90,11 +90,11 @@ class Gathered:
 
 
 class Acquisition:
-    """Reads one device until stopped. ``say``: told of every change of state, one line each.
+    """Reads one device until stopped. ``say`` gets one line for every change of state.
 
-    For all: ``source``, ``counters``, ``hello``, ``queue``, ``to_ros_ns``.
-    Of the thread: ``beat`` (monotonic time, s, of its last round), ``failed`` (what ended it).
-    Raises ConfigError if there is no source of the name that the rig has.
+    For every thread: ``source``, ``counters``, ``hello``, ``queue``, ``to_ros_ns``.
+    Of the reader thread: ``beat`` (monotonic time, s, of its last round), ``failed`` (the error that ended it).
+    Raises ConfigError if the rig names an unknown source.
     """
 
     def __init__(self, rig: Rig, say: Say) -> None:
@@ -107,7 +107,7 @@ class Acquisition:
         self.beat = time.monotonic()
         self.failed: BaseException | None = None
 
-        # The rig, and what it means here.
+        # Values from the rig.
         self._rig = rig
         self._name = self.source.name
         self._say = say
@@ -141,9 +141,9 @@ class Acquisition:
         self._thread = threading.Thread(target=self._run, name='reader', daemon=True)
 
     def open(self) -> None:
-        """Open the source and hear the device out.
+        """Open the source and wait for its HELLO.
 
-        Raises DeviceError where the port cannot be had, nothing of use comes in 2 s, or the device
+        Raises DeviceError if the port cannot be opened, nothing valid arrives in 2 s, or the device
         does not fit the rig.
         """
         hello = self.source.open(SILENCE_S)
@@ -156,14 +156,14 @@ class Acquisition:
         self._connected = True
 
     def start(self) -> None:
-        """Start the reader thread; :meth:`open` came before. What comes from now on is read."""
+        """Start the reader thread, after :meth:`open`. Samples that arrive from now on are read."""
         self._thread.start()
         self._ready.wait(READY_S)
 
     def stop(self) -> None:
         """Stop the reader and close the port; an Ended item is the last on the queue.
 
-        A reader that waits for its device is told to give up; one that does not come back is left behind.
+        A source that waits for its device is asked to give up; a reader thread that still hangs is abandoned.
         """
         self._stop.set()
         if self._thread.ident is None:
@@ -188,17 +188,17 @@ class Acquisition:
 
     @property
     def away(self) -> bool:
-        """Whether the device is waited for."""
+        """Whether the run waits for the device to come back."""
         return not self._connected
 
     def clock_state(self) -> ClockState:
-        """How the device's clock stands to the host's."""
+        """Offset and rate of the device's clock against the host's."""
         return self._clock.state()
 
     def system_clock_step_ns(self) -> int:
-        """How far the system clock has moved against CLOCK_MONOTONIC since the start.
+        """How far the system clock has moved against CLOCK_MONOTONIC since the start, ns.
 
-        Stamps do not follow it: they would tear apart. The next start takes it over.
+        Stamps do not follow it, because time would jump within a recording. The next start uses the new time.
         """
         return time.time_ns() - time.monotonic_ns() - self.to_ros_ns
 
@@ -210,7 +210,7 @@ class Acquisition:
             try:
                 self.source.start()
             except DeviceError as error:
-                # Pulled out since it was heard out.
+                # Unplugged since its HELLO.
                 self._disconnected(error)
         self._ready.set()
         silent_since = time.monotonic()
@@ -250,9 +250,9 @@ class Acquisition:
             self.queue.put(Ended())
 
     def _gather(self) -> None:
-        """Let samples come before the next read; the last ones of a block are waited for one by one.
+        """Let samples gather before the next read; the last ones of a block are waited for one by one.
 
-        The clock map lives on the samples that are read as they come, and the estimate waits for the last.
+        The clock map needs samples that are read as they arrive, and the estimate needs the last one.
         """
         if not self._clock.regressed:
             # The time of the read is the time of the sample.
@@ -293,7 +293,7 @@ class Acquisition:
                 return
             self.counters.refused_reopenings += 1
             refusal = str(error)
-            # Why it is not taken back is news once; that there is no port yet is none.
+            # Report once why the device is refused; a port that is still missing is not worth a line.
             if 'no such port' not in refusal and refusal != self._refusal:
                 self._refusal = refusal
                 self._repeats.tell('refused', f'{refusal}; still trying', time.monotonic(), NEWS)
@@ -307,10 +307,10 @@ class Acquisition:
         self._repeats.tell('back', f'{self._name}: the device is back', time.monotonic(), NEWS)
 
     def feed(self, events: Sequence[Event], now: int) -> bool:
-        """Sort the frames of one read at ``now`` (CLOCK_MONOTONIC, ns); True where one was a sample.
+        """Sort the frames of one read at ``now`` (CLOCK_MONOTONIC, ns); True if one was a sample.
 
-        The reader thread calls it; without one, whoever has a clock of his own may (a test, a simulation).
-        Raises AnotherDeviceError if the device has become another one.
+        The reader thread calls it. Without a reader thread, a caller with its own clock may (a test, a simulation).
+        Raises AnotherDeviceError if a HELLO has another serial number than the first one.
         """
         counters = self.counters
         good = False
@@ -332,7 +332,7 @@ class Acquisition:
                 waiting = self._gathered.seq
                 self._last_number = number
                 if self._clock.torn(number, t):
-                    # What came before the clock jumped is stamped by the map that held then.
+                    # Samples from before the clock jumped are stamped by the map that was valid then.
                     self._hand_over(now)
                     if self._clock.observe(seq, t, now):
                         self._jumped(now)
@@ -366,9 +366,9 @@ class Acquisition:
         self._repeats.tell('jump', f"{self._name}: the device's clock jumped; times are laid anew", now / 1e9, NEWS)
 
     def _unusual(self, number: int, step: Step, missing: int, flags: int, now: int) -> bool:
-        """Count a sample that does not simply follow; False where it is to be passed over."""
+        """Count a sample that does not directly follow the last one; False if it is to be skipped."""
         if step is Step.FIRST:
-            # What we joined in the middle of is passed over: the first block is a whole one.
+            # Skip the block in which we joined: the first block is a whole one.
             self._first_number = -(-number // self._block_size) * self._block_size
         elif step is Step.REPEAT:
             self.counters.repeated += 1
@@ -415,7 +415,7 @@ class Acquisition:
             return
         self._gathered = Gathered()
         t_ns = self._ros_time_ns(np.array(gathered.t, np.int64))
-        # A clock laid anew may point before what was already stamped: time does not go back.
+        # A restarted clock map may give times before the last stamp: time must not go back.
         if t_ns[0] <= self._last_t_ns or bool((t_ns[1:] <= t_ns[:-1]).any()):
             steps = np.arange(1, len(t_ns) + 1)
             t_ns = np.maximum.accumulate(np.maximum(t_ns - steps, self._last_t_ns)) + steps

@@ -1,6 +1,6 @@
-"""Follows the clock of a device: which samples the clock map is shown, and whether the clock jumped.
+"""Follows the clock of a device: chooses the samples for the clock map, and detects jumps of the clock.
 
-Owns no clock: every time comes from the caller. Times of samples are device microseconds, times of reads are
+It reads no clock: every time comes from the caller. Times of samples are device microseconds, times of reads are
 CLOCK_MONOTONIC nanoseconds.
 """
 
@@ -15,7 +15,7 @@ from psd_deflection.records import IntArray
 from psd_deflection.timing import ClockMap, ClockState
 
 TORN_US = 50_000
-"""Device time that disagrees with the sample numbers by more: the clock jumped, or the device paused."""
+"""If device time and sample numbers disagree by more than this, the clock jumped or the device paused."""
 
 
 LAG_WINDOW_S = 10.0
@@ -33,7 +33,7 @@ class ClockWatch:
         self.regressed = regressed
         self._period_us = period_us
         self._map = ClockMap()
-        # The last pair that the map was shown: sequence number as sent (32 bits), device time.
+        # The last pair that the map was given: sequence number as sent (32 bits), device time.
         self._observed: tuple[int, int] | None = None
         # The last sample that was taken: extended number, device time.
         self._taken: tuple[int, int] | None = None
@@ -43,9 +43,9 @@ class ClockWatch:
         self._reply: tuple[int, int, int] | None = None
 
     def newest(self, events: Sequence[Event], now: int) -> bool:
-        """Show the map what one read at ``now`` gave, before any of it is stamped; True if the clock jumped.
+        """Give the map the samples of one read at ``now``, before any is stamped; True if the clock jumped.
 
-        Only the newest sample of a read says how late the line is.
+        Only the newest sample of a read tells the delay of the line.
         """
         if not self.regressed:
             return False
@@ -56,22 +56,22 @@ class ClockWatch:
         if self._observed is not None:
             last_seq, last_t = self._observed
             if (last_seq - seq) % WRAP < NEARBY and t_us <= last_t:
-                # Repeated: it says nothing.
+                # Repeated: it carries no information.
                 return False
             passed = (seq - last_seq) % WRAP * self._period_us
             if abs(t_us - last_t - passed) > TORN_US:
-                # The clock may have jumped within this read: that is seen sample by sample.
+                # The clock may have jumped within this read: only a look at each sample tells.
                 return False
         return self.observe(seq, t_us, now)
 
     def observe(self, seq: int, t_us: int, now: int) -> bool:
-        """Show the map one sample that was read at ``now``; True if the clock jumped and times are laid anew."""
+        """Give the map one sample that was read at ``now``; True if the clock jumped and the map restarted."""
         passed = None if self._observed is None else (seq - self._observed[0]) % WRAP * self._period_us
         self._observed = (seq, t_us)
         return self._map.observe(t_us, now, passed)
 
     def torn(self, number: int, t_us: int) -> bool:
-        """Whether the time of a sample that is taken does not agree with its number, seen from the one before."""
+        """Whether the step in time from the previous sample disagrees with the step in number."""
         if not self.regressed:
             return False
         last, self._taken = self._taken, (number, t_us)
@@ -107,17 +107,17 @@ class ClockWatch:
     def reply(self, t_us: int, sent_ns: int, now: int) -> None:
         """The answer to a ping that was sent at ``sent_ns``.
 
-        The map is shown it once the next sample has come, if it lies between that one and the last one: another
-        timer of the device than that of the samples would draw all stamps with it.
+        The map gets it when the next sample has come, if its time lies between the last sample and that one. An answer
+        from another timer of the device than that of the samples would shift all stamps.
         """
         if not self.regressed or self._taken is None or t_us < self._taken[1] - PONG_SLACK * self._period_us:
             return
         self._reply = t_us, sent_ns, now
 
     def to_host_ns(self, t: IntArray) -> IntArray:
-        """Host time (n,) of samples in their order."""
+        """Host times (n,) of samples in order, ns."""
         return self._map.to_host_ns(t) if self.regressed else t
 
     def state(self) -> ClockState:
-        """How the device's clock stands to the host's."""
+        """Offset and rate of the device's clock against the host's."""
         return self._map.state()

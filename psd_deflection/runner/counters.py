@@ -1,6 +1,6 @@
-"""What came off the wire, counted.
+"""Counters of everything that a device sent or lost.
 
-Every sample that is missing is counted once, under its cause, as far as it can be known.
+Every missing sample is counted once, under its cause if that is known.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ UNSEEN = 'on the wire, without a trace'
 
 @dataclass(slots=True)
 class AcquisitionCounters:
-    """What came off the wire. Written by the reader alone; anyone may read."""
+    """Samples and frames received and lost. Only the reader writes; any thread may read."""
 
     bytes: int = 0
     samples: int = 0
@@ -42,6 +42,6 @@ class AcquisitionCounters:
         return sum(self.bad_frames.values())
 
     def count_lost(self, missing: int, cause: str) -> None:
-        """``missing`` samples will not come."""
+        """Count ``missing`` samples as lost."""
         self.lost += missing
         self.lost_by[cause] = self.lost_by.get(cause, 0) + missing

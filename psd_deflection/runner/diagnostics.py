@@ -1,4 +1,4 @@
-"""Once a second: what the run looks like, in numbers, for ``/diagnostics`` and for the terminal."""
+"""The state of the run in numbers, once a second, for ``/diagnostics`` and for the terminal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from psd_deflection.runner.session import Session
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 
 CLOCK_STEP_NS = 20_000_000
-"""A system clock that has moved by more against CLOCK_MONOTONIC was set."""
+"""A system clock that has moved by more than this against CLOCK_MONOTONIC was set."""
 
 
 class _Seen(NamedTuple):
@@ -22,6 +22,7 @@ class _Seen(NamedTuple):
     blocks: int
     estimates: int
     degraded: int
+    contradictions: int
     clock_jumps: int
 
 
@@ -46,9 +47,10 @@ class HealthReporter:
             pipeline.blocks,
             pipeline.estimates,
             pipeline.degraded,
+            s.pipeline.stamped.contradictions,
             wire.clock_jumps,
         )
-        # The first report counts from the start; its rates are those of an unknown time.
+        # The first report counts from the start. The time that it covers is unknown, so it gives no rates.
         before = self._seen
         self._seen = now
         seconds = (now.t_ns - before.t_ns) / 1e9 if before is not None else 0.0
@@ -142,6 +144,10 @@ class HealthReporter:
             message = (
                 f'degraded: {new.degraded} of {new.blocks} blocks from one detector, twist {twist}; {spots.reason}'
             )
+        elif new.contradictions:
+            level = WARN
+            wrong = self._session.pipeline.stamped.most_likely_wrong() or 'which one is wrong cannot be told'
+            message = f'the four readings contradict each other in {new.contradictions} blocks: {wrong}'
         values = [
             ('rate (estimates/s)', rate),
             ('blocks', str(pipeline.blocks)),
@@ -151,6 +157,7 @@ class HealthReporter:
             *((f'found: {finding}', str(count)) for finding, count in sorted(pipeline.findings.items())),
             *((f'refused: {cause}', str(count)) for cause, count in sorted(pipeline.refused.items())),
         ]
+        values += self._session.pipeline.stamped.words()
         if latency is not None:
             values.append(('latency, median (ms)', f'{latency.median * 1e3:.3f}'))
             values.append(('latency, worst of a second (ms)', f'{latency.worst * 1e3:.3f}'))
@@ -162,7 +169,7 @@ class HealthReporter:
         if spots is None:
             return DiagnosticEntry(name, STALE, 'no block yet', ())
         if new.samples == 0:
-            # What was seen last says nothing about now.
+            # The last readings are out of date.
             return DiagnosticEntry(name, STALE, 'no samples', ())
         total = spots.sums[psd - 1]
         x, y = spots.dots[2 * psd - 2], spots.dots[2 * psd - 1]

@@ -17,7 +17,7 @@ class Wire(Protocol):
 
 
 class ChangeWire(Protocol):
-    """Takes changes of parameters, which are no message."""
+    """Takes changes of parameters, which are not messages."""
 
     def put_change(self, change: ParameterChange) -> None:
         """Note the change."""

@@ -17,7 +17,7 @@ Say = Callable[[str], None]
 
 
 class Companion(Protocol):
-    """What runs beside a session, such as its live page."""
+    """Something that runs beside a session, such as its live page."""
 
     def close(self) -> None:
         """End it, before the session."""
@@ -29,9 +29,10 @@ def run_headless(
     watch: Callable[[Session], None],
     start_companion: Callable[[Session, Say], Companion | None],
 ) -> int:
-    """Run a session with these parameters until SIGINT, SIGTERM or SIGHUP; the exit status.
+    """Run a session with these parameters until SIGINT, SIGTERM or SIGHUP; return the exit status.
 
-    ``watch``: called every 0.1 s. ``start_companion``: called before samples flow. Raises what ended the session.
+    ``watch``: called every 0.1 s. ``start_companion``: called before samples flow. Raises the error that ended
+    the session.
     """
     signals = Signals()
     try:

@@ -1,6 +1,6 @@
 """Asks the device for its time now and then, at random phase to its samples.
 
-Owns no clock: every time comes from the caller.
+It reads no clock: every time comes from the caller.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ PING_S = (0.1, 0.4)
 """Bounds of the random time between two pings: their phase to the samples must not repeat."""
 
 UNANSWERED = 20
-"""A device that has left so many pings unanswered in a row does not know them: it is asked no more."""
+"""After this many unanswered pings in a row the device does not support them, and gets no more."""
 
 
 class Pinger:
-    """One ping is under way at most; a new one forgets the one before."""
+    """Keeps at most one ping under way; a new ping replaces the one before."""
 
     def __init__(self) -> None:
         self._random = random.Random()
@@ -27,7 +27,7 @@ class Pinger:
         self._sent_ns = 0
 
     def is_due(self, now_s: float) -> bool:
-        """Whether it is time to ask."""
+        """Whether the next ping is due."""
         return self._unanswered < UNANSWERED and now_s >= self._next_s
 
     def ask(self, source: Source, now_s: float, sent_ns: int) -> bool:

@@ -1,8 +1,8 @@
 """The pipeline thread: takes chunks off the queue, runs the pipeline, gives its records to the sinks.
 
 It is the only thread that touches the pipeline. Requests from other threads (take the zero, attach
-or detach a recording) are carried out between two blocks, so that none of them falls into one. A
-request must not wait for anything: whatever it waits for, the estimates wait for too.
+or detach a recording) run between two blocks, never within one. A request must not wait for anything,
+because the estimates wait for the request.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from psd_deflection.runner.acquisition import Arrival, Item, Restarted
 T = TypeVar('T')
 
 REQUEST_TIMEOUT_S = 2.0
-"""How long a request waits for its turn, and then once more for its end."""
+"""Time limit for a request to begin, and again for it to end, s."""
 
 LATENCY_NS = 1_000_000_000
-"""Latencies are told over this time."""
+"""Latencies are reported over this time."""
 
 INTERVAL_S = 1.0
-"""Between two lines about estimates, at least."""
+"""Minimum time between two lines about estimates."""
 
 
 class RecordSink(Protocol):
@@ -48,9 +48,9 @@ class Latency:
 
 
 class Spokesman:
-    """Says when estimates stop and why, and when they are back: one line a second at most.
+    """Reports when estimates stop and why, and when they resume: one line a second at most.
 
-    What came and went meanwhile is counted in the next line.
+    Blocks that were affected in between are counted in the next line.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:
@@ -62,7 +62,7 @@ class Spokesman:
         self._changes = 0
 
     def block(self, cause: str, text: str, now: float) -> None:
-        """One block: ``cause`` '' where all is well; ``text`` what to say; ``now`` monotonic, s."""
+        """Take one block. ``cause``: '' if all is well. ``text``: the line to print. ``now``: monotonic time, s."""
         if cause != self._now:
             self._changes += 1
             self._now, self._text = cause, text
@@ -79,9 +79,9 @@ class Spokesman:
 
 
 class Processing:
-    """Runs ``pipeline`` over ``items`` until one of them is Ended; ``sinks`` take the records in their order.
+    """Runs ``pipeline`` over ``items`` until one of them is Ended; ``sinks`` get the records in this order.
 
-    ``clock``: monotonic time, ns, the one that the chunks' ``read_ns`` are of.
+    ``clock``: monotonic time, ns; the same clock as that of the chunks' ``read_ns``.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Processing:
         self._thread.start()
 
     def join(self, timeout: float | None = None) -> None:
-        """Wait until everything that was read is processed; the acquisition was stopped before."""
+        """Wait until everything that was read is processed. Stop the acquisition first."""
         if self._thread.ident is not None:
             self._thread.join(timeout)
 
@@ -118,20 +118,20 @@ class Processing:
         return self._thread.is_alive()
 
     def latency(self) -> Latency | None:
-        """How long the blocks of the last second took, or None if there was none."""
+        """Latencies of the blocks of the last second, or None if there was none."""
         since = self._clock() - LATENCY_NS
         taken = sorted(seconds for at, seconds in tuple(self._latencies) if at >= since)
         return Latency(taken[len(taken) // 2], taken[-1]) if taken else None
 
     def silent_s(self) -> float:
-        """Since the samples that were processed last came, s."""
+        """Time since the samples arrived that were processed last, s."""
         return (self._clock() - self._heard_ns) / 1e9
 
     def request(self, action: Callable[[], T]) -> T:
-        """Run ``action`` between two blocks and return what it returns; its errors come through.
+        """Run ``action`` between two blocks and return its result; its errors are raised here.
 
-        Raises TimeoutError if its turn does not come within ``REQUEST_TIMEOUT_S``: it is not run then,
-        ever. Raises TimeoutError with another message if it was begun and does not end in that time.
+        Raises TimeoutError if it cannot begin within ``REQUEST_TIMEOUT_S``; then it never runs. Raises
+        TimeoutError with another message if it has begun and does not end in that time.
         """
         asked: Future[T] = Future()
         self._requests.put((asked, action))
@@ -145,7 +145,7 @@ class Processing:
         return asked.result()
 
     def give(self, records: Iterable[Record]) -> int:
-        """Hand each record to every sink as it comes; how many there were."""
+        """Hand each record to every sink as it comes; return the number of records."""
         count = 0
         for record in records:
             count += 1
@@ -184,7 +184,7 @@ class Processing:
                 asked, action = self._requests.get_nowait()
             except queue.Empty:
                 return
-            # Whoever gave up was told that it was not done.
+            # The caller that gave up was told that the action did not run.
             if not asked.set_running_or_notify_cancel():
                 continue
             try:

@@ -1,7 +1,7 @@
-"""What a daemon asks of the system: memory that stays, a reader that comes first, a watchdog that is fed.
+"""What a daemon requests from the system: locked memory, real-time priority for the reader, a watchdog.
 
-None of it is needed to run. What the system grants, and what it refuses and why, is said once in the
-log either way (``docs/deploy``).
+None of it is needed to run. The log says once what the system granted and what it refused, with the reason
+(``docs/deploy``).
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import time
 from collections.abc import Callable
 
 READER_PRIORITY = 50
-"""SCHED_FIFO, for the reader alone: threads inherit the policy, so it asks for itself."""
+"""SCHED_FIFO priority of the reader thread. Threads inherit the policy, so the reader sets its own."""
 
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
 
 
 def prefer_reader() -> str:
-    """Give the calling thread SCHED_FIFO 50; what came of it, in words."""
+    """Give the calling thread SCHED_FIFO 50; return the outcome as text."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(READER_PRIORITY))
     except (OSError, AttributeError) as error:
@@ -31,10 +31,10 @@ def prefer_reader() -> str:
 
 
 def lock_memory() -> str:
-    """``mlockall``, so that no page of ours is swapped out; what came of it, in words.
+    """Call ``mlockall``, so that none of our memory is swapped out; return the outcome as text.
 
-    Pages are locked as they are touched: stacks that were never used cost nothing. Under a finite
-    limit nothing is locked, because memory that is asked for later would be refused, and kill us.
+    Pages are locked as they are touched: unused stacks cost nothing. Under a finite limit nothing is
+    locked, because a later allocation would be refused and end the process.
     """
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     if limit != resource.RLIM_INFINITY and os.geteuid() != 0:
@@ -50,13 +50,13 @@ def lock_memory() -> str:
 
 
 def settle() -> None:
-    """What is there now stays: the collector need not look at it again."""
+    """Exempt the present objects from garbage collection: they stay until the end."""
     gc.collect()
     gc.freeze()
 
 
 class Watchdog:
-    """Tells systemd that the daemon is ready and alive (sd_notify, over the socket that it names).
+    """Tells systemd that the daemon is ready and alive (sd_notify(3)).
 
     Without ``NOTIFY_SOCKET`` in the environment it does nothing. ``clock``: monotonic, s.
     """
@@ -69,7 +69,7 @@ class Watchdog:
         usec = os.environ.get('WATCHDOG_USEC', '')
         pid = os.environ.get('WATCHDOG_PID', '')
         meant = not pid or pid == str(os.getpid())
-        # Twice as often as it must be.
+        # Twice as often as necessary.
         self._interval = int(usec) / 2e6 if usec.isdecimal() and meant else 0.0
         self._last = -self._interval
 
@@ -81,7 +81,7 @@ class Watchdog:
                 channel.connect(self._address)
                 channel.send(text.encode())
         except OSError:
-            # Nobody listens: nothing of ours depends on it.
+            # systemd does not listen; the run does not depend on it.
             self._address = ''
 
     def ready(self) -> None:
@@ -89,7 +89,7 @@ class Watchdog:
         self._tell('READY=1')
 
     def alive(self) -> None:
-        """Call it from the loop that must not hang."""
+        """Tell systemd that the process is alive; to be called from the loop that must not hang."""
         if not self._interval:
             return
         now = self._clock()

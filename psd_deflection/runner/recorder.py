@@ -1,14 +1,14 @@
-"""The recorder thread: what was published, written to a bag without holding up what is to come.
+"""The recorder thread writes the published messages to a bag without delaying the pipeline.
 
-Each recording has a thread of its own, which alone touches the disk: it opens the bag, asks the
-pipeline thread to attach it between two blocks, writes what comes, and closes the bag once it is
-detached. To attach and to detach is to swap one reference. Whoever asks for a start or an end gets a
-future, which is resolved when the disk has answered.
+Each recording has its own thread, the only one that touches the disk. It opens the bag, asks the
+pipeline thread to attach the recording between two blocks, writes the messages, and closes the bag once
+the recording is detached. Attaching and detaching swap one reference. A caller that starts or ends a
+recording gets a future, which is resolved when the disk has answered.
 
-Encoded messages come through a bounded queue; what does not fit is counted, never waited for. An
-error of the disk, or a disk with less room than the reserve, ends the recording with a message;
-acquisition and publishing go on. Once a chunk is on the disk a crash does not cost it any more; a
-chunk ends after half a second of log time, or of nothing to write.
+Encoded messages come through a bounded queue. A message that does not fit is dropped and counted. A disk
+error, or a disk with less room than the reserve, ends the recording with a message; acquisition and
+publishing continue. A chunk that is on the disk survives a crash. A chunk ends after half a second of log
+time, or after half a second without messages.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from psd_deflection.records import ParameterChange
 
 MESSAGES_PER_BLOCK = 100
 """The recorder's queue holds this many messages for each block of ``queue_blocks``. A block makes about
-ten, so that a disk may stand still ten times as long as the pipeline may: 50 s by default, in 25 MB."""
+ten messages, so the disk may pause ten times as long as the pipeline: 50 s by default, in 25 MB."""
 JOIN_S = 1.0
-"""How long the end of the program waits for recordings that are being written."""
+"""How long the program waits at its end for recordings that are still being written."""
 
 IDLE_S = 0.5
 LOOK_EVERY = 250
-"""Messages between two looks at the file and the room on its disk: half a second's worth."""
+"""Messages between two checks of the file and of the room on its disk: half a second's worth."""
 
-ELSEWHERE = 'make room, or record elsewhere (--record FOLDER, bag_dir)'
+ELSEWHERE = 'make room, or record elsewhere (parameter bag_dir)'
 
 Message = tuple[str, str, bytes, int]
 Item = Message | ParameterChange | None
@@ -59,14 +59,14 @@ class _FullError(Exception):
 
 
 class _GoneError(Exception):
-    """Somebody deleted or moved the file: what is written into it from now on, nobody finds."""
+    """Somebody deleted or moved the file: further messages would be lost."""
 
 
 class Take:
     """One recording.
 
-    ``opened``: its folder once it is attached, or why it is not. ``closed``: its folder once the bag
-    is closed, or why it ended without that. Nobody can cancel either.
+    ``opened``: resolves to its folder once it is attached, or to the error that prevented it. ``closed``:
+    resolves to its folder once the bag is closed, or to the error that prevented it. Neither can be cancelled.
     """
 
     def __init__(self, config: AcquisitionConfig) -> None:
@@ -81,9 +81,9 @@ class Take:
 
 
 class Recorder:
-    """One recording at a time; a wire like any other. ``say`` is told when one ends by itself.
+    """Makes one recording at a time; a wire like any other. ``say`` gets a line if a recording ends by itself.
 
-    ``between_blocks`` runs an action in the thread that records (``Processing.request``).
+    ``between_blocks`` runs an action in the thread that calls the wires (``Processing.request``).
     ``failure``: why the last recording ended by itself, empty while all is well; for diagnostics.
     """
 
@@ -100,9 +100,9 @@ class Recorder:
         self._say = say
         self._between_blocks = between_blocks
         self._limit = queue_blocks * MESSAGES_PER_BLOCK
-        # Held for the swapping of references and the counting, never while the disk is waited for.
+        # Held to swap references and to count, never while waiting for the disk.
         self._lock = threading.Lock()
-        # Two openings in one second must not choose one name.
+        # Two recordings opened in one second must not choose the same name.
         self._naming = threading.Lock()
         self._opening: Take | None = None
         self._take: Take | None = None
@@ -111,13 +111,13 @@ class Recorder:
 
     @property
     def folder(self) -> Path | None:
-        """Where the recording goes, or None while none is made."""
+        """Folder of the recording, or None while there is none."""
         take = self._take
         return take.folder if take is not None else None
 
     @property
     def opening(self) -> bool:
-        """Whether the disk is waited for at the start of a recording."""
+        """Whether a recording waits for the disk to begin."""
         return self._opening is not None
 
     @property
@@ -132,9 +132,10 @@ class Recorder:
         hello: Mapping[str, object] | None,
         memory: Callable[[Rig], ParameterChange | None],
     ) -> Future[Path | None]:
-        """Start a recording in ``bag_dir``; its folder once it runs. If one runs or starts, it is that one's.
+        """Start a recording in ``bag_dir``; the future gives its folder once it runs.
 
-        ``memory``: called with ``rig`` as the recording is attached, and put first. The future raises
+        If a recording already runs or starts, its future is returned. ``memory``: called with ``rig`` when
+        the recording is attached; its records come first. The future raises
         RecordingError if the folder cannot be made, the disk has no room, or the recording was ended
         before the disk answered; TimeoutError if no data flows.
         """
@@ -163,16 +164,16 @@ class Recorder:
             take.queue.put((topic, type_name, cdr, t_ns))
 
     def put_change(self, change: ParameterChange) -> None:
-        """Note that parameters changed. Never dropped: without it no replay is the same."""
+        """Record a change of parameters. Never dropped: without it the replay would differ."""
         take = self._take
         if take is not None:
             take.queue.put(change)
 
     def stop(self) -> Future[Path | None]:
-        """Detach the recording; its folder once it is closed, None if none was made.
+        """Detach the recording; the future gives its folder once it is closed, None if there was none.
 
-        A recording that is being opened will not begin. To be called between two blocks, so that the
-        last one is whole. The future raises RecordingError if the recording could not be closed.
+        A recording that is being opened does not begin. To be called between two blocks, so that the
+        last block is whole. The future raises RecordingError if the recording could not be closed.
         """
         with self._lock:
             opening, self._opening = self._opening, None
@@ -189,7 +190,7 @@ class Recorder:
         return none
 
     def close(self) -> Path | None:
-        """End for good: what still writes has ``JOIN_S``. The folder of the recording that ran, if one did."""
+        """End for good; wait at most ``JOIN_S`` for the disk. Return the folder of the recording that ran, if any."""
         folder = self.folder
         with self._lock:
             self._ended = True
@@ -267,7 +268,7 @@ class Recorder:
                 raise RecordingError(f'{error}; {ELSEWHERE}') from None
 
     def _refuse(self, take: Take, error: Exception) -> None:
-        """Answer that ``take`` does not begin, unless it has begun or that was answered already."""
+        """Resolve ``take.opened`` with an error, unless it is resolved already."""
         with self._lock:
             if self._opening is not take:
                 return
@@ -275,18 +276,18 @@ class Recorder:
         take.opened.set_exception(error)
 
     def _record(self, take: Take, bag: BagWriter) -> str:
-        """Write until the end, and close; '' or why it ended without that."""
+        """Write until the end, and close; return '' or why the recording ended early."""
         try:
             try:
                 try:
                     self._write(bag, take.queue, take.config)
                 finally:
-                    # Before the disk is waited for again: a start must not be told that this one runs.
+                    # Before waiting for the disk again: a new start must not be told that this recording runs.
                     with self._lock:
                         if self._take is take:
                             self._take = None
             except _FullError as error:
-                # There is room for index and summary: that is what the reserve is for.
+                # The reserve leaves room for index and summary.
                 bag.close()
                 return f'{bag.folder}: {error}; it is complete up to here'
             bag.close()
@@ -297,7 +298,7 @@ class Recorder:
         except RecordingError as error:
             return f'{error}; `psd-deflection recover {bag.folder}` makes it whole'
         except Exception as error:
-            # Whatever it was: a recorder that is dead and says nothing would be worse.
+            # Any error at all: a recorder that died without a message would be worse.
             with contextlib.suppress(Exception):
                 bag.close()
             return f'{bag.folder}: {type(error).__name__}: {error}'
@@ -342,16 +343,16 @@ class Recorder:
 
 
 def _nearest(folder: Path) -> Path:
-    """The folder, or the nearest above it that exists."""
+    """The folder itself, or its nearest parent that exists."""
     return next((p for p in (folder, *folder.absolute().parents) if p.exists()), Path('/'))
 
 
 def _missing_room(folder: Path, reserve: int) -> str:
-    """What to say where the disk of ``folder`` has less than ``reserve`` bytes of room; else ''."""
+    """Why the disk of ``folder`` is too full (less than ``reserve`` bytes left); '' if it is not."""
     try:
         free = shutil.disk_usage(folder).free
     except OSError:
-        # A disk that does not say is written to until it refuses.
+        # A disk that does not tell its free space is written to until it refuses.
         return ''
     if free >= reserve:
         return ''

@@ -1,9 +1,8 @@
-"""One run of the daemon, put together: device, reader, pipeline, sinks, recorder.
+"""One run of the daemon: device, reader, pipeline, sinks and recorder.
 
-The ROS node and the command line are two users of it; neither is needed. Threads: ``reader``
-(acquisition), ``pipeline`` (processing), ``recorder`` while recording; the caller's own thread
-opens, asks and closes. No other thread waits for the disk:
-a zero is kept by a thread ``zero``, which ends when it is on the disk.
+The ROS node and the command line both use it; neither is needed. Threads: ``reader`` (acquisition),
+``pipeline`` (processing), ``recorder`` while recording; the caller's own thread opens, sends requests and
+closes. Only the threads ``recorder`` and ``zero`` wait for the disk. ``zero`` saves a zero and then ends.
 """
 
 from __future__ import annotations
@@ -29,41 +28,41 @@ from psd_deflection.runner.zero_store import ZeroStore
 from psd_deflection.solvers.registry import check_live
 
 HUNG_S = 5.0
-"""A thread that has not come round for this long hangs: the watchdog is not fed any more."""
+"""A thread that has completed no round for this long hangs: the watchdog gets no more signals."""
 
 SILENT_S = 5.0
-"""Dots that came longer ago than this, and two blocks, are not the present ones."""
+"""Dots older than this plus two blocks are out of date."""
 
 JOIN_S = 0.5
-"""How long the last blocks may take at the end."""
+"""Time limit for the last blocks at the end."""
 
 KEEP_S = 0.2
-"""How long the last zero may take to be on the disk at the end."""
+"""Time limit for the last zero to reach the disk at the end."""
 
 OPEN_S = 2.0
-"""How long the start waits for the disk of a recording that is wanted from the start."""
+"""How long the start waits for the disk if a recording is wanted from the start."""
 
 LONGEST_LINE = 2000
 """Characters of a line that is said."""
 
 
 def zero_text(rig: Rig) -> str:
-    """What ``rig`` takes for the unloaded dots, in a line."""
+    """The unloaded dots of ``rig``, as one line of text."""
     (x1, y1), (x2, y2) = (psd.zero for psd in rig.psds)
     return f'unloaded dots (mm): psd_1 ({x1 * 1e3:z.4f}, {y1 * 1e3:z.4f}), psd_2 ({x2 * 1e3:z.4f}, {y2 * 1e3:z.4f})'
 
 
 def why_no_zero(pipeline: Pipeline) -> str:
-    """What to say where :meth:`Pipeline.zero` took none."""
+    """Why :meth:`Pipeline.zero` took no zero, as text."""
     last = pipeline.last_spots
     return f'no good block now: {last.reason}' if last is not None and last.reason else 'no good block yet'
 
 
 class Session:
-    """Opens on construction. ``say``: told of changes of state, one line each, from any thread; so
-    is whoever else is put on ``listeners``.
+    """Opens the device on construction. ``say`` and every function in ``listeners`` get one line for each
+    change of state, from any thread.
 
-    Raises DeviceError, ConfigError, SolverError or RecordingError where the run cannot start.
+    Raises DeviceError, ConfigError, SolverError or RecordingError if the run cannot start.
     """
 
     def __init__(self, rig: Rig, say: Callable[[str], None]) -> None:
@@ -78,13 +77,13 @@ class Session:
             self._simulated = SimulatedRigProcess(rig)
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)
-            say(f'no port given: started the simulated rig on {self._simulated.port} (--port names a real one)')
+            say(f'no port given: started the simulated rig on {self._simulated.port} (parameter port names a real one)')
         try:
             self.acquisition = Acquisition(rig, say)
             self.acquisition.open()
             hello = self.acquisition.hello
             self._store: ZeroStore | None = None
-            # The rig that we simulate ourselves is unloaded anew each time.
+            # Our own simulated rig starts unloaded, so no kept zero applies.
             if rig.acquisition.keep_zero and not self.simulated:
                 self._store = ZeroStore(rig, hello.info.get('serial') if hello is not None else None)
                 rig, about = self._store.load(rig)
@@ -111,7 +110,7 @@ class Session:
 
     @property
     def pipeline(self) -> Pipeline:
-        """The pipeline; only its counters and last records are for other threads."""
+        """The pipeline. Other threads may only read its counters and last records."""
         return self.processing.pipeline
 
     @property
@@ -126,24 +125,25 @@ class Session:
 
     @property
     def failed(self) -> BaseException | None:
-        """What ended the pipeline or the reader thread, if something did."""
+        """The error that ended the pipeline or the reader thread, or None."""
         return self.processing.failed or self.acquisition.failed
 
     def responsive(self) -> bool:
-        """Whether reader and pipeline came round lately; a device that is away does not hold them up."""
+        """Whether reader and pipeline completed a round lately; they do so even while the device is away."""
         now = time.monotonic()
         return all(now - beat < HUNG_S for beat in (self.acquisition.beat, self.processing.beat))
 
     def start(self) -> None:
         """Start recording if the rig says so, and let samples flow.
 
-        The disk has ``OPEN_S`` to answer, so that the recording has the first block. If it has not answered by then,
-        samples flow, and the recording begins when it does. Raises RecordingError if it refuses.
+        Waits up to ``OPEN_S`` for the disk, so that the recording has the first block. If the disk has not
+        answered by then, samples flow, and the recording begins when the disk answers. Raises RecordingError
+        if the disk refuses.
         """
         cdr.prepare(TOPIC_TYPES.values())
         if self.rig.acquisition.realtime:
             self._tell(lock_memory())
-        # The recorder is served last: what is published comes first.
+        # The recorder comes last: publishing has priority.
         self.fanout.wires.append(self.recorder)
         self.processing.start()
         if self.rig.acquisition.record:
@@ -156,9 +156,9 @@ class Session:
         self.acquisition.start()
 
     def record(self, wanted: bool) -> Future[Path | None]:
-        """Start or stop a recording between two blocks; its folder, or None if none was made.
+        """Start or stop a recording between two blocks; the future gives its folder, or None if there was none.
 
-        Waits for the pipeline at most, never for the disk: the future is resolved when the disk has
+        Waits only for the pipeline, never for the disk: the future is resolved when the disk has
         answered. For its errors see :meth:`Recorder.start` and :meth:`Recorder.stop`. Raises
         TimeoutError if no data flows.
         """
@@ -182,9 +182,9 @@ class Session:
             self._tell(f'not recorded: {error}')
 
     def temperature(self, celsius: float) -> None:
-        """The ambient temperature, for the corrections that need it; from the next block on.
+        """Set the ambient temperature for the corrections that need it, from the next block on.
 
-        Raises TimeoutError where no data flows.
+        Raises TimeoutError if no data flows.
         """
         if not self.pipeline.needs_temperature:
             return
@@ -197,10 +197,10 @@ class Session:
         self.processing.request(change)
 
     def zero(self) -> ParameterChange | None:
-        """Take the present dots as the unloaded ones; None where the last block is not good.
+        """Take the present dots as the unloaded ones; None if the last block is not good.
 
-        They are kept for the next run where the rig says so. Raises TimeoutError where no data flows:
-        where the dots are now, nobody knows then.
+        They are kept for the next run if the rig says so. Raises TimeoutError if no data flows, because the
+        present dots are unknown then.
         """
         rig = self.rig
         patience = SILENT_S + 2.0 * rig.estimator.block_size / rig.converter.sample_rate_hz
@@ -222,7 +222,7 @@ class Session:
     def change(self, values: Mapping[str, float | str | tuple[float, ...]]) -> None:
         """Change live parameters, together, between two blocks.
 
-        Raises TimeoutError where no data flows, ConfigError where a value is out of bounds; then
+        Raises TimeoutError if no data flows, ConfigError if a value is out of bounds; then
         nothing has changed.
         """
         self.processing.request(lambda: self.processing.give([self.pipeline.change(values)]))
@@ -236,9 +236,9 @@ class Session:
             self._store.keep(self.rig, self._tell)
 
     def close(self) -> Path | None:
-        """Stop reading, process what was read, end the recording; returns its folder.
+        """Stop reading, process what was read, end the recording; return its folder.
 
-        Ends within two seconds whichever part hangs. Does nothing the second time.
+        Ends within two seconds even if a part hangs. A second call does nothing.
         """
         if self._closed:
             return None

@@ -1,7 +1,7 @@
-"""SIGINT, SIGTERM, SIGHUP: a wish to end, not an interruption, but for the waiting for a device.
+"""SIGINT, SIGTERM and SIGHUP ask the program to end; they interrupt it only while it waits for a device.
 
-A signal that raised wherever it comes would tear the last blocks off a recording. So it is noted,
-and whoever runs looks; only while a device is waited for does it end the waiting at once.
+A signal that raised an exception anywhere would cut the last blocks off a recording. So the signal sets an
+event, which the main loop checks. Only the wait for a device ends at once.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ T = TypeVar('T')
 
 
 class StopRequestedError(BaseException):
-    """A signal came while the main thread waited for a device. Like KeyboardInterrupt, no Exception."""
+    """A signal came while the main thread waited for a device. Like KeyboardInterrupt, it is not an Exception."""
 
 
 class Signals:
-    """The signals from now on: ``stop`` is set at once; inside :meth:`interruptible` they end the waiting too.
+    """Handles the signals from now on: they set ``stop``; inside :meth:`interruptible` they end the wait too.
 
-    SIGHUP, a terminal that is closed or an ssh that breaks off, is one of them unless it was to be
-    passed over (``nohup``): the recording gets its end. For the main thread alone.
+    SIGHUP (the terminal was closed, or the ssh connection broke) is one of them unless it is ignored
+    (``nohup``), so that the recording is completed. For the main thread only.
     """
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ class Signals:
             raise StopRequestedError
 
     def interruptible(self, action: Callable[[], T]) -> T:
-        """``action()``; a signal before or during it ends it with StopRequestedError."""
+        """Return ``action()``. A signal before or during it raises StopRequestedError."""
         self._raise = True
         try:
             if self.stop:
@@ -50,6 +50,6 @@ class Signals:
             self._raise = False
 
     def restore(self) -> None:
-        """Give the signals back to who had them."""
+        """Restore the previous signal handlers."""
         for number, handler in self._previous.items():
             signal.signal(number, handler)

@@ -1,4 +1,4 @@
-"""Starts the simulated rig as a process of its own, as a device would be."""
+"""Starts the simulated rig as a separate process, like a real device."""
 
 from __future__ import annotations
 
@@ -20,15 +20,16 @@ _waiting: list[subprocess.Popen[bytes]] = []
 
 
 def simulates(values: Mapping[str, object]) -> bool:
-    """Whether a session of a rig with these parameters starts a simulated rig: it can, and no port is named."""
+    """Whether a session with these parameters starts a simulated rig: no port is named and the device has a twin."""
     return not values.get('port') and values.get('source', 'serial') in SIMULATED
 
 
 @contextlib.contextmanager
 def started_early(wanted: bool) -> Iterator[None]:
-    """Start the process of the next rig now, if one is ``wanted``; ends it if none took it.
+    """Start the process of the next rig now, if it is ``wanted``; end it if no session took it.
 
-    It imports while its daemon does, and waits for its parameters: whoever types the command sees the dots sooner.
+    The process imports its modules while the daemon imports its own, then waits for parameters. So the user
+    sees the dots sooner.
     """
     if wanted:
         _waiting.append(_start())
@@ -52,7 +53,7 @@ def _start() -> subprocess.Popen[bytes]:
 
 
 class SimulatedRigProcess:
-    """The process behind ``port``; it ends when this one closes its standard input, or dies."""
+    """The process behind ``port``. It ends when this process closes its standard input, or dies."""
 
     def __init__(self, rig: Rig) -> None:
         self._process = _waiting.pop() if _waiting else _start()
@@ -68,7 +69,7 @@ class SimulatedRigProcess:
         line = self._process.stdout.readline().decode() if ready else ''
         if not line.startswith(PORT_LINE):
             self.close()
-            raise DeviceError('the simulated rig did not start; try `psd-deflection simulate --serve`, which says why')
+            raise DeviceError('the simulated rig did not start; `python -m psd_deflection.devices.serve` says why')
         self.port = line[len(PORT_LINE) :].strip()
 
     def hang_up(self) -> None:

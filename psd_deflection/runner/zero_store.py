@@ -1,10 +1,10 @@
-"""The unloaded dots that ``~/zero`` took, kept from run to run: one small file a device.
+"""Keeps the unloaded dots of the last ``~/zero`` from run to run: one small file per device.
 
-They are kept by the device's serial number below ``$XDG_STATE_HOME/psd_deflection`` (or in the file
-that ``zero_file`` names). The rig file has the last word: the zero that it had when the kept one was
-taken stands in the file beside it, and once the rig file says something else the kept one is passed
-over. What the file holds is checked like any parameter, and a bad file is passed over with a line in
-the log; it never stops a run. Whoever takes a zero does not wait for the disk: a thread writes the file.
+The file is below ``$XDG_STATE_HOME/psd_deflection``, named by the device's serial number, or is the file
+that ``zero_file`` names. The rig file has priority: the kept file also holds the zero that the rig file had
+at the time, and once the rig file changes its zero the kept one is ignored. The values are checked like any
+parameter. A bad file is ignored with a line in the log; it never stops a run. A thread writes the file, so
+that taking a zero does not wait for the disk.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ MAX_BYTES = 10_000
 
 
 def state_folder() -> Path:
-    """Where programs keep what they remember (XDG base directory specification)."""
+    """Folder for the state of programs (XDG base directory specification)."""
     return Path(os.environ.get('XDG_STATE_HOME') or Path.home() / '.local' / 'state') / 'psd_deflection'
 
 
 class ZeroStore:
-    """The kept zero of one device. ``configured``: the rig as its file has it, without a kept zero."""
+    """The kept zero of one device. ``configured``: the rig from its file, without a kept zero."""
 
     def __init__(self, configured: Rig, serial: object) -> None:
         self._configured = {name: configured.values[name] for name in ZEROS}
         named = configured.acquisition.zero_file
-        # A serial number is the device's word: nothing of it may lead out of the folder.
+        # The device chooses its serial number: it must not lead out of the folder.
         self._serial = str(serial)
         safe = re.sub(r'[^A-Za-z0-9._-]', '_', self._serial)[:64].strip('.') or 'unknown'
         if safe != self._serial:
-            # Two serial numbers that differ only in what was taken out are two files.
+            # Serial numbers that differ only in characters that were replaced or cut need two files.
             safe += '_' + hashlib.sha256(self._serial.encode(errors='backslashreplace')).hexdigest()[:12]
         self.path = Path(named).expanduser() if named else state_folder() / f'zero_{safe}.json'
         self._saving = threading.Lock()
@@ -49,7 +49,7 @@ class ZeroStore:
         self._thread: threading.Thread | None = None
 
     def load(self, rig: Rig) -> tuple[Rig, str]:
-        """The rig with the kept zero, where there is one, and a line to say about it, or ''."""
+        """The rig with the kept zero, if there is one, and a line to report about it, or ''."""
         try:
             with self.path.open('rb') as stream:
                 content = stream.read(MAX_BYTES + 1)
@@ -70,7 +70,7 @@ class ZeroStore:
         return replace_values(rig, zeros, str(self.path)), f'zero of the last run, from {self.path}'
 
     def save(self, rig: Rig) -> str:
-        """Keep the zero of ``rig``; '' or why that could not be."""
+        """Save the zero of ``rig``; return '' or why it failed."""
         kept = {'serial': self._serial, **{name: rig.values[name] for name in ZEROS}, 'configured': self._configured}
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -80,13 +80,13 @@ class ZeroStore:
         return ''
 
     def keep(self, rig: Rig, say: Callable[[str], None]) -> None:
-        """Save the zero of ``rig`` in a thread of its own; ``say`` is told if that could not be. The last one wins."""
+        """Save the zero of ``rig`` in a separate thread; ``say`` gets a line if it fails. The last zero wins."""
         self._wanted = rig
         self._thread = threading.Thread(target=self._keep, args=(say,), name='zero', daemon=True)
         self._thread.start()
 
     def join(self, timeout: float) -> bool:
-        """Wait until the last zero is saved; whether it is."""
+        """Wait until the last zero is saved; return whether it is."""
         if self._thread is None:
             return True
         self._thread.join(timeout)
