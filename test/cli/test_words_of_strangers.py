@@ -9,6 +9,7 @@ import pytest
 
 from psd_deflection.cli import info
 from psd_deflection.cli.main import main
+from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 
 CLEAN = Path(__file__).parent.parent.parent / 'bags' / 'clean'
@@ -28,7 +29,7 @@ def test_info_prints_no_control_characters(monkeypatch: pytest.MonkeyPatch, caps
         recording.parameters = {ESCAPE: ESCAPE}
         return recording
 
-    info_of = info.open_recording
+    info_of = open_recording
     monkeypatch.setattr(info, 'open_recording', opened)
     assert main(['info', str(CLEAN)]) == 0
     out = capsys.readouterr().out
