@@ -20,9 +20,9 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import yaml
 
 from psd_deflection.errors import ConfigError, did_you_mean
+from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
 from psd_deflection.parameters import Parameter, Section, Value, check_value, parameter, shown
 from psd_deflection.records import FloatArray
 
@@ -475,23 +475,17 @@ def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[
 
 def _read_yaml(path: Path) -> object:
     try:
-        size = path.stat().st_size
-        if size > MAX_FILE_BYTES:
-            raise ConfigError(f'{path}: {size} bytes: a parameter file has at most {MAX_FILE_BYTES}')
-        text = path.read_text(encoding='utf-8')
+        text = read_text(path, MAX_FILE_BYTES)
     except FileNotFoundError:
         raise ConfigError(f'{path}: no such parameter file') from None
     except OSError as error:
         raise ConfigError(f'{path}: cannot be read as a parameter file ({error.strerror or error})') from None
-    except UnicodeDecodeError:
-        raise ConfigError(f'{path}: cannot be read as a parameter file (it is no text)') from None
+    except YamlError as error:
+        raise ConfigError(f'{path}: cannot be read as a parameter file ({error})') from None
     try:
-        return yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        mark = getattr(error, 'problem_mark', None)
-        where = f':{mark.line + 1}:{mark.column + 1}' if mark is not None else ''
-        problem = getattr(error, 'problem', None) or 'not YAML'
-        raise ConfigError(f'{path}{where}: malformed YAML: {problem}') from None
+        return parse_yaml(text)
+    except YamlError as error:
+        raise ConfigError(f'{path}{error.where}: {error}') from None
 
 
 def _flatten(tree: Mapping[Any, Any], prefix: str, out: dict[str, object], path: Path, depth: int) -> None:

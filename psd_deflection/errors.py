@@ -79,3 +79,24 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """``; did you mean X?`` if ``name`` is close to one of ``known``, else an empty string."""
     near = difflib.get_close_matches(name, list(known), n=1)
     return f'; did you mean {near[0]}?' if near else ''
+
+
+def printable(text: str, longest: int) -> str:
+    """``text`` in one line of printable characters; what is beyond ``longest`` characters is cut, with an ellipsis.
+
+    A stranger's words (a device's, a file's) can so neither move the cursor, change colours, forge a line, nor fail
+    to be encoded. Text that is so already comes back as it is.
+    """
+    if text.isprintable() and len(text) <= longest:
+        return text
+    pieces: list[str] = []
+    length = 0
+    for character in text[: longest + 1]:
+        piece = character if character.isprintable() else character.encode('unicode_escape').decode('ascii')
+        length += len(piece)
+        pieces.append(piece)
+    if length <= longest and len(text) <= longest:
+        return ''.join(pieces)
+    while length > longest - 1:
+        length -= len(pieces.pop())
+    return ''.join(pieces) + '\N{HORIZONTAL ELLIPSIS}'

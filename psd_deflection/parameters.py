@@ -192,6 +192,8 @@ def _bool(parameter: Parameter, value: object) -> bool:
 def _string(parameter: Parameter, value: object) -> str:
     if not isinstance(value, str):
         raise _RefusedError('must be text')
+    if not value.isprintable():
+        raise _RefusedError('must be text that can be printed')
     if parameter.choices is not None and value not in parameter.choices:
         raise _RefusedError(f'must be {parameter.bound_text()}')
     return value

@@ -120,6 +120,17 @@ class ClockMap:
                 self._refit(device)
         return False
 
+    def lay_anew(self, t_device_us: int, t_host_ns: int) -> None:
+        """The clock cannot be followed: begin again with this pair."""
+        device = t_device_us * 1000
+        self.resets += 1
+        self._start(device, t_host_ns)
+        self._bucket_min = (device, t_host_ns - device)
+
+    def host_ns(self, t_device_us: int) -> int:
+        """Where the map has this device time now."""
+        return self._host(t_device_us * 1000)
+
     def observe_reply(self, t_device_us: int, sent_ns: int, t_host_ns: int) -> None:
         """A ping was sent at ``sent_ns``, answered at this device time, and the answer read at ``t_host_ns``."""
         device = t_device_us * 1000

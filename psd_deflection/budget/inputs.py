@@ -13,10 +13,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import cast
 
-import yaml
-
 from psd_deflection.config import MAX_FILE_BYTES
 from psd_deflection.errors import ConfigError, did_you_mean
+from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
 from psd_deflection.parameters import Parameter, check_value
 
 
@@ -144,15 +143,13 @@ def read_inputs(
 
 def _read(path: Path) -> dict[object, object]:
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise ConfigError(f'{path}: more than {MAX_FILE_BYTES} bytes: not a file of inputs')
-        tree = yaml.safe_load(path.read_text(encoding='utf-8'))
+        tree = parse_yaml(read_text(path, MAX_FILE_BYTES))
     except FileNotFoundError:
         raise ConfigError(f'{path}: no such file of inputs') from None
     except OSError as error:
         raise ConfigError(f'{path}: cannot be read as inputs ({error.strerror or error})') from None
-    except (RecursionError, ValueError, yaml.YAMLError):
-        raise ConfigError(f'{path}: cannot be read as inputs (it is no YAML)') from None
+    except YamlError as error:
+        raise ConfigError(f'{path}{error.where}: cannot be read as inputs ({error})') from None
     if tree is None:
         return {}
     if not isinstance(tree, dict):

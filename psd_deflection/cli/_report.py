@@ -5,12 +5,21 @@ from __future__ import annotations
 import io
 import json
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.errors import RecordingError
+from psd_deflection.errors import RecordingError, printable
 from psd_deflection.files import replace_file
+
+LONGEST_LINE = 2000
+"""Characters of a line with words of a file or of a device in it."""
+
+
+def warn(warning: str) -> None:
+    """One warning on the standard error. It may hold words of a file."""
+    print(f'warning: {printable(warning, LONGEST_LINE)}', file=sys.stderr)
 
 
 def columns(rows: Sequence[Sequence[str]], left: int = 1) -> str:

@@ -16,13 +16,12 @@ import argparse
 import contextlib
 import heapq
 import itertools
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from psd_deflection.cli._options import recording_name
 from psd_deflection.cli._progress import progress_of, told
-from psd_deflection.cli._report import print_json
+from psd_deflection.cli._report import print_json, warn
 from psd_deflection.config import load_rig
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.readers import open_recording
@@ -120,4 +119,4 @@ def _to_rerun(path: str, out: Path, params_file: str | None, in_json: bool) -> i
 
 def _warn(recording: Recording) -> None:
     for warning in recording.warnings:
-        print(f'warning: {warning}', file=sys.stderr)
+        warn(warning)

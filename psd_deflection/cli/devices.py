@@ -17,11 +17,11 @@ from collections.abc import Sequence
 from dataclasses import asdict
 
 from psd_deflection.cli._progress import told
-from psd_deflection.cli._report import print_json
+from psd_deflection.cli._report import LONGEST_LINE, print_json
 from psd_deflection.devices.device import Device
 from psd_deflection.devices.registry import known_devices
 from psd_deflection.devices.survey import Port, suggestions, survey
-from psd_deflection.errors import DeviceError
+from psd_deflection.errors import DeviceError, printable
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the survey; the exit status is 0 whatever was found, unless a port that was named could not be asked."""
     devices, refusals = known_devices()
     for refusal in refusals:
-        print(f'psd-deflection devices: not asked for: {refusal}', file=sys.stderr)
+        print(printable(f'psd-deflection devices: not asked for: {refusal}', LONGEST_LINE), file=sys.stderr)
     with told('asking; a port that stays silent takes some seconds', quiet=args.json):
         ports = survey(devices, args.ports)
     if args.json:
@@ -50,7 +50,8 @@ def run(args: argparse.Namespace) -> int:
         if args.ports and not port.asked:
             continue
         about = f' ({port.description})' if port.description and port.description != 'n/a' else ''
-        print(f'{port.port}{about}\n  {port.answer}')
+        # What stands in a USB descriptor is the device's word as well.
+        print(f'{port.port}{printable(about, LONGEST_LINE)}\n  {printable(port.answer, LONGEST_LINE)}')
     for suggested in suggestions(devices, ports):
         print('\n' + parameter_lines(suggested))
     _refuse_unasked(args.ports, ports)

@@ -16,8 +16,9 @@ from typing import Any
 
 from msg_adapters import DEFLECTION, LOAD, SAMPLES
 from psd_deflection.cli._progress import progress_of, told
-from psd_deflection.cli._report import print_json
+from psd_deflection.cli._report import LONGEST_LINE, print_json
 from psd_deflection.config import BY_NAME
+from psd_deflection.errors import printable
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 
@@ -108,7 +109,8 @@ def run(args: argparse.Namespace) -> int:
         print_json(found, indent=2)
         return 0
     for line in _lines(found):
-        print(line)
+        # Names and values in a recording are a stranger's.
+        print(printable(line, LONGEST_LINE))
     return 0
 
 

@@ -21,6 +21,7 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from psd_deflection import __version__
+from psd_deflection.cli._report import LONGEST_LINE
 from psd_deflection.errors import (
     EXIT_STATUSES,
     INTERRUPTED,
@@ -28,6 +29,7 @@ from psd_deflection.errors import (
     RecordingError,
     UsageError,
     did_you_mean,
+    printable,
 )
 
 COMMANDS: dict[str, str] = {
@@ -143,7 +145,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _tell(line: str) -> None:
     """On the standard error; where that cannot be written, the exit status still says it."""
     with contextlib.suppress(OSError):
-        print(line, file=sys.stderr)
+        # It may hold words of a file or of a device.
+        print(printable(line, LONGEST_LINE), file=sys.stderr)
 
 
 def _discard_output() -> None:

@@ -12,12 +12,11 @@ a recording that is still being made.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from typing import Any
 
 from psd_deflection.cli._progress import told
-from psd_deflection.cli._report import print_json
+from psd_deflection.cli._report import print_json, warn
 from psd_deflection.recordings.repair import Recovered, recover
 
 
@@ -34,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
         with told(f'reading {path}, and writing anew what is cut', quiet=args.json):
             done = recover(path)
         for warning in (w for file in done.files for w in file.warnings):
-            print(f'warning: {warning}', file=sys.stderr)
+            warn(warning)
         found.append({'path': path, **in_json(done)})
         if not args.json:
             print('\n'.join(_lines(path, done)))

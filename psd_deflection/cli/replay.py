@@ -21,7 +21,7 @@ import numpy as np
 
 from psd_deflection.cli._options import recording_name
 from psd_deflection.cli._progress import progress_of, told
-from psd_deflection.cli._report import print_json
+from psd_deflection.cli._report import print_json, warn
 from psd_deflection.config import Rig
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.comparison import Comparison
@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
             sink.close()
     seconds = time.perf_counter() - began
     for warning in [*recording.warnings, *_rate_warning(recording, rig)]:
-        print(f'warning: {warning}', file=sys.stderr)
+        warn(warning)
     if comparison is not None:
         comparison.finish()
     _print_summary(args, rig, pipeline, totals, seconds, comparison)

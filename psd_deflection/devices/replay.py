@@ -50,6 +50,8 @@ class Pacer:
 class Replay(Source):
     """``source: replay``."""
 
+    volts = True
+
     def __init__(self, rig: Rig) -> None:
         self.name = rig.acquisition.port
         if not self.name:

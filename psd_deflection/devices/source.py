@@ -45,8 +45,8 @@ class Sample(NamedTuple):
     """One sample of a source that does not speak the frames of ``docs/protocol.md``.
 
     ``flags``, ``seq``: as in ``protocol.frames.SampleFrame``. ``t``: in the unit of the source's
-    :class:`Clock`. ``readings``: x1 y1 sum1 x2 y2 sum2; converter counts (whole, -32768 to 32767) if
-    the source's HELLO has ``volts_per_count``, volts if that is None.
+    :class:`Clock`. ``readings``: x1 y1 sum1 x2 y2 sum2; volts if :attr:`Source.volts` is True, else
+    converter counts (whole, -32768 to 32767).
     """
 
     flags: int
@@ -85,19 +85,21 @@ class Source(abc.ABC):
 
     ``name``: its port or file, for messages. ``clock``: the kind of a sample's time. ``numbered``: whether
     the device numbers its samples, so that losses on the wire are detected. If it does not, the source
-    numbers the samples that came, from 0 after each ``open``.
+    numbers the samples that came, from 0 after each ``open``. ``volts``: whether readings are volts. If not,
+    they are converter counts, whatever the device says. It is valid once ``open`` has returned.
     """
 
     name: str
     clock: Clock = Clock.DEVICE
     numbered: bool = True
+    volts: bool = False
 
     @abc.abstractmethod
     def open(self, timeout: float) -> HelloFrame:
         """Open the device, wait for its description at most ``timeout`` s, and return it as a HELLO.
 
         The HELLO has ``serial``, ``firmware``, ``sample_rate_hz``, ``channels`` and
-        ``volts_per_count`` (a number, or None for samples in volts). The reader compares it with the rig,
+        ``volts_per_count`` (a number, or None if :attr:`volts`). The reader compares it with the rig,
         and it is recorded. Raises DeviceError that says what to do; then nothing is left open.
         """
 

@@ -46,8 +46,7 @@ class TextLines(PortSource):
         self._baud = rig.acquisition.baud
         self._decoder = LineDecoder()
         self._time = TimeExtender()
-        self._counts = False
-        self._serial = ''
+        self.volts = True
 
     def open(self, timeout: float) -> HelloFrame:
         """Open the port and wait for the line that describes the device."""
@@ -63,7 +62,8 @@ class TextLines(PortSource):
                 for item in decoder.feed(piece):
                     lines += isinstance(item, Line)
                     if isinstance(item, Description) and 'sample_rate_hz' in item.info:
-                        return self._hello(item.info)
+                        self.volts = positive(item.info.get('volts_per_count')) is None
+                        return _hello(item.info)
         except BaseException:
             self.close()
             raise
@@ -75,19 +75,6 @@ class TextLines(PortSource):
         else:
             why = 'nothing comes; does the sketch run, and is this its port?'
         raise DeviceError(f'{self.name}: {why} (waited {timeout:g} s)')
-
-    def _hello(self, info: dict[str, object]) -> HelloFrame:
-        self._counts = positive(info.get('volts_per_count')) is not None
-        self._serial = str(info.get('serial', ''))[:64]
-        own: dict[str, object] = {
-            'serial': self._serial,
-            'firmware': 'text lines',
-            'channels': list(CHANNELS),
-            'volts_per_count': None,
-        }
-        # Keep known keys only: the line is not trusted, and it goes into recordings.
-        known = ('firmware', 'sample_rate_hz', 'channels', 'volts_per_count')
-        return HelloFrame(PROTOCOL_VERSION, own | {k: v for k, v in info.items() if k in known})
 
     def start(self) -> None:
         """Discard the lines that came before the description."""
@@ -105,10 +92,12 @@ class TextLines(PortSource):
                 events.append(self._sample(item))
             elif isinstance(item, BadFrame):
                 events.append(item)
+            elif 'sample_rate_hz' in item.info:
+                events.append(_hello(item.info))
         return Received(events, now, len(received))
 
     def _sample(self, line: Line) -> Event:
-        if not self._counts:
+        if self.volts:
             if max(map(abs, line.readings)) > MAX_VOLTS:
                 return BadFrame('a reading is out of all bounds', 0)
             return Sample(0, line.seq, self._time.extend(line), line.readings)
@@ -125,6 +114,19 @@ class TextLines(PortSource):
             'sample numbers': 'of the device',
             'sample times': 'of the device',
         }
+
+
+def _hello(info: Mapping[str, object]) -> HelloFrame:
+    """What the line that describes the device says."""
+    own: dict[str, object] = {
+        'serial': str(info.get('serial', ''))[:64],
+        'firmware': 'text lines',
+        'channels': list(CHANNELS),
+        'volts_per_count': None,
+    }
+    # Only what is known is kept: the line is a stranger's and goes into recordings.
+    known = ('firmware', 'sample_rate_hz', 'channels', 'volts_per_count')
+    return HelloFrame(PROTOCOL_VERSION, own | {k: v for k, v in info.items() if k in known})
 
 
 class SimulatedLines:

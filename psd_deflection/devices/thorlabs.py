@@ -61,6 +61,7 @@ class ThorlabsPair(Source):
     """``source: thorlabs``; ``port`` names two ports separated by a comma, PSD 1 first."""
 
     clock = Clock.HOST
+    volts = True
 
     def __init__(self, rig: Rig) -> None:
         self.name = rig.acquisition.port

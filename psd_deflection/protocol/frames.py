@@ -18,6 +18,8 @@ from typing import NamedTuple
 
 from cobs import cobs
 
+from psd_deflection.protocol.words import device_words
+
 PROTOCOL_VERSION = 1
 MAX_ENCODED = 512
 """Longest encoded frame, without the closing zero."""
@@ -68,7 +70,10 @@ class StatusFrame(NamedTuple):
 
 
 class HelloFrame(NamedTuple):
-    """HELLO: protocol version, and the device's description of itself (empty for another version)."""
+    """HELLO: protocol version, and the device's description of itself (empty for another version).
+
+    ``info`` of a decoded frame holds printable texts and finite numbers only (``protocol.words``).
+    """
 
     version: int
     info: dict[str, object]
@@ -209,7 +214,7 @@ def _parse_hello(body: bytes, size: int) -> Frame:
         return BadFrame(BadReason.BODY, size)
     if not isinstance(info, dict):
         return BadFrame(BadReason.BODY, size)
-    return HelloFrame(version, info)
+    return HelloFrame(version, device_words(info))
 
 
 class FrameDecoder:

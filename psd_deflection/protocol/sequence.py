@@ -30,8 +30,8 @@ class SequenceExtender:
     """Extends u32 sequence numbers to 64 bits.
 
     A number just ahead of the last one follows it, even if the device's clock jumped. A number
-    further ahead (modulo 2^32, less than half way round) is a gap if device time advanced. A number
-    at or just behind the last, with a device time that is not newer, is a duplicated frame.
+    further ahead (modulo 2^32, less than half way round) is a gap if device time advanced. The last
+    number again, or one just behind it with a device time that is not newer, is a duplicated frame.
     Anything else means that the device restarted.
     """
 
@@ -56,7 +56,7 @@ class SequenceExtender:
             self._last, self._last_time = last + ahead, t_device_us
             return last + ahead, (Step.NEXT if ahead == 1 else Step.GAP), ahead - 1
         behind = -ahead % WRAP
-        if behind < NEARBY and t_device_us <= self._last_time:
+        if behind == 0 or (behind < NEARBY and t_device_us <= self._last_time):
             return last - behind, Step.REPEAT, 0
         base = self._next_base()
         self._offset = base % WRAP

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 import re
 from typing import NamedTuple
 
 from psd_deflection.protocol.frames import BadFrame
 from psd_deflection.protocol.sequence import WRAP
+from psd_deflection.protocol.words import device_words, finite
 
 MAX_LINE = 400
 """Bytes. Longer lines are malformed."""
@@ -90,14 +90,15 @@ def _description(text: bytes, size: int) -> Item:
         info = json.loads(text)
     except (ValueError, RecursionError):
         return BadFrame('comment without a description', size)
-    return Description(info) if isinstance(info, dict) else BadFrame('comment without a description', size)
+    return (
+        Description(device_words(info)) if isinstance(info, dict) else BadFrame('comment without a description', size)
+    )
 
 
 def positive(value: object) -> float | None:
     """``value`` if it is a number above zero, else None."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value <= 0:
-        return None
-    return float(value)
+    number = finite(value)
+    return number if number is not None and number > 0.0 else None
 
 
 class LineDecoder:

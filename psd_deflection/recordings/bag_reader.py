@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 
 from msg_adapters import (
     DEFLECTION_WITH_COVARIANCE,
@@ -30,6 +29,7 @@ from msg_adapters import (
 )
 from msg_adapters.header import header, stamp_ns
 from psd_deflection.errors import RecordingError
+from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
 from psd_deflection.protocol.sequence import WRAP
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.bag_writer import META_CHANGE, META_HELLO, META_PARAMETERS, META_SOFTWARE
@@ -336,14 +336,11 @@ def read_information(path: Path) -> dict[str, Any]:
     """What ``metadata.yaml`` says of its bag. Raises RecordingError where that is nothing."""
     way_out = '`psd-deflection recover` makes it anew'
     try:
-        if path.stat().st_size > MAX_YAML_BYTES:
-            raise RecordingError(f'{path}: is larger than {MAX_YAML_BYTES} bytes')
-        tree = yaml.safe_load(path.read_text(encoding='utf-8'))
+        tree = parse_yaml(read_text(path, MAX_YAML_BYTES))
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        problem = getattr(error, 'problem', None) or 'not YAML'
-        raise RecordingError(f'{path}: malformed YAML: {problem}; {way_out}') from None
+    except YamlError as error:
+        raise RecordingError(f'{path}{error.where}: {error}; {way_out}') from None
     information = tree.get('rosbag2_bagfile_information') if isinstance(tree, dict) else None
     if not isinstance(information, dict):
         raise RecordingError(f'{path}: has no rosbag2_bagfile_information; {way_out}')

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import yaml
 
-from psd_deflection.config import Rig, replace_values
+from psd_deflection.config import MAX_FILE_BYTES, Rig, replace_values
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.replay_engine import rig_at_end
 from psd_deflection.records import CHANNELS, FloatArray, IntArray
@@ -120,11 +120,11 @@ def read_observations(paths: Sequence[str | Path], rig: Rig | None = None) -> li
 
 def _listed(path: Path) -> list[tuple[str, dict[str, object]]]:
     try:
-        tree = yaml.safe_load(path.read_text(encoding='utf-8'))
+        tree = parse_yaml(read_text(path, MAX_FILE_BYTES))
     except OSError as error:
         raise ConfigError(f'{path}: cannot be read as a list of recordings ({error.strerror or error})') from None
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise ConfigError(f'{path}: malformed YAML: {getattr(error, "problem", None) or "not YAML"}') from None
+    except YamlError as error:
+        raise ConfigError(f'{path}{error.where}: {error}') from None
     if not isinstance(tree, list) or not tree:
         raise ConfigError(f'{path}: must be a list of "- recording: FILE" with optional "overrides:"')
     out: list[tuple[str, dict[str, object]]] = []

@@ -13,12 +13,12 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 
-import yaml
 from mcap.records import Channel, McapRecord, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from psd_deflection import __version__
 from psd_deflection.errors import RecordingError
+from psd_deflection.foreign_yaml import YamlError, parse_yaml
 from psd_deflection.recordings.bag_metadata import (
     DEFAULT_QOS,
     FileCount,
@@ -60,8 +60,8 @@ def _qos_of(metadata: dict[str, str]) -> Qos | list[Qos]:
     text = metadata.get('offered_qos_profiles', '')
     if not text or len(text) > _MAX_QOS_TEXT:
         return DEFAULT_QOS if not text else []
-    with contextlib.suppress(yaml.YAMLError, RecursionError, ValueError):
-        found = yaml.safe_load(text)
+    with contextlib.suppress(YamlError):
+        found = parse_yaml(text)
         if isinstance(found, list) and all(isinstance(q, dict) for q in found):
             return found
     return []

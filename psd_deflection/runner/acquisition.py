@@ -27,9 +27,10 @@ from psd_deflection.protocol.sequence import SequenceExtender, Step
 from psd_deflection.records import FLAG_DEVICE_DROPPED, IntArray, RawChunk
 from psd_deflection.runner.clock_watch import ClockWatch
 from psd_deflection.runner.counters import AWAY, BY_DEVICE, DAMAGED, UNSEEN, AcquisitionCounters
-from psd_deflection.runner.hello import check_hello
+from psd_deflection.runner.hello import AnotherDeviceError, HelloGate
 from psd_deflection.runner.pinger import Pinger
 from psd_deflection.runner.realtime import prefer_reader
+from psd_deflection.runner.repeats import Repeats
 from psd_deflection.timing import ClockState
 
 SILENCE_S = 2.0
@@ -42,6 +43,9 @@ READ_TIMEOUT_S = 0.1
 READY_S = 10.0
 GIVE_UP_TIMES = 5
 """Number of give_up() calls at stop, READ_TIMEOUT_S apart."""
+
+NEWS = 3
+"""Events of one kind that are told one by one, before they are counted and told together."""
 
 GATHER_S = 0.004
 """Longest time that the reader lets samples gather: waking up costs more than reading a sample."""
@@ -88,7 +92,7 @@ class Gathered:
 class Acquisition:
     """Reads one device until stopped. ``say`` gets one line for every change of state.
 
-    For every thread: ``source``, ``counters``, ``hello`` (the last that fits the rig), ``queue``, ``to_ros_ns``.
+    For every thread: ``source``, ``counters``, ``hello``, ``queue``, ``to_ros_ns``.
     Of the reader thread: ``beat`` (monotonic time, s, of its last round), ``failed`` (the error that ended it).
     Raises ConfigError if the rig names an unknown source.
     """
@@ -96,7 +100,6 @@ class Acquisition:
     def __init__(self, rig: Rig, say: Say) -> None:
         self.source: Source = make_source(rig)
         self.counters = AcquisitionCounters()
-        self.hello: HelloFrame | None = None
         self.queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
         # Monotonic time is mapped to ROS time by one constant: a step of the wall clock while
         # running must not tear the stamps apart.
@@ -108,11 +111,11 @@ class Acquisition:
         self._rig = rig
         self._name = self.source.name
         self._say = say
+        self._repeats = Repeats(say)
+        self._gate = HelloGate(rig)
         self._block_size = rig.estimator.block_size
         self._period_us = 1e6 / rig.converter.sample_rate_hz
         self._latency_ns = round(rig.acquisition.latency_offset * 1e9)
-        # None: the readings are volts.
-        self._volts_per_count: float | None = rig.converter.volts_per_count
 
         # Numbers and times of samples.
         self._sequence = SequenceExtender(self._block_size)
@@ -145,11 +148,10 @@ class Acquisition:
         """
         hello = self.source.open(SILENCE_S)
         try:
-            self._volts_per_count = check_hello(hello, self._rig, self._name)
+            self._gate.take(hello, self.source.name, volts=self.source.volts)
         except BaseException:
             self.source.close()
             raise
-        self.hello = hello
         self._name = self.source.name
         self._connected = True
 
@@ -178,6 +180,11 @@ class Acquisition:
                 self.queue.put(Ended())
                 return
         self.source.close()
+
+    @property
+    def hello(self) -> HelloFrame | None:
+        """The device's last HELLO that was taken, None before the first."""
+        return self._gate.hello
 
     @property
     def away(self) -> bool:
@@ -210,6 +217,7 @@ class Acquisition:
         try:
             while not self._stop.is_set():
                 self.beat = time.monotonic()
+                self._repeats.settle(self.beat)
                 if not self._connected:
                     if not self._stop.wait(RETRY_S):
                         self._reopen()
@@ -226,7 +234,7 @@ class Acquisition:
                         self._hand_over(now)
                     if now / 1e9 - silent_since > SILENCE_S:
                         silent_since = now / 1e9
-                        self._silent(size)
+                        self._silent(size, now)
                     if self._pinger.is_due(now / 1e9):
                         self.counters.pings += self._pinger.ask(self.source, now / 1e9, time.monotonic_ns())
                 except DeviceError as error:
@@ -255,10 +263,10 @@ class Acquisition:
         if rest >= 2 * period_s:
             time.sleep(rest)
 
-    def _silent(self, size: int) -> None:
+    def _silent(self, size: int, now: int) -> None:
         self.counters.silences += 1
         what = 'bytes but no sample (is the baud rate right?)' if size else 'no sample'
-        self._say(f'{self._name}: {what} for {SILENCE_S:g} s; still listening')
+        self._repeats.tell('silent', f'{self._name}: {what} for {SILENCE_S:g} s; still listening', now / 1e9)
         # It may have been stopped, by itself or by another program.
         self.source.wake()
 
@@ -272,15 +280,13 @@ class Acquisition:
         self._connected = False
         self._was_away = True
         self._refusal = ''
-        self._say(f'{error}; waiting for it to come back')
+        self._repeats.tell('away', f'{error}; waiting for it to come back', time.monotonic(), NEWS)
 
     def _reopen(self) -> None:
         try:
             hello = self.source.reopen()
             if hello is not None:
-                # Another device on the same port must not go on as if it were the first.
-                self._volts_per_count = check_hello(hello, self._rig, self.source.name)
-                self.hello = hello
+                self._gate.take(hello, self.source.name, volts=self.source.volts)
         except DeviceError as error:
             self.source.close()
             if self._stop.is_set():
@@ -290,7 +296,7 @@ class Acquisition:
             # Report once why the device is refused; a port that is still missing is not worth a line.
             if 'no such port' not in refusal and refusal != self._refusal:
                 self._refusal = refusal
-                self._say(f'{refusal}; still trying')
+                self._repeats.tell('refused', f'{refusal}; still trying', time.monotonic(), NEWS)
             return
         self._connected = True
         self._name = self.source.name
@@ -298,23 +304,24 @@ class Acquisition:
         if not self.source.numbered:
             self._sequence.restart()
             self._restarted()
-        self._say(f'{self._name}: the device is back')
+        self._repeats.tell('back', f'{self._name}: the device is back', time.monotonic(), NEWS)
 
     def feed(self, events: Sequence[Event], now: int) -> bool:
         """Sort the frames of one read at ``now`` (CLOCK_MONOTONIC, ns); True if one was a sample.
 
         The reader thread calls it. Without a reader thread, a caller with its own clock may (a test, a simulation).
+        Raises AnotherDeviceError if a HELLO has another serial number than the first one.
         """
         counters = self.counters
         good = False
         if self._clock.newest(events, now):
-            self._jumped()
+            self._jumped(now)
         for frame in events:
             if type(frame) is SampleFrame or type(frame) is Sample:
                 good = True
                 flags, seq, t, readings = frame
                 number, step, missing = self._sequence.extend(seq, t)
-                if step is not Step.NEXT and not self._unusual(number, step, missing, flags):
+                if step is not Step.NEXT and not self._unusual(number, step, missing, flags, now):
                     continue
                 self._bad_since_sample = 0
                 self._was_away = False
@@ -328,7 +335,18 @@ class Acquisition:
                     # Samples from before the clock jumped are stamped by the map that was valid then.
                     self._hand_over(now)
                     if self._clock.observe(seq, t, now):
-                        self._jumped()
+                        self._jumped(now)
+                elif self._clock.lags(number, t, now):
+                    self._hand_over(now)
+                    self._clock.lay_anew(number, seq, t, now)
+                    self.counters.clock_jumps += 1
+                    self._repeats.tell(
+                        'lag',
+                        f"{self._name}: the device's clock stands still, or falls behind its sample numbers; "
+                        'times are laid anew',
+                        now / 1e9,
+                        NEWS,
+                    )
                 elif waiting and number // self._block_size != waiting[0] // self._block_size:
                     self._hand_over(now)
                 self._gathered.add(number, t, readings, flags)
@@ -343,11 +361,11 @@ class Acquisition:
                 self._other(frame, now)
         return good
 
-    def _jumped(self) -> None:
+    def _jumped(self, now: int) -> None:
         self.counters.clock_jumps += 1
-        self._say(f"{self._name}: the device's clock jumped; times are laid anew")
+        self._repeats.tell('jump', f"{self._name}: the device's clock jumped; times are laid anew", now / 1e9, NEWS)
 
-    def _unusual(self, number: int, step: Step, missing: int, flags: int) -> bool:
+    def _unusual(self, number: int, step: Step, missing: int, flags: int, now: int) -> bool:
         """Count a sample that does not directly follow the last one; False if it is to be skipped."""
         if step is Step.FIRST:
             # Skip the block in which we joined: the first block is a whole one.
@@ -365,7 +383,7 @@ class Acquisition:
             self.counters.count_lost(missing, cause)
         elif step is Step.RESTART:
             self._restarted()
-            self._say(f'{self._name}: the device started anew')
+            self._repeats.tell('restart', f'{self._name}: the device started anew', now / 1e9, NEWS)
         return True
 
     def _restarted(self) -> None:
@@ -385,10 +403,11 @@ class Acquisition:
                 self.counters.temperature = frame.temperature_centi / 100.0
         elif isinstance(frame, HelloFrame) and frame != self.hello:
             try:
-                self._volts_per_count = check_hello(frame, self._rig, self._name)
-                self.hello = frame
+                self._gate.take(frame, self._name, volts=self.source.volts)
+            except AnotherDeviceError:
+                raise
             except DeviceError as error:
-                self._say(f'{error}; kept to the first HELLO')
+                self._repeats.tell('hello', f'{error}; kept to the first HELLO', now / 1e9)
 
     def _hand_over(self, now: int) -> None:
         gathered = self._gathered
@@ -408,10 +427,10 @@ class Acquisition:
             np.array(gathered.seq, np.int64),
             t_ns,
             np.array(gathered.readings, np.float32)
-            if self._volts_per_count is None
+            if self._gate.volts_per_count is None
             else np.array(gathered.readings, np.int16),
             np.array(gathered.flags, np.uint8),
-            self._volts_per_count,
+            self._gate.volts_per_count,
         )
         self.queue.put(Arrival(raw, now))
 

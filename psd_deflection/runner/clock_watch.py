@@ -18,6 +18,13 @@ TORN_US = 50_000
 """If device time and sample numbers disagree by more than this, the clock jumped or the device paused."""
 
 
+LAG_WINDOW_S = 10.0
+"""Time over which sample numbers and device time are compared."""
+
+PONG_SLACK = 2.0
+"""Periods by which an answer to a ping may lie outside the two samples that it came between."""
+
+
 class ClockWatch:
     """``period_us``: nominal time between two samples. ``regressed``: whether the device's clock needs the map at
     all; if it does not, times go through as they are."""
@@ -30,6 +37,10 @@ class ClockWatch:
         self._observed: tuple[int, int] | None = None
         # The last sample that was taken: extended number, device time.
         self._taken: tuple[int, int] | None = None
+        # A sample of the last LAG_WINDOW_S: extended number, device time.
+        self._past = (0, 0)
+        # An answer to a ping that waits for the sample after it: device time, sent, read.
+        self._reply: tuple[int, int, int] | None = None
 
     def newest(self, events: Sequence[Event], now: int) -> bool:
         """Give the map the samples of one read at ``now``, before any is stamped; True if the clock jumped.
@@ -64,12 +75,44 @@ class ClockWatch:
         if not self.regressed:
             return False
         last, self._taken = self._taken, (number, t_us)
-        return last is not None and abs(t_us - last[1] - (number - last[0]) * self._period_us) > TORN_US
+        torn = last is not None and abs(t_us - last[1] - (number - last[0]) * self._period_us) > TORN_US
+        if self._reply is not None:
+            reply, self._reply = self._reply, None
+            if not torn and reply[0] <= t_us + PONG_SLACK * self._period_us:
+                self._map.observe_reply(*reply)
+        if last is None or torn:
+            self._past = self._taken
+        return torn
+
+    def lags(self, number: int, t_us: int, now: int) -> bool:
+        """Whether device time has fallen behind the numbers of the samples, and by that behind the host as well.
+
+        Each neighbour may agree with the one before: a clock that stands still is a millisecond behind at each.
+        """
+        if not self.regressed:
+            return False
+        passed = (number - self._past[0]) * self._period_us
+        if passed - (t_us - self._past[1]) > TORN_US:
+            return now - self._map.host_ns(t_us) > TORN_US * 1000
+        if passed > LAG_WINDOW_S * 1e6:
+            self._past = number, t_us
+        return False
+
+    def lay_anew(self, number: int, seq: int, t_us: int, now: int) -> None:
+        """Forget what the map has learnt: this sample was taken at ``now``."""
+        self._past = number, t_us
+        self._observed = seq, t_us
+        self._map.lay_anew(t_us, now)
 
     def reply(self, t_us: int, sent_ns: int, now: int) -> None:
-        """Give the map the answer to a ping that was sent at ``sent_ns``."""
-        if self.regressed:
-            self._map.observe_reply(t_us, sent_ns, now)
+        """The answer to a ping that was sent at ``sent_ns``.
+
+        The map gets it when the next sample has come, if its time lies between the last sample and that one. An answer
+        from another timer of the device than that of the samples would shift all stamps.
+        """
+        if not self.regressed or self._taken is None or t_us < self._taken[1] - PONG_SLACK * self._period_us:
+            return
+        self._reply = t_us, sent_ns, now
 
     def to_host_ns(self, t: IntArray) -> IntArray:
         """Host times (n,) of samples in order, ns."""

@@ -23,6 +23,7 @@ class _Seen(NamedTuple):
     estimates: int
     degraded: int
     contradictions: int
+    clock_jumps: int
 
 
 class HealthReporter:
@@ -47,6 +48,7 @@ class HealthReporter:
             pipeline.estimates,
             pipeline.degraded,
             s.pipeline.stamped.contradictions,
+            wire.clock_jumps,
         )
         # The first report counts from the start. The time that it covers is unknown, so it gives no rates.
         before = self._seen
@@ -62,7 +64,7 @@ class HealthReporter:
             t_ns,
             (
                 self._acquisition(new, rate(new.samples)),
-                self._clock(),
+                self._clock(new),
                 self._estimates(new, rate(new.estimates)),
                 self._laser(1, new),
                 self._laser(2, new),
@@ -101,7 +103,7 @@ class HealthReporter:
             values.append(('device temperature (degC)', f'{wire.temperature:.2f}'))
         return DiagnosticEntry('psd_deflection: acquisition', level, message, tuple(values))
 
-    def _clock(self) -> DiagnosticEntry:
+    def _clock(self, new: _Seen) -> DiagnosticEntry:
         acquisition = self._session.acquisition
         clock, wire = acquisition.clock_state(), acquisition.counters
         stepped = acquisition.system_clock_step_ns()
@@ -119,6 +121,9 @@ class HealthReporter:
         if clock.round_trip_ns is not None:
             values.append(('least round trip (us)', f'{clock.round_trip_ns / 1e3:.0f}'))
         level, message = OK, f'skew {clock.skew_ppm:z.1f} ppm'
+        if new.clock_jumps:
+            level = WARN
+            message = f"the device's clock jumped or stood still: times were laid anew {new.clock_jumps} times"
         if abs(stepped) > CLOCK_STEP_NS:
             level = WARN
             message = f'the system clock was set by {stepped / 1e9:+.3f} s; stamps go on as before until the next start'

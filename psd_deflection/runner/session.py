@@ -14,6 +14,7 @@ from pathlib import Path
 
 from msg_adapters import TOPIC_TYPES
 from psd_deflection.config import ZEROS, Rig, replace_values
+from psd_deflection.errors import printable
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings import cdr
 from psd_deflection.records import ParameterChange
@@ -40,6 +41,9 @@ KEEP_S = 0.2
 
 OPEN_S = 2.0
 """How long the start waits for the disk if a recording is wanted from the start."""
+
+LONGEST_LINE = 2000
+"""Characters of a line that is said."""
 
 
 def zero_text(rig: Rig) -> str:
@@ -100,6 +104,7 @@ class Session:
             raise
 
     def _tell(self, text: str) -> None:
+        text = printable(text, LONGEST_LINE)
         for listener in tuple(self.listeners):
             listener(text)
 

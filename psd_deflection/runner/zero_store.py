@@ -9,6 +9,7 @@ that taking a zero does not wait for the disk.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -37,9 +38,12 @@ class ZeroStore:
         self._configured = {name: configured.values[name] for name in ZEROS}
         named = configured.acquisition.zero_file
         # The device chooses its serial number: it must not lead out of the folder.
-        safe = re.sub(r'[^A-Za-z0-9._-]', '_', str(serial))[:64].strip('.') or 'unknown'
+        self._serial = str(serial)
+        safe = re.sub(r'[^A-Za-z0-9._-]', '_', self._serial)[:64].strip('.') or 'unknown'
+        if safe != self._serial:
+            # Serial numbers that differ only in characters that were replaced or cut need two files.
+            safe += '_' + hashlib.sha256(self._serial.encode(errors='backslashreplace')).hexdigest()[:12]
         self.path = Path(named).expanduser() if named else state_folder() / f'zero_{safe}.json'
-        self._serial = str(serial)[:64]
         self._saving = threading.Lock()
         self._wanted: Rig | None = None
         self._thread: threading.Thread | None = None
@@ -59,6 +63,8 @@ class ZeroStore:
             return rig, ''
         except (OSError, ValueError, RecursionError, ConfigError) as error:
             return rig, f'{self.path}: the kept zero cannot be used ({error}); the rig file holds'
+        if kept.get('serial') != self._serial:
+            return rig, f'{self.path}: the kept zero is that of another device; the rig file holds'
         if kept['configured'] != self._configured:
             return rig, f'{self.path}: the rig file has another zero than when this one was kept; the rig file holds'
         return replace_values(rig, zeros, str(self.path)), f'zero of the last run, from {self.path}'

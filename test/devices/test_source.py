@@ -32,6 +32,8 @@ VOLTS = (0.1, 0.2, 5.0, 0.3, 0.4, 5.0)
 class Scripted(Source):
     """Gives ``script`` reading by reading; an exception in it is raised."""
 
+    volts = True
+
     def __init__(self, rig: Rig) -> None:
         self.name = 'scripted'
         self.script: list[list[Any] | Exception] = []
@@ -39,8 +41,8 @@ class Scripted(Source):
 
     def open(self, timeout: float) -> HelloFrame:
         self.calls.append('open')
-        info: dict[str, object] = {'sample_rate_hz': 1000.0, 'channels': list(CHANNELS), 'volts_per_count': None}
-        return HelloFrame(1, info)
+        info: dict[str, object] = {'serial': 'S-1', 'firmware': 'test', 'sample_rate_hz': 1000.0}
+        return HelloFrame(1, info | {'channels': list(CHANNELS), 'volts_per_count': None})
 
     def start(self) -> None:
         self.calls.append('start')

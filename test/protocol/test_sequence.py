@@ -18,6 +18,13 @@ def test_the_next_one_a_gap_and_a_repeat() -> None:
     assert s.extend(13, 13000) == (13, Step.NEXT, 0)
 
 
+def test_a_number_that_stands_still_is_a_repeat_whatever_the_clock_says() -> None:
+    s = SequenceExtender(20)
+    s.extend(7, 7000)
+    assert [s.extend(7, 7000 + 1000 * k) for k in range(3)] == [(7, Step.REPEAT, 0)] * 3
+    assert s.extend(8, 11_000) == (8, Step.NEXT, 0)
+
+
 def test_the_wrap_is_passed_with_and_without_a_gap() -> None:
     s = SequenceExtender(20)
     s.extend(WRAP - 1, 5)

@@ -382,7 +382,7 @@ def test_bags_of_another_kind_are_refused(tmp_path: Path, changes: dict[str, obj
         ('a.mcap', b'\x89MCAP0\r\n', 'holds no samples before the cut'),
         ('metadata.yaml', b'rosbag2_bagfile_information: [1', 'malformed YAML'),
         ('metadata.yaml', b'- 1', 'has no rosbag2_bagfile_information'),
-        ('metadata.yaml', b'\xff\xfe\xff', 'malformed YAML'),
+        ('metadata.yaml', b'\xff\xfe\xff', 'it is no text'),
         ('metadata.yaml', b'[' * 5000, 'malformed YAML'),
     ],
 )

@@ -90,8 +90,72 @@ def test_numbers_may_wrap() -> None:
 def test_an_answer_to_a_ping_bounds_the_delay() -> None:
     watched = watch()
     watched.newest([sample(0)], BOOT + 3 * MS)
+    watched.torn(0, 0)
     watched.reply(1000, BOOT + 3 * MS, BOOT + 4 * MS)
+    watched.torn(1, 1000)
     assert watched.state().round_trip_ns == MS
+
+
+@pytest.mark.parametrize(('claimed_us', 'believed'), [(100_400, True), (145_400, False), (55_000, False)])
+def test_an_answer_to_a_ping_lies_between_the_samples_around_it(claimed_us: int, believed: bool) -> None:
+    watched = watch()
+    for k in range(101):
+        watched.newest([sample(k)], BOOT + k * MS)
+        watched.torn(k, k * 1000)
+    before = host_of(watched, 100_000)
+    watched.reply(claimed_us, BOOT + 99 * MS, BOOT + 101 * MS)
+    watched.torn(101, 101_000)
+    assert (watched.state().round_trip_ns == 2 * MS) is believed
+    watched.newest([sample(102)], BOOT + 102 * MS)
+    assert abs(host_of(watched, 100_000) - before) < 10_000
+
+
+def test_an_answer_across_a_jump_of_the_clock_is_not_believed() -> None:
+    watched = watch()
+    watched.newest([sample(0)], BOOT)
+    watched.torn(0, 0)
+    watched.reply(500, BOOT, BOOT + MS)
+    assert watched.torn(1, 10**9)
+    assert watched.state().round_trip_ns is None
+
+
+def stamped(clock_us: list[int]) -> list[int]:
+    """How late the stamp of each of these samples is, ns: one a millisecond, each read as it comes."""
+    watched = watch()
+    late = []
+    for k, t_us in enumerate(clock_us):
+        now = BOOT + k * MS
+        watched.newest([sample(k, t_us)], now)
+        if watched.torn(k, t_us):
+            watched.observe(k, t_us, now)
+        elif watched.lags(k, t_us, now):
+            watched.lay_anew(k, k, t_us, now)
+        late.append(now - host_of(watched, t_us))
+    return late
+
+
+@pytest.mark.parametrize('share', [0.0, 0.5, 0.98])
+def test_a_clock_that_stands_still_or_crawls_is_laid_anew(share: float) -> None:
+    late = stamped([min(k, 500) * 1000 + round(max(k - 500, 0) * 1000 * share) for k in range(12_000)])
+    assert max(late) < 60 * MS
+
+
+def test_a_line_that_was_held_up_is_no_lag() -> None:
+    watched = watch()
+    for k in range(1000):
+        # What the host has not read for a second comes at once.
+        now = BOOT + max(k, 999) * MS
+        assert not watched.torn(k, k * 1000)
+        assert not watched.lags(k, k * 1000, now)
+
+
+def test_a_device_that_is_faster_than_it_says_does_not_lag() -> None:
+    watched = watch()
+    for k in range(3000):
+        t_us, now = k * 900, BOOT + k * 900_000
+        watched.newest([sample(k, t_us)], now)
+        assert not watched.torn(k, t_us)
+        assert not watched.lags(k, t_us, now)
 
 
 @pytest.mark.parametrize('t', [0, 123_456_789])

@@ -28,6 +28,23 @@ def test_what_was_kept_comes_back_for_the_same_device_alone(rig: Rig) -> None:
     assert ZeroStore(rig, 'B-2').load(rig) == (rig, '')
 
 
+@pytest.mark.parametrize(
+    ('one', 'other'), [('Rig \u00c4', 'Rig \u00d6'), ('a' * 64 + 'x', 'a' * 64 + 'y'), ('', 'unknown'), ('A', 'A.')]
+)
+def test_two_serial_numbers_never_share_a_zero(rig: Rig, one: str, other: str) -> None:
+    assert ZeroStore(rig, one).save(replace_values(rig, ZERO)) == ''
+    assert ZeroStore(rig, other).load(rig) == (rig, '')
+    assert ZeroStore(rig, one).load(rig)[0].values['psd_1.zero'] == ZERO['psd_1.zero']
+
+
+def test_a_zero_file_of_another_device_is_passed_over(tmp_path: Path) -> None:
+    named = load_rig(overrides={'zero_file': str(tmp_path / 'zero.json')})
+    assert ZeroStore(named, 'A').save(replace_values(named, ZERO)) == ''
+    back, said = ZeroStore(named, 'B').load(named)
+    assert back is named
+    assert 'that of another device' in said
+
+
 def test_a_rig_file_that_says_otherwise_now_holds(rig: Rig) -> None:
     ZeroStore(rig, 'A').save(replace_values(rig, ZERO))
     edited = load_rig(overrides={'psd_1.zero': [5e-4, 0.0]})

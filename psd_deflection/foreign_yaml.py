@@ -1,0 +1,109 @@
+"""Reads YAML that a stranger may have written: parameter files, ``metadata.yaml``, lists and inputs.
+
+Only plain types come out (maps, lists, text, numbers, dates), and only as much as was allowed for: a few hundred bytes
+of aliases or merge keys can stand for more than any memory holds, and some tags make the parser itself fail.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+MAX_DEPTH = 50
+MAX_NODES = 50_000
+"""Keys, values, lists and maps of one file, each counted as often as aliases and merge keys repeat it."""
+
+MAX_SCALAR = 200
+"""Characters of a number, a date or what else is no text. A text may have any length."""
+
+_TEXT = 'tag:yaml.org,2002:str'
+_Loader: type[yaml.SafeLoader] = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+
+
+class YamlError(ValueError):
+    """What is wrong, in a few words. ``where``: ``:line:column`` to put behind the file's name, or ''."""
+
+    def __init__(self, problem: str, mark: Any = None) -> None:
+        super().__init__(problem)
+        self.where = f':{mark.line + 1}:{mark.column + 1}' if mark is not None else ''
+
+
+def read_text(path: Path, most: int) -> str:
+    """The UTF-8 text of a file of at most ``most`` bytes, whatever its size is said to be.
+
+    Raises OSError, YamlError for a longer file and for one that is no text.
+    """
+    with path.open('rb') as stream:
+        content = stream.read(most + 1)
+    if len(content) > most:
+        raise YamlError(f'it has more than {most} bytes')
+    try:
+        return content.decode('utf-8')
+    except UnicodeDecodeError:
+        raise YamlError('it is no text') from None
+
+
+def parse_yaml(text: str) -> object:
+    """The tree of one YAML document, None for an empty one. Raises YamlError."""
+    try:
+        _count(text)
+        loader = _Loader(text)
+        try:
+            root = loader.get_single_node()
+            if root is None:
+                return None
+            _measure(root, {}, set())
+            return loader.construct_document(root)
+        finally:
+            loader.dispose()
+    except YamlError:
+        raise
+    except yaml.MarkedYAMLError as error:
+        raise YamlError(f'malformed YAML: {error.problem or "not YAML"}', error.problem_mark) from None
+    except Exception:
+        raise YamlError('malformed YAML: not YAML') from None
+
+
+def _count(text: str) -> None:
+    """Refuse what is too large or nested too deep before anything of it is built."""
+    nodes = depth = 0
+    for event in yaml.parse(text, Loader=_Loader):
+        if isinstance(event, yaml.NodeEvent):
+            nodes += 1
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        if depth > MAX_DEPTH:
+            raise YamlError(f'malformed YAML: nested deeper than {MAX_DEPTH}', event.start_mark)
+        if nodes > MAX_NODES:
+            raise YamlError(f'malformed YAML: more than {MAX_NODES} keys and values', event.start_mark)
+
+
+def _measure(node: yaml.Node, known: dict[int, int], inside: set[int]) -> int:
+    """How many nodes ``node`` stands for once every alias is written out.
+
+    An alias stands behind what it repeats, so that this goes no deeper than the text is nested.
+    """
+    if id(node) in known:
+        return known[id(node)]
+    if id(node) in inside:
+        raise YamlError('malformed YAML: an alias to what it stands in', node.start_mark)
+    size = 1
+    if isinstance(node, yaml.ScalarNode):
+        if node.tag != _TEXT and len(node.value) > MAX_SCALAR:
+            raise YamlError(f'malformed YAML: a number of {len(node.value)} characters', node.start_mark)
+    else:
+        inside.add(id(node))
+        children = [n for pair in node.value for n in pair] if isinstance(node, yaml.MappingNode) else node.value
+        for child in children:
+            size += _measure(child, known, inside)
+            if size > MAX_NODES:
+                raise YamlError(
+                    f'malformed YAML: aliases stand for more than {MAX_NODES} keys and values', node.start_mark
+                )
+        inside.discard(id(node))
+    known[id(node)] = size
+    return size

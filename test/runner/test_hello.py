@@ -1,0 +1,259 @@
+"""The gate for what a device says of itself."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import time
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+from cobs import cobs
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.devices.source import Received, Source
+from psd_deflection.errors import DeviceError
+from psd_deflection.protocol.frames import HelloFrame, SampleFrame
+from psd_deflection.protocol.words import MAX_TEXT
+from psd_deflection.records import CHANNELS
+from psd_deflection.runner import acquisition as module
+from psd_deflection.runner.acquisition import Acquisition, Arrival
+from psd_deflection.runner.hello import AnotherDeviceError, HelloGate
+
+VOLTS = 10.0 / 32768
+GOOD: dict[str, object] = {
+    'serial': 'T-1',
+    'firmware': 'test',
+    'sample_rate_hz': 1000.0,
+    'channels': list(CHANNELS),
+    'volts_per_count': VOLTS,
+}
+HUGE = 10**308 * 10
+
+
+def info(**changes: object) -> dict[str, object]:
+    return {k: v for k, v in (GOOD | changes).items() if v is not ...}
+
+
+def sealed(payload: bytes) -> bytes:
+    """A frame of these bytes, with its check."""
+    encoded: bytes = cobs.encode(payload + zlib.crc32(payload).to_bytes(4, 'little'))
+    return b'\x00' + encoded + b'\x00'
+
+
+def gate(first: Mapping[str, object] | None = None, *, volts: bool = False) -> HelloGate:
+    made = HelloGate(load_rig())
+    if first is not None:
+        made.take(HelloFrame(1, dict(first)), 'port', volts=volts)
+    return made
+
+
+@pytest.mark.parametrize(
+    ('changes', 'said'),
+    [
+        ({'sample_rate_hz': HUGE}, "sample_rate_hz 'a whole number of 1027 bits', the rig file says 1000"),
+        ({'sample_rate_hz': math.nan}, "sample_rate_hz 'nan', the rig file says 1000"),
+        ({'sample_rate_hz': math.inf}, "sample_rate_hz 'inf'"),
+        ({'sample_rate_hz': True}, 'sample_rate_hz True'),
+        ({'sample_rate_hz': [1000]}, r'sample_rate_hz \[1000\]'),
+        ({'sample_rate_hz': ...}, 'sample_rate_hz None'),
+        ({'volts_per_count': None}, 'volts_per_count None, needed is a number'),
+        ({'volts_per_count': ...}, 'volts_per_count None, needed is a number'),
+        ({'volts_per_count': HUGE}, "volts_per_count 'a whole number"),
+        ({'volts_per_count': math.nan}, "volts_per_count 'nan'"),
+        ({'serial': ...}, 'serial None, needed is a text'),
+        ({'serial': 7}, 'serial 7, needed is a text'),
+        ({'firmware': ...}, 'firmware None, needed is a text'),
+        ({'firmware': ['a']}, r"firmware \['a'\], needed is a text"),
+        ({'channels': {'x1': 1}}, 'channels'),
+    ],
+)
+def test_what_does_not_fit_is_refused_at_the_start_and_later(changes: dict[str, object], said: str) -> None:
+    for before in (gate(), gate(GOOD)):
+        kept = before.hello
+        with pytest.raises(DeviceError, match=f'port: HELLO has {said}') as error:
+            before.take(HelloFrame(1, info(**changes)), 'port', volts=False)
+        assert len(str(error.value)) < 400
+        assert (before.hello, before.volts_per_count) == (kept, VOLTS)
+
+
+def test_volts_only_if_the_source_says_so() -> None:
+    assert gate(info(volts_per_count=None), volts=True).volts_per_count is None
+    with pytest.raises(DeviceError, match='needed is null, since its samples are volts'):
+        gate(GOOD, volts=True)
+
+
+def test_another_serial_number_is_another_device() -> None:
+    taken = gate(GOOD)
+    with pytest.raises(AnotherDeviceError, match="serial number 'T-2' and not 'T-1'"):
+        taken.take(HelloFrame(1, info(serial='T-2', channels=[])), 'port', volts=False)
+    assert taken.hello == HelloFrame(1, GOOD)
+
+
+def test_the_scale_stays_and_other_keys_may_change() -> None:
+    taken = gate(GOOD)
+    with pytest.raises(DeviceError, match=r'volts_per_count 0.0003054.* now and had 0.00030517.* before'):
+        taken.take(HelloFrame(1, info(volts_per_count=1.0009 * VOLTS)), 'port', volts=False)
+    assert taken.volts_per_count == VOLTS
+    taken.take(HelloFrame(1, info(firmware='newer', uptime=5)), 'port', volts=False)
+    assert taken.hello is not None
+    assert taken.hello.info['uptime'] == 5
+
+
+def test_words_are_printable_and_bounded() -> None:
+    hello = gate(info(serial='\ud800\x1b[31m', firmware='x' * 1000, note={'\x07': '\x1b]0;t\x07'})).hello
+    assert hello is not None
+    assert hello.info['serial'] == '\\ud800\\x1b[31m'
+    assert len(str(hello.info['firmware'])) == MAX_TEXT
+    assert hello.info['note'] == {'\\x07': '\\x1b]0;t\\x07'}
+    json.dumps(hello.info, ensure_ascii=False).encode()
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(st.characters()) | st.just(HUGE),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(st.dictionaries(st.sampled_from([*GOOD, 'other']), VALUES, max_size=6), st.booleans(), st.booleans())
+def test_any_hello_is_taken_or_refused_with_a_device_error(changes: dict[str, Any], volts: bool, first: bool) -> None:
+    before = gate(info(volts_per_count=None) if volts else GOOD, volts=volts) if first else gate()
+    scale = before.volts_per_count
+    with contextlib.suppress(DeviceError):
+        before.take(HelloFrame(1, info(**changes)), 'port', volts=volts)
+    if before.hello is not None:
+        json.dumps(before.hello.info, allow_nan=False, ensure_ascii=False).encode()
+    if first:
+        assert before.volts_per_count == scale
+
+
+class Quiet(Source):
+    """Says ``answers`` when it is opened, the last one again and again; the test feeds it."""
+
+    def __init__(self, *answers: Mapping[str, object]) -> None:
+        self.name = 'quiet'
+        self.answers = [dict(a) for a in answers]
+        self.closed = 0
+
+    def open(self, timeout: float) -> HelloFrame:
+        return HelloFrame(1, self.answers.pop(0) if len(self.answers) > 1 else self.answers[0])
+
+    def start(self) -> None: ...
+
+    def read(self, timeout: float) -> Received:
+        return Received([], time.monotonic_ns(), 0)
+
+    def close(self) -> None:
+        self.closed += 1
+
+    def describe(self) -> dict[str, str]:
+        return {}
+
+
+def opened(monkeypatch: pytest.MonkeyPatch, source: Source, said: list[str], rig: Rig | None = None) -> Acquisition:
+    monkeypatch.setattr(module, 'make_source', lambda rig: source)
+    acquisition = Acquisition(load_rig() if rig is None else rig, said.append)
+    acquisition.open()
+    return acquisition
+
+
+def sample(seq: int, t_us: int | None = None) -> SampleFrame:
+    return SampleFrame(0, seq, seq * 1000 if t_us is None else t_us, (0, 0, 16384, 0, 0, 16384))
+
+
+def stamps(acquisition: Acquisition) -> list[int]:
+    out: list[int] = []
+    while not acquisition.queue.empty():
+        item = acquisition.queue.get()
+        if isinstance(item, Arrival):
+            out += item.raw.t_ns.tolist()
+    return out
+
+
+def test_a_flood_of_hellos_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    acquisition = opened(monkeypatch, Quiet(GOOD), said)
+    for k in range(3000):
+        acquisition.feed([HelloFrame(1, info(sample_rate_hz=k % 500))], k * 1_000_000)
+    assert len(said) == 1
+    assert 'sample_rate_hz 0, the rig file says 1000' in said[0]
+    assert 'kept to the first HELLO' in said[0]
+
+
+def test_the_scale_of_samples_does_not_change_in_mid_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    acquisition = opened(monkeypatch, Quiet(GOOD), said)
+    other = HelloFrame(1, info(volts_per_count=1.0009 * VOLTS))
+    for k in range(40):
+        acquisition.feed([sample(k), other], k * 1_000_000)
+    chunks = [acquisition.queue.get() for _ in range(2)]
+    assert [c.raw.volts_per_count for c in chunks if isinstance(c, Arrival)] == [VOLTS, VOLTS]
+    assert len(said) == 1
+
+
+def test_another_device_in_mid_stream_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Quiet(GOOD)
+    acquisition = opened(monkeypatch, source, [])
+    with pytest.raises(AnotherDeviceError):
+        acquisition.feed([sample(0), HelloFrame(1, info(serial='T-2')), sample(1)], 0)
+    assert acquisition.counters.samples == 1
+
+
+def test_a_number_that_stands_still_floods_neither_log_nor_queue(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    acquisition = opened(monkeypatch, Quiet(GOOD), said)
+    for k in range(1200):
+        acquisition.feed([sample(20, 20_000 + 1000 * k)], k * 1_000_000)
+    assert said == []
+    assert (acquisition.counters.restarts, acquisition.counters.repeated) == (0, 1199)
+    assert acquisition.queue.empty()
+
+
+def test_a_device_that_starts_anew_all_the_time_is_told_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    acquisition = opened(monkeypatch, Quiet(GOOD), said)
+    for k in range(1000):
+        acquisition.feed([sample(10_000 - 200 * (k % 2), 1000 * k)], k * 1_000_000)
+    assert acquisition.counters.restarts > 100
+    assert len([line for line in said if 'started anew' in line]) <= module.NEWS + 1
+
+
+def test_a_clock_that_stands_still_is_told_and_stamps_follow_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    acquisition = opened(monkeypatch, Quiet(GOOD), said)
+    late = []
+    for k in range(19_000):
+        now = 10**12 + k * 1_000_000
+        acquisition.feed([sample(k, min(k, 1000) * 1000)], now)
+        late += [now + acquisition.to_ros_ns - t for t in stamps(acquisition)[-1:]]
+    assert len(late) >= 950
+    assert max(late) < 80_000_000
+    assert acquisition.counters.clock_jumps > 100
+    assert any('clock stands still' in line for line in said)
+    assert len(said) <= module.NEWS + 3
+
+
+def test_the_kept_words_are_the_same_for_a_port_of_bytes(device: Any, rig: Rig) -> None:
+    body = json.dumps(info(serial='\ud800', firmware='\x1b[31m')).encode()
+    device.answer = sealed(b'\x10\x01' + body)
+    acquisition = Acquisition(rig, lambda _: None)
+    acquisition.open()
+    try:
+        assert acquisition.hello is not None
+        assert (acquisition.hello.info['serial'], acquisition.hello.info['firmware']) == ('\\ud800', '\\x1b[31m')
+    finally:
+        acquisition.stop()
+
+
+@pytest.mark.parametrize('rate', ['1' + 309 * '0', 'NaN', '1e999'])
+def test_no_rate_on_the_wire_ends_the_reader(device: Any, rig: Rig, rate: str) -> None:
+    text = json.dumps(info(sample_rate_hz=12345)).replace('12345', rate)
+    device.answer = sealed(b'\x10\x01' + text.encode())
+    with pytest.raises(DeviceError, match='sample_rate_hz'):
+        Acquisition(rig, lambda _: None).open()

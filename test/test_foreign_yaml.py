@@ -1,0 +1,134 @@
+"""YAML of a stranger: plain types, bounded, and no exception but the declared one."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psd_deflection.budget.inputs import read_inputs
+from psd_deflection.config import MAX_FILE_BYTES, load_rig
+from psd_deflection.errors import ConfigError, PsdDeflectionError, RecordingError
+from psd_deflection.foreign_yaml import MAX_DEPTH, MAX_NODES, YamlError, parse_yaml, read_text
+from psd_deflection.recordings.bag_reader import read_information
+from psd_deflection.recordings.observations import read_observations
+
+TAGS = [
+    'x: !!bool foo',
+    'x: !!int ""',
+    'x: !!int "-"',
+    'x: !!int "0x"',
+    'x: !!float ""',
+    'x: !!timestamp foo',
+    'x: !!timestamp 2001-99-99',
+    'x: !!binary "ä"',
+    'x: !!python/object/apply:os.system [true]',
+    'x: !!set [1]',
+    'x: !!omap 1',
+    '? [1]\n: 2',
+    'x: 1' + '0' * 5000,
+    'x: 1' + ':59' * 100_000,
+    'x: [1',
+    'x: "\\ud800"',
+    '%YAML 9.9\n---\nx: 1',
+    '--- 1\n--- 2',
+    '[' * 100_000,
+    'x: &a [*a]',
+    'x: *nobody',
+    '\x07',
+]
+
+
+def merge_bomb() -> str:
+    lines = ['m0: &m0 {k0: 1}']
+    lines += [f'm{n}: &m{n} {{<<: [{", ".join([f"*m{n - 1}"] * 10)}]}}' for n in range(1, 10)]
+    return '\n'.join(lines)
+
+
+def alias_bomb() -> str:
+    lines = ['a0: &a0 [' + ', '.join('x' * 10) + ']']
+    lines += [f'a{n}: &a{n} [{", ".join([f"*a{n - 1}"] * 10)}]' for n in range(1, 9)]
+    return '\n'.join(lines)
+
+
+BOMBS = [merge_bomb(), alias_bomb(), '\n'.join(f'k{n}: {n}' for n in range(60_000))]
+
+
+def readers(path: Path) -> list[type[PsdDeflectionError]]:
+    """Every reader of such a file refuses this one; with what."""
+    found: list[type[PsdDeflectionError]] = []
+    for read in (
+        lambda: load_rig(path),
+        lambda: read_information(path),
+        lambda: read_observations([str(path)], None),
+        lambda: read_inputs(path),
+    ):
+        with pytest.raises(PsdDeflectionError) as error:
+            read()
+        assert path.name in str(error.value)
+        assert len(str(error.value)) < 500
+        found.append(error.type)
+    return found
+
+
+@pytest.mark.parametrize('text', TAGS)
+def test_what_is_no_plain_tree_is_refused_by_every_reader(tmp_path: Path, text: str) -> None:
+    with pytest.raises(YamlError, match='malformed YAML'):
+        parse_yaml(text)
+    path = tmp_path / 'strange.yaml'
+    path.write_text(text, encoding='utf-8')
+    assert readers(path) == [ConfigError, RecordingError, ConfigError, ConfigError]
+
+
+@pytest.mark.parametrize('text', BOMBS, ids=['merge keys', 'aliases', 'keys'])
+def test_a_bomb_is_refused_before_it_is_built(tmp_path: Path, text: str) -> None:
+    with pytest.raises(YamlError, match=f'more than {MAX_NODES} keys and values'):
+        parse_yaml(text)
+    path = tmp_path / 'bomb.yaml'
+    path.write_text(text)
+    readers(path)
+
+
+def test_the_place_is_named(tmp_path: Path) -> None:
+    path = tmp_path / 'mine.yaml'
+    path.write_text('a: 1\nb: [1\nc: 2\n')
+    with pytest.raises(ConfigError, match=r'mine\.yaml:\d+:\d+: malformed YAML: '):
+        load_rig(path)
+
+
+def test_a_file_without_an_end_is_read_no_further_than_its_bound() -> None:
+    with pytest.raises(YamlError, match=f'more than {MAX_FILE_BYTES} bytes'):
+        read_text(Path('/dev/zero'), MAX_FILE_BYTES)
+
+
+def test_aliases_and_merge_keys_within_the_bound_are_as_ever() -> None:
+    text = 'a: &a {x: 1, y: [1.5, two, 2001-01-01]}\nb: {<<: *a, z: 3}\nc: *a\n'
+    assert parse_yaml(text) == yaml.safe_load(text)
+    assert parse_yaml('') is None
+
+
+def test_depth_is_bounded_and_a_long_text_is_not() -> None:
+    assert parse_yaml('[' * MAX_DEPTH + ']' * MAX_DEPTH) is not None
+    with pytest.raises(YamlError, match='nested deeper'):
+        parse_yaml('[' * (MAX_DEPTH + 1) + ']' * (MAX_DEPTH + 1))
+    assert parse_yaml('a: ' + 'x' * 100_000) == {'a': 'x' * 100_000}
+
+
+WORDS = 'a 1 : - [ ] { } , &x *x <<: !!int !!bool !!set !!timestamp !!float " 0x 1e . 2001-01-01 | ? ! % --- ~'
+PIECES = st.sampled_from(WORDS.split(' '))
+
+
+@given(st.lists(PIECES | st.sampled_from([' ', '  ', '\n', '\t']) | st.text(max_size=3), max_size=30).map(''.join))
+def test_any_text_is_read_or_refused(text: str) -> None:
+    with contextlib.suppress(YamlError):
+        parse_yaml(text)
+
+
+@pytest.mark.parametrize('value', ['\ud800x', 'a\x1b[31m', 'a\nb'])
+def test_a_text_that_cannot_be_printed_is_no_parameter(value: str) -> None:
+    with pytest.raises(ConfigError, match=r'bag_dir = .*: must be text that can be printed'):
+        load_rig(overrides={'bag_dir': value})
