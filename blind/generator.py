@@ -1,4 +1,4 @@
-"""A second rig, written from the contract alone: nothing of ``psd_deflection.simulation`` is imported.
+"""A second rig, written from docs/simulation.md alone: nothing of ``psd_deflection.simulation`` is imported.
 
 Its own way in everything: the motion is integrated by Runge-Kutta of order four at a fifth of a
 millisecond (as one matrix polynomial a step, the loads held over each sample), the optics intersect
@@ -318,8 +318,8 @@ def electronics(m: Array, light: Array, t: Array, effects: Sequence[Spec]) -> Ar
     return volts
 
 
-def output(volts: Array, effects: Sequence[Spec]) -> Array:
-    """Clipping, coarse steps, the converter's own steps."""
+def output(volts: Array, effects: Sequence[Spec], bits: int = 16) -> Array:
+    """Clipping, coarse steps, the own steps of a converter of so many bits over +-10 V."""
     v = volts
     for e in find(effects, 'amplifier_saturation'):
         cols = [0, 1, 2, 3, 4, 5] if e['sums'] else [0, 1, 3, 4]
@@ -327,7 +327,9 @@ def output(volts: Array, effects: Sequence[Spec]) -> Array:
         v[:, cols] = np.clip(v[:, cols], -e['limit'], e['limit'])
     for e in find(effects, 'quantisation'):
         v = e['step'] * np.round(v / e['step'])
-    return np.clip(np.round(v / LSB), -32768, 32767) * LSB
+    lsb = LSB * 2.0 ** (16 - bits)
+    half = 2 ** (bits - 1)
+    return np.clip(np.round(v / lsb), -half, half - 1) * lsb
 
 
 def noise(n: int, kind: str, seed: int) -> Array:
@@ -345,6 +347,33 @@ def noise(n: int, kind: str, seed: int) -> Array:
             out[i] = 0.5 * out[i - 1] + math.sqrt(0.75) * e[i]
         return SIGMA * out
     return SIGMA * e
+
+
+def electronic_noise(
+    n: int, seed: int, *, sigmas: Sequence[float] = (SIGMA,) * 6, memory: float = 0.0, heavy: bool = False
+) -> Array:
+    """(n, 6) V of rms ``sigmas``: each sample is ``memory`` times the last one and something new (AR(1))."""
+    rng = np.random.default_rng(seed)
+    new = rng.standard_t(4, size=(n, 6)) / math.sqrt(2.0) if heavy else rng.normal(size=(n, 6))
+    if memory:
+        out = np.empty_like(new)
+        before = out[0] = new[0]
+        fresh = math.sqrt(1.0 - memory**2)
+        for i in range(1, n):
+            before = out[i] = memory * before + fresh * new[i]
+        new = out
+    return np.asarray(new * np.asarray(sigmas))
+
+
+def present(n: int, seed: int, share: float = 0.0, burst: int = 0) -> npt.NDArray[np.bool_]:
+    """Which of n samples arrive: ``share`` of them lost one by one, and of every 200 ``burst`` together."""
+    rng = np.random.default_rng(seed)
+    here = rng.random(n) >= share
+    if burst:
+        for start in range(0, n - 200, 200):
+            first = start + int(rng.integers(0, 200 - burst))
+            here[first : first + burst] = False
+    return here
 
 
 class Generator:

@@ -91,7 +91,8 @@ def block_middle_ns(block: SampleBlock, block_size: int, period_ns: float) -> in
     """When the middle of the whole block was, ns, from the samples that are present.
 
     Each present sample says where slot (N-1)/2 is; the mean of these is taken, so that a lost
-    sample moves the stamp by no more than the clock's own jitter.
+    sample moves the stamp by no more than the clock's own jitter. The mean of the samples that are left belongs to
+    another time: :mod:`psd_deflection.uncertainty.block_fit` gives the value at the stamp.
     """
     first = int(block.t_ns[0])
     slots = block.seq - block.index * block_size

@@ -141,6 +141,27 @@ class EstimatorConfig:
         maximum=100.0,
         live=True,
     )
+    block_fit: str = parameter(
+        'poly',
+        '',
+        'what a block gives: its mean, or a polynomial at the stamp (poly), which follows motion inside the block',
+        choices=('poly', 'mean'),
+        before='mean',
+    )
+    covariance: str = parameter(
+        'measured',
+        '',
+        "noise behind the covariances: the rig file's, or measured in the stream after 100 blocks",
+        choices=('measured', 'file'),
+        before='file',
+    )
+    consistency: str = parameter(
+        'widen',
+        '',
+        'when the four readings contradict each other: widen the covariance, refuse the block, or only report it',
+        choices=('widen', 'refuse', 'report'),
+        before='report',
+    )
     splitter: bool = parameter(
         False, '', 'both detectors share two lasers over a beam splitter (thesis 5.4): one lost halves both sums'
     )
@@ -371,6 +392,16 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
     other.
     """
     return _rig({p.name: p.default for p in PARAMETERS}, {}, values, source)
+
+
+def rig_as_recorded(values: Mapping[str, object], source: str) -> Rig:
+    """The rig of a recording's parameters: one that they do not name was not there yet, and what held before it holds.
+
+    A recording names every parameter of its time; one that names none (CSV) has today's defaults. Raises ConfigError
+    as :func:`rig_from_values` does.
+    """
+    then = {p.name: p.before for p in PARAMETERS if p.before is not None} if values else {}
+    return rig_from_values({**then, **values}, source)
 
 
 def replace_values(rig: Rig, changes: Mapping[str, object], source: str = 'override') -> Rig:

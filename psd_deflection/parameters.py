@@ -42,7 +42,8 @@ _KINDS: Mapping[object, Kind] = {float: 'double', int: 'integer', bool: 'bool', 
 class Parameter:
     """One thing that can be set. ``minimum``/``maximum`` hold for each element of an array.
 
-    ``above``: an exclusive lower bound. ``live``: may change while the node runs.
+    ``above``: an exclusive lower bound. ``live``: may change while the node runs. ``before``: what held before there
+    was this parameter, and so what a recording that does not name it was made with; None: the default.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Parameter:
     length: int | None = None
     choices: tuple[str, ...] | None = None
     live: bool = False
+    before: Any = None
 
     def bound_text(self) -> str:
         """The bounds or the choices in words, for an error message or ``--help``; '' if there are none."""
@@ -82,6 +84,7 @@ def parameter(
     above: float | None = None,
     choices: tuple[str, ...] | None = None,
     live: bool = False,
+    before: T | None = None,
 ) -> T:
     """Declare a parameter as a field of a dataclass; the field's type is its type.
 
@@ -89,7 +92,7 @@ def parameter(
     The rest is explained at :class:`Parameter`.
     """
     declared = {'unit': unit, 'description': description, 'minimum': minimum, 'maximum': maximum, 'above': above}
-    metadata = {**declared, 'name': name, 'choices': choices, 'live': live}
+    metadata = {**declared, 'name': name, 'choices': choices, 'live': live, 'before': before}
     declaration: T = field(default=default, metadata=metadata)
     return declaration
 

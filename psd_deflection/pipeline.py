@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from math import expm1
+from math import expm1, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -39,15 +39,18 @@ from psd_deflection.records import (
     TipLoad,
 )
 from psd_deflection.solvers import solver_from_rig
-from psd_deflection.solvers.interface import SolverStatus
+from psd_deflection.solvers.interface import Solution, SolverStatus
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 from psd_deflection.solvers.one_psd import OnePsd
+from psd_deflection.uncertainty.consistency import Checked, widened
+from psd_deflection.uncertainty.stamped import FIT, HELD_RESIDUAL, NOISE, StampedDots
 
 ZERO_BLOCKS = 25
 """Blocks whose mean is taken as the unloaded dots by :meth:`Pipeline.zero`: half a second."""
 
 START, FIRST_TEMPERATURE, TEMPERATURE = ENVIRONMENT
 HELD, FROZEN = 'state.held_twist', 'state.frozen_blocks'
+REMEMBERED = (NOISE, FIT, HELD_RESIDUAL)
 """Names under which :meth:`Pipeline.memory` tells what is remembered."""
 
 Dots = tuple[float, float, float, float]
@@ -95,6 +98,7 @@ class Pipeline:
         self._environment: dict[str, float] = {}
         self._held: _Held | None = None
         self._frozen = (0, 0)
+        self.stamped = StampedDots(rig)
         variances = dot_noise_variances(rig)
         self._variances = [tuple(float(v) / n for v in variances) for n in range(1, config.block_size + 1)]
         self._build(rig)
@@ -171,12 +175,15 @@ class Pipeline:
             if isinstance(value, (int, float)):
                 self._environment[name] = float(value)
         held, frozen = values.pop(HELD, None), values.pop(FROZEN, None)
+        told = {name: tuple(v) for name in REMEMBERED if isinstance(v := values.pop(name, None), list)}
         if isinstance(held, list) and len(held) == 3:
             self._held = _Held(int(held[0]), held[1], held[2])
         if isinstance(frozen, list) and len(frozen) == 2:
             self._frozen = (int(frozen[0]), int(frozen[1]))
         if values:
             self._build(replace_values(self.rig, values, 'change'))
+            self.stamped.set_zeros(self.rig)
+        self.stamped.restore(told)
 
     def memory(self, rig: Rig) -> ParameterChange | None:
         """What the next block depends on beside its samples and ``rig``, or None if that is nothing.
@@ -192,6 +199,8 @@ class Pipeline:
             values.append((HELD, tuple(self._held)))
         if self._frozen != (0, 0):
             values.append((FROZEN, self._frozen))
+        if self.last_spots is not None:
+            values += self.stamped.memory().items()
         if not values:
             return None
         last = self.last_spots
@@ -234,16 +243,26 @@ class Pipeline:
         verdict = self._optics.judge(block, dots, sums, self._frozen)
         status, reason = verdict.status, verdict.reason
         t_ns = block_middle_ns(block, size, self._period_ns)
+        slots = block.seq - block.index * size
         variances = self._variances_of(verdict, sums, present)
+        spread: FloatArray | None = None
+        checked: Checked | None = None
         best: DeflectionEstimate | None = None
         degraded = False
         if status is BlockStatus.OK:
-            best, failure = self._solve(0, t_ns, block.index, dots, variances)
-            if best is None:
-                status, reason = BlockStatus.NOT_SOLVED, failure
-            else:
+            if self.stamped.active:
+                fitted = self.stamped.fit(slots, samples)
+                x1, y1, x2, y2 = fitted.dots.tolist()
+                dots = (x1, y1, x2, y2)
+                spread = self._spread_of(verdict, sums, fitted.covariance)
+            best, checked, failure = self._primary(t_ns, block.index, dots, variances, spread)
+            if failure is not None:
+                status, reason = failure
+            elif best is not None:
                 self._held = _Held(t_ns, best.theta, best.variances[2])
         elif verdict.faulty:
+            if self.rig.estimator.covariance == 'measured':
+                variances = self.stamped.mean_variances(present)
             best = self._from_the_other(verdict.faulty, t_ns, block.index, dots, variances)
             degraded = best is not None
         self.last_estimate = best
@@ -260,15 +279,19 @@ class Pipeline:
                 self._recent = []
             self._recent = [*self._recent[1 - ZERO_BLOCKS :], dots]
             for number in range(1, len(self._solvers)):
-                other, _ = self._solve(number, t_ns, block.index, dots, variances)
-                if other is not None:
-                    yield other
+                solution, _ = self._solve(number, dots, variances)
+                if solution is not None:
+                    yield self._estimate(number, t_ns, block.index, solution, dots, variances, spread, checked)
         else:
             self._recent = []
         if best is None:
             name = status.name.lower()
             self.counters.refused[name] = self.counters.refused.get(name, 0) + 1
         # What follows, no estimate waits for.
+        if status is BlockStatus.OK and not verdict.findings:
+            self.stamped.learn(block.index, slots, samples)
+        if checked is not None:
+            self.stamped.suspect(block.index, dots, checked)
         if not self._optics.refuses_frozen:
             self._count_still(volts)
         findings = verdict.findings + self._optics.late_findings(block, verdict, self._frozen)
@@ -296,19 +319,64 @@ class Pipeline:
         first, second = self._optics.still(volts)
         self._frozen = (self._frozen[0] + 1 if first else 0, self._frozen[1] + 1 if second else 0)
 
-    def _solve(
-        self, number: int, t_ns: int, block: int, dots: Dots, variances: tuple[float, ...]
-    ) -> tuple[DeflectionEstimate | None, str]:
+    def _primary(
+        self, t_ns: int, block: int, dots: Dots, variances: tuple[float, ...], spread: FloatArray | None
+    ) -> tuple[DeflectionEstimate | None, Checked | None, tuple[BlockStatus, str] | None]:
+        """The primary solver's estimate, the check of its readings, and why there is no estimate."""
+        solution, failure = self._solve(0, dots, variances)
+        if solution is None:
+            return None, None, (BlockStatus.NOT_SOLVED, failure)
+        checked = self.stamped.check(dots, solution.residual, np.diag(variances) if spread is None else spread)
+        if checked.contradict and self.rig.estimator.consistency == 'refuse':
+            reason = f'the four readings contradict each other: chi-square {checked.chi_square:.0f} of 1'
+            return None, checked, (BlockStatus.INCONSISTENT, reason)
+        return self._estimate(0, t_ns, block, solution, dots, variances, spread, checked), checked, None
+
+    def _solve(self, number: int, dots: Dots, variances: tuple[float, ...]) -> tuple[Solution | None, str]:
         """The answer of solver ``number``, or None and why there is none."""
-        name, solver, primary = self._solvers[number]
+        name, solver, _ = self._solvers[number]
         s = solver.solve(dots, variances)
         if s.status is not SolverStatus.OK:
             return None, f'{name}: {s.status.name.lower().replace("_", " ")}'
+        return s, ''
+
+    def _estimate(
+        self,
+        number: int,
+        t_ns: int,
+        block: int,
+        s: Solution,
+        dots: Dots,
+        variances: tuple[float, ...],
+        spread: FloatArray | None,
+        checked: Checked | None,
+    ) -> DeflectionEstimate:
+        """An answer with its covariance; ``spread`` (4, 4) m^2 of the dots, None where ``variances`` are all of it."""
+        name, solver, primary = self._solvers[number]
         rms = (sum(r * r for r in s.residual) / len(s.residual)) ** 0.5
-        return (
-            DeflectionEstimate(t_ns, block, name, s.dx, s.dy, s.theta, s.phi, s.omega, s.covariance, rms, primary),
-            '',
+        covariance: tuple[float, ...] = s.covariance
+        widen = checked is not None and any(checked.possible) and self.rig.estimator.consistency == 'widen'
+        # A printed threshold method has no covariance, and no slope either.
+        if (spread is not None or widen) and covariance[0] == covariance[0]:
+            gain = solver.gain(dots, variances, s)
+            own = np.array(covariance).reshape(3, 3)
+            if spread is not None:
+                own = np.einsum('ik,jk->ij', np.einsum('ic,ck->ik', gain, spread), gain)
+            if widen and checked is not None:
+                own = widened(own, gain, checked.possible)
+            covariance = tuple(own.ravel().tolist())
+        chi_square = checked.chi_square if primary and checked is not None else nan
+        return DeflectionEstimate(
+            t_ns, block, name, s.dx, s.dy, s.theta, s.phi, s.omega, covariance, rms, primary, chi_square
         )
+
+    def _spread_of(self, verdict: Verdict, sums: FloatArray, covariance: FloatArray) -> FloatArray:
+        """:meth:`_variances_of` for the fit's own covariance (4, 4)."""
+        if not verdict.findings:
+            return covariance
+        first, second = self._optics.background_variance(sums)
+        more = 4.0 if verdict.half_light else 1.0
+        return more * covariance + np.diag([first, first, second, second])
 
     def _variances_of(self, verdict: Verdict, sums: FloatArray, present: int) -> tuple[float, ...]:
         """Of the dots' means: of the noise, and of what light that is missing or not ours adds."""

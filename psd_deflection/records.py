@@ -7,6 +7,7 @@ each solver and a :class:`TipLoad`. Times are integer nanoseconds of ROS time; e
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
@@ -40,6 +41,7 @@ class BlockStatus(IntEnum):
     OUTSIDE_ACTIVE_AREA = 4
     NOT_SOLVED = 5
     FROZEN = 6
+    INCONSISTENT = 7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +105,8 @@ class DeflectionEstimate(NamedTuple):
     ``dx``, ``dy`` m; ``theta``, ``phi``, ``omega`` rad, right-hand positive about Z, X, Y.
     ``covariance``: 3 x 3 of (dx, dy, theta), row by row, m^2, m rad, rad^2.
     ``residual_rms``: rms of the four dot residuals, m. ``primary``: the one that is published as
-    ``/link_tip/deflection``.
+    ``/link_tip/deflection``. ``chi_square``: of the one reading too many, 1 degree of freedom; NaN where it was
+    not checked.
     """
 
     t_ns: int
@@ -117,6 +120,7 @@ class DeflectionEstimate(NamedTuple):
     covariance: tuple[float, ...]
     residual_rms: float
     primary: bool
+    chi_square: float = math.nan
 
     @property
     def pose(self) -> tuple[float, float, float]:

@@ -125,6 +125,9 @@ def test_csv_out_has_the_contracts_columns(tmp_path: Path) -> None:
         rows = list(csv.DictReader(stream))
     names = ['t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta']
     assert list(rows[0])[:7] == names
+    assert list(rows[0])[-1] == 'chi_square'
+    # One number left of four readings and three unknowns: 1 on the average.
+    assert 0.7 < np.mean([float(r['chi_square']) for r in rows]) < 1.3
     for solver in ('exact', 'wls', 'iterative'):
         assert {f'{solver}_dx', f'{solver}_dy', f'{solver}_theta'} <= set(rows[0])
     assert len(rows) == 200

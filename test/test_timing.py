@@ -1,4 +1,4 @@
-"""Device clock to host time: the figures of the field notes, on a simulated USB line."""
+"""Device clock to host time: the figures of docs/robustness.md, on a simulated USB line."""
 
 from __future__ import annotations
 

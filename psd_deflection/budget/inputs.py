@@ -137,9 +137,7 @@ def read_inputs(
             found = INPUT_BY_NAME.get(str(name))
             if found is None:
                 hint = did_you_mean(str(name), INPUT_BY_NAME)
-                raise ConfigError(
-                    f'{place}: {name} = {value!r}: no such input{hint} (`psd-deflection budget --explain` has all)'
-                )
+                raise ConfigError(f'{place}: {name} = {value!r}: no such input{hint}')
             values[str(name)] = cast(float, check_value(found.parameter, value, place))
     return values
 

@@ -8,7 +8,7 @@ from psd_deflection.calibration.sensors import (
     Tetralateral,
     make_sensor,
 )
-from psd_deflection.calibration.volts import Calibration, SensorFlag, counts_to_volts, dot_noise_variances
+from psd_deflection.calibration.volts import Calibration, counts_to_volts, dot_noise_variances
 
 __all__ = [
     'Calibration',
@@ -16,7 +16,6 @@ __all__ = [
     'Pincushion',
     'Quadrant',
     'Sensor',
-    'SensorFlag',
     'Tetralateral',
     'counts_to_volts',
     'dot_noise_variances',

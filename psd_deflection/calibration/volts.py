@@ -1,9 +1,8 @@
-"""Converter counts to volts, volts to the places of the dots, and which of them not to believe."""
+"""Converter counts to volts, volts to the places of the dots."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntFlag
 
 import numpy as np
 import numpy.typing as npt
@@ -11,19 +10,6 @@ import numpy.typing as npt
 from psd_deflection.calibration.sensors import Quadrant, Sensor, make_sensor
 from psd_deflection.config import Rig
 from psd_deflection.records import DOT_CHANNELS, FloatArray
-
-
-class SensorFlag(IntFlag):
-    """Why a reading of one PSD is not to be believed."""
-
-    LASER_LOST = 1
-    """The sum signal is below ``sum_min``."""
-    SATURATED = 2
-    """A channel stands at an end of the converter's range."""
-    OUTSIDE = 4
-    """The spot's centre is off the active area, or past where a segmented sensor still tells places."""
-    CLIPPED = 8
-    """Part of the spot is off the active area: the reading is pulled inward."""
 
 
 def counts_to_volts(counts: npt.NDArray[np.int16], volts_per_count: float) -> npt.NDArray[np.float32]:
@@ -39,15 +25,11 @@ def counts_to_volts(counts: npt.NDArray[np.int16], volts_per_count: float) -> np
 class Calibration:
     """Readings to the places of the dots.
 
-    ``sensitivity``: m/V on x and y, at the centre. ``sensors``: both. ``sum_min`` V: less means that
-    the laser is lost. ``full_scale``, ``step``: the converter's, V.
+    ``sensitivity``: m/V on x and y, at the centre. ``sensors``: both.
     """
 
     sensitivity: float
     sensors: tuple[Sensor, Sensor]
-    sum_min: float
-    full_scale: float
-    step: float
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Calibration:
@@ -55,9 +37,6 @@ class Calibration:
         return cls(
             sensitivity=rig.amplifier.sensitivity,
             sensors=(make_sensor(rig.psds[0]), make_sensor(rig.psds[1])),
-            sum_min=rig.estimator.sum_min,
-            full_scale=rig.converter.full_scale,
-            step=rig.converter.volts_per_count,
         )
 
     def dots(self, volts: npt.NDArray[np.float32]) -> FloatArray:
@@ -82,23 +61,6 @@ class Calibration:
         places = [sensor.place(half) for sensor, half in zip(self.sensors, halves, strict=True)]
         sums = [sensor.sum_signal(half) for sensor, half in zip(self.sensors, halves, strict=True)]
         return np.hstack(places), np.column_stack(sums)
-
-    def flags(self, volts: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-        """:class:`SensorFlag` of each sample and PSD, (n, 2); ``volts`` (n, 6) float32."""
-        dots = np.abs(np.multiply(volts[:, DOT_CHANNELS], self.sensitivity, dtype=np.float64))
-        # A converter at its end gives its last step, a little less than the full scale on one side.
-        at_end = np.abs(volts) >= self.full_scale - 1.5 * self.step
-        out = np.zeros((len(volts), 2), dtype=np.uint8)
-        for i, sensor in enumerate(self.sensors):
-            place = sensor.from_linear(dots[:, 2 * i : 2 * i + 2])
-            for flag, hit in (
-                (SensorFlag.LASER_LOST, ~(volts[:, 3 * i + 2] >= self.sum_min)),
-                (SensorFlag.SATURATED, at_end[:, 3 * i : 3 * i + 3].any(axis=1)),
-                (SensorFlag.OUTSIDE, ~(place <= sensor.reach() * (1.0 - 1e-12)).all(axis=1)),
-                (SensorFlag.CLIPPED, ~(place + sensor.spot_radius <= sensor.half).all(axis=1)),
-            ):
-                out[hit, i] |= np.uint8(flag)
-        return out
 
 
 def dot_noise_variances(rig: Rig) -> FloatArray:

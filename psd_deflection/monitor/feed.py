@@ -32,8 +32,9 @@ COLUMNS = (
     'present',
     'lost',
     'status',
+    'chi_square',
 )
-"""Columns of a row on the page: s, -, m, V, m, rad, their standard deviations, samples, BlockStatus."""
+"""Columns of a row on the page: s, -, m, V, m, rad, their standard deviations, samples, BlockStatus, chi-square."""
 
 
 class BlockResult(NamedTuple):
@@ -89,4 +90,6 @@ def row_json(result: BlockResult) -> str:
     numbers += ['null'] * (12 - len(numbers))
     # A double holds a time since the epoch only to the microsecond.
     seconds = f'{spots.t_ns // 1_000_000_000}.{spots.t_ns % 1_000_000_000 // 1000:06d}'
-    return f'[{seconds},{spots.index},{",".join(numbers)},{spots.present},{spots.lost},{int(spots.status)}]'
+    chi_square = estimate.chi_square if estimate is not None else math.nan
+    last = f'{chi_square:.4g}' if math.isfinite(chi_square) else 'null'
+    return f'[{seconds},{spots.index},{",".join(numbers)},{spots.present},{spots.lost},{int(spots.status)},{last}]'

@@ -123,6 +123,7 @@ class ShownRecording:
         self._pipeline, self._steps = open_steps()
         self._requests: queue.SimpleQueue[Future[str]] = queue.SimpleQueue()
         self._stop = threading.Event()
+        self._woken = threading.Event()
         self._ended = False
         self._lost = 0
         self._last: SpotMeans | None = None
@@ -141,6 +142,7 @@ class ShownRecording:
     def close(self) -> None:
         """Stop playing."""
         self._stop.set()
+        self._woken.set()
         if self._thread.ident is not None:
             self._thread.join()
 
@@ -185,7 +187,12 @@ class ShownRecording:
                 'psd_deflection: estimates',
                 level,
                 message,
-                (('rate (estimates/s)', str(new_estimates)), ('estimates', str(estimates)), *refused),
+                (
+                    ('rate (estimates/s)', str(new_estimates)),
+                    ('estimates', str(estimates)),
+                    *refused,
+                    *self._pipeline.stamped.words(),
+                ),
             )
         )
         return DiagnosticReport(t_ns, tuple(entries))
@@ -196,15 +203,18 @@ class ShownRecording:
             raise RefusedError('not zeroed: the recording has ended')
         asked: Future[str] = Future()
         self._requests.put(asked)
+        self._woken.set()
         try:
             return asked.result(REQUEST_TIMEOUT_S)
         except TimeoutError:
-            asked.cancel()
-            raise RefusedError('not zeroed: no data flows') from None
+            if asked.cancel():
+                raise RefusedError('not zeroed: no data flows') from None
+            # It was begun at this very moment: its answer is the true one.
+            return asked.result(REQUEST_TIMEOUT_S)
 
     async def record(self, wanted: bool) -> str:
         """Refuse: a recording is not recorded again."""
-        raise RefusedError('a recording is not recorded again; `psd-deflection replay REC --out OUT` writes one')
+        raise RefusedError('a recording is not recorded again; the command replay writes its answers')
 
     def _run(self) -> None:
         try:
@@ -240,7 +250,10 @@ class ShownRecording:
                     self._last = record
                 self._feed.put(record)
             self._carry_out()
-            if self._stop.wait(max(due - time.monotonic(), 0.0)):
+            while not self._stop.is_set() and self._woken.wait(max(due - time.monotonic(), 0.0)):
+                self._woken.clear()
+                self._carry_out()
+            if self._stop.is_set():
                 return
 
     def _carry_out(self) -> None:

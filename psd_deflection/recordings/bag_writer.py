@@ -211,6 +211,7 @@ class McapFile(_Closing):
 
     def write_encoded(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
         """Write one message that is already encoded as CDR, at log time ``t_ns``.
+
         Raises KeyError for a type that no adapter of :mod:`msg_adapters` declares.
         """
         with self._guard():

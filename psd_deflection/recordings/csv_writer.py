@@ -124,7 +124,7 @@ class CsvSampleSink(_CsvFile):
 
 
 class CsvEstimateSink(_CsvFile):
-    """Estimates: ``t,dx,dy,theta,sd_dx,sd_dy,sd_theta`` (s, m, m, rad), then three columns a solver.
+    """Estimates: ``t,dx,dy,theta,sd_dx,sd_dy,sd_theta`` (s, m, m, rad), three columns a solver, ``chi_square``.
 
     One row for each block that some solver answered; a block without an answer has no row, and a
     solver without an answer has empty cells.
@@ -134,7 +134,7 @@ class CsvEstimateSink(_CsvFile):
         self._solvers = tuple(solvers)
         self._block: list[DeflectionEstimate] = []
         names = [f'{solver}_{q}' for solver in self._solvers for q in ('dx', 'dy', 'theta')]
-        super().__init__(path, ['t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta', *names])
+        super().__init__(path, ['t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta', *names, 'chi_square'])
 
     def put(self, record: Record) -> None:
         """Take one record; all except estimates are ignored."""
@@ -158,5 +158,7 @@ class CsvEstimateSink(_CsvFile):
         for solver in self._solvers:
             e = by_solver.get(solver)
             cells += ['', '', ''] if e is None else [repr(e.dx), repr(e.dy), repr(e.theta)]
+        known = primary is not None and not math.isnan(primary.chi_square)
+        cells.append(repr(primary.chi_square) if primary is not None and known else '')
         self._block = []
         self._write([','.join(cells)])

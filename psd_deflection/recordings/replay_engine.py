@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from psd_deflection.config import Rig, load_rig, replace_values, rig_from_values
+from psd_deflection.config import BY_NAME, Rig, load_rig, replace_values, rig_as_recorded
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
@@ -18,16 +18,17 @@ from psd_deflection.records import ENVIRONMENT, RawChunk, Record, SampleBlock
 
 def rig_at_start(recording: Recording) -> Rig:
     """The rig at the start of the recording; the thesis rig if the recording holds none. Raises ConfigError."""
-    return rig_from_values(recording.parameters, f'{recording.path} (recorded parameters)')
+    return rig_as_recorded(recording.parameters, f'{recording.path} (recorded parameters)')
 
 
 def rig_at_end(recording: Recording) -> Rig:
     """The rig with every recorded change. A zero taken during the run describes the rig from the start.
+
     Raises ConfigError.
     """
     rig = rig_at_start(recording)
     for change in recording.changes:
-        values = {name: value for name, value in change.values if name not in ENVIRONMENT}
+        values = {name: value for name, value in change.values if name in BY_NAME}
         if values:
             rig = replace_values(rig, values, f'{recording.path} (changed at block {change.block})')
     return rig

@@ -22,6 +22,7 @@ class _Seen(NamedTuple):
     blocks: int
     estimates: int
     degraded: int
+    contradictions: int
 
 
 class HealthReporter:
@@ -37,7 +38,15 @@ class HealthReporter:
         wire, pipeline = s.acquisition.counters, s.pipeline.counters
         dropped = wire.queue_dropped + s.recorder.dropped
         now = _Seen(
-            t_ns, wire.samples, wire.lost, wire.bad, dropped, pipeline.blocks, pipeline.estimates, pipeline.degraded
+            t_ns,
+            wire.samples,
+            wire.lost,
+            wire.bad,
+            dropped,
+            pipeline.blocks,
+            pipeline.estimates,
+            pipeline.degraded,
+            s.pipeline.stamped.contradictions,
         )
         # The first report counts from the start. The time that it covers is unknown, so it gives no rates.
         before = self._seen
@@ -130,6 +139,10 @@ class HealthReporter:
             message = (
                 f'degraded: {new.degraded} of {new.blocks} blocks from one detector, twist {twist}; {spots.reason}'
             )
+        elif new.contradictions:
+            level = WARN
+            wrong = self._session.pipeline.stamped.most_likely_wrong() or 'which one is wrong cannot be told'
+            message = f'the four readings contradict each other in {new.contradictions} blocks: {wrong}'
         values = [
             ('rate (estimates/s)', rate),
             ('blocks', str(pipeline.blocks)),
@@ -139,6 +152,7 @@ class HealthReporter:
             *((f'found: {finding}', str(count)) for finding, count in sorted(pipeline.findings.items())),
             *((f'refused: {cause}', str(count)) for cause, count in sorted(pipeline.refused.items())),
         ]
+        values += self._session.pipeline.stamped.words()
         if latency is not None:
             values.append(('latency, median (ms)', f'{latency.median * 1e3:.3f}'))
             values.append(('latency, worst of a second (ms)', f'{latency.worst * 1e3:.3f}'))

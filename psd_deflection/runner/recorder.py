@@ -37,7 +37,7 @@ IDLE_S = 0.5
 LOOK_EVERY = 250
 """Messages between two checks of the file and of the room on its disk: half a second's worth."""
 
-ELSEWHERE = 'make room, or record elsewhere (--record FOLDER, bag_dir)'
+ELSEWHERE = 'make room, or record elsewhere (parameter bag_dir)'
 
 Message = tuple[str, str, bytes, int]
 Item = Message | ParameterChange | None

@@ -73,7 +73,7 @@ class Session:
             self._simulated = SimulatedRigProcess(rig)
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)
-            say(f'no port given: started the simulated rig on {self._simulated.port} (--port names a real one)')
+            say(f'no port given: started the simulated rig on {self._simulated.port} (parameter port names a real one)')
         try:
             self.acquisition = Acquisition(rig, say)
             self.acquisition.open()

@@ -69,7 +69,7 @@ class SimulatedRigProcess:
         line = self._process.stdout.readline().decode() if ready else ''
         if not line.startswith(PORT_LINE):
             self.close()
-            raise DeviceError('the simulated rig did not start; try `psd-deflection simulate --serve`, which says why')
+            raise DeviceError('the simulated rig did not start; `python -m psd_deflection.devices.serve` says why')
         self.port = line[len(PORT_LINE) :].strip()
 
     def hang_up(self) -> None:

@@ -18,14 +18,13 @@ and one plane will do unless k L_i/L = 1).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, sin, tan
 from typing import ClassVar, Literal
 
 import numpy as np
 
 from psd_deflection.errors import ConfigError, SolverError
+from psd_deflection.geometry.landings import landing, landings
 from psd_deflection.geometry.layout import SMALLEST_BASE_LINE, Geometry, check_twist
-from psd_deflection.geometry.plate import Row
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers.beam import slope_per_metre
 from psd_deflection.solvers.gauss_newton import fit, fit_many
@@ -164,7 +163,7 @@ class BasePairSolver(Solver):
         predicted: list[float] = []
         rows: list[Sequence[float]] = []
         for _, _, lx, ly, height in self._rows:
-            px, py, jx, jy = _landing(lx, ly, height, dx, dy, theta, phi, omega)
+            px, py, jx, jy = landing(lx, ly, height, dx, dy, theta, phi, omega)
             predicted.append(px)
             predicted.append(py)
             for j in (jx, jy):
@@ -187,53 +186,3 @@ class BasePairSolver(Solver):
         covariance = spread[:3] @ found.covariance @ spread[:3].T
         status = np.where(found.converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED).astype(np.int8)
         return Solutions(full[:, :3].copy(), full[:, 3:].copy(), covariance, found.residual, status)
-
-
-def _landing(
-    lx: float, ly: float, height: float, dx: float, dy: float, theta: float, phi: float, omega: float
-) -> tuple[float, float, Row, Row]:
-    """Where laser (lx, ly) falls in the plane at ``height``, and the derivatives of that."""
-    ct = cos(theta)
-    st = sin(theta)
-    ax = ct * lx - st * ly
-    ay = st * lx + ct * ly
-    co = cos(omega)
-    cp = cos(phi)
-    to = tan(omega)
-    tp = tan(phi)
-    return (
-        dx + ax / co + height * to,
-        dy + ay / cp - ax * to * tp - height * tp / co,
-        (1.0, 0.0, -ay / co, 0.0, (ax * sin(omega) + height) / (co * co)),
-        (
-            0.0,
-            1.0,
-            ax / cp + ay * to * tp,
-            (ay * sin(phi) - ax * to - height / co) / (cp * cp),
-            -tp * (ax + height * sin(omega)) / (co * co),
-        ),
-    )
-
-
-def landings(beams: FloatArray, heights: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The same for n poses (n, 5): places (n, 2P) and derivatives (n, 2P, 5)."""
-    dx, dy, theta, phi, omega = (poses[:, i, None] for i in range(5))
-    ax = np.cos(theta) * beams[:, 0] - np.sin(theta) * beams[:, 1]
-    ay = np.sin(theta) * beams[:, 0] + np.cos(theta) * beams[:, 1]
-    co = np.cos(omega)
-    cp = np.cos(phi)
-    to = np.tan(omega)
-    tp = np.tan(phi)
-    n, count = ax.shape
-    place = np.empty((n, 2 * count))
-    place[:, 0::2] = dx + ax / co + heights * to
-    place[:, 1::2] = dy + ay / cp - ax * to * tp - heights * tp / co
-    j = np.zeros((n, 2 * count, 5))
-    j[:, 0::2, 0] = 1.0
-    j[:, 1::2, 1] = 1.0
-    j[:, 0::2, 2] = -ay / co
-    j[:, 1::2, 2] = ax / cp + ay * to * tp
-    j[:, 1::2, 3] = (ay * np.sin(phi) - ax * to - heights / co) / (cp * cp)
-    j[:, 0::2, 4] = (ax * np.sin(omega) + heights) / (co * co)
-    j[:, 1::2, 4] = -tp * (ax + heights * np.sin(omega)) / (co * co)
-    return place, j

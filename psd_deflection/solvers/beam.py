@@ -19,7 +19,7 @@ from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.geometry.plate import crossing, crossings, flat_pose, flat_poses
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers.gauss_newton import fit, fit_many
-from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus, flat_gain
 
 
 class BeamSolver(Solver):
@@ -87,6 +87,10 @@ class BeamSolver(Solver):
             rows.append((jx[0] + tie * jx[4], jx[1] - tie * jx[3], jx[2]))
             rows.append((jy[0] + tie * jy[4], jy[1] - tie * jy[3], jy[2]))
         return predicted, rows
+
+    def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
+        """As of a flat plate: the tilts change it by their own size, some thousandths. See :class:`Solver`."""
+        return flat_gain(tuple(self._centers.ravel().tolist()), dots, variances, solution)
 
     def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
         """N blocks. See :class:`Solver`."""

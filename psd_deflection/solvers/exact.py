@@ -26,7 +26,7 @@ import numpy.typing as npt
 from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus, flat_gain
 from psd_deflection.solvers.plane import (
     interleave,
     positive,
@@ -59,6 +59,7 @@ class ExactSolver(Solver):
         self._count = check_twist(geometry)
         self._centers = np.asarray(geometry.centers, dtype=np.float64)
         self._beams = np.asarray(geometry.beams, dtype=np.float64)
+        self._places = tuple(self._centers.ravel().tolist())
         (self._c1x, self._c1y), (self._c2x, self._c2y) = self._centers[:2].tolist()
         (self._l1x, self._l1y), (self._l2x, self._l2y) = self._beams[:2].tolist()
 
@@ -119,6 +120,10 @@ class ExactSolver(Solver):
             c, s, vx1 * vx2 * mx + mean_y * vxt, -mean_x * vxt, vy1 * vy2 * my - mean_x * vyt, vxt, vyt, vtt
         )
         return Solution(dx, dy, theta, 0.0, 0.0, covariance, (rx1, ry1, -ex * vx2, -ey * vy2), status, steps)
+
+    def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
+        """In closed form. See :class:`Solver`."""
+        return flat_gain(self._places, dots, variances, solution)
 
     def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
         """N blocks. See :class:`Solver`."""

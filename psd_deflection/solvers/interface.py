@@ -15,6 +15,7 @@ from __future__ import annotations
 import abc
 from dataclasses import dataclass
 from enum import IntEnum
+from math import cos, sin
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -23,6 +24,9 @@ import numpy.typing as npt
 from psd_deflection.config import Rig
 from psd_deflection.geometry.layout import Geometry
 from psd_deflection.records import FloatArray
+
+_STEP = 1e-8
+"""m. Of differences: far above rounding, far below what bends the answer."""
 
 
 class SolverStatus(IntEnum):
@@ -101,3 +105,37 @@ class Solver(abc.ABC):
     @abc.abstractmethod
     def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
         """Solve n blocks at once: ``dots`` (n, 2P) m, ``variances`` (2P,) or (n, 2P) m^2."""
+
+    def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
+        """How the answer goes with each dot, d(dX, dY, theta)/d(dots), (3, 2P): 1 and rad/m.
+
+        With it the covariance of the dots becomes that of the answer, K C K^T, whatever the weights were.
+        ``solution``: what :meth:`solve` gave for ``dots`` and ``variances``. By differences here.
+        """
+        out = np.empty((3, len(dots)))
+        for i in range(len(dots)):
+            moved = self.solve((*dots[:i], dots[i] + _STEP, *dots[i + 1 :]), variances)
+            out[0, i] = (moved.dx - solution.dx) / _STEP
+            out[1, i] = (moved.dy - solution.dy) / _STEP
+            out[2, i] = (moved.theta - solution.theta) / _STEP
+        return out
+
+
+def flat_gain(
+    centers: tuple[float, ...], dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution
+) -> FloatArray:
+    """:meth:`Solver.gain` of weighted least squares on a flat plate: P A^T V^-1, P the solution's own covariance.
+
+    ``centers``: (x1, y1, x2, y2, ...), m. The readings of a dot at q = c + m go with the pose as
+    -R(-theta) and (q_y, -q_x).
+    """
+    c, s = cos(solution.theta), sin(solution.theta)
+    xx, xy, xt, _, yy, yt, _, _, tt = solution.covariance
+    rows: tuple[list[float], list[float], list[float]] = ([], [], [])
+    for i in range(0, len(dots), 2):
+        qx, qy = centers[i] + dots[i], centers[i + 1] + dots[i + 1]
+        for ax, ay, at, v in ((-c, -s, qy, variances[i]), (s, -c, -qx, variances[i + 1])):
+            rows[0].append((xx * ax + xy * ay + xt * at) / v)
+            rows[1].append((xy * ax + yy * ay + yt * at) / v)
+            rows[2].append((xt * ax + yt * ay + tt * at) / v)
+    return np.array(rows)

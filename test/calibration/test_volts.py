@@ -13,13 +13,11 @@ from scipy.integrate import quad
 from psd_deflection.calibration import (
     Calibration,
     Quadrant,
-    SensorFlag,
     counts_to_volts,
     dot_noise_variances,
     make_sensor,
 )
 from psd_deflection.config import SENSOR_TYPES, PsdConfig, rig_from_values
-from psd_deflection.errors import ConfigError
 from psd_deflection.records import CHANNELS
 
 
@@ -124,32 +122,3 @@ def test_currents_of_both_psds() -> None:
     dots, sums = calibration.dots_of_currents(currents)
     np.testing.assert_allclose(dots, [[2.5e-3, 0.0, 5e-3, 0.0]], atol=1e-15)
     np.testing.assert_allclose(sums, [[4.0, 2.0]])
-
-
-@pytest.mark.parametrize(
-    ('channels', 'flags'),
-    [
-        ((0.0, 0.0, 5.0, 0.0, 0.0, 5.0), (0, 0)),
-        ((0.0, 0.0, 2.4, 0.0, 0.0, 5.0), (SensorFlag.LASER_LOST, 0)),
-        ((0.0, 0.0, float('nan'), 0.0, 0.0, 5.0), (SensorFlag.LASER_LOST, 0)),
-        ((0.0, 0.0, 5.0, 0.0, 0.0, 9.9997), (0, SensorFlag.SATURATED)),
-        # 4.6 mm: the centre of the spot is on, its rim of 0.5 mm is not.
-        ((0.0, 0.0, 5.0, 9.2, 0.0, 5.0), (0, SensorFlag.CLIPPED)),
-        ((0.0, -10.0, 5.0, 0.0, 0.0, 5.0), (SensorFlag.SATURATED | SensorFlag.OUTSIDE | SensorFlag.CLIPPED, 0)),
-    ],
-)
-def test_flags(channels: tuple[float, ...], flags: tuple[int, int]) -> None:
-    got = Calibration.from_rig(rig_from_values({})).flags(volts(*channels))
-    assert got.dtype == np.uint8
-    assert got.tolist() == [list(flags)]
-
-
-def test_a_quadrant_past_its_reach_is_outside() -> None:
-    calibration = Calibration.from_rig(rig_from_values({'psd_2.type': 'quadrant'}))
-    assert calibration.flags(volts(0.0, 0.0, 5.0, 0.3, 0.0, 5.0)).tolist() == [[0, 0]]
-    assert calibration.flags(volts(0.0, 0.0, 5.0, 8.0, 0.0, 5.0)).tolist() == [[0, SensorFlag.OUTSIDE]]
-
-
-def test_an_unknown_sensor_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"'camera': must be one of duolateral"):
-        make_sensor(psd('camera'))

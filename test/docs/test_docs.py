@@ -115,6 +115,12 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert anchor in anchors(path), f'{page.name}: {target}'
 
 
+def test_the_tests_that_follow_the_steps_are_there() -> None:
+    named = re.findall(r'`(test/[a-z_/]+\.py)`', (ROOT / 'docs' / 'extending.md').read_text())
+    assert len(named) == 7
+    assert [name for name in named if not (ROOT / name).is_file()] == []
+
+
 def test_no_page_loads_anything_from_elsewhere() -> None:
     for page in PAGES:
         assert not re.search(r'!\[[^\]]*\]\(https?:', page.read_text()), page

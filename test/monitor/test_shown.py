@@ -13,12 +13,12 @@ from psd_deflection.monitor.shown import RefusedError, ShownRecording
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.replay_engine import replayed, rig_at_start
-from psd_deflection.records import Record
+from psd_deflection.records import BlockStatus, Record, SpotMeans
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
 
 
-def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event) -> ShownRecording:
+def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event, speed: float = 1e6) -> ShownRecording:
     rig = rig_at_start(open_recording(BAGS / name))
 
     def open_steps() -> tuple[Pipeline, Iterator[list[Record]]]:
@@ -30,7 +30,7 @@ def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event) ->
         said.append(text)
         ended.set()
 
-    return ShownRecording(name, open_steps, feed, say, speed=1e6)
+    return ShownRecording(name, open_steps, feed, say, speed=speed)
 
 
 def test_a_recording_is_shown_as_it_is_with_its_losses() -> None:
@@ -48,9 +48,34 @@ def test_a_recording_is_shown_as_it_is_with_its_losses() -> None:
     assert report.entries[0].message == 'end of the recording'
     with pytest.raises(RefusedError, match='has ended'):
         source.zero()
-    with pytest.raises(RefusedError, match='replay REC --out'):
+    with pytest.raises(RefusedError, match='not recorded again'):
         asyncio.run(source.record(True))
     assert said == ['lost_samples: end of the recording']
+
+
+class Heard(Feed):
+    """Says when the first block with an estimate has come."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.estimated = threading.Event()
+
+    def put(self, record: Record) -> None:
+        super().put(record)
+        if isinstance(record, SpotMeans) and record.status is BlockStatus.OK:
+            self.estimated.set()
+
+
+def test_a_zero_does_not_wait_for_the_next_block_of_a_slow_recording() -> None:
+    feed, said = Heard(), list[str]()
+    # The next block comes two seconds later, the longest wait; a request is answered at once.
+    source = source_of('clean', feed, said, threading.Event(), speed=1e-3)
+    source.start()
+    assert feed.estimated.wait(60.0)
+    told = source.zero()
+    source.close()
+    assert told.startswith('unloaded dots (mm): psd_1 (')
+    assert said == [told]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The frames of contract section 5. The bytes of the case table were written down, not encoded by us."""
+"""The frames of docs/protocol.md. The bytes of the case table were written down, not encoded by us."""
 
 from __future__ import annotations
 

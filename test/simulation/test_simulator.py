@@ -52,7 +52,7 @@ def test_settled_pose_is_the_beam_formula() -> None:
     rig = load_rig()
     step = RigSimulator(rig).step(loads.constant(loads.sidebar(50.0), 12.0).loads)
     assert np.array_equal(step.pose[0], np.zeros(3))
-    # 50 N: errata G-10.
+    # 50 N (docs/mechanics.md).
     np.testing.assert_allclose(
         step.pose[-1], [0.0, -2.2271675e-3, -50 * 0.585**2 / rig.link.torsional_stiffness], atol=2e-9
     )

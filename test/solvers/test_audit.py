@@ -52,7 +52,7 @@ def test_the_code_loses_and_mistakes_counter_clockwise_twist(code_runs: Any) -> 
 
 @pytest.mark.parametrize('k', [1.0, 1.395, 2.0])
 def test_a_wrong_slope_ratio_costs_little(k: float) -> None:
-    """rms over the grid where the beam solver takes 1.5: micrometres and millidegrees (errata, 2.7)."""
+    """rms over the grid where the beam solver takes 1.5: micrometres and millidegrees (docs/methods.md)."""
     true = Geometry(thesis_geometry().centers, np.zeros((2, 2)), np.zeros(2), 0.585, k)
     poses = grid('cantilever tilts', true)
     found = make_solver('beam', thesis_geometry()).solve_many(dots_of(true, poses), VARIANCES)

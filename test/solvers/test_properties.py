@@ -134,7 +134,7 @@ def test_the_base_pair_sees_twist_when_the_link_is_a_beam(rays: Any, pose: Any, 
 
 
 def test_section_5_3_in_numbers(rays: Any) -> None:
-    """L_1 = 585, L_2 = 485 mm, dY = 2 mm, k = 1.5: dots, and what 5.4-5.7 make of them (errata G-7)."""
+    """L_1 = 585, L_2 = 485 mm, dY = 2 mm, k = 1.5: dots, and what 5.4-5.7 make of them (thesis 5.3)."""
     geometry = Geometry(np.array([[0.0, 0.07], [-0.1, 0.0]]), np.zeros((2, 2)), np.array([-0.585, -0.485]), L)
 
     def linear(pose: tuple[float, ...]) -> tuple[float, float, float]:

@@ -206,8 +206,9 @@ const TILES = [
   ['dropped, queue', 'dropped by a full queue'], ['dropped, device', 'dropped by the device'], ['disconnects', 'disconnects'],
   ['latency, median (ms)', 'latency, median (ms)'], ['latency, worst (ms)', 'latency, worst of a second (ms)'],
   ['clock skew (ppm)', 'skew (ppm)'], ['clock residual (µs)', 'residual (us)'],
+  ['χ² of the readings', 'chi-square of the readings'], ['contradicting blocks', 'blocks whose readings contradict each other'],
 ];
-const LOSSES = new Set(['lost', 'bad frames', 'dropped by a full queue', 'dropped by the device', 'disconnects']);
+const LOSSES = new Set(['blocks whose readings contradict each other', 'lost', 'bad frames', 'dropped by a full queue', 'dropped by the device', 'disconnects']);
 
 function showHealth(found) {
   health = found;

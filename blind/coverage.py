@@ -1,0 +1,289 @@
+"""How often the truth is inside the intervals that are published: ``python -m blind.coverage --help``.
+
+Samples come from :mod:`blind.generator`, with noise that the rig file does not describe; the estimates
+are the product's own pipeline's. Each row is a rig: 100 s at rest, then sixteen steps of 50 N (sidebar,
+on and off) with 5 s of ringing each. The truth is the pose at the middle of the block.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from blind import generator
+from blind.generator import Array
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import DeflectionEstimate, RawChunk
+
+SIZE = 20
+CHI_SQUARE_3 = 7.814728
+"""95 % of a chi-square of 3 degrees of freedom."""
+SETTLED = 100
+"""Blocks before the noise is measured; they are not counted at rest."""
+SHIFTS = ((0.31372e-3, -0.27182e-3), (0.16180e-3, 0.46692e-3))
+"""Where the PSDs are off their places, so that no reading stands in the middle of a converter's step, m."""
+LOSSES = {'none': (0.0, 0), '2 %': (0.02, 0), '20 %': (0.2, 0), 'bursts of 8': (0.0, 8)}
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One rig: rms noise of each channel V, AR(1) memory, tails, hum V, converter, offsets of x1, y1, x2, y2 V."""
+
+    label: str
+    sigmas: tuple[float, ...] = (2e-3,) * 6
+    memory: float = 0.0
+    heavy: bool = False
+    hum: float = 0.0
+    bits: int = 16
+    offsets: tuple[float, ...] = ()
+
+
+ROWS = (
+    Row('white'),
+    Row('AR(1) 0.3', memory=0.3),
+    Row('AR(1) 0.6', memory=0.6),
+    Row('AR(1) 0.9', memory=0.9),
+    Row('twice the noise', sigmas=(4e-3,) * 6),
+    Row('hum 5 mV', hum=5e-3),
+    Row('12 bit', bits=12),
+    Row('24 bit', bits=24),
+    Row('heavy tails', heavy=True),
+    Row('offsets, zeroed', offsets=(1e-3, -2e-3, 0.5e-3, 1.5e-3)),
+    Row('1, 2, 4, 2 mV', sigmas=(1e-3, 2e-3, 2e-3, 4e-3, 2e-3, 2e-3)),
+)
+
+
+class Inside(NamedTuple):
+    """Shares of the blocks whose truth is inside 95 % (dX, dY, theta, all three jointly) and inside 3 sd; rms error."""
+
+    axes: tuple[float, float, float]
+    joint: float
+    three: float
+    rms: tuple[float, float, float]
+    blocks: int
+
+
+class Scored(NamedTuple):
+    """At rest and ringing; ``alarms``: share of the blocks whose readings are said to contradict each other."""
+
+    rest: Inside
+    ringing: Inside
+    alarms: float
+
+
+def inside(error: Array, covariance: Array) -> Inside:
+    """``error`` (n, 3), ``covariance`` (n, 3, 3)."""
+    sd = np.sqrt(np.einsum('nii->ni', covariance))
+    size = np.abs(error) / sd
+    joint = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    a, b, c = (size < 1.959964).mean(axis=0).tolist()
+    x, y, t = np.sqrt((error**2).mean(axis=0)).tolist()
+    return Inside((a, b, c), float((joint < CHI_SQUARE_3).mean()), float((size < 3.0).mean()), (x, y, t), len(error))
+
+
+def rig(row: Row, **overrides: object) -> Rig:
+    """The nominal rig with that converter; its noise stays 2 mV, white."""
+    values: dict[str, object] = {'solver': 'exact', 'solvers': ['exact'], 'converter.bits': min(row.bits, 16)}
+    for i, (shift, place) in enumerate(zip(SHIFTS, generator.PLACES, strict=True), start=1):
+        values[f'psd_{i}.center'] = [p + s for p, s in zip(place, shift, strict=True)]
+        values[f'psd_{i}.zero'] = [-s for s in shift]
+    return load_rig(overrides={**values, **overrides})
+
+
+@cache
+def motion(rest_s: int, steps: int) -> tuple[Array, Array]:
+    """Volts (n, 6) without noise and poses (n / 20, 3) at the blocks' middles."""
+    n = rest_s * 1000
+    loads = np.zeros((n + steps * 5000, 3))
+    for step in range(0, steps, 2):
+        # Off the blocks' grid, each at another place in its block.
+        first = n + step * 5000 + 7 * step % SIZE
+        loads[first : first + 5000] = (0.0, -50.0, -29.25)
+    fine = generator.motion(loads, 0.585, [])
+    return _optics(fine), _middles(fine)
+
+
+def _optics(fine: Array) -> Array:
+    none = np.zeros(len(fine))
+    shifted = [
+        {'name': 'sensor_position', 'psd': i, 'x': x, 'y': y, 'aimed': False} for i, (x, y) in enumerate(SHIFTS, 1)
+    ]
+    m, light = generator.sensors(generator.optics(fine, none, none, 0.585, shifted), none, none, [])
+    return generator.electronics(m, light, none, [])
+
+
+def _middles(fine: Array) -> Array:
+    # Between samples 9 and 10: by the four fine places about it.
+    at = np.arange(0, len(fine) - 99, 100) + 47
+    return np.asarray((9.0 * (fine[at] + fine[at + 1]) - fine[at - 1] - fine[at + 2]) / 16.0)
+
+
+def volts_of(row: Row, clean: Array, seed: int) -> Array:
+    """What the converter gives, (n, 6) V."""
+    out = clean + generator.electronic_noise(len(clean), seed, sigmas=row.sigmas, memory=row.memory, heavy=row.heavy)
+    t = np.arange(len(clean)) / generator.RATE
+    out += row.hum * np.sin(2.0 * np.pi * 60.0 * t)[:, None]
+    if row.offsets:
+        out[:, [0, 1, 3, 4]] += row.offsets
+    return generator.output(out, [], row.bits)
+
+
+def estimates(
+    pipeline: Pipeline, volts: Array, here: npt.NDArray[np.bool_], *, zero_at: int = 0
+) -> list[DeflectionEstimate]:
+    """The primary estimates of samples (n, 6) V of which ``here`` (n,) arrive."""
+    seq = np.flatnonzero(here)
+    cut = int(np.searchsorted(seq, zero_at * SIZE))
+    out: list[DeflectionEstimate] = []
+    for part in (seq[:cut], seq[cut:]):
+        if zero_at and out:
+            pipeline.zero()
+        chunk = RawChunk(part, part * 1_000_000, volts[part].astype(np.float32), np.zeros(len(part), np.uint8))
+        out += [r for r in pipeline.process(chunk) if isinstance(r, DeflectionEstimate) and r.primary]
+    return out
+
+
+def score(row: Row, loss: str, *, rest_s: int = 100, steps: int = 16, seed: int = 1, **overrides: object) -> Scored:
+    """One cell of the table."""
+    clean, truth = motion(rest_s, steps)
+    share, burst = LOSSES[loss]
+    here = generator.present(len(clean), seed + 1000, share, burst)
+    pipeline = Pipeline(rig(row, **overrides))
+    got = estimates(pipeline, volts_of(row, clean, seed), here, zero_at=SETTLED if row.offsets else 0)
+    block = np.array([e.block for e in got])
+    error = np.array([(e.dx, e.dy, e.theta) for e in got]) - truth[block]
+    covariance = np.array([e.covariance for e in got]).reshape(-1, 3, 3)
+    first = rest_s * 1000 // SIZE
+    rest = (block >= 2 * SETTLED) & (block < first)
+    ringing = block >= first
+    return Scored(
+        inside(error[rest], covariance[rest]),
+        inside(error[ringing], covariance[ringing]),
+        pipeline.stamped.contradictions / len(got),
+    )
+
+
+def coarse(poses: int = 150, seed: int = 1) -> Inside:
+    """A 10 bit converter, whose step is ten times the noise: the last 20 blocks of 120 in each of many poses."""
+    rng = np.random.default_rng(seed)
+    row = Row('10 bit', bits=10)
+    errors, covariances = [], []
+    for _ in range(poses):
+        pose = rng.uniform(-1.0, 1.0, 3) * (1e-3, 1e-3, 1e-2)
+        volts = volts_of(row, _optics(np.tile(pose, (120 * SIZE * generator.FINER, 1))), int(rng.integers(1 << 30)))
+        for e in estimates(Pipeline(rig(row)), volts, np.ones(len(volts), bool))[100:]:
+            errors.append(np.array((e.dx, e.dy, e.theta)) - pose)
+            covariances.append(np.array(e.covariance).reshape(3, 3))
+    return inside(np.array(errors), np.array(covariances))
+
+
+def fault(kind: str, channel: int, load: tuple[float, float, float], seed: int = 1) -> tuple[float, str]:
+    """Largest error in own standard deviations of any estimate of a rig with one wrong reading, and what is named.
+
+    ``kind``: dead, stuck, inverted (``channel`` 0 to 3: x1, y1, x2, y2) or swapped (0 or 1: the PSD whose x and y are
+    exchanged). Four seconds at rest, then ``load`` (N, N, N m) switched on for four.
+    """
+    n = 8000
+    loads = np.zeros((n, 3))
+    loads[n // 2 + 7 :] = load
+    fine = generator.motion(loads, 0.585, [])
+    clean, truth = _optics(fine), _middles(fine)
+    volts = volts_of(Row(kind), clean, seed)
+    column = (0, 1, 3, 4)[channel]
+    if kind == 'dead':
+        volts[:, column] = 0.0
+    elif kind == 'stuck':
+        volts[n // 4 :, column] = volts[n // 4, column]
+    elif kind == 'inverted':
+        volts[:, column] *= -1.0
+    else:
+        pair = [3 * channel, 3 * channel + 1]
+        volts[:, pair] = volts[:, pair[::-1]]
+    # Zeroed as it is: the readings at rest are what they are then.
+    pipeline = Pipeline(rig(Row(kind)))
+    worst = 0.0
+    for e in estimates(pipeline, volts, np.ones(n, bool), zero_at=SETTLED // 2):
+        if e.block < SETTLED // 2:
+            continue
+        sd = np.sqrt(np.array(e.covariance).reshape(3, 3).diagonal())
+        worst = max(worst, float(np.abs((np.array((e.dx, e.dy, e.theta)) - truth[e.block]) / sd).max()))
+    return worst, pipeline.stamped.most_likely_wrong()
+
+
+FAULTS = tuple(
+    [(kind, channel) for kind in ('dead', 'stuck', 'inverted') for channel in range(4)]
+    + [('swapped', psd) for psd in range(2)]
+)
+
+
+def faults() -> int:
+    """Print :func:`fault` for every wrong reading at 10, 30 and 50 N."""
+    print('| wrong | load | largest error, own sd | named |\n|---|---|---|---|')
+    for kind, channel in FAULTS:
+        for force in (10.0, 30.0, 50.0):
+            for name, load in (('sidebar', (0.0, -force, -0.585 * force)), ('link', (0.0, -force, 0.0))):
+                worst, named = fault(kind, channel, load)
+                print(
+                    f'| {kind} {channel} | {force:g} N, {name} | {worst:.1f} | {named or "cannot be told"} |',
+                    flush=True,
+                )
+    return 0
+
+
+def bound() -> Array:
+    """Least rms error (3,) that white noise of 2 mV and 16 bits leave in a mean of 20 samples (Cramer-Rao)."""
+    (ax, ay), (bx, by) = generator.PLACES
+    a = np.array([[-1.0, 0.0, ay], [0.0, -1.0, -ax], [-1.0, 0.0, by], [0.0, -1.0, -bx]])
+    variance = generator.MM_PER_V**2 * (generator.SIGMA**2 + generator.LSB**2 / 12.0) / SIZE
+    return np.sqrt(variance * np.linalg.inv(a.T @ a).diagonal())
+
+
+HEAD = '| noise | loss | rest: ΔX | ΔY | θ | joint | ringing: ΔX | ΔY | θ | joint | within 3 sd | alarms |'
+
+
+def _cells(i: Inside) -> str:
+    return ' | '.join(f'{v:.3f}' for v in (*i.axes, i.joint))
+
+
+def _job(job: tuple[Row, str]) -> tuple[Row, str, Scored]:
+    return (*job, score(*job))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the table of docs/accuracy.md."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--jobs', type=int, default=2, help='processes at once')
+    parser.add_argument('--faults', action='store_true', help='instead: each reading wrong in turn')
+    args = parser.parse_args(argv)
+    if args.faults:
+        return faults()
+    print(HEAD)
+    print('|---' * (HEAD.count('|') - 1) + '|')
+    cost: Array | None = None
+    motion(100, 16)
+    with ProcessPoolExecutor(args.jobs) as pool:
+        rough = pool.submit(coarse)
+        for row, loss, s in pool.map(_job, [(row, loss) for row in ROWS for loss in LOSSES]):
+            name = row.label if loss == 'none' else ''
+            tail = f'{s.ringing.three:.4f} | {s.alarms:.5f}'
+            print(f'| {name} | {loss} | {_cells(s.rest)} | {_cells(s.ringing)} | {tail} |', flush=True)
+            if cost is None:
+                cost = np.array(s.rest.rms) / bound()
+        r = rough.result()
+    print(f'| 10 bit, no dither | none | {_cells(r)} | | | | | {r.three:.4f} | |')
+    if cost is not None:
+        words = ', '.join(f'{c:.3f}' for c in cost)
+        print(f'\nrms error at rest over the Cramér–Rao bound (white, no loss): {words}')
+    return 0
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -1,0 +1,1 @@
+"""How sure a block is: its noise from the stream, its dots at its stamp, its readings against each other."""

@@ -1,0 +1,285 @@
+"""What the dots were at the stamp: a polynomial through one block, weighted by what is known of the motion.
+
+The mean of N samples is not the value in their middle while the link moves: 20 samples at 1 kHz take
+12 % off a motion of 14 Hz, 27 % at 21 Hz, and where samples are lost the mean belongs to another
+time. So each block is described by orthonormal polynomials q_k of order 0 to 4 over its N places,
+z(s) = sum_k c_k q_k(s), and the answer is their value in the middle. Order 0 is the mean; the higher
+ones cost noise, and are worth it only while there is motion. How much motion there is the stream
+says: tau_k^2, the mean of c_k^2 over the last blocks less what noise puts into it, is taken as the
+prior variance of c_k, so that the answer is the posterior mean of Gaussian c_k (empirical Bayes; the
+weight of order k is tau_k^2/(tau_k^2 + v_k) in a whole block). At rest the weights go to 0 and the
+answer is the mean; in motion to 1.
+
+The answer is linear in the samples, w^T z. So its variance is w^T Gamma w with the measured
+autocovariance Gamma, plus sum_k (q_k(middle) - w^T q_k)^2 tau_k^2 for the motion that the weights
+leave out. A motion that order 4 cannot follow (a load that is switched inside the block) shows in
+what is left of the samples: then their rms is added as an error that does not average out.
+
+The four readings are turned into four combinations first: x and y of the plate's middle, its twist,
+and the length of the base line, exactly, which does not move
+while the plate stays flat.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from psd_deflection.records import FloatArray, IntArray
+
+ORDER = 4
+"""Highest order: it follows a quarter period inside a block to 1e-4 of the amplitude."""
+
+_FORGET = 1.0 / 24.0
+"""Share of the newest block in the running mean of c_k^2."""
+
+_BIAS = 0.1
+"""Times v_k, taken off tau_k^2: a mean that cannot be negative is too large by about that where there is no motion."""
+
+_SUDDEN = 12.0
+"""c_k^2 over what is expected of it, above which this block alone says how much motion there is."""
+
+_MISFIT = 5.0
+"""Standard deviations of the sum of squares that is left, above which the polynomial does not fit."""
+
+_ANY = 1e30
+"""m^2: nothing is known of order 0 beforehand."""
+
+_LARGEST = 64
+"""Samples a block up to which the colour of the noise makes the weights; of larger ones it makes the variance alone."""
+
+_ORDERS = np.arange(ORDER + 1)
+
+_WIDEN = 1.0
+"""Times what is left of the samples: the standard deviation of a misfit's error in the middle."""
+
+
+class Fitted(NamedTuple):
+    """``dots`` (4,) m at the stamp, their ``covariance`` (4, 4) m^2, ``misfit``: the polynomial does not fit."""
+
+    dots: FloatArray
+    covariance: FloatArray
+    misfit: bool
+
+
+def basis(size: int) -> FloatArray:
+    """Orthonormal polynomials (N, K) over the places 0 ... N - 1; at most one order for each four samples."""
+    orders = min(ORDER, (size - 1) // 4) + 1
+    u = (np.arange(size) - 0.5 * (size - 1)) / max(0.5 * (size - 1), 0.5)
+    columns: list[FloatArray] = []
+    column: FloatArray
+    for k in range(orders):
+        column = np.asarray(u**k, dtype=np.float64)
+        # Twice: once leaves rounding that shows.
+        for _ in range(2):
+            for q in columns:
+                column = column - (q * column).sum() * q
+        columns.append(column / float((column * column).sum()) ** 0.5)
+    return np.stack(columns, axis=1)
+
+
+def combinations(beams: FloatArray) -> FloatArray:
+    """Orthogonal (4, 4): x and y of the middle, twist, base line, each of (x1, y1, x2, y2). ``beams`` (2, 2), m."""
+    along = (beams[0] - beams[1]) / np.hypot(*(beams[0] - beams[1]))
+    x, y = float(along[0]), float(along[1])
+    rows = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0], [-y, x, y, -x], [x, y, -x, -y]])
+    return np.asarray(rows * 0.5**0.5)
+
+
+class BlockFit:
+    """Fits block after block; see the module's text. It remembers how much motion there was."""
+
+    def __init__(self, size: int, centers: FloatArray, beams: FloatArray, poly: bool = True) -> None:
+        """``size``: N samples of a whole block. ``centers``, ``beams`` (2, 2) m. ``poly``: False gives the mean."""
+        self._size = size
+        self._poly = poly
+        self._q = basis(size) if poly else basis(size)[:, :1]
+        self._orders = self._q.shape[1]
+        self._fft = 1 << (2 * size - 1).bit_length()
+        self._middle = _at_middle(self._q)
+        self._squares = np.zeros((4, self._orders))
+        # Until motion is seen there was none.
+        self._weight = np.ones((4, self._orders))
+        self._folds = np.full(self._fft // 2 + 1, 2.0 / self._fft)
+        self._folds[[0, -1]] = 1.0 / self._fft
+        self.set_geometry(centers, beams)
+
+    def set_geometry(self, centers: FloatArray, beams: FloatArray) -> None:
+        """Use these places (2, 2), m, from now on; :meth:`set_noise` must follow."""
+        self._turn = combinations(beams)
+        apart = centers[0] - centers[1]
+        self._across, self._along = (
+            float(np.einsum('i,i->', row[:2], apart)) for row in (self._turn[2], self._turn[3])
+        )
+        self._base_line = float(np.hypot(*(beams[0] - beams[1]))) * 0.5**0.5
+
+    def set_noise(self, gamma: FloatArray) -> None:
+        """Use the autocovariance ``gamma`` (4, 4, N) m^2 of the readings."""
+        turned = np.einsum('ac,cdl,bd->abl', self._turn, gamma, self._turn)
+        whole = np.zeros((4, 4, self._fft))
+        whole[:, :, : self._size] = turned
+        # The covariance with an earlier sample is the transposed one with a later.
+        whole[:, :, self._fft - self._size + 1 :] = turned.transpose(1, 0, 2)[:, :, :0:-1]
+        self._spectrum = np.fft.fft(whole)[:, :, : self._fft // 2 + 1] * self._folds
+        own = turned[range(4), range(4)]
+        self._precision = _precision(own, white=not self._poly or self._size > _LARGEST)
+        self._u = np.einsum('ast,tk->ask', self._precision, self._q)
+        self._information = np.einsum('sj,ask->ajk', self._q, self._u)
+        self._inverse = inverse(self._information)
+        self._v = np.einsum('akk->ak', self._inverse).copy()
+        f = np.fft.rfft(self._u, self._fft, axis=1)
+        self._of_whole = np.einsum('afk,abf,bfj->akbj', f, self._spectrum, np.conj(f)).real
+
+    def fit(self, slots: IntArray, dots: FloatArray) -> Fitted:
+        """The dots at the middle of the block. ``slots`` (n,): which samples are present. ``dots`` (n, 4), m."""
+        z = np.einsum('ac,sc->as', self._turn, dots)
+        # The length itself, not its first order: a twist by 1 degree would move that by 13 um.
+        z[3] = np.hypot(z[3] + self._along, z[2] + self._across) - self._base_line
+        # Of numbers about their mean: motion of millimetres leaves no rounding in what is left of it.
+        offset = z.sum(axis=1) / len(slots)
+        z -= offset[:, None]
+        whole = len(slots) == self._size
+        if whole:
+            q, precision, u, information, inverted, v = (
+                self._q,
+                self._precision,
+                self._u,
+                self._information,
+                self._inverse,
+                self._v,
+            )
+        else:
+            q = self._q[slots]
+            precision = self._without(slots)
+            u = np.einsum('ast,tk->ask', precision, q)
+            information = np.einsum('sj,ask->ajk', q, u)
+            inverted = inverse(information)
+            v = np.einsum('akk->ak', inverted)
+        h = np.einsum('ask,as->ak', u, z)
+        c = np.einsum('akj,aj->ak', inverted, h)
+        if self._orders > 1:
+            motion = self._motion(c, v)
+            # In a whole block odd orders are 0 in the middle and uncorrelated with even ones.
+            step = 2 if whole else 1
+            known = information[:, ::step, ::step].copy()
+            diagonal = _ORDERS[: known.shape[1]]
+            known[:, diagonal, diagonal] += 1.0 / motion[:, ::step]
+            x = np.zeros((4, self._orders))
+            x[:, ::step] = (inverse(known) * self._middle[::step]).sum(axis=2)
+        else:
+            motion = v
+            x = inverted[:, :, 0] * self._middle
+        value = np.einsum('ak,ak->a', x, h) + offset
+        if whole:
+            covariance = np.einsum('ak,akb->ab', x, np.einsum('akbj,bj->akb', self._of_whole, x))
+        else:
+            weights = np.zeros((4, self._size))
+            weights[:, slots] = np.einsum('ask,ak->as', u, x)
+            covariance = self._spread(weights)
+        misfit = False
+        left = len(slots) - self._orders
+        if self._orders > 1 and left > 0:
+            missed = self._middle - np.einsum('akj,aj->ak', information, x)
+            missed[:, 0] = 0.0
+            more = np.einsum('ak,ak->a', missed * missed, motion)
+            # In units of the noise: a chi-square of n - K degrees of freedom.
+            squares = np.einsum('as,as->a', z, np.einsum('ast,at->as', precision, z)) - np.einsum('ak,ak->a', h, c)
+            outside = squares > left + _MISFIT * (2.0 * left) ** 0.5
+            misfit = bool(outside.any())
+            if misfit:
+                rest = z - np.einsum('sk,ak->as', q, c)
+                more += np.where(outside, _WIDEN**2 * (rest * rest).sum(axis=1) / left, 0.0)
+            covariance[_ORDERS[:4], _ORDERS[:4]] += more
+        # Back from the length to the part along the base line at rest.
+        length, across = float(value[3]) + self._base_line, float(value[2]) + self._across
+        along = max(length * length - across * across, 1e-4 * length * length) ** 0.5
+        value[3] = along - self._along
+        back = self._turn.copy()
+        back[2] -= (across / along) * back[3]
+        back[3] *= length / along
+        return Fitted(
+            np.einsum('ac,a->c', self._turn, value),
+            np.einsum('ac,ad->cd', back, np.einsum('ab,bd->ad', covariance, back)),
+            misfit,
+        )
+
+    def state(self) -> tuple[float, ...]:
+        """What :meth:`set_state` needs to go on from here."""
+        return (*self._squares.ravel().tolist(), *self._weight.ravel().tolist())
+
+    def set_state(self, values: tuple[float, ...]) -> None:
+        """Go on from :meth:`state` of another one. Raises ValueError where it is not of this block size."""
+        size = self._squares.size
+        if len(values) != 2 * size:
+            raise ValueError(f'a fit of {self._size} samples a block has {2 * size} values, not {len(values)}')
+        self._squares = np.array(values[:size]).reshape(4, -1)
+        self._weight = np.array(values[size:]).reshape(4, -1)
+
+    def _without(self, slots: IntArray) -> FloatArray:
+        """The precision (4, n, n) of the samples that are present: a block of a matrix's inverse, inverted."""
+        lost = np.ones(self._size, dtype=bool)
+        lost[slots] = False
+        gone = np.flatnonzero(lost)
+        p = self._precision
+        cross = p[:, slots[:, None], gone]
+        inner = inverse(p[:, gone[:, None], gone])
+        return np.asarray(
+            p[:, slots[:, None], slots] - np.einsum('asg,atg->ast', np.einsum('asg,agh->ash', cross, inner), cross)
+        )
+
+    def _motion(self, c: FloatArray, v: FloatArray) -> FloatArray:
+        """tau^2 (4, K) after this block; infinite for order 0, of which nothing is known beforehand."""
+        excess = c * c - v
+        # A block with gaps says less the more noise its coefficients have.
+        sure = np.minimum(self._v / v, 1.0) ** 2
+        self._squares += _FORGET * (sure * excess - self._squares)
+        self._weight += _FORGET * (sure - self._weight)
+        tau = np.maximum(self._squares / np.maximum(self._weight, 1e-3) - _BIAS * self._v, 0.0)
+        tau = np.where(c * c > _SUDDEN * (v + tau), np.maximum(excess, tau), tau)
+        tau[:, 0] = _ANY
+        return np.asarray(np.maximum(tau, self._v * 1e-9))
+
+    def _spread(self, weights: FloatArray) -> FloatArray:
+        """Covariance (4, 4) of the weighted sums; ``weights`` (4, N)."""
+        f = np.fft.rfft(weights, self._fft)
+        return np.asarray(np.einsum('af,abf,bf->ab', f, self._spectrum, np.conj(f)).real)
+
+
+def inverse(matrices: FloatArray) -> FloatArray:
+    """Inverses of positive definite ``matrices`` (n, k, k), by elimination; no pivots are needed.
+
+    Element by element, so that the bits are those of any machine.
+    """
+    size = matrices.shape[1]
+    out = matrices.copy()
+    for i in range(size):
+        pivot = 1.0 / out[:, i, i]
+        row = out[:, i, :] * pivot[:, None]
+        column = out[:, :, i].copy()
+        out -= column[:, :, None] * row[:, None, :]
+        out[:, i, :] = row
+        out[:, :, i] = -column * pivot[:, None]
+        out[:, i, i] = pivot
+    return out
+
+
+def _precision(gamma: FloatArray, white: bool) -> FloatArray:
+    """Inverse (4, N, N) of the covariance that ``gamma`` (4, N) stands for; of white noise as strong if ``white``."""
+    size = gamma.shape[1]
+    lags = np.abs(np.arange(size)[:, None] - np.arange(size))
+    if not white:
+        out = inverse(gamma[:, lags])
+        if np.isfinite(out).all() and (np.einsum('ass->as', out) > 0.0).all():
+            return out
+    return np.asarray(np.eye(size) / gamma[:, :1, None])
+
+
+def _at_middle(q: FloatArray) -> FloatArray:
+    """The polynomials' values (K,) in the middle of the block, between two places where N is even."""
+    size, orders = q.shape
+    u = (np.arange(size) - 0.5 * (size - 1)) / max(0.5 * (size - 1), 0.5)
+    # Each is a combination of powers of u; the middle is u = 0, its constant term.
+    powers = np.stack([u**k for k in range(orders)], axis=1)
+    middle: FloatArray = np.linalg.solve(powers.T @ powers, powers.T @ q)[0]
+    return middle

@@ -1,0 +1,274 @@
+"""The noise of the four readings, measured in the stream: how they vary about a link at rest.
+
+What an estimate's covariance needs is the variance of a weighted mean over one block, so colour
+counts as much as size: gamma_cd(l), the covariance of reading c with reading d l samples later, for
+l from 0 to N - 1. It is measured in segments of 50 blocks; each segment's mean and slope are taken
+off, which costs 2 of 50 degrees of freedom and is put back.
+
+Motion is no noise. Four readings see three unknowns, and the fourth combination, how much longer the
+base line between the dots is than that between the beams, holds still whatever a flat plate does. A
+segment is at rest where no combination that moves with the link has a block mean that varies much
+more, against its roughness inside the blocks, than the one that does not move. During motion the
+values of the last rest hold. Before there was any rest, the roughness inside the blocks gives each
+reading's size, and the combination that does not move gives the colour.
+
+A converter's steps set the least noise: rounding to steps of q is noise of variance q^2/12 a sample
+(Widrow & Kollar, Quantization Noise, 2008), and what the noise does not dither stays as an error
+that no mean removes, of variance sum_k q^2/(2 pi^2 k^2) exp(-4 pi^2 k^2 s^2/q^2) for noise s (ibid.,
+the characteristic function of the noise at multiples of 2 pi/q).
+"""
+
+from __future__ import annotations
+
+from math import exp, pi
+
+import numpy as np
+
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.uncertainty.block_fit import basis, combinations, inverse
+
+SEGMENT_BLOCKS = 50
+"""Blocks of one segment: a second at 50 blocks a second."""
+
+STATED_SEGMENTS = 2
+"""Segments after which measured noise is used: two seconds at 50 blocks a second."""
+
+_LEAST_SHARE = 0.5
+"""A segment of which fewer samples are present tells nothing."""
+
+_LONGEST = 20
+"""Segments that the running mean remembers."""
+
+_MOTION = 4.0
+"""Times more variance of the block means than roughness explains: motion. Chance does it once in 10^6."""
+
+_RISEN = 2.0
+"""Times the variance so far: motion, or more noise. Chance does it once in 10^5 segments."""
+
+_FALLEN = 0.4
+"""Times the variance so far: what was taken for noise was motion, or the noise is less now."""
+
+_PATIENCE = 3
+"""Segments in a row at rest and louder: the noise is more now."""
+
+
+class StreamNoise:
+    """Autocovariance of the readings x1, y1, x2, y2, m; see the module's text.
+
+    ``gamma`` (4, 4, N): what to compute with, the converter's share included, m^2. ``measured``: whether
+    it comes from the stream; until then it is the rig file's. ``at_rest``: whether the stream was ever
+    seen at rest.
+    """
+
+    def __init__(self, size: int, centers: FloatArray, beams: FloatArray, variance: float, step: float) -> None:
+        """``size``: N. ``centers``, ``beams`` (2, 2) m. ``variance`` m^2 of a sample by the rig file; ``step`` m."""
+        self._size = size
+        self._wanted = 4 + 16 * size
+        self._stated = variance
+        self._step = step
+        self.set_geometry(centers, beams)
+        self._mean_of = _mean_weights(size)
+        self._q = basis(size)
+        self._average: FloatArray | None = None
+        self._count = 0
+        self._seen = 0
+        self._louder = 0
+        self.at_rest = False
+        self._segment = -1
+        self._blocks: list[tuple[int, IntArray, FloatArray]] = []
+        self.gamma = self._from_file()
+
+    def set_geometry(self, centers: FloatArray, beams: FloatArray) -> None:
+        """Use these places, m, from now on."""
+        self._turn = combinations(beams)
+        self._apart = centers[0] - centers[1]
+        self._base_line = float(np.hypot(*(beams[0] - beams[1])))
+
+    @property
+    def measured(self) -> bool:
+        """Whether ``gamma`` comes from the stream."""
+        return self._seen >= STATED_SEGMENTS
+
+    def sample_sd(self) -> FloatArray:
+        """Standard deviation (4,), m, of one sample."""
+        return np.asarray(np.sqrt(self.gamma[range(4), range(4), 0]))
+
+    def mean_sd(self) -> FloatArray:
+        """Standard deviation (4,), m, of the mean of a whole block."""
+        return np.asarray(np.sqrt(np.einsum('ccl,l->c', self.gamma, self._mean_of)))
+
+    def add(self, index: int, slots: IntArray, dots: FloatArray) -> bool:
+        """A block's samples; True where they ended a segment that changed ``gamma``.
+
+        ``index``: the block's number. ``slots`` (n,): which of its N samples are present. ``dots`` (n, 4), m.
+        """
+        changed = False
+        segment = index // SEGMENT_BLOCKS
+        if segment != self._segment:
+            changed = self._close()
+            self._segment = segment
+        self._blocks.append((index, slots, dots))
+        if index % SEGMENT_BLOCKS == SEGMENT_BLOCKS - 1:
+            changed |= self._close()
+        return changed
+
+    def forget_segment(self) -> None:
+        """Leave what the segment under way has gathered, so that who starts here gathers the same."""
+        self._blocks = []
+
+    def state(self) -> tuple[float, ...]:
+        """What :meth:`set_state` needs to go on from here."""
+        head = (float(self._seen), float(self._count), float(self._louder), float(self.at_rest))
+        return head if self._average is None else (*head, *self._average.ravel().tolist())
+
+    def set_state(self, values: tuple[float, ...]) -> None:
+        """Go on from :meth:`state` of another one. Raises ValueError where it is not of this block size."""
+        if len(values) not in (4, self._wanted):
+            raise ValueError(f'noise of {self._size} samples a block has {self._wanted} values, not {len(values)}')
+        self._seen, self._count, self._louder = (int(v) for v in values[:3])
+        self.at_rest = bool(values[3])
+        self._average = np.array(values[4:]).reshape(4, 4, self._size) if len(values) > 4 else None
+        self.gamma = self._in_use()
+
+    def _from_file(self) -> FloatArray:
+        gamma = np.zeros((4, 4, self._size))
+        gamma[range(4), range(4), 0] = self._stated
+        return self._with_steps(gamma)
+
+    def _in_use(self) -> FloatArray:
+        if self._average is None or not self.measured:
+            return self._from_file()
+        return self._with_steps(self._average)
+
+    def _with_steps(self, gamma: FloatArray) -> FloatArray:
+        out = gamma.copy()
+        rounding = self._step**2 / 12.0
+        for c in range(4):
+            level = max(float(out[c, c, 0]), rounding)
+            out[c, c, 0] = level
+            # More than the rig file's noise does not dither with certainty: a reading on the edge between
+            # two steps varies by half a step with next to no noise.
+            out[c, c] += _undithered(min(level, self._stated) - rounding, self._step)
+        return out
+
+    def _close(self) -> bool:
+        """Take the segment into the average where it may be."""
+        blocks, self._blocks = self._blocks, []
+        size = self._size
+        if sum(len(slots) for _, slots, _ in blocks) < _LEAST_SHARE * SEGMENT_BLOCKS * size:
+            return False
+        start = self._segment * SEGMENT_BLOCKS
+        places = np.concatenate([(index - start) * size + slots for index, slots, _ in blocks])
+        dots = np.concatenate([d for _, _, d in blocks])
+        apart = dots[:, :2] - dots[:, 2:] + self._apart
+        fixed = (np.hypot(apart[:, 0], apart[:, 1]) - self._base_line) * 0.5**0.5
+        series = np.column_stack((dots, fixed))
+        lags = _autocovariance(places, series, SEGMENT_BLOCKS * size, size)
+        # Mean and slope of the segment were taken off, and with them 2 of its 50 blocks' variance.
+        lags += np.einsum('cdl,l->cd', lags, self._mean_of)[:, :, None] * (2.0 / (SEGMENT_BLOCKS - 2))
+        self._seen += 1
+        rough = _roughness(places, np.column_stack((np.einsum('sc,ac->sa', dots, self._turn[:3]), series)), self._q)
+        self._judge(lags[:4, :4], lags[4, 4], rough + self._step**2 / 12.0)
+        self.gamma = self._in_use()
+        return True
+
+    def _judge(self, gamma: FloatArray, fixed: FloatArray, rough: FloatArray) -> None:
+        """``rough`` (8,): of three combinations, four readings and the one that does not move, m^2."""
+        turned = np.einsum('ac,cdl,ad->al', self._turn[:3], gamma, self._turn[:3])
+        least = self._step**2 / 12.0
+        means = turned @ self._mean_of + least / self._size
+        fixed_mean = float(fixed @ self._mean_of) + least / self._size
+        fixed_rough = float(rough[7])
+        still = bool((means * fixed_rough <= _MOTION * rough[:3] * fixed_mean).all())
+        if not self.at_rest:
+            if still:
+                self._restart(gamma)
+                self.at_rest = True
+            else:
+                self._into_average(_guess(fixed, rough[3:7] / fixed_rough))
+            return
+        before = self._average if self._average is not None else gamma
+        known = np.einsum('ac,cdl,ad,l->a', self._turn[:3], before, self._turn[:3], self._mean_of) + least / self._size
+        ratio = means / known
+        if (ratio > _RISEN).any():
+            self._louder = self._louder + 1 if still else 0
+            if self._louder >= _PATIENCE:
+                self._restart(gamma)
+        elif (ratio < _FALLEN).any():
+            self._restart(gamma)
+        else:
+            self._into_average(gamma)
+
+    def _restart(self, gamma: FloatArray) -> None:
+        self._average, self._count, self._louder = gamma, 1, 0
+
+    def _into_average(self, gamma: FloatArray) -> None:
+        self._louder = 0
+        self._count = min(self._count + 1, _LONGEST)
+        before = self._average if self._average is not None else gamma
+        self._average = before + (gamma - before) / self._count
+
+
+def _guess(fixed: FloatArray, size: FloatArray) -> FloatArray:
+    """In motion: each reading ``size`` (4,) times the combination that does not move, coloured like it."""
+    out = np.zeros((4, 4, len(fixed)))
+    out[range(4), range(4)] = fixed * size[:, None]
+    return out
+
+
+def _mean_weights(size: int) -> FloatArray:
+    """Weights (N,) of gamma(l) that give the variance of a block's mean."""
+    lags = np.arange(size)
+    return np.asarray(np.where(lags > 0, 2.0, 1.0) * (size - lags) / size**2)
+
+
+def _roughness(places: IntArray, series: FloatArray, q: FloatArray) -> FloatArray:
+    """Variance (c,) of ``series`` (n, c) about a polynomial in each block: the median over the blocks of a segment."""
+    size, orders = q.shape
+    blocks, slots = np.divmod(places, size)
+    whole = np.zeros((SEGMENT_BLOCKS, size, series.shape[1]))
+    here = np.zeros((SEGMENT_BLOCKS, size))
+    whole[blocks, slots] = series
+    here[blocks, slots] = 1.0
+    count = here.sum(axis=1)
+    enough = count >= orders + 2
+    whole, here, count = whole[enough], here[enough], count[enough]
+    whole = (whole - whole.sum(axis=1, keepdims=True) / count[:, None, None]) * here[:, :, None]
+    gram = np.einsum('bsk,sj->bkj', here[:, :, None] * q, q)
+    h = np.einsum('bsc,sk->bkc', whole, q)
+    left = np.einsum('bsc,bsc->bc', whole, whole) - np.einsum(
+        'bkc,bkc->bc', h, np.einsum('bkj,bjc->bkc', inverse(gram), h)
+    )
+    if not len(left):
+        return np.zeros(series.shape[1])
+    return np.asarray(np.median(left / (count - orders)[:, None], axis=0))
+
+
+def _autocovariance(places: IntArray, series: FloatArray, length: int, lags: int) -> FloatArray:
+    """(c, c, lags) of ``series`` (n, c) at ``places`` (n,) below ``length``, less mean and slope; gaps are left out."""
+    at = places - places.sum() / len(places)
+    centred = series - series.sum(axis=0) / len(series)
+    centred -= at[:, None] * (np.einsum('t,tc->c', at, centred) / float((at * at).sum()))
+    count = series.shape[1]
+    padded = np.zeros((count + 1, 1 << (length + lags - 1).bit_length()))
+    padded[:count, places] = centred.T
+    padded[count, places] = 1.0
+    spectra = np.fft.rfft(padded)
+    pairs = np.fft.irfft(np.conj(spectra[:count, None]) * spectra[None, :count])[:, :, :lags]
+    present = np.fft.irfft(np.abs(spectra[count]) ** 2)[:lags]
+    # Where two samples are never that far apart, nothing is known: taken as independent.
+    return np.asarray(np.where(present > 0.5, pairs / np.maximum(present, 1.0), 0.0))
+
+
+def _undithered(variance: float, step: float) -> float:
+    """Variance of the error that rounding to ``step`` leaves in the mean of many readings of that noise."""
+    if step <= 0.0:
+        return 0.0
+    decay = 4.0 * pi * pi * max(variance, 0.0) / step**2
+    total = 0.0
+    for k in range(1, 200):
+        term = exp(-min(decay * k * k, 700.0)) / (k * k)
+        total += term
+        if term < 1e-9:
+            break
+    return step**2 / (2.0 * pi * pi) * total

@@ -1,0 +1,33 @@
+"""A short form of ``python -m blind.coverage``: the truth is inside the published intervals as often as they say."""
+
+from __future__ import annotations
+
+import pytest
+
+from blind.coverage import ROWS, fault, score
+
+LABELS = ('white', 'AR(1) 0.9', 'twice the noise', '1, 2, 4, 2 mV')
+
+
+@pytest.mark.parametrize('label', LABELS)
+def test_the_truth_is_inside(label: str) -> None:
+    row = next(r for r in ROWS if r.label == label)
+    s = score(row, '20 %' if label == 'white' else 'none', rest_s=24, steps=4, seed=3)
+    for part in (s.rest, s.ringing):
+        assert part.blocks >= 900
+        # 0.95, give or take three standard deviations of a thousand blocks.
+        assert all(0.92 < share < 0.98 for share in (*part.axes, part.joint))
+    assert s.ringing.three > 0.99
+    assert s.alarms == 0.0
+
+
+def test_what_was_published_before_was_not_inside() -> None:
+    """The judge can say no: the mean of a block with the rig file's noise, while the link rings."""
+    s = score(ROWS[0], 'none', rest_s=8, steps=2, seed=3, block_fit='mean', covariance='file', consistency='report')
+    assert s.ringing.joint < 0.5
+
+
+@pytest.mark.parametrize(('kind', 'channel'), [('dead', 1), ('stuck', 3), ('inverted', 0), ('swapped', 1)])
+def test_a_wrong_reading_keeps_the_truth_inside_8_sd(kind: str, channel: int) -> None:
+    worst, _ = fault(kind, channel, (0.0, -30.0, -17.55))
+    assert worst < 8.0

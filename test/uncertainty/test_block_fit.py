@@ -1,0 +1,139 @@
+"""The fit through one block: exact on what it can follow, the mean where nothing moves, honest about its variance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.uncertainty.block_fit import BlockFit, basis, combinations, inverse
+
+PLACES = np.array([[0.0, 0.070], [-0.100, 0.0]])
+SIGMA = 1e-6
+SIZE = 20
+ALL = np.arange(SIZE)
+GAPS = [ALL, np.delete(ALL, [3, 11]), np.arange(8, 20), np.array([0, 1, 2, 3, 4, 5, 6, 13, 14, 15, 16, 19])]
+
+
+def white(size: int = SIZE, sigma: float = SIGMA) -> FloatArray:
+    gamma = np.zeros((4, 4, size))
+    gamma[range(4), range(4), 0] = sigma**2
+    return gamma
+
+
+def fitter(poly: bool = True, gamma: FloatArray | None = None) -> BlockFit:
+    out = BlockFit(SIZE, PLACES, PLACES, poly)
+    out.set_noise(white() if gamma is None else gamma)
+    return out
+
+
+def dots_of(pose: FloatArray) -> FloatArray:
+    """Flat plate, (n, 4): m = R(-theta)(l - d) - c."""
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    out = []
+    for x, y in PLACES:
+        u, v = x - pose[:, 0], y - pose[:, 1]
+        out += [c * u + s * v - x, -s * u + c * v - y]
+    return np.stack(out, axis=1)
+
+
+@pytest.mark.parametrize('size', [1, 2, 5, 9, 20, 64, 100])
+def test_the_polynomials_are_orthonormal_and_start_with_the_mean(size: int) -> None:
+    q = basis(size)
+    np.testing.assert_allclose(q.T @ q, np.eye(q.shape[1]), atol=1e-13)
+    np.testing.assert_allclose(q[:, 0], size**-0.5)
+    assert q.shape[1] <= 5
+
+
+def test_combinations_are_orthogonal_and_the_last_does_not_see_motion() -> None:
+    t = combinations(PLACES)
+    np.testing.assert_allclose(t @ t.T, np.eye(4), atol=1e-15)
+    small = dots_of(np.array([[1e-6, 0.0, 0.0], [0.0, 1e-6, 0.0], [0.0, 0.0, 1e-6]]))
+    assert abs(small @ t[3]).max() < 1e-12
+    assert abs(small @ t[2]).max() > 5e-8
+
+
+def test_inverses_of_positive_definite_matrices() -> None:
+    a = np.random.default_rng(0).normal(size=(6, 7, 5))
+    m = np.einsum('nij,nik->njk', a, a)
+    np.testing.assert_allclose(np.einsum('nij,njk->nik', inverse(m), m), np.tile(np.eye(5), (6, 1, 1)), atol=1e-9)
+
+
+@pytest.mark.parametrize('slots', GAPS, ids=lambda s: f'{len(s)} samples')
+def test_a_ringing_plate_is_followed_where_samples_are_missing_too(slots: IntArray) -> None:
+    """14 and 21 Hz of some tenths of a millimetre, without noise: the mean is tens of micrometres off."""
+    fit = fitter()
+    t = (ALL - 9.5) * 1e-3
+    worst = worst_of_mean = 0.0
+    for block in range(60):
+        at = t + 0.02 * block
+        pose = np.stack((1e-4 * np.sin(88.0 * at), 5e-4 * np.cos(88.0 * at), 2e-3 * np.cos(132.0 * at + 0.3)), axis=1)
+        when = 0.02 * block
+        truth = dots_of(
+            np.array([[1e-4 * np.sin(88.0 * when), 5e-4 * np.cos(88.0 * when), 2e-3 * np.cos(132.0 * when + 0.3)]])
+        )[0]
+        here = slots if block % 4 == 3 else ALL
+        dots = dots_of(pose)[here]
+        fitted = fit.fit(here, dots)
+        sd = np.sqrt(fitted.covariance.diagonal())
+        worst = max(worst, float((abs(fitted.dots - truth) / sd).max()))
+        worst_of_mean = max(worst_of_mean, float(abs(dots.mean(axis=0) - truth).max()))
+    assert worst < 2.5
+    assert worst_of_mean > 3e-5
+
+
+def test_at_rest_the_mean_is_kept_to_3_percent_and_the_variance_is_the_measured_one() -> None:
+    rng = np.random.default_rng(1)
+    fit = fitter()
+    got, means, stated = [], [], []
+    for _ in range(4000):
+        dots = rng.normal(0.0, SIGMA, (SIZE, 4))
+        fitted = fit.fit(ALL, dots)
+        got.append(fitted.dots)
+        means.append(dots.mean(axis=0))
+        stated.append(fitted.covariance.diagonal())
+    cost = np.std(got, axis=0) / np.std(means, axis=0)
+    assert (cost < 1.04).all()
+    assert (cost > 1.0).all()
+    np.testing.assert_allclose(np.sqrt(np.mean(stated, axis=0)), np.std(got, axis=0), rtol=0.06)
+
+
+def test_coloured_and_common_noise_is_in_the_covariance() -> None:
+    """One disturbance in all readings alike: the mean of x1 and x2 has it whole, their difference not at all."""
+    lags = 0.9 ** np.arange(SIZE)
+    gamma = np.tile(lags * SIGMA**2, (4, 4, 1))
+    gamma[range(4), range(4), 0] += 0.01 * SIGMA**2
+    fitted = fitter(poly=False, gamma=gamma).fit(ALL, np.zeros((SIZE, 4)))
+    toeplitz = 0.9 ** abs(ALL[:, None] - ALL)
+    expected = SIGMA**2 * toeplitz.mean()
+    np.testing.assert_allclose(fitted.covariance[0, 2], expected, rtol=1e-9)
+    difference = np.array([1.0, 0.0, -1.0, 0.0])
+    assert difference @ fitted.covariance @ difference < 0.01 * expected
+
+
+def test_a_load_that_is_switched_inside_the_block_widens_it() -> None:
+    fit = fitter()
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        fit.fit(ALL, rng.normal(0.0, SIGMA, (SIZE, 4)))
+    t = np.maximum(ALL - 6, 0) * 1e-3
+    dots = rng.normal(0.0, SIGMA, (SIZE, 4))
+    dots[:, 1] += 8.5 * t**2
+    fitted = fit.fit(ALL, dots)
+    assert fitted.misfit
+    error = fitted.dots[1] - 8.5 * 3.5e-3**2
+    assert abs(error) < 3.0 * fitted.covariance[1, 1] ** 0.5
+
+
+def test_another_fit_goes_on_from_the_state_to_the_bit() -> None:
+    rng = np.random.default_rng(3)
+    one, other = fitter(), fitter()
+    for _ in range(20):
+        one.fit(ALL, rng.normal(0.0, 5.0 * SIGMA, (SIZE, 4)))
+    other.set_state(one.state())
+    dots = rng.normal(0.0, SIGMA, (SIZE, 4))
+    a, b = one.fit(GAPS[1], dots[GAPS[1]]), other.fit(GAPS[1], dots[GAPS[1]])
+    assert (a.dots == b.dots).all()
+    assert (a.covariance == b.covariance).all()
+    with pytest.raises(ValueError, match='40 values, not 3'):
+        other.set_state((1.0, 2.0, 3.0))

@@ -1,0 +1,150 @@
+"""Noise from the stream: right in size and colour, deaf to motion, never below the converter's steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psd_deflection.records import FloatArray
+from psd_deflection.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise
+
+PLACES = np.array([[0.0, 0.070], [-0.100, 0.0]])
+SIGMA = 1e-6
+SIZE = 20
+SEGMENT = SEGMENT_BLOCKS * SIZE
+STEP = 1e-9
+
+
+def stream(step: float = STEP) -> StreamNoise:
+    return StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, step)
+
+
+def coloured(n: int, memory: float, seed: int, sigma: float = SIGMA) -> FloatArray:
+    e = np.random.default_rng(seed).normal(size=(n, 4))
+    out = np.empty_like(e)
+    out[0] = e[0]
+    for i in range(1, n):
+        out[i] = memory * out[i - 1] + (1.0 - memory**2) ** 0.5 * e[i]
+    return out * sigma
+
+
+def feed(noise: StreamNoise, dots: FloatArray, first: int = 0, lost: tuple[int, ...] = ()) -> None:
+    slots = np.delete(np.arange(SIZE), lost)
+    for b in range(len(dots) // SIZE):
+        noise.add(first + b, slots, dots[SIZE * b : SIZE * b + SIZE][slots])
+
+
+def ringing(n: int) -> FloatArray:
+    """A flat plate that swings by 0.2 mm and 1 mrad, (n, 4), m."""
+    t = np.arange(n) * 1e-3
+    y, theta = 2e-4 * np.sin(88.0 * t), 1e-3 * np.sin(132.0 * t)
+    out = []
+    for px, py in PLACES:
+        c, s = np.cos(theta), np.sin(theta)
+        out += [c * px + s * (py - y) - px, -s * px + c * (py - y) - py]
+    return np.stack(out, axis=1)
+
+
+def mean_variance(memory: float) -> float:
+    lags = np.arange(SIZE)
+    return float((memory ** abs(lags[:, None] - lags)).mean())
+
+
+@pytest.mark.parametrize('memory', [0.0, 0.3, 0.6, 0.9])
+@pytest.mark.parametrize('lost', [(), (2, 3, 11)], ids=['all', 'gaps'])
+def test_the_variance_of_a_mean_is_found_with_its_colour(memory: float, lost: tuple[int, ...]) -> None:
+    noise = stream()
+    feed(noise, coloured(15 * SEGMENT, memory, 4, 2.0 * SIGMA), lost=lost)
+    assert noise.measured
+    assert rested(noise)
+    np.testing.assert_allclose(noise.mean_sd(), 2.0 * SIGMA * mean_variance(memory) ** 0.5, rtol=0.12)
+    np.testing.assert_allclose(noise.sample_sd(), 2.0 * SIGMA, rtol=0.06)
+
+
+def test_until_two_segments_came_it_is_the_rig_files() -> None:
+    noise = stream()
+    feed(noise, coloured(2 * SEGMENT - SIZE, 0.0, 5, 3.0 * SIGMA))
+    assert not noise.measured
+    np.testing.assert_allclose(noise.sample_sd(), SIGMA, rtol=1e-3)
+
+
+def test_motion_is_not_taken_for_noise() -> None:
+    noise = stream()
+    feed(noise, coloured(5 * SEGMENT, 0.0, 6))
+    before = noise.gamma.copy()
+    feed(noise, coloured(5 * SEGMENT, 0.0, 7) + ringing(5 * SEGMENT), 5 * SEGMENT_BLOCKS)
+    assert (noise.gamma == before).all()
+
+
+def rested(noise: StreamNoise) -> bool:
+    return noise.at_rest
+
+
+def test_a_rig_that_never_rests_takes_the_colour_from_the_base_line() -> None:
+    noise = stream()
+    feed(noise, coloured(10 * SEGMENT, 0.6, 8) + ringing(10 * SEGMENT))
+    assert not rested(noise)
+    np.testing.assert_allclose(noise.mean_sd(), SIGMA * mean_variance(0.6) ** 0.5, rtol=0.25)
+    # And the first rest replaces it.
+    feed(noise, coloured(10 * SEGMENT, 0.6, 9), 10 * SEGMENT_BLOCKS)
+    assert rested(noise)
+    np.testing.assert_allclose(noise.mean_sd(), SIGMA * mean_variance(0.6) ** 0.5, rtol=0.12)
+
+
+def test_more_noise_is_believed_after_three_segments_less_at_once() -> None:
+    noise = stream()
+    feed(noise, coloured(5 * SEGMENT, 0.0, 10))
+    feed(noise, coloured(2 * SEGMENT, 0.0, 11, 5.0 * SIGMA), 5 * SEGMENT_BLOCKS)
+    np.testing.assert_allclose(noise.sample_sd(), SIGMA, rtol=0.1)
+    feed(noise, coloured(SEGMENT, 0.0, 12, 5.0 * SIGMA), 7 * SEGMENT_BLOCKS)
+    np.testing.assert_allclose(noise.sample_sd(), 5.0 * SIGMA, rtol=0.1)
+    feed(noise, coloured(SEGMENT, 0.0, 13), 8 * SEGMENT_BLOCKS)
+    np.testing.assert_allclose(noise.sample_sd(), SIGMA, rtol=0.1)
+
+
+def test_one_spike_is_not_noise() -> None:
+    noise = stream()
+    feed(noise, coloured(5 * SEGMENT, 0.0, 14))
+    before = noise.gamma.copy()
+    dots = coloured(SEGMENT, 0.0, 15)
+    dots[333, 2] += 1e-3
+    feed(noise, dots, 5 * SEGMENT_BLOCKS)
+    assert (noise.gamma == before).all()
+
+
+@pytest.mark.parametrize(('sigma', 'seeds'), [(0.0, 1), (0.3, 1), (0.6, 1)])
+def test_the_error_of_a_mean_of_coarse_readings_is_inside_what_is_said(sigma: float, seeds: int) -> None:
+    """Steps of 10 um: over all places between two steps, the rms error of the mean is what is stated, or less."""
+    step = 10e-6
+    rng = np.random.default_rng(16)
+    errors, stated = [], []
+    for place in np.linspace(0.0, 1.0, 40):
+        noise = StreamNoise(SIZE, PLACES, PLACES, max(sigma * step, 1e-9) ** 2 + step**2 / 12.0, step)
+        dots = step * np.round(place + rng.normal(0.0, sigma, (3 * SEGMENT, 4)))
+        feed(noise, dots)
+        errors.append(dots.reshape(-1, SIZE, 4).mean(axis=1) - step * place)
+        stated.append(noise.mean_sd() ** 2)
+    rms, said = float(np.mean(np.square(errors)) ** 0.5), float(np.mean(stated) ** 0.5)
+    assert rms <= 1.05 * said
+    assert said < 2.5 * rms
+
+
+def test_a_dead_reading_is_no_better_than_a_converters_step() -> None:
+    noise = stream(step=1e-6)
+    dots = coloured(4 * SEGMENT, 0.0, 17)
+    dots[:, 3] = 0.0
+    feed(noise, dots)
+    assert noise.mean_sd()[3] >= 1e-6 / 12.0**0.5
+
+
+def test_another_one_goes_on_from_the_state_to_the_bit() -> None:
+    one, other = stream(), stream()
+    feed(one, coloured(5 * SEGMENT + 7 * SIZE, 0.3, 18))
+    one.forget_segment()
+    other.set_state(one.state())
+    more = coloured(3 * SEGMENT, 0.3, 19, 1.2 * SIGMA)
+    for noise in (one, other):
+        feed(noise, more, 5 * SEGMENT_BLOCKS + 7)
+    assert (one.gamma == other.gamma).all()
+    with pytest.raises(ValueError, match='324 values, not 5'):
+        other.set_state((0.0,) * 5)

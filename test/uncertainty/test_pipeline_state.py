@@ -1,0 +1,99 @@
+"""What the pipeline remembers of noise, motion and contradictions: told in memory(), and then no bit differs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blind import generator
+from psd_deflection.config import Rig, load_rig, rig_as_recorded
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import BlockStatus, DeflectionEstimate, RawChunk, Record, SpotMeans
+
+
+def volts(seconds: int, seed: int, dead: int | None = None) -> generator.Array:
+    """At rest, 50 N from 3.007 s on; every seventh sample's noise larger."""
+    n = seconds * 1000
+    loads = np.zeros((n, 3))
+    loads[3007:] = (0.0, -50.0, -29.25)
+    out = generator.Generator(loads, np.zeros(n), 0.585).clean([])
+    out += generator.electronic_noise(n, seed, sigmas=(3e-3,) * 6, memory=0.4)
+    if dead is not None:
+        out[:, dead] = 0.0
+    return generator.output(out, [])
+
+
+def chunk(samples: generator.Array, first: int = 0) -> RawChunk:
+    seq = np.arange(first, first + len(samples))
+    return RawChunk(seq, seq * 1_000_000, samples.astype(np.float32), np.zeros(len(seq), np.uint8))
+
+
+def estimates(records: list[Record]) -> list[DeflectionEstimate]:
+    return [r for r in records if isinstance(r, DeflectionEstimate)]
+
+
+@pytest.mark.parametrize('start', [1, 40, 99, 130, 173, 251])
+@pytest.mark.parametrize('dead', [None, 1], ids=['sound', 'y1 dead'])
+def test_a_recording_begun_at_any_block_replays_to_the_bit(start: int, dead: int | None) -> None:
+    rig = load_rig()
+    samples = volts(7, 1, dead)
+    live = Pipeline(rig)
+    list(live.process(chunk(samples[: 20 * start])))
+    memory = live.memory(rig)
+    rest = chunk(samples[20 * start :], 20 * start)
+    expected = estimates(list(live.process(rest)))
+    replay = Pipeline(rig)
+    assert memory is not None
+    assert memory.block == start
+    replay.apply(memory)
+    assert estimates(list(replay.process(rest))) == expected
+    # And it would not be the same without.
+    assert estimates(list(Pipeline(rig).process(rest))) != expected
+
+
+def test_a_recording_from_before_has_the_mean_and_the_rig_files_noise() -> None:
+    named = dict(load_rig().values)
+    for name in ('block_fit', 'covariance', 'consistency'):
+        del named[name]
+    then = rig_as_recorded(named, 'test').estimator
+    assert (then.block_fit, then.covariance, then.consistency) == ('mean', 'file', 'report')
+    # What it does name stays, and a recording that names nothing has today's defaults.
+    assert rig_as_recorded({**named, 'covariance': 'measured'}, 'test').estimator.covariance == 'measured'
+    assert rig_as_recorded({}, 'test').estimator == load_rig().estimator
+
+
+def run(rig: Rig, samples: generator.Array) -> tuple[Pipeline, list[Record]]:
+    pipeline = Pipeline(rig)
+    return pipeline, list(pipeline.process(chunk(samples)))
+
+
+def test_a_dead_reading_is_widened_named_and_refused_if_asked() -> None:
+    samples = volts(9, 2, dead=1)
+    pipeline, records = run(load_rig(), samples)
+    late = [e for e in estimates(records) if e.primary and e.block > 200]
+    # y1 of 2.2 mm is missing: the truth is inside three of the widened standard deviations.
+    assert all(e.chi_square > 1e4 for e in late)
+    assert all(abs(e.dy + 2.2272e-3) < 3.0 * e.covariance[4] ** 0.5 for e in late[-50:])
+    assert all(abs(e.dy + 2.2272e-3) > 1e-4 for e in late[-50:])
+    assert pipeline.stamped.most_likely_wrong() == 'y1 does not move with the others'
+    _, records = run(load_rig(overrides={'consistency': 'refuse'}), samples)
+    spots = [s for s in records if isinstance(s, SpotMeans) and s.index > 200]
+    assert {s.status for s in spots} == {BlockStatus.INCONSISTENT}
+    assert 'contradict' in spots[0].reason
+    _, records = run(load_rig(overrides={'consistency': 'report'}), samples)
+    assert max(e.covariance[4] for e in estimates(records) if e.block > 300) < 1e-12
+
+
+def test_every_solver_has_the_gain_that_its_answers_show() -> None:
+    from psd_deflection.solvers import solver_from_rig
+
+    rig = load_rig()
+    dots, variances = (1.1e-3, -2.2e-3, 1e-5, -2.3e-3), (5e-14, 6e-14, 7e-14, 8e-14)
+    for name in ('exact', 'wls', 'iterative', 'beam', 'ols', 'minimum_tilt'):
+        solver = solver_from_rig(name, rig)
+        solution = solver.solve(dots, variances)
+        gain = solver.gain(dots, variances, solution)
+        for i in range(4):
+            there = [solver.solve((*dots[:i], dots[i] + h, *dots[i + 1 :]), variances) for h in (1e-6, -1e-6)]
+            slope = [(getattr(there[0], q) - getattr(there[1], q)) / 2e-6 for q in ('dx', 'dy', 'theta')]
+            np.testing.assert_allclose(gain[:, i], slope, rtol=0.03, atol=0.05, err_msg=name)
