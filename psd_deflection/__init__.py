@@ -33,7 +33,6 @@ def discover(recordings: Sequence[str | Path], rig: Rig | str | Path | None = No
     """Name the effects that the simulation lacks to explain ``recordings``.
 
     ``recordings``: files with loads, or ``.yaml`` lists of them.
-
     ``rig``: the known rig, or its parameter file; by default the parameters in the recordings. The same
     ``seed`` gives the same answer. ``psd_deflection.discovery.result`` turns the answer into
     ``result.json`` and ``model.yaml``. Raises :class:`psd_deflection.errors.RecordingError` if a

@@ -104,7 +104,7 @@ class Program:
             os.killpg(self.process.pid, number)
 
     def wait(self) -> int:
-        """Wait for the end; return the exit status. If it does not end in time it is killed, and RuntimeError raised."""
+        """Wait for the end; return the exit status. Past the time limit it is killed, and RuntimeError raised."""
         try:
             status = self.process.wait(self._wait_s)
         except subprocess.TimeoutExpired:
