@@ -1,9 +1,9 @@
-"""Compare, where, which, add, show on a plant that is not ours: what an adapter has to give, and the steps.
+"""The five steps of discover on another plant, and the interface of its adapter.
 
 A plant simulates its own load cases with any of its own effects on. Real machines differ from their
 models by far more than sensor noise, and their residuals are long-lived; so here the level of the
-residual is a parameter of the likelihood (N log RSS for each channel) and N counts correlation times.
-Held-out means refitted without a whole load case, and judged on it.
+residual is a parameter of the likelihood (N log RSS for each channel), and N counts correlation
+times. For a held-out test the model is refitted without a whole load case and tested on it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class PlantEffect:
 
 
 class Plant(Protocol):
-    """What an adapter gives."""
+    """The interface of an adapter."""
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -47,13 +47,13 @@ class Plant(Protocol):
 
     @property
     def library(self) -> tuple[PlantEffect, ...]:
-        """What may be missing."""
+        """The effects that may be missing."""
 
     def measured(self) -> list[FloatArray]:
         """Per load case, (channels, n)."""
 
     def simulate(self, model: Model, cases: Sequence[int]) -> list[FloatArray]:
-        """The same of the listed cases, simulated with the effects of ``model``."""
+        """The listed cases in the same form, simulated with the effects of ``model``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,7 @@ class _Fitter:
 
 
 def discover_in(plant: Plant) -> PlantDiscovery:
-    """What ``plant``'s nominal model lacks: effects added while BIC and unseen load cases both agree."""
+    """The effects that ``plant``'s model lacks, added while BIC and unseen load cases both improve."""
     fitter = _Fitter(plant)
     everything = range(len(fitter.data))
     current: Model = {}
@@ -186,7 +186,7 @@ def discover_in(plant: Plant) -> PlantDiscovery:
             tried = [(name, now - value) for value, name, _, _ in trials]
         value, name, model, residuals = trials[0]
         unseen = fitter.heldout(model)
-        # Each case at its own level: one that goes badly wrong shall not speak for the others.
+        # Each case at its own level, so that one bad case does not dominate the others.
         gains = np.array(
             [
                 float(np.sum(fitter.count * np.log(np.mean(a**2, axis=1) / np.mean(b**2, axis=1))) / len(everything))

@@ -1,14 +1,14 @@
-"""discover on data that no one here made: a two-link flexible arm, through the adapter. ``python -m blind.arm``.
+"""discover on open data of another machine, a two-link flexible arm, through the adapter. ``python -m blind.arm``.
 
-Stage 1 of the arm: a geared motor turns a hub, a flexible link carries the rest. Written from the
-equations of motion (hub angle h, tip angle against the hub d, motor current u)::
+Stage 1 of the arm: a geared motor turns a hub, and a flexible link carries the rest. The equations
+of motion are (hub angle h, tip angle against the hub d, motor current u)::
 
     J1 h'' = Ks d - B1 h' + B2 d' - T(h') + Kt u
     d'' = -(1/J1 + 1/J2)(Ks d + B2 d') + (B1 h' + T(h') - Kt u)/J1
 
 The maker's model has B2 = 0 and no Coulomb friction T. Each measured step is simulated from its first
-state with the current that the arm's controller asked for: the linear-quadratic gain of the nominal
-model on the recorded states. A closed loop would hide much of what the model lacks.
+state with the current that the arm's controller commanded: the linear-quadratic gain of the nominal
+model applied to the recorded states. A closed loop would hide many of the model's errors.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What is hidden: every case of the suite, drawn from its own seed, scaled to a stated gap.
+"""The cases of the suite: hidden effects, drawn from the case's own seed and scaled to a stated gap.
 
 The gap is the rms over x1 y1 x2 y2 of the block-mean dots, effect minus nominal, both without
-noise, in units of what the noise leaves (2 mV rms over 20 samples: 0.2236 um). Mains hum is null in
-block means at some frequencies: its gap is that of single samples over their noise.
+noise, in units of the gap from noise alone (2 mV rms over 20 samples: 0.2236 um). Mains hum is null
+in block means at some frequencies: its gap is that of single samples over their noise.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SHOWS_ACROSS_LENGTHS = frozenset(
         *('self_weight', 'mount_tilt'),
     )
 )
-"""Effects that one link length cannot tell from another of them: half of their cases have two."""
+"""Effects that one link length cannot distinguish; half of their cases have two lengths."""
 
 MIMICKED: Mapping[str, str] = {
     'bending_stiffness': 'clamp_bending_compliance',
@@ -42,7 +42,7 @@ MIMICKED: Mapping[str, str] = {
     'refraction': 'thermal_drift of both PSDs',
     'axis_crosstalk': 'sensor_rotation and sensor_gain on the diagonals these loads give',
 }
-"""What the rest of the catalogue can do just as well: leaving it out leaves nothing unknown."""
+"""Effects that others can replace exactly: leaving them out leaves nothing unknown."""
 
 
 def histories() -> tuple[Array, Array]:
@@ -188,7 +188,7 @@ ALIENS = tuple(n for n in DRAWS if n.startswith('alien_'))
 
 @dataclass(frozen=True)
 class Case:
-    """One run. ``wanted``: (effect, gap in floors), not yet scaled. ``without``: left out of the library."""
+    """One run. ``wanted``: (effect, gap in floors), not yet scaled. ``without``: effects left out of the library."""
 
     key: str
     kind: str
@@ -199,7 +199,7 @@ class Case:
 
     @property
     def seed(self) -> int:
-        """Of its noise and its draws; from its name, so that adding cases changes none."""
+        """Seed of its noise and draws, from its name, so that adding cases changes no other case."""
         return zlib.crc32(self.key.encode())
 
 
@@ -216,7 +216,7 @@ def gap_of(design: tuple[Generator, ...], effect: Mapping[str, Any]) -> float:
         v = g.clean([effect])
         nominal = g.clean([])
         if effect['name'] in ('amplifier_saturation', 'quantisation'):
-            # These meet the signal with its noise on it; the same noise on both leaves the effect.
+            # These act on the noisy signal; with the same noise on both, the difference is the effect.
             hiss = generator.noise(len(v), 'white', 12345)
             v, nominal = generator.output(v + hiss, [effect]), generator.output(nominal + hiss, [])
         if effect['name'] == 'mains_interference':
@@ -284,7 +284,7 @@ def all_cases(seeds: int = 4, nulls: int = 300, wrong: int = 102, pairs: int = 6
 
 
 def short_cases() -> list[Case]:
-    """A slice for every change: a few of each kind."""
+    """A small selection to run on every change: a few of each kind."""
     out = [
         Case(f'single-{name}-{gap:g}-s', 'single', 'one', ((name, gap),))
         for name, gap in (

@@ -1,10 +1,10 @@
-"""A second rig, written from docs/simulation.md alone: nothing of ``psd_deflection.simulation`` is imported.
+"""A second rig simulation, written from docs/simulation.md alone; imports nothing of ``psd_deflection.simulation``.
 
-Its own way in everything: the motion is integrated by Runge-Kutta of order four at a fifth of a
+Its methods are different: the motion is integrated by Runge-Kutta of order four at a fifth of a
 millisecond (as one matrix polynomial a step, the loads held over each sample), the optics intersect
 each beam with the plate in three dimensions by solving a linear system, lag and delay act on the
-five times finer signal, and hysteresis runs sample by sample. Where its physics goes beyond the
-nominal, that is an effect and stands in the truth.
+five times finer signal, and hysteresis runs sample by sample. Any physics beyond the nominal rig is
+an effect and is listed in the truth.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def _rk4(a: Array, b: Array) -> tuple[Array, Array]:
 def _march(a: Array, b: Array, held: Array, start: Array) -> Array:
     """States (n * FINER, 2) from ``start`` (2,); ``held`` (n, 1) is the input from each sample to the next.
 
-    FINER steps make a sample; within one the input is held, so that the steps' own matrices can be
-    multiplied out once and the march goes by samples.
+    FINER steps make a sample; within a sample the input is held. So the matrices of the steps are
+    multiplied once, and the loop runs over samples.
     """
     p, q = _rk4(a, b)
     reach, push = [np.eye(2)], [np.zeros((2, 1))]
@@ -140,7 +140,7 @@ def motion(loads: Array, length: float, effects: Sequence[Spec]) -> Array:
         rows = static[:, axis]
         total = rows.copy()
         for e in creeps:
-            # What has crept so far drives the oscillator, frozen over a sample.
+            # The creep so far drives the oscillator, constant over a sample.
             crept, decay = 0.0, math.exp(-1.0 / (RATE * e['time_constant']))
             lag = np.empty(len(rows))
             for i, u in enumerate(rows.tolist()):
@@ -261,7 +261,7 @@ def sensors(dots: Array, t: Array, warm: Array, effects: Sequence[Spec]) -> tupl
 
 
 def _alien_sensors(m: Array, t: Array, warm: Array, effects: Sequence[Spec]) -> None:
-    """What is in no catalogue, each on PSD 1 or 2, in place."""
+    """Effects that are in no catalogue, each on PSD 1 or 2; changes ``m`` in place."""
     for e in effects:
         size = e.get('size', 0.0)
         if e['name'] == 'alien_square_crosstalk':
@@ -398,7 +398,7 @@ class Generator:
         return electronics(m, light, t, effects)
 
     def record(self, effects: Sequence[Spec], kind: str, seed: int) -> Array:
-        """Volts (n, 6) as a converter gives them."""
+        """Volts (n, 6) as read by a converter."""
         clean = self.clean(effects)
         return output(clean + noise(len(clean), kind, seed), effects)
 

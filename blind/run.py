@@ -1,8 +1,7 @@
 """Run the blind suite: seal the truths, let discover answer, score. ``python -m blind.run --help``.
 
 Truths and thresholds are written and hashed before the first answer; discover is given volts, loads
-and temperatures, nothing else. Each answer is saved as it comes, and a run that was stopped goes on
-where it was.
+and temperatures, nothing else. Each answer is saved immediately, and a stopped run continues where it was.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ def truth_of(case: Case) -> list[dict[str, Any]]:
 
 
 def observe(case: Case, truth: Sequence[dict[str, Any]]) -> list[Observation]:
-    """What discover is given."""
+    """The input of discover."""
     rig = load_rig()
     out = []
     for i, g in enumerate(designs(case.design)):
@@ -86,7 +85,7 @@ def seal(cases: Sequence[Case], folder: Path) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Seal, run what is missing, score; exit status 1 where a threshold is not met."""
+    """Seal, run what is missing, score; exit status 1 if a threshold is not met."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--out', default='build/blind', help='folder for truths and answers (default: build/blind)')
     parser.add_argument('--jobs', type=int, default=1, help='processes at once')

@@ -32,7 +32,7 @@ THRESHOLDS: dict[str, float] = {
 
 @dataclass(frozen=True)
 class Row:
-    """A sealed truth and its answer. ``told_apart``: whether the design can, decided beforehand."""
+    """A sealed truth and its answer. ``told_apart``: whether the design can tell it apart, decided beforehand."""
 
     key: str
     kind: str
@@ -82,7 +82,7 @@ def covered(row: Row) -> list[tuple[str, bool]]:
             if t['name'] != e['name']:
                 continue
             fitted = e['parameters']
-            # Other choices are another effect; what they fit is not the truth's parameter.
+            # With other choices it is another effect, whose parameters are not those of the truth.
             if any(k in t and isinstance(v, int) and int(t[k]) != v for k, v in fitted.items()):
                 continue
             for name, value in fitted.items():
@@ -151,7 +151,7 @@ def summary(rows: Sequence[Row]) -> tuple[str, bool]:
 
 
 def _detections(sheet: _Sheet, single: Sequence[Row]) -> None:
-    """Of one effect alone, large enough to be seen."""
+    """Cases with one effect that is large enough to be seen."""
     wanted = THRESHOLDS['named_or_equivalent']
     hit = [bool(r.sets) and r.truth[0]['name'] in r.sets[0] for r in single]
     sheet.rate('truth named first or in its set, gap >= 3 floors', single, hit, wanted, 1.0, True)
@@ -165,7 +165,7 @@ def _detections(sheet: _Sheet, single: Sequence[Row]) -> None:
 
 
 def _false_alarms(sheet: _Sheet, rows: Sequence[Row]) -> None:
-    """Where nothing was hidden, with the noise that the rig file tells of and with another."""
+    """Cases without a hidden effect, with the rig file's noise and with another."""
     for kind, name in (('null', 'right'), ('wrong', 'wrong')):
         of = [r for r in rows if r.kind == kind]
         alarm = [r.answer['verdict'] != 'nothing_missing' for r in of]
@@ -174,7 +174,7 @@ def _false_alarms(sheet: _Sheet, rows: Sequence[Row]) -> None:
 
 
 def _unknowns(sheet: _Sheet, rows: Sequence[Row]) -> None:
-    """What the library has not must be called unknown; what it has should not."""
+    """Effects missing from the library must be called unknown; effects in it should not."""
     for kinds in (('leftout',), ('alien',), ('leftout', 'alien')):
         of = [r for r in rows if r.kind in kinds]
         right = [r.answer['verdict'] == 'unknown_effect' for r in of]
@@ -188,7 +188,7 @@ def _unknowns(sheet: _Sheet, rows: Sequence[Row]) -> None:
 
 
 def _held_out(sheet: _Sheet, rows: Sequence[Row]) -> None:
-    """The gap that is left on load cases that the fit has not seen."""
+    """The remaining gap on load cases that the fit has not seen."""
     known = [r for r in rows if r.kind in ('single', 'pair', 'null', 'wrong')]
     if not known:
         return

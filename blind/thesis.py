@@ -1,9 +1,9 @@
-"""The thesis's own discrepancies, worked through with the simulation. ``python -m blind.thesis``.
+"""The thesis's own discrepancies, analysed with the simulation. ``python -m blind.thesis``.
 
 Table B1 has an experimental row (60 N on the sidebar: bending 3.38 mm, twist 0.022 rad, point D
 29.45 mm) that its theory (2.68 mm, 0.020 rad, 14.2 mm) does not meet; Table 5.1 has errors of 84 %
-and 21 % in dX. Every effect of the catalogue is given the size at which it closes a gap, if it can
-at all within its bounds, and what that size does to the other figures is printed beside it.
+and 21 % in dX. For every effect of the catalogue this finds the size at which it closes a gap, if
+there is one within its bounds, and prints the other figures at that size.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
 from psd_deflection.solvers import solver_from_rig
 
 SETTLE = 14.0
-"""s under load before the figures are read: the modes have died down, creep has come."""
+"""s under load before the figures are read: the modes have decayed, and creep is complete."""
 
 BENDING, TWIST, POINT_D = 3.38e-3, 0.022, 29.45e-3
 ARM = loads.SIDEBAR_ARM
@@ -62,7 +62,7 @@ def knobs(rig: Rig) -> Iterator[tuple[str, Callable[[float], ActiveEffect], floa
 def closing(
     figure: Callable[[ActiveEffect], float], make: Callable[[float], ActiveEffect], low: float, high: float, off: float
 ) -> float | None:
-    """The size at which ``figure`` is zero: the nearest to ``off``, None where there is none."""
+    """The size at which ``figure`` is zero: the nearest to ``off``, None if there is none."""
 
     def f(value: float) -> float:
         out = figure(make(value))
@@ -175,7 +175,7 @@ def table_51() -> list[str]:
         x1, y1, x2, y2 = (float(v) for v in dots)
         s = solver.solve((x1, y1, x2, y2), (1e-12, 1e-12, 1e-12, 1e-12))
         pose, _ = settled(rig, load, [active])
-        # The camera sees the true pose; what moves the tip itself moves it for both.
+        # The camera sees the true pose, so an effect that moves the tip moves it for both.
         return s.dx / pose[0] - 1.0, s.dy / pose[1] - 1.0, s.theta / pose[2] - 1.0
 
     lines.append('exact solver: the size of an effect that alone would make the error in dX, and what else it would do')

@@ -1,6 +1,6 @@
-"""Record to message field dict and back: one file a message, no logic; serves rclpy and MCAP alike.
+"""Converts records to dicts of message fields and back, one file per message; used by rclpy and MCAP.
 
-:func:`to_messages` says which record goes to which topics; the fields are plain dicts with the
+:func:`to_messages` decides which record goes to which topics; the fields are plain dicts with the
 names of the ROS message definitions, so that nothing here needs ROS.
 """
 
@@ -89,8 +89,9 @@ _BY_NAME = {t.name: t for t in TOPICS}
 _OF_RECORD = {kind: tuple(t for t in TOPICS if t.record is kind) for kind in {t.record for t in TOPICS}}
 
 _MEASURED = (BlockStatus.OK, BlockStatus.OUTSIDE_ACTIVE_AREA, BlockStatus.NOT_SOLVED)
-"""The dots of these blocks were seen. With the laser lost or a channel saturated, the mean is not
-where the dot was, and of too few samples it is not the mean of the block: nothing is published."""
+"""Blocks whose dots are published. If the laser is lost, a channel is saturated or samples are too
+few, the mean is not the place of the dot, and nothing is published.
+"""
 
 
 class Message(NamedTuple):
@@ -103,24 +104,24 @@ class Message(NamedTuple):
 
 
 def solver_topic(solver: str) -> str:
-    """Where one solver's own answer goes."""
+    """The topic of one solver's own answer."""
     return f'/link_tip/{solver}/deflection'
 
 
 def to_messages(record: Record) -> tuple[Message, ...]:
-    """Every message that a record is published and recorded as; none where there is nothing to say."""
+    """Every message that a record is published and recorded as; an empty tuple if there is none."""
     return tuple(messages(record))
 
 
 def messages(record: Record) -> Iterator[Message]:
-    """:func:`to_messages`, each made only when it is asked for: the first waits for no other."""
+    """:func:`to_messages` as a generator: the first message does not wait for the others."""
     if not isinstance(record, DeflectionEstimate):
         yield from _messages(record)
         return
     t_ns = record.t_ns
     fields = pose_stamped.from_estimate(record)
     if record.primary:
-        # The one that a controller waits for goes first.
+        # A controller waits for this message: send it first.
         yield Message(DEFLECTION, pose_stamped.MESSAGE.name, t_ns, fields)
     yield Message(solver_topic(record.solver), pose_stamped.MESSAGE.name, t_ns, fields)
     if record.primary:

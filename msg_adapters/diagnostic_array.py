@@ -1,4 +1,4 @@
-"""diagnostic_msgs/DiagnosticArray: health, once a second."""
+"""diagnostic_msgs/DiagnosticArray: the diagnostics, once a second."""
 
 from __future__ import annotations
 

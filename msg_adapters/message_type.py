@@ -1,9 +1,9 @@
-"""What a message type is: its name, its definition as text, its hash. Each adapter declares its own.
+"""A message type: its name, its definition as text and its hash. Each adapter declares its own.
 
-No ROS need be installed, so the standard definitions stand here as text. A recording carries the
+The definitions are kept here as text because ROS need not be installed. A recording carries the
 definition of each of its types (MCAP schema encoding ``ros2msg``), and the CDR encoder is made from
-the same text. Comments and constants that the standard files have beyond these lines change neither
-bytes nor hashes; the tests compare fields and hashes with an independent store of the standard
+the same text. The comments and constants of the standard files are left out; they change neither
+bytes nor hashes. The tests compare fields and hashes with an independent collection of the standard
 definitions.
 """
 
@@ -20,7 +20,7 @@ _SHARED: Mapping[str, str] = {
     'geometry_msgs/Quaternion': 'float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n',
     'geometry_msgs/Pose': 'geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n',
 }
-"""Parts that more than one message is made of."""
+"""Types that several messages contain."""
 
 _SEPARATOR = '=' * 80 + '\n'
 
@@ -28,8 +28,8 @@ _SEPARATOR = '=' * 80 + '\n'
 class MessageType:
     """One type. ``name``: ``pkg/msg/Name``. ``text``: its fields, one a line, other types as ``pkg/Name``.
 
-    ``type_hash``: its REP-2011 hash, which rosbag2 notes beside each topic. ``parts``: the types of its
-    fields that no other message has.
+    ``type_hash``: its REP-2011 hash, which rosbag2 stores for each topic. ``parts``: the types of
+    fields that only this message has.
     """
 
     def __init__(self, name: str, type_hash: str, text: str, parts: Mapping[str, str] | None = None) -> None:

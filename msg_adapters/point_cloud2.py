@@ -1,10 +1,10 @@
-"""sensor_msgs/PointCloud2: the raw samples of one block, one point a sample.
+"""sensor_msgs/PointCloud2: the raw samples of one block, one point per sample.
 
 Little-endian fields in this order: ``seq`` UINT32 (the sample number modulo 2^32), ``dt`` UINT32
 (ns after header.stamp, which is the time of the first sample), then the six channels in volts,
-FLOAT32. Two more follow only in blocks that need them, so that replay sees all that the live
-pipeline saw: ``flags`` UINT32 where some sample carries a flag, and after it ``seq_high`` UINT32
-(seq div 2^32) once the sample number has passed 32 bits, after 49 days at 1 kHz.
+FLOAT32. Two more follow only in blocks that need them, so replay has the same input as the live
+pipeline: ``flags`` UINT32 if a sample has a flag, and after it ``seq_high`` UINT32 (seq div 2^32)
+once the sample number has passed 32 bits, after 49 days at 1 kHz.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ MAX_SPAN_NS = 2**32 - 1
 """The largest ``dt``: 4.29 s."""
 
 MAX_STEP = 65_536
-"""Bytes of one point of anybody's cloud that is read."""
+"""Largest point, in bytes, that is read from a cloud of another program."""
 
 _FORMATS = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 
@@ -91,10 +91,10 @@ def from_block(block: SampleBlock) -> Fields:
 
 
 def parts(block: SampleBlock) -> Iterator[SampleBlock]:
-    """The block itself or, where its samples lie too far apart for ``dt``, the block in pieces.
+    """The block itself or, if its samples are too far apart for ``dt``, the block in pieces.
 
-    A device that was stopped within a block and started seconds later numbers on without a gap;
-    only then does one block take more than one message.
+    This happens only if a device was stopped within a block and started seconds later, because its
+    numbers continue without a gap.
     """
     start = 0
     while len(block.t_ns) > start:
@@ -111,7 +111,7 @@ def parts(block: SampleBlock) -> Iterator[SampleBlock]:
 
 
 def layout(fields: Mapping[str, Any]) -> npt.DTypeLike:
-    """The numpy dtype of the points of any PointCloud2 that has our fields, whatever else it has.
+    """The numpy dtype of the points of any PointCloud2 that has these fields, possibly among others.
 
     Raises ValueError naming the field that is absent, of another kind, or outside the point.
     """
@@ -139,7 +139,7 @@ def layout(fields: Mapping[str, Any]) -> npt.DTypeLike:
 def to_points(fields: Mapping[str, Any]) -> tuple[int, npt.NDArray[np.void]]:
     """(header.stamp in ns, the points as a structured array with at least our eight fields).
 
-    Raises ValueError where the layout or the size of the message contradicts itself.
+    Raises ValueError if the layout or the size of the message contradicts itself.
     """
     width, height, step = int(fields['width']), int(fields['height']), int(fields['point_step'])
     data = bytes(fields['data'])

@@ -1,4 +1,4 @@
-"""geometry_msgs/PoseWithCovarianceStamped: the primary estimate with how sure it is."""
+"""geometry_msgs/PoseWithCovarianceStamped: the primary estimate with its covariance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MESSAGE = MessageType(
 )
 
 UNOBSERVED_VARIANCE = 1e6
-"""On the diagonal of the axes that two flat PSDs do not see (z in m^2, roll and pitch in rad^2)."""
+"""Variance of the axes that two flat PSDs do not see (z in m^2, roll and pitch in rad^2)."""
 
 _OBSERVED = (0, 1, 5)
 """x, y and yaw in ROS order (x, y, z, roll, pitch, yaw)."""

@@ -1,7 +1,8 @@
 """Blocks of N by sequence number: which samples belong together, their mean and covariance.
 
-A block is ``seq // block_size``, so that a lost sample shortens one block and shifts none. A block
-is complete as soon as its last number came, or one of a later block; nothing is filled in.
+The block number is ``seq // block_size``, so a lost sample shortens one block and shifts none. A
+block is complete when its last sample, or a sample of a later block, has arrived. Lost samples are
+not filled in.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from psd_deflection.records import FloatArray, RawChunk, SampleBlock
 
 
 class BlockCutter:
-    """Turns chunks of any size into whole blocks; what is not finished waits for the next chunk.
+    """Turns chunks of any size into whole blocks; an unfinished block waits for the next chunk.
 
-    ``repeated`` counts samples passed over because their number does not rise.
+    ``repeated`` counts the samples that were ignored because their number did not increase.
     """
 
     def __init__(self, block_size: int) -> None:
@@ -61,7 +62,7 @@ class BlockCutter:
         return done
 
     def flush(self) -> list[SampleBlock]:
-        """The unfinished block, where there is one: the stream has ended or started anew."""
+        """The unfinished block, if any: call it when the stream ended or restarted."""
         return [self._join()] if self._pending else []
 
     def _join(self) -> SampleBlock:
@@ -78,7 +79,7 @@ class BlockCutter:
 
 
 def covariance(values: FloatArray) -> FloatArray:
-    """Unbiased sample covariance (c, c) of ``values`` (n, c); zeros where n < 2."""
+    """Unbiased sample covariance (c, c) of ``values`` (n, c); zeros if n < 2."""
     n, c = values.shape
     if n < 2:
         return np.zeros((c, c))
@@ -88,10 +89,10 @@ def covariance(values: FloatArray) -> FloatArray:
 
 
 def block_middle_ns(block: SampleBlock, block_size: int, period_ns: float) -> int:
-    """When the middle of the whole block was, ns, from the samples that are present.
+    """Time of the middle of the whole block, ns, from the samples that are present.
 
-    Each present sample says where slot (N-1)/2 is; the mean of these is taken, so that a lost
-    sample moves the stamp by no more than the clock's own jitter. The mean of the samples that are left belongs to
+    Each sample gives an estimate of the time of slot (N-1)/2. The result is their mean, so a lost
+    sample moves the stamp by no more than the clock's jitter. The mean of the remaining samples belongs to
     another time: :mod:`psd_deflection.uncertainty.block_fit` gives the value at the stamp.
     """
     first = int(block.t_ns[0])

@@ -1,12 +1,12 @@
-"""The rig: a parameter file or flat values in, frozen sections out; every bound checked.
+"""The rig: turns a parameter file or flat values into frozen sections and checks every bound.
 
 Each field of a section declares one parameter: its type, default, unit, bounds and a sentence.
-Everything else follows from there: :data:`PARAMETERS`, the checks, ``psd-deflection params``, the
-node's descriptors and the documentation. A new parameter is one more field.
+Everything else is derived from these: :data:`PARAMETERS`, the checks, ``psd-deflection params``,
+the node's descriptors and the documentation. A new parameter is one more field.
 
 :func:`load_rig` reads a ROS 2 parameter file (``/**: ros__parameters:``) without ROS;
-:func:`rig_from_values` makes the frozen :class:`Rig` from flat values (``link.length``) and is what
-the node calls with the values that rclpy gives it.
+:func:`rig_from_values` makes the frozen :class:`Rig` from flat values (``link.length``). The node
+calls it with the values from rclpy.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class EstimatorConfig:
     """How samples become estimates."""
 
     block_size: int = parameter(20, 'samples', 'samples averaged for one estimate', minimum=1, maximum=1000)
-    min_samples: int = parameter(10, 'samples', 'a block with fewer present has no estimate', minimum=1, maximum=1000)
+    min_samples: int = parameter(10, 'samples', 'a block with fewer samples has no estimate', minimum=1, maximum=1000)
     sum_min: float = parameter(
         2.5, 'V', 'a sum signal below this means that the laser is lost', minimum=0.0, maximum=100.0, live=True
     )
@@ -175,14 +175,14 @@ class EstimatorConfig:
     frozen: str = parameter(
         'report',
         '',
-        'a detector of which no bit moves: report it in /diagnostics, or refuse its blocks as well',
+        'a detector whose values do not change by one bit: report it in /diagnostics, or also reject its blocks',
         choices=('report', 'refuse'),
         live=True,
     )
     twist_sd: float = parameter(
         0.01,
         'rad',
-        'standard deviation of the twist where it is not measured (degraded)',
+        'standard deviation of the twist if it is not measured (degraded)',
         above=0.0,
         maximum=10.0,
         live=True,
@@ -190,7 +190,7 @@ class EstimatorConfig:
     twist_hold: float = parameter(
         0.1,
         's',
-        'time in which a held twist is forgotten: its variance grows to twist_sd^2 (degraded: hold)',
+        'time after which a held twist counts for nothing: its variance has grown to twist_sd^2 (degraded: hold)',
         above=0.0,
         maximum=1e6,
         live=True,
@@ -296,10 +296,12 @@ class AcquisitionConfig:
 
 @dataclass(frozen=True, slots=True)
 class MonitorConfig:
-    """What is shown: markers for RViz, and the live page."""
+    """What the user sees: markers in RViz and the live page."""
 
     markers: bool = parameter(False, '', 'publish link, plate, beams and dots for RViz (/link_tip/markers)')
-    markers_magnify: float = parameter(10.0, '', 'how much larger they show displacements', above=0.0, maximum=1e4)
+    markers_magnify: float = parameter(
+        10.0, '', 'factor by which the markers exaggerate displacements', above=0.0, maximum=1e4
+    )
     enabled: bool = parameter(False, '', 'serve the live page', name='monitor')
     address: str = parameter(
         '127.0.0.1', '', 'address it is served on; 0.0.0.0 shows it to the network', name='monitor_address'
@@ -333,7 +335,7 @@ SECTIONS: tuple[Section[Any], ...] = (
     MONITOR,
 )
 PARAMETERS: tuple[Parameter, ...] = tuple(p for section in SECTIONS for p in section.parameters.values())
-"""Everything that can be set, in the order in which it is listed."""
+"""All parameters, in the order in which they are listed."""
 BY_NAME: Mapping[str, Parameter] = MappingProxyType({p.name: p for p in PARAMETERS})
 ZEROS = tuple(section.parameters['zero'].name for section in PSDS)
 """The parameters that ``~/zero`` sets, one for each detector."""
@@ -348,7 +350,7 @@ _COMPARE = {'less than': operator.lt, 'at most': operator.le}
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """The whole parameter set. ``values`` is what it was made of, flat, defaults included.
+    """The whole parameter set. ``values``: the flat values that it was made of, including defaults.
 
     ``effects``: the keys below ``effects.``, without that prefix.
     """
@@ -365,7 +367,7 @@ class Rig:
     effects: Mapping[str, Any] = field(default_factory=dict)
 
     def flat(self) -> dict[str, object]:
-        """All values under their flat names, those of the simulated effects too: :func:`rig_from_values` reads them."""
+        """All values under their flat names, including simulated effects; :func:`rig_from_values` reads them."""
         return {**self.values, **{EFFECTS_PREFIX + key: value for key, value in self.effects.items()}}
 
     @property
@@ -385,11 +387,11 @@ class Rig:
 
 
 def rig_from_values(values: Mapping[str, object], source: str = 'parameters') -> Rig:
-    """Make a :class:`Rig` from flat values; what is missing takes its default.
+    """Make a :class:`Rig` from flat values; missing values take their defaults.
 
-    Parameters that every ROS node has are passed over: ``ros2 param dump`` writes them too. Raises ConfigError for
-    an unknown key (with the nearest known one), a wrong type, a value out of bounds, or values that contradict each
-    other.
+    Parameters that every ROS node has are ignored, because ``ros2 param dump`` writes them too. Raises ConfigError
+    for an unknown key (with the nearest known one), a wrong type, a value out of bounds, or values that contradict
+    each other.
     """
     return _rig({p.name: p.default for p in PARAMETERS}, {}, values, source)
 
@@ -410,7 +412,7 @@ def replace_values(rig: Rig, changes: Mapping[str, object], source: str = 'overr
 
 
 def _rig(values: Mapping[str, Value], effects: Mapping[str, Any], changes: Mapping[str, object], source: str) -> Rig:
-    """The rig of ``values``, which are checked already, and ``changes``, which are checked here."""
+    """The rig of ``values``, already checked, and ``changes``, checked here."""
     v = dict(values)
     effects = dict(effects)
     for key, value in changes.items():

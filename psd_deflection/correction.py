@@ -1,10 +1,11 @@
-"""Undo what is known to be wrong with sensors and optics, so that the estimate gets better too.
+"""Corrects the dots for known errors of sensors and optics, so that the estimate improves too.
 
-A solver takes the rig at its word. Where the rig file lists effects of the detectors and the
-optics, a measured reading is first walked back through them (background light, gain, cross-talk,
-non-linearity, rotation, temperature); then, with the pose these dots imply, the difference between
-the true and the nominal optics (places of PSDs and beams, wandering beams, tilt) is taken off. What
-remains are the dots that the nominal, flat, perfectly placed rig would have shown.
+A solver assumes the nominal rig. If the rig file lists effects of the detectors and the optics,
+each reading is corrected in two steps. First the effects of the detectors are inverted (background
+light, gain, cross-talk, non-linearity, rotation, temperature). Then the pose is computed from these
+dots, and the difference between the true and the nominal optics at that pose is subtracted (places
+of PSDs and beams, wandering beams, tilt). The result is the dots that a nominal, flat, perfectly
+placed rig would have shown.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ from psd_deflection.simulation.optics import dots_on_plate
 from psd_deflection.simulation.physics import Physics
 
 PASSES = 3
-"""Fixed-point passes for the pose; each gains the relative size of the optics effect (< 1 %)."""
+"""Fixed-point passes for the pose; each reduces the error by the relative size of the effect (< 1
+%).
+"""
 OPTICS = ('centers', 'beams', 'heights', 'slope_ratio')
 """The constants that decide where the beams meet the plate (fields of :class:`Physics`)."""
 
@@ -46,20 +49,20 @@ class Correction:
             try:
                 corrects = self._add(active)
             except Exception as error:
-                # The file may be a stranger's; it must not fail at the first block of a run.
+                # The effect may be a user's own file. Fail here, not at the first block of a run.
                 raise ConfigError(
                     f'effects: {active.label}: fails on a reading ({type(error).__name__}: {error}); '
                     f'an effect that reads t or warmer must declare it in uses'
                 ) from error
             uses |= active.effect.uses if corrects else frozenset()
         self.uses_time = 'time' in uses
-        """Whether a corrected effect goes on with time."""
+        """Whether a corrected effect depends on time."""
         self.uses_temperature = 'temperature' in uses
-        """Whether a corrected effect goes with temperature."""
+        """Whether a corrected effect depends on temperature."""
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Correction:
-        """The correction for the effects of ``rig``; raises ConfigError where they are malformed."""
+        """The correction for the effects of ``rig``; raises ConfigError if they are malformed."""
         return cls(rig, effects_of_rig(rig))
 
     @property
@@ -68,10 +71,10 @@ class Correction:
         return bool(self._sensors) or self._moves_optics
 
     def _add(self, active: ActiveEffect) -> bool:
-        """Take an effect in and say whether there is something to correct for it.
+        """Add an effect; returns whether it needs a correction.
 
-        It is run on two samples, on which time and temperature are missing if it does not declare
-        them: in a run they would silently be zeros.
+        The effect is run on two samples. If it does not declare time or temperature, they are
+        missing here, because in a run they would silently be zeros.
         """
         effect, before = active.effect, _optics(self._true)
         t, warmer = (np.zeros(2 if use in effect.uses else 0) for use in ('time', 'temperature'))
@@ -106,7 +109,7 @@ class Correction:
     ) -> FloatArray:
         """Corrected dots (n, 4), m, of measured ``dots`` (n, 4), m.
 
-        ``sums`` (n, 2) V, nominal where None; ``warmer`` (n,) K above the recording's first
+        ``sums`` (n, 2) V, nominal if None; ``warmer`` (n,) K above the recording's first
         temperature; ``t`` (n,) s since its first sample.
         """
         n = len(dots)

@@ -1,7 +1,7 @@
 """The errors a user can meet, each with the exit status that the command line gives it.
 
-Every message is one line that names what was wrong, where, and the way out. Anything else that
-is raised is a defect of ours and ends with a traceback.
+Every message is one line: what is wrong, where, and how to fix it. Any other exception is a defect
+of this package and ends with a traceback.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ EXIT_STATUSES: Mapping[int, str] = {
 
 
 class PsdDeflectionError(Exception):
-    """Base of every error that is the outside world's, not ours."""
+    """Base class of all errors that input, files or devices cause, not a defect of this package."""
 
     exit_status = 70
 
 
 class UsageError(PsdDeflectionError):
-    """An option has a value that it does not take, is missing, or does not go together with another.
+    """An option is missing, has an invalid value, or contradicts another option.
 
     Example: ``--out run.png: no .png is written; X.csv, X.mcap or a bag folder (X) is``.
     """
@@ -76,6 +76,6 @@ class SolverError(PsdDeflectionError):
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """``; did you mean X?`` for a name that is nearly one of ``known``, else nothing."""
+    """``; did you mean X?`` if ``name`` is close to one of ``known``, else an empty string."""
     near = difflib.get_close_matches(name, list(known), n=1)
     return f'; did you mean {near[0]}?' if near else ''

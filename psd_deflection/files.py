@@ -8,9 +8,9 @@ from pathlib import Path
 
 
 def replace_file(path: Path, content: bytes) -> None:
-    """Write ``path`` under another name, to the disk, then give it its own: a crash leaves the old file or the new.
+    """Write ``path`` under another name, flush it, then rename it: a crash leaves the old file or the new.
 
-    A symbolic link stays one. Raises OSError; then ``path`` is as it was.
+    A symbolic link stays a link. Raises OSError; then ``path`` is unchanged.
     """
     place = path.resolve()
     partial = place.with_name(place.name + '.partial')

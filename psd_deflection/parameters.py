@@ -40,10 +40,10 @@ _KINDS: Mapping[object, Kind] = {float: 'double', int: 'integer', bool: 'bool', 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One thing that can be set. ``minimum``/``maximum`` hold for each element of an array.
+    """One parameter. ``minimum`` and ``maximum`` apply to each element of an array.
 
-    ``above``: an exclusive lower bound. ``live``: may change while the node runs. ``before``: what held before there
-    was this parameter, and so what a recording that does not name it was made with; None: the default.
+    ``above``: an exclusive lower bound. ``live``: the parameter may be changed while the node runs. ``before``: the
+    value for recordings that were made before this parameter existed and do not name it; None: the default.
     """
 
     name: str
@@ -64,7 +64,7 @@ class Parameter:
         if self.choices is not None:
             return f'one of {", ".join(self.choices)}'
         words = (('above', self.above), ('at least', self.minimum), ('at most', self.maximum))
-        # Whole numbers as they are typed: nobody writes 1e+06 bytes.
+        # Whole numbers in full: 1000000 bytes, not 1e+06.
         form = '.0f' if self.kind == 'integer' else 'g'
         return ' and '.join(f'{word} {bound:{form}}' for word, bound in words if bound is not None)
 
@@ -88,8 +88,8 @@ def parameter(
 ) -> T:
     """Declare a parameter as a field of a dataclass; the field's type is its type.
 
-    ``name``: what it is called in a parameter file, below the section's prefix, if not as the field.
-    The rest is explained at :class:`Parameter`.
+    ``name``: its name in a parameter file, below the section's prefix, if it differs from the
+    field's name. :class:`Parameter` explains the rest.
     """
     declared = {'unit': unit, 'description': description, 'minimum': minimum, 'maximum': maximum, 'above': above}
     metadata = {**declared, 'name': name, 'choices': choices, 'live': live, 'before': before}
@@ -115,7 +115,7 @@ class Section(Generic[T]):
         )
 
     def of(self, values: Mapping[str, Value]) -> T:
-        """The section that flat, checked values (``link.length``) make; lists become tuples."""
+        """The section with these flat, checked values (``link.length``); lists become tuples."""
         own = {name: values[p.name] for name, p in self.parameters.items()}
         return self._kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in own.items()})
 
@@ -132,18 +132,18 @@ def _declared(prefix: str, field_name: str, kind: object, default: object, metad
 
 
 def shown(value: object) -> str:
-    """``value`` for a message: as it is typed, cut short if a file or a device gives very much."""
+    """``value`` for a message: as the user types it, cut short if it is very long."""
     try:
         return _SHORT.repr(value)
     except ValueError:
-        # Python refuses to write a whole number of thousands of digits.
+        # Python refuses to print integers of thousands of digits.
         return 'a number of too many digits'
 
 
 def check_value(parameter: Parameter, value: object, source: str) -> Value:
-    """Return ``value`` as the parameter's type, or refuse it.
+    """Return ``value`` converted to the parameter's type.
 
-    Raises ConfigError naming ``source``, key, value and bound.
+    Raises ConfigError naming ``source``, key, value and bound if the value is not valid.
     """
     try:
         return _CHECKS[parameter.kind](parameter, value)
@@ -152,12 +152,12 @@ def check_value(parameter: Parameter, value: object, source: str) -> Value:
 
 
 class _RefusedError(Exception):
-    """What a value must be."""
+    """A value is not valid; the text says what it must be."""
 
 
 def _number(parameter: Parameter, value: object) -> float:
     if isinstance(value, str):
-        # YAML 1.1 reads 69e9 as a string; ROS reads it as a number, and so do we.
+        # YAML 1.1 reads 69e9 as a string. ROS reads it as a number, so this does too.
         try:
             value = float(value)
         except ValueError:

@@ -1,12 +1,13 @@
-"""From chunks of samples to records: the same object live and in replay.
+"""From chunks of samples to records; the live run and replay use the same class.
 
-It owns no clock, thread or I/O, so that what it gives depends on the rig, the samples and the order
-of calls alone, and ``replay`` can show that bit for bit. Counts -> volts -> blocks -> dots in
-metres -> what the rig file knows to be wrong taken off -> health -> solvers -> estimates and the
-load that the link model needs for them.
+It owns no clock, thread or I/O. Its output depends only on the rig, the samples and the order of
+calls, so ``replay`` reproduces it bit for bit. The steps are: counts -> volts -> blocks -> dots in
+metres -> correction of the effects in the rig file -> health checks -> solvers -> estimates, and
+the tip load that the link model computes from them.
 
-What it remembers from block to block (the twist that ``degraded: hold`` holds, how long a detector
-has stood still) is told as a record when a recording starts (:meth:`Pipeline.memory`).
+It has some state from block to block: the twist that ``degraded: hold`` keeps, and for how long a
+detector's values have not changed. When a recording starts, this state is written as a record
+(:meth:`Pipeline.memory`).
 """
 
 from __future__ import annotations
@@ -46,21 +47,22 @@ from psd_deflection.uncertainty.consistency import Checked, widened
 from psd_deflection.uncertainty.stamped import FIT, HELD_RESIDUAL, NOISE, StampedDots
 
 ZERO_BLOCKS = 25
-"""Blocks whose mean is taken as the unloaded dots by :meth:`Pipeline.zero`: half a second."""
+"""Number of blocks that :meth:`Pipeline.zero` averages: half a second."""
 
 START, FIRST_TEMPERATURE, TEMPERATURE = ENVIRONMENT
 HELD, FROZEN = 'state.held_twist', 'state.frozen_blocks'
 REMEMBERED = (NOISE, FIT, HELD_RESIDUAL)
-"""Names under which :meth:`Pipeline.memory` tells what is remembered."""
+"""Names of the values in the record of :meth:`Pipeline.memory`."""
 
 Dots = tuple[float, float, float, float]
 
 
 @dataclass(slots=True)
 class PipelineCounters:
-    """What went through: samples, blocks, estimates, and blocks without one.
+    """Counts of samples, blocks, estimates, and blocks without an estimate.
 
-    ``degraded``: estimates of one detector alone, among ``estimates``. ``findings``: blocks with each.
+    ``degraded``: those of ``estimates`` that come from one detector. ``findings``: number of blocks
+    with each finding.
     """
 
     samples: int = 0
@@ -82,7 +84,7 @@ class _Held(NamedTuple):
 class Pipeline:
     """Samples in, records out.
 
-    Raises SolverError or ConfigError where the rig cannot be solved.
+    Raises SolverError or ConfigError if the rig cannot be solved.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -115,19 +117,19 @@ class Pipeline:
 
     @property
     def repeated(self) -> int:
-        """Samples passed over because their number did not rise."""
+        """Number of samples ignored because their number did not increase."""
         return self._cutter.repeated
 
     @property
     def needs_temperature(self) -> bool:
-        """Whether a corrected effect goes with the ambient temperature."""
+        """Whether a corrected effect depends on the ambient temperature."""
         return self._correction.uses_temperature
 
     def process(self, chunk: RawChunk) -> Iterator[Record]:
         """The records of every block that ``chunk`` completes, each as soon as it is known.
 
-        A block's primary estimate comes first, before the other solvers run: who publishes it as it
-        comes publishes it soonest. Take them all: the next chunk must not come before.
+        A block's primary estimate comes first, before the other solvers run, so it can be published
+        without delay. Exhaust the generator before calling :meth:`process` again.
         """
         readings = chunk.readings
         volts: npt.NDArray[np.float32]
@@ -141,14 +143,14 @@ class Pipeline:
             yield from self._block(block)
 
     def flush(self) -> Iterator[Record]:
-        """The records of the unfinished block: the stream has ended, or starts anew."""
+        """The records of the unfinished block; call it when the stream ended or restarts."""
         for block in self._cutter.flush():
             yield from self._block(block)
 
     def zero(self) -> ParameterChange | None:
-        """Take the mean of the last blocks' dots as the unloaded ones, from the next block on.
+        """Use the mean dots of the last blocks as the unloaded dots, from the next block on.
 
-        None where no good block has come yet or the last was not one. The change is a record: replay applies it again.
+        None if the last block was not good or there is none yet. Replay applies the returned record again.
         """
         if not self._recent or self.last_spots is None:
             return None
@@ -156,9 +158,9 @@ class Pipeline:
         return self.change(dict(zip(ZEROS, ((x1, y1), (x2, y2)), strict=True)))
 
     def change(self, values: Mapping[str, float | str | tuple[float, ...]]) -> ParameterChange:
-        """Change parameters from the next block on; the change as a record.
+        """Change parameters from the next block on; returns the change as a record.
 
-        Raises ConfigError where a value is out of bounds; then nothing has changed.
+        Raises ConfigError if a value is out of bounds; then nothing has changed.
         """
         last = self.last_spots
         record = ParameterChange(
@@ -168,7 +170,7 @@ class Pipeline:
         return record
 
     def apply(self, change: ParameterChange) -> None:
-        """Use the changed values from now on. Raises ConfigError where one is out of bounds."""
+        """Use the changed values from now on. Raises ConfigError if one is out of bounds."""
         values = {name: list(v) if isinstance(v, tuple) else v for name, v in change.values}
         for name in ENVIRONMENT:
             value = values.pop(name, None)
@@ -186,9 +188,9 @@ class Pipeline:
         self.stamped.restore(told)
 
     def memory(self, rig: Rig) -> ParameterChange | None:
-        """What the next block depends on beside its samples and ``rig``, or None if that is nothing.
+        """The state that the next block depends on besides its samples and ``rig``; None if there is none.
 
-        ``rig``: as it was before; what was changed since is part of the memory.
+        ``rig``: the rig as it was at the start; later changes are part of the memory.
         """
         changed = {name: value for name, value in self.rig.values.items() if value != rig.values[name]}
         values: list[tuple[str, float | str | tuple[float, ...]]] = []
@@ -208,7 +210,7 @@ class Pipeline:
         return ParameterChange(t_ns, block, tuple(values))
 
     def temperature(self, celsius: float) -> ParameterChange | None:
-        """The ambient temperature from the next block on; None where no correction needs it."""
+        """Set the ambient temperature from the next block on; None if no correction needs it."""
         if not self._correction.uses_temperature:
             return None
         index = self.last_spots.index + 1 if self.last_spots is not None else 0
@@ -273,7 +275,7 @@ class Pipeline:
         if best is not None and not degraded:
             fx, fy, tz = self._statics.tip_load(best.dx, best.dy, best.theta)
             yield TipLoad(t_ns, fx, fy, tz)
-            # A mean taken across an outage must not become a zero.
+            # The zero must not be a mean across an outage.
             last = self.last_spots
             if last is not None and t_ns - last.t_ns > ZERO_BLOCKS * size * self._period_ns:
                 self._recent = []
@@ -287,7 +289,7 @@ class Pipeline:
         if best is None:
             name = status.name.lower()
             self.counters.refused[name] = self.counters.refused.get(name, 0) + 1
-        # What follows, no estimate waits for.
+        # The estimates are out: the rest is not urgent.
         if status is BlockStatus.OK and not verdict.findings:
             self.stamped.learn(block.index, slots, samples)
         if checked is not None:
@@ -333,7 +335,7 @@ class Pipeline:
         return self._estimate(0, t_ns, block, solution, dots, variances, spread, checked), checked, None
 
     def _solve(self, number: int, dots: Dots, variances: tuple[float, ...]) -> tuple[Solution | None, str]:
-        """The answer of solver ``number``, or None and why there is none."""
+        """The answer of solver ``number``, or None and the reason."""
         name, solver, _ = self._solvers[number]
         s = solver.solve(dots, variances)
         if s.status is not SolverStatus.OK:
@@ -351,7 +353,7 @@ class Pipeline:
         spread: FloatArray | None,
         checked: Checked | None,
     ) -> DeflectionEstimate:
-        """An answer with its covariance; ``spread`` (4, 4) m^2 of the dots, None where ``variances`` are all of it."""
+        """An answer with its covariance; ``spread`` (4, 4) m^2 of the dots, None if ``variances`` are all of it."""
         name, solver, primary = self._solvers[number]
         rms = (sum(r * r for r in s.residual) / len(s.residual)) ** 0.5
         covariance: tuple[float, ...] = s.covariance
@@ -379,19 +381,19 @@ class Pipeline:
         return more * covariance + np.diag([first, first, second, second])
 
     def _variances_of(self, verdict: Verdict, sums: FloatArray, present: int) -> tuple[float, ...]:
-        """Of the dots' means: of the noise, and of what light that is missing or not ours adds."""
+        """Variances of the dots' means, m^2: from the noise, and from missing or foreign light."""
         variances = self._variances[present - 1]
         if not verdict.findings:
             return variances
         first, second = self._optics.background_variance(sums)
-        # The divider's noise goes with the inverse of the light.
+        # The noise behind the divider grows as the inverse of the light.
         more = 4.0 if verdict.half_light else 1.0
         return tuple(more * v + b for v, b in zip(variances, (first, first, second, second), strict=True))
 
     def _from_the_other(
         self, faulty: int, t_ns: int, block: int, dots: Dots, variances: tuple[float, ...]
     ) -> DeflectionEstimate | None:
-        """The translation from the detector that is left, by the rule that ``degraded`` names."""
+        """The translation from the remaining detector, by the rule that ``degraded`` names."""
         config = self.rig.estimator
         theta, variance = 0.0, config.twist_sd**2
         if config.degraded == 'off':

@@ -1,8 +1,9 @@
-"""What flows through the house: frozen records with shapes and units.
+"""The records that the pipeline passes on: frozen, with shapes and units.
 
-One sample's way: counts in a :class:`RawChunk`, cut by sequence number into a
-:class:`SampleBlock`, averaged to :class:`SpotMeans`, solved to a :class:`DeflectionEstimate` for
-each solver and a :class:`TipLoad`. Times are integer nanoseconds of ROS time; everything else SI.
+A sample passes through them in this order: it arrives as counts in a :class:`RawChunk`. Its
+sequence number puts it into a :class:`SampleBlock`, whose average is a :class:`SpotMeans`. Each
+solver turns that into a :class:`DeflectionEstimate`, and the link model into a :class:`TipLoad`.
+Times are integer nanoseconds of ROS time; everything else SI.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ FLAG_DEVICE_DROPPED = 2
 
 
 class BlockStatus(IntEnum):
-    """Why a block has, or has not, an estimate."""
+    """Whether a block has an estimate and, if not, why."""
 
     OK = 0
     TOO_FEW_SAMPLES = 1
@@ -46,13 +47,12 @@ class BlockStatus(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawChunk:
-    """Samples as they came, in order, with no claim to be a whole block.
+    """Samples as they arrived, in order; not necessarily a whole block.
 
-    ``seq`` int64 (n,): the sample number, extended past the 32 bits of the wire.
-    ``t_ns`` int64 (n,): when each was taken, ROS time, ns.
-    ``readings`` (n, 6): int16 converter counts, or float32 volts, in the order of ``CHANNELS``.
-    ``flags`` uint8 (n,): as on the wire.
-    ``volts_per_count``: V a count; None says that ``readings`` are volts already.
+    ``seq`` int64 (n,): the sample number, extended beyond the 32 bits of the protocol. ``t_ns``
+    int64 (n,): when each sample was taken, ROS time, ns. ``readings`` (n, 6): int16 converter
+    counts, or float32 volts, in the order of ``CHANNELS``. ``flags`` uint8 (n,): as in the
+    protocol. ``volts_per_count``: V per count; None if ``readings`` are already volts.
     """
 
     seq: IntArray
@@ -64,7 +64,7 @@ class RawChunk:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampleBlock:
-    """The samples that are present of one block; a lost one is absent, never invented.
+    """The samples of one block that arrived; lost samples are left out, never filled in.
 
     ``index``: seq // block_size. ``seq`` int64 (n,), ``t_ns`` int64 (n,) ROS time in ns,
     ``volts`` float32 (n, 6), ``flags`` uint8 (n,), n >= 1.
@@ -82,9 +82,9 @@ class SpotMeans:
     """The two dots averaged over one block.
 
     ``t_ns``: middle of the block. ``dots``: (x1, y1, x2, y2), m, from each PSD's centre.
-    ``sums``: (sum1, sum2), V. ``covariance`` (4, 4): sample covariance of the dots, m^2 (zeros
-    where fewer than two samples are present). ``present`` + ``lost`` = block size. ``reason`` is
-    empty when ``status`` is OK. ``findings``: what is worth telling and stops no estimate.
+    ``sums``: (sum1, sum2), V. ``covariance`` (4, 4): sample covariance of the dots, m^2 (zeros if
+    fewer than two samples are present). ``present`` + ``lost`` = block size. ``reason`` is empty
+    when ``status`` is OK. ``findings``: warnings that do not prevent an estimate.
     """
 
     t_ns: int
@@ -104,9 +104,9 @@ class DeflectionEstimate(NamedTuple):
 
     ``dx``, ``dy`` m; ``theta``, ``phi``, ``omega`` rad, right-hand positive about Z, X, Y.
     ``covariance``: 3 x 3 of (dx, dy, theta), row by row, m^2, m rad, rad^2.
-    ``residual_rms``: rms of the four dot residuals, m. ``primary``: the one that is published as
-    ``/link_tip/deflection``. ``chi_square``: of the one reading too many, 1 degree of freedom; NaN where it was
-    not checked.
+    ``residual_rms``: rms of the four dot residuals, m. ``primary``: True for the estimate that is
+    published as ``/link_tip/deflection``. ``chi_square``: of the one redundant reading, 1 degree of
+    freedom; NaN if it was not checked.
     """
 
     t_ns: int
@@ -168,15 +168,17 @@ class TemperatureReading(NamedTuple):
 
 
 ENVIRONMENT = ('environment.start_ns', 'environment.first_temperature', 'environment.temperature')
-"""Changes that are no parameters: the stream's first sample (ns), and degrees Celsius then and now."""
+"""Recorded changes other than parameters: time of the first sample (ns), degrees Celsius then and
+now.
+"""
 
 
 class ParameterChange(NamedTuple):
-    """What the estimates depend on and that changed while the run went on.
+    """A value that affects the estimates and was changed during the run.
 
-    Parameters (``~/zero``, a live one), and what :data:`ENVIRONMENT` names. ``values``: name and
-    value, checked already; they hold from block ``block`` on. It is recorded, and replay applies it
-    at the same block.
+    These are parameters (set by ``~/zero`` or live) and the names in :data:`ENVIRONMENT`.
+    ``values``: names and checked values; they apply from block ``block`` on. The change is
+    recorded, and replay applies it at the same block.
     """
 
     t_ns: int
@@ -185,7 +187,9 @@ class ParameterChange(NamedTuple):
 
 
 class DiagnosticEntry(NamedTuple):
-    """One line of health: ``level`` 0 OK, 1 WARN, 2 ERROR, 3 STALE, as diagnostic_msgs has them."""
+    """One diagnostic status: ``level`` 0 OK, 1 WARN, 2 ERROR, 3 STALE, as diagnostic_msgs has
+    them.
+    """
 
     name: str
     level: int

@@ -1,23 +1,22 @@
-"""Device clock to host time, by regression on counters; a sample's arrival time is never its stamp.
+"""Converts device time to host time by regression; a sample's arrival time is never its stamp.
 
 Theory of operation. A byte cannot arrive before it was sent: host time minus device time is the
-clocks' offset plus a delay that is never negative and often far above its least. So only the least
-delay of each second of device time is kept (``WINDOW_S`` of them), and the line that matters is the
-lower edge of these points: the edge of their lower convex hull that spans their middle (field
-notes: 12 us standard deviation at 30 ppm skew and 1 ms USB polling; the mean of arrivals has 770).
-Until ``FIT_AFTER_S`` points are there, a one-sided filter holds (Olson, "A passive solution to the
-sensor synchronization problem", IROS 2010): the least delay so far, where an older one counts less by
-the most that the clocks may have drifted apart since (``MAX_SKEW``).
+clocks' offset plus a delay. The delay is never negative and often far above its minimum. So only
+the smallest delay of each second of device time is kept (``WINDOW_S`` of them). The fitted line is
+the lower edge of these points: the edge of their lower convex hull that spans their middle.
+(``test/test_timing.py`` checks that stamps stay within 50 us of the true times.) Until there are
+``FIT_AFTER_S`` points, a one-sided filter is used instead (Olson, "A passive solution to the sensor
+synchronization problem", IROS 2010). It takes the smallest delay so far, after raising each older
+one by the most that the clocks may have drifted apart since (``MAX_SKEW``).
 
-Samples at 1 kHz beat with the 1 ms polling of USB: their least delay of a second may stay high for
-many seconds. Where the device answers pings, their answers come at random phase and go into the same
-minima. A round trip also bounds what no one-way clock can see: the constant part of the delay is at
-most the least round trip (``ClockState.round_trip_ns``), and ``latency_offset`` takes it off where
-it is known.
+Samples at 1 kHz beat with the 1 ms polling of USB, so the smallest delay of a second may stay high
+for many seconds. If the device answers pings, the answers arrive at random phase and enter the same
+minima. One-way times cannot show the constant part of the delay. Pings bound it: it is at most the
+shortest round trip (``ClockState.round_trip_ns``). If it is known, ``latency_offset`` subtracts it.
 
-A better fit is not jumped to. The map from device to host time stays continuous and rises
-everywhere; it is steered to the fit within a bounded slope, so that stamps stay evenly spaced.
-Only where the device's clock itself jumped (a restart, a step) is the map laid anew, and counted.
+The map from device to host time does not jump to a better fit. It stays continuous and strictly
+rising, and approaches the fit with a bounded slope, so stamps stay evenly spaced. Only if the
+device's clock itself jumped (a restart, a step) does the map start again; such resets are counted.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ STEER_SETTLING = 2e-3
 """Largest extra slope in the first ``SETTLING_S``: 20 ms between blocks stay 20 ms within 40 us."""
 STEER_RUNNING = 2e-4
 EARLY_NS = 50_000_000
-"""A sample that comes this much before the map says it can: the device's clock jumped ahead."""
+"""A sample that arrives this much earlier than the map allows: the device's clock jumped ahead."""
 MAX_SKEW = 1e-4
 LATE_NS = 5 * SECOND_NS
 """A whole second of samples this late: the device's clock jumped back, or stood still."""
@@ -46,7 +45,7 @@ LATE_NS = 5 * SECOND_NS
 class ClockState(NamedTuple):
     """For diagnostics: skew in ppm, offset (host minus device) and residual in ns, resets.
 
-    ``round_trip_ns``: the least of the pings since the map was laid, None where none was answered.
+    ``round_trip_ns``: the shortest ping since the map started; None if no ping was answered.
     """
 
     skew_ppm: float
@@ -82,10 +81,10 @@ class ClockMap:
     def observe(self, t_device_us: int, t_host_ns: int, passed_us: float | None = None) -> bool:
         """One pair: the newest sample of a read, and when the read returned.
 
-        ``passed_us``: device time that the sample numbers say has passed since the last pair, where
-        they say so. A sample that comes too early for the map, by a clock that agrees with them,
-        shows that the first samples came late; the map is laid anew and nothing jumped.
-        Returns True where the device's clock jumped and the map was laid anew.
+        ``passed_us``: device time since the last pair according to the sample numbers, if they tell
+        it. If a sample arrives too early for the map but the clock agrees with the sample numbers,
+        then the first samples were late: the map starts again without counting a jump. Returns True
+        if the device's clock jumped and the map started again.
         """
         device = t_device_us * 1000
         if not self._started:
@@ -122,10 +121,10 @@ class ClockMap:
         return False
 
     def observe_reply(self, t_device_us: int, sent_ns: int, t_host_ns: int) -> None:
-        """A ping sent at ``sent_ns`` was answered with this device time, and the answer read at ``t_host_ns``."""
+        """A ping was sent at ``sent_ns``, answered at this device time, and the answer read at ``t_host_ns``."""
         device = t_device_us * 1000
         delay = t_host_ns - device
-        # It says nothing of a clock that jumped: the samples do.
+        # A reply is not used to detect a jump of the clock; the samples are.
         if not self._started or self._bucket_min is None or abs(self._host(device) - t_host_ns) > EARLY_NS:
             return
         trip = t_host_ns - sent_ns
@@ -142,7 +141,7 @@ class ClockMap:
         return host
 
     def state(self) -> ClockState:
-        """Where the clocks stand."""
+        """Skew, offset and residual of the current map."""
         return ClockState(
             self._fit[0] * 1e6,
             self._anchor_host - self._anchor_device,
@@ -165,7 +164,7 @@ class ClockMap:
         else:
             skew, intercept = lower_line([(d - self._origin, y) for d, y in self._minima])
         self._fit = (skew, intercept)
-        # The map turns at the last stamp that was given: what follows joins on to it.
+        # The slope changes at the last stamp that was returned, so the map stays continuous.
         turn = max(self._mapped, self._anchor_device)
         target = turn + intercept + skew * (turn - self._origin)
         host = self._host(turn)

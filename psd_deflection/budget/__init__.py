@@ -1,5 +1,5 @@
-"""The error budget of a rig: what each cause does to dX, dY and theta (thesis chapter 3, corrected).
+"""The error budget of a rig: the error of dX, dY and theta from each cause (thesis chapter 3, corrected).
 
-``read_inputs`` and a rig make a ``Situation``; ``evaluate`` gives every cause and the totals to first
-order, ``monte_carlo`` the same through the exact chain.
+``read_inputs`` and a rig make a ``Situation``; ``evaluate`` computes every cause and the totals to
+first order; ``monte_carlo`` computes them through the exact chain.
 """

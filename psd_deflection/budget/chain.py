@@ -1,11 +1,11 @@
 """The measuring chain with its imperfections, exact: from a pose of the tip to readings and stored zeros.
 
-Theory of operation. A sensor stands at C = (c + error, h + error) on the plate, its axes turned and
+Theory of operation. A sensor is at C = (c + error, h + error) on the plate, its axes turned and
 tilted by R_s = Ry Rx Rz. Its beam was set so that the dot lies at m_0 before load: it passes through
-C + R_s (m_0, 0) and runs along (u_x, u_y, 1). Under load the plate is at d + R(.), with the tilts of a
-cantilever, so the dot is where the beam meets the plane through d + R C with normal R R_s e_z. Nothing
-is linearised: every error of the budget is a field of :class:`Chain`, and what it does is computed,
-not estimated. What happens since the zero was stored (``..._shift``) acts on the loaded reading only.
+C + R_s (m_0, 0) and runs along (u_x, u_y, 1). Under load the plate is at d + R(.), with the tilts of
+a cantilever, so the dot is where the beam meets the plane through d + R C with normal R R_s e_z.
+Nothing is linearised: every error of the budget is a field of :class:`Chain`, and its effect is
+computed exactly. Changes after the zero was stored (``..._shift``) act on the loaded reading only.
 
 Arrays have a leading axis of n trials or of 1, then P sensors, then x and y.
 """
@@ -29,10 +29,10 @@ def _none(*shape: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """A rig as it is, beside what its parameter file says (the first block).
+    """A rig as its parameter file describes it (first group of fields), and its errors.
 
     ``centers`` (P, 2), ``heights`` (P,), ``zeros`` (P, 2), ``half_area`` (P, 2), ``link_length``: m.
-    ``slope_ratio`` (n,): the k that the link really has. Then the errors, all 0 in a rig as drawn:
+    ``slope_ratio`` (n,): the true k of the link. The errors follow, all 0 for the nominal rig:
     """
 
     centers: FloatArray
@@ -53,15 +53,15 @@ class Chain:
     beam_slope: FloatArray = field(default_factory=lambda: _none(1, 1, 2))
     """dx/dz, dy/dz of the beam."""
     center_shift: FloatArray = field(default_factory=lambda: _none(1, 1, 2))
-    """m, the centre has moved since the zero was stored."""
+    """m, movement of the centre since the zero was stored."""
     beam_shift: FloatArray = field(default_factory=lambda: _none(1, 1, 2))
-    """m, the dot has moved with the beam since."""
+    """m, movement of the dot with the beam since the zero was stored."""
     spot_diameter: FloatArray = field(default_factory=lambda: _none(1, 1))
-    """m, 1/e^2; 0 is a point that no edge clips."""
+    """m, 1/e^2 diameter; 0 is a point, which is never clipped."""
     nonlinearity: FloatArray = field(default_factory=lambda: _none(1, 1))
     """1/m^2: r becomes r (1 + k r^2)."""
     background: FloatArray = field(default_factory=lambda: _none(1, 1))
-    """Current that is not the spot's, centred, over the spot's."""
+    """Background current, centred, divided by the spot's current."""
     gain: FloatArray = field(default_factory=lambda: _none(1, 1, 2))
     """Scale error."""
     reading_shift: FloatArray = field(default_factory=lambda: _none(1, 1, 2))
@@ -71,16 +71,16 @@ class Chain:
 
     @classmethod
     def of(cls, rig: Rig) -> Chain:
-        """The rig as drawn."""
+        """The nominal rig."""
         half_area = np.array([p.active_area for p in rig.psds]) / 2.0
         slope_ratio = np.array([rig.link.slope_ratio])
         return cls(rig.centers, rig.heights, rig.zeros, half_area, rig.link.length, slope_ratio)
 
 
 def dots(chain: Chain, pose: FloatArray, dz: float = 0.0) -> FloatArray:
-    """(n, P, 2), m: where the dots lie in each sensor's own axes at ``pose`` (3,): dX, dY, theta.
+    """(n, P, 2), m: the dots in each sensor's own axes at ``pose`` (3,): dX, dY, theta.
 
-    ``dz``: the tip's shortening, m; matters to inclined beams only.
+    ``dz``: the tip's shortening, m; it affects inclined beams only.
     """
     tilted = tied_pose(pose, chain.slope_ratio, chain.link_length)
     plate = rotation(tilted[..., 2], tilted[..., 3], tilted[..., 4])[:, None]
@@ -94,10 +94,11 @@ def dots(chain: Chain, pose: FloatArray, dz: float = 0.0) -> FloatArray:
 
 
 def clipped(places: FloatArray, diameter: FloatArray, half_area: FloatArray) -> FloatArray:
-    """Centroid (n, P, 2) of what the active area catches of a Gaussian spot at ``places``.
+    """Centroid (n, P, 2) of the part of a Gaussian spot at ``places`` that is on the active area.
 
-    Beam diameter D (1/e^2) is four standard deviations of the intensity, and the area's edges cut x and
-    y apart, so each is the mean of a truncated normal. A spot on the area to 6 deviations is untouched.
+    Beam diameter D (1/e^2) is four standard deviations of the intensity, and the area's edges clip x
+    and y independently. So each coordinate is the mean of a truncated normal. A spot at least 6
+    deviations inside the area is unchanged.
     """
     if not np.any(diameter > 0.0):
         return places

@@ -1,8 +1,8 @@
-"""E_C, what the method itself gets wrong on perfect readings (last row of Table 3.1; 3.9, 3.10 corrected).
+"""E_C, the method's own error on perfect readings (last row of Table 3.1; 3.9, 3.10 corrected).
 
-An exact method: nothing. Least squares of chapter 4 linearises: theta comes out as its sine and d
-unturned, d^ - d = -theta z x d + theta^2 l/2. The iteration of section 2.2 stops at the first trial angle
-inside a window, which is always short of the true one.
+For an exact method it is zero. The least squares of chapter 4 are linear: the result is sin theta instead
+of theta, and d is not rotated, d^ - d = -theta z x d + theta^2 l/2. The iteration of section 2.2 stops at
+the first trial angle inside a window, which is always short of the true one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from psd_deflection.records import FloatArray
 
 
 def stop_window(beams: FloatArray, tolerance: float) -> float:
-    """How far from the true angle both of 3.9 and 3.10 first hold, rad: tolerance / max(|E_x|, |E_y|)."""
+    """Distance from the true angle at which both 3.9 and 3.10 first hold, rad: tolerance / max(|E_x|, |E_y|)."""
     base = np.abs(beams[0] - beams[1])
     return tolerance / float(base.max())
 
@@ -32,11 +32,11 @@ def _iteration(at: Situation) -> Contribution:
             f'iteration_tolerance = {at["iteration_tolerance"]:g} m: its window of +-{window:g} rad is narrower than '
             f'iteration_step = {step:g} rad: the iteration may step over it; take a finer step'
         )
-    # The first trial inside the window lies anywhere within one step of its edge.
+    # The first trial inside the window is uniform within one step of its edge.
     short, deviation = window - step / 2.0, step / math.sqrt(12.0)
     if abs(twist) <= window:
         short, deviation = abs(twist), 0.0
-    # The thesis takes d from PSD 1: d = l_1 - R(theta) q_1, so an angle error swings it by l_1 - d.
+    # The thesis takes d from PSD 1: d = l_1 - R(theta) q_1, so an angle error moves it by that angle times l_1 - d.
     arm = at.rig.centers[0] + at.rig.zeros[0] - at.pose[:2]
     response = np.array([arm[1], -arm[0], 1.0])
     return Contribution(-math.copysign(short, twist) * response, deviation**2 * np.outer(response, response))
@@ -54,13 +54,13 @@ class Computation(Cause):
     inputs = ('iteration_tolerance', 'iteration_step')
 
     def contribution(self, at: Situation) -> Contribution:
-        """As declared; the stop rule leaves a bias and, by its grid, a little chance."""
+        """As declared; the stop rule leaves a bias and, because of its grid, a small random part."""
         if at.method == 'thesis_iteration':
             return _iteration(at)
         return Contribution(perfect_answer(at) - at.pose, np.zeros((3, 3)))
 
     def without(self, chain: Chain, at: Situation) -> Chain:
-        """As declared: the chain is innocent."""
+        """As declared: the chain is unchanged."""
         return chain
 
     def perturb(self, chain: Chain, at: Situation, count: int, random: np.random.Generator) -> Chain:

@@ -1,4 +1,4 @@
-"""Terms of the surroundings: the second group of Table 3.1, and the beams."""
+"""Terms of the environment (second group of Table 3.1) and of the beams."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _refraction(at: Situation) -> FloatArray:
 
 
 def _refract(chain: Chain, values: FloatArray, at: Situation) -> Chain:
-    # The gradient bends both beams alike; a boundary (a plume) meets each by itself.
+    # A gradient bends both beams equally; a boundary (a plume) meets each beam separately.
     both, each = values[:, None, :2], values[:, 2:].reshape(-1, 2, 2)
     return replace(chain, beam_shift=chain.beam_shift + both + each)
 
@@ -51,7 +51,7 @@ REFRACTION = Term(
 
 
 def averaging_gain(block_size: int, frequency: float, sample_rate_hz: float) -> float:
-    """What the mean of a block leaves of a sinusoid: |sin(pi N f/fs) / (N sin(pi f/fs))|.
+    """The fraction of a sinusoid that remains in the mean of a block: |sin(pi N f/fs) / (N sin(pi f/fs))|.
 
     20 samples at 1 kHz null 50 Hz and leave 0.16 of 60 Hz.
     """

@@ -1,9 +1,9 @@
-"""The estimators whose errors are budgeted, and their first-order response.
+"""The estimators of the error budget, and their first-order response.
 
 Each takes readings and stored zeros, (n, P, 2) m, and gives (n, 3): dX, dY, theta. Its ``response`` is
 the Jacobian of that answer by readings and by zeros at a true pose, (3, 2P) each: for the exact
 methods S = (J^T J)^-1 J^T with J the Jacobian of the exact model, and -S dq/dl for the zeros, because
-a zero moves the beam that it stands for.
+each zero defines the place of a beam.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from psd_deflection.solvers.registry import solver_class
 
 
 class Estimator(abc.ABC):
-    """One way from readings to a pose. ``slope_ratio``: the k that it takes the link to have; 0 for a flat plate."""
+    """One way from readings to a pose. ``slope_ratio``: the k that it assumes; 0 for a flat plate."""
 
     slope_ratio: float
 
@@ -56,7 +56,7 @@ class ExactEstimator(Estimator):
         if self.slope_ratio == 0.0:
             return pose
         tie = tie_matrix(self.slope_ratio, self.link_length)
-        # Six steps take any pose in a sensor's range to rounding: the start is off by the tilt alone.
+        # Six steps converge to rounding in the sensors' range: the start lacks only the tilt.
         for _ in range(6):
             full = tied_pose(pose, self.slope_ratio, self.link_length)
             model, slopes = crossings(full, beams, self.heights)
@@ -103,7 +103,7 @@ METHODS = ('exact', 'beam', 'wls', 'thesis_iteration')
 def method_of(rig: Rig) -> str:
     """The method by which the rig's own solver is budgeted, as that solver's class declares it.
 
-    Raises ConfigError for an unknown solver and for one whose errors no method has.
+    Raises ConfigError for an unknown solver and for a solver without a budget method.
     """
     name = rig.estimator.solver
     method = solver_class(name).budgeted_as
@@ -117,9 +117,9 @@ def method_of(rig: Rig) -> str:
 def estimator_of(rig: Rig, method: str) -> Estimator:
     """The estimator of one of ``METHODS``.
 
-    ``thesis_iteration`` gives the exact angle less what its stop rule leaves (``budget.computation``), so
-    it responds to errors as ``exact`` does. Raises ConfigError for another name, or if the two
-    centres coincide.
+    ``thesis_iteration`` gives the exact angle minus the error of its stop rule (``budget.computation``),
+    so it responds to errors as ``exact`` does. Raises ConfigError for another name, or if the two centres
+    coincide.
     """
     if method not in METHODS:
         raise ConfigError(f'method = {method!r}: must be one of {", ".join(METHODS)}')

@@ -20,7 +20,7 @@ TABLE_3_1 = ('E_LP', 'E_DC', 'E_R', 'E_TH', 'E_RF', 'E_EMF', 'E_Algn', 'E_Tilt',
 """The rows of the thesis's Table 3.1."""
 
 _CHUNK = 10_000
-"""Draws at once: bounds the memory of a long Monte Carlo."""
+"""Number of draws computed at once; it limits memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +40,7 @@ class Budget:
     def shares(self, line: Contribution) -> FloatArray:
         """(3,): mean square of a line over the total's, for dX, dY, theta.
 
-        They add to 1 but for the products of biases, which no single line owns.
+        They add to 1 except for products of biases, which belong to no single line.
         """
         whole = self.total().rms ** 2
         return np.asarray(np.divide(line.rms**2, whole, out=np.zeros(3), where=whole > 0.0))
@@ -60,9 +60,9 @@ def monte_carlo(
 ) -> Contribution:
     """Mean error and covariance of ``count`` draws of all ``causes`` at once.
 
-    Through the exact chain and the exact estimator: nothing here is linearised. What is not among
-    ``causes`` is as drawn, the tilt of the tip included; errors are counted from the answer without
-    ``causes``. ``drawn`` is told how many more are done.
+    It uses the exact chain and the exact estimator; nothing is linearised. All other causes are
+    absent, including the tilt of the tip. Errors are relative to the answer without ``causes``.
+    ``drawn`` is called with the number of draws just done.
     """
     random = np.random.default_rng(seed)
     plain = at.chain

@@ -1,8 +1,8 @@
-"""What the budget must be told beside the rig file: each input once, with default, unit, bounds and source.
+"""The inputs of the budget besides the rig file, each with default, unit, bounds and source.
 
-A tolerance is the half-width of what was possible and counts as a uniform distribution (its deviation
-is the half-width over sqrt 3); a "typical" value is a standard deviation. An assumption says so:
-it is the first thing to replace by what is known of a real rig.
+A tolerance is the half-width of a uniform distribution (its standard deviation is the half-width over
+sqrt 3). A "typical" value is a standard deviation. The source of a guess begins with "assumption":
+replace these first by values of the real rig.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ INPUT_BY_NAME: Mapping[str, Input] = MappingProxyType({i.parameter.name: i for i
 def read_inputs(
     path: str | Path | None = None, settings: Mapping[str, object] | None = None, source: str = 'settings'
 ) -> dict[str, float]:
-    """All inputs: the defaults, under those of a YAML file (``name: value`` lines), under ``settings``.
+    """All inputs: ``settings`` override the YAML file (``name: value`` lines), which overrides the defaults.
 
     ``source``: where ``settings`` come from, for messages.
 

@@ -1,6 +1,6 @@
 """The light between laser and detector: thesis equations 3.1 to 3.4, corrected.
 
-What was wrong in print (and what it did) is said at each function. All plain floats, SI.
+Each function states the error of the printed equation and its consequence. All values are plain floats, SI.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ STANDARD_PRESSURE = 101_325.0
 def beam_diameter(initial_diameter: float, wavelength: float, distance: float) -> float:
     """1/e^2 diameter of a Gaussian beam, m, ``distance`` (m) from its waist of ``initial_diameter`` (m).
 
-    D(l) = D0 sqrt(1 + (4 lambda l/(pi D0^2))^2). The thesis's 3.1 puts diameters into the law of
-    the radii: 1 mm at 650 nm grows to 1.111 mm in 0.585 m, not to 1.007 mm.
+    D(l) = D0 sqrt(1 + (4 lambda l/(pi D0^2))^2). The thesis's 3.1 uses diameters in the formula for
+    radii: 1 mm at 650 nm grows to 1.111 mm in 0.585 m, not to 1.007 mm.
     """
     return initial_diameter * math.hypot(1.0, 4.0 * wavelength * distance / (math.pi * initial_diameter**2))
 
@@ -43,7 +43,7 @@ def boundary_shift(angle: float, index_1: float, index_2: float, distance: float
 def gradient_shift(index_gradient: float, distance: float) -> float:
     """Shift of the dot, m, after ``distance`` (m) across a transverse gradient dn/dy (1/m): (dn/dy) l^2/2.
 
-    What a beam along the link really meets; 3.4 gives nothing at normal incidence.
+    Beams along the link meet a gradient; 3.4 gives zero at normal incidence.
     """
     return index_gradient * distance**2 / 2.0
 
@@ -76,7 +76,7 @@ def air_index(
 def index_per_kelvin(temperature: float, wavelength: float = 633e-9) -> float:
     """dn/dT, 1/K, at standard pressure: -9.3e-7 at 293.15 K.
 
-    Of dry air: where air is warmed its vapour stays what it was, and does next to nothing.
+    For dry air: warming does not change the vapour content, and its effect is negligible.
     """
     step = 0.5
     warmer = air_index(STANDARD_PRESSURE, temperature + step, 0.0, wavelength=wavelength)

@@ -19,7 +19,7 @@ def spot_diameter(at: Situation) -> float:
 
 
 def averaged(deviation: float, at: Situation) -> float:
-    """Deviation of a block's mean for that of one sample, the samples being independent."""
+    """Deviation of a block's mean from that of one sample, for independent samples."""
     return deviation / math.sqrt(at.rig.estimator.block_size)
 
 
@@ -27,7 +27,7 @@ def averaged(deviation: float, at: Situation) -> float:
 
 
 def _light_profile(at: Situation) -> FloatArray:
-    # A profile that stays as it is moves nothing: the sensor reads the centroid wherever that lies.
+    # A constant profile causes no error: the sensor reads the centroid in any case.
     return np.full(4, at['profile_change'] * spot_diameter(at))
 
 

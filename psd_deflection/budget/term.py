@@ -1,16 +1,15 @@
-"""What a term of the budget is, and how it becomes deviations of dX, dY and theta.
+"""A term of the budget, and how it becomes deviations of dX, dY and theta.
 
-A term declares a few error parameters, independent of each other, with a standard deviation each, and
-how their values change the measuring chain. From that follow both answers. First order: half the
-difference of the readings that the exact chain gives at plus and minus one deviation, times the
-Jacobian of the estimator. Where that is next to nothing because a parameter acts as its square (a
-tilted sensor is foreshortened by a^2/2 either way) or as a product with another, the second order
-counts: the half sum of the two is a bias and adds 2 bias^2 to the variance, the mixed difference adds
-its square (GUM 5.1.2, note, for normal distributions). Monte Carlo: normal values, the exact chain,
-the exact estimator.
+A term declares a few independent error parameters, each with a standard deviation, and how their
+values change the measuring chain. Two calculations use this. First order: half the difference of the
+exact chain's readings at plus and minus one deviation, times the Jacobian of the estimator. Some
+parameters act as a square (a tilted sensor is foreshortened by a^2/2 either way) or as a product with
+another, so the second order is added: the mean of the two readings gives a bias and adds 2 bias^2 to
+the variance, and the mixed difference adds its square (GUM 5.1.2, note, for normal distributions).
+Monte Carlo: normal values, the exact chain, the exact estimator.
 
-A *known* term is no chance at all (the tilt that a flat model leaves out): one parameter, present or
-not, whose effect is a bias with a sign.
+A *known* term is not random (the tilt that a flat model leaves out). It has one parameter, present
+or absent, and its effect is a bias with a sign.
 """
 
 from __future__ import annotations
@@ -39,16 +38,16 @@ class Kind(Enum):
     """When an error takes a new value."""
 
     PER_ESTIMATE = 'per estimate'
-    """Anew in each block: averaging over time helps."""
+    """A new value in each block: averaging over time helps."""
     SYSTEMATIC = 'systematic'
-    """Once an installation, a zeroing or a temperature: averaging does not help."""
+    """One value per installation, zero or temperature: averaging does not help."""
     KNOWN = 'known bias'
-    """Follows from the pose; a fuller model would take it off."""
+    """Follows from the pose; a more complete model would remove it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Situation:
-    """Where the budget is drawn up: a rig, its inputs, a true pose (3,) of the tip, and a method."""
+    """The conditions of a budget: a rig, its inputs, a true pose (3,) of the tip, and a method."""
 
     rig: Rig
     inputs: Mapping[str, float]
@@ -90,7 +89,7 @@ class Situation:
 
 
 class Contribution(NamedTuple):
-    """What a term does to (dX, dY, theta): ``bias`` (3,) m, m, rad and ``covariance`` (3, 3)."""
+    """The effect of a term on (dX, dY, theta): ``bias`` (3,) m, m, rad and ``covariance`` (3, 3)."""
 
     bias: FloatArray
     covariance: FloatArray
@@ -104,7 +103,7 @@ class Contribution(NamedTuple):
 class Cause(abc.ABC):
     """One line of the budget.
 
-    ``row``: its name in the thesis's Table 3.1 (or section 3.2), '' for one that the thesis leaves out.
+    ``row``: its name in the thesis's Table 3.1 (or section 3.2), '' if the thesis leaves it out.
     ``formula``: in words of its ``inputs`` and the rig file.
     """
 
@@ -116,7 +115,7 @@ class Cause(abc.ABC):
 
     @abc.abstractmethod
     def contribution(self, at: Situation) -> Contribution:
-        """What it does, to first and, if that is nothing, second order."""
+        """Its effect to first and second order."""
 
     @abc.abstractmethod
     def without(self, chain: Chain, at: Situation) -> Chain:
@@ -128,15 +127,15 @@ class Cause(abc.ABC):
 
     @abc.abstractmethod
     def beside(self, at: Situation, count: int, random: np.random.Generator) -> FloatArray:
-        """(count, 3): what it adds to the estimate itself, beside the chain."""
+        """(count, 3): errors that it adds to the estimate itself, not through the chain."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Term(Cause):
     """A cause that acts on the measuring chain.
 
-    ``deviations``: of its k error parameters, at a situation. ``apply``: the chain with values (n, k)
-    of them; for a known term the value is 1 if it is present and 0 if not.
+    ``deviations``: of its k error parameters, at a situation. ``apply``: returns the chain with
+    values (n, k) of these parameters; for a known term the value is 1 if it is present and 0 if not.
     """
 
     name: str

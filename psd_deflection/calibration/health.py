@@ -1,8 +1,8 @@
-"""What a block's samples say about lasers and detectors, before anyone computes with them.
+"""Checks lasers and detectors from a block's samples, before the block is solved.
 
-A fault is a reason not to believe one detector (``faulty``); a finding is news that does not stop
-the estimate (``findings``). Everything comes from the block's own samples and the rig, but for one
-count: how many blocks in a row a detector has stood still, which the pipeline keeps.
+A fault makes one detector unreliable (``faulty``). A finding is a warning that does not stop the
+estimate (``findings``). Both come from the block's own samples and the rig. One count comes from
+the pipeline: the number of blocks in a row in which a detector's values did not change.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from psd_deflection.config import Rig
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, FloatArray, SampleBlock
 
 FROZEN_BLOCKS = 5
-"""Blocks in a row without the last bit of x, y or sum moving: noise does not do that."""
+"""Blocks in a row in which x, y and sum do not change by one bit, which noise would prevent."""
 
 NOISY = 5.0
 """Times the noise of the rig file."""
 
 HALF_LIGHT = (0.35, 0.65)
-"""Share of ``sum_nominal`` on both detectors when one of the splitter's two lasers is out."""
+"""Fraction of ``sum_nominal`` on both detectors if one of the splitter's two lasers fails."""
 
 _NAMES = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
 _THIRD_DIFFERENCE = 20.0
@@ -31,9 +31,8 @@ _THIRD_DIFFERENCE = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """``faulty``: the one detector (1 or 2) that is to blame, 0 where it is neither alone.
-
-    ``faults``: all that are. ``half_light``: the splitter works with one of its two lasers.
+    """``faulty``: the faulty detector (1 or 2), 0 if it is neither or both. ``faults``: all faulty
+    detectors. ``half_light``: the splitter works with one of its two lasers.
     """
 
     status: BlockStatus
@@ -45,7 +44,7 @@ class Verdict:
 
 
 def _long(frozen: tuple[int, int]) -> list[tuple[int, str]]:
-    """(PSD, what to say) of those that have stood still for too long."""
+    """(PSD, message) for each PSD whose values have not changed for too long."""
     return [
         (psd, f'psd_{psd} stands still: no bit has moved for {blocks} blocks')
         for psd, blocks in enumerate(frozen, start=1)
@@ -62,28 +61,28 @@ class OpticsHealth:
         self._min_samples = config.min_samples
         self._splitter = config.splitter
         self._nominal = rig.amplifier.sum_nominal
-        # Half the light is no lost laser where two lasers share both detectors.
+        # If two lasers share both detectors, half the light does not mean a lost laser.
         self._sum_min = config.sum_min * (0.5 if self._splitter else 1.0)
         self._sum_max = config.sum_max
         self.refuses_frozen = config.frozen == 'refuse'
         step = rig.converter.volts_per_count
-        # The converter's last step on either side: beyond it the true value is not known.
+        # The converter's last step on either side: the true value may lie beyond it.
         self._rail = np.float32((2 ** (rig.converter.bits - 1) - 1) * step)
         self._half = tuple(half / 2.0 for psd in rig.psds for half in psd.active_area)
         self._radius = tuple(psd.spot_radius for psd in rig.psds for _ in range(2))
-        # Where the noise is below a step, standing still is what a good detector does.
+        # If the noise is below one step, constant values are normal.
         self._moves = rig.amplifier.noise > step
         self._noise = NOISY * (rig.amplifier.noise**2 + step**2 / 12.0) ** 0.5
 
     def still(self, volts: npt.NDArray[np.float32]) -> tuple[bool, bool]:
-        """Whether x, y and sum of PSD 1, of PSD 2 are the same to the last bit throughout."""
+        """For PSD 1 and PSD 2: whether x, y and sum are identical in all samples."""
         if not self._moves or len(volts) < max(self._min_samples, 2):
             return (False, False)
         same = (volts == volts[0]).all(axis=0)
         return (bool(same[:3].all()), bool(same[3:].all()))
 
     def judge(self, block: SampleBlock, dots: tuple[float, ...], sums: FloatArray, frozen: tuple[int, int]) -> Verdict:
-        """The block's verdict, the cause before its consequences. ``frozen``: blocks in a row that each stood still."""
+        """The block's verdict, causes before consequences. ``frozen``: blocks in a row without change, per PSD."""
         faults: dict[int, tuple[BlockStatus, str]] = {}
 
         def fault(psd: int, status: BlockStatus, reason: str) -> None:
@@ -117,7 +116,7 @@ class OpticsHealth:
         findings = self._findings(dots, sums, set(faults), half_light)
         if not faults:
             return Verdict(BlockStatus.OK, '', 0, findings, half_light)
-        # The worst cause first: what is lost explains what is saturated or outside.
+        # The worst cause first: a lost laser explains a saturated or outside reading.
         psd = min(faults, key=lambda p: (_ORDER.index(faults[p][0]), p))
         status, reason = faults[psd]
         lone = len(faults) == 1 and present >= self._min_samples
@@ -145,11 +144,11 @@ class OpticsHealth:
         return tuple(out)
 
     def late_findings(self, block: SampleBlock, verdict: Verdict, frozen: tuple[int, int]) -> tuple[str, ...]:
-        """Findings that no estimate waits for: a noisy detector, one that stands still."""
+        """Findings computed after the estimate: a noisy detector, a detector whose values do not change."""
         faulty = verdict.faults
         out = []
         if len(block.seq) == self._size >= 10:
-            # Third differences: the link's own motion leaves next to nothing in them.
+            # Third differences almost remove the link's own motion.
             rough = np.diff(block.volts, n=3, axis=0)
             level = np.sqrt(np.einsum('ij,ij->j', rough, rough) / (len(rough) * _THIRD_DIFFERENCE))
             for psd in (1, 2):
@@ -161,10 +160,10 @@ class OpticsHealth:
         return tuple(out)
 
     def background_variance(self, sums: FloatArray) -> tuple[float, float]:
-        """Variance (m^2) that other light may have added to a dot of each PSD, 0 where there is none.
+        """Variance (m^2) that other light may have added to a dot of each PSD; 0 if there is none.
 
-        A background of share b pulls a reading by b (x_b - x); where its centre x_b is, nobody knows:
-        evenly spread over the active area it has a variance of (b L/2)^2 / 3.
+        Background light of fraction b shifts a reading by b (x_b - x). Its centre x_b is unknown. If
+        x_b is uniform over the active area, the shift has a variance of (b L/2)^2 / 3.
         """
         out = []
         for psd in (0, 1):

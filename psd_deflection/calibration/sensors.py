@@ -1,13 +1,14 @@
-"""From photocurrents to the place of the spot and back, one class a kind of sensor.
+"""From photocurrents to the place of the spot and back, with one class for each kind of sensor.
 
-A lateral sensor is one sheet: the photocurrent divides between electrodes as a resistor divides it, so
-that differences over sums are linear in the place (2.3, 2.4 times half the active length). A segmented
-one is four separate diodes: what it says depends on how the spot's light is spread, and saturates when
-the spot has left the cross in its middle. 2.1, 2.2 give it as a pure number; for a laser's Gaussian
-spot of radius w (to 1/e^2) that number is erf(sqrt(2) x/w), which is inverted here.
+Numbers such as 2.3 are equations of the thesis. A lateral sensor is one resistive sheet that divides
+the photocurrent between its electrodes. So difference over sum is linear in the place (2.3, 2.4 times
+half the active length). A segmented sensor is four separate diodes. Its reading depends on the profile
+of the spot and saturates when the spot no longer covers the cross in the middle. 2.1 and 2.2 give a
+pure number. For a laser's Gaussian spot of radius w (to 1/e^2) that number is erf(sqrt(2) x/w), which
+is inverted here.
 
-The sensors are ideal; what real ones add (``sensor_nonlinearity``, ``axis_crosstalk``,
-``ambient_light`` ...) is an effect of the simulation.
+These sensors are ideal. The errors of real sensors (``sensor_nonlinearity``, ``axis_crosstalk``,
+``ambient_light`` ...) are effects of the simulation.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Sensor(abc.ABC):
         """Currents (n, 4) of a spot at ``place`` (n, 2) m whose photocurrent is ``total`` (n,) A."""
 
     def sum_signal(self, currents: FloatArray) -> FloatArray:
-        """The photocurrent (n,), A: what a sum channel shows."""
+        """The photocurrent (n,), A, as the sum channel shows it."""
         total: FloatArray = np.asarray(currents, dtype=np.float64).sum(axis=1)
         return total
 
@@ -62,12 +63,12 @@ class Sensor(abc.ABC):
     def from_linear(self, place: FloatArray) -> FloatArray:
         """Places (n, 2), m, of ``place``: volts times the sensitivity at the centre, m.
 
-        The same for a lateral sensor; undoes the bend of a segmented one.
+        Unchanged for a lateral sensor; for a segmented one it inverts the nonlinear curve.
         """
         return place
 
     def reach(self) -> FloatArray:
-        """How far from the centre a reading is a place (2,), m."""
+        """Largest distance from the centre at which a reading is valid, (2,), m."""
         return self.half
 
 
@@ -100,7 +101,7 @@ class Duolateral(_EdgeElectrodes):
     share: ClassVar[float] = 0.5
 
     def sum_signal(self, currents: FloatArray) -> FloatArray:
-        """The photocurrent (n,), A: it passes both pairs, and is counted once."""
+        """The photocurrent (n,), A: it passes both pairs but is counted once."""
         return super().sum_signal(currents) / 2.0
 
 
@@ -112,7 +113,7 @@ class Tetralateral(_EdgeElectrodes):
 
 
 class Pincushion(Sensor):
-    """One sheet with an electrode in each corner and edges bent so that the ratios come out linear.
+    """One sheet with an electrode in each corner and curved edges that make the ratios linear.
 
     x = (Lx/2)[(X2 + Y1) - (X1 + Y2)]/sum, y = (Ly/2)[(X2 + Y2) - (X1 + Y1)]/sum (Hamamatsu, improved
     tetralateral PSDs).
@@ -136,10 +137,11 @@ class Pincushion(Sensor):
 
 
 class Quadrant(Sensor):
-    """Four diodes, I1 to I4 counter-clockwise from the upper right, no gap between them (2.1, 2.2).
+    """Four diodes, I1 to I4 counter-clockwise from the upper right, without a gap (2.1, 2.2).
 
-    A Gaussian spot of radius w at x gives X = erf(sqrt(2) x/w), whatever y. Useful to 1.5 w: there
-    99.7 % of the light is on one side, and a reading changes by a hundredth of what it does in the middle.
+    A Gaussian spot of radius w at x gives X = erf(sqrt(2) x/w), whatever y. It is useful to 1.5 w: there
+    99.7 % of the light is on one side, and the slope of the reading is a hundredth of the slope in the
+    middle.
     """
 
     name: ClassVar[str] = 'quadrant'
@@ -150,7 +152,7 @@ class Quadrant(Sensor):
     def __init__(self, active_area: tuple[float, float], spot_radius: float) -> None:
         """See :class:`Sensor`."""
         super().__init__(active_area, spot_radius)
-        # Not with the module: it would make every start a fifth of a second later, and few have this sensor.
+        # Imported here: it takes a fifth of a second, and few rigs have this sensor.
         from scipy.special import erf as erf_many
         from scipy.special import erfinv
 
@@ -170,7 +172,7 @@ class Quadrant(Sensor):
         return np.column_stack((part * right * up, part * left * up, part * left * down, part * right * down))
 
     def from_ratios(self, ratios: FloatArray) -> FloatArray:
-        """Places (n, 2), m, of ratios (n, 2): w/sqrt(2) erfinv; held at 1.5 w beyond it."""
+        """Places (n, 2), m, of ratios (n, 2): w/sqrt(2) erfinv, limited to 1.5 w."""
         limit = erf(sqrt(2.0) * self._REACH)
         return np.asarray(self.spot_radius / sqrt(2.0) * self._erfinv(np.clip(ratios, -limit, limit)))
 
@@ -183,7 +185,7 @@ class Quadrant(Sensor):
         return self.from_ratios(np.asarray(place) * (sqrt(8.0 / pi) / self.spot_radius))
 
     def reach(self) -> FloatArray:
-        """1.5 w, or the edge of the diodes where that is nearer."""
+        """1.5 w, or the edge of the diodes if that is nearer."""
         return np.minimum(self.half, self._REACH * self.spot_radius)
 
 
@@ -199,7 +201,7 @@ def make_sensor(psd: PsdConfig) -> Sensor:
 
 
 def _over(difference: FloatArray, total: FloatArray) -> FloatArray:
-    """Their ratio; NaN where there is no light."""
+    """The ratio; NaN without light."""
     out = np.full(difference.shape, np.nan)
     np.divide(difference, total, out=out, where=np.broadcast_to(total > 0.0, difference.shape))
     return out

@@ -15,8 +15,8 @@ from psd_deflection.records import DOT_CHANNELS, FloatArray
 def counts_to_volts(counts: npt.NDArray[np.int16], volts_per_count: float) -> npt.NDArray[np.float32]:
     """Volts (n, 6) of converter counts (n, 6); ``volts_per_count`` V.
 
-    The product is formed in double precision and rounded once to float32, which is what a
-    recording holds: a replay from volts then starts from the very same numbers.
+    The product is computed in double precision and rounded once to float32, as in a recording. So a
+    replay from volts starts from exactly the same numbers.
     """
     return np.multiply(counts, volts_per_count, dtype=np.float64).astype(np.float32)
 
@@ -25,7 +25,7 @@ def counts_to_volts(counts: npt.NDArray[np.int16], volts_per_count: float) -> np
 class Calibration:
     """Readings to the places of the dots.
 
-    ``sensitivity``: m/V on x and y, at the centre. ``sensors``: both.
+    ``sensitivity``: m/V on x and y, at the centre. ``sensors``: one for each PSD.
     """
 
     sensitivity: float
@@ -33,7 +33,7 @@ class Calibration:
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Calibration:
-        """What the rig's parameters say."""
+        """The calibration of the rig's parameters."""
         return cls(
             sensitivity=rig.amplifier.sensitivity,
             sensors=(make_sensor(rig.psds[0]), make_sensor(rig.psds[1])),
@@ -42,8 +42,8 @@ class Calibration:
     def dots(self, volts: npt.NDArray[np.float32]) -> FloatArray:
         """Places (n, 4), m: x1, y1, x2, y2, each from its PSD's centre; ``volts`` (n, 6) float32.
 
-        Volts are those of an amplifier that divides by the sum: place over ``sensitivity``. A
-        segmented sensor's bend is undone.
+        The amplifier divides by the sum, so a voltage is the place over ``sensitivity``. The
+        nonlinear curve of a segmented sensor is inverted.
         """
         dots = np.multiply(volts[:, DOT_CHANNELS], self.sensitivity, dtype=np.float64)
         for i, sensor in enumerate(self.sensors):

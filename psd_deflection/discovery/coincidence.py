@@ -1,10 +1,10 @@
-"""Effects that agree in size as independent ones hardly would: one cause that the catalogue lacks.
+"""Effects whose sizes agree too well to be independent: they stand in for one unknown cause.
 
-Where the true cause is not in the catalogue, several effects together may do its work, so well that
-nothing unknown remains to be seen. What gives them away is that their sizes are tied: a lag of the
-amplifiers becomes two delays of the same length, a turned load two detectors turned alike. The ratio
-of two amplitudes is weighed under "one cause", where it is 1 to within what the fit can tell, against
-"independent", where it may lie anywhere within two decades (Jeffreys's prior of a scale).
+If the true cause is not in the catalogue, several effects together may explain the data so well that
+nothing unknown remains. But then their sizes are tied: a lag of the amplifiers becomes two delays of
+equal length, a rotated load becomes two detectors rotated by the same angle. Two hypotheses about
+the ratio of two amplitudes are compared. Under "one cause" it is 1 within the uncertainty of the
+fit. Under "independent" it may be anywhere within two decades (Jeffreys's prior for a scale).
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from psd_deflection.records import FloatArray
 from psd_deflection.simulation.physics import Physics
 
 DECADES = 2.0
-"""Over which the ratio of two independent sizes spreads."""
+"""Range over which the ratio of two independent sizes is spread."""
 ODDS = 20.0
-"""For one cause against independent effects, over all pairs compared; by Markov's inequality
-independent effects come to this at most once in as many searches."""
+"""Odds for one cause against independent effects, over all pairs compared. By Markov's inequality,
+independent effects reach odds of N at most once in N searches.
+"""
 EXACT = 0.003
-"""Relative; no ratio is trusted to better, since a stand-in does the work of another only nearly."""
+"""Relative; no ratio is trusted to better, because a stand-in matches the true cause only approximately."""
 _SAME_UNIT: Mapping[str, str] = {'rad': ''}
 
 
@@ -42,7 +43,7 @@ class Coincidence:
 
 
 def _amplitudes(fit: Fit, physics: Physics, covariance: FloatArray) -> list[tuple[int, float, str]]:
-    """Column, distance from off and unit of every amplitude that stands clear of zero."""
+    """Column, distance from off and unit of every amplitude that is significantly different from zero."""
     out = []
     for column, (i, name) in enumerate(fit.free):
         p = fit.effects[i].effect.parameter(name)

@@ -1,8 +1,9 @@
-"""Compare, localise, name, add, show: :func:`discover` is the whole of it.
+"""Compare, localise, name, add, show: :func:`discover` runs all steps.
 
 The default answer is "nothing missing"; an effect is named only if all of these hold: library-wide
-p <= 0.01, a BIC better by more than 10, a gain on load cases not seen of more than two standard
-errors, and parameters within their bounds. What no effect explains is described as unknown.
+p <= 0.01, a BIC better by more than 10, a gain of more than two standard errors on held-out load
+cases, and parameters within their bounds. A discrepancy that no effect explains is described as
+unknown.
 """
 
 from __future__ import annotations
@@ -32,17 +33,19 @@ EQUIVALENT = 21.6
 """Loss in chi-square below which an alternative of no more parameters counts as equivalent: at
 lambda sin^2(theta/2) = 5.4 one in a hundred would be misnamed, and sin^2(theta) is four times that."""
 EQUIVALENT_BIC = 6.0
-"""An alternative with more parameters must also be this close in BIC: a wider effect always does as well."""
+"""An alternative with more parameters must also be this close in BIC, because a more flexible effect always
+fits as well.
+"""
 UNKNOWN_P = 1e-4
 UNKNOWN_SHARE = 0.02
-"""Of what the effects explain; less than this left over is the simulation's own business."""
+"""Fraction of the explained part; a smaller remainder is attributed to the simulation's own error."""
 UNKNOWN_EXCESS = 60.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NamedEffect:
     """One effect of the answer. ``sd``: per fitted parameter. ``alternatives``: (name, loss in
-    chi-square, difference of BIC), the closest first; ``equivalent``: those this data cannot exclude.
+    chi-square, difference of BIC), the closest first; ``equivalent``: those that this data cannot exclude.
     """
 
     active: ActiveEffect
@@ -57,8 +60,8 @@ class NamedEffect:
 
 @dataclass(frozen=True, slots=True)
 class Unknown:
-    """What no effect explains, or only several tied to each other: ``signature`` in words, ``explains``:
-    its share of the gap's energy. ``remains``: whether it is still there with all effects added.
+    """A discrepancy that no effect explains, or only several tied effects: ``signature`` in words,
+    ``explains``: its fraction of the gap's energy. ``remains``: whether it is still present with all effects added.
     """
 
     signature: str
@@ -91,7 +94,7 @@ class Discovery:
 
     @property
     def active_effects(self) -> list[ActiveEffect]:
-        """What to add to the rig file."""
+        """The effects to add to the rig file."""
         return [*self.workspace.base, *(e.active for e in self.effects)]
 
 
@@ -118,12 +121,12 @@ def discover(
     bank: SignatureBank | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Discovery:
-    """Name what the simulation of ``rig`` lacks to explain ``recordings``.
+    """Name the effects that the simulation of ``rig`` lacks to explain ``recordings``.
 
     Each recording carries its rig with its own overrides; ``rig`` is the common one (that of the
     first by default), whose effects count as known. ``without``: effects to leave out of the
-    library. ``bank``: signatures of the same design from an earlier call. Raises ConfigError where
-    the rig's effects are malformed.
+    library. ``bank``: signatures of the same design from an earlier call. Raises ConfigError if the
+    rig's effects are malformed.
     """
     rig = recordings[0].rig if rig is None else rig
     rng = np.random.default_rng(seed)
@@ -158,7 +161,7 @@ def discover(
 def _credible(
     search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut], seen: float, rng: np.random.Generator
 ) -> tuple[Fit, list[HeldOut], Localisation]:
-    """Where something unknown remains, an effect that explains less than what remains is a stand-in for it."""
+    """Remove effects that explain less than the unknown remainder: they probably stand in for it."""
     ws = search.workspace
     while True:
         left = localise(ws, fit.residual, fit.jacobian if fit.free else None, rng)
@@ -177,7 +180,7 @@ def _credible(
 
 
 def _lattice(workspace: Workspace, base: Sequence[ActiveEffect], effects: Sequence[Effect]) -> ActiveEffect | None:
-    """The first of ``effects`` with the step that is seen in the values themselves, if there is one."""
+    """The first of ``effects`` with the step that the readings themselves show, if there is one."""
     if not effects or any(a.effect.lattice for a in base):
         return None
     found = [propose.coarse_step(o) for o in workspace.observations]
@@ -186,12 +189,12 @@ def _lattice(workspace: Workspace, base: Sequence[ActiveEffect], effects: Sequen
         return None
     effect = effects[0]
     values = effect.off_values(workspace.physics, next(effect.variants()))
-    # The recording with the longest lever knows it best.
+    # The recording with the widest range of values determines it best.
     return ActiveEffect(effect, {**values, effect.lattice: min(steps, key=lambda s: s[1])[0]})
 
 
 def _accept(search: Search, result: SearchResult, rng: np.random.Generator) -> tuple[list[HeldOut], Fit]:
-    """The joint rule: effects that fail it are taken out, the weakest first, and the rest refitted."""
+    """The joint rule: remove the effects that fail it, the weakest first, and refit the rest."""
     ws, fit = search.workspace, result.fit
     while True:
         heldout = []
@@ -244,7 +247,7 @@ def _answer(
     progress('where')
     before = left if fit is null else localise(ws, null.residual, None, rng)
     floor = ws.floor()
-    # Coarse steps make noise that comes and goes with the signal; what they explain stands against that.
+    # Coarse steps cause noise that varies with the signal; compare what they explain with it.
     explained = max(null.chi2 - fit.chi2, 0.0) + (0.0 if lattice is None else 2.0 * _lattice_gain(ws, lattice))
     unknown = _unknown(left, explained) or _tied(coincidences(fit, ws.physics), fit, result, before)
     verdict = 'unknown_effect' if unknown else 'effects_found' if named else 'nothing_missing'
@@ -272,9 +275,9 @@ def _answer(
 
 
 def _named(search: Search, result: SearchResult, fit: Fit, heldout: Sequence[HeldOut]) -> list[NamedEffect]:
-    """The effects of ``fit`` with their standard deviations, and with what explains the recording as well."""
+    """The effects of ``fit`` with their standard deviations and the equally good alternatives."""
     ws, covariance = search.workspace, fit.covariance()
-    # Where the joint rule has taken effects out, what stood beside them is no longer comparable.
+    # If the joint rule has removed effects, their alternatives are no longer comparable.
     as_found = fit is result.fit
     named: list[NamedEffect] = []
     for i, active in enumerate(fit.effects):
@@ -304,7 +307,7 @@ def _named(search: Search, result: SearchResult, fit: Fit, heldout: Sequence[Hel
 
 
 def _waterfall(ws: Workspace, fit: Fit, gap_before: float, gap_after: float) -> tuple[tuple[str, float], ...]:
-    """The gap as each effect is added, and what noise alone would leave."""
+    """The gap after each effect is added, and the gap from noise alone."""
     steps = [('as described', gap_before)]
     for i in range(len(fit.effects) - 1):
         _, difference = ws.residual([*ws.base, *fit.effects[: i + 1]])
@@ -315,13 +318,13 @@ def _waterfall(ws: Workspace, fit: Fit, gap_before: float, gap_after: float) -> 
 
 
 def _lattice_gain(workspace: Workspace, lattice: ActiveEffect) -> float:
-    """Log-likelihood of all readings lying on the lattice: by chance each does with 1 in step/LSB."""
+    """Log-likelihood of all readings lying on the lattice: by chance each does so with probability LSB/step."""
     lsb = workspace.observations[0].rig.converter.volts_per_count
     return workspace.size * workspace.fine[0] * float(np.log(max(lattice.values[lattice.effect.lattice] / lsb, 1.0)))
 
 
 def _named_lattice(workspace: Workspace, lattice: ActiveEffect) -> NamedEffect:
-    """Coarse steps are seen in the values themselves."""
+    """The named effect of coarse steps, which the readings themselves show."""
     gain = _lattice_gain(workspace, lattice)
     sd = min(s[1] for o in workspace.observations if (s := propose.coarse_step(o)) is not None)
     heldout = HeldOut(gain, float(np.sqrt(2.0 * gain)))
@@ -351,7 +354,7 @@ def _unknown(left: Localisation, explained: float) -> tuple[Unknown, ...]:
 
 
 def _tied(ties: Sequence[Coincidence], fit: Fit, result: SearchResult, before: Localisation) -> tuple[Unknown, ...]:
-    """What effects that agree in size beyond chance do together is put down to one cause, not named here."""
+    """Effects whose sizes agree beyond chance are reported as one unknown cause."""
     if not ties:
         return ()
     tie = ties[0]

@@ -1,4 +1,4 @@
-"""Which experiment would tell two explanations apart: tried by simulating both, within the rig's limits."""
+"""Finds an experiment that distinguishes two explanations, by simulating both within the rig's limits."""
 
 from __future__ import annotations
 
@@ -33,14 +33,16 @@ class Proposal:
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """``separation``: least chi-square by which the alternatives would miss; below ``TELLS_APART`` none does."""
+    """``separation``: smallest chi-square between the alternatives; below ``TELLS_APART`` the experiment is not
+    enough.
+    """
 
     words: str
     separation: float
 
     @property
     def text(self) -> str:
-        """For people and result.json."""
+        """The suggestion as text, for people and result.json."""
         if self.separation < TELLS_APART:
             return (
                 f'none of the experiments tried tells them apart; the best, {self.words}, separates by chi-square '
@@ -50,7 +52,7 @@ class Suggestion:
 
 
 def proposals(rig: Rig) -> list[Proposal]:
-    """Experiments that a rig like the thesis's can do, 10 to 40 s each; dots stay on the sensors."""
+    """Experiments that a rig like the thesis's can do, 10 to 40 s each, with the dots on the sensors."""
     rate = rig.converter.sample_rate_hz
     zero = (0.0, 0.0, 0.0)
     up = [zero, (0.0, -50.0, 0.0), zero, (0.0, 50.0, 0.0), zero, (50.0, 0.0, 0.0), zero, (-50.0, 0.0, 0.0), zero]
@@ -65,7 +67,7 @@ def proposals(rig: Rig) -> list[Proposal]:
     climbed = loads.steps(stairs, 2.0, rate)
     swept = loads.chirp((3.0, 3.0, 2.0), 2.0, 40.0, 20.0, rate)
     shorter = 0.7 * rig.link.length
-    # EI and GJ of a shorter link raise its frequencies; with the rig's own kept, the test is on statics.
+    # A shorter link has higher frequencies. They are kept here, so only the statics differ.
     both = loads.steps([zero, (0.0, -50.0, 0.0), (50.0, 0.0, 0.0), (0.0, 0.0, 25.0), zero], 3.0, rate)
     return [
         Proposal('weights of 50 N pulling along +-Y and +-X in turn, on the link itself', steps, None, {}),
@@ -91,7 +93,7 @@ def _white(rig: Rig, effects: Sequence[ActiveEffect], p: Proposal, size: int, si
 
 
 def suggest(workspace: Workspace, named: Fit, others: Sequence[Fit]) -> Suggestion | None:
-    """The experiment that best separates ``named`` from the worst of ``others``, added to what is there.
+    """The experiment that best separates ``named`` from the worst of ``others``, added to the existing recordings.
 
     Each alternative may adapt its parameters to the old data and the new together.
     """

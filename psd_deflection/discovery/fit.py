@@ -1,8 +1,8 @@
 """Full nonlinear refit of a set of effects: Levenberg-Marquardt on the whitened residual, bounded.
 
-Own few lines rather than scipy.optimize.least_squares: every simulation is counted and shared, the
-Jacobian at the optimum is kept for the covariance, the hold-out and the next screening, and steps
-are taken in each parameter's own scale.
+It does not use scipy.optimize.least_squares for three reasons. Every simulation must be counted and
+shared. The Jacobian at the optimum is reused for the covariance, the hold-out and the next
+screening. Steps are taken in each parameter's own scale.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from psd_deflection.records import FloatArray
 from psd_deflection.simulation.declaration import ActiveEffect, EffectParameter
 
 STEP = 0.05
-"""Finite difference, in scales of the parameter."""
+"""Step of the finite difference, in units of the parameter's scale."""
 
 STOP = 0.05
-"""A refit ends with the iteration that gains less than this in chi-square."""
+"""A refit ends when an iteration gains less than this in chi-square."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,11 +40,11 @@ class Fit:
 
     @property
     def parameters(self) -> int:
-        """How many were fitted."""
+        """Number of fitted parameters."""
         return len(self.free)
 
     def covariance(self) -> FloatArray:
-        """(p, p), of the parameters, from the curvature; unseen directions come out large."""
+        """(p, p), of the parameters, from the curvature; unobservable directions get large values."""
         if not self.free:
             return np.empty((0, 0))
         lengths = np.maximum(np.linalg.norm(self.jacobian, axis=0), 1e-150)
@@ -70,7 +70,7 @@ def _moved(
 
 
 def refit(workspace: Workspace, effects: Sequence[ActiveEffect], iterations: int = 8) -> Fit:
-    """Fit all parameters of ``effects``, from where they stand."""
+    """Fit all parameters of ``effects``, starting from their current values."""
     free = _free(effects)
     x = np.array([effects[i].values[p.name] for i, p in free])
     bounds = [p.bounds(workspace.physics, effects[i].values) for i, p in free]
@@ -102,7 +102,7 @@ def refit(workspace: Workspace, effects: Sequence[ActiveEffect], iterations: int
         g = (jacobian.T @ residual) / lengths
         gained = 0.0
         for _ in range(5):
-            # Against a bound, a parameter that would leave it stands still.
+            # A parameter at its bound does not move if the step would leave the bounds.
             stuck = ((x <= low) & (g < 0.0)) | ((x >= high) & (g > 0.0))
             go = np.flatnonzero(~stuck)
             if len(go) == 0:

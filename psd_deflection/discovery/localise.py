@@ -1,11 +1,11 @@
-"""Where the simulation and the data part: channel by channel, load case by load case, band by band.
+"""Where the simulation and the data differ: by channel, load case and frequency band.
 
-Two families of statistics on a whitened residual. *Cells*: energy per channel, load case and
-frequency band, as standard deviations above what noise has; its null is a parametric bootstrap that
-puts the base model's freedom back in (projection, which is its refit to first order) and takes the
-maximum over all cells. *Dependence*: how much of each channel follows a regressor (loads, their
-rate and history, dot position, temperature, time), which says on what the discrepancy depends, and
-whether oddly or evenly.
+There are two kinds of statistics on a whitened residual. *Cells*: energy per channel, load case and
+frequency band, in standard deviations above noise. The null distribution is a parametric bootstrap
+of the maximum over all cells; it accounts for the base model's fitted parameters by projection (a
+refit to first order). *Dependence*: how much of each channel follows a regressor (loads, their rate
+and history, dot position, temperature, time). It shows what the discrepancy depends on, and whether
+the dependence is odd or even.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from psd_deflection.simulation.simulator import ForwardModel
 
 BANDS = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, 125.0)
 CLIP = 6.0
-"""Whitened values beyond this count as this: an outlier of heavy-tailed noise is no structure."""
+"""Whitened values are limited to this, so outliers of heavy-tailed noise do not count as structure."""
 DRAWS = 39
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One place of the ``where`` list; ``statistic``: standard deviations above noise."""
+    """One entry of the ``where`` list; ``statistic``: standard deviations above noise."""
 
     channel: str
     recording: int
@@ -52,8 +52,9 @@ class Dependence:
 @dataclass(frozen=True, slots=True, eq=False)
 class Localisation:
     """Cells, most conspicuous first; dependences likewise. ``excess``:
-    chi-square beyond noise in all significant places; ``p``: that noise alone does this. ``map``
-    (spans, 6, bands): all cells; ``spans``: recording, start and end of each load case, s."""
+    chi-square beyond noise in all significant places; ``p``: probability that noise alone gives
+    this. ``map`` (spans, 6, bands): all cells; ``spans``: recording, start and end of each load
+    case, s."""
 
     cells: tuple[Cell, ...]
     dependences: tuple[Dependence, ...]
@@ -111,7 +112,7 @@ def _energies(parts: list[FloatArray], layouts: list[_Layout]) -> tuple[FloatArr
 
 
 def regressors(workspace: Workspace) -> list[dict[str, list[FloatArray]]]:
-    """Per PSD (two), per name, per recording: what a residual may depend on, on fine blocks (nf,)."""
+    """Per PSD (two), per name, per recording: regressors of a residual, on fine blocks (nf,)."""
     out: list[dict[str, list[FloatArray]]] = [{}, {}]
     for o, size in zip(workspace.observations, workspace.fine, strict=True):
         chunk = ForwardModel(o.rig, workspace.base).run(o.loads, o.temperature)
@@ -166,7 +167,7 @@ def regressors(workspace: Workspace) -> list[dict[str, list[FloatArray]]]:
 
 
 def dependences(workspace: Workspace, residual: FloatArray, known: FloatArray | None) -> list[Dependence]:
-    """Every channel against every regressor, what ``known`` (D, p) can explain put aside."""
+    """Every channel against every regressor, after projecting out ``known`` (D, p)."""
     table = regressors(workspace)
     q = None
     if known is not None and known.shape[1]:
@@ -245,7 +246,7 @@ def localise(
         i, c, b = np.unravel_index(flat, z.shape)
         layout = layouts[int(i)]
         value = float(z[i, c, b])
-        # The clipped statistic decides; where it is beyond doubt the unclipped one ranks better.
+        # The clipped statistic decides significance; the unclipped one ranks clear cases better.
         shown = float(raw_z[i, c, b]) if p_of(value) < 0.01 else value
         when = (layout.start * layout.period, layout.stop * layout.period)
         band = (BANDS[int(b)], min(BANDS[int(b) + 1], 0.5 / layout.period))

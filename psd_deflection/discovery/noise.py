@@ -1,9 +1,10 @@
-"""The noise: from rest and from where no effect is, never from the residual that is to be explained.
+"""Estimates the noise from rest and from frequencies without effects, not from the discrepancy itself.
 
-The level comes from the upper half of the residual's spectrum (no link motion there), from the lower
-nine tenths over frequencies, which lines of mains and modes do not move. The colour comes from rest:
-before the first load, and long after the last change. Only where rest shows memory beyond doubt is
-an autoregressive model fitted; otherwise the noise is white, which is sharper.
+The level comes from the upper half of the residual's spectrum (no link motion there), using the
+lower nine tenths of the frequencies, so that lines of mains and modes do not affect it. The colour
+comes from rest: before the first load, and long after the last change. An autoregressive model is
+fitted only if the rest is clearly correlated; otherwise the noise is taken as white, which makes the
+tests more sensitive.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class NoiseModel:
 
 
 def rest_windows(observation: Observation) -> list[slice]:
-    """Samples at which the link stands still by its known loads."""
+    """Samples at which the link is at rest according to its known loads."""
     dynamics = observation.rig.dynamics
     slow = min(
         dynamics.bending_damping_ratio * dynamics.bending_frequency,
@@ -78,7 +79,7 @@ def strip_lines(residual: FloatArray, limit: int = 4) -> FloatArray:
     n = len(out)
     for _ in range(limit):
         power = np.abs(np.fft.rfft(out * np.hanning(n))) ** 2
-        # Against its own neighbourhood: coloured noise has high ground that is no line.
+        # Compare with neighbouring frequencies: coloured noise has broad maxima that are not lines.
         ratio = power / np.maximum(median_filter(power, size=min(101, len(power))), 1e-300)
         ratio[: max(3, n // 500)] = 0.0
         peak = int(np.argmax(ratio))
@@ -91,7 +92,7 @@ def strip_lines(residual: FloatArray, limit: int = 4) -> FloatArray:
 
 
 def _level(power: FloatArray) -> float:
-    """Mean of exponentially distributed ``power`` from its lower nine tenths: lines do not move it.
+    """Mean of exponentially distributed ``power`` from its lower nine tenths, unaffected by lines.
 
     The mean of an exponential below its 0.9 quantile is (1 - 0.1 (1 + ln 10))/0.9 of the whole.
     """
@@ -119,7 +120,7 @@ def _block_autocovariance(acov: FloatArray, size: int, lags: int) -> FloatArray:
 def estimate_noise(observation: Observation, residual: FloatArray, fine: int, floor: float) -> NoiseModel:
     """Noise of ``residual`` (n, 6) V, measured minus simulated; NaN where samples are lost.
 
-    ``fine``: samples a fine block. ``floor``: V, no channel is taken as quieter than this.
+    ``fine``: samples a fine block. ``floor``: V, smallest noise that is assumed for a channel.
     """
     block = observation.rig.estimator.block_size
     windows = rest_windows(observation)

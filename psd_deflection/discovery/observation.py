@@ -1,7 +1,7 @@
-"""What discover compares: one recording as arrays on an unbroken sample grid, with its own rig.
+"""The input of discover: one recording as arrays on a complete sample grid, with its own rig.
 
-The rest of the package knows no files: a reader fills an :class:`Observation`. Lost samples stay
-in their places as NaN, so that the simulation runs on the true time axis and nothing is invented.
+The rest of the package does not read files: a reader fills an :class:`Observation`. Lost samples
+are NaN, so the simulation runs on the true time axis and no sample is made up.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ QUIET = 0.25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """``volts`` (n, 6) V, NaN where a sample is lost; ``loads`` (n, 3) N, N, N m, held.
+    """``volts`` (n, 6) V, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held.
 
     ``temperature`` (n,) degrees Celsius or None. ``rig``: the rig with this recording's own
     overrides. ``digest``: of its source.
@@ -67,8 +67,9 @@ class Observation:
 def load_cases(loads: FloatArray, period: float) -> IntArray:
     """The load case of each sample, int (n,), counted from 0.
 
-    A case begins where the load changes after at least ``QUIET`` seconds of rest: each step with
-    its ringing is one, a sweep or ramp is one. Where there is but one, it is cut into four pieces.
+    A case begins if the load changes after at least ``QUIET`` seconds of rest. Each step with its
+    ringing is one case; a sweep or ramp is one case. If there is only one case, it is cut into four
+    pieces.
     """
     n = len(loads)
     changed = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1

@@ -1,4 +1,4 @@
-"""Where to look for what cannot be reached by a derivative: frequencies, limits, coarse steps."""
+"""Starting values that a search by derivatives cannot find: frequencies, limits, coarse steps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from psd_deflection.discovery.observation import Observation
 from psd_deflection.records import DOT_CHANNELS, FloatArray
 
 PEAK = 40.0
-"""A spectral line counts from this many times the median power around it (one in 1e12 bins by chance)."""
+"""A spectral line must exceed the median power around it by this factor (chance: 1e-12 per bin)."""
 
 
 def spectral_peaks(
@@ -19,8 +19,8 @@ def spectral_peaks(
 ) -> list[float]:
     """Frequencies, Hz, of the strongest lines of raw residuals (n, 6) V, strongest first.
 
-    The recording with the strongest line decides; each is refined to where the line's own
-    amplitude is greatest, since a search by derivative needs the phase right over the recording.
+    The recording with the strongest line is used. Each frequency is refined to the line's greatest
+    amplitude, because a search by derivatives needs the right phase over the whole recording.
     """
     best: list[tuple[float, float]] = []
     for residual, sigma, period in zip(residuals, sigmas, periods, strict=True):
@@ -62,10 +62,10 @@ def spectral_peaks(
 def persistent(
     peaks: Sequence[float], residuals: Sequence[FloatArray], sigmas: Sequence[FloatArray], periods: Sequence[float]
 ) -> list[float]:
-    """Those of ``peaks`` that hum all the time with one phase, as mains do and ringing does not.
+    """Those of ``peaks`` that are always present with a constant phase, as mains hum is and ringing is not.
 
-    Quarter by quarter of each recording the line's complex amplitude must be of one kind: its sum
-    as long as its parts together, and no quarter without.
+    The line's complex amplitude is computed for each quarter of a recording. The magnitude of their
+    sum must equal the sum of their magnitudes, and no quarter may be without the line.
     """
     out = []
     for f in peaks:
@@ -95,8 +95,8 @@ def highest_voltages(observations: Sequence[Observation], with_sums: bool, noise
 def coarse_step(observation: Observation) -> tuple[float, float] | None:
     """The step on whose multiples all readings lie, if it is coarser than the converter's, and its sd; V.
 
-    The gaps between neighbouring values that occur are whole multiples of it: the finest common
-    one is refined until all readings are multiples to within the converter's own rounding.
+    The gaps between neighbouring values are whole multiples of the step. The smallest common step
+    is refined until all readings are multiples of it within the converter's own rounding.
     """
     lsb = observation.rig.converter.volts_per_count
     volts = observation.volts[np.all(np.isfinite(observation.volts), axis=1)]
@@ -106,7 +106,7 @@ def coarse_step(observation: Observation) -> tuple[float, float] | None:
     if len(gaps) < 3 or np.quantile(gaps, 0.5) < 2:
         return None
     gap = float(np.median(gaps[gaps <= 1.5 * np.quantile(gaps, 0.25)]))
-    # Refine on the multiples: a longer lever each time, so that rounding of the step averages out.
+    # Refine with larger and larger multiples, so that rounding of the step averages out.
     reach = 4.0
     span = float(np.abs(values).max())
     while True:

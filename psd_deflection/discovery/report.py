@@ -1,4 +1,4 @@
-"""report.html: one page that opens offline and can be read by a person who was not there."""
+"""report.html: one self-contained page for readers who have not seen the experiment."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _spectrum(rows: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
     from scipy.signal import periodogram
 
     frequency, power = periodogram(np.nan_to_num(rows), 1.0 / period, window='hann', detrend=False)
-    # Log-spaced averages: a raw periodogram hides its lines in its own scatter.
+    # Log-spaced averages: in a raw periodogram scatter hides the lines.
     edges = np.geomspace(frequency[1], frequency[-1], 90)
     index = np.digitize(frequency[1:], edges)
     total = power[:, 1:].mean(axis=0)
@@ -115,7 +115,7 @@ def _waterfall_figure(discovery: Discovery) -> Figure:
     names, values, colors = zip(*bars, strict=True)
     figure = Figure(figsize=(10, 0.6 + 0.42 * len(bars)), layout='constrained')
     axis = figure.subplots()
-    # By place, not by name: the same effect may stand there twice, for either PSD.
+    # By position, not by name: an effect may appear twice, once for each PSD.
     axis.barh(range(len(bars)), values, color=colors)
     axis.set_yticks(range(len(bars)), names)
     axis.invert_yaxis()

@@ -1,4 +1,4 @@
-"""What discover leaves: result.json and model.yaml (docs/discover.md)."""
+"""The output of discover: result.json and model.yaml (docs/discover.md)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from psd_deflection.simulation.declaration import ActiveEffect
 
 
 def _number(value: float) -> float:
-    # JSON has no infinity; a chi-square or standard deviation that large says no more than this.
+    # JSON has no infinity; for a chi-square or standard deviation this is as good.
     if math.isnan(value):
         return 0.0
     return float(min(max(value, -1e300), 1e300))

@@ -1,8 +1,8 @@
-"""Score tests: how much of a residual each effect's signature explains, all others put aside.
+"""Score tests: how much of a residual each effect's signature explains by itself.
 
-With whitened signatures M and residual r, g = M'r and F = M'M; what parameters already in the model
-(columns J) can explain is projected out. The gain of a candidate is T = g'F^-1 g over its own
-columns: the drop of chi-square if it were added, to first order; under "nothing missing" it is
+With whitened signatures M and residual r, g = M'r and F = M'M; the part that parameters already in
+the model (columns J) can explain is projected out. The gain of a candidate is T = g'F^-1 g over its
+own columns: the drop of chi-square if it were added, to first order; under "nothing missing" it is
 chi-square with as many degrees of freedom as columns.
 """
 
@@ -21,7 +21,9 @@ from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import FloatArray
 
 SEEN = 1e-6
-"""A column of whose squared length less than this is left after projection counts as explained already."""
+"""Columns that keep less than this fraction of their squared length after projection are skipped as
+already explained.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +64,7 @@ class Screen:
         at = 0
         for candidate, columns in found:
             white = [workspace.whiten(column).astype(np.float32) for column in columns]
-            # What moves a reading by less than a thousandth of sigma over the recording is not there.
+            # Ignore signatures that change the readings by less than a thousandth of sigma.
             if max(float(np.dot(w, w)) for w in white) < 1e-6:
                 continue
             self.candidates.append(candidate)
@@ -98,10 +100,10 @@ class Screen:
         return out
 
     def pairs(self, residual: FloatArray, penalty: float, limit: int) -> list[tuple[Score, Score, float]]:
-        """The ``limit`` best pairs by joint gain less ``penalty`` a column: what no greedy step finds."""
+        """The ``limit`` best pairs by joint gain minus ``penalty`` per column; greedy steps may miss these."""
         g, fisher = self._projected(residual, None)
         singles = self.score(residual)
-        # Per effect and choices the best shape is enough; thousands of pairs are a matter of milliseconds.
+        # For each effect and its choices the best shape is enough; thousands of pairs take milliseconds.
         best: dict[tuple[object, ...], Score] = {}
         for score in singles:
             best.setdefault(score.candidate.variant, score)

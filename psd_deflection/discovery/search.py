@@ -1,8 +1,9 @@
-"""Which effects: greedy add, pairs that no greedy step finds, drop, swap; refitted in full each time.
+"""Chooses the effects: add greedily, add pairs, drop, swap, with a full refit each time.
 
-The order of things: score every candidate on what is left (a matter of milliseconds), refit the
-most promising few, keep the best by BIC if it passes; where something is left after the first, try
-the best pairs of the linear screen as well; in the end drop what no longer earns its place.
+The search scores every candidate on the residual (this takes milliseconds), refits the few most
+promising, and keeps the best by BIC if it passes. If a residual remains after the first effect, it
+also tries the best pairs of the linear screen. At the end it drops effects that are no longer
+significant.
 """
 
 from __future__ import annotations
@@ -19,25 +20,26 @@ from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.simulation.declaration import ActiveEffect, Effect
 
 P_ACCEPT = 0.01
-"""Library-wide p of an effect at most this."""
+"""Largest library-wide p of an accepted effect."""
 BIC_ACCEPT = 10.0
-"""And a BIC this much better."""
+"""Smallest improvement of BIC by an accepted effect."""
 SHARE_ACCEPT = 0.002
-"""And at least this share of what the model as a whole explains: beyond it the simulation itself,
-two exact but different discretisations for example, is not to be trusted to explain."""
+"""Smallest fraction of the whole model's gain that an accepted effect must explain. Smaller
+discrepancies may come from the simulation itself, for example from its discretisation.
+"""
 MAX_EFFECTS = 4
 TRIALS = 7
 BUDGET = 500
 """Forward simulations after which nothing more is added; the alternatives end at twice as many."""
 SWAP_REACH = 0.6
-"""Of what the named effect explains, the share an alternative must explain to be refitted."""
+"""An alternative is refitted only if it explains this fraction of what the named effect explains."""
 
 
 @dataclass(slots=True, eq=False)
 class SearchResult:
     """``fit``: the model chosen. ``null``: the rig file's own. ``p``: library-wide, per effect.
-    ``delta_bic``: what dropping each effect would cost. ``alternatives``: for each effect of ``fit``,
-    refits with another in its place.
+    ``delta_bic``: loss of BIC if each effect were dropped. ``alternatives``: for each effect of
+    ``fit``, refits with another in its place.
     """
 
     null: Fit
@@ -56,7 +58,7 @@ def key_of(active: ActiveEffect) -> tuple[object, ...]:
 
 
 def slot(effect: Effect, values: Mapping[str, float]) -> tuple[object, ...]:
-    """What there is one of: an effect, for each PSD. Two readings of one effect at once explain nothing."""
+    """Key of which a model has at most one: an effect, for each PSD."""
     return (effect.name, *(values[p.name] for p in effect.parameters if p.each))
 
 
@@ -100,7 +102,7 @@ class Search:
             for i in range(len(fit.effects)):
                 rest = [a for j, a in enumerate(fit.effects) if j != i]
                 fits.append(refit(self.workspace, rest, iterations=6) if rest else null)
-            # With the fit itself, so that no other takes its identity.
+            # Keep the fit itself too, so that no other object gets its id.
             kept = self._without[id(fit)] = (fit, fits)
         return kept[1]
 
@@ -130,7 +132,7 @@ class Search:
         return float(-np.expm1(count * np.log1p(-min(local, 1.0 - 1e-16))))
 
     def renoise(self, fit: Fit) -> Fit:
-        """Noise again, now that most of the discrepancy is explained; where it differs, the fit under it."""
+        """Estimate the noise again, now that most of the discrepancy is explained; refit if it differs."""
         before = self.workspace.noise
         self.workspace.estimate_noise([*self.workspace.base, *fit.effects])
         now = self.workspace.noise
@@ -145,7 +147,7 @@ class Search:
         return refit(self.workspace, fit.effects, iterations=6)
 
     def run(self) -> SearchResult:
-        """Search; the answer may well be that nothing is missing."""
+        """Search; the answer may be that nothing is missing."""
         ws = self.workspace
         null = refit(ws, ())
         scores = self.screen.score(null.residual)
@@ -159,7 +161,7 @@ class Search:
             scores = [s for s in scores if slot(s.candidate.effect, s.candidate.start) not in taken]
             if not scores or min(s.p for s in scores) > P_ACCEPT:
                 break
-            # From the second on, what is left is smaller and the first guess better.
+            # From the second effect on, the residual is smaller and the first guess better.
             tried = promising(scores, self.penalty, 0.3, TRIALS if not current.effects else 4)
             starts = [[*current.effects, s.candidate.from_coefficients(s.coefficients)] for s in tried]
             better = self._best_of(starts, 2, 6) if current.effects else self._best_of(starts, 4, 12)
@@ -182,7 +184,7 @@ class Search:
         return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace)
 
     def _swap(self, null: Fit, current: Fit) -> tuple[Fit, list[list[Fit]]]:
-        """Each effect against what might stand in its place; the better model stays, twice at most."""
+        """Try to replace each effect by its alternatives and keep the better model; at most two rounds."""
         others: list[list[Fit]] = []
         for swaps in range(3):
             others = []
@@ -234,7 +236,7 @@ class Search:
         return p, delta_bic, delta_chi2
 
     def alternatives(self, null: Fit, current: Fit, index: int, gain: float) -> list[Fit]:
-        """Refits with effect ``index`` swapped for each effect that might do as well, best first.
+        """Refits with effect ``index`` swapped for each plausible alternative, best first.
 
         ``gain``: what the named effect explains, in chi-square; ``null``: the fit of no effect.
         """
@@ -245,7 +247,7 @@ class Search:
         without = self.without_each(current, null)[index]
         known = without.jacobian if rest else None
         scores = self.screen.score(without.residual, known)
-        # Screening is linear: what falls short by little, or by a small share, deserves a full refit.
+        # Screening is linear: a candidate that falls short by little needs a full refit.
         bar = min(SWAP_REACH * gain, gain - 60.0) if gain > 100.0 else 0.5 * gain
         best: dict[str, Score] = {}
         for s in scores:
@@ -254,8 +256,8 @@ class Search:
                 continue
             if name not in best:
                 best[name] = s
-        # The most likely eight: an exact confounder screens as high as the named effect itself.
-        # Where the search itself was dear, the data are no simple case, and three must do.
+        # The best eight: an exact confounder scores as high as the named effect itself. If the search was
+        # already expensive, the case is complicated; try two only.
         ranked = sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.workspace.simulations < BUDGET else 2]
         fits = []
         for s in ranked:

@@ -1,4 +1,4 @@
-"""What each effect would do to these recordings: its signature, by simulating a small dose of it."""
+"""The signature of each effect: the change of these recordings by a small simulated dose."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Columns = list[list[FloatArray]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """One effect with its choices and shapes fixed; its columns span what it can do, to first order.
+    """One effect with its choices and shapes fixed; its columns span its possible effects, to first order.
 
     ``free``: the parameter of each column. ``start``: values at the probe.
     """
@@ -31,7 +31,7 @@ class Candidate:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """What tells it from the others."""
+        """A key that distinguishes it from other candidates."""
         return (self.effect.name, *(round(v, 9) if math.isfinite(v) else 'rig' for v in self.start.values()))
 
     @property
@@ -79,7 +79,7 @@ def candidates(
     proposals: Mapping[str, Sequence[float]],
     without: Sequence[str] = (),
 ) -> Iterator[Candidate]:
-    """Every candidate of the catalogue but those named in ``without``.
+    """Every candidate of the catalogue except those named in ``without``.
 
     ``proposals``: the values to try, by the name that a parameter's ``propose`` gives.
     """
@@ -156,7 +156,7 @@ class SignatureBank:
         self._base: tuple[ActiveEffect, ...] = ()
 
     def nominal(self, workspace: Workspace) -> list[FloatArray]:
-        """The simulation without any effect (but those of the rig file)."""
+        """The simulation without any effect, except those of the rig file."""
         if self._nominal is None:
             self._base = workspace.base
             self._nominal = workspace.simulate(self._base)

@@ -1,7 +1,7 @@
-"""Does it hold on load cases it has not seen? Hold-out of whole load cases, never of interleaved blocks.
+"""Tests a model on held-out load cases: whole load cases, never interleaved blocks.
 
-The model is refitted without each group of load cases by one Gauss-Newton step from the optimum,
-which for effects this close to linear is the refit itself, and judged on the group left out.
+For each group of load cases the model is refitted without it, by one Gauss-Newton step from the
+optimum, and tested on that group. One step is enough because the effects are nearly linear.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ BOOTSTRAPS = 400
 
 
 def fold_of_case(workspace: Workspace) -> IntArray:
-    """The fold of each load case: dealt round, so that each fold holds cases of several kinds."""
+    """The fold of each load case: assigned in turn, so each fold contains several kinds of cases."""
     count = max(int(c.max()) for c in workspace.case) + 1
     return np.arange(count) % min(FOLDS, count)
 
@@ -38,7 +38,7 @@ def heldout_residual(workspace: Workspace, fit: Fit) -> FloatArray:
         test = folds == fold
         jt, rt = j[test], fit.residual[test]
         f = whole_f - jt.T @ jt
-        # A ridge of one prior standard deviation: what only this fold could show stays where it was.
+        # A ridge of one prior standard deviation: parameters that only this fold shows do not move.
         f[np.diag_indices_from(f)] += 1e-6
         step = np.linalg.lstsq(f, whole_g - jt.T @ rt, rcond=1e-9)[0]
         out[test] = rt - jt @ step
@@ -50,7 +50,7 @@ def heldout_gap(workspace: Workspace, fit: Fit) -> float:
     if not fit.free:
         return workspace.gap(fit.difference)
     white = heldout_residual(workspace, fit) - fit.residual
-    # The change is slow against a fine block, so that undoing the whitening is a scaling per channel.
+    # The change is slow compared with a fine block, so the inverse of whitening is a scaling per channel.
     parts = []
     for part, d, noise in zip(workspace.split(white), fit.difference, workspace.noise, strict=True):
         gain = noise.innovation / np.maximum(1.0 - noise.ar.sum(axis=1), 0.05)
@@ -67,15 +67,15 @@ class HeldOut:
 
     @property
     def holds(self) -> bool:
-        """Gains by more than two standard errors."""
+        """Whether the gain exceeds two standard errors."""
         return self.gain > 2.0 * self.error
 
 
 def heldout_gain(workspace: Workspace, without: Fit, fit: Fit, rng: np.random.Generator) -> HeldOut:
-    """What ``fit`` gains over ``without`` on unseen load cases.
+    """Gain of ``fit`` over ``without`` on unseen load cases.
 
     The standard error is the smaller of the block bootstrap's and that of the likelihood ratio
-    itself, since an effect that shows in a few short stretches only makes the former meaningless.
+    itself, because the former is meaningless for an effect that shows only in a few short intervals.
     """
     a, b = heldout_residual(workspace, without), heldout_residual(workspace, fit)
     gains = 0.5 * (a * a - b * b)

@@ -1,8 +1,9 @@
-"""Recordings and simulations side by side, as whitened vectors of one common likelihood.
+"""Recordings and simulations as whitened vectors of one common likelihood.
 
-Samples are first averaged over *fine blocks* of a few milliseconds (link motion survives them, and
-a recording shrinks fourfold), then whitened by the noise model, so that half the squared length of
-a residual vector is its negative log-likelihood. Every simulation goes through here and is counted.
+Samples are first averaged over *fine blocks* of a few milliseconds (short enough for the link's
+motion, and a recording becomes four times smaller). Then they are whitened by the noise model, so
+half the squared length of a residual vector is its negative log-likelihood. All simulations are run
+and counted here.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from psd_deflection.simulation.simulator import ForwardModel
 
 FINE_SECONDS = 0.004
 MAX_FINE = 60_000
-"""Fine blocks of all recordings together, about; long ones get longer blocks, so that memory stays bounded."""
+"""Approximate total number of fine blocks; long recordings get longer blocks, which limits memory."""
 
 
 def fine_means(rows: FloatArray, size: int) -> FloatArray:
@@ -49,7 +50,7 @@ class Workspace:
         for o in self.observations:
             block = o.rig.estimator.block_size
             wanted = max(1, round(max(FINE_SECONDS, longest) / o.period))
-            # A fine block divides an estimate block, so that blocks are means of whole fine ones.
+            # An estimate block is a whole number of fine blocks.
             size = max(d for d in range(1, min(wanted, block) + 1) if block % d == 0)
             means = fine_means(o.volts.T, size)
             good = np.all(np.isfinite(means), axis=0)
@@ -65,7 +66,7 @@ class Workspace:
         self.data = self.whiten(self.measured)
 
     def estimate_noise(self, effects: Sequence[ActiveEffect]) -> None:
-        """(Re)estimate the noise, the link's motion as simulated with ``effects``."""
+        """Estimate the noise (again), with the link's motion simulated with ``effects``."""
         self.noise = []
         self.simulations += 1
         for o, size in zip(self.observations, self.fine, strict=True):
@@ -74,7 +75,7 @@ class Workspace:
             self.noise.append(estimate_noise(o, o.volts - chunk.volts.T, size, floor))
 
     def raw_residual(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
-        """Measured minus simulated (n, 6) V of each recording, samples, 0 where lost."""
+        """Measured minus simulated (n, 6) V of each recording, samples, 0 if lost."""
         self.simulations += 1
         out = []
         for o in self.observations:
@@ -93,7 +94,7 @@ class Workspace:
         return out
 
     def whiten(self, fine: Sequence[FloatArray]) -> FloatArray:
-        """One vector of all recordings, white and of unit variance where the noise model holds."""
+        """One vector of all recordings, white and of unit variance if the noise model holds."""
         parts = [w.whiten(f, v).ravel() for f, w, v in zip(fine, self.noise, self.valid, strict=True)]
         return np.concatenate(parts)
 
@@ -122,7 +123,7 @@ class Workspace:
         )
 
     def block_dots(self, fine: Sequence[FloatArray]) -> list[FloatArray]:
-        """Block means of the dots (4, blocks), m, of fine-block volts; NaN where a sample is lost."""
+        """Block means of the dots (4, blocks), m, of fine-block volts; NaN if a sample is lost."""
         out = []
         for f, v, s, o in zip(fine, self.valid, self.fine, self.observations, strict=True):
             rows = np.where(v, f[list(DOT_CHANNELS)], np.nan)
@@ -140,7 +141,7 @@ class Workspace:
         return np.asarray(np.sqrt(np.nanmean(blocks**2, axis=1)))
 
     def floor(self) -> float:
-        """What noise alone leaves of the gap, m."""
+        """The gap from noise alone, m."""
         total, count = 0.0, 0.0
         for w, o, v in zip(self.noise, self.observations, self.valid, strict=True):
             n = float(v.sum())

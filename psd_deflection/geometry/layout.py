@@ -1,8 +1,8 @@
-"""Where the PSDs, the beams and the link are; a layout that cannot be solved is refused by name.
+"""Where the PSDs, the beams and the link are; an unsolvable layout is refused with the reason.
 
 Theory of operation. A dot reading m_i is where laser i falls on PSD i, from the PSD's centre c_i,
-in plate axes. Before load it was m_i0, so the beam stands at l_i = c_i + m_i0, fixed to the base,
-and the plate point under it now is q_i = c_i + m_i.
+in plate axes. Before load it was m_i0, so the beam is at l_i = c_i + m_i0, fixed to the base. The
+plate point under it is now q_i = c_i + m_i.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from psd_deflection.errors import SolverError
 from psd_deflection.records import FloatArray
 
 SMALLEST_BASE_LINE = 1e-6
-"""m. Closer beams than a spot's own noise are one beam."""
+"""m. Beams closer together than the noise of a dot count as one beam."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +36,9 @@ class Geometry:
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Geometry:
-        """What ``psd_N.center``, ``.zero``, ``.height`` and ``link`` of a parameter file describe."""
+        """The geometry that ``psd_N.center``, ``.zero``, ``.height`` and ``link`` of a parameter file
+        describe.
+        """
         return cls(rig.centers, rig.zeros, rig.heights, rig.link.length, rig.link.slope_ratio)
 
     @property
@@ -67,10 +69,10 @@ def check_shapes(geometry: Geometry) -> int:
 
 
 def check_twist(geometry: Geometry) -> int:
-    """The number P of PSDs, after checking that their beams stand apart.
+    """The number P of PSDs, after checking that their beams do not coincide.
 
-    det(A^T A) = 2 |l_1 - l_2|^2 for two PSDs: apart is all that a flat plate needs (the thesis's
-    4.21 *and* 4.22 ask too much). Raises SolverError.
+    For two PSDs det(A^T A) = 2 |l_1 - l_2|^2, so a flat plate needs no more than distinct beams
+    (the thesis's 4.21 *and* 4.22 ask too much). Raises SolverError.
     """
     count = check_shapes(geometry)
     beams = geometry.beams

@@ -1,8 +1,8 @@
-"""The linearised plate of the thesis's chapter 4, put right: matrix, gain, condition, error bound.
+"""The linearised plate of the thesis's chapter 4, corrected: matrix, gain, condition, error bound.
 
-A b = m - m_0 with rows [-1, 0, l_iy] for x_i and [0, -1, -l_ix] for y_i. The source writes absolute
-coordinates on the left (4.5, 4.6, 4.14) and, in its code, two rows of another rig (4.7-4.12 with
-theta_1 = -90 deg, theta_2 = -180 deg); its rank condition (4.21 and 4.22) is met by 4.21 *or* 4.22.
+A b = m - m_0 with rows [-1, 0, l_iy] for x_i and [0, -1, -l_ix] for y_i. The thesis has absolute
+coordinates on the left (4.5, 4.6, 4.14). Its code has two rows of another rig (4.7-4.12 with
+theta_1 = -90 deg, theta_2 = -180 deg). For full rank it asks for 4.21 and 4.22; either is enough.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ def gain_matrix(design: FloatArray, row_scaling: FloatArray | None = None) -> Fl
 class ConditionNumber(NamedTuple):
     """||A|| ||A+|| in the Frobenius norm (4.29) and in the 2-norm.
 
-    ``angle_length``: the length, m, that an angle of 1 rad is counted as. The number means nothing
-    without it: 0.001 gives the thesis's (A in mm), 1.0 that of A in m. In the Frobenius norm it is
-    3 at best, not 1, for three unknowns.
+    ``angle_length``: the length, m, that counts as an angle of 1 rad. The condition number has no
+    meaning without it: 0.001 gives the thesis's number (A in mm), 1.0 the number for A in m. For
+    three unknowns the best value is 3 in the Frobenius norm, not 1.
     """
 
     frobenius: float
@@ -55,7 +55,7 @@ class ConditionNumber(NamedTuple):
 
 
 def condition_number(design: FloatArray, angle_length: float) -> ConditionNumber:
-    """4.28, 4.29 with their unit named; ``design`` (2P, 3) in m, ``angle_length`` in m."""
+    """4.28 and 4.29 with the unit stated; ``design`` (2P, 3) in m, ``angle_length`` in m."""
     scaled = design / np.array([1.0, 1.0, angle_length])
     inverse = np.linalg.pinv(scaled)
     return ConditionNumber(
@@ -72,22 +72,22 @@ def error_bound(
     reading_error: FloatArray,
     row_scaling: FloatArray | None = None,
 ) -> FloatArray:
-    """How far (dX, dY, theta) can be from the true pose, each by itself (3,): m, m, rad.
+    """Largest error of dX, dY and theta, one by one, (3,): m, m, rad.
 
-    ``pose`` (3,) as solved with ``design`` (2P, 3). The true matrix is off by at most ``design_error``
-    (2P, 3) and the readings, with all that the linear model lacks, by at most ``reading_error`` (2P,)
-    m, entry by entry. ``row_scaling`` (2P,): Po, if the answer is a weighted one. Infinite if
-    errors of that size could hide the pose altogether.
+    ``pose`` (3,) as solved with ``design`` (2P, 3). ``design_error`` (2P, 3) bounds the error of each
+    entry of the matrix. ``reading_error`` (2P,) m bounds the error of each reading, including what the
+    linear model leaves out. ``row_scaling`` (2P,): Po, if the answer is weighted. The result is
+    infinite if such errors could hide the pose completely.
 
-    Replaces 4.33 and 4.34. Those add metres to radians in one norm, so that the number depends on the
-    unit (in mm it is a thousand times too large for the thesis's own example), and 4.32, on which they
-    stand, holds for consistent equations only: with a residual r it lacks (A^T A)^-1 dA^T r, and 4.33 is
-    broken by up to nine times. Asked for the distance to the *pose* x*, the residual drops out: with
+    It replaces 4.33 and 4.34. These add metres to radians in one norm, so the number depends on the unit
+    (in mm it is a thousand times too large for the thesis's own example). They also rest on 4.32, which
+    holds for consistent equations only: with a residual r it lacks (A^T A)^-1 dA^T r, and the true error
+    exceeds 4.33 by up to nine times. The distance to the *pose* x* does not contain the residual. With
     (A + dA) x* = b + db and x = G b, G A = I,
 
         x - x* = G (dA x* - db),     |x - x*| <= (I - |G| E)^-1 |G| (e + E |x|),
 
-    where E >= |dA|, e >= |db|, in magnitudes, and nothing is neglected.
+    where E >= |dA| and e >= |db| entry by entry. No term is neglected.
     """
     gain = np.abs(gain_matrix(design, row_scaling))
     e_a = np.abs(design_error)

@@ -6,12 +6,13 @@ deviation sigma and two PSDs at c1, c2 with midpoint m and distance b = |c1 - c2
     var theta = 2 sigma^2/b^2
     var dX    = sigma^2/2 + m_y^2 var theta       var dY = sigma^2/2 + m_x^2 var theta
 
-so the best pair stands diametrically opposite, as far out as there is room. The condition number
-of A mixes metres and radians: it says something only with its units stated. Here theta is scaled by
-a length (0.1 m: a twist counts as the way of a point 0.1 m out), so that cond = 1 for +-100 mm.
+so the best pair is diametrically opposite, as far out as the space allows. The condition number of
+A mixes metres and radians and is meaningless without its units. Here theta is scaled by a length
+(0.1 m: a twist counts as the displacement of a point 0.1 m from the centre), so cond = 1 for +-100
+mm.
 
-Tilts phi, omega need more: two coplanar PSDs do not see them (the Jacobian's rank is 4 of 5 at most,
-and 3 at rest), three see them once their surfaces stand at different heights.
+Tilts phi and omega need more. Two coplanar PSDs do not see them (the Jacobian's rank is at most 4 of
+5, and 3 at rest). Three PSDs see them if their surfaces are at different heights.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from psd_deflection.geometry.plate import crossings, tie_matrix, tied_pose
 from psd_deflection.records import FloatArray
 
 SCALE = 0.1
-"""m: the length by which theta is scaled when a condition number or a single cost is formed."""
+"""m: the length that scales theta in a condition number or in the cost."""
 
 
 class Spread(NamedTuple):
@@ -39,9 +40,10 @@ class Spread(NamedTuple):
 
 
 def spread_of_pair(centers: FloatArray, sigma: float) -> Spread:
-    """Of (dX, dY, theta) at rest for two PSDs whose readings have equal deviation ``sigma`` (m).
+    """Deviations of (dX, dY, theta) at rest for two PSDs whose readings have deviation ``sigma``
+    (m).
 
-    The closed form of the module's text.
+    It is the closed form in the module's docstring.
     """
     distance = math.hypot(*(centers[0] - centers[1]))
     middle_x, middle_y = (centers[0] + centers[1]) / 2.0
@@ -68,8 +70,8 @@ def ring(count: int, radius: float, azimuth: float = math.pi / 2.0) -> FloatArra
 def pose_spread(pose: FloatArray, centers: FloatArray, heights: FloatArray, sigma: float) -> FloatArray:
     """Deviations (5,) of dX, dY m, theta, phi, omega rad, all five free, at ``pose`` (5,).
 
-    What the readings do not determine is infinite: both tilts at rest, and always one of the five
-    for two PSDs.
+    Unknowns that the readings do not determine get infinity: both tilts at rest and, with two PSDs,
+    always one of the five.
     """
     jacobian = crossings(pose, centers, heights)[1].reshape(-1, 5)
     return _deviations(jacobian, sigma)
@@ -80,7 +82,7 @@ def slope_ratio_spread(
 ) -> FloatArray:
     """Deviations (4,) of dX, dY, theta and k when the tilts are tied, phi = -k dY/L, omega = +k dX/L.
 
-    ``pose`` (3,): dX, dY, theta; it must be deflected, for at rest k does nothing.
+    ``pose`` (3,): dX, dY, theta; it must be deflected, because at rest k has no effect.
     """
     full = tied_pose(pose, slope_ratio, link_length)
     jacobian = crossings(full, centers, heights)[1].reshape(-1, 5)
@@ -91,7 +93,7 @@ def slope_ratio_spread(
 
 
 def _deviations(jacobian: FloatArray, sigma: float) -> FloatArray:
-    # Columns of unit length first: metres and radians must not decide what counts as singular.
+    # Scale the columns to unit length, so that the units do not decide what counts as singular.
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0.0] = 1.0
     _, values, rows = np.linalg.svd(jacobian / scale, full_matrices=True)
@@ -99,14 +101,15 @@ def _deviations(jacobian: FloatArray, sigma: float) -> FloatArray:
     values = np.concatenate([values, np.zeros(count - len(values))])
     seen = values > 1e-12
     out = sigma / scale * np.sqrt(np.sum((rows[seen] / values[seen, None]) ** 2, axis=0))
-    # A direction that no reading sees leaves every unknown that has a part in it undetermined.
+    # Every unknown with a component along an unseen direction is undetermined.
     out[np.any(np.abs(rows[~seen]) > 1e-9, axis=0)] = math.inf
     return np.asarray(out)
 
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """Where sensor centres may stand: a disc of ``radius`` (m), outside ``keep_out`` (m), inside ``box``.
+    """The allowed places of sensor centres: a disc of ``radius`` (m), outside ``keep_out`` (m), inside
+    ``box``.
 
     ``box``: (x_min, y_min, x_max, y_max), m, or None.
     """
@@ -130,7 +133,7 @@ class Room:
     def holds(self, points: FloatArray) -> FloatArray:
         """Mask (...,) of ``points`` (..., 2)."""
         reach = np.hypot(points[..., 0], points[..., 1])
-        # A hair of slack, or rounding would cut the rim off.
+        # A little slack, because rounding would exclude the rim.
         inside = (reach <= self.radius * (1.0 + 1e-12)) & (reach >= self.keep_out * (1.0 - 1e-12))
         if self.box is not None:
             x_min, y_min, x_max, y_max = self.box
@@ -166,8 +169,9 @@ def _pair_costs(first: FloatArray, second: FloatArray) -> FloatArray:
 def best_pair(room: Room) -> FloatArray:
     """(2, 2): the two places in ``room`` of least ``cost``; the first is the higher one.
 
-    All pairs of candidates, then a pattern search around the best: deterministic, and the cost is
-    smooth away from coinciding sensors. Raises ConfigError when the room holds no two places.
+    It compares all pairs of candidates, then runs a pattern search around the best. The search is
+    deterministic, and the cost is smooth except at coinciding sensors. Raises ConfigError if
+    ``room`` has no two places.
     """
     points = room.candidates()
     if len(points) < 2:
@@ -185,7 +189,7 @@ def best_pair(room: Room) -> FloatArray:
         trial = trial[np.all(room.holds(trial), axis=-1)]
         value = _pair_costs(trial[:, 0], trial[:, 1])
         at = int(np.argmin(value))
-        # An improvement in the last digit would walk along a flat optimum for ever.
+        # Ignore improvements in the last digit: on a flat optimum the search would not end.
         if value[at] < least * (1.0 - 1e-12):
             best, least = trial[at], float(value[at])
         else:

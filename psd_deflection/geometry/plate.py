@@ -9,10 +9,10 @@ R = Ry(omega) Rx(phi) Rz(theta),
 
 The reading is q_i - c_i. The derivatives are those of these lines, in the order dX, dY, theta, phi, omega;
 at rest the first three are the rows [-1, 0, l_y], [0, -1, -l_x] of the design matrix (``linear``). Beam and
-translation enter as l - d alone, so that dq/dl = -dq/d(dX, dY).
+translation enter only as l - d, so dq/dl = -dq/d(dX, dY).
 
 ``crossing`` and ``flat_pose`` take floats: a solver calls them once a block in real time, where numpy's cost per
-call would dominate. ``crossings`` and ``flat_poses`` are their twins for arrays, with the same formulas.
+call would dominate. ``crossings`` and ``flat_poses`` are the same formulas for arrays.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Row = Five[float]
 def _point(
     lx: Number, ly: Number, height: Number, dx: Number, dy: Number, turns: Turns[Number]
 ) -> tuple[Number, Number, Number, Number]:
-    """x', y', q_x, q_y of the module's text."""
+    """x', y', q_x, q_y as in the module's docstring."""
     ct, st, cp, sp, co, so = turns
     y = (ly - dy + height * sp) / cp
     x = (lx - dx - height * so * cp - y * so * sp) / co
@@ -110,7 +110,9 @@ def points_under(
     phi: FloatArray,
     omega: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """q_x and q_y, m, one coordinate an array, of any shapes that broadcast: for long runs of samples."""
+    """q_x and q_y, m, one array for each coordinate, of any shapes that broadcast; for long runs of
+    samples.
+    """
     return _point(lx, ly, height, dx, dy, _turns(theta, phi, omega))[2:]
 
 
@@ -164,7 +166,7 @@ def flat_poses(points: FloatArray, beams: FloatArray) -> FloatArray:
 def tied_pose(pose: FloatArray, slope_ratio: FloatArray | float, link_length: float) -> FloatArray:
     """(..., 5) from (..., 3): the tilts of a cantilever, phi = -k dY/L, omega = +k dX/L.
 
-    ``slope_ratio`` k: one, or (...,) of its own for each pose.
+    ``slope_ratio`` k: one for all poses, or (...,) one for each.
     """
     tilt = np.asarray(slope_ratio)[..., None] / link_length * np.stack([-pose[..., 1], pose[..., 0]], axis=-1)
     return np.concatenate([np.broadcast_to(pose, (*tilt.shape[:-1], 3)), tilt], axis=-1)

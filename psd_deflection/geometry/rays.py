@@ -1,7 +1,7 @@
 """Dots in space: beams that are not parallel to Z, surfaces that are turned and tilted on the plate.
 
-``plate`` is the solvers' model, with parallel beams and surfaces parallel to the plate. What a rig may have
-beside it (an inclined beam, a sensor that is not square) is computed here without approximation.
+``plate`` is the solvers' model, with parallel beams and surfaces parallel to the plate. This module covers,
+without approximation, what that model leaves out: inclined beams and tilted sensors.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The link as a beam: load to deflection and back, tube sections.
 
-What the real-time path needs is :class:`LinkStatics` alone; ``section`` serves ``psd-deflection design``.
+The real-time path needs only :class:`LinkStatics`; ``section`` serves ``psd-deflection design``.
 """
 
 from psd_deflection.mechanics.statics import LinkStatics

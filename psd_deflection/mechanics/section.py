@@ -1,4 +1,4 @@
-"""The tube's cross-section: what geometry alone contributes to stiffness (thesis A-9 ... A-15, B-1, B-3)."""
+"""The tube's cross-section: the part of the stiffness that comes from geometry (thesis A-9 ... A-15, B-1, B-3)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class TubeSection:
         """
         third = wall**2 / 12.0
         half = second_moment / (2.0 * math.pi * wall)
-        # The second of Cardano's two terms as third/first: their difference would lose half the digits.
+        # Cardano's second term as third/first: the difference would lose half the digits.
         first = math.cbrt(half + math.sqrt(half**2 + third**3))
         return cls.from_mean(first - third / first, wall)
 

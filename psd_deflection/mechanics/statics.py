@@ -1,7 +1,7 @@
 """Static deflection of the link tip under a load at the tip, both ways.
 
-The wrench that is published is the load that this model needs for the deflection that was
-measured, so the inverse runs once a block: plain floats.
+The published wrench is the load that gives the measured deflection in this model. The inverse runs
+once per block, so it uses plain floats.
 
 A cantilever of bending stiffness EI, torsional stiffness GJ and length L, loaded at its tip
 centroid without moments (thesis A-10, A-21; the signs are those of ``link_tip_rest``, right-handed)::

@@ -1,13 +1,13 @@
-"""What Thorlabs KPA101/TQD001 position aligners say: APT messages of the quad detector; pure.
+"""APT messages of the quad detector in Thorlabs KPA101/TQD001 position aligners; no I/O.
 
-Theory of operation. A message is a 6-byte header, and for a long one the data that the header
-announces. There is no check sum and no end mark, so a receiver that lost a byte can only look for
-the next header that makes sense. The device is asked for its readings and answers once.
+Theory of operation. A message is a 6-byte header; a long message adds the data that the header
+announces. There is no checksum and no end mark, so a receiver that lost a byte can only look for
+the next plausible header. The device answers each request for its readings once.
 
 Reading, little-endian: submessage u16 (3), x difference int16, y difference int16, sum u16, and the
 two position outputs int16. The differences are +-10 V over the int16 range; the sum is taken as 0 to
-10 V over the u16 range (drivers disagree about its scale: ``docs/devices/thorlabs.md``). The
-differences are not divided by the sum in the device: the place on the sensor is (L/2) x / sum.
+10 V over the u16 range (drivers disagree about its scale: ``docs/devices/thorlabs.md``). The device
+does not divide the differences by the sum: the place on the sensor is (L/2) x / sum.
 
 Sources: Thorlabs, "APT Communications Protocol", quad control messages 0x0870 to 0x0881 and
 MGMSG_HW_REQ_INFO; two open drivers for the scales and the sign of x.
@@ -37,11 +37,11 @@ FULL_SCALE = 10.0
 """Volts given for a dot at the edge of the active area."""
 
 SUM_FLOOR = 0.05
-"""V. Below it there is no light to divide by."""
+"""V. Below this sum there is too little light to divide by."""
 
 
 class Readings(NamedTuple):
-    """``x``, ``y``: 10 V at the edge of the active area, 0 where ``total`` is too low; ``total`` V."""
+    """``x``, ``y``: 10 V at the edge of the active area, 0 if ``total`` is too low; ``total`` V."""
 
     x: float
     y: float
@@ -49,7 +49,7 @@ class Readings(NamedTuple):
 
 
 class HardwareInfo(NamedTuple):
-    """Who answers."""
+    """The device that answered."""
 
     serial: int
     model: str
@@ -60,9 +60,9 @@ Message = Readings | HardwareInfo | BadFrame
 
 
 def readings_of(x_difference: int, y_difference: int, total: int) -> Readings:
-    """Raw numbers to the volts that our own amplifier would give: x 10 V / sum.
+    """Converts raw numbers to the volts of the rig's amplifier: x 10 V / sum.
 
-    Without light the quotient would be noise: x and y are then 0, and the low sum says why.
+    Without light the quotient would be noise, so x and y are then 0; the low sum shows the reason.
     """
     volts = total * SUM_VOLTS
     if volts < SUM_FLOOR:
@@ -84,7 +84,7 @@ def encode_info(serial: int, model: str) -> bytes:
 
 
 class AptDecoder:
-    """Messages from a stream, however it was split; what makes no sense is passed over and counted."""
+    """Decodes messages from a stream, however it was split; skips and counts invalid bytes."""
 
     def __init__(self) -> None:
         self._rest = b''
@@ -116,7 +116,7 @@ class AptDecoder:
         return out
 
     def reset(self) -> int:
-        """Forget an unfinished message; how many bytes it had."""
+        """Discard an unfinished message; returns its number of bytes."""
         size = len(self._rest) + self._skipped
         self._rest, self._skipped = b'', 0
         return size

@@ -1,14 +1,15 @@
-"""What DATAQ converters of the DI-1100/1110/2108/4108 family say: commands, replies, scans; pure.
+"""Commands, replies and scans of DATAQ DI-1100/1110/2108/4108 converters; no I/O.
 
-Theory of operation. Commands are ASCII, ended by a carriage return, and are echoed with their
-answer while the device is not scanning (``start`` is not). A scan is the scan list's channels in
-their order, each a little-endian int16 over the channel's range, without framing, number or time.
-So one lost byte would shift all that follows, unseen. The counter channel is put last in the list
-as a marker: with nothing wired to its input and reset to zero it reads the constant 0x8000 (offset
-binary), which an analog channel shows only at its negative rail. A scan without the marker in its
-place is out of step; the decoder then looks for the place at which three scans in a row have it.
+Theory of operation. Commands are ASCII and end with a carriage return. While the device is not
+scanning, it echoes each with its answer (except ``start``). A scan is the scan list's channels in
+order, each a little-endian int16 over the channel's range, without framing, number or time. So one
+lost byte would shift everything after it unnoticed. As a marker, the counter channel is the last in
+the list. With nothing wired to its input and reset to zero it reads the constant 0x8000 (offset
+binary), which an analog channel shows only at its negative rail. If the marker is not in its place,
+the decoder has lost the scan boundary. It then looks for the offset at which three scans in a row
+end with the marker.
 
-What this cannot see is the loss of whole scans: the device does not number them.
+The loss of whole scans cannot be detected, because the device does not number them.
 
 Sources: DATAQ Instruments, "Data Acquisition Instrument Command Protocol"; the vendor's public
 example programs for the DI-1110 (counter offset) and drivers of others (reply padding with zeros;
@@ -25,7 +26,7 @@ from typing import NamedTuple
 from psd_deflection.protocol.frames import BadFrame
 
 CLOCK_HZ = 60_000_000
-"""Scan rate = CLOCK_HZ / (srate * dec), a scan or a channel each: devices differ, see ``plan_rate``."""
+"""Scan rate = CLOCK_HZ / (srate * dec), counted in scans or in conversions: devices differ, see ``plan_rate``."""
 
 VOLTS_PER_COUNT = 10.0 / 32768.0
 """On the +-10 V range (code 0 of the scan list word, the only one all models have)."""
@@ -40,11 +41,11 @@ ANALOG = 6
 SCAN = struct.Struct('<6h')
 STRIDE = SCAN.size + len(MARKER)
 LOOK = 4 * STRIDE
-"""Bytes that are looked at when out of step: three whole scans from whatever offset."""
+"""Bytes needed to find the scan boundary: three whole scans from any offset."""
 
 
 class Model(NamedTuple):
-    """``analog`` inputs; ``counter``: has one for the marker; ``decimates``: knows ``dec``; least ``srate``."""
+    """``analog`` inputs; ``counter``: has a counter for the marker; ``decimates``: knows ``dec``; least ``srate``."""
 
     analog: int
     counter: bool
@@ -59,14 +60,14 @@ MODELS: dict[str, Model] = {
     '2108': Model(8, True, True, 375),
     '4108': Model(8, True, True, 375),
 }
-"""By what ``info 1`` answers. The least ``srate`` is that of the highest rate in the data sheet."""
+"""By the answer to ``info 1``. The least ``srate`` gives the highest rate of the data sheet."""
 
 SRATE_MAX = 65_535
 DEC_MAX = 512
 
 
 class Rate(NamedTuple):
-    """``srate`` and ``dec`` to send, and the scans a second that come of them."""
+    """``srate`` and ``dec`` to send, and the resulting scans per second."""
 
     srate: int
     dec: int
@@ -74,10 +75,11 @@ class Rate(NamedTuple):
 
 
 def plan_rate(wanted_hz: float, model: Model, per_channel: bool) -> Rate | None:
-    """The setting nearest to ``wanted_hz`` scans a second; None where the model cannot do it.
+    """The setting nearest to ``wanted_hz`` scans a second; None if the model cannot do it.
 
-    ``per_channel``: the device takes CLOCK_HZ / (srate * dec) as conversions, not scans. A device of
-    one clock and eight inputs may do either, and the documents are not at one: the source measures.
+    ``per_channel``: CLOCK_HZ / (srate * dec) counts conversions per second, not scans. The vendor's
+    documents disagree on this for devices with one clock and eight inputs, so the source measures
+    it.
     """
     ticks = CLOCK_HZ / wanted_hz / (ANALOG + 1 if per_channel else 1)
     dec = max(1, math.ceil(ticks / SRATE_MAX))
@@ -102,10 +104,10 @@ def scan_list(inputs: Sequence[int]) -> list[str]:
 
 
 def find_reply(received: bytes, asked: str) -> str | None:
-    """What followed the echo of ``asked`` in ``received``: '' for a bare echo, None where there is none yet.
+    """The text after the echo of ``asked`` in ``received``: '' for a bare echo, None if there is no echo yet.
 
-    A reply ends with a carriage return, and zeros may pad it. Scans that were still on their way may
-    stand before the echo.
+    A reply ends with a carriage return, and zeros may pad it. Scans that were still in transit may
+    come before the echo.
     """
     whole, _, _ = received.rpartition(b'\r')
     for line in reversed(whole.replace(b'\x00', b'').split(b'\r')):
@@ -119,14 +121,14 @@ def find_reply(received: bytes, asked: str) -> str | None:
 
 
 class ScanDecoder:
-    """Cuts the stream into scans by the marker; what it returns does not depend on how it was split."""
+    """Cuts the stream into scans by the marker; the result does not depend on how the stream was split."""
 
     def __init__(self) -> None:
         self._rest = b''
         self._in_step = True
 
     def feed(self, received: bytes) -> list[tuple[int, ...] | BadFrame]:
-        """Scans (x1, y1, sum1, x2, y2, sum2 counts), and a BadFrame for bytes that belong to none."""
+        """Scans (x1, y1, sum1, x2, y2, sum2 counts), and a BadFrame for bytes that belong to no scan."""
         stream = self._rest + received
         out: list[tuple[int, ...] | BadFrame] = []
         at, end = 0, len(stream)
@@ -151,7 +153,7 @@ class ScanDecoder:
 
 
 def _step(stream: bytes, at: int) -> int | None:
-    """Bytes to pass over until three scans in a row end in the marker."""
+    """Number of bytes to skip until three scans in a row end with the marker."""
     for skip in range(1, STRIDE):
         first = at + skip + SCAN.size
         if all(stream[first + k * STRIDE : first + k * STRIDE + 2] == MARKER for k in range(3)):

@@ -1,10 +1,11 @@
-"""The serial frames of version 1: values on one side, bytes on the other.
+"""Encodes and decodes the serial frames of protocol version 1 (``docs/protocol.md``).
 
 Theory of operation. A frame on the wire is ``COBS(type u8 | body | crc32 u32) 00``, little-endian,
 at most 512 bytes encoded, CRC-32 (zlib's) over type and body. COBS leaves no zero byte inside, so a
-zero always ends a frame and a receiver that joins late, or meets garbage, is in step again at the
-next zero. The decoder takes bytes, however they were split, and returns values; what it cannot
-accept is a :class:`BadFrame` with the reason, never an exception: the wire belongs to the world.
+zero byte always ends a frame. A receiver that joins late or receives garbage resynchronises at the
+next zero byte. The decoder accepts bytes however they were split and returns values. Malformed
+frames become a :class:`BadFrame` with the reason, never an exception, because input from outside
+may contain anything.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class FrameType(IntEnum):
 
 
 class BadReason(StrEnum):
-    """Why bytes between two zeros are no frame."""
+    """Why the bytes between two zero bytes are not a valid frame."""
 
     COBS = 'not COBS'
     TOO_SHORT = 'shorter than type and CRC'
@@ -67,7 +68,7 @@ class StatusFrame(NamedTuple):
 
 
 class HelloFrame(NamedTuple):
-    """HELLO: protocol version, and what the device says of itself (empty for another version)."""
+    """HELLO: protocol version, and the device's description of itself (empty for another version)."""
 
     version: int
     info: dict[str, object]
@@ -95,13 +96,13 @@ class StartFrame(NamedTuple):
 
 
 class StopFrame(NamedTuple):
-    """STOP: stream no samples."""
+    """STOP: stop streaming samples."""
 
 
 class BadFrame(NamedTuple):
-    """Bytes that are no frame of ours: ``size`` encoded bytes up to the zero that ended them.
+    """Bytes that are not a valid frame: ``size`` encoded bytes before the closing zero.
 
-    ``reason``: a :class:`BadReason` here; other protocols have reasons of their own.
+    ``reason``: a :class:`BadReason` here; other protocols have their own reasons.
     """
 
     reason: str
@@ -117,7 +118,7 @@ _EMPTY: dict[int, GoodFrame] = {
     FrameType.STOP: StopFrame(),
 }
 MAX_DEVICE_US = 1 << 53
-"""285 years: a device time beyond it is no time, and would not fit the host's nanoseconds."""
+"""285 years: a later device time is not plausible and would overflow the host's nanoseconds."""
 
 _SAMPLE = struct.Struct('<BBIQ6h')
 _STATUS = struct.Struct('<BIh')
@@ -134,7 +135,7 @@ def _seal(payload: bytes) -> bytes:
 def encode(frame: GoodFrame) -> bytes:
     """The bytes of one frame, closing zero included.
 
-    Raises ValueError where a field does not fit, or a HELLO is longer than 512 bytes encoded.
+    Raises ValueError if a field does not fit or a HELLO is longer than 512 bytes encoded.
     """
     try:
         match frame:
@@ -164,7 +165,7 @@ def encode(frame: GoodFrame) -> bytes:
 
 
 def _parse(payload: bytes, size: int) -> Frame:
-    """``payload``: type, body and CRC, COBS taken off; ``size``: encoded, for the report."""
+    """``payload``: type, body and CRC, COBS decoded; ``size``: encoded size, for the report."""
     if len(payload) < 5:
         return BadFrame(BadReason.TOO_SHORT, size)
     body = payload[:-4]
@@ -200,7 +201,7 @@ def _parse_hello(body: bytes, size: int) -> Frame:
         return BadFrame(BadReason.LENGTH, size)
     version = body[1]
     if version != PROTOCOL_VERSION:
-        # What follows the version is that version's business; that it is another one is the news.
+        # The body of another version is unknown; report the version only.
         return HelloFrame(version, {})
     try:
         info = json.loads(body[2:].decode('utf-8'))
@@ -214,9 +215,9 @@ def _parse_hello(body: bytes, size: int) -> Frame:
 class FrameDecoder:
     """Cuts a stream at its zeros; holds at most one unfinished frame of ``MAX_ENCODED`` bytes.
 
-    What it returns does not depend on how the stream was split. The bytes before the first zero are
-    the tail of a frame that began before we listened: if they are no frame, they are passed over
-    without a :class:`BadFrame`.
+    The result does not depend on how the stream was split. The bytes before the first zero may be
+    the end of a frame that began before the port was opened. If they are not a valid frame, they
+    are ignored without a :class:`BadFrame`.
     """
 
     def __init__(self) -> None:

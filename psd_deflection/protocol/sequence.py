@@ -1,8 +1,8 @@
-"""Sequence numbers past 32 bits, and what a jump in them means.
+"""Extends sequence numbers beyond 32 bits and interprets jumps in them.
 
 The wire's ``seq`` wraps at 2^32 (49 days at 1 kHz). Blocks are cut by the extended number, which
-only ever rises: a device that starts again from zero is put at the next multiple of
-``alignment`` above the last sample, so that its blocks stay aligned to its own numbers.
+always increases. If a device restarts from zero, its numbers continue at the next multiple of
+``alignment`` above the last sample. So its blocks stay aligned to its own numbers.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ class Step(Enum):
 
 
 NEARBY = 64
-"""Samples within which a number is taken as a neighbour of the last one, whatever the clock says."""
+"""A number this close to the last one counts as its neighbour, whatever the clock says."""
 
 
 class SequenceExtender:
     """Extends u32 sequence numbers to 64 bits.
 
-    A number just ahead of the last one follows it, even where the device's clock jumped. One
-    further ahead (modulo 2^32, less than half way round) is a gap if device time went on. One at
-    or just behind the last, with a device time that is not newer, is a duplicated frame. Anything
-    else is a device that started again.
+    A number just ahead of the last one follows it, even if the device's clock jumped. A number
+    further ahead (modulo 2^32, less than half way round) is a gap if device time advanced. A number
+    at or just behind the last, with a device time that is not newer, is a duplicated frame.
+    Anything else means that the device restarted.
     """
 
     def __init__(self, alignment: int) -> None:
@@ -64,7 +64,7 @@ class SequenceExtender:
         return base + seq, Step.RESTART, 0
 
     def restart(self) -> None:
-        """What comes next was numbered anew, from 0: for a device whose samples the host numbers."""
+        """The next sample is number 0 again; for devices whose samples the host numbers."""
         if self._last is not None:
             base = self._next_base()
             self._offset, self._last, self._last_time = base % WRAP, base - 1, -1

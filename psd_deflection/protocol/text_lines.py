@@ -1,14 +1,14 @@
-"""One sample a line of text: what a quick Arduino can send and a person can read; pure.
+"""One sample per line of text, simple to send from an Arduino and readable; no I/O.
 
 Theory of operation. A line is ``seq,t_us,x1,y1,sum1,x2,y2,sum2`` and a newline (a carriage return
-before it is passed over): ``seq`` and ``t_us`` whole numbers modulo 2^32, the six readings decimal.
-A line that begins with ``#`` describes the device: a JSON object with ``sample_rate_hz`` and, where
-the readings are converter counts, ``volts_per_count``; without it they are volts. It is sent at
-power-up and once a second.
+before it is ignored): ``seq`` and ``t_us`` whole numbers modulo 2^32, the six readings decimal. A
+line that begins with ``#`` describes the device: a JSON object with ``sample_rate_hz`` and, if the
+readings are converter counts, ``volts_per_count``. Without ``volts_per_count`` the readings are
+volts. The device sends this line at power-up and once a second.
 
-A line may end in ``*hh``, the exclusive-or of all bytes before the ``*`` in hexadecimal (as NMEA 0183
-has it). Lines without it are taken as they come, and a digit that the wire changed is then not seen:
-text has no CRC. Lost lines are seen by ``seq``.
+A line may end in ``*hh``, the exclusive-or of all bytes before the ``*`` in hexadecimal (as in NMEA
+0183). Lines without it are accepted unchecked. Without the checksum, a corrupted digit goes
+unnoticed. Lost lines are detected by ``seq``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from psd_deflection.protocol.frames import BadFrame
 from psd_deflection.protocol.sequence import WRAP
 
 MAX_LINE = 400
-"""Bytes. What is longer is no line of ours."""
+"""Bytes. Longer lines are malformed."""
 
 FIELDS = 8
 _WHOLE = re.compile(rb'\d{1,10}')
@@ -40,7 +40,7 @@ class Line(NamedTuple):
 
 
 class Description(NamedTuple):
-    """What a ``#`` line says."""
+    """The JSON object of a ``#`` line."""
 
     info: dict[str, object]
 
@@ -85,7 +85,7 @@ def parse(line: bytes) -> Item | None:
 
 
 def _description(text: bytes, size: int) -> Item:
-    """A comment that is no JSON object is nobody's fault, but no description either."""
+    """The description of a comment line; a BadFrame if the comment is not a JSON object."""
     try:
         info = json.loads(text)
     except (ValueError, RecursionError):
@@ -94,14 +94,14 @@ def _description(text: bytes, size: int) -> Item:
 
 
 def positive(value: object) -> float | None:
-    """``value`` where it is a number above zero."""
+    """``value`` if it is a number above zero, else None."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value <= 0:
         return None
     return float(value)
 
 
 class LineDecoder:
-    """Cuts a stream at its newlines; what comes before the first is the tail of a line begun before we listened."""
+    """Cuts a stream at its newlines; ignores the incomplete line before the first newline."""
 
     def __init__(self) -> None:
         self._rest = b''
@@ -131,10 +131,10 @@ class LineDecoder:
 
 
 class TimeExtender:
-    """Microseconds of 32 bits (``micros()`` wraps after 71.6 minutes) to ones that go on.
+    """Extends 32-bit microseconds (``micros()`` wraps after 71.6 minutes).
 
-    Time that went back while the sample number went on has wrapped; while the number went back as
-    well, the device started anew, and so does its time.
+    If time goes back while the sample number advances, the time has wrapped. If the number goes
+    back as well, the device has restarted and its time starts again.
     """
 
     def __init__(self) -> None:
@@ -148,7 +148,7 @@ class TimeExtender:
             ahead = (line.seq - last.seq) % WRAP
             if not 0 < ahead < WRAP // 2:
                 if (last.seq - line.seq) % WRAP < 64 and last.t_us - line.t_us < WRAP // 2 and line.seq > 64:
-                    # An old line once more: not for the clock.
+                    # A repeated old line: it does not change the clock.
                     return self._high + line.t_us
                 self._high = 0
             elif last.t_us - line.t_us > WRAP // 2:

@@ -1,7 +1,7 @@
 """The rig in numbers: load history to link, optics, detectors and electronics.
 
-One way through, stage by stage, each vectorised over samples and free of noise until the last:
+The stages run in one direction, each vectorised over samples and without noise until the last:
 loads (``load``) -> static pose and modes (``link``) -> beams on the tip plate (``optics``) ->
 detector response (``psd``) -> amplifier and converter (``electronics``). The nominal rig is the
-thesis's own model; everything else is an *effect*, one file each in ``effects/``.
+thesis's own model; everything else is an *effect*, each in its own file in ``effects/``.
 """

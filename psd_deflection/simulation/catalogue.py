@@ -1,15 +1,15 @@
-"""Which effects there are, how one is loaded, and how a rig file says that one is on.
+"""The list of effects, how an effect is loaded, and how a rig file switches it on.
 
 An effect is one file with one :class:`~psd_deflection.simulation.declaration.Effect` called
 ``EFFECT``; the file has the effect's name. Adding a file to ``effects/`` or to a folder of
 ``$PSD_DEFLECTION_EFFECTS`` adds an effect; so does an entry point of the group
-``psd_deflection.effects`` of another package. In a rig file the effects stand below ``effects:``,
-one map each, under any key::
+``psd_deflection.effects`` of another package. In a rig file the effects are listed below
+``effects:``, one map each, under any key::
 
     effects:
       sensor_rotation_2: {name: sensor_rotation, psd: 2, angle: 0.01}
 
-so that the file remains a ROS 2 parameter file.
+This keeps the file a valid ROS 2 parameter file.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ def effect_folders() -> list[Path]:
     try:
         return [Path(folder).expanduser() for folder in listed.split(os.pathsep) if folder]
     except RuntimeError:
-        # A service without a home has no effects there.
+        # A service may have no home directory.
         return []
 
 
 def _places() -> dict[str, Place]:
     """Where each effect is, by name; nothing is imported. Raises ConfigError if two have one name."""
-    # Not with the module: a rig without effects needs none of it, and it takes a while.
+    # Imported here: it is slow, and a rig without effects does not need it.
     from importlib.metadata import EntryPoint, entry_points
 
     names = [module.name for module in pkgutil.iter_modules(ours.__path__)]
@@ -66,7 +66,7 @@ def _places() -> dict[str, Place]:
         try:
             files = sorted(f for f in folder.iterdir() if f.suffix == '.py')
         except OSError as error:
-            # Few have the default one, and a service may not look into a home.
+            # The default folder is optional, and a service may not be allowed to read a home.
             if FOLDERS in os.environ:
                 raise ConfigError(f'{FOLDERS}: {folder}: cannot be read ({error.strerror or error})') from None
             continue
@@ -94,7 +94,7 @@ def _of_file(path: Path) -> object:
     if spec is None or spec.loader is None:
         raise ImportError(f'{path} is not a Python file')
     module = importlib.util.module_from_spec(spec)
-    # Dataclasses of the file look their module up.
+    # Dataclasses in the file look up their module in sys.modules.
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module.EFFECT
@@ -104,7 +104,7 @@ def _load(name: str, place: Place) -> Effect:
     try:
         found = _of_file(place) if isinstance(place, Path) else place.load()
     except (Exception, SystemExit) as error:
-        # Whatever a stranger's file raises, the user needs its name and the cause.
+        # A user's file may raise anything; the message names the file and the cause.
         raise ConfigError(f'{_words(place)}: holds no effect ({type(error).__name__}: {error})') from error
     if not isinstance(found, Effect):
         raise ConfigError(f'{_words(place)}: EFFECT = {found!r}: must be an Effect')
@@ -120,7 +120,7 @@ def catalogue() -> Mapping[str, Effect]:
 
 
 def make_active(name: str, values: Mapping[str, object], source: str) -> ActiveEffect:
-    """Load one effect, and only that, and check its parameters.
+    """Load this effect only, and check its parameters.
 
     Raises ConfigError naming source, key, value, bound, or the file that cannot be loaded.
     """
@@ -159,7 +159,7 @@ def make_active(name: str, values: Mapping[str, object], source: str) -> ActiveE
 
 
 def effects_of_rig(rig: Rig) -> list[ActiveEffect]:
-    """The effects that a rig file has on, of flat keys ``KEY.name``, ``KEY.angle`` ...; raises ConfigError."""
+    """The effects of a rig file, from flat keys ``KEY.name``, ``KEY.angle`` ...; raises ConfigError."""
     groups: dict[str, dict[str, object]] = {}
     for key, value in rig.effects.items():
         group, dot, name = key.partition('.')

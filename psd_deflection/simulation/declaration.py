@@ -1,7 +1,7 @@
-"""What an effect is: the declaration that a file in ``effects/``, or one of yours, makes.
+"""The declaration of an effect, made by a file in ``effects/`` or by your own file.
 
-It holds all that the simulation, the correction and the discovery know of an effect; none of them
-knows an effect by its name.
+It holds everything that the simulation, the correction and the discovery know about an effect. None
+of them refers to an effect by name.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ STAGES: tuple[Stage, ...] = typing.get_args(Stage)
 
 @dataclass(frozen=True, slots=True)
 class EffectParameter:
-    """One parameter of an effect, with its bounds and what a search has to know of it.
+    """One parameter of an effect, with its bounds and the settings of a search.
 
-    ``nominal``: the value at which the effect is off, or that a parameter takes when it is not
-    given; NaN means the rig file's own, the field ``of_rig`` of :class:`Physics`. ``scale``: the
-    size of a probe, about the prior's standard deviation. ``within``: narrower bounds that the rig
-    sets, given the effect's values.
+    ``nominal``: the value at which the effect is off, and the default of a parameter that is not
+    given. NaN means the rig file's value, the field ``of_rig`` of :class:`Physics`. ``scale``: the
+    size of a probe, roughly the prior's standard deviation. ``within``: narrower bounds that the
+    rig sets, given the effect's values.
 
     ``kind``: an ``amplitude`` switches the effect on; ``coupled`` means nothing while the amplitudes
     are nominal; a ``phase`` (rad) belongs to the amplitude that ``partner`` names; a ``shape`` also
@@ -43,12 +43,11 @@ class EffectParameter:
     ``choices``. A rig may have one such effect for each value of an ``each`` choice (one for each
     PSD), otherwise one.
 
-    ``propose``: where the recordings themselves say what to try, or a function of the choices that
-    says it. ``spectral``: peaks of the residual's spectrum, and ``grid``; ``line``: those of steady amplitude and
-    phase; ``highest``: the largest voltage seen, ``highest_dots``: the same without the sums;
-    ``lattice``: the step on whose multiples all readings lie, and the effect is then named without a
-    search. ``power``: the signature of a ``finite`` effect grows with this power of the parameter;
-    0: it does not grow in proportion.
+    ``propose``: how the values to try are found in the recordings, or a function of the choices that returns
+    this. ``spectral``: peaks of the residual's spectrum, and ``grid``; ``line``: those of steady amplitude and
+    phase; ``highest``: the largest voltage seen, ``highest_dots``: the same without the sums; ``lattice``: the
+    step on whose multiples all readings lie, and then the effect is named without a search. ``power``: the
+    signature of a ``finite`` effect grows with this power of the parameter; 0: it does not grow in proportion.
     """
 
     name: str
@@ -88,7 +87,7 @@ class EffectParameter:
 PSD = EffectParameter(
     'psd', '', 1, 2, 1, 'which PSD', nominal=1, kind='choice', choices=(1, 2), required=True, each=True
 )
-"""The parameter of every effect that belongs to one detector."""
+"""A parameter of every effect of one detector."""
 MOVES_FREQUENCY = EffectParameter(
     'moves_frequency',
     '',
@@ -99,13 +98,13 @@ MOVES_FREQUENCY = EffectParameter(
     kind='choice',
     choices=(0, 1),
 )
-"""The parameter of every effect on a stiffness."""
+"""A parameter of every effect on a stiffness."""
 
 
 @dataclass(slots=True, eq=False)
 class Reading:
-    """n readings on their way back to what the PSDs would have shown: ``dots`` (4, n) m,
-    ``sums`` (2, n) V, ``warmer`` (n,) K, ``t`` (n,) s. Changed in place.
+    """n readings during the correction: ``dots`` (4, n) m, ``sums`` (2, n) V, ``warmer`` (n,) K,
+    ``t`` (n,) s. Changed in place.
     """
 
     dots: FloatArray
@@ -116,15 +115,15 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """One physical effect: what it is, where it acts, and how.
+    """One physical effect: its description, where it acts, and how.
 
     ``equation`` and ``source`` are for the reader. ``needs``: the excitation that shows it.
     ``configure`` changes the constants before a run; ``apply`` changes a chunk at ``point``;
-    ``correct`` undoes it on a reading, where that is possible without the load. What moves the
-    beams (``point`` is ``beam``) or the constants of the optics needs no ``correct``. ``uses``: what
-    the correction must know besides dots and sums. ``order``: among the effects of one stage.
-    ``finite``: the signature at the nominal value vanishes, so that only the values of ``grid`` are
-    probed, each as it is. Raises ValueError where the declaration contradicts itself.
+    ``correct`` undoes it on a reading, if that is possible without the load. An effect that moves
+    the beams (``point`` is ``beam``) or changes the constants of the optics needs no ``correct``.
+    ``uses``: inputs of the correction besides dots and sums. ``order``: among the effects of one
+    stage. ``finite``: the signature at the nominal value vanishes, so exactly the values of
+    ``grid`` are probed. Raises ValueError if the declaration contradicts itself.
     """
 
     name: str
@@ -170,7 +169,7 @@ class Effect:
 
     @property
     def lattice(self) -> str:
-        """The parameter that is the step on whose multiples all readings lie, or none."""
+        """The name of the parameter that is the step of all readings, '' if there is none."""
         return next((p.name for p in self.parameters if p.propose == 'lattice'), '')
 
     def parameter(self, name: str) -> EffectParameter:

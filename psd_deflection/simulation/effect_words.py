@@ -1,4 +1,4 @@
-"""Effects in words, as a command line gives them: ``NAME,KEY=VALUE,...``."""
+"""Effects in the notation of the command line: ``NAME,KEY=VALUE,...``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Load histories and temperatures in words, as a command line gives them."""
+"""Load histories and temperatures in the notation of the command line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Load histories: what is known to pull at the tip, sample by sample.
+"""Load histories: the known load at the tip, sample by sample.
 
 The thesis hangs 10, 30 and 50 N on a sidebar, 0.585 m from the link on its +X side, and on the
 link itself (thesis chapter 5). A weight pulls along -Y; on the sidebar it also turns the tip by
@@ -17,7 +17,7 @@ from psd_deflection.errors import RecordingError
 from psd_deflection.records import FloatArray
 
 SIDEBAR_ARM = 0.585
-"""Where the weight hangs on the sidebar, m from the link, toward +X."""
+"""Place of the weight on the sidebar, m from the link, toward +X."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,7 +31,7 @@ class LoadHistory:
         return len(self.loads)
 
     def then(self, *others: LoadHistory) -> LoadHistory:
-        """This one, then the others (all at this one's rate)."""
+        """This history, followed by the others (all at its rate)."""
         return LoadHistory(np.concatenate([self.loads, *(o.loads for o in others)]), self.sample_rate_hz)
 
 
@@ -89,7 +89,7 @@ def thesis_load_cases(dwell: float = 4.0, rate: float = 1000.0) -> LoadHistory:
 
 
 def identification(rate: float = 1000.0) -> LoadHistory:
-    """24 s in which every effect of the catalogue that one recording can show is excited.
+    """24 s that excite every effect of the catalogue that one recording can show.
 
     Steps of weight on the sidebar and on the link, pulls along X, torque both ways, back through
     the same levels (hysteresis), and a chirp through both modes.
@@ -149,13 +149,13 @@ def from_csv(path: str | Path, rate: float = 1000.0) -> LoadHistory:
     t = np.asarray(times) - times[0]
     step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
     wanted = np.arange(_count(float(t[-1]) + step, rate)) / rate
-    # Half a nanosecond of grace, so that a row written at a sample's own time holds from it.
+    # Half a nanosecond of tolerance, so a row at a sample's time applies from that sample.
     index = np.clip(np.searchsorted(t, wanted + 0.5e-9, side='right') - 1, 0, len(t) - 1)
     return LoadHistory(np.asarray(rows)[index], rate)
 
 
 class CyclicLoads:
-    """A history over and over, for a device that never ends; the first time from sample ``start`` on."""
+    """A history that repeats, for a device that never ends; it begins at sample ``start``."""
 
     def __init__(self, history: LoadHistory, start: int = 0) -> None:
         if len(history) == 0:

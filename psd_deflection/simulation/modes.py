@@ -33,8 +33,8 @@ def mode_coefficients(frequency: float, damping_ratio: float, period: float) -> 
 def lag_coefficients(time_constant: float, period: float) -> tuple[FloatArray, FloatArray]:
     """First-order low-pass tau y' = u - y of a smooth input: numerator (4,), denominator (2,).
 
-    Exact for an input that is a cubic through its last four samples: on modes of tens of hertz at
-    1 kHz a straight line between samples would be wrong by a percent of the lag.
+    Exact for an input that is a cubic through its last four samples: for modes of tens of hertz at
+    1 kHz, linear interpolation between samples would cause an error of 1 % of the lag.
     """
     a = period / time_constant
     e = math.exp(-a)
@@ -68,7 +68,7 @@ def held_lag_coefficients(time_constant: float, period: float) -> tuple[FloatArr
 
 
 class Filter:
-    """A linear filter that remembers: any splitting of its input gives the same output, bit for bit.
+    """A linear filter with state: any splitting of its input gives the same output, bit for bit.
 
     ``start``: the constant input before the first sample (the filter is settled on it).
     """

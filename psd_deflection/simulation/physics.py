@@ -1,4 +1,4 @@
-"""The constants one simulation runs on: those of the rig file, which effects may change."""
+"""The constants of one simulation: from the rig file, changed by effects."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Physics:
 
     @classmethod
     def of(cls, rig: Rig) -> Physics:
-        """The nominal constants of a rig file: no effect is in them."""
+        """The nominal constants of a rig file, without effects."""
         return cls(
             period=1.0 / rig.converter.sample_rate_hz,
             length=rig.link.length,
@@ -76,10 +76,10 @@ class Physics:
 
     @property
     def force_compliance(self) -> float:
-        """Tip deflection per force at the tip, m/N: L^3/3EI, and the clamp's turn by F L times L."""
+        """Tip deflection per force at the tip, m/N: L^3/3EI, plus the clamp's rotation by F L times L."""
         return self._statics.deflection(1.0, 0.0, 0.0)[0] + self.clamp_bending * self.length**2
 
     @property
     def torque_compliance(self) -> float:
-        """Twist per torque, rad/(N m): L/GJ and the clamp's own."""
+        """Twist per torque, rad/(N m): L/GJ plus the clamp's compliance."""
         return self._statics.deflection(0.0, 0.0, 1.0)[2] + self.clamp_torsion

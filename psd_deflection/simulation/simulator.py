@@ -1,10 +1,10 @@
-"""The forward model: loads in, converter counts out, as a whole or in steps of any size.
+"""The forward model: from loads to converter counts, all at once or in steps of any size.
 
-Theory of operation. A :class:`Chunk` holds consecutive samples, one row a quantity, and passes the
-stages in order. What must be remembered between chunks (modes, hysteresis, delays) lives in the
-simulator, so that a history cut anywhere gives the same samples bit for bit; for this everything
-is elementwise or a recursive filter, and the noise is drawn sample by sample. Effects hook in at
-named points (:data:`~psd_deflection.simulation.declaration.Point`).
+Theory of operation. A :class:`Chunk` holds consecutive samples, one row per quantity, and passes
+the stages in order. The simulator keeps the state between chunks (modes, hysteresis, delays), so a
+history cut anywhere gives the same samples bit for bit. For this reason every operation is
+elementwise or a recursive filter, and the noise is drawn sample by sample. Effects act at named
+points (:data:`~psd_deflection.simulation.declaration.Point`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from psd_deflection.simulation.physics import Physics
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedChunk:
-    """What :meth:`RigSimulator.step` gives for n samples.
+    """The result of :meth:`RigSimulator.step` for n samples.
 
     ``counts`` int16 (n, 6): converter counts in the order of ``CHANNELS``. ``pose`` (n, 3): true
     dX m, dY m, theta rad. ``dots`` (n, 4): true x1 y1 x2 y2 on the plate, m.
@@ -41,7 +41,7 @@ class SimulatedChunk:
 class ForwardModel:
     """The stages without noise and converter; keeps its state between calls.
 
-    ``effects``: what is on; by default those of the rig file.
+    ``effects``: the active effects; by default those of the rig file.
     """
 
     def __init__(self, rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> None:
@@ -102,13 +102,13 @@ class ForwardModel:
         return chunk
 
     def finish(self, chunk: Chunk) -> None:
-        """What acts on the signal with its noise on it: clipping and coarse steps."""
+        """Apply the effects that act on the noisy signal: clipping and coarse steps."""
         self._at('output', chunk)
 
     def expect(self, loads: FloatArray, temperature: FloatArray | None = None) -> Chunk:
         """Like :meth:`run`, then the mean of the output over the rig's noise.
 
-        What leaves the converter's range stays at its ends, as in a recording.
+        Values beyond the converter's range are limited to its ends, as in a recording.
         """
         chunk = self.run(loads, temperature)
         chunk.noise = self.physics.noise

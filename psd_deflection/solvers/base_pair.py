@@ -1,6 +1,6 @@
 """``base_pair``: lasers at the tip, PSDs at the base, in two planes (the thesis's section 5.3).
 
-Now the tip's tilt carries the beam along: PSD i, a distance L_i = -h_i below the tip, sees
+Here the tip's tilt turns the beams: PSD i, a distance L_i = -h_i below the tip, sees
 
     X_i = dX + a_ix/cos(omega) - L_i tan(omega),
     Y_i = dY + a_iy/cos(phi) - a_ix tan(omega) tan(phi) + L_i tan(phi)/cos(omega),     a_i = R(theta) l_i,
@@ -9,10 +9,10 @@ which is exact for R = Ry(omega) Rx(phi) Rz(theta). 5.4-5.7 are its small-angle 
 (their tan phi is -tan phi here; 5.3's factor of 1.5 *opposes* the translation: for PSDs at the clamp
 a dot moves by (1 - k) dY, which at k = 1 is Fig. 5.9, nothing at all).
 
-5.6 takes both lasers' translations as equal, which any torsion breaks: four readings, five unknowns.
-0.1 degree of twist is then read as 1 mm of dY. So one must say what closes the system: ``no_twist``
-(5.3's own assumption: dX, dY, phi, omega), or ``beam`` (phi = -k dY/L, omega = +k dX/L: dX, dY, theta,
-and one plane will do unless k L_i/L = 1).
+5.6 assumes equal translations of both lasers, which is false under torsion: then 0.1 degree of twist
+is read as 1 mm of dY. Four readings cannot give five unknowns, so the caller must choose an
+assumption: ``no_twist`` (5.3's own assumption: dX, dY, phi, omega), or ``beam`` (phi = -k dY/L, omega
+= +k dX/L: dX, dY, theta, and one plane is enough unless k L_i/L = 1).
 """
 
 from __future__ import annotations
@@ -33,15 +33,14 @@ from psd_deflection.solvers.interface import Solution, Solutions, Solver, Solver
 Assume = Literal['beam', 'no_twist', 'nothing']
 
 _SMALLEST_GAIN = 1e-3
-"""Dot travel per travel of an unknown below which we say that it cannot be seen."""
+"""If a dot moves by less than this per unit of an unknown, the unknown counts as unseen."""
 
 
 class BasePairSolver(Solver):
     """PSDs fixed to the base, lasers on the tip plate, beams along -Z of the plate; P >= 2.
 
     ``Geometry.centers``: of the PSDs, in base axes. ``heights``: of their planes over the tip section,
-    below zero: -L_i. ``beams`` = centers + zeros: where the lasers sit on the plate. Dots are read in
-    base axes.
+    below zero: -L_i. ``beams`` = centers + zeros: the lasers' places on the plate. Dots are in base axes.
     """
 
     name: ClassVar[str] = 'base_pair'
@@ -50,8 +49,7 @@ class BasePairSolver(Solver):
     def __init__(self, geometry: Geometry, assume: Assume = 'beam') -> None:
         """Bind to ``geometry`` under the assumption ``assume`` (see the module).
 
-        Raises ConfigError for another assumption, SolverError with the reason if that leaves
-        something unseen.
+        Raises ConfigError for another assumption, SolverError with the reason if an unknown cannot be seen.
         """
         self._count = check_twist(geometry)
         heights = np.asarray(geometry.heights, dtype=np.float64)

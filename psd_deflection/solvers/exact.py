@@ -4,14 +4,14 @@ The flat plate's model, m_i = R(-theta)(l_i - d) - c_i, has no small angle in it
 
     F = sum_i wx_i rx_i^2 + wy_i ry_i^2,     r_i = q_i - R(-theta) l_i + f,   f = R(-theta) d,
 
-with w the inverse variances. For a given theta the best f is a weighted mean for each axis; what is
-left is a function of one angle,
+with w the inverse variances. For a given theta the best f is a weighted mean for each axis; the
+rest is a function of one angle,
 
     F/2 = (P c^2 + 2 Q c s + R s^2)/2 - A c - B s + constant,     c = cos theta, s = sin theta.
 
-Where the weights of x and y agree, Q = 0 and P = R, and tan theta = B/A is the closed form (the
+If the weights of x and y agree, Q = 0 and P = R, and tan theta = B/A is the closed form (the
 orthogonal Procrustes problem: Schoenemann 1966; Arun, Huang & Blostein 1987). For two PSDs that is
-the turn of the base line between the dots, whatever the weights of the PSDs. Otherwise Newton's
+the rotation of the base line between the dots, whatever the weights of the PSDs. Otherwise Newton's
 method starts there and doubles its digits each time. The covariance is (J^T W J)^-1 at the answer.
 """
 
@@ -47,8 +47,8 @@ _CHUNK = 4096
 class ExactSolver(Solver):
     """Maximum likelihood for a flat plate, P >= 2 PSDs, exact in the angle.
 
-    ``Geometry.heights`` and tilts are not in its model; cantilever tilts of the thesis rig cost it
-    at most some micrometres (``docs/methods.md``), the ``beam`` solver removes that.
+    Its model ignores ``Geometry.heights`` and tilts. On the thesis rig the cantilever's tilts cause
+    errors of at most some micrometres (``docs/methods.md``); the ``beam`` solver removes them.
     """
 
     name: ClassVar[str] = 'exact'
@@ -98,7 +98,7 @@ class ExactSolver(Solver):
             )
         if theta != theta or steps == _MAX_STEPS:
             status = SolverStatus.NOT_CONVERGED
-        # The base line under the beams, in plate axes, and what the dots miss it by.
+        # The base line under the beams, in plate axes, and the dots' difference from it.
         px = c * lx + s * ly
         py = c * ly - s * lx
         ex = (qx - px) * mx
@@ -111,7 +111,7 @@ class ExactSolver(Solver):
         dx = l1x - c * p1x + s * p1y
         dy = l1y - s * p1x - c * p1y
         vtt = 1.0 / (mx * py * py + my * px * px)
-        # Weighted mean of the plate points: of y with the weights of x, and the other way round.
+        # Weighted means of the plate points: of y with the weights of x, and vice versa.
         mean_y = p1y - py * vx1 * mx
         mean_x = p1x - px * vy1 * my
         vxt = mean_y * vtt
@@ -160,7 +160,7 @@ class ExactSolver(Solver):
         theta = np.arctan2(across, along)
         if (mx == my).all():
             converged = np.isfinite(theta)
-            # cos and sin of the arctangent, for the price of one root.
+            # cos and sin of the arctangent with one square root.
             size = np.hypot(along, across)
             with np.errstate(invalid='ignore'):
                 c = np.where(size != 0.0, along / size, 1.0)
@@ -282,7 +282,7 @@ def _newton(
         turned = c * c - s * s
         slope = difference * s * c + mixed * turned + along * s - across * c
         curvature = difference * turned - 4.0 * mixed * s * c + along * c + across * s
-        # The magnitude of the curvature: a step is always downhill.
+        # The magnitude of the curvature makes every step go downhill.
         step = slope / abs(curvature)
         theta -= step
         c = cos(theta)
@@ -295,7 +295,7 @@ def _newton(
 def _newton_many(
     theta: FloatArray, difference: FloatArray, mixed: FloatArray, along: FloatArray, across: FloatArray
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """:func:`_newton` for n blocks, until the slowest has ended; with which of them converged."""
+    """:func:`_newton` for n blocks, until the slowest ends; also returns which converged."""
     converged = np.zeros(theta.shape, dtype=bool)
     for _ in range(_MAX_STEPS):
         c = np.cos(theta)

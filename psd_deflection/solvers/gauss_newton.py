@@ -1,8 +1,8 @@
-"""Gauss-Newton, once in floats for a block and once vectorised for n: the driver of several methods.
+"""Gauss-Newton in floats for one block and vectorised for n blocks; several methods use it.
 
 A model gives predicted readings and their derivatives; the driver repeats x <- x + (J^T W J)^-1 J^T W r
-until a step no longer matters. Residuals of some micrometres on a rig of decimetres make each step
-some thousand times smaller than the one before, so that four or five suffice. The covariance is
+until a step no longer matters. The residuals are micrometres and the rig is decimetres, so each
+step is some thousand times smaller than the one before, and four or five suffice. The covariance is
 (J^T W J)^-1 at the last step.
 """
 
@@ -87,7 +87,7 @@ def fit(model: Model, start: Sequence[float], measured: Sequence[float], varianc
             largest = max(largest, abs(change))
         steps += 1
         if largest < LAST_STEP:
-            # So small a step moves the residual along the derivatives, to the last digit.
+            # For so small a step the linear model of the residual is exact to the last digit.
             residual = [
                 r - sum([a * b for a, b in zip(row, step, strict=True)]) for r, row in zip(residual, rows, strict=True)
             ]
@@ -97,7 +97,7 @@ def fit(model: Model, start: Sequence[float], measured: Sequence[float], varianc
 
 
 def _invert(lower: list[list[float]]) -> list[list[float]] | None:
-    """The inverse of a symmetric positive matrix of which the lower half is given (Cholesky)."""
+    """The inverse of a symmetric positive matrix, given its lower half (Cholesky)."""
     p = len(lower)
     for i in range(p):
         line = lower[i]
@@ -137,7 +137,7 @@ def fit_many(model: ModelMany, start: FloatArray, measured: FloatArray, variance
     weights = np.broadcast_to(1.0 / positive(variances), measured.shape)
     out = Fits(start.copy(), np.empty((n, p, p)), np.empty(measured.shape), np.zeros(n, dtype=bool))
     for first in range(0, n, CHUNK):
-        # A block that has converged is left alone: its answer does not depend on its neighbours.
+        # Converged blocks are not changed, so an answer does not depend on its neighbours.
         active = np.arange(first, min(first + CHUNK, n))
         for _ in range(MAX_STEPS):
             predicted, rows = model(out.parameters[active])

@@ -1,13 +1,13 @@
-"""What every solver takes and gives, for one block and for many.
+"""The inputs and outputs of every solver, for one block and for many.
 
 Theory of operation. A dot reading m_i is where laser i falls on PSD i, from the PSD's centre c_i,
-in plate axes. Before load it was m_i0, so the beam stands at l_i = c_i + m_i0, fixed to the base,
-and the plate point under it now is q_i = c_i + m_i. A flat plate that moved by d = (dX, dY) and
-turned by theta about +Z has q_i = Rz(-theta)(l_i - d); a solver inverts this, or the fuller model
-with tilts phi (about X) and omega (about Y), R = Ry(omega) Rx(phi) Rz(theta).
+in plate axes. Before load it was m_i0, so the beam is at l_i = c_i + m_i0, fixed to the base. The
+plate point under it is now q_i = c_i + m_i. A flat plate that moved by d = (dX, dY) and turned by
+theta about +Z has q_i = Rz(-theta)(l_i - d); a solver inverts this, or the fuller model with tilts
+phi (about X) and omega (about Y), R = Ry(omega) Rx(phi) Rz(theta).
 
-``solve`` takes plain floats and gives plain floats: it is called once a block in real time, where
-numpy's cost per call would dominate. ``solve_many`` is vectorised over n blocks.
+``solve`` takes and returns plain floats: it is called once per block in real time, and numpy's cost
+per call would dominate. ``solve_many`` is vectorised over n blocks.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Solver(abc.ABC):
 
     @classmethod
     def options_from_rig(cls, rig: Rig) -> dict[str, Any]:
-        """What the method takes from the rig file beside the geometry: keyword arguments of the class."""
+        """The options that the method reads from the rig file: keyword arguments of the class."""
         return {}
 
     @abc.abstractmethod

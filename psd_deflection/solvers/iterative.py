@@ -1,15 +1,15 @@
-"""``iterative``: the thesis's section 2.2 as it was meant.
+"""``iterative``: the thesis's section 2.2, corrected.
 
-Turn both dots back about the tip's centroid by one trial angle theta; each PSD then says by itself
-how far the tip went (2.18, 2.19),
+Turn both dots back about the tip's centroid by one trial angle theta; each PSD then gives a
+translation of the tip (2.18, 2.19),
 
     Delta_i = l_i - R(theta) q_i.
 
-At the right angle they agree. The thesis steps the angle by 0.01 degree and stops at the first
-trial where the differences are *below* a tolerance (2.20-2.23, without a magnitude), with one
-angle a PSD; that stops up to 57 mdeg too early, or at zero. Here the trial angle is one for both,
-the disagreement is counted alike in x and y and in both signs, and the angle is corrected by what
-the disagreement says until it changes no more. d is then the mean of the Delta_i.
+At the right angle they agree. The thesis steps the angle by 0.01 degree, with its own angle for
+each PSD. It stops at the first trial at which the signed differences are *below* a tolerance
+(2.20-2.23). That is up to 57 mdeg too early, or at zero. Here both PSDs share the trial angle, and
+the disagreement counts equally in x and y and in both signs. The disagreement gives a correction of
+the angle, repeated until the angle no longer changes. d is then the mean of the Delta_i.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _LAST_STEP = 1e-8
 
 
 _LARGEST_STEP = 0.5
-"""rad. A larger correction is a tangent far from where it was drawn."""
+"""rad. For a larger correction the tangent is not a good approximation."""
 
 
 class IterativeSolver(Solver):
-    """Trial angles until the PSDs agree, P >= 2 PSDs. All dots count alike, whatever their noise.
+    """Trial angles until the PSDs agree, P >= 2 PSDs. All dots have equal weight, whatever their noise.
 
     The covariance is that of this unweighted answer: G V G^T, V the dots' own.
     """
@@ -67,7 +67,7 @@ class IterativeSolver(Solver):
             my += qy
         mx /= count
         my /= count
-        # How well the turned dots lie along the beams, and how far across: all that a trial needs.
+        # Dot and cross product of the turned dots and the beams: all that a trial needs.
         along = across = 0.0
         for qx, qy, lx, ly in plate:
             along += (qx - mx) * lx + (qy - my) * ly

@@ -1,15 +1,15 @@
-"""``minimum_tilt``: what four readings leave of the thesis's section 2.3.
+"""``minimum_tilt``: the part of the thesis's section 2.3 that four readings can determine.
 
-Section 2.3 looks for two tilts beside dX, dY and theta. Four readings cannot give five unknowns: one
-dot fixes the translation, and M(q_1 - q_2) = l_1 - l_2 is two equations for three angles. Put right
-(``thesis.tilt_branches``), its chain reproduces all four readings for *any* admissible trial angle, so
-that its stopping test (2.46-2.49) says nothing.
+Section 2.3 looks for two tilts besides dX, dY and theta. Four readings cannot give five unknowns:
+one dot fixes the translation, and M(q_1 - q_2) = l_1 - l_2 is two equations for three angles. With
+its errors corrected (``thesis.tilt_branches``), the method reproduces all four readings for *any*
+admissible trial angle. So its stopping test (2.46-2.49) has no meaning.
 
-What can be seen: the azimuth of the base line, which is theta to within phi omega / 2, and by how much
-the base line is foreshortened, |l_12| = |q_12| cos beta. The smallest tilt that explains it leans the
-plate by beta along the base line, one way *or the other*: the dots are the same for (phi, omega) and
-(-phi, -omega). A tilt about the base line leaves no trace. The answer carries the branch that leans
-PSD 1 towards the base; dX, dY and theta are the same for both.
+Two things can be measured: the azimuth of the base line, which is theta to within phi omega / 2, and
+the foreshortening of the base line, |l_12| = |q_12| cos beta. The smallest tilt that explains it leans
+the plate by beta along the base line, one way *or the other*: the dots are the same for (phi, omega)
+and (-phi, -omega). A tilt about the base line does not change the dots. The answer gives the branch
+that leans PSD 1 towards the base; dX, dY and theta are the same for both.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from psd_deflection.solvers.interface import Solution, Solutions, Solver, Solver
 from psd_deflection.solvers.plane import Covariance, split, turn_covariance
 
 _TOO_SHORT = 3.0
-"""Standard deviations by which the base line may be shorter than the beams' before we say so."""
+"""The base line may be shorter than the distance of the beams by this many standard deviations."""
 
 
 class MinimumTiltSolver(Solver):
     """The least tilt along the base line that explains its length; two PSDs at height 0.
 
     ``theta`` is the turn of the base line's projection. ``INADMISSIBLE``: the base line on the plate
-    is shorter than between the beams by more than three standard deviations, which no tilt can do.
-    Within that, the tilt is 0 and the answer the flat plate's. The covariance holds away from zero
-    tilt; near it the tilt is not a smooth function of the readings.
+    is shorter than between the beams by more than three standard deviations, which no tilt
+    explains. Within that, the tilt is 0 and the answer is the flat plate's. The covariance holds
+    away from zero tilt; near it the tilt is not a smooth function of the readings.
     """
 
     name: ClassVar[str] = 'minimum_tilt'

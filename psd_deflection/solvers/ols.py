@@ -1,4 +1,4 @@
-"""``ols``: ordinary least squares on the linearised plate, with the design matrix put right.
+"""``ols``: ordinary least squares on the linearised plate, with the corrected design matrix.
 
 The thesis's section 4.2 (4.24, x = A+ b) with the corrected rows of ``geometry.linear`` and the pre-load
 readings subtracted. On exact data of a flat plate it gives theta' = sin theta and

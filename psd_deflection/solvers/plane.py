@@ -1,4 +1,4 @@
-"""The flat plate's shared algebra: what one motion does to the dots, and what dot noise does back.
+"""Shared algebra of the flat plate: from motion to dots, and from dot noise to the estimate.
 
 With p_i = R(-theta)(l_i - d) the plate point under beam i and f = R(-theta) d, a small change of
 pose moves dot i by
@@ -6,9 +6,9 @@ pose moves dot i by
     dx_i = -df_x + p_iy dtheta,      dy_i = -df_y - p_ix dtheta,
 
 the corrected rows of the thesis's design matrix (4.5, 4.6) with p_i for l_i. Each axis has its own
-weighted mean, which eliminates f and leaves one unknown; so neither the estimate nor its covariance
-needs a matrix. ``solve`` of each method is written out in floats on these formulas; here is the
-form for n blocks.
+weighted mean. This eliminates f and leaves one unknown, so neither the estimate nor its covariance
+needs a matrix. Each method's ``solve`` writes these formulas out in floats; this module has them
+for n blocks.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """``pose``: three or more PSDs at different heights see the tilts themselves, without a beam theory.
 
 Coplanar surfaces under parallel beams see a tilt only through foreshortening: nothing at zero tilt, a
-fifth of a degree of noise at 0.3 degree, and never its sign. Surfaces staggered along Z turn a tilt
-into a displacement of h tan(tilt): with h = (+100, -50, -50) mm and 2 um of noise the tilts come out
-to about a millidegree. Five unknowns, 2P readings, Gauss-Newton from the flat plate's answer.
+noise of 0.2 degree at 0.3 degree, and never its sign. Surfaces at different heights turn a tilt into
+a displacement of h tan(tilt): with h = (+100, -50, -50) mm and 2 um of noise the tilts have a
+deviation of about a millidegree. Five unknowns, 2P readings, Gauss-Newton from the flat plate's
+answer.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Names to methods: the one list of what ``solver:`` and ``solvers:`` of a rig file may say.
+"""The solver names that ``solver:`` and ``solvers:`` of a rig file may contain.
 
-A method joins by its class (see :class:`~psd_deflection.solvers.interface.Solver`: it says itself which parameters
-are its options and how its errors are budgeted) and by a line here. Its module is imported when the method is
-asked for.
+To add a method, write a class (see :class:`~psd_deflection.solvers.interface.Solver`) and add a line here. The
+class declares which parameters are its options and how its errors are budgeted. The module is imported only when
+the method is used.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from psd_deflection.solvers.interface import Solver
 
 
 class Entry(NamedTuple):
-    """``path``: ``module:class``. ``instead``: of a method that is for comparison only, what a live run takes."""
+    """``path``: ``module:class``. ``instead``: for a comparison-only method, the method to use in a live run."""
 
     path: str
     instead: str = ''

@@ -1,13 +1,13 @@
-"""``wls``: weighted least squares on the linearised plate, with the design matrix put right.
+"""``wls``: weighted least squares on the linearised plate, with the corrected design matrix.
 
 The thesis's section 4.3 with the corrected rows of ``geometry.linear`` and the pre-load readings
 subtracted. The weights are the inverse variances. The thesis's own choice, rows scaled by
-Po = [0.03, 0.5, 10, 0.1], makes W = Po^2 (its 4.25 and its code differ on that); it is kept under
-the name ``thesis``. It is no statement about noise: it takes dX from x2 and dY from y1 alone and
-ignores x1, which is what hides the wrong sign in the source's matrix.
+Po = [0.03, 0.5, 10, 0.1], makes W = Po^2 (its 4.25 and its code differ on that). This choice is
+kept under the name ``thesis``. It does not describe the noise: it takes dX from x2 alone and dY
+from y1 alone. It ignores x1, and that hides the wrong sign in the thesis's matrix.
 
-With the inverse variances each axis has its own weighted mean, and what is left is one equation for
-theta; no matrix is inverted. Linear still means that d comes out unturned; ``wls_exact`` undoes that.
+With the inverse variances each axis has its own weighted mean, which leaves one equation for theta;
+no matrix is inverted. The linear model still leaves d unrotated; ``wls_exact`` corrects this.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ Weights = Literal['inverse_variance', 'thesis']
 class WlsSolver(Solver):
     """Weighted linear least squares, P >= 2 PSDs.
 
-    With the weights ``thesis`` the covariance is G V G^T for the gain G that those weights make:
-    they are not the noise's, so (A^T W A)^-1 would not be the estimate's covariance.
+    With the weights ``thesis`` the covariance is G V G^T for the gain G of those weights. (A^T W
+    A)^-1 would be wrong, because they are not the inverse variances.
     """
 
     name: ClassVar[str] = 'wls'

@@ -1,4 +1,4 @@
-"""``wls_exact``: the linear answer of ``wls``, with what linearising did to it undone exactly.
+"""``wls_exact``: the linear answer of ``wls``, with the linearisation error removed exactly.
 
 On a flat plate b = m - m_0 = (R(-theta) - I) l_i - f, f = R(-theta) d. Put into the weighted linear
 solution this gives, for any weights and any size of angle,
@@ -8,7 +8,7 @@ solution this gives, for any weights and any size of angle,
     dY'    = f_y + xbar_y (sin theta - theta') + ybar_y (1 - cos theta),
 
 with means of the beams weighted by wx (.._x) and wy (.._y) and kappa a number of the rig and the
-weights (0 where the weights of x and y agree: then theta = asin theta'). One arcsine inverts it. The
+weights (0 if the weights of x and y agree: then theta = asin theta'). One arcsine inverts it. The
 readings are combined as ``wls`` combines them, ``thesis`` weights included.
 """
 
@@ -28,10 +28,10 @@ from psd_deflection.solvers.wls import THESIS_ROW_SCALING, Weights, WlsSolver
 
 
 class WlsExactSolver(Solver):
-    """``wls`` without the small angle, P >= 2 PSDs; options as of :class:`WlsSolver`.
+    """``wls`` without the small-angle approximation, P >= 2 PSDs; same options as :class:`WlsSolver`.
 
-    ``INADMISSIBLE``: the readings ask for a sine above 1. The residual is that of ``wls``'s linear
-    model, whose combination of the readings this is.
+    ``INADMISSIBLE``: the readings need a sine above 1. The residual is that of the linear model of
+    ``wls``, because the readings are combined in the same way.
     """
 
     name: ClassVar[str] = 'wls_exact'
@@ -43,7 +43,7 @@ class WlsExactSolver(Solver):
         weights: Weights = 'inverse_variance',
         row_scaling: tuple[float, ...] = THESIS_ROW_SCALING,
     ) -> None:
-        """Bind to ``geometry``; options and errors as of :class:`WlsSolver`."""
+        """Bind to ``geometry``; same options and errors as :class:`WlsSolver`."""
         self._wls = WlsSolver(geometry, weights, row_scaling)
         self._beams = np.asarray(geometry.beams, dtype=np.float64)
         self._rows = tuple((lx, ly) for lx, ly in self._beams.tolist())
@@ -55,7 +55,7 @@ class WlsExactSolver(Solver):
 
     @classmethod
     def options_from_rig(cls, rig: Rig) -> dict[str, Any]:
-        """As of ``wls``."""
+        """The same as for ``wls``."""
         return WlsSolver.options_from_rig(rig)
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
@@ -94,7 +94,7 @@ class WlsExactSolver(Solver):
         versine = 2.0 * sin(0.5 * theta) ** 2
         fx = linear.dx + xy * (s - linear.theta) - xx * versine
         fy = linear.dy - yx * (s - linear.theta) - yy * versine
-        # The way from a change of the linear answer to one of this answer, in plate axes.
+        # Derivative of this answer by the linear answer, in plate axes.
         slope = 1.0 / (c - kappa * s)
         tx = -fy * slope + xy * (c * slope - 1.0) - xx * s * slope
         ty = fx * slope - yx * (c * slope - 1.0) - yy * s * slope

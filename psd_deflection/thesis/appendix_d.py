@@ -1,15 +1,15 @@
-"""``appendix_d``: the thesis's MATLAB code for the iterative method, branch and all; for comparison only.
+"""``appendix_d``: the thesis's MATLAB code for the iterative method, unchanged; for comparison only.
 
-Kept to see what its published figures are made of. Its faults are its own:
+It is kept to explain the thesis's published figures. The code has these faults:
 
 - ``tA || tB && rA && ...`` binds as ``tA || (tB && rA)``: direction A (clockwise) is taken on the x test
   alone, and the ``elseif`` of direction B is reached by ``tB && rB`` only;
-- the y test is a ratio within 3 %, so that its window closes as dY goes to 0: 84 % of counter-clockwise
-  twists with |dY| < 50 um find no trial, and the zeros of the first lines are returned as a measurement;
-- where dY is about 100 mm times theta, direction A accepts a counter-clockwise twist, with its sign wrong.
+- the y test is a ratio within 3 %, so its window closes as dY goes to 0: 84 % of counter-clockwise
+  twists with |dY| < 50 um find no trial, and the code returns its initial zeros as a measurement;
+- if dY is about 100 mm times theta, direction A accepts a counter-clockwise twist, with the wrong sign.
 
-Text lost in the listing is restored from its neighbours: the left side of ``PSD2_x_Diff_A = ...``, both
-``Vert_Disp = ...``, and ``INIT_XI`` is ``INIT_X1``.
+Text missing from the printed listing is restored from similar lines: the left side of ``PSD2_x_Diff_A =
+...``, both ``Vert_Disp = ...``, and ``INIT_XI`` is ``INIT_X1``.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _MM = 1e3
 
 
 class AppendixDResult(NamedTuple):
-    """What the code returns, in its own units: mm, mm, degrees clockwise. ``branch``: where it left."""
+    """The code's result in its own units: mm, mm, degrees clockwise. ``branch``: the branch that returned."""
 
     horz_disp: float
     vert_disp: float

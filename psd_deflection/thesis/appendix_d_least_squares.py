@@ -2,9 +2,9 @@
 
 Its matrix (4.12 with theta_1 = -90, theta_2 = -180 degrees) has rows of two different rigs: with PSD 1
 above and PSD 2 on the -X side, the torsion entries of the two PSDs disagree in sign. A twist theta then
-comes out as 0.342 theta in plain least squares, 0.912 theta with the sidebar's weights (which silence x1,
-and with it most of the contradiction: the source found them "closest to calibration data"), and -0.995
-theta with those for direct loads (which silence y2). The pre-load readings are not subtracted.
+comes out as 0.342 theta in plain least squares, 0.912 theta with the sidebar's weights (which suppress x1
+and with it most of the contradiction: the thesis found them "closest to calibration data"), and -0.995
+theta with those for direct loads (which suppress y2). The pre-load readings are not subtracted.
 """
 
 from __future__ import annotations

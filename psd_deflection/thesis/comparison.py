@@ -1,6 +1,6 @@
-"""How far each method is off, by condition; and where the figures of the thesis's Table 5.1 come from.
+"""The errors of each method, by condition, and the origin of the thesis's Table 5.1.
 
-Exact readings of a rig with the thesis's geometry go through every method; what comes out is the
+Exact readings of a rig with the thesis's geometry go through every method. The result is the
 method's own error, without noise. ``psd-deflection compare-methods`` prints it.
 """
 
@@ -27,11 +27,11 @@ DIRECT = (3.0, 0.5, 10.0, 0.1)
 """Po of the thesis for the load on the link itself (Figs 5.24-5.29)."""
 
 VARIANCES = np.full(4, (2e-6) ** 2)
-"""m^2. No noise is added; the methods ask for weights."""
+"""m^2. No noise is added, but the methods need variances for their weights."""
 
 
 class Method(NamedTuple):
-    """A row of the table. ``sign``: of theta, where the source's own is ambiguous (the better one)."""
+    """A row of the table. ``sign``: of theta, if the thesis leaves it ambiguous (the one that fits better)."""
 
     label: str
     name: str
@@ -58,16 +58,16 @@ VARIANTS: tuple[Method, ...] = (
     Method('beam, k = 1.5', 'beam', {}),
 )
 
-"""The printed methods and their corrected ones, with the options that the thesis has for them."""
+"""The printed methods and their corrected ones, with the thesis's options."""
 
 CONDITIONS = ('flat', 'independent tilts', 'cantilever tilts')
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Errors:
-    """Errors of one method under one condition, over the trials that gave a number.
+    """Errors of one method under one condition, over the trials that gave an answer.
 
-    ``rms``, ``largest`` (3,): dX m, dY m, theta rad. ``silent``: share of trials without a number.
+    ``rms``, ``largest`` (3,): dX m, dY m, theta rad. ``silent``: fraction of trials without an answer.
     """
 
     rms: FloatArray
@@ -128,7 +128,7 @@ def dots_of(geometry: Geometry, poses: FloatArray) -> FloatArray:
 
 
 def solve(method: Method, geometry: Geometry, dots: FloatArray) -> Solutions:
-    """What ``method`` makes of ``dots`` (n, 4)."""
+    """The answers of ``method`` for ``dots`` (n, 4)."""
     solutions = make_solver(method.name, geometry, **method.options).solve_many(dots, VARIANCES)
     solutions.pose[:, 2] *= method.sign
     return solutions
@@ -163,13 +163,13 @@ SIDEBAR_POSE = np.array([0.12e-3, -2.2272e-3, np.radians(-0.9407)])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cause:
-    """What may be amiss with the rig beside the algorithms. Lengths m, angles rad.
+    """A possible error of the rig, in addition to the algorithms' errors. Lengths m, angles rad.
 
     ``height``: of both surfaces. ``rotation``: of both PSDs in their plane. ``gain``: of all
     readings. ``beam_1``: slope of beam 1 in x and y. ``offset``: pre-load dot of PSD 1 and of
-    PSD 2, the same in x and y, which least squares leaves in (4.14). ``camera_roll``: of the camera's axes.
-    ``center``: error of the plate's centre. ``slope_ratio``: k. ``printed_matrix``: least squares
-    with the code's matrix.
+    PSD 2, the same in x and y, which least squares does not subtract (4.14). ``camera_roll``: of the
+    camera's axes. ``center``: error of the plate's centre. ``slope_ratio``: k. ``printed_matrix``: least
+    squares with the code's matrix.
     """
 
     label: str

@@ -46,7 +46,7 @@ _MDEG = 1e3 * 180.0 / np.pi
 
 
 def drawn() -> Iterator[tuple[str, Figure]]:
-    """Every figure and its name, one after the other; it is closed when the next is asked for."""
+    """Every figure and its name, one after the other; a figure is closed before the next is drawn."""
     with plt.rc_context(_STYLE):
         for name, draw in FIGURES.items():
             figure = draw()
@@ -59,7 +59,7 @@ def _arrow(ax: Any, start: tuple[float, float], end: tuple[float, float], color:
 
 
 def sign_convention() -> Figure:
-    """Plate, PSDs, beams; and which way each quantity is positive."""
+    """Plate, PSDs and beams, and the positive direction of each quantity."""
     figure, (front, side, top) = plt.subplots(1, 3, figsize=(9.6, 4.2), width_ratios=(1.35, 1, 1), layout='constrained')
     for ax in (front, side, top):
         ax.set_aspect('equal')
@@ -143,7 +143,7 @@ def comparison() -> Figure:
 
 
 def iterative() -> Figure:
-    """What the trial angle sees, and where each criterion stops."""
+    """The PSDs' disagreement against the trial angle, and where each criterion stops."""
     geometry = thesis_geometry()
     pose = np.array([0.5e-3, -1.2e-3, np.radians(0.55), 0.0, 0.0])
     dots = dots_of(geometry, pose[None])[0]
@@ -170,7 +170,7 @@ def iterative() -> Figure:
 
 
 def linear() -> Figure:
-    """What linearising leaves out, and which channels the weights listen to."""
+    """The error of linearising, and which channels the weights use."""
     geometry = thesis_geometry()
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.4), layout='constrained')
     theta = np.radians(np.linspace(-3, 3, 121))
@@ -227,10 +227,10 @@ def exact() -> Figure:
 
 
 def appendix_d() -> Figure:
-    """Where the code of Appendix D finds the twist, a wrong one, or none."""
+    """Where the code of Appendix D finds the right twist, a wrong one, or none."""
     geometry = thesis_geometry()
     dy, theta = np.meshgrid(np.linspace(-4e-3, 4e-3, 121), np.radians(np.linspace(-2, 2, 121)))
-    # Off any regular grid, which would beat with the trial angles.
+    # Random points, because a regular grid would beat with the trial angles.
     theta = theta + np.radians(0.03) * np.random.default_rng(4).uniform(-1.0, 1.0, theta.shape)
     poses = np.zeros((dy.size, 5))
     poses[:, 0], poses[:, 1], poses[:, 2] = 1e-4, dy.ravel(), theta.ravel()
@@ -264,7 +264,7 @@ def appendix_d() -> Figure:
 
 
 def minimum_tilt() -> Figure:
-    """The tilt found against the tilt there was, with noise."""
+    """Estimated against true tilt, with noise."""
     geometry = thesis_geometry()
     true = np.radians(np.linspace(0.0, 1.5, 61))
     along = (geometry.beams[0] - geometry.beams[1]) / np.hypot(*(geometry.beams[0] - geometry.beams[1]))
@@ -293,7 +293,7 @@ def minimum_tilt() -> Figure:
 
 
 def beam() -> Figure:
-    """What the tilt of a cantilever costs a flat method, by load and height of the sensors."""
+    """The error of a flat method due to the cantilever's tilt, by load and height of the sensors."""
     figure, axes = plt.subplots(1, 2, figsize=(8.6, 3.4), sharey=True, layout='constrained')
     force = np.linspace(2.0, 50.0, 25)
     for ax, height in zip(axes, (0.0, 0.020), strict=True):
@@ -329,7 +329,7 @@ def beam() -> Figure:
 
 
 def pose() -> Figure:
-    """How staggering three PSDs makes the tilts visible."""
+    """How three PSDs at different heights make the tilts visible."""
     steps = np.geomspace(2e-3, 0.1, 25)
     turns = np.radians([0.0, 120.0, 240.0])
     centers = 0.1 * np.column_stack((np.cos(turns), np.sin(turns)))
@@ -354,7 +354,7 @@ def pose() -> Figure:
 
 
 def base_pair() -> Figure:
-    """What twist does to the method of section 5.3, and what tying the tilts does about it."""
+    """The error of section 5.3's method under twist, and its correction by tying the tilts to the deflection."""
     nominal = thesis_geometry()
     geometry = Geometry(nominal.centers, nominal.zeros, np.array([-0.585, -0.485]), nominal.link_length, 1.5)
     theta = np.radians(np.linspace(-1, 1, 81))

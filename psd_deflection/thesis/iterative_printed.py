@@ -1,17 +1,17 @@
-"""``iterative_printed``: the thesis's section 2.2 as it stands on the page; for comparison only.
+"""``iterative_printed``: the thesis's section 2.2 as printed; for comparison only.
 
-Trial angles a = 0, 0.01, ... degree; both dots are turned back clockwise, then counter-clockwise, and
-the first trial is taken at which PSD 1's translation less PSD 2's is below a tolerance of 0.1 mm in x
-and in y (2.20-2.23). Three readings of those tests:
+Trial angles a = 0, 0.01, ... degree; both dots are rotated back clockwise, then counter-clockwise.
+The answer is the first trial at which PSD 1's translation minus PSD 2's is below a tolerance of 0.1
+mm in x and in y (2.20-2.23). There are three variants of the test:
 
-- ``printed``: no magnitudes, as on the page. A large negative difference passes too.
-- ``absolute``: with magnitudes, as surely meant. The first trial inside a window of 0.1 mm over the base
-  line's reach is taken, so that |theta| comes out up to 57 mdeg too small and dX, dY, taken from PSD 1
-  alone, off by that times its lever of 70 mm: about 0.07 mm.
+- ``printed``: no magnitudes, as printed. A large negative difference passes too.
+- ``absolute``: with magnitudes, as probably intended. The first trial inside a window of 0.1 mm over the
+  base line's reach is taken, so that |theta| comes out up to 57 mdeg too small and dX, dY, taken from
+  PSD 1 alone, off by that times its lever of 70 mm: about 0.07 mm.
 - ``argmin``: on the same grid of angles, the least difference, and the mean of both PSDs. Off by half a
   step at most.
 
-``iterative`` is the method put right.
+``iterative`` is the corrected method.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from psd_deflection.solvers.plane import split
 Criterion = Literal['printed', 'absolute', 'argmin']
 
 TOLERANCE = 0.1e-3
-"""m: the "arbitrary tolerance" of 2.20-2.23, as the code of Appendix D has it."""
+"""m: the "arbitrary tolerance" of 2.20-2.23, as in the code of Appendix D."""
 
 STEP_DEG = 0.01
 LAST_TRIAL = 400
 """Trials go to 4 degrees, as in Appendix D."""
 
 NO_COVARIANCE = (float('nan'),) * 9
-"""A threshold has no derivative, so that no covariance follows from it."""
+"""A threshold has no derivative, so there is no covariance."""
 
 _CHUNK = 4096
 
 
 class IterativePrintedSolver(Solver):
-    """Section 2.2 with its threshold; two PSDs. ``NO_HIT``, and no number, if no trial passes.
+    """Section 2.2 with its threshold; two PSDs. ``NO_HIT``, without numbers, if no trial passes.
 
     The covariance is NaN: the answer is a step function of the readings.
     """

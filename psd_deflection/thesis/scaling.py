@@ -1,9 +1,10 @@
 """Appendix B: how two links, one carrying the other, deflect when they are scaled.
 
-A flexible link BC is clamped at B; a rigid link CD of the same length stands at right angles on its
-tip; a force P at D bends BC by P L^3/3EI and twists it by P L_CD L/GJ, and the twist moves D by
-another L_CD sin(theta). The tables of the appendix are walked cell by cell: what is computed from
-the stated modulus rounds to what is printed, or the cell is an erratum with its reason.
+A flexible link BC is clamped at B; a rigid link CD of the same length is attached at right angles
+to its tip; a force P at D bends BC by P L^3/3EI and twists it by P L_CD L/GJ, and the twist moves D
+by another L_CD sin(theta). Each cell of the appendix's tables is compared: either the value
+computed from the stated modulus rounds to the printed value, or the cell is an erratum with a
+reason.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ FORCE = 60.0
 
 YOUNGS_MODULUS = 69e9
 SHEAR_MODULUS = 24e9
-"""Pa, aluminium 6061 as Table B2 has it. E/G = 2.875 would need a Poisson ratio of 0.44; data sheets say G = 26 GPa."""
+"""Pa, aluminium 6061 as in Table B2. E/G = 2.875 would need a Poisson ratio of 0.44; data sheets say G = 26 GPa."""
 
 FITTED_YOUNGS_MODULUS = 68.9e9
 """Pa: the value that Table B1's bending deflections of cases 1 and 5 were computed with (an erratum)."""
@@ -57,7 +58,7 @@ class TwinLink:
         return self.statics.deflection(0.0, 0.0, force * self.length)[2]
 
     def tip_by_twist(self, force: float, small_angle: bool = False) -> float:
-        """How far the twist of BC moves D, m: L sin(theta), or L theta."""
+        """Displacement of D by the twist of BC, m: L sin(theta), or L theta."""
         twist = self.twist(force)
         return self.length * (twist if small_angle else math.sin(twist))
 
@@ -69,8 +70,8 @@ class TwinLink:
 def torsion_to_bending_ratio(youngs_modulus: float, shear_modulus: float, length_ratio: float = 1.0) -> float:
     """TBR for small twist: 1.5 (E/G) (L_CD/L_BC)^2.
 
-    B-8 is the case ``length_ratio`` = 1; that the ratio depends on the material alone, as the
-    appendix concludes, holds only because its two links are equally long.
+    B-8 is the case ``length_ratio`` = 1; The appendix concludes that the ratio depends on the
+    material alone. This holds only because its two links have equal length.
     """
     return 1.5 * youngs_modulus / shear_modulus * length_ratio**2
 
@@ -154,7 +155,7 @@ class Cell(NamedTuple):
 
     @property
     def agrees(self) -> bool:
-        """Whether what is computed rounds to what is printed."""
+        """Whether the computed value rounds to the printed one."""
         return round_as(self.computed, self.printed) == Decimal(self.printed)
 
 

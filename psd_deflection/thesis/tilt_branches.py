@@ -1,6 +1,6 @@
-"""Section 2.3 put right: all tilts that explain four readings at a given twist.
+"""Section 2.3 of the thesis, corrected: all tilts that explain four readings at a given twist.
 
-``minimum_tilt`` is what can be measured of them.
+The solver ``minimum_tilt`` gives the part of them that can be measured.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ class TiltBranch(NamedTuple):
 def tilt_branches(geometry: Geometry, dots: tuple[float, ...], theta: float) -> tuple[TiltBranch, ...]:
     """All (dX, dY, phi, omega) that give exactly these dots at twist ``theta``: none, or four.
 
-    The thesis's 2.32-2.43 put right, for two PSDs at height 0:
+    The thesis's 2.32-2.43, corrected, for two PSDs at height 0:
 
     - 2.32: (X^_i, Y^_i) = R(theta) q_i, signs kept;
     - 2.34, 2.35: Y_T,i = l_iy - dY; so 2.36: cos phi = (l_1y - l_2y)/(Y^_1 - Y^_2), dY = l_2y - Y^_2 cos phi;
-    - 2.37: Pr_i = +- Y^_i sin |phi|, the sign is not to be had;
+    - 2.37: Pr_i = +- Y^_i sin |phi|, the sign cannot be determined;
     - 2.38: DT^2 = (Pr_1 - Pr_2)^2 + (X^_1 - X^_2)^2, a sum;
     - 2.40, 2.41: omega = atan2(Pr_1 - Pr_2, X^_1 - X^_2) +- acos((l_1x - l_2x)/DT);
     - 2.42: dX = l_1x - X^_1 cos omega - Pr_1 sin omega.
 
-    Raises SolverError if the beams stand side by side or one above the other (l_1y = l_2y loses
-    phi, l_1x = l_2x loses omega).
+    Raises SolverError if the beams are exactly side by side or one above the other (phi cannot be
+    found if l_1y = l_2y, omega cannot if l_1x = l_2x).
     """
     if check_twist(geometry) != 2:
         raise SolverError('tilt branches are those of two PSDs')

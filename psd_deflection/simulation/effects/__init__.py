@@ -1,1 +1,1 @@
-"""One physical effect a file; each declares one ``EFFECT``."""
+"""One physical effect per file; each file declares one ``EFFECT``."""

@@ -12,7 +12,7 @@ from psd_deflection.simulation.physics import Physics
 
 
 def _on_the_detector(axis: int) -> Callable[[Physics, Values], tuple[float, float]]:
-    # Light that is measured falls on the active area; so does its centroid.
+    # Measured light falls on the active area, so its centroid is there too.
     def within(physics: Physics, values: Values) -> tuple[float, float]:
         half = float(physics.half_area[int(values['psd']) - 1, axis])
         return -half, half

@@ -1,7 +1,7 @@
 """The amplifier clips before the converter does.
 
-Without the noise on the signal (``chunk.noise`` > 0) the mean of the clipped noisy signal is
-given, so that a comparison is fair where the signal grazes the limit.
+If the signal is without noise (``chunk.noise`` > 0), the result is the mean of the clipped noisy
+signal. This keeps a comparison fair where the signal is close to the limit.
 """
 
 from __future__ import annotations

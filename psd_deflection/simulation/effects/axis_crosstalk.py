@@ -1,4 +1,4 @@
-"""Each axis of a PSD sees some of the other."""
+"""Each axis of a PSD reads a part of the other axis."""
 
 from __future__ import annotations
 

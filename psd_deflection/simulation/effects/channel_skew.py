@@ -1,7 +1,7 @@
 """The samples of one PSD are late.
 
-Between samples a cubic through four of them is read, never one from the future, so that a live
-device can do it as well.
+Values between samples come from a cubic through four samples. Future samples are not used, so a
+live device can do the same.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def _apply(chunk: Chunk, values: Values, state: State) -> None:
     steps = values['delay'] / chunk.physics.period
     whole = math.floor(steps)
     part = steps - whole
-    # Four nodes around the wanted place; one-sided where the middle would need the next sample.
+    # Four nodes around the wanted time; one-sided if a centred cubic would need the next sample.
     first = whole - 1 if whole >= 1 else 0
     where = steps - first
     psd = int(values['psd']) - 1

@@ -1,7 +1,7 @@
 """The clamp sticks: the deflection lags behind the load by half a loop, whichever way it moves.
 
-A play operator y <- min(max(y, x - r), x + r) of half width r. Each sample is a clamp of the
-state, clamps compose to clamps, and so a prefix scan serves the whole chunk without a loop.
+A play operator y <- min(max(y, x - r), x + r) of half width r. Each sample clamps the state, and a
+composition of clamps is a clamp. So a prefix scan computes the whole chunk without a loop.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The link goes on yielding after each change of load."""
+"""The deflection continues to grow after each change of load."""
 
 from __future__ import annotations
 

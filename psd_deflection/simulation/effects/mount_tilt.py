@@ -1,4 +1,4 @@
-"""The base is not square to the beams: the tip stands off by a slope times the length."""
+"""The base is not square to the beams: the tip is displaced by a slope times the length."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The converter steps more coarsely than the rig file says.
 
-Without the noise on the signal (``chunk.noise`` > 0) the mean over the noise is given: the bias of
-rounding is a Fourier series whose terms the noise damps as exp(-2 (pi k sigma/step)^2).
+If the signal is without noise (``chunk.noise`` > 0), the result is the mean over the noise: the
+bias of rounding is a Fourier series whose terms the noise damps as exp(-2 (pi k sigma/step)^2).
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from psd_deflection.simulation.modes import Filter, mode_coefficients
 from psd_deflection.simulation.physics import Physics
 
 HIGHER = 1.6
-"""Times the first mode's frequency, at least: beside the first, a second one would only mimic it."""
+"""Smallest ratio to the first mode's frequency: a closer second mode would only mimic the first."""
 
 
 def _above_the_first(physics: Physics, values: Values) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""A mass at the tip that the rig file knows nothing of lowers the bending frequency."""
+"""A mass at the tip that is missing from the rig file lowers the bending frequency."""
 
 from __future__ import annotations
 
