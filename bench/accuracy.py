@@ -1,4 +1,4 @@
-"""``make bench``: the error of the estimates against the simulated truth, beside the least that any method can have.
+"""``make bench``: the error of the estimates against the simulated truth, beside the lower bound for any method.
 
 The Cramér–Rao bound comes from the dots' own equation (m = R(-theta)(l - d) - c, differentiated by differences) and
 from the noise that the rig file states: amplifier noise and one converter step, in the mean of a block.
@@ -18,7 +18,7 @@ from psd_deflection.simulation.loads import constant, direct, sidebar
 from psd_deflection.simulation.simulator import RigSimulator
 
 SETTLED_S = 10.0
-"""After the load is on, at which the modes have rung down to nothing."""
+"""Time after the load step when the modes have decayed."""
 
 CASES = {'unloaded': (0.0, 0.0, 0.0)}
 CASES |= {f'{f:g} N on the sidebar': sidebar(f) for f in (10.0, 30.0, 50.0)}

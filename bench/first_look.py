@@ -1,4 +1,4 @@
-"""What someone waits for who types ``make run``: until the page is served, shows the dots, and they move.
+"""Times from ``make run`` until the page is served, shows the dots, and the dots move.
 
     python -m bench.first_look [--times 3]
 
@@ -50,7 +50,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--times', type=int, default=1)
     args = parser.parse_args()
-    # What make sets up is not part of it.
+    # The set-up by make is not part of the time.
     subprocess.run(['make', '--silent', 'setup'], cwd=ROOT, check=True)
     # A browser that was closed may still tidy up in its profile.
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:

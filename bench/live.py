@@ -1,10 +1,10 @@
-"""``make bench``, the live line: what it costs beside the least that ROS and MCAP allow.
+"""``make bench``, the live path: its cost beside the minimum that ROS and MCAP allow.
 
 Every figure stands beside a peer's from the same run, as a ratio: machines differ and are shared.
 
 - Latency: last byte of a block written to the port -> callback in another process, beside a bare
   publisher of the same message -> the same callback, both in the same subscriber at the same time.
-- The same with the live page served and looked at, in turns with the node alone.
+- The same with the live page open, in turns with the node alone.
 - CPU: the node with recording, as a share of one core.
 - Replay of ten minutes beside bare iteration of the same file with ``mcap``.
 """
@@ -69,7 +69,7 @@ def subscriber() -> None:
     ready = False
     while not stop.is_set():
         rclpy.spin_once(node, timeout_sec=0.1)
-        # Until then the two have not found each other: nothing can be measured.
+        # Publisher and subscriber must discover each other before anything can be measured.
         if not ready and len({topic for topic, *_ in rows}) == 2:
             ready = True
             print('ready', flush=True)
@@ -100,7 +100,7 @@ def bare_publisher() -> None:
 
 
 def looker(url: str) -> None:
-    """Child process: takes what the live page sends, as a browser does; prints of how many blocks that told."""
+    """Child process: receives the live page's data like a browser; prints the number of blocks in it."""
     import aiohttp
 
     stop = until_stdin_closes()
@@ -189,7 +189,7 @@ def measure(seconds: float, settle: float, page: bool, into: Latencies) -> None:
         node = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
         assert node.stderr is not None
         url = next(line.split()[1] for line in node.stderr if line.startswith('monitor: ')) if page else ''
-        # What it goes on saying is read and left.
+        # Its further output is read and ignored.
         threading.Thread(target=node.stderr.read, daemon=True).start()
         children = [child('subscriber'), child('bare'), *([child('looker', url)] if page else [])]
         ear, bare = children[:2]
@@ -204,7 +204,7 @@ def measure(seconds: float, settle: float, page: bool, into: Latencies) -> None:
         heard, _ = ear.communicate()
         if page:
             told, _ = children[2].communicate()
-            # However seldom a busy machine lets it send, every block is in it; half of them may be on the way.
+            # Even on a busy machine every block must arrive; up to half of them may still be under way.
             if int(told) < 0.5 * BLOCKS_PER_S * seconds:
                 raise SystemExit(f'the page told of {told} blocks in {seconds:g} s')
         node.terminate()

@@ -1,7 +1,7 @@
 """Speed of the solvers, beside their peers in the same run: ``python bench/solvers.py``.
 
-Ratios carry from machine to machine better than times do. A peer's rate is measured on fewer blocks,
-enough for a tenth of a second or more.
+Ratios depend less on the machine than times do. A peer's rate is measured on fewer blocks, enough for a
+tenth of a second or more.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ STEP = np.radians(0.01)
 
 
 def best_of(action: Callable[[], Any], repeats: int = 5) -> float:
-    """Least time, s: what the machine can do when nothing else wants it."""
+    """Least time, s: the least affected by other work on the machine."""
     action()
     times = []
     for _ in range(repeats):

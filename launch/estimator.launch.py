@@ -1,6 +1,6 @@
 """The estimator: ``ros2 launch psd_deflection estimator.launch.py port:=/dev/ttyACM0 record:=true``.
 
-What is not given here is as ``params_file`` says.
+Parameters that are not given here come from ``params_file``.
 """
 
 from launch import LaunchContext, LaunchDescription

@@ -1,4 +1,4 @@
-"""Headless Chromium, driven by its own driver: for the page's tests, its pictures and its timing."""
+"""Headless Chromium with its driver, for the page's tests, pictures and timing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FLAGS = (
     '--disable-background-networking',
     '--disable-component-update',
     '--disable-sync',
-    # A page that nobody looks at is drawn all the same.
+    # Draw the page although it is not visible.
     '--disable-background-timer-throttling',
     '--disable-renderer-backgrounding',
     '--js-flags=--expose-gc',

@@ -47,13 +47,13 @@ PATIENCE_S = 60.0
 
 
 def expected(number: int) -> tuple[int, ...]:
-    """What synthetic.c makes of a sample's number."""
+    """The counts that synthetic.c computes from a sample's number."""
     ramp = number % 2000 - 1000
     return (ramp, -ramp, 16384 + number % 7, number % 256, number % 5, 16384 - number % 11)
 
 
 def dialogue(port: str) -> tuple[int, float]:
-    """Ask for each answer that the page promises; bad frames seen, and the median round trip of a PING, s."""
+    """Request every answer in docs/protocol.md; return the bad frames and the median round trip of a PING, s."""
     line = SerialPort(port, 921_600)
     decoder = FrameDecoder()
     bad = 0
@@ -86,7 +86,7 @@ def dialogue(port: str) -> tuple[int, float]:
             raise SystemExit(f'FAILED: {pong!r} answers PING {cookie}')
     line.write(encode(StopFrame()) + encode(PingFrame(0)))
     until(PongFrame)
-    # What was on its way is through; from here on only HELLO and STATUS may come.
+    # Samples that were under way have arrived; from here on only HELLO and STATUS may come.
     quiet: list[Frame] = []
     line.write(encode(PingFrame(1)))
     until(PongFrame, quiet)
@@ -128,7 +128,7 @@ class Checked:
 
 
 def main() -> int:
-    """Run it; 0 where all is as it should be."""
+    """Run the check; 0 if everything is correct."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('elf', type=Path)
     parser.add_argument('--seconds', type=float, default=20.0)
@@ -152,7 +152,7 @@ def main() -> int:
         f'({wire.device_overruns} dropped by the device), {checked.wrong} wrong, {bad + wire.bad} bad frames, '
         f'{wire.restarts} restarts, skew {clock.skew_ppm:.1f} ppm, PING median {trip * 1e3:.2f} ms'
     )
-    # A busy host starves qemu, and the device then drops: what it took and what it says it dropped make up the time.
+    # On a busy host the device in qemu drops samples: those sent and those reported as dropped must make up the time.
     enough = checked.enough.is_set() and checked.samples + wire.lost >= 0.95 * 1000 * checked.span_s
     enough = enough and checked.samples > 1000
     silent = wire.lost > wire.device_overruns or (wire.lost > 0 and wire.device_dropped == 0)

@@ -1,7 +1,7 @@
 """``make rerun``: converts recordings for Rerun, reads them with Rerun's own reader, and looks at the viewer's picture.
 
-Poses, bands, dots, sums and losses must be the recording's own, and nothing may stand where nothing was measured. Where
-there is no screen, the viewer gets a virtual one (xvfb-run, a software Vulkan: apt install xvfb mesa-vulkan-drivers).
+Poses, bands, dots, sums and losses must equal those of the recording, and gaps must stay gaps.
+Without a screen, the viewer gets a virtual one (xvfb-run, a software Vulkan: apt install xvfb mesa-vulkan-drivers).
 
   python -m tools.check_rerun bags/lost_samples --out build/rerun
   python -m tools.check_rerun bags/lost_samples --out build/rerun --figure docs/figures/rerun.png
@@ -34,13 +34,13 @@ WINDOW = '1500x900'
 VIEWER_S = 180.0
 LIGHT = (255, 80, 60)
 SHARE = 5e-4
-"""Of the pixels have a trace's colour, at least (seen: 2e-3); an empty viewport has a few of its icons'."""
+"""Minimum share of pixels in a trace's colour (measured: 2e-3); an empty viewport has a few, from its icons."""
 FIGURE_SPEED = 4.0
-"""What plays faster has moved by the time the picture is taken."""
+"""Playback speed: slow enough that nothing has moved when the picture is taken."""
 
 
 def need(true: bool, what: str) -> None:
-    """End with ``what`` where it is not so."""
+    """End the program with the message ``what`` unless the condition holds."""
     if not true:
         raise SystemExit(f'FAILED: {what}')
 
@@ -72,7 +72,7 @@ class Written:
 
 
 def check_poses(written: Written, recording: Recording) -> int:
-    """Each recorded estimate is there and no other; a line breaks wherever one is missing. The number of breaks."""
+    """Check the estimates and the breaks of the lines at missing ones; return the number of breaks."""
     series = recording.estimates()['/link_tip/deflection_with_covariance']
     if series.covariance is None:
         raise SystemExit('FAILED: the recording has no covariance')
@@ -100,7 +100,7 @@ def check_poses(written: Written, recording: Recording) -> int:
 
 
 def check_dots(written: Written, recording: Recording, rig: Rig) -> None:
-    """Each block's mean, reckoned from its volts, stands where the light is seen and nowhere else."""
+    """Check that the dots are the block means, computed from the volts, of exactly the blocks with light."""
     samples = recording.samples
     _, first = np.unique(samples['seq'] // recording.block_size, return_index=True)
     present = np.diff([*first, len(samples)])
@@ -122,14 +122,14 @@ def check_dots(written: Written, recording: Recording, rig: Rig) -> None:
 
 
 def picture(files: list[Path], target: Path) -> bool:
-    """What the viewer shows of ``files``, on a screen that is not there; False where that cannot be had."""
+    """Take a picture of ``files`` in the viewer on a virtual screen; False if that is not possible."""
     missing = shutil.which('xvfb-run') is None or not list(Path('/usr/share/vulkan/icd.d').glob('*.json'))
     if missing:
         print('no picture: it needs xvfb-run and a Vulkan driver (apt install xvfb mesa-vulkan-drivers)')
         return False
     target.unlink(missing_ok=True)
     with tempfile.TemporaryDirectory() as home:
-        # A first start has no settings, and tells nobody that it was.
+        # Without settings the viewer starts for the first time; usage statistics are off.
         environment = {**os.environ, 'HOME': home, 'XDG_RUNTIME_DIR': home, 'XDG_CONFIG_HOME': home}
         subprocess.run([BIN / 'rerun', 'analytics', 'disable'], env=environment, capture_output=True, check=True)
         command = ['xvfb-run', '-a', '-s', '-screen 0 1600x1000x24', str(BIN / 'rerun'), '--port', 'auto']
@@ -143,7 +143,7 @@ def picture(files: list[Path], target: Path) -> bool:
 
 
 def check_picture(path: Path) -> None:
-    """Every trace is seen on the left, the dots and beams above on the right."""
+    """Check that every trace is visible on the left, and the dots and beams at the top right."""
     pixels = np.asarray(Image.open(path).convert('RGB'), np.int64)
     height, width = pixels.shape[:2]
     left, above = pixels[:, : width // 2], pixels[: height // 3, width // 2 :]

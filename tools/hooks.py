@@ -1,4 +1,4 @@
-"""What the pages get from the program itself when the site is built, so that they cannot disagree.
+"""Inserts text from the program into the pages when the site is built, so that the two agree.
 
 ``<!-- messages -->``: every error message, by exit status. ``<!-- commands -->``: every command's
 help. ``<!-- parameters -->``: every parameter. ``<!-- exit statuses -->``: what each one means.
@@ -30,7 +30,7 @@ STATUS = {
 """Error class to exit status."""
 
 WITHOUT_STATUS = ('DamagedError', 'RefusedError', 'SourceEndedError', '_FullError', '_GoneError')
-"""What is told, as a warning, by the live page or in the log, and ends nothing."""
+"""Messages of the live page or the log: warnings that end nothing."""
 
 READERS = (
     'msg_adapters',
@@ -42,7 +42,7 @@ READERS = (
 
 
 def template(node: ast.expr) -> str:
-    """The text of a message, with … for what depends on the case; '' where it is no literal."""
+    """The text of a message, with … for variable parts; '' if it is not a literal."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return node.value
     if isinstance(node, ast.JoinedStr):
@@ -125,7 +125,7 @@ def _expanded(node: ast.expr, functions: dict[str, ast.FunctionDef]) -> Iterator
 
 
 def message_tables() -> str:
-    """One table an exit status, and one of what ends nothing."""
+    """One table per exit status, and one of messages that end nothing."""
     out = []
     found = list(messages())
     headings = {name: f'Exit status {status}: {name}' for name, status in sorted(STATUS.items(), key=lambda i: i[1])}
@@ -145,7 +145,7 @@ def cell(text: str) -> str:
 
 
 def command_help() -> str:
-    """What each command says of itself."""
+    """The help of each command."""
     out = []
     os.environ['COLUMNS'] = '90'
     make_parser(())
@@ -185,13 +185,13 @@ def on_page_markdown(markdown: str, **kwargs: Any) -> str:
     for name, fill in FILLED.items():
         mark = f'<!-- {name} -->'
         if mark in markdown:
-            # In the place of the line below it too, which is for those who read the file itself.
+            # Also replace the line below the marker, which is for readers of the file itself.
             before, _, after = markdown.partition(f'{mark}\n')
             markdown = f'{before}{fill()}\n{after.partition(chr(10))[2]}'
     return markdown
 
 
 def on_page_content(html: str, **kwargs: Any) -> str:
-    """mkdocs calls it for each page: docstrings name other things as Sphinx wants them, which is not drawn here."""
+    """mkdocs calls it for each page: convert Sphinx roles in docstrings, which mkdocs does not render."""
     html = re.sub(r':(?:class|meth|func|mod|data|attr):(?=<code>)', '', html)
     return re.sub(r'<code>~[\w.]*\.(\w+)</code>', r'<code>\1</code>', html)

@@ -1,7 +1,7 @@
-"""A program as a process, and what it says: for tests, campaigns and what runs the documents' commands.
+"""Runs a program as a process and reads its output, for tests, campaigns and the check of documented commands.
 
-A thread reads whatever the program prints, so that it never waits for us. :meth:`Program.until` waits for a line, not
-for a time; a program that does not answer is an error that quotes what it said instead.
+A thread reads all output, so that the program never blocks on it. :meth:`Program.until` waits for a line, not
+for a time. If the line does not come, the error quotes the output.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 WAIT_S = 60.0
-"""Longest wait for what will come; a busy machine takes its time."""
+"""Longest wait for an expected line, generous for a busy machine."""
 
 ROOT = Path(__file__).resolve().parent.parent
 PSD_DEFLECTION = (sys.executable, '-m', 'psd_deflection')
@@ -26,9 +26,9 @@ PSD_DEFLECTION = (sys.executable, '-m', 'psd_deflection')
 
 
 class Program:
-    """``command`` in a session of its own, without input; stdout and stderr are heard together.
+    """``command`` in a new session, without input; stdout and stderr are read together.
 
-    ``terminal`` gives it a terminal, as a person has one; otherwise it writes into a pipe. ``wait_s`` limits each wait.
+    ``terminal``: it writes to a terminal; otherwise into a pipe. ``wait_s`` limits each wait.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Program:
 
     @property
     def text(self) -> str:
-        """All that it has said so far."""
+        """All output so far."""
         return self._said.decode(errors='replace')
 
     @property
@@ -85,7 +85,7 @@ class Program:
         return [line for line in (lines if self._ended else lines[:-1]) if line]
 
     def until(self, pattern: str) -> re.Match[str]:
-        """The first match in a line. RuntimeError if the program ends, or the time is over, without one."""
+        """Wait for the first match in a line. RuntimeError if the program ends or the time runs out first."""
         found: list[re.Match[str]] = []
 
         def look() -> bool:
@@ -99,12 +99,12 @@ class Program:
         return found[0]
 
     def send(self, number: int) -> None:
-        """To the program and all that it started; nothing if they have ended."""
+        """Send a signal to the program and its children; does nothing if they have ended."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, number)
 
     def wait(self) -> int:
-        """Its exit status, with all that it said heard. RuntimeError, and it is killed, if it does not end in time."""
+        """Wait for the end; return the exit status. Past the time limit it is killed, and RuntimeError raised."""
         try:
             status = self.process.wait(self._wait_s)
         except subprocess.TimeoutExpired:
@@ -117,7 +117,7 @@ class Program:
         return status
 
     def end(self, number: int = signal.SIGINT) -> int:
-        """Ctrl-C (or another signal) if it runs still; its exit status."""
+        """Send Ctrl-C (or another signal) if it still runs; return its exit status."""
         if self.process.poll() is None:
             self.send(number)
         return self.wait()

@@ -77,13 +77,13 @@ SHORTEST = {
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
     'shots': 'SHOT_SECONDS=2',
 }
-"""Variables with which a ``make`` target is over in seconds."""
+"""Variables with which a ``make`` target takes only seconds."""
 
 SHORTER = {
     r'^python -m blind\.run\b': '--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation',
     r'^ros2 topic echo\b': '--once',
 }
-"""Arguments that, put behind those of a command, have it over in seconds."""
+"""Additional arguments with which a command takes only seconds."""
 
 VERDICTS = {
     'faults': r'between the faults +\d',
@@ -99,7 +99,7 @@ TOOLS = {
     r'^curl ': ('curl',),
     r'^ros2 ': ('ros2',),
 }
-"""Programs without which a command is passed over, and said to be."""
+"""Programs without which a command is skipped with a message."""
 
 ADMINISTRATION = re.compile(r'/opt/psd_deflection|^(apt|install|journalctl|ssh|sudo|systemctl|udevadm|useradd) ')
 """Lines for root or for another machine: never typed here. test/docs/test_deploy.py checks the files they install."""
@@ -160,7 +160,7 @@ def _lines(kind: str, text: str) -> Iterator[str]:
 
 
 def filled(line: str, recording: str = 'bags/clean') -> str:
-    """``line`` with what a reader would put in for its placeholders; ``recording``: for one that was made at home."""
+    """``line`` with its placeholders filled in; ``recording``: replaces a recording that the reader would have made."""
     line = re.sub(r'\bREC(ORDING)?\b', 'bags/clean', re.sub(r'recordings/psd_(\.\.\.|\w+)', recording, line))
     line = line.replace('OUT.csv', 'out.csv').replace('--out OUT', '--out out').replace('METHOD', 'wls')
     return re.sub(r'\b(my|other)_rig\.yaml', 'config/thesis_rig.yaml', line)
@@ -196,7 +196,7 @@ def blocks_to_run() -> list[list[Command]]:
 
 
 def what_is_missing(line: str) -> str:
-    """What ``line`` needs and this machine does not have, or what is not done here; '' if it can be run."""
+    """Why ``line`` cannot be run here (a missing program, or a command for root); '' if it can."""
     if ADMINISTRATION.search(line):
         return NEVER_HERE[0]
     return ', '.join(t for p, tools in TOOLS.items() if re.search(p, line) for t in tools if not shutil.which(t))
@@ -211,7 +211,7 @@ def stale() -> list[str]:
 
 
 class Reader:
-    """Someone who reads the documents and types what they say, in ``folder``."""
+    """A reader who types the documented commands in ``folder``."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -220,7 +220,7 @@ class Reader:
         self._served = ''
 
     def block(self, lines: list[str], ran: Callable[[str, float, str], None]) -> None:
-        """Type the lines of a block one after the other; ``ran`` is told seconds and, where it failed, why."""
+        """Type the lines of a block one after the other; ``ran`` gets the seconds and, after a failure, the reason."""
         try:
             for line in lines:
                 began = time.monotonic()
@@ -236,7 +236,7 @@ class Reader:
             self._background.clear()
 
     def type(self, line: str) -> None:
-        """One command; raises RuntimeError where it does not do what it should."""
+        """Run one command; raises RuntimeError if it fails."""
         line = line.replace('/dev/ttyACM0', 'ttyACM0').replace('/dev/pts/3', self._served)
         if 'ttyACM0' in line and self._device is None:
             self._device = self._start('psd-deflection simulate --serve --link ttyACM0')
@@ -326,7 +326,7 @@ def a_domain_of_our_own() -> Iterator[str]:
 
 
 def copy_checkout(target: Path) -> None:
-    """What git knows or would take, with its times, so that make finds nothing to be done anew."""
+    """Copy the files that git tracks or would add, with their times, so that make rebuilds nothing."""
     names = subprocess.run(
         ['git', 'ls-files', '-z', '--cached', '--others', '--exclude-standard'],
         cwd=ROOT,

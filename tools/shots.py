@@ -1,6 +1,6 @@
 """Makes the pictures of the live page in docs/figures: ``make shots``; needs Chromium and its driver.
 
-The page shows the simulated rig until every load case has gone by, and 50 N hang on the sidebar.
+The page shows the simulated rig; the pictures are taken after all load cases, with 50 N on the sidebar.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ void converter_sample(uint32_t number, int16_t counts[CHANNELS])
     GPIO_OUT |= PIN_CONVST;
     wait_some();
     for (unsigned tries = 0; (GPIO_DATA & PIN_BUSY) && tries < BUSY_TRIES; tries++) {
-        /* A converter that stays busy must not hold up the device: its old numbers are then read, and no more. */
+        /* A converter that stays busy must not block the device: then its old values are read. */
     }
     GPIO_OUT &= ~PIN_CS;
     for (unsigned channel = 0; channel < CHANNELS; channel++) {

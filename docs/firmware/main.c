@@ -1,6 +1,6 @@
 /* A PSD device: samples six channels at 1 kHz from a timer's interrupt and sends the frames of docs/protocol.md.
  *
- * Who runs where. The timer's interrupt takes a sample, numbers and stamps it by the clock, and puts it into a ring. The
+ * Data flow. The timer's interrupt takes a sample, numbers and stamps it by the clock, and puts it into a ring. The
  * main loop makes frames of them and hands those to the UART's ring, which the transmit interrupt empties. The receive
  * interrupt collects bytes up to a zero; the main loop reads them as a frame. Each ring has one writer and one reader and
  * indices that only the one or the other writes, so no lock is needed; indices run freely and wrap at 2^32, which is why
@@ -62,8 +62,8 @@ void on_sample_timer(void)
 
     ticks = ticks + (uint32_t)(now - last_ticks);
     last_ticks = now;
-    /* Which sample this is says the clock, not the count of interrupts: one that came more than a period late (or not
-     * at all) would else be a sample lost in silence. */
+    /* The clock gives the sample's number, not the count of interrupts: otherwise an interrupt that is more than a
+     * period late, or missing, would be an unreported loss. */
     const uint64_t t_us = ticks / TICKS_PER_US;
     const uint32_t number = (uint32_t)(ticks / TICKS_PER_PERIOD) - 1u;
     const int32_t missed = (int32_t)(number - taken);
@@ -97,7 +97,7 @@ void on_sample_timer(void)
 
 void on_received(uint8_t byte)
 {
-    /* Host frames are 15 bytes at most; what is longer is none of ours and is passed over up to its zero. */
+    /* Host frames have at most 15 bytes; a longer one is invalid and is skipped up to its zero. */
     static bool too_long;
     static size_t size;
     struct request *r = &requests[requests_in % REQUESTS];

@@ -1,4 +1,4 @@
-"""What a session looks like to whoever started it: one live line, and messages above it."""
+"""The terminal display of a session: one live line, and messages above it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PLAIN_REFRESH_LATER_S = 60.0
 
 
 class Display:
-    """One live line on a terminal; lines elsewhere, soon one a minute. Its methods may be called by any thread."""
+    """One live line on a terminal; elsewhere lines, soon one a minute. Any thread may call its methods."""
 
     def __init__(self) -> None:
         self._live = sys.stderr.isatty()
@@ -31,35 +31,35 @@ class Display:
         self._recorded: list[Path] = []
 
     def watch(self, session: Session) -> None:
-        """Look at a session that runs: show where it stands, and remember what it records."""
+        """Watch a running session: show its state, and remember its recordings."""
         folder = session.recorder.folder
         if folder is not None and folder not in self._recorded:
             self._recorded.append(folder)
         self.update(session)
 
     def tell_recorded(self) -> None:
-        """Say which recordings were made, and how to replay them."""
+        """Print the recordings that were made, and how to replay them."""
         for folder in (f for f in self._recorded if f.is_dir()):
             self.say(f'recorded {folder}\n  replay it:  {program()} replay {shlex.quote(str(folder))} --compare')
 
     def say(self, text: str) -> None:
-        """A message of its own line, above the live one."""
+        """Print a message on its own line, above the live one."""
         with self._lock:
             self._put(text + '\n', shown=False)
 
     def update(self, session: Session) -> None:
-        """Show where things stand, when it is time to."""
+        """Show the state, if an update is due."""
         now = time.monotonic()
         passed = now - self._last
         if passed < self._wait:
             return
         if self._last and not self._live:
-            # A journal is read for what changed; each change says so itself.
+            # In a journal regular lines are noise; changes have their own messages.
             self._wait = min(2.0 * self._wait, PLAIN_REFRESH_LATER_S)
         samples = session.acquisition.counters.samples
         rate = (samples - self._samples) / passed if self._last else math.nan
         if samples < self._samples:
-            # Another session, which counts from nought.
+            # Another session, which counts from zero.
             rate = math.nan
         self._last, self._samples = now, samples
         text = live_line(session, rate)
@@ -69,7 +69,7 @@ class Display:
     def _put(self, text: str, shown: bool) -> None:
         clear = '\r\x1b[K' if self._shown else ''
         self._shown = shown
-        # The terminal may be gone, and whoever speaks here reads or records: that goes on unheard.
+        # The terminal may be gone; the calling thread reads or records and must continue.
         with contextlib.suppress(OSError, ValueError):
             print(clear + text, end='', file=sys.stderr, flush=True)
 
@@ -84,7 +84,7 @@ def live_line(session: Session, rate: float) -> str:
     if session.recorder.folder is not None:
         tail += '  ● rec'
     if rate == 0.0:
-        # An old estimate beside a device that sends nothing would look like a new one.
+        # While the device sends nothing, an old estimate would look like a new one.
         body = 'no samples: the device is away' if session.acquisition.away else 'no samples come'
     elif estimate is not None:
         sd = [math.sqrt(v) for v in estimate.variances]

@@ -1,4 +1,4 @@
-"""What the values of options must be: a mistake in one ends with status 2, before anything is read or written."""
+"""Checks of option values: a mistake ends with status 2, before anything is read or written."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FOREIGN = """
 .tif .tiff .toml .tsv .txt .ulg .webp .xls .xlsx .xml .xz .yaml .yml .zip .zst
 """
 FOREIGN = frozenset(_FOREIGN.split())
-"""Endings of files of other kinds. Any other ending is a part of a folder's name, as in ``run_0.5N``."""
+"""Endings of other kinds of files. Any other ending is part of a folder's name, as in ``run_0.5N``."""
 
 PICTURES = ('.png', '.svg', '.pdf')
 
@@ -48,7 +48,7 @@ def number(option: str, least: float, most: float) -> Callable[[str], float]:
     def read(text: str) -> float:
         with contextlib.suppress(ValueError):
             value = float(text)
-            # NaN is within no bounds.
+            # NaN fails every comparison.
             if least <= value <= most:
                 return value
         raise UsageError(f'{option} {text}: must be a number of at least {least:g} and at most {most:g}')
@@ -57,9 +57,9 @@ def number(option: str, least: float, most: float) -> Callable[[str], float]:
 
 
 def parameter_option(parser: argparse._ActionsContainer, option: str, name: str) -> None:
-    """Add ``option``, which sets the parameter ``name``; its declaration says what it is, its type and its default.
+    """Add ``option``, which sets the parameter ``name``; help, type and default come from its declaration.
 
-    :func:`given_parameters` has what was given.
+    :func:`given_parameters` returns the given values.
     """
     p = BY_NAME[name]
     text = p.description + (f' (default {p.default})' if p.default != '' else '')
@@ -73,7 +73,7 @@ def parameter_option(parser: argparse._ActionsContainer, option: str, name: str)
 
 
 def given_parameters(args: argparse.Namespace) -> dict[str, object]:
-    """What was given for options that bear a parameter's name; ``--record FOLDER`` sets ``bag_dir`` as well."""
+    """Values of the given options that set parameters; ``--record FOLDER`` sets ``bag_dir`` as well."""
     values = {name: v for name, v in vars(args).items() if name in BY_NAME and v is not None and v is not False}
     folder = values.get('record')
     if folder is not None:
@@ -108,16 +108,16 @@ def picture_name(*suffixes: str) -> Callable[[str], str]:
 
 
 def need_folder(out: Path) -> None:
-    """Raise RecordingError, before the work is done, where the folder of ``out`` is not there."""
+    """Raise RecordingError, before the work is done, if the folder of ``out`` does not exist."""
     if not out.parent.is_dir():
         raise RecordingError(f'--out {out}: cannot be written (there is no folder {out.parent})')
 
 
 @contextlib.contextmanager
 def given_as_option(*parameters: str) -> Iterator[None]:
-    """A value that is refused within came as an option: a mistake of the command line (2), not of a file (3).
+    """Turn a refused value inside into a UsageError: it came as an option (status 2), not from a file (3).
 
-    ``parameters`` have an option of their own: where the message says ``keep_out = ...`` it says ``--keep-out = ...``.
+    ``parameters``: those with their own option; in the message ``keep_out = ...`` becomes ``--keep-out = ...``.
     """
     try:
         yield
@@ -129,13 +129,13 @@ def given_as_option(*parameters: str) -> Iterator[None]:
 
 
 def refuse(args: argparse.Namespace, defaults: Mapping[str, object], why: str) -> None:
-    """Raise UsageError where one of the options ``defaults`` has another value: it would be passed over in silence."""
+    """Raise UsageError if one of the options ``defaults`` has another value: it would be ignored silently."""
     for name, default in defaults.items():
         if getattr(args, name) != default:
             raise UsageError(f'--{name.replace("_", "-")} {why}')
 
 
 def finite(option: str, values: tuple[float, ...]) -> None:
-    """Raise UsageError where one is not."""
+    """Raise UsageError unless all are finite."""
     if not all(map(math.isfinite, values)):
         raise UsageError(f'{option} {" ".join(f"{v:g}" for v in values)}: must be finite')

@@ -1,4 +1,4 @@
-"""How to call this program from where the user stands, for the commands that it suggests."""
+"""The name under which the user can call this program, for the commands that it suggests."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ NAME = 'psd-deflection'
 
 
 def program() -> str:
-    """``psd-deflection`` where the shell finds it; else how it was called, as by ``make run`` from ``.venv/bin``."""
+    """``psd-deflection`` if the shell finds it; else the path that was used, as by ``make run`` from ``.venv/bin``."""
     if shutil.which(NAME) is not None:
         return NAME
     called = Path(sys.argv[0])

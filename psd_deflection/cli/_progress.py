@@ -1,4 +1,4 @@
-"""The progress of what may take longer than two seconds: on a terminal only, and gone when it is done."""
+"""Progress of work that may take longer than two seconds: only on a terminal, and removed at the end."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 
 def progress_of(blocks: Iterable[SampleBlock], total: int | None = None, *, quiet: bool = False) -> Bar:
-    """``blocks``, counted on the standard error once a second has gone by; ``quiet``: not at all."""
+    """Yield ``blocks`` and count them on the standard error after the first second; ``quiet``: not at all."""
     hidden = True if quiet else None
     return tqdm(blocks, total=total, unit=' blocks', delay=1.0, leave=False, disable=hidden, ncols=80)
 
 
 @contextlib.contextmanager
 def told(words: str, *, quiet: bool = False) -> Iterator[None]:
-    """Say on a terminal what is done meanwhile, where it cannot be counted; gone when it is done."""
+    """Show on a terminal what is being done, for work that cannot be counted; removed at the end."""
     shown = not quiet and sys.stderr is not None and sys.stderr.isatty()
     if shown:
         print(f'{words} ...', end='', file=sys.stderr, flush=True)

@@ -34,7 +34,7 @@ def columns(rows: Sequence[Sequence[str]], left: int = 1) -> str:
 
 
 def print_json(value: Any, indent: int | None = None) -> None:
-    """Print ``value`` as JSON, with null for what JSON has no number for (NaN, infinite)."""
+    """Print ``value`` as JSON, with null for numbers that JSON does not have (NaN, infinite)."""
     print(json.dumps(_plain(value), indent=indent, allow_nan=False))
 
 
@@ -47,14 +47,14 @@ def _plain(value: Any) -> Any:
 
 
 def save_figure(figure: Any, path: Path, **options: Any) -> None:
-    """Write a matplotlib figure in the kind that its ending says; raises RecordingError as :func:`save` does."""
+    """Write a matplotlib figure in the format of its ending; raises RecordingError as :func:`save` does."""
     stream = io.BytesIO()
     figure.savefig(stream, format=path.suffix[1:].lower(), **options)
     save(stream.getvalue(), path)
 
 
 def save(content: bytes, path: Path) -> None:
-    """Write ``path`` whole or not at all; raises RecordingError where the disk refuses."""
+    """Write ``path`` completely or not at all; raises RecordingError if the disk refuses to write."""
     try:
         replace_file(path, content)
     except OSError as error:

@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the survey; the exit status is 0 whatever was found, unless a port that was named could not be asked."""
+    """Print the survey; the exit status is 0 unless a named port could not be asked."""
     devices, refusals = known_devices()
     for refusal in refusals:
         print(printable(f'psd-deflection devices: not asked for: {refusal}', LONGEST_LINE), file=sys.stderr)
@@ -65,7 +65,7 @@ def _refuse_unasked(named: list[str], ports: list[Port]) -> None:
 
 
 def epilog(devices: Sequence[Device]) -> str:
-    """What each name means that ``source:`` takes."""
+    """A description of each name that ``source:`` accepts."""
     width = max(len(device.name) for device in devices)
     lines = []
     for device in devices:
@@ -75,7 +75,7 @@ def epilog(devices: Sequence[Device]) -> str:
 
 
 def parameter_lines(values: dict[str, object]) -> str:
-    """A ROS 2 parameter file of these values, to be put beside those of the rig."""
+    """A ROS 2 parameter file of these values, to be merged with that of the rig."""
     lines = ['/**:', '  ros__parameters:']
     section = ''
     for name, value in values.items():

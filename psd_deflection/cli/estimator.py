@@ -63,7 +63,7 @@ def _live_solver(name: str) -> str:
 
 
 def overrides_of(args: argparse.Namespace) -> dict[str, object]:
-    """The parameters that the arguments give; the file's values below the single ones."""
+    """The parameters from the arguments; single options override the file."""
     values = given_parameters(args)
     if args.source is not None and args.source not in source_names():
         raise UsageError(f'--source {args.source}: must be one of {", ".join(source_names())}')
@@ -77,14 +77,14 @@ def overrides_of(args: argparse.Namespace) -> dict[str, object]:
 
 
 def simulates_at_once(overrides: Mapping[str, object], ros_arguments: Sequence[str] = ()) -> bool:
-    """Whether a simulated rig will be started, as far as can be told before ROS has read its arguments."""
+    """Whether a simulated rig will probably be started; ROS has not read its arguments yet."""
     told_to_ros = any(a == '--params-file' or a.startswith(('port:=', 'source:=')) for a in ros_arguments)
     return not told_to_ros and simulates(overrides)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run until Ctrl-C."""
-    # Others are added by `ros2 launch`, and nothing is lost with them.
+    # `ros2 launch` adds others; they can be ignored.
     if args.no_ros and any(a in ('-p', '--param', '--params-file') for a in args.ros_arguments):
         raise UsageError(
             'parameters behind --ros-args are not read with --no-ros: put them into a --params-file before it'

@@ -23,10 +23,10 @@ from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 
 _EPOCH_FROM_NS = 10**18
-"""September 2001; smaller times count from a zero of their own."""
+"""September 2001; smaller times do not count from the epoch."""
 
 _BREAK = 0.5
-"""Where time and sample numbers disagree by this share the device was stopped or started anew between two blocks."""
+"""If time and sample numbers disagree by this share, the device was stopped or restarted between two blocks."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,12 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def changed_parameters(parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """Those that are not at their default, and those that this version does not know."""
+    """Parameters that differ from their defaults, and those that this version does not know."""
     return {k: v for k, v in parameters.items() if k not in BY_NAME or BY_NAME[k].default != v}
 
 
 def lacks(recording: Recording, topics: Mapping[str, int]) -> list[str]:
-    """What is not in it and some command would need, each with the way out."""
+    """Missing parts that some command needs, each with the fix."""
     found = []
     if not topics.get(SAMPLES):
         found.append(f'samples ({SAMPLES}): nothing can be computed from it')

@@ -69,7 +69,7 @@ _REFUSED_OUTPUT = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG)
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
-    """Wraps what is written in paragraphs as wide as the terminal is; lines that are indented stay."""
+    """Wraps paragraphs to the width of the terminal; indented lines stay as they are."""
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog, width=min(shutil.get_terminal_size().columns - 2, _WIDEST))
@@ -87,7 +87,7 @@ class _Help(argparse.RawDescriptionHelpFormatter):
 
 
 def make_parser(chosen: Collection[str], value: type[argparse.Action] | None = None) -> argparse.ArgumentParser:
-    """The whole command line; the arguments of the commands ``chosen`` only, since the others' modules stay unread."""
+    """The parser of all commands; only the ``chosen`` ones have arguments, so that other modules are not imported."""
     parser = argparse.ArgumentParser(
         prog='psd-deflection',
         description='Tip deflection and twist of a flexible link from two position sensing detectors.',
@@ -114,16 +114,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status (``psd_deflection.errors`` lists them)."""
     status = 0
     if sys.stderr is None:
-        # `2>&-`: print() would put on stdout what is for the standard error.
+        # `2>&-`: print() would write messages for the standard error to stdout.
         sys.stderr = Path(os.devnull).open('w', encoding='utf-8')  # noqa: SIM115 - open as long as the program
     with contextlib.suppress(AttributeError, ValueError):
-        # A Δ that the terminal has no letter for is no reason to fail.
+        # A Δ that the terminal cannot encode must not cause an error.
         sys.stdout.reconfigure(errors='replace')  # type: ignore[union-attr]
     try:
         try:
             status = _run(list(sys.argv[1:] if argv is None else argv))
         finally:
-            # Here, where it can still be said what is wrong, and not as the interpreter ends.
+            # Flush here, where an error can still be reported, not at the interpreter's exit.
             if sys.stdout is not None:
                 sys.stdout.flush()
     except KeyboardInterrupt:
@@ -143,14 +143,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _tell(line: str) -> None:
-    """On the standard error; where that cannot be written, the exit status still says it."""
+    """Print on the standard error; if that cannot be written, only the exit status reports the error."""
     with contextlib.suppress(OSError):
         # It may hold words of a file or of a device.
         print(printable(line, LONGEST_LINE), file=sys.stderr)
 
 
 def _discard_output() -> None:
-    """Let what is still in its buffer go nowhere, else the interpreter trips over it once more."""
+    """Discard the rest of its buffer, else the interpreter fails on it again at exit."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
@@ -159,7 +159,7 @@ def _discard_output() -> None:
 
 def _run(argv: list[str]) -> int:
     chosen = [a for a in argv if a and not a.startswith('-')][:1]
-    # `ros2 run` and `ros2 launch` add arguments of their own: they are for rclpy, not for argparse.
+    # `ros2 run` and `ros2 launch` add arguments for rclpy, which argparse must not see.
     own, ros_arguments = _split_ros_arguments(argv)
     try:
         _refuse_empty(own)
@@ -171,11 +171,11 @@ def _run(argv: list[str]) -> int:
         _tell(f'{" ".join(["psd-deflection", *chosen])}: {error}')
         return error.exit_status
     if unknown:
-        # The parser of the whole program would answer with its own usage, which names none of the command's options.
+        # Let the subcommand's parser report the error, so that its own usage is printed.
         args.refuse(f'unrecognized arguments: {" ".join(unknown)}{_ros_hint(unknown)}')
     args.ros_arguments = ros_arguments
     out: str | None = getattr(args, 'out', None)
-    # What was there before is another run's, and this one has not written into it.
+    # An output that existed before belongs to another run; this one has not written to it.
     fresh = out is not None and not os.path.lexists(out)
     try:
         with _ended_like_ctrl_c() if fresh else contextlib.nullcontext():
@@ -194,9 +194,9 @@ def _run(argv: list[str]) -> int:
 
 @contextlib.contextmanager
 def _ended_like_ctrl_c() -> Iterator[None]:
-    """What a `timeout` or a closed terminal ends leaves no output either that looks whole."""
+    """Treat `timeout` and a closed terminal like Ctrl-C, so that no unfinished output looks complete."""
     before = {}
-    # Only the main thread may say so.
+    # Only the main thread may set signal handlers.
     with contextlib.suppress(ValueError):
         for number in (signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is signal.SIG_DFL:
@@ -209,9 +209,9 @@ def _ended_like_ctrl_c() -> Iterator[None]:
 
 
 def set_aside(out: Path) -> str:
-    """Take an output that was not finished out of the way of whoever takes it for whole; returns where it is, in words.
+    """Rename an unfinished output, so that it does not look complete; return its new place as text.
 
-    An empty folder goes; else it becomes ``NAME.partial``, or ``NAME.partial2`` and so on.
+    An empty folder is deleted; else it becomes ``NAME.partial``, or ``NAME.partial2`` and so on.
     """
     try:
         if out.is_dir() and not any(out.iterdir()):
@@ -228,7 +228,7 @@ def set_aside(out: Path) -> str:
 
 
 def _refuse_empty(argv: Sequence[str]) -> None:
-    """Raise UsageError for an argument without content: what a script has where a variable is not set."""
+    """Raise UsageError for an empty argument, as from a variable that is not set in a script."""
     for before, argument in itertools.pairwise(['', *argv]):
         option, equals, value = argument.partition('=')
         if argument == '' or (option.startswith('--') and equals and not value):

@@ -172,7 +172,7 @@ class SimulatedLines:
 
 
 class LinesEar:
-    """Recognises a line that describes the device. ``baud``: the speed at which it listens, and which it suggests."""
+    """Recognises a line that describes the device. ``baud``: the speed at which it listens, to be suggested."""
 
     def __init__(self, baud: int) -> None:
         self.promising = False

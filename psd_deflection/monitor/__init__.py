@@ -1,6 +1,6 @@
-"""The live page: what the rig does, in a browser, with nothing from outside hosts.
+"""The live page: shows the rig in a browser and loads nothing from outside hosts.
 
-``feed`` takes records off the pipeline thread through a bounded queue, ``server`` has a thread of
-its own and serves the page and a websocket, ``access`` says who may do what, ``source`` is what is
-shown: a running session, or a recording at its own pace.
+``feed`` takes records off the pipeline thread through a bounded queue, ``server`` serves the page and a
+websocket in its own thread, ``access`` decides who may do what, ``shown`` is the source of the page: a
+running session, or a recording in real time.
 """

@@ -1,10 +1,10 @@
 """Who may see the page and who may press its buttons.
 
-A browser sends what any web page tells it to, also to 127.0.0.1. So a request must name this
-machine as its host (else a foreign name could be made to point here: DNS rebinding), and one that
-comes from a page must come from ours (else any site could take the zero: cross-site request
-forgery, cross-site websocket hijacking). Where others on the network can reach the page, its
-buttons need a token besides.
+Any web page can make a browser send requests, also to 127.0.0.1. So a request must name this
+machine as its host: otherwise a foreign name could point here (DNS rebinding). A request that
+comes from a page must come from our page: otherwise any site could take the zero (cross-site request
+forgery, cross-site websocket hijacking). If others on the network can reach the page, its
+buttons also need a token.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 
 def host_name(host_header: str) -> str:
-    """The name in a Host header, without port and brackets, lower case; '' where it is malformed."""
+    """The name in a Host header, without port and brackets, lower case; '' if it is malformed."""
     try:
         return (urlsplit('//' + host_header).hostname or '').rstrip('.')
     except ValueError:
@@ -25,7 +25,7 @@ def host_name(host_header: str) -> str:
 
 
 def is_address(name: str) -> bool:
-    """Whether ``name`` is an IP address: one that no foreign name server can point elsewhere."""
+    """Whether ``name`` is an IP address, which no name server can redirect."""
     try:
         ipaddress.ip_address(name.partition('%')[0])
     except ValueError:
@@ -34,14 +34,14 @@ def is_address(name: str) -> bool:
 
 
 def is_loopback(address: str) -> bool:
-    """Whether only this machine reaches a server bound to ``address``."""
+    """Whether only this machine can reach a server bound to ``address``."""
     if address == 'localhost':
         return True
     return is_address(address) and ipaddress.ip_address(address).is_loopback
 
 
 def is_own_host(host_header: str, address: str) -> bool:
-    """Whether the Host header names this machine: an address, localhost, or the name it goes by."""
+    """Whether the Host header names this machine: an address, localhost, or its host name."""
     name = host_name(host_header)
     if not name:
         return False
@@ -60,8 +60,8 @@ def is_own_page(headers: Mapping[str, str]) -> bool:
 
 
 def is_token(given: str | None, expected: str) -> bool:
-    """Whether the token is right; takes as long for a near miss as for a far one."""
-    # A header may hold bytes that are no text; they come as lone surrogates.
+    """Whether the token is right, compared in constant time."""
+    # A header may hold bytes that are not text; they appear as lone surrogates.
     return given is not None and hmac.compare_digest(
         given.encode(errors='surrogateescape'), expected.encode(errors='surrogateescape')
     )

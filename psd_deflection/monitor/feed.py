@@ -1,7 +1,6 @@
-"""From the pipeline thread to the page's thread: a sink that never waits and never grows.
+"""Passes records from the pipeline thread to the page's thread; it never waits and never grows.
 
-What does not fit into the queue is counted and passed over; the estimates that are published and
-recorded do not know that anyone looks on.
+Items that do not fit into the queue are dropped and counted. Publishing and recording are not affected.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import NamedTuple
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock, SpotMeans
 
 QUEUE_ITEMS = 2000
-"""Ten seconds of a block's two items at 100 blocks/s."""
+"""Ten seconds at 100 blocks/s and two items per block."""
 
 COLUMNS = (
     't',
@@ -35,11 +34,11 @@ COLUMNS = (
     'status',
     'chi_square',
 )
-"""A row as the page gets it: s, -, m, V, m, rad, their standard deviations, samples, BlockStatus, chi-square."""
+"""Columns of a row on the page: s, -, m, V, m, rad, their standard deviations, samples, BlockStatus, chi-square."""
 
 
 class BlockResult(NamedTuple):
-    """One block's dots, and its primary estimate where it has one."""
+    """One block's dots, and its primary estimate if it has one."""
 
     spots: SpotMeans
     estimate: DeflectionEstimate | None
@@ -55,7 +54,7 @@ class Feed:
         self._queue: queue.SimpleQueue[BlockResult | SampleBlock] = queue.SimpleQueue()
 
     def put(self, record: Record) -> None:
-        """Take one record; kinds that the page does not show are passed over."""
+        """Take one record; kinds that the page does not show are ignored."""
         if isinstance(record, DeflectionEstimate):
             if record.primary:
                 self._estimate = record
@@ -67,11 +66,11 @@ class Feed:
 
     @property
     def waiting(self) -> int:
-        """Items that nobody has taken yet."""
+        """Number of items that wait in the queue."""
         return self._queue.qsize()
 
     def take(self) -> list[BlockResult | SampleBlock]:
-        """What came since the last call, in order; does not wait."""
+        """The items since the last call, in order; does not wait."""
         return [self._queue.get_nowait() for _ in range(self._queue.qsize())]
 
     def _offer(self, item: BlockResult | SampleBlock) -> None:
@@ -82,14 +81,14 @@ class Feed:
 
 
 def row_json(result: BlockResult) -> str:
-    """One row in the order of ``COLUMNS``, as JSON; null where there is no number."""
+    """One row in the order of ``COLUMNS``, as JSON; null for missing numbers."""
     spots, estimate = result
     values: list[float] = [*spots.dots, *spots.sums]
     if estimate is not None:
         values += [*estimate.pose, *(math.sqrt(max(v, 0.0)) for v in estimate.variances)]
     numbers = [f'{v:.7g}' if math.isfinite(v) else 'null' for v in values]
     numbers += ['null'] * (12 - len(numbers))
-    # Microseconds are all that a double can hold of a time since the epoch.
+    # A double holds a time since the epoch only to the microsecond.
     seconds = f'{spots.t_ns // 1_000_000_000}.{spots.t_ns % 1_000_000_000 // 1000:06d}'
     chi_square = estimate.chi_square if estimate is not None else math.nan
     last = f'{chi_square:.4g}' if math.isfinite(chi_square) else 'null'

@@ -1,10 +1,9 @@
 """The page's own thread: an aiohttp server with the page, a websocket and two buttons.
 
-Everything it holds has a fixed size: the rows of the last minute, the last messages, one cursor a
-browser. A browser that is too slow misses rows (its traces have gaps), and nothing waits for it:
-each gets what is new when its last message has left. What strangers send costs an answer, never a
-traceback in the log, and connections that nobody looks through are ended before they use up the
-daemon's file descriptors.
+All its buffers have a fixed size: the rows of the last minute, the last messages, one cursor per
+browser. A browser gets new rows once its last message has been sent. If it is too slow it misses rows
+(its traces have gaps), and nothing waits for it. A bad request gets an error response, never a
+traceback in the log. Idle connections are closed before they use up the daemon's file descriptors.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ HISTORY_S = 60.0
 MESSAGES = 50
 BROWSERS = 16
 CONNECTIONS = 100
-"""That may be open beside the browsers' websockets; a browser opens six at most."""
+"""Maximum plain HTTP connections, in addition to websockets; a browser opens at most six."""
 
 PATH_CHARACTERS = 100
 START_S = 10.0
@@ -65,13 +64,13 @@ HEADERS = {
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
-# aiohttp logs each malformed request with a traceback: whoever reaches the port could fill the journal.
+# aiohttp logs each malformed request with a traceback: an attacker could fill the journal.
 _UNHEARD = logging.getLogger('psd_deflection.monitor.http')
 _UNHEARD.disabled = True
 
 
 class MonitorServer:
-    """Serves ``shown``, fed by ``feed``, from :meth:`start` to :meth:`close`. ``say``: where it tells its address."""
+    """Serves ``shown``, fed by ``feed``, from :meth:`start` to :meth:`close`. ``say`` gets the address as a line."""
 
     def __init__(self, shown: Shown, feed: Feed, config: MonitorConfig, say: Callable[[str], None]) -> None:
         self.token = ''
@@ -101,14 +100,14 @@ class MonitorServer:
             self.token = os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(16)
 
     def start(self) -> str:
-        """Start the thread; returns the page's address. Raises ConfigError where it cannot be served."""
+        """Start the thread; return the page's address. Raises ConfigError if it cannot be served."""
         self._thread.start()
         self.url = self._started.result(START_S)
         self._say(f'monitor: {self.url}' + (f'#token={self.token}' if self.token else ''))
         return self.url
 
     def close(self) -> None:
-        """Say goodbye to the browsers and end the thread; does nothing the second time."""
+        """Close the connections to the browsers and end the thread; a second call does nothing."""
         if self._loop is not None and self._ended is not None and self._thread.is_alive():
             with contextlib.suppress(RuntimeError):
                 self._loop.call_soon_threadsafe(self._ended.set)
@@ -166,7 +165,7 @@ class MonitorServer:
             except OSError as error:
                 if error.errno != errno.EADDRINUSE:
                     raise
-                # Measuring goes on without its usual address rather than not at all.
+                # An unusual address is better than no page.
                 self._say(f'monitor: port {port} is in use (by another monitor?); taking a free one')
                 await web.TCPSite(runner, address, 0).start()
         except (OSError, UnicodeError) as error:
@@ -179,7 +178,7 @@ class MonitorServer:
         name = {'0.0.0.0': socket.gethostname(), '::': socket.gethostname()}.get(address, address)
         return f'http://{f"[{name}]" if ":" in name else name}:{port}/'
 
-    # What the threads of the run bring.
+    # Data from the threads of the run.
 
     async def _pump(self, runner: web.AppRunner) -> None:
         due = 0.0
@@ -214,7 +213,7 @@ class MonitorServer:
     def _take_health(self) -> None:
         now = time.monotonic()
         if self._report is None or now - self._report_at >= HEALTH_S:
-            # A report tells of the time since the last one: of a moment, it would say that nothing came.
+            # A report covers the time since the last one: over a very short time it would show no samples.
             self._report, self._report_at = self._shown.health(time.time_ns()), now
         self._health = (self._health[0] + 1, self._health_json(self._report))
         self._wake()
@@ -244,7 +243,7 @@ class MonitorServer:
             }
         )
 
-    # What browsers ask.
+    # Requests of browsers.
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -266,12 +265,12 @@ class MonitorServer:
         return web.FileResponse(PAGE / 'index.html')
 
     async def _websocket(self, request: web.Request) -> web.StreamResponse:
-        # Who does not read for this long is gone.
-        # Not compressed: aiohttp compresses what is long in a task of its own, which outlives a browser that has left.
+        # A browser that does not read for this long is gone.
+        # Not compressed: aiohttp compresses long messages in a separate task, which outlives a browser that has left.
         browser = web.WebSocketResponse(heartbeat=10.0, max_msg_size=1024, compress=False)
         await browser.prepare(request)
         if len(self._browsers) >= BROWSERS:
-            # A page is told the reason of a close; that of a handshake which failed, it is not.
+            # A page learns the reason of a close, but not that of a failed handshake.
             await browser.close(
                 code=WSCloseCode.TRY_AGAIN_LATER, message=f'{BROWSERS} browsers look on already'.encode()
             )
@@ -353,7 +352,7 @@ class MonitorServer:
             return _answer(403, 'refused: the buttons are off; the parameter monitor_control allows them')
         if self.token and not access.is_token(request.headers.get(TOKEN_HEADER), self.token):
             return _answer(401, 'refused: the token is missing or wrong; the address printed at the start has it')
-        # A type that no foreign form can send.
+        # A type that a form of another site cannot send.
         if request.content_type != 'application/json':
             return _answer(415, 'refused: Content-Type must be application/json')
         try:

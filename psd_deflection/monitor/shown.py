@@ -1,4 +1,4 @@
-"""What the page shows: a session that runs, or a recording played at its own pace."""
+"""The source of the page: a running session, or a recording played in real time."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from psd_deflection.runner.diagnostics import ERROR, OK, WARN, HealthReporter
 from psd_deflection.runner.session import Session, why_no_zero, zero_text
 
 LONGEST_WAIT_S = 2.0
-"""A pause in a recording is not sat out for longer."""
+"""Longest wait for a pause in a recording, s."""
 
 REQUEST_TIMEOUT_S = 1.0
 
 
 class RefusedError(Exception):
-    """What was asked for cannot be done now; the message says why, in one line."""
+    """The request cannot be carried out now; the message says why, in one line."""
 
 
 class Shown(Protocol):
-    """What the server asks of whatever it shows. Every call may come from the server's threads."""
+    """Interface of everything that the server can show. Calls come from the server's threads."""
 
     @property
     def rig(self) -> Rig:
@@ -42,10 +42,10 @@ class Shown(Protocol):
         """Once a second."""
 
     def zero(self) -> str:
-        """Take the present dots as the unloaded ones; what was done, in a line. Raises RefusedError."""
+        """Take the present dots as the unloaded ones; return the result as a line. Raises RefusedError."""
 
     async def record(self, wanted: bool) -> str:
-        """Start or stop a recording; what was done, in a line, once the disk has answered. Raises RefusedError."""
+        """Start or stop a recording; return the result as a line once the disk has answered. Raises RefusedError."""
 
 
 class ShownSession:
@@ -87,7 +87,7 @@ class ShownSession:
         """Start or stop the recorder between two blocks."""
         try:
             asked = await asyncio.to_thread(self._session.record, wanted)
-            # Not in a thread of a pool: a disk that hangs would take one after the other, and hold up the exit.
+            # Not in a thread pool: a disk that hangs would block one thread after the other, and delay the exit.
             folder = await asyncio.wrap_future(asked)
         except (TimeoutError, PsdDeflectionError) as error:
             raise RefusedError(str(error)) from None
@@ -97,10 +97,10 @@ class ShownSession:
 
 
 class ShownRecording:
-    """A recording, once or over and over; a thread of its own feeds ``feed``.
+    """A recording, played once or repeatedly; a separate thread feeds ``feed``.
 
-    ``open_steps``: a fresh pipeline and the records of each step of it. ``speed``: times as fast as
-    recorded.
+    ``open_steps``: returns a new pipeline and the records of each of its steps. ``speed``: factor of the
+    recorded speed.
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class ShownRecording:
         return {'kind': 'replay', 'name': self._name, 'recording': None}
 
     def health(self, t_ns: int) -> DiagnosticReport:
-        """What was played so far, and why blocks have no estimate."""
+        """Counts of the part played so far, and why blocks have no estimate."""
         counters = self._pipeline.counters
         samples, estimates, lost = counters.samples, counters.estimates, self._lost
         new_samples = max(samples - self._seen[0], 0)
@@ -198,7 +198,7 @@ class ShownRecording:
         return DiagnosticReport(t_ns, tuple(entries))
 
     def zero(self) -> str:
-        """Take the zero between two blocks: what would have been measured from here on."""
+        """Take the zero between two blocks; it holds for the rest of the playback."""
         if self._ended or self._thread.ident is None:
             raise RefusedError('not zeroed: the recording has ended')
         asked: Future[str] = Future()
@@ -213,7 +213,7 @@ class ShownRecording:
             return asked.result(REQUEST_TIMEOUT_S)
 
     async def record(self, wanted: bool) -> str:
-        """Refuse: it is recorded already."""
+        """Refuse: a recording is not recorded again."""
         raise RefusedError('a recording is not recorded again; the command replay writes its answers')
 
     def _run(self) -> None:

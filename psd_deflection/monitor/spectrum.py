@@ -1,9 +1,9 @@
 """Amplitude spectral density of the dots from the last seconds of raw samples.
 
 Welch's method (P. D. Welch, IEEE Trans. Audio Electroacoust. 15, 1967): Hann windows, half
-overlapping, linear trend left in but for the mean. A segment holds only samples that follow each
-other: a lost sample ends one, and nothing is filled in. Nor does one hold a sample without light: its
-place, 0 mm, is no dot's.
+overlapping; the mean is removed, a linear trend is not. A segment holds only consecutive samples: a lost
+sample ends it, and nothing is filled in. A sample without light ends it too, because its position, 0 mm,
+is not that of a dot.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SECONDS = 4.0
 
 
 class Spectrum:
-    """Remembers the last ``seconds`` (None: all there were); one thread at a time."""
+    """Keeps the samples of the last ``seconds`` (None: all); one thread at a time."""
 
     def __init__(self, rig: Rig, seconds: float | None = SECONDS) -> None:
         self.rate_hz = rig.converter.sample_rate_hz
@@ -32,7 +32,7 @@ class Spectrum:
         self._blocks: deque[SampleBlock] = deque(
             maxlen=None if samples is None else max(2, round(samples / rig.estimator.block_size))
         )
-        # As the optics' health has it: half the light is no lost laser where two share both detectors.
+        # Same threshold as the optics' health: with a beam splitter, half the light does not mean no light.
         self._sum_min = rig.estimator.sum_min * (0.5 if rig.estimator.splitter else 1.0)
         self._window = np.hanning(SEGMENT + 1)[:-1]
 

@@ -1,4 +1,4 @@
-"""Puts a page in front of a session: the few lines that the node and the command line share."""
+"""Starts the page of a session, for the node and the command line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def need_server() -> None:
-    """Raise ConfigError, with the way out, where what the page needs is not installed."""
+    """Raise ConfigError, with the fix, if aiohttp is not installed."""
     if importlib.util.find_spec('aiohttp') is None:
         raise ConfigError(
             "the live page needs aiohttp: `pip install 'psd_deflection[monitor]'` or `apt install python3-aiohttp`, "
@@ -25,20 +25,20 @@ def need_server() -> None:
 
 
 def start_monitor(session: Session, say: Callable[[str], None]) -> MonitorServer | None:
-    """Serve ``session`` where its rig says ``monitor``; else None. The session's sinks gain one.
+    """Serve ``session`` if its rig has ``monitor`` set; else None. It adds a sink to the session.
 
-    ``say`` is told the address. Raises ConfigError where it cannot be served.
+    ``say`` gets the address as a line. Raises ConfigError if it cannot be served.
     """
     if not session.rig.monitor.enabled:
         return None
     need_server()
-    # Only here: whoever does not look on does without aiohttp.
+    # Imported here: only the page needs aiohttp.
     from psd_deflection.monitor.server import MonitorServer
 
     feed = Feed()
     server = MonitorServer(ShownSession(session), feed, session.rig.monitor, say)
     server.start()
-    # Behind what is published and recorded.
+    # After publishing and recording.
     session.processing.sinks.append(feed)
     session.listeners.append(server.tell)
     return server

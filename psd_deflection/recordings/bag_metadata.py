@@ -1,7 +1,7 @@
-"""What rosbag2 Jazzy writes beside the messages: ``metadata.yaml`` version 9 and QoS profiles.
+"""Metadata as rosbag2 Jazzy writes it beside the messages: ``metadata.yaml`` version 9 and QoS profiles.
 
-The QoS of a topic stands twice in a bag, in ``metadata.yaml`` and in the MCAP channel; readers
-that compare them skip a topic where they differ, so both are made here from one value.
+A bag holds the QoS of a topic twice, in ``metadata.yaml`` and in the MCAP channel. Some readers
+skip a topic if the two differ, so both are made here from one value.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def qos_text(qos: Qos) -> str:
 
 
 def to_yaml(tree: object) -> str:
-    """Block style, in the order given, as rosbag2 has it."""
+    """YAML in block style, in the given order, as rosbag2 writes it."""
 
     class Dumper(yaml.SafeDumper):
         def ignore_aliases(self, data: object) -> bool:
@@ -83,7 +83,7 @@ class FileCount:
 
 
 def _times(start_ns: int, end_ns: int, count: int) -> dict[str, Any]:
-    # What rosbag2 has for a bag without a message.
+    # The value that rosbag2 writes for a bag without messages.
     return {
         'starting_time': {'nanoseconds_since_epoch': start_ns if count else 2**63 - 1},
         'duration': {'nanoseconds': end_ns - start_ns if count else 0},
@@ -128,6 +128,6 @@ def bag_information(
 
 
 def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:
-    """``metadata.yaml`` as a whole or not at all. Raises OSError."""
+    """Write ``metadata.yaml`` completely or not at all. Raises OSError."""
     text = to_yaml({'rosbag2_bagfile_information': information})
     replace_file(folder / 'metadata.yaml', text.encode())

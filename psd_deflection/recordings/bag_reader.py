@@ -1,7 +1,7 @@
-"""Reads bags (folders) and lone MCAP files, ours and those of ``ros2 bag record`` and others.
+"""Reads bags (folders) and single MCAP files: our own and those of ``ros2 bag record`` and other programs.
 
-Sample numbers are recorded modulo 2^32 and are extended again here, so that blocks come out as the
-writer cut them (2^32 is no multiple of 20).
+Sample numbers are recorded modulo 2^32. They are extended again here, so that the blocks are those of
+the writer (2^32 is not a multiple of 20).
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ from psd_deflection.records import (
 MAX_YAML_BYTES = 16_000_000
 
 _BATCH = 50
-"""Messages whose samples are decoded at once: numpy's cost is by the call."""
+"""Number of messages whose samples are decoded at once: numpy's cost is per call."""
 
 T = TypeVar('T')
 
 
 class BagRecording(Recording):
-    """A bag folder or a lone ``.mcap``. Raises RecordingError where nothing of it can be read."""
+    """A bag folder or a single ``.mcap``. Raises RecordingError if nothing in it can be read."""
 
     def __init__(self, path: Path, block_size: int | None = None) -> None:
         super().__init__(path, block_size)
@@ -71,7 +71,7 @@ class BagRecording(Recording):
         self.changes = self._changes_in(metadata)
 
     def _files_of(self, folder: Path) -> list[Path]:
-        """The bag's files in order: as ``metadata.yaml`` names them, else by their number."""
+        """The bag's files in the order of ``metadata.yaml``, else of their numbers."""
         meta_file = folder / 'metadata.yaml'
         found = files_in(folder)
         if not meta_file.is_file():
@@ -102,7 +102,7 @@ class BagRecording(Recording):
 
     @property
     def complete(self) -> bool:
-        """True where every file has its end and all that was read so far was whole."""
+        """True if every file has its end and everything read so far was undamaged."""
         return not any(s.warnings for s in self._sources)
 
     @property
@@ -127,19 +127,19 @@ class BagRecording(Recording):
         return sorted(out, key=lambda change: change.block)
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Messages as they lie in the files: (channel, log_time, cdr), of ``topics`` or of all."""
+        """Encoded messages of the files: (channel, log_time, cdr), of ``topics`` or of all."""
         for source in self._sources:
             yield from source.messages(topics)
 
     def topics(self) -> dict[str, int]:
-        """How many messages of each topic it holds."""
+        """Number of messages of each topic."""
         counts: dict[str, int] = {}
         for channel, _, _ in self.messages():
             counts[channel.topic] = counts.get(channel.topic, 0) + 1
         return counts
 
     def blocks(self) -> Iterator[SampleBlock]:
-        """The samples, cut into blocks at seq // block_size. Raises RecordingError if there is none."""
+        """The samples, cut into blocks at seq // block_size. Raises RecordingError if there are none."""
         blocks = super().blocks()
         first = next(blocks, None)
         if first is None:
@@ -169,7 +169,7 @@ class BagRecording(Recording):
                 yield RawChunk(seq[finite], t_ns[finite], volts[finite], flags[finite])
 
     def _clouds(self) -> Iterator[tuple[int, list[tuple[int, npt.NDArray[np.void]]]]]:
-        """(log time, messages as (stamp, points)); those of one yield are alike in layout."""
+        """Yields (log time, messages as (stamp, points)); all messages of one yield have the same layout."""
         decoder = CloudDecoder()
         batch: list[tuple[int, npt.NDArray[np.void]]] = []
         first_time = 0
@@ -194,7 +194,7 @@ class BagRecording(Recording):
             raise RecordingError(f'{self.path}: {topic} is {found!r} in {encoding!r}, not {wanted} in cdr')
 
     def _decoded(self, topic: str, convert: Callable[[dict[str, Any]], T]) -> list[T]:
-        """Every message of ``topic``; one without a stamp (0) has the time at which it came."""
+        """Every message of ``topic``; a message without a stamp (0) gets its time of arrival."""
         out = []
         for channel, log_time, message in self.messages([topic]):
             self._check_type(channel.type, channel.encoding, topic)
@@ -239,10 +239,10 @@ class BagRecording(Recording):
 
 
 class _SequenceCounter:
-    """Extends sample numbers past the 32 bits that others' recordings have, and ours until then.
+    """Extends 32-bit sample numbers, as in recordings of other programs and in ours before the first wrap.
 
-    A number that goes back is a wrap where so many samples could have been taken meanwhile, else a
-    device that started anew; then counting goes on in the next block, so that nothing is mixed.
+    A number that goes back is a wrap if that many samples fit into the elapsed time. Otherwise the device
+    has restarted; then counting continues in the next block, so that no block mixes the two runs.
     """
 
     _FASTEST_HZ = 20_000
@@ -256,7 +256,7 @@ class _SequenceCounter:
         self._last_t = -1
 
     def follows(self, samples: Samples) -> bool:
-        """Whether these samples go on from the last ones without any number or time going back."""
+        """Whether these samples continue the last ones without a number or time going back."""
         return (
             (self._last is None or int(samples.seq[0]) + self._base_of(samples) > self._last)
             and int(samples.t_ns[0]) > self._last_t
@@ -268,7 +268,7 @@ class _SequenceCounter:
         return self._moved if samples.whole else self._moved + self._wrapped
 
     def extended(self, samples: Samples) -> IntArray:
-        """Numbers that rise from call to call. Raises ValueError where they do not rise within one."""
+        """Numbers that increase from call to call. Raises ValueError if they do not increase within one call."""
         seq, t_ns = samples.seq.copy(), samples.t_ns
         if seq[-1] < seq[0] and not samples.whole:
             seq[seq < seq[0]] += WRAP
@@ -288,7 +288,7 @@ class _SequenceCounter:
         return seq
 
     def _go_on(self, last: int, first: int, t_ns: int, whole: bool) -> None:
-        """Take up counting after ``last`` at ``first``, which is not above it."""
+        """Continue counting after ``last`` at ``first``, which is not greater."""
         step = (first - last) % WRAP
         if not whole and 0 < step <= 1000 + (t_ns - self._last_t) * self._FASTEST_HZ // 1_000_000_000:
             self._wrapped += last + step - first
@@ -300,7 +300,7 @@ class _SequenceCounter:
 
 def _to_change(entry: Mapping[str, str]) -> ParameterChange:
     def number(value: object) -> float:
-        # As they are: a whole number must come back as one.
+        # Unchanged: an integer must be read back as an integer.
         if isinstance(value, int | float):
             return value
         raise TypeError
@@ -333,7 +333,7 @@ def files_in(folder: Path) -> list[Path]:
 
 
 def read_information(path: Path) -> dict[str, Any]:
-    """What ``metadata.yaml`` says of its bag. Raises RecordingError where that is nothing."""
+    """The content of ``metadata.yaml``. Raises RecordingError if it cannot be used."""
     way_out = '`psd-deflection recover` makes it anew'
     try:
         tree = parse_yaml(read_text(path, MAX_YAML_BYTES))

@@ -1,9 +1,9 @@
-"""Writes recordings: rosbag2 bags (a folder with ``metadata.yaml`` and MCAP) and lone MCAP files.
+"""Writes recordings: rosbag2 bags (a folder with ``metadata.yaml`` and MCAP) and single MCAP files.
 
-A crash must cost at most a second: chunks span less than half a second of log time and are handed
-to the operating system as they end (``durable``: to the disk); parameters, version and hello are at
-the front of every file. What a crash leaves is read up to the cut by
-:mod:`psd_deflection.recordings.bag_reader` and made whole again by :mod:`psd_deflection.recordings.repair`.
+A crash must cost at most a second. So chunks span less than half a second of log time and are handed
+to the operating system when they end (``durable``: written to the disk). Parameters, version and hello are at
+the front of every file. After a crash, :mod:`psd_deflection.recordings.bag_reader` reads the file up to the
+cut, and :mod:`psd_deflection.recordings.repair` repairs it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from psd_deflection.recordings.bag_metadata import (
 from psd_deflection.records import ParameterChange, Record
 
 CHUNK_NS = 500_000_000
-"""Log time that a chunk spans at most: with what waits in queues, a crash costs less than a second."""
+"""Largest log time that a chunk spans: together with the queues, a crash costs less than a second."""
 
 META_SOFTWARE = 'psd_deflection'
 META_PARAMETERS = 'psd_deflection.parameters'
@@ -48,8 +48,8 @@ META_CHANGE = 'psd_deflection.change.'
 
 
 _CHUNK_INDICES = '_Writer__chunk_indices'
-"""Where mcap's writer keeps them; it has no public place for them. Under another name in a later mcap they would
-stay in memory, and the tests fail."""
+"""Private attribute of mcap's writer that holds the chunk indexes; there is no public one. If a later mcap renames it,
+they stay in memory, and a test fails."""
 
 CUSTOM = {'psd_deflection_version': __version__}
 
@@ -66,16 +66,16 @@ def _json_values(values: Mapping[str, object]) -> dict[str, str]:
 
 
 class _IndexSpool:
-    """The chunk indexes of a recording until its end, in a file without a name beside it.
+    """Keeps the chunk indexes of a recording until its end, in an unnamed file beside it.
 
-    The writer keeps them in a list: a kilobyte a chunk, 180 MB a day.
+    The writer would keep them in a list: a kilobyte per chunk, 180 MB a day.
     """
 
     def __init__(self, folder: Path) -> None:
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - open as long as the recording
 
     def append(self, index: ChunkIndex) -> None:
-        """Put one behind the others."""
+        """Append one chunk index."""
         record = RecordBuilder()
         index.write(record)
         self._file.write(record.end())
@@ -84,7 +84,7 @@ class _IndexSpool:
         yield self
 
     def write(self, summary: RecordBuilder) -> None:
-        """All of them, as they stand in the summary."""
+        """All chunk indexes, encoded as in the summary."""
         self._file.seek(0)
         while part := self._file.read(1 << 20):
             summary.write(part)
@@ -108,12 +108,12 @@ class _Closing:
 
 
 class McapFile(_Closing):
-    """One MCAP file being written; the part that a bag and a lone file share.
+    """One MCAP file being written; common to bags and single files.
 
-    ``write`` takes the records of one thread. Raises RecordingError where the file exists, cannot
-    be made, or the disk refuses more; after such an error the file is closed and holds all chunks
-    that were complete. While it is written the file is locked (``flock``), so that nobody repairs it.
-    ``durable``: chunks reach the disk before the next one begins, not only the operating system.
+    ``write`` takes the records of one thread. Raises RecordingError if the file exists, cannot be
+    created, or the disk refuses to write. After such an error the file is closed and holds all
+    complete chunks. While it is being written the file is locked (``flock``), so that no program repairs it.
+    ``durable``: each chunk is written to the disk, not only to the operating system, before the next begins.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class McapFile(_Closing):
 
     @property
     def size(self) -> int:
-        """Bytes of the file so far; what is in the unfinished chunk not counted."""
+        """Bytes of the file so far, without the unfinished chunk."""
         return self._stream.tell() if self._stream is not None else 0
 
     def flush(self) -> None:
@@ -210,7 +210,7 @@ class McapFile(_Closing):
             self.write_encoded(message.topic, message.type, cdr.encode(message.type, message.fields), message.t_ns)
 
     def write_encoded(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
-        """Write one message that is CDR already, at log time ``t_ns``.
+        """Write one message that is already encoded as CDR, at log time ``t_ns``.
 
         Raises KeyError for a type that no adapter of :mod:`msg_adapters` declares.
         """
@@ -246,12 +246,12 @@ class McapFile(_Closing):
         return channel
 
     def count(self) -> FileCount:
-        """The file as ``metadata.yaml`` has it."""
+        """The file's entry for ``metadata.yaml``."""
         messages = sum(t.messages for t in self.topics.values())
         return FileCount(self.path.name, self.start_ns, self.end_ns, messages)
 
     def close(self) -> None:
-        """Write index and summary and close; does nothing the second time."""
+        """Write index and summary and close; a second call does nothing."""
         if self._stream is None:
             return
         with self._guard():
@@ -274,9 +274,9 @@ class BagWriter(_Closing):
     """A rosbag2 bag being written: ``NAME/NAME_0.mcap`` and so on, ``NAME/metadata.yaml`` at the end.
 
     ``rig_values``: the flat parameter set, effects included.
-    ``max_bytes``, ``max_s``: a file that is as large, or spans as much log time, is ended and the
-    next one begun (0: never); each file can be read alone. Raises RecordingError where the folder
-    exists already or cannot be made; :meth:`write` and the others as :class:`McapFile` does.
+    ``max_bytes``, ``max_s``: a file of this size, or with this span of log time, is closed and the
+    next one begun (0: never); each file can be read alone. Raises RecordingError if the folder
+    exists already or cannot be created; :meth:`write` and the others raise it as in :class:`McapFile`.
     """
 
     def __init__(
@@ -332,7 +332,7 @@ class BagWriter(_Closing):
             self.write_encoded(message.topic, message.type, cdr.encode(message.type, message.fields), message.t_ns)
 
     def write_encoded(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
-        """Write one message that is CDR already, at log time ``t_ns``; begin a new file where it is time to."""
+        """Write one message that is already encoded as CDR, at log time ``t_ns``; begin a new file if it is due."""
         file = self._file
         full = self._max_bytes and file.size >= self._max_bytes
         if full or (self._max_ns and file.topics and t_ns - file.start_ns >= self._max_ns):
@@ -340,7 +340,7 @@ class BagWriter(_Closing):
         self._file.write_encoded(topic, type_name, message, t_ns)
 
     def rotate(self) -> None:
-        """End the file and begin the next; what changed so far stands in it as well."""
+        """Close the file and begin the next, which repeats the changes so far."""
         before = self._file
         before.close()
         self._ended.append((before.count(), list(before.topics.values())))
@@ -349,7 +349,7 @@ class BagWriter(_Closing):
             self._file.write(change)
 
     def drop_oldest(self) -> Path | None:
-        """Delete the oldest file that is whole; None where there is only the one being written."""
+        """Delete the oldest complete file; None if there is only the one being written."""
         if not self._ended:
             return None
         count, _ = self._ended.pop(0)
@@ -365,16 +365,16 @@ class BagWriter(_Closing):
         self._file.flush()
 
     def information(self) -> dict[str, Any]:
-        """The tree of ``metadata.yaml`` for what was written so far."""
+        """The tree of ``metadata.yaml`` for the messages written so far."""
         parts = [*self._ended, (self._file.count(), list(self._file.topics.values()))]
         topics = totals(t for _, counts in parts for t in counts)
         return bag_information([count for count, _ in parts], topics, CUSTOM)
 
     def close(self) -> None:
-        """Close the file, then write ``metadata.yaml``; does nothing the second time.
+        """Close the file, then write ``metadata.yaml``; a second call does nothing.
 
         A bag whose file ended with an error gets no ``metadata.yaml``: ``psd-deflection recover``
-        makes one of what is there, and our reader needs none.
+        makes one from the files, and our reader needs none.
         """
         if self.closed:
             return

@@ -1,9 +1,9 @@
-"""Message field dicts <-> CDR bytes: the one place that knows the encoding.
+"""Converts message field dicts to CDR bytes and back; no other module knows the encoding.
 
-The node publishes and the recorder writes the very same bytes (XCDR1, little-endian, header
-``00 01 00 00``), so a message is encoded once, by encoders that are made from the definitions.
-Messages that are a header and numbers, seven of a block's eight, are packed in one go, and read so
-where only the numbers count. All else is read by ``mcap_ros2``.
+The node publishes and the recorder writes the same bytes (XCDR1, little-endian, header
+``00 01 00 00``), so a message is encoded once. The encoders are made from the message definitions.
+Seven of a block's eight messages consist of a header and numbers: they are packed in one step, and
+:func:`numbers` reads them in one step. ``mcap_ros2`` decodes all others.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _encoder(type_name: str) -> Encoder:
 
 
 def encoder_of(message: MessageType) -> Encoder:
-    """What makes CDR of the fields of such messages."""
+    """An encoder from message fields to CDR."""
     fields = _number_fields(message)
     if fields is not None:
         return _packer(fields)
@@ -58,7 +58,7 @@ def encoder_of(message: MessageType) -> Encoder:
 
 
 def _writer(message: MessageType, kind: str) -> _Writer:
-    """What appends a ``kind``, a type or an array of one, to bytes; '' is the message itself."""
+    """A function that appends a ``kind`` (a type or an array of one) to bytes; '' is the message itself."""
     array = _ARRAY.fullmatch(kind)
     if array is not None:
         return _array_writer(_writer(message, array[1]), array[1], array[2])
@@ -96,7 +96,7 @@ def _write_text(out: bytearray, value: str) -> None:
 
 
 def _array_writer(write_one: _Writer, kind: str, length: str) -> _Writer:
-    """``length``: of an array of fixed length, else ''."""
+    """``length``: number of elements of a fixed array, else ''."""
 
     def write(out: bytearray, values: Any) -> None:
         if not length:
@@ -113,7 +113,7 @@ def _array_writer(write_one: _Writer, kind: str, length: str) -> _Writer:
 
 
 def _number_fields(message: MessageType) -> list[tuple[tuple[str, ...], int]] | None:
-    """Where each float64 of a message that is a header and float64 is; None for another message."""
+    """Access path of each float64, if a message consists of a header and float64 numbers; else None."""
     (first, _), *others = message.members()
     if first != 'std_msgs/Header' or not all(_only_numbers(message, kind) for kind, _ in others):
         return None
@@ -126,7 +126,7 @@ def _only_numbers(message: MessageType, kind: str) -> bool:
 
 
 def _numbers(message: MessageType, kind: str, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], int]]:
-    """Where each float64 of a ``kind`` is, and how many are there: 0 for a lone one."""
+    """Access path of each float64 of a ``kind``, and how many are there: 0 for a single number."""
     array = _FLOAT64.fullmatch(kind)
     if array is not None:
         yield path, int(array[1] or 0)
@@ -136,8 +136,8 @@ def _numbers(message: MessageType, kind: str, path: tuple[str, ...]) -> Iterator
 
 
 def _packer(fields: list[tuple[tuple[str, ...], int]]) -> Encoder:
-    """An encoder of messages that are a header and float64 ``fields``."""
-    # Lone numbers that are neighbours in one part of the message are taken together.
+    """An encoder for messages that consist of a header and float64 ``fields``."""
+    # Single numbers that are neighbours in one part of the message are read together.
     together: list[tuple[tuple[str, ...], list[str]]] = []
     for path, size in fields:
         if size:
@@ -151,7 +151,7 @@ def _packer(fields: list[tuple[tuple[str, ...], int]]) -> Encoder:
 
     @cache
     def layout(size: int) -> struct.Struct:
-        # Numbers stand at multiples of 8, counted from behind the encapsulation.
+        # Numbers are at multiples of 8, counted from behind the encapsulation.
         return struct.Struct(f'<4siII{size}s{-(12 + size) % 8}x{numbers}d')
 
     def encode(message: Mapping[str, Any]) -> bytes:
@@ -163,7 +163,7 @@ def _packer(fields: list[tuple[tuple[str, ...], int]]) -> Encoder:
             values += take(part)
         header = message['header']
         stamp, frame = header['stamp'], header['frame_id'].encode()
-        # With the zero that ends it.
+        # Including the terminating zero.
         size = len(frame) + 1
         return layout(size).pack(_ENCAPSULATION, stamp['sec'], stamp['nanosec'], size, frame, *values)
 
@@ -171,7 +171,7 @@ def _packer(fields: list[tuple[tuple[str, ...], int]]) -> Encoder:
 
 
 def _taker(names: list[str]) -> Callable[[Any], Iterable[float]]:
-    """The numbers of a part: its fields of these names, or all of it where it is an array."""
+    """The numbers of a part: its fields of these names, or all elements if it is an array."""
     if not names:
         return iter
     return itemgetter(*names) if len(names) > 1 else lambda part: (part[names[0]],)
@@ -198,7 +198,7 @@ def encode(type_name: str, fields: Mapping[str, Any]) -> bytes:
 
 
 def prepare(type_names: Iterable[str]) -> None:
-    """Make the encoders now: the first message of a stream must not wait for them."""
+    """Make the encoders now, so that the first message of a stream does not wait for them."""
     for type_name in type_names:
         _encoder(type_name)
 
@@ -206,7 +206,7 @@ def prepare(type_names: Iterable[str]) -> None:
 def decode(type_name: str, cdr: bytes) -> dict[str, Any]:
     """The fields of one message, nested dicts and lists; ``uint8[]`` as bytes.
 
-    Raises ValueError where the bytes are not a message of that type.
+    Raises ValueError if the bytes are not a message of that type.
     """
     try:
         fields: dict[str, Any] = _plain(_decoder(type_name)(cdr))
@@ -218,9 +218,9 @@ def decode(type_name: str, cdr: bytes) -> dict[str, Any]:
 
 
 def numbers(type_name: str, cdr: bytes) -> tuple[int, tuple[float, ...]]:
-    """(stamp in ns, every number) of a message that is a header and float64, in the order of its definition.
+    """(stamp in ns, all numbers) of a message of a header and float64 numbers, in the order of its definition.
 
-    A tenth of the time of :func:`decode`. Raises ValueError if the message is too short or big-endian.
+    Takes a tenth of the time of :func:`decode`. Raises ValueError if the message is too short or big-endian.
     """
     if cdr[:2] != _LITTLE:
         raise ValueError('is not little-endian CDR')

@@ -1,7 +1,7 @@
-"""Reads the point clouds that hold the samples, without the generic decoder's cost.
+"""Reads the point clouds that hold the samples, faster than the generic decoder.
 
-The clouds of one recording differ in stamp, width and points alone, so what stands between is parsed
-once and compared afterwards. What does not fit is read by the generic decoder.
+The clouds of one recording differ only in stamp, width and points. So the bytes between these are parsed
+once and then only compared. A message that differs goes to the generic decoder.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _U32 = struct.Struct('<I')
 
 
 class _Layout(NamedTuple):
-    """What the messages of one kind have in common, and where the rest lies."""
+    """The common bytes of messages of one kind, and the offsets of the other parts."""
 
     width_at: int
     row_step_at: int
@@ -38,11 +38,11 @@ class CloudDecoder:
     _MOST = 8
 
     def __init__(self) -> None:
-        # Ours come in two kinds, with and without flags.
+        # Our messages have two layouts, with and without flags.
         self._layouts: list[_Layout] = []
 
     def decode(self, message: bytes) -> tuple[int, npt.NDArray[np.void]]:
-        """(header.stamp in ns, the points). Raises ValueError where it is no such message."""
+        """(header.stamp in ns, the points). Raises ValueError if it is not a PointCloud2."""
         for width_at, row_step_at, before_width, after_width, dtype in self._layouts:
             if message[12:width_at] == before_width and message[width_at + 4 : row_step_at] == after_width:
                 try:
@@ -61,7 +61,7 @@ class CloudDecoder:
 
 
 def _learn(message: bytes, dtype: np.dtype[np.void]) -> _Layout:
-    """Where the parts lie that change from one message to the next; ``message`` is a sound one."""
+    """Offsets of the parts that change from one message to the next; ``message`` must be valid."""
 
     def after_text(at: int) -> int:
         (length,) = _U32.unpack_from(message, at)
@@ -79,7 +79,7 @@ def _learn(message: bytes, dtype: np.dtype[np.void]) -> _Layout:
 class Samples(NamedTuple):
     """Samples in order: ``seq`` int64 (n,), ``t_ns`` (n,), ``volts`` (n, 6), ``flags`` (n,).
 
-    ``whole``: False where ``seq`` is modulo 2^32.
+    ``whole``: False if ``seq`` is modulo 2^32.
     """
 
     whole: bool
@@ -97,7 +97,7 @@ def joined_points(messages: Sequence[tuple[int, npt.NDArray[np.void]]]) -> Sampl
     seq = points['seq'].astype(np.uint32).astype(np.int64)
     whole = 'seq_high' in names
     if whole:
-        # 31 bits more are enough for ever, and no file can make them negative.
+        # 31 more bits are always enough, and no file can make the number negative.
         seq += (points['seq_high'].astype(np.int64) & 0x3FFFFFFF) << 32
     return Samples(
         whole,

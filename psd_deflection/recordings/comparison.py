@@ -1,7 +1,7 @@
-"""Holds what a replay gives against what was recorded, message by message, byte by byte.
+"""Compares the messages of a replay with the recorded ones, byte by byte.
 
-Messages are matched by topic and stamp. Both sides are read as streams, so that a recording of any
-length is compared in little memory.
+Messages are matched by topic and stamp. Both sides are read as streams, so that recordings of any
+length are compared in little memory.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ _LAG_NS = 2_000_000_000
 
 
 class Comparison:
-    """Feed it the replay's records in order; then ``finish``. ``same``: no bit differs.
+    """Feed it the replay's records in order, then call ``finish``. ``same``: no bit differs.
 
-    Raises RecordingError where the recording holds no estimates to compare with.
+    Raises RecordingError if the recording holds no estimates to compare with.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -50,11 +50,11 @@ class Comparison:
 
     @property
     def same(self) -> bool:
-        """True where every message of either side is in the other, and no bit differs."""
+        """True if each side has every message of the other, and no bit differs."""
         return not (self.different or self.only_recorded or self.only_replayed)
 
     def add(self, records: list[Record]) -> None:
-        """Compare what ``records`` are published as."""
+        """Compare the messages of ``records``."""
         newest = 0
         for record in records:
             if isinstance(record, ParameterChange):
@@ -63,7 +63,7 @@ class Comparison:
                 if topic in self._replayed:
                     self._replayed[topic].append((t_ns, cdr.encode(type_name, fields)))
                 elif topic not in _NOT_ESTIMATED:
-                    # A solver that runs now and did not then.
+                    # A solver that runs now but did not when the recording was made.
                     self._count_only_replayed(topic, t_ns)
                 newest = max(newest, t_ns)
         if newest:
@@ -72,14 +72,14 @@ class Comparison:
             self._match()
 
     def finish(self) -> None:
-        """What is left on either side has no counterpart."""
+        """Report messages that are left on either side: they have no counterpart."""
         self._read_until(None)
         self._complete = self._recording.complete
         self._match()
         for topic in self._recorded:
             for t_ns, _ in self._recorded[topic]:
                 if t_ns > self._newest and not self._complete:
-                    # The cut took the samples and left what was made of them.
+                    # The cut removed the samples but not the estimates made from them.
                     continue
                 self.only_recorded += 1
                 self._note(f'{topic} at {t_ns} ns is recorded, the replay has none')
@@ -87,7 +87,7 @@ class Comparison:
                 self._count_only_replayed(topic, t_ns)
 
     def counts(self) -> dict[str, int | bool]:
-        """For programs: messages by how they compare, and ``same``."""
+        """For programs: numbers of equal, different and unmatched messages, and ``same``."""
         return {
             'same': self.same,
             'equal': self.equal,
@@ -97,7 +97,7 @@ class Comparison:
         }
 
     def summary(self) -> str:
-        """One line, and the largest difference where there is one."""
+        """One line, and the largest difference if there is one."""
         if self.same:
             return f'compared: {self.equal} messages, no bit differs'
         lines = [

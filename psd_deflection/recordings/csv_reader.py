@@ -1,7 +1,7 @@
-"""Reads CSV recordings: one sample a row, header first, the format of other people's loggers too.
+"""Reads CSV recordings: one sample per row, header first, also from other loggers.
 
-Times are read as decimals into integer nanoseconds, never through a float: seconds since the epoch
-have no nanoseconds left in one. The file is read in passes and never held whole.
+Times are read as decimals into integer nanoseconds, never through a float: a float cannot hold
+nanoseconds since the epoch. The file is read in passes and never held whole in memory.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ REQUIRED = ('t', *CHANNELS)
 KNOWN = (*REQUIRED, *LOAD_COLUMNS, TEMPERATURE_COLUMN, *REFERENCE_COLUMNS)
 
 MAX_LINE = 10_000
-"""Characters; a longer line is no row of samples."""
+"""Maximum characters of a line; a longer line is not a row of samples."""
 
 MAX_SECONDS = 2**31
 """A ROS stamp has 31 bits of seconds."""
@@ -39,7 +39,7 @@ MAX_VOLTS = 1e6
 _RATE_ROWS = 10_000
 
 _BATCH = 500
-"""Rows that become arrays at once: numpy's cost is by the call."""
+"""Number of rows that are converted at once: numpy's cost is per call."""
 
 
 class _Row(NamedTuple):
@@ -49,9 +49,9 @@ class _Row(NamedTuple):
 
 
 class CsvRecording(Recording):
-    """An opened CSV. ``sample_rate_hz`` where it is known; else it is found from the rows' times.
+    """An opened CSV. ``sample_rate_hz``: if known; otherwise computed from the rows' times.
 
-    Raises RecordingError naming file, line and column where something is not as it should be.
+    Raises RecordingError naming file, line and column of a fault.
     """
 
     def __init__(self, path: Path, block_size: int | None = None, sample_rate_hz: float | None = None) -> None:
@@ -174,9 +174,9 @@ class CsvRecording(Recording):
         return value
 
     def _find_step(self) -> float:
-        """Time between samples, ns: the mean of those steps that are within half of the median.
+        """Time between samples, ns: the mean of the steps that differ from the median by less than half.
 
-        Gaps do not count, and neither do the last digits of times that were written in short.
+        So neither gaps nor rounded times affect it.
         """
         times = []
         for row in self._rows():
@@ -188,15 +188,15 @@ class CsvRecording(Recording):
         steps = np.diff(np.array(times, dtype=np.int64)).astype(np.float64)
         median = float(np.median(steps))
         near = steps[(steps > 0.5 * median) & (steps < 1.5 * median)]
-        # Between steps of very different length the median may be near to none of them.
+        # If the steps differ very much, the median may be close to none of them.
         return float(near.mean()) if len(near) else float(steps.min())
 
     def _chunks(self) -> Iterator[RawChunk]:
         """The samples; the first has seq 0.
 
-        A row's number is that of the row before plus the whole number of steps between them. What
-        is left over is carried on and forgotten slowly, so that neither jitter of less than half a
-        step nor a clock that runs a little fast makes a loss where there is none.
+        A row's number is that of the row before plus the whole number of steps between them. The
+        remainder is carried to the next row and decays slowly, so that neither jitter of less than half a
+        step nor a clock that runs slightly fast looks like a loss.
         """
         take = itemgetter(*(self._columns[c] for c in CHANNELS))
         seqs: list[int] = []
@@ -217,7 +217,7 @@ class CsvRecording(Recording):
                     values = list(map(float, take(row.cells)))
                 except ValueError:
                     values = [math.nan]
-                # NaN and what is beyond the bound come through the sum; which cell it was is looked up then.
+                # NaN and values beyond the bound show in the sum; only then the cell is searched.
                 if not sum(map(abs, values)) <= MAX_VOLTS:
                     values = [self._number(row, c, MAX_VOLTS) for c in CHANNELS]
                 seqs.append(seq)
@@ -227,7 +227,7 @@ class CsvRecording(Recording):
                     yield _chunk(seqs, times, volts)
                     seqs, times, volts = [], [], []
         except RecordingError:
-            # What stands before the bad row is good.
+            # Rows before the bad one are good.
             if seqs:
                 yield _chunk(seqs, times, volts)
             raise
@@ -235,7 +235,7 @@ class CsvRecording(Recording):
             yield _chunk(seqs, times, volts)
 
     def topics(self) -> dict[str, int]:
-        """As a bag of the same samples would have them."""
+        """Number of messages by topic, as in a bag of the same samples."""
         counts = {SAMPLES: sum(1 for _ in self.blocks())}
         for topic, found in ((LOAD, self.loads()), (REFERENCE, self.references()), (TEMPERATURE, self.temperatures())):
             if found:
@@ -247,7 +247,7 @@ class CsvRecording(Recording):
         return iter(())
 
     def _optional(self, names: Sequence[str]) -> Iterator[tuple[int, tuple[float, ...]]]:
-        """(t_ns, values) of each row whose cells of these columns are filled in."""
+        """(t_ns, values) of each row that has values in these columns."""
         if names[0] not in self._columns:
             return
         at = [self._columns[n] for n in names]
@@ -259,7 +259,7 @@ class CsvRecording(Recording):
                 yield row.t_ns, tuple(self._number(row, n) for n in names)
 
     def loads(self) -> list[AppliedLoad]:
-        """The load of the first row and each that differs from the one before it."""
+        """The first load and each load that differs from the one before it."""
         out: list[AppliedLoad] = []
         for t_ns, (fx, fy, tz) in self._optional(LOAD_COLUMNS):
             if not out or out[-1][1:] != (fx, fy, tz):
@@ -267,11 +267,11 @@ class CsvRecording(Recording):
         return out
 
     def references(self) -> list[ReferencePose]:
-        """One for each row that has one."""
+        """One reference for each row that has one."""
         return [ReferencePose(t_ns, dx, dy, theta) for t_ns, (dx, dy, theta) in self._optional(REFERENCE_COLUMNS)]
 
     def temperatures(self) -> list[TemperatureReading]:
-        """The first one and each that differs from the one before it."""
+        """The first temperature and each that differs from the one before it."""
         out: list[TemperatureReading] = []
         for t_ns, (celsius,) in self._optional((TEMPERATURE_COLUMN,)):
             if not out or out[-1].celsius != celsius:

@@ -1,6 +1,6 @@
 """Writes CSV: samples as a recording that can be read again, and estimates for a spreadsheet.
 
-Numbers are written with as many digits as bring the same number back (float32 volts, float64
+Numbers are written with enough digits to read the same number back (float32 volts, float64
 poses), times with nine decimals.
 """
 
@@ -31,7 +31,7 @@ def seconds(t_ns: int) -> str:
 
 
 class _CsvFile:
-    """A CSV being written. Raises RecordingError where it exists or the disk refuses."""
+    """A CSV being written. Raises RecordingError if it exists or the disk refuses to write."""
 
     def __init__(self, path: str | Path, header: Sequence[str]) -> None:
         self.path = Path(path)
@@ -62,10 +62,10 @@ class _CsvFile:
         raise RecordingError(f'{self.path}: cannot be written ({error.strerror or error})') from None
 
     def _finish(self) -> None:
-        """Write what is still held back."""
+        """Write the rows that are still held back."""
 
     def close(self) -> None:
-        """Write the rest and close; does nothing the second time."""
+        """Write the rest and close; a second call does nothing."""
         if self._stream is None:
             return
         self._finish()
@@ -89,7 +89,7 @@ class CsvSampleSink(_CsvFile):
 
     ``kinds``: the kinds of records that have columns beside the samples: AppliedLoad, ReferencePose,
     TemperatureReading. Such a record goes into the first row at or after its time and must come before
-    that row's block; loads and temperatures are held, a reference stands once.
+    that row's block. Loads and temperatures are held; a reference is written once.
     """
 
     def __init__(self, path: str | Path, kinds: Collection[type[Record]] = ()) -> None:
@@ -105,7 +105,7 @@ class CsvSampleSink(_CsvFile):
         super().__init__(path, header)
 
     def put(self, record: Record) -> None:
-        """Take one record; those that have no place in the file are passed over."""
+        """Take one record; records without columns in the file are ignored."""
         if isinstance(record, SampleBlock):
             self._write([self._row(record, i) for i in range(len(record.seq))])
         elif isinstance(record, AppliedLoad | ReferencePose | TemperatureReading) and type(record) in self._waiting:
@@ -127,7 +127,7 @@ class CsvEstimateSink(_CsvFile):
     """Estimates: ``t,dx,dy,theta,sd_dx,sd_dy,sd_theta`` (s, m, m, rad), three columns a solver, ``chi_square``.
 
     One row for each block that some solver answered; a block without an answer has no row, and a
-    solver that had none in it has empty cells.
+    solver without an answer has empty cells.
     """
 
     def __init__(self, path: str | Path, solvers: Collection[str]) -> None:
@@ -137,7 +137,7 @@ class CsvEstimateSink(_CsvFile):
         super().__init__(path, ['t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta', *names, 'chi_square'])
 
     def put(self, record: Record) -> None:
-        """Take one record; all but estimates are passed over."""
+        """Take one record; all except estimates are ignored."""
         if not isinstance(record, DeflectionEstimate):
             return
         if self._block and self._block[0].block != record.block:

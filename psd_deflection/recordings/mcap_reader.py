@@ -1,9 +1,9 @@
-"""Reads one MCAP file from front to back, whatever state it is in.
+"""Reads one MCAP file from front to back, even if it is cut or damaged.
 
-Two things keep this apart from the ``mcap`` package's own readers. A file that lost its tail, or a
-chunk that lost its bits, gives everything else, with a warning. And no size that a file declares is
-believed before it has been compared with the file's own size or a bound. What is inside a record
-is parsed by ``mcap.records``. The format: https://mcap.dev/spec.
+It differs from the readers of the ``mcap`` package in two ways. If a file lost its end, or a chunk is
+damaged, everything else is read, with a warning. Every size that a file declares is compared with the
+file's own size or a bound before it is used. ``mcap.records`` parses the content of a record.
+The format: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _MESSAGE_HEAD = struct.Struct('<HIQQ')
 
 
 class RecordedChannel(NamedTuple):
-    """A topic as the file has it. ``type`` as ``pkg/msg/Name``."""
+    """A topic as declared in the file. ``type`` as ``pkg/msg/Name``."""
 
     topic: str
     type: str
@@ -45,7 +45,7 @@ class RecordedChannel(NamedTuple):
 
 
 class RawMessage(NamedTuple):
-    """One message as it lies in the file."""
+    """One encoded message of the file."""
 
     channel: RecordedChannel
     log_time: int
@@ -53,11 +53,11 @@ class RawMessage(NamedTuple):
 
 
 class DamagedError(Exception):
-    """What was read contradicts itself."""
+    """The bytes contradict themselves."""
 
 
 class _WholeFields(ReadDataStream):
-    """The library's field reader, which takes a field that its record cuts short for a whole one."""
+    """The library's field reader with a check: the library accepts a field that is longer than its record."""
 
     def read(self, length: int) -> bytes:
         """The next ``length`` bytes. Raises DamagedError if the record ends before them."""
@@ -96,10 +96,10 @@ def _parsed(opcode: int, content: bytes) -> McapRecord:
 
 
 class McapReader:
-    """One file. ``metadata``: MCAP metadata records by name, the last of a name counts.
+    """One file. ``metadata``: MCAP metadata records by name; the last of a name counts.
 
-    ``cut_at``: the byte where the file ends before its end, None where it is whole. ``warnings``
-    grow as chunks are read. Raises RecordingError where the file cannot be opened or is no MCAP.
+    ``cut_at``: the byte at which a cut file ends, None if the file is complete. ``warnings``
+    grow as chunks are read. Raises RecordingError if the file cannot be opened or is not an MCAP.
     """
 
     def __init__(self, path: Path) -> None:
@@ -125,7 +125,7 @@ class McapReader:
             self.warnings.append(line)
 
     def _records(self, stream: BinaryIO) -> Iterator[tuple[int, int, int]]:
-        """(opcode, offset of the content, its length) of every record that is whole."""
+        """(opcode, offset of the content, its length) of every complete record."""
         at = len(MAGIC)
         while True:
             stream.seek(at)
@@ -152,7 +152,7 @@ class McapReader:
             self._warn(f'ends at byte {at} before its end (a recorder that was stopped hard?); all before is read')
 
     def _scan(self, stream: BinaryIO) -> None:
-        """Look at every record's head; read those that say what is in the file."""
+        """Look at every record's head; read the records that describe the file."""
         magic = stream.read(len(MAGIC))
         if not magic:
             raise self._refuse('is empty')
@@ -221,7 +221,7 @@ class McapReader:
 
     def _messages_in(self, records: bytes, topics: Collection[str] | None) -> Iterator[RawMessage]:
         wanted = self._wanted(topics)
-        # The library's Message takes ten times as long, and this loop sees every message of a replay.
+        # The library's Message is ten times slower, and this loop handles every message of a replay.
         unpack, head = _MESSAGE_HEAD.unpack_from, _MESSAGE_HEAD.size
         for opcode, at, end in _records_in(records):
             if opcode == Opcode.MESSAGE:
@@ -239,7 +239,7 @@ class McapReader:
         return {n: c for n, c in self._channels.items() if topics is None or c.topic in topics}
 
     def contents(self) -> Iterator[McapRecord]:
-        """Every schema, channel, metadata record and message that lies whole in the file, in its order.
+        """Every complete schema, channel, metadata record and message, in the order of the file.
 
         Damage is left out with a warning. Raises RecordingError if the disk fails.
         """

@@ -1,4 +1,4 @@
-"""Recordings for discover: files to arrays on an unbroken sample grid, loads and temperatures held."""
+"""Reads recordings for discover into arrays on a sample grid without gaps; loads and temperatures are held."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ MAX_SAMPLES = 20_000_000
 def read_observation(
     path: str | Path, rig: Rig | None = None, overrides: Mapping[str, object] | None = None, source: str = 'overrides'
 ) -> Observation:
-    """One recording, with the rig that it tells of where none is given, and ``overrides`` on it.
+    """One recording with its rig (by default from its own parameters), changed by ``overrides``.
 
-    Raises RecordingError where it has no loads or cannot be read, ConfigError for a bad override.
+    Raises RecordingError if it has no loads or cannot be read, ConfigError for a bad override.
 
     The sample at t sees the loads applied before t: a load counts from the first sample at or
     after its own time.
@@ -100,7 +100,7 @@ def _digest(path: Path) -> str:
 
 
 def read_observations(paths: Sequence[str | Path], rig: Rig | None = None) -> list[Observation]:
-    """All of ``paths``: recordings, or ``.yaml`` lists of them with what differs in each::
+    """All of ``paths``: recordings, or ``.yaml`` lists of recordings with the parameters that differ in each::
 
         - recording: short.csv
           overrides: {link.length: 0.4}

@@ -16,9 +16,9 @@ def open_recording(
 ) -> Recording:
     """Open ``path``: a bag folder, a lone ``.mcap`` or a ``.csv``.
 
-    ``block_size``: samples a block, where it shall not be that of the recording's own parameters
-    (20 where it has none). ``sample_rate_hz``: for a CSV, where its times do not tell.
-    Raises RecordingError where it is none of the three, or none that can be read.
+    ``block_size``: samples per block; by default from the recording's own parameters (20 if it has
+    none). ``sample_rate_hz``: for a CSV whose times do not determine it.
+    Raises RecordingError if it is none of the three, or cannot be read.
     """
     path = Path(path)
     suffix = path.suffix.lower()

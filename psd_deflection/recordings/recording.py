@@ -1,4 +1,4 @@
-"""What a recording gives, be it a bag, a lone MCAP file or a CSV."""
+"""Interface of all recordings: bags, single MCAP files and CSV."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class EstimateSeries:
     """The deflections that were recorded on one topic, in the order of the recording.
 
     ``t_ns`` int64 (n,). ``pose`` (n, 3): dX m, dY m, theta rad. ``tilt`` (n, 2): phi, omega, rad.
-    ``covariance`` (n, 3, 3) of the pose, or None where the topic has none.
+    ``covariance`` (n, 3, 3) of the pose, or None if the topic has none.
     """
 
     topic: str
@@ -53,10 +53,10 @@ class EstimateSeries:
 class Recording(abc.ABC):
     """An opened recording. Every iterator starts from the front and may be taken more than once.
 
-    ``path``: what was opened. ``parameters``: the flat parameter set it was made with, {} where
-    none is inside. ``hello``: the device's, or None. ``version``: of the software that recorded,
-    or ''. ``changes``: of parameters, made while the run went on, in their order. ``warnings``: one
-    line each, complete after the first whole reading.
+    ``path``: what was opened. ``parameters``: the flat parameter set it was made with, {} if it holds
+    none. ``hello``: the device's, or None. ``version``: of the software that recorded, or ''.
+    ``changes``: of parameters during the run, in order. ``warnings``: one line each, complete after the
+    first full pass over the recording.
     """
 
     def __init__(self, path: Path, block_size: int | None) -> None:
@@ -69,7 +69,7 @@ class Recording(abc.ABC):
 
     @property
     def block_size(self) -> int:
-        """Samples a block: what was asked for, else what it was recorded with, else 20."""
+        """Samples per block: the requested number, else the recorded one, else 20."""
         if self._block_size is not None:
             return self._block_size
         recorded = self.parameters.get('block_size')
@@ -78,17 +78,17 @@ class Recording(abc.ABC):
     @property
     @abc.abstractmethod
     def complete(self) -> bool:
-        """False where the tail is missing or a part that was read is damaged."""
+        """False if the end is missing or a part that was read is damaged."""
 
     @property
     @abc.abstractmethod
     def warnings(self) -> Sequence[str]:
-        """What is wrong with it and did not stop the reading."""
+        """Faults that did not stop the reading."""
 
     def blocks(self) -> Iterator[SampleBlock]:
         """The samples, cut into blocks at seq // block_size.
 
-        Raises RecordingError if there is none, or if what is there is not readable.
+        Raises RecordingError if there are none, or if they cannot be read.
         """
         cutter = BlockCutter(self.block_size)
         for chunk in self._chunks():
@@ -97,15 +97,15 @@ class Recording(abc.ABC):
 
     @abc.abstractmethod
     def _chunks(self) -> Iterator[RawChunk]:
-        """The samples in order, any number at a time, in volts; ``seq`` rises throughout."""
+        """The samples in order, any number at a time, in volts; ``seq`` always increases."""
 
     @abc.abstractmethod
     def topics(self) -> dict[str, int]:
-        """How many messages of each topic it holds; for a CSV, as a bag of it would have them."""
+        """Number of messages of each topic; for a CSV, as in a bag of the same samples."""
 
     @abc.abstractmethod
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Messages as they lie in the files, of ``topics`` or of all; none from a CSV."""
+        """Encoded messages of the files, of ``topics`` or of all; none from a CSV."""
 
     @abc.abstractmethod
     def loads(self) -> list[AppliedLoad]:
@@ -121,7 +121,7 @@ class Recording(abc.ABC):
 
     @abc.abstractmethod
     def estimates(self) -> dict[str, EstimateSeries]:
-        """Recorded deflections by topic; {} where none were recorded."""
+        """Recorded deflections by topic; {} if none were recorded."""
 
     @functools.cached_property
     def sample_rate_hz(self) -> float:
@@ -152,7 +152,7 @@ class Recording(abc.ABC):
 
 
 def from_json(values: Mapping[str, str]) -> dict[str, Any]:
-    """Metadata values that are JSON; what is not stays text."""
+    """Metadata values parsed as JSON; other values stay text."""
     out: dict[str, Any] = {}
     for key, text in values.items():
         try:

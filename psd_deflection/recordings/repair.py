@@ -1,8 +1,8 @@
-"""Makes a recording whole that a crash cut: index and summary for each file, ``metadata.yaml`` for the bag.
+"""Repairs a recording that a crash cut: index and summary for each file, ``metadata.yaml`` for the bag.
 
-Everything that lies whole in a file is copied, byte for byte, into a new one beside it; only then
-does the new one take the name, and the old one becomes ``NAME.mcap.cut``: nothing is lost by
-trying. Files that have their end already are not touched.
+Every intact record of a file is copied, byte for byte, into a new file beside it. Only then is the old file
+renamed to ``NAME.mcap.cut`` and the new one takes its name, so a failed repair loses nothing. Files that
+have their end are not touched.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _MAX_QOS_TEXT = 100_000
 
 @dataclass(slots=True)
 class RecoveredFile:
-    """One file: what it holds now; ``repaired`` where it had to be; ``warnings`` of the reading."""
+    """One file: its content now; ``repaired``: whether it needed repair; ``warnings`` of the reading."""
 
     path: Path
     repaired: bool
@@ -48,7 +48,7 @@ class RecoveredFile:
 
 @dataclass(slots=True)
 class Recovered:
-    """``files`` in order; ``metadata_written``: ``metadata.yaml`` was made anew; ``set_aside``: held nothing."""
+    """``files`` in order; ``metadata_written``: ``metadata.yaml`` was written; ``set_aside``: files without content."""
 
     files: list[RecoveredFile]
     metadata_written: bool
@@ -56,7 +56,7 @@ class Recovered:
 
 
 def _qos_of(metadata: dict[str, str]) -> Qos | list[Qos]:
-    """The profile of a channel, so that ``metadata.yaml`` and the channel say the same."""
+    """The QoS profile of a channel, so that ``metadata.yaml`` and the channel agree."""
     text = metadata.get('offered_qos_profiles', '')
     if not text or len(text) > _MAX_QOS_TEXT:
         return DEFAULT_QOS if not text else []
@@ -68,7 +68,7 @@ def _qos_of(metadata: dict[str, str]) -> Qos | list[Qos]:
 
 
 class _Copy:
-    """Counts what it is given, and writes it where ``target`` is given."""
+    """Counts the records that it gets, and writes them if there is a ``target``."""
 
     def __init__(self, target: Path | None) -> None:
         self.topics: dict[str, TopicCount] = {}
@@ -178,10 +178,10 @@ def _refuse_if_written(path: Path) -> None:
 
 
 def recover(path: str | Path) -> Recovered:
-    """Repair ``path``, a bag folder or a lone ``.mcap``, in its place.
+    """Repair ``path``, a bag folder or a single ``.mcap``, in place.
 
-    Raises RecordingError where nothing of it can be read, where it is being recorded, or where the
-    disk refuses.
+    Raises RecordingError if nothing in it can be read, if it is still being recorded, or if the
+    disk refuses to write.
     """
     path = Path(path)
     try:
@@ -199,7 +199,7 @@ def recover(path: str | Path) -> Recovered:
 
 
 def _describes(metadata: Path, files: list[RecoveredFile]) -> bool:
-    """Whether ``metadata.yaml`` can be read and names the files that are there; what rosbag2 compressed is its own."""
+    """Whether ``metadata.yaml`` can be read and lists the files of the folder, or files that rosbag2 compressed."""
     try:
         information = read_information(metadata)
     except RecordingError:
@@ -217,7 +217,7 @@ def _recover_folder(folder: Path) -> Recovered:
         _refuse_if_written(file)
     files, set_aside = [], []
     for file in paths:
-        # A file that the crash left without its first bytes has nothing to give.
+        # A file without its first bytes holds nothing.
         if file.stat().st_size <= len(MAGIC) and len(paths) > 1:
             aside = file.with_name(file.name + '.cut')
             file.rename(aside)

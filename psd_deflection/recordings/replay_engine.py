@@ -1,7 +1,7 @@
 """Replay: a recording through the same pipeline as in the live node, block by block.
 
-Commands, the monitor and the benchmarks replay with this. ``source: replay`` is another thing: a
-device (:mod:`psd_deflection.devices.replay`) that plays the samples alone, at their own pace.
+Commands, the monitor and the benchmarks use it. ``source: replay`` is different: it is a device
+(:mod:`psd_deflection.devices.replay`) that plays only the samples, in real time.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from psd_deflection.records import ENVIRONMENT, RawChunk, Record, SampleBlock
 
 
 def rig_at_start(recording: Recording) -> Rig:
-    """The rig that the recording began with; the thesis rig if it tells of none. Raises ConfigError."""
+    """The rig at the start of the recording; the thesis rig if the recording holds none. Raises ConfigError."""
     return rig_as_recorded(recording.parameters, f'{recording.path} (recorded parameters)')
 
 
 def rig_at_end(recording: Recording) -> Rig:
-    """The rig with every recorded change: a zero that was taken is what the rig was all along, only known better.
+    """The rig with every recorded change. A zero taken during the run describes the rig from the start.
 
     Raises ConfigError.
     """
@@ -35,7 +35,7 @@ def rig_at_end(recording: Recording) -> Rig:
 
 
 def open_for_replay(path: str | Path, params_file: str | None = None) -> tuple[Recording, Rig]:
-    """The recording, to be cut into the rig's blocks, and the rig: of ``params_file``, else its own.
+    """The recording, cut into the rig's blocks, and the rig: from ``params_file``, else from the recording.
 
     Raises RecordingError and ConfigError.
     """
@@ -49,12 +49,12 @@ def open_for_replay(path: str | Path, params_file: str | None = None) -> tuple[R
 def replayed(
     recording: Recording, pipeline: Pipeline, blocks: Iterable[SampleBlock] | None = None
 ) -> Iterator[list[Record]]:
-    """The records of each step; recorded changes of parameters apply at their own block.
+    """The records of each step; each recorded change of parameters applies at its block.
 
-    ``blocks``: those of the recording, if a caller counts them on the way.
+    ``blocks``: the recording's blocks, for a caller that counts them.
     """
     changes = list(recording.changes)
-    # What our own recorder noted says when a temperature took effect; of others' recordings, the stamps do.
+    # Our recorder notes when a temperature took effect; for other recordings the stamps decide.
     noted = any(name in ENVIRONMENT for change in changes for name, _ in change.values)
     temperatures = [] if noted or not pipeline.needs_temperature else recording.temperatures()
     for block in recording.blocks() if blocks is None else blocks:
@@ -63,7 +63,7 @@ def replayed(
             if warmer is not None:
                 yield [warmer]
         while changes and changes[0].block <= block.index:
-            # What is unfinished belongs to the time before the change.
+            # The unfinished block belongs to the time before the change.
             yield list(pipeline.flush())
             change = changes.pop(0)
             pipeline.apply(change)

@@ -1,8 +1,8 @@
-"""Writes a Rerun recording that shows itself: the blueprint (what is drawn where) lies in the file.
+"""Writes a Rerun recording that includes its layout (blueprint), so that the viewer shows it at once.
 
-Rerun opens our MCAP too and shows nothing, since no view is made of messages. Its file is for people: µm, mdeg and
-mm, the units of ``plot``. A block without an estimate is a row without values, which breaks a line and
-takes a dot away; a block that is gone altogether is told by the count of lost samples alone.
+Rerun can open our MCAP but shows no view of it. The units are those of ``plot``: µm, mdeg and mm. A block
+without an estimate is a row without values, which breaks the line and removes the dot. A block that is
+completely lost appears only in the count of lost samples.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ POSE = (
 _LOAD = (('fx', 'Fx (N)', POSE[0][4]), ('fy', 'Fy (N)', POSE[1][4]), ('tz', 'Tz (N m)', POSE[2][4]))
 _LIGHT, _METAL, _SENSOR, _LOST = (255, 80, 60), (150, 160, 172), (90, 102, 117), (235, 80, 80)
 _BATCH = 2000
-"""Rows of an entity that wait to be written together: Rerun's cost is by the call."""
+"""Number of rows of an entity that are written together: Rerun's cost is per call."""
 _TRAIL_S = 2.0
 _STATIONS = np.linspace(0.0, 1.0, 9)
 _EPOCH_NS = 10**17
-"""Times below (1973) are since a start, not since the epoch."""
+"""Smaller times (before 1973) count from a start, not from the epoch."""
 
 Row = tuple[float, ...] | None
 
 
 def need_rerun() -> None:
-    """Raise ConfigError, with the way out, where rerun is not installed."""
-    # Not `rerun`: any folder of that name would do for it.
+    """Raise ConfigError, with the fix, if rerun is not installed."""
+    # Not `rerun`: any folder of that name would match.
     if importlib.util.find_spec('rerun_bindings') is None:
         raise ConfigError(
             "an .rrd needs rerun: `pip install rerun-sdk` or `pip install 'psd_deflection[rerun]'` (170 MB), "
@@ -53,12 +53,12 @@ def need_rerun() -> None:
 class RerunFile:
     """Estimates, dots, loads and losses as an ``.rrd``; a sink like any other.
 
-    Raises ConfigError where rerun is not installed, RecordingError where the file exists, or cannot be written.
+    Raises ConfigError if rerun is not installed, RecordingError if the file exists or cannot be written.
     """
 
     def __init__(self, path: str | Path, rig: Rig, name: str = '') -> None:
         need_rerun()
-        # Only here: whoever writes no .rrd does without rerun.
+        # Imported here: only an .rrd needs rerun.
         import rerun as rr
 
         self.path = Path(path)
@@ -83,7 +83,7 @@ class RerunFile:
         self._describe()
 
     def put(self, record: Record) -> None:
-        """Take one record; a block's estimate and load come before its dots, as the pipeline has them."""
+        """Take one record; a block's estimate and load come before its dots, as from the pipeline."""
         if isinstance(record, DeflectionEstimate) and record.primary:
             self._estimate = record
         elif isinstance(record, TipLoad):
@@ -94,7 +94,7 @@ class RerunFile:
             self._before, self._estimate, self._load = record, None, None
 
     def close(self) -> None:
-        """Write the rest and close; does nothing the second time."""
+        """Write the rest and close; a second call does nothing."""
         if self._closed:
             return
         self._closed = True
@@ -107,7 +107,7 @@ class RerunFile:
             raise RecordingError(f'{self.path}: cannot be written ({error})') from None
 
     def _gone(self, s: SpotMeans) -> None:
-        """Break every line where blocks are gone altogether, and count what is lost with them."""
+        """Break every line where whole blocks are missing, and count their samples as lost."""
         before = self._before
         if before is None or s.index == before.index + 1:
             return
@@ -145,12 +145,12 @@ class RerunFile:
         moved = None if pose is None else tuple(self._magnify * v for v in pose)
         self._add('rig/link', t_ns, moved)
         self._add('rig/tip', t_ns, moved)
-        # It does not change while it is seen.
+        # It does not change while it is visible.
         if moved is None or not self._open.get('rig/tip/plate'):
             self._add('rig/tip/plate', t_ns, moved)
 
     def _add(self, path: str, t_ns: int, row: Row) -> None:
-        """A row of an entity; None where it has no value from now on, said once."""
+        """Add a row of an entity; None, written once, if it has no value from now on."""
         if row is None and not self._open.get(path):
             return
         self._open[path] = row is not None
@@ -203,7 +203,7 @@ class RerunFile:
         self._stream.log(path, *what, static=True, strict=True)
 
     def _describe(self) -> None:
-        """What does not change: names, colours, areas, lasers."""
+        """The constant parts: names, colours, areas, lasers."""
         rr, rig = self._rr, self._rig
         for name, label, unit, _, color in POSE:
             self._static(f'tip/{name}', rr.SeriesLines(names=f'{label} ({unit})', colors=color, widths=1.5))
@@ -255,9 +255,9 @@ def _plate(rig: Rig) -> list[tuple[Sequence[float], Sequence[float]]]:
 
 
 def blueprint(rig: Rig, speed: float = 1.0) -> Any:
-    """What is drawn where: traces on the left; on the right both detectors, the rig in space, loads and sums.
+    """The layout: traces on the left; on the right both detectors, the rig in space, loads and sums.
 
-    ``speed``: how fast it plays; it plays at once.
+    ``speed``: playback speed; playback starts at once.
     """
     import rerun.blueprint as rrb
 

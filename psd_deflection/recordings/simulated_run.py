@@ -1,4 +1,4 @@
-"""A simulated recording: what the rig would have measured, and the estimates that the daemon would have made of it."""
+"""A simulated recording: the samples of the rig, and the estimates that the daemon computes from them."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from psd_deflection.simulation.simulator import RigSimulator
 CHUNK_SECONDS = 1.0
 
 BAG_START_NS = 1_000_000_000
-"""A bag's stamps start here: zero means "no stamp" to many tools."""
+"""Stamps of a simulated bag start here: many tools treat zero as "no stamp"."""
 
 
 @dataclass(frozen=True)
 class SimulatedRun:
-    """One run. ``rig``: as it is. ``known``: as the daemon takes it to be; only its effects are corrected.
+    """One run. ``rig``: the true rig. ``known``: the rig that the daemon assumes; only its effects are corrected.
 
     ``loads`` (n, 3): N, N, N m, one row a sample. ``temperature`` (n,): degrees Celsius, or None.
-    ``reference``: whether the true pose is recorded, once a block.
+    ``reference``: whether the true pose is recorded, once per block.
     """
 
     rig: Rig
@@ -41,12 +41,12 @@ class SimulatedRun:
     reference: bool = False
 
     def records(self, start_ns: int = BAG_START_NS) -> Iterator[Record]:
-        """Everything in the order of time; the first sample is at ``start_ns``."""
+        """All records in order of time; the first sample is at ``start_ns``."""
         rig, loads, temperature = self.rig, self.loads, self.temperature
         simulator, pipeline = RigSimulator(rig, self.seed), Pipeline(self.known)
         period = 1e9 / rig.converter.sample_rate_hz
         block = rig.estimator.block_size
-        # A temperature takes effect with the block that follows it: then block by block.
+        # A temperature takes effect with the next block, so process block by block.
         size = max(1, round(CHUNK_SECONDS * rig.converter.sample_rate_hz)) if temperature is None else block
         last: tuple[float, ...] | None = None
         last_temperature: float | None = None
@@ -59,7 +59,7 @@ class SimulatedRun:
                 if load != last:
                     last = load
                     yield AppliedLoad(int(t_ns[i - start]), *load)
-                # The thermometer reads as often as an estimate comes: it is slow, and so is the air.
+                # One temperature reading per estimate is enough: air temperature changes slowly.
                 if temperature is not None and i % block == 0 and float(temperature[i]) != last_temperature:
                     last_temperature = float(temperature[i])
                     yield TemperatureReading(int(t_ns[i - start]), last_temperature)
@@ -69,7 +69,7 @@ class SimulatedRun:
             part = simulator.step(loads[start:stop], None if temperature is None else temperature[start:stop])
             if self.reference:
                 for i in range(0, stop - start, block):
-                    # The middle of the block is where the estimate stands.
+                    # The estimate is for the middle of the block.
                     k = min(i + block // 2, stop - start - 1)
                     yield ReferencePose(int(t_ns[k]), *(float(v) for v in part.pose[k]))
             flags = np.zeros(stop - start, dtype=np.uint8)

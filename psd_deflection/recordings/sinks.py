@@ -1,4 +1,4 @@
-"""Where records go: a recorder is a sink like any other."""
+"""Sinks of records: CSV, MCAP, bag and Rerun, chosen by the file name."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from psd_deflection.records import Record
 
 
 class Sink(Protocol):
-    """Takes records, one thread at a time. Both calls raise RecordingError if the disk refuses."""
+    """Takes records, one thread at a time. Both calls raise RecordingError if the disk refuses to write."""
 
     def put(self, record: Record) -> None:
-        """Take one record; a sink passes over the kinds it has no place for."""
+        """Take one record; a sink ignores the kinds that it cannot store."""
 
     def close(self) -> None:
-        """Write what is held back and close; does nothing the second time."""
+        """Write the buffered rest and close; a second call does nothing."""
 
 
 def is_csv(path: str | Path) -> bool:
@@ -36,10 +36,10 @@ def open_sink(
     samples_with: Collection[type[Record]] | None = None,
     title: str = '',
 ) -> Sink:
-    """The sink for ``path``: a ``.csv``, an ``.rrd`` (for Rerun), an ``.mcap`` (a lone file), else a bag folder.
+    """The sink for ``path``: a ``.csv``, an ``.rrd`` (for Rerun), an ``.mcap`` (a single file), else a bag folder.
 
-    ``rig_values``: the flat parameter set. ``samples_with``: a CSV has the samples, with columns for these
-    kinds of records beside them; None: it has the estimates. ``title``: how an ``.rrd`` is called.
+    ``rig_values``: the flat parameter set. ``samples_with``: a CSV holds the samples, with columns for these
+    kinds of records; None: it holds the estimates. ``title``: title of an ``.rrd``.
     Raises RecordingError if ``path`` exists or cannot be made, ConfigError if rerun is not installed.
     """
     path = Path(path)

@@ -1,12 +1,12 @@
-"""The node ``estimator``: publishes what the pipeline gives, from the pipeline's own thread.
+"""The node ``estimator``: publishes the pipeline's records, from the pipeline's own thread.
 
 A message is encoded once; the same bytes are published and recorded. The executor in the main
 thread serves parameters, services, inputs and the 1 Hz diagnostics, nothing faster.
 
 It is a lifecycle node (REP-2002 states). *Configured*, it has the port, reads, estimates and
 records; *active*, it publishes as well. Deactivation stops publishing and nothing else, cleanup
-frees the port. With ``autostart`` (the default) it does both steps itself, so that whoever knows
-nothing of lifecycles meets an ordinary node.
+frees the port. With ``autostart`` (the default) it does both steps itself and behaves like an ordinary
+node.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 NODE_NAME = 'estimator'
 
 SPIN_S = 0.1
-"""How long a signal may wait to be seen."""
+"""Longest time until a signal takes effect, s."""
 
 
 class _ManagedNode(LifecycleNode):  # type: ignore[misc]
@@ -73,13 +73,13 @@ class _ManagedNode(LifecycleNode):  # type: ignore[misc]
         return self.owner.transition(self.owner.finish)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        # What went wrong stays in `error`: whoever starts the node says it.
+        # The error stays in `error`: the caller that starts the node reports it.
         self.owner.cleanup()
         return TransitionCallbackReturn.SUCCESS
 
 
 class EstimatorNode:
-    """Node and, while it is configured, session. Raises ConfigError where the parameters are refused."""
+    """The node and, while it is configured, its session. Raises ConfigError if the parameters are refused."""
 
     def __init__(self, overrides: Mapping[str, object], say: Callable[[str], None] | None, signals: Signals) -> None:
         self.session: Session | None = None
@@ -104,7 +104,7 @@ class EstimatorNode:
                 'leave it out for its default'
             ) from None
         except RuntimeError as error:
-            # What DDS refuses: security that it was built without, or an enclave that may not.
+            # DDS refuses: it was built without security, or the enclave has no permission.
             raise ConfigError('ROS: ' + ' '.join(str(error).split())) from None
         self.node.owner = self
         try:
@@ -112,11 +112,11 @@ class EstimatorNode:
             self.rig = rig_of_node(self.node)
             self._live = LiveParameters(self.node)
             self.node.create_service(Trigger, ZERO, self._zero)
-            # In a group of its own: while one request waits for the disk, the node serves everything else.
+            # In a separate group: while one request waits for the disk, the node serves everything else.
             self.node.create_service(SetBool, RECORD, self._record, callback_group=ReentrantCallbackGroup())
             self._survive_requests()
             self._wire, self._inputs = self._wires()
-            # Neither a simulated clock that stands still nor a system clock that is set keeps health from being told.
+            # A steady clock: health is published even if a simulated clock stops or the system clock is set.
             self.node.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
             self._markers = self._make_markers()
         except BaseException:
@@ -135,16 +135,16 @@ class EstimatorNode:
     def _make_markers(self) -> RigMarkers | None:
         if not self.rig.monitor.markers:
             return None
-        # Only here: whoever shows nothing does without visualization_msgs.
+        # Imported here: only the markers need visualization_msgs.
         from psd_deflection.ros.markers import RigMarkers
 
         return RigMarkers(self.node, self.rig)
 
     def _survive_requests(self) -> None:
-        """Answer a request that goes wrong, and say so, instead of ending by it.
+        """Answer a failed request and log the error, instead of ending the node.
 
-        rclpy raises out of its own services where an active node is asked to activate, or a parameter
-        has a type that there is not: the executor would pass that on to whoever measures.
+        rclpy raises in its own services if an active node is asked to activate, or if a parameter has an
+        unknown type. The executor would raise that in the main thread and end the measurement.
         """
 
         def survivor(carry_out: Callable[[Any, Any], Any], name: str) -> Callable[[Any, Any], Any]:
@@ -162,7 +162,7 @@ class EstimatorNode:
             service.callback = survivor(service.callback, service.service_name)
 
     def transition(self, action: Callable[[], None]) -> TransitionCallbackReturn:
-        """Run one transition; what goes wrong outside is said, kept in ``error``, and leaves the state as it was."""
+        """Run one transition; an error is logged, kept in ``error``, and leaves the state unchanged."""
         try:
             action()
         except PsdDeflectionError as error:
@@ -178,12 +178,12 @@ class EstimatorNode:
         return TransitionCallbackReturn.FAILURE
 
     def _tell_error(self, text: str) -> None:
-        # At start it is raised, and said by whoever started us.
+        # At the start it is raised, and the caller reports it.
         if not self._starting:
             self._say(text)
 
     def start(self) -> None:
-        """Configure and activate, where ``autostart`` says so. Raises what stands in the way."""
+        """Configure and activate, if ``autostart`` is set. Raises the error of a failed transition."""
         if self.node.get_parameter('use_sim_time').value:
             self._say('use_sim_time is true: what is measured is stamped by the system clock all the same')
         if not self.rig.acquisition.autostart:
@@ -222,12 +222,12 @@ class EstimatorNode:
         self._say(f'publishing on ROS domain {domain}: {topics} …; services {node}/zero, {node}/record')
 
     def deactivate(self) -> None:
-        """Publish no more; reading and recording go on."""
+        """Stop publishing; reading and recording continue."""
         self._silence()
         self._say('not publishing; reading and recording go on')
 
     def release(self) -> None:
-        """End the session, and say so."""
+        """End the session, and log it."""
         self.cleanup()
         self._say('not configured: the port is free')
 
@@ -312,7 +312,7 @@ class EstimatorNode:
         self._wire.put(message.topic, message.type, cdr.encode(message.type, message.fields), now)
 
     def _named(self, report: DiagnosticReport) -> DiagnosticReport:
-        """``report`` under this node's name where that is not the usual one: two rigs are told apart."""
+        """``report`` with this node's name if that is not the usual one, to distinguish two rigs."""
         node = self.node.get_fully_qualified_name().removeprefix('/')
         if node == NODE_NAME:
             return report
@@ -334,8 +334,8 @@ def run(
     """Run the node until SIGINT or SIGTERM, however often they come.
 
     ``overrides``: parameters that take precedence over ``ros_args``. ``while_running`` is called
-    about ten times a second, for a display. Raises the errors of the package where the run cannot
-    start, or where the pipeline failed.
+    about ten times a second, for a display. Raises the errors of the package if the run cannot
+    start, or if the pipeline failed.
     """
     signals = Signals()
     try:

@@ -1,10 +1,9 @@
-"""What RViz shows: link, plate, detectors, beams and dots, and the transforms where tf2 is there.
+"""Markers for RViz: link, plate, detectors, beams and dots, and the transforms if tf2 is installed.
 
-Only made where the parameter ``markers`` is on. What does not move (beams, lasers, link at rest) is
-latched, so that an RViz started later sees it. What moves is taken away where there is no estimate,
-and goes by itself when nothing comes any more: a link that is drawn is a link that is measured.
-Micrometres cannot be seen beside half a metre: displacements are drawn ``markers_magnify`` times as
-large; the transforms are not.
+They are published if the parameter ``markers`` is on. Static parts (beams, lasers, link at rest) are
+latched, so that an RViz started later shows them. Moving parts are removed if there is no estimate, and
+expire if messages stop, so that only measured poses are shown. Micrometres are invisible beside half a
+metre, so displacements are drawn ``markers_magnify`` times as large; the transforms are true to scale.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ def _marker(
 
 
 def at_rest(rig: Rig) -> Any:
-    """The MarkerArray of what does not move: the unloaded link, both lasers, both beams."""
+    """The MarkerArray of the static parts: the unloaded link, both lasers, both beams."""
     length, radius = rig.link.length, rig.link.outer_radius
     link = _marker(
         0,
@@ -73,7 +72,7 @@ def at_rest(rig: Rig) -> Any:
 
 
 def moving(rig: Rig, estimate: DeflectionEstimate | None, spots: SpotMeans, magnify: float) -> Any:
-    """The MarkerArray of bent link, plate, detectors and dots; without ``estimate`` all of them are taken away."""
+    """The MarkerArray of bent link, plate, detectors and dots; without ``estimate`` all of them are removed."""
     length = rig.link.length
     dx, dy, theta = (magnify * v for v in estimate.pose) if estimate is not None else (0.0, 0.0, 0.0)
     c, s = math.cos(theta), math.sin(theta)
@@ -128,9 +127,9 @@ def transform(parent: str, child: str, t_ns: int, at: Vector, rotation: dict[str
 
 
 class RigMarkers:
-    """Publishes ten times a second what ``session`` last knew; nothing while it is None.
+    """Publishes the last state of ``session`` ten times a second; nothing while it is None.
 
-    What is at rest is published again when the zero was taken: the beams then stand where the dots are.
+    The static parts are published again after a zero, because the beams then end at the new dots.
     """
 
     def __init__(self, node: Node, rig: Rig) -> None:

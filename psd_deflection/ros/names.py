@@ -1,4 +1,4 @@
-"""What the node is called by on the graph, and how each topic is delivered. Anything may read it: it needs no rclpy."""
+"""Names of the node on the graph, and the QoS of each topic. It needs no rclpy, so any module may import it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MARKERS_AT_REST = '/link_tip/markers_at_rest'
 LATCHED = Delivery(depth=1, latched=True)
 
 _SAMPLES_DEPTH = 50
-"""A second of raw blocks: a subscriber that stutters misses none."""
+"""A second of raw blocks: a subscriber that pauses for less misses none."""
 
 _DELIVERY: Mapping[str, Delivery] = {
     SAMPLES: Delivery(_SAMPLES_DEPTH),
@@ -37,7 +37,7 @@ def delivery(topic: str) -> Delivery:
 
 ZERO, RECORD = '~/zero', '~/record'
 SERVICES = (ZERO, RECORD)
-"""What the node serves; ``~`` stands for the node's name."""
+"""Services of the node; ``~`` stands for the node's name."""
 
 BASE, REST, TIP = 'link_base', 'link_tip_rest', 'link_tip'
 """Frames: the clamp, the unloaded tip, the tip."""

@@ -1,10 +1,10 @@
 """The rig's parameters as ROS parameters, with types, ranges and units.
 
-What is given on the command line, in a launch file or in a parameter file reaches the node as
-overrides. :func:`rig_from_values` validates them, as it does everywhere else: ``0`` for a length is
-refused by name, and a whole number will do for a ``double``. A change while the node runs is
-validated by the pipeline, which knows the values that must fit together. The descriptors come from
-the declarations; by them rclpy refuses read-only parameters, other types and what is out of range.
+Values from the command line, a launch file or a parameter file reach the node as overrides.
+:func:`rig_from_values` validates them as everywhere else: ``0`` for a length is refused by name, and a
+whole number is accepted for a ``double``. The pipeline validates a change while the node runs, because it
+knows which values depend on each other. The descriptors come from the declarations; with them rclpy
+refuses read-only parameters, wrong types and values out of range.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class LiveParameters:
         node.add_on_set_parameters_callback(self._change)
 
     def show(self, rig: Rig) -> None:
-        """Let the node's parameters say what the rig has now: a zero that was taken can be read there."""
+        """Set the node's parameters to the present values of the rig, so that a new zero can be read there."""
         changed = [
             RosParameter(p.name, value=rig.values[p.name])
             for p in PARAMETERS

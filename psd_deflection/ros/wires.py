@@ -1,4 +1,4 @@
-"""What joins a session to the graph: publishers of encoded messages, subscriptions that are recorded."""
+"""Connects a session to the graph: publishers of encoded messages, subscriptions that are recorded."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from psd_deflection.ros.names import delivery
 from psd_deflection.runner.session import Session
 
 MAX_INPUT_BYTES = 4096
-"""Of one message that others publish and we record: the longest of ours has some hundred bytes."""
+"""Maximum size of a message of another node that we record, bytes; valid ones have some hundred bytes."""
 
 
 def message_class(type_name: str) -> Any:
@@ -32,15 +32,15 @@ def message_class(type_name: str) -> Any:
 
 
 def relative(topic: str) -> str:
-    """``topic`` as the node asks for it: in the node's namespace, as two rigs on one graph want it.
+    """``topic`` as a relative name in the node's namespace, so that two rigs can share a graph.
 
-    Without a namespace that is the topic's own name. Health goes where everybody's goes.
+    Without a namespace this is the topic's own name. ``/diagnostics`` stays absolute, as is usual.
     """
     return topic if topic == DIAGNOSTICS else topic.removeprefix('/')
 
 
 def qos(topic: str) -> QoSProfile:
-    """How ``topic`` is delivered."""
+    """QoS profile of ``topic``."""
     depth, reliable, latched = delivery(topic)
     return QoSProfile(
         depth=depth,
@@ -62,7 +62,7 @@ class PublisherWire:
             )
 
     def names(self, topics: Iterable[str]) -> list[str]:
-        """What they are called on the graph, remapping included."""
+        """Names of the topics on the graph, including remapping."""
         return [self._publishers[topic].topic_name for topic in topics]
 
     def put(self, topic: str, type_name: str, cdr: bytes, t_ns: int) -> None:
@@ -72,7 +72,7 @@ class PublisherWire:
 
 
 def say_on_rosout(node: Node, say: Callable[[str], None]) -> Callable[[str], None]:
-    """``say``, and a line on ``/rosout`` each time: the terminal's own lines do not go through the ROS log."""
+    """Call ``say`` and also write the line to ``/rosout``: the terminal's lines do not go through the ROS log."""
     as_every_node = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     publisher = node.create_publisher(Log, '/rosout', as_every_node)
     name = node.get_logger().name
@@ -81,7 +81,7 @@ def say_on_rosout(node: Node, say: Callable[[str], None]) -> Callable[[str], Non
         say(text)
         line = Log(level=Log.INFO, name=name, msg=text)
         line.stamp.sec, line.stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
-        # A thread that was not waited for may have something to say when the node is gone.
+        # An abandoned thread may log a line after the node is gone.
         with contextlib.suppress(RuntimeError):
             publisher.publish(line)
 
@@ -89,10 +89,10 @@ def say_on_rosout(node: Node, say: Callable[[str], None]) -> Callable[[str], Non
 
 
 class InputRecorder:
-    """Known loads, references and temperatures go into the recording as they come.
+    """Records known loads, references and temperatures as they arrive.
 
-    ``session``: the one that records, or None. A message that is longer than any of its type has
-    reason to be is passed over and counted in ``refused``: a stranger must not fill the disk.
+    ``session``: the one that records, or None. A message that is too long for its type is ignored and
+    counted in ``refused``, so that another node cannot fill the disk.
     """
 
     def __init__(self, node: Node) -> None:

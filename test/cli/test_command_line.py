@@ -36,9 +36,7 @@ def test_the_command_line_without_a_command_names_them(capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize(('typed', 'hint'), [('inf', 'did you mean info?'), ('frobnicate', '--help` lists them')])
-def test_a_command_that_is_none_is_one_line_with_the_way_out(
-    typed: str, hint: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unknown_command_is_one_line_with_a_hint(typed: str, hint: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([typed]) == 2
     out, err = capsys.readouterr()
     assert out == ''
@@ -196,7 +194,7 @@ def test_ctrl_c_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
         (None, '/somewhere/__main__.py', f'{sys.executable} -m psd_deflection'),
     ],
 )
-def test_what_it_suggests_can_be_typed(
+def test_suggested_commands_can_be_typed(
     found: str | None, called: str, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr('shutil.which', lambda name: found)

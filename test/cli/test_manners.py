@@ -187,7 +187,7 @@ def test_ctrl_c_leaves_no_output_that_looks_whole(
     assert [p.name for p in folder.iterdir()] == ['out.csv.partial']
 
 
-def test_what_was_there_before_stays_where_it_is(
+def test_an_existing_output_is_not_moved(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(args: object) -> int:
@@ -244,7 +244,7 @@ def program(line: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize('unbuffered', ['', '1'], ids=['buffered', 'unbuffered'])
 @pytest.mark.parametrize('command', ['params', 'params --json', 'info CLEAN', '--help'])
-def test_a_reader_that_leaves_is_no_error(command: str, unbuffered: str) -> None:
+def test_a_closed_pipe_is_not_an_error(command: str, unbuffered: str) -> None:
     command = command.replace('CLEAN', CLEAN)
     for reader in ('true', 'head -1'):
         done = program(f'PROGRAM {command} | {reader}', PYTHONUNBUFFERED=unbuffered)
@@ -264,7 +264,7 @@ def test_an_output_that_cannot_be_written_to_is_one_line(command: str, unbuffere
 
 @pytest.mark.skipif(not Path('/dev/full').exists(), reason='no /dev/full here')
 @pytest.mark.parametrize('where', ['2>&-', '2>/dev/full'])
-def test_a_standard_error_that_nobody_reads_changes_nothing_else(where: str, folder: Path) -> None:
+def test_a_closed_standard_error_keeps_the_exit_status(where: str, folder: Path) -> None:
     (folder / 'cut.mcap').write_bytes(Path(CLEAN, 'clean_0.mcap').read_bytes()[:100_000])
     done = program(f'PROGRAM replay nowhere {where}')
     assert (done.returncode, done.stdout) == (4, '')

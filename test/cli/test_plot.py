@@ -142,7 +142,7 @@ def test_the_picture_is_named_like_the_recording(
         ([str(BAGS / 'clean'), '--out', '/no/such/folder/x.png'], 4, 'cannot be written'),
     ],
 )
-def test_what_cannot_be_drawn_is_one_line(
+def test_an_undrawable_recording_gives_one_line(
     arguments: list[str], status: int, told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['plot', *arguments]) == status

@@ -157,7 +157,7 @@ def test_another_rate_than_was_set_is_refused(wired: Any, unloaded: Any) -> None
         source.open(2.0)
 
 
-def test_an_unplugged_one_is_configured_anew(wired: Any, run: Any, unloaded: Any) -> None:
+def test_an_unplugged_device_is_configured_again(wired: Any, run: Any, unloaded: Any) -> None:
     port = wired(SimulatedDataq(unloaded(load_rig())))
     running = run(load_rig(overrides={'source': 'dataq', 'port': str(port.link)}))
     running.take(40)
@@ -171,7 +171,7 @@ def test_an_unplugged_one_is_configured_anew(wired: Any, run: Any, unloaded: Any
     assert running.acquisition.counters.disconnects == 1
 
 
-def test_one_that_falls_silent_is_configured_anew(wired: Any, run: Any, unloaded: Any) -> None:
+def test_a_silent_device_is_configured_again(wired: Any, run: Any, unloaded: Any) -> None:
     device = SimulatedDataq(unloaded(load_rig()))
     running = run(load_rig(overrides={'source': 'dataq', 'port': str(wired(device).link)}))
     running.take(40)

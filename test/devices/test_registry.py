@@ -56,6 +56,6 @@ def test_a_simulated_device_is_recognised_and_its_suggestion_makes_a_rig(
     assert rig.acquisition.port == ','.join(port.port for port in ports)
 
 
-def test_a_name_that_is_none_can_not_be_simulated() -> None:
+def test_an_unknown_device_cannot_be_simulated() -> None:
     assert 'nonsense' not in SIMULATED
     assert 3 not in SIMULATED

@@ -101,7 +101,7 @@ def test_the_reader_ends_with_the_recording(tmp_path: Path) -> None:
     assert any('at its end' in s for s in said)
 
 
-def test_a_recording_that_is_none_is_named(tmp_path: Path) -> None:
+def test_error_names_a_file_that_is_not_a_recording(tmp_path: Path) -> None:
     with pytest.raises(DeviceError, match='no such recording'):
         make_source(load_rig(overrides={'source': 'replay', 'port': str(tmp_path / 'x')})).open(1.0)
     with pytest.raises(ConfigError, match='name the recording'):

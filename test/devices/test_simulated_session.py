@@ -43,6 +43,6 @@ def test_a_rate_that_the_pair_cannot_do_ends_before_it_begins() -> None:
         Session(load_rig(overrides={'source': 'thorlabs'}), lambda _: None)
 
 
-def test_what_cannot_be_simulated_needs_a_port() -> None:
+def test_a_device_without_a_twin_needs_a_port() -> None:
     with pytest.raises(ConfigError, match='name the recording'):
         Session(load_rig(overrides={'source': 'replay'}), lambda _: None)

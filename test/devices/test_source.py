@@ -178,7 +178,7 @@ def test_a_source_that_breaks_ends_the_run_as_an_error() -> None:
     assert isinstance(acquisition.failed, ZeroDivisionError)
 
 
-def test_a_source_names_its_own_reasons_for_what_is_no_sample() -> None:
+def test_a_source_gives_its_own_reasons_for_bad_frames() -> None:
     acquisition = acquisition_of([[BadFrame('five fields', 9), BadFrame('five fields', 9)]])
     run(acquisition)
     assert acquisition.counters.bad_frames == {'five fields': 2}

@@ -82,7 +82,7 @@ FIELDS = st.lists(st.sampled_from(['7', '-2', '.5', '1e3', 'x', '']), min_size=6
 @given(st.lists(st.binary(max_size=100) | ALMOST | FIELDS.map(lambda f: f'\n{",".join(f)}\n'.encode()), max_size=10))
 @example([b'\n3,4,1,2,3,4,5,6\n'])
 @example([b'\n3,4,1,2,3,4,5\n', b'\n3,4,1,2,3,4,5,6,7\n'])
-def test_garbage_makes_up_no_sample_and_what_follows_is_read(pieces: list[bytes]) -> None:
+def test_garbage_gives_no_sample_and_reading_continues(pieces: list[bytes]) -> None:
     decoder = LineDecoder()
     lines = [i for piece in pieces for i in decoder.feed(piece) if isinstance(i, Line)]
     # What stands between two newlines as eight numbers, read by another hand; * and # are the decoder's own affair.
@@ -99,7 +99,7 @@ def test_garbage_makes_up_no_sample_and_what_follows_is_read(pieces: list[bytes]
     assert decoder.feed(b'\n7,7000,0.1,-0.2,5,0,1.5,4.75\n')[-1] == LINE
 
 
-def test_micros_wraps_and_a_restart_starts_it_anew() -> None:
+def test_micros_wraps_and_restarts_with_the_device() -> None:
     extender = TimeExtender()
     got = [
         extender.extend(Line(s, t % 2**32, VALUES))
@@ -162,7 +162,7 @@ class Says:
         (b'\n1,2,0,0,5,0,0,5\n', 'no line that describes them'),
     ],
 )
-def test_what_is_no_such_device_is_named(wired: Any, text: bytes, said: str) -> None:
+def test_another_device_is_refused_by_name(wired: Any, text: bytes, said: str) -> None:
     port = wired(Says(text))
     with pytest.raises(DeviceError, match=said):
         make_source(load_rig(overrides={'source': 'lines', 'port': str(port.link)})).open(2.0)

@@ -199,7 +199,7 @@ def pattern(row: str) -> re.Pattern[str]:
     ],
     ids=lambda v: ' '.join(v) if isinstance(v, list) else str(v),
 )
-def test_what_a_user_is_told_is_on_the_troubleshooting_page(
+def test_every_user_message_is_on_the_troubleshooting_page(
     status: int, argv: list[str], hooks: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
     page = hooks.on_page_markdown((ROOT / 'docs' / 'troubleshooting.md').read_text())
@@ -227,7 +227,7 @@ def test_what_a_user_is_told_is_on_the_troubleshooting_page(
     assert any(pattern(row).search(hooks.cell(said)) for row in rows if len(row.replace('…', '').strip()) > 10), said
 
 
-def test_every_error_has_a_status_that_is_told(hooks: Any) -> None:
+def test_every_error_has_a_documented_status(hooks: Any) -> None:
     kinds = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, errors.PsdDeflectionError)]
     ours = {k.exit_status for k in kinds} - {errors.PsdDeflectionError.exit_status}
     assert set(errors.EXIT_STATUSES) == {0, 1, errors.INTERRUPTED, *ours}

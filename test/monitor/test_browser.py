@@ -238,7 +238,7 @@ def test_the_page_outlives_an_unplugged_device(page: Page, start: Start, tmp_pat
     assert [c for c in page.complaints() if '409' not in c] == []
 
 
-def test_the_page_finds_a_daemon_that_was_started_anew(page: Page, start: Start) -> None:
+def test_the_page_reconnects_to_a_restarted_daemon(page: Page, start: Start) -> None:
     port = str(free_port())
     first = start('monitor', str(BAGS / 'clean'), '--loop', '--http-port', port, '--control')
     page.open(address_of(first))
@@ -276,7 +276,7 @@ def test_the_bands_show_two_standard_deviations(page: Page, serve: Callable[...,
 
 
 @pytest.mark.parametrize('width', [390, 844, 1024, 1440])
-def test_nothing_is_cut_off_or_laid_over_its_neighbour(page: Page, serve: Callable[..., Serving], width: int) -> None:
+def test_no_element_is_cut_off_or_overlaps(page: Page, serve: Callable[..., Serving], width: int) -> None:
     serving = serve(monitor_control=True)
     serving.shown.recordings.append('recordings/test')
     serving.give(0, 20)

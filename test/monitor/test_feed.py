@@ -40,13 +40,13 @@ def test_a_block_without_an_estimate_does_not_borrow_one() -> None:
         assert row['status'] == BlockStatus.LASER_LOST
 
 
-def test_what_is_no_number_becomes_null() -> None:
+def test_nan_becomes_null() -> None:
     spots = dataclasses.replace(spots_of(0), dots=(math.nan, math.inf, 0.0, -math.inf))
     row = json.loads(row_json(BlockResult(spots, None)))
     assert row[2:6] == [None, None, 0, None]
 
 
-def test_what_nobody_takes_is_counted_and_passed_over() -> None:
+def test_items_beyond_the_queue_are_dropped_and_counted() -> None:
     feed = Feed(limit=10)
     block = SampleBlock(
         0, np.zeros(1, np.int64), np.zeros(1, np.int64), np.zeros((1, 6), np.float32), np.zeros(1, np.uint8)

@@ -60,7 +60,7 @@ def rows_in(messages: list[Any]) -> list[Any]:
     return [row for m in messages for row in m.get('rows', [])]
 
 
-def test_a_browser_gets_the_last_minute_then_what_is_new(serve: Serve) -> None:
+def test_a_browser_gets_the_last_minute_then_new_rows(serve: Serve) -> None:
     serving = serve()
     serving.give(0, 5)
     serving.server.tell('a message')
@@ -130,7 +130,7 @@ def test_the_buttons_are_off_unless_allowed(serve: Serve) -> None:
     assert not serving.shown.recordings
 
 
-def test_allowed_buttons_work_and_say_what_they_did(serve: Serve) -> None:
+def test_allowed_buttons_work_and_report_the_result(serve: Serve) -> None:
     serving = serve(monitor_control=True)
     assert ask(serving.url + 'api/zero')[:2] == (200, '{"ok": true, "message": "unloaded dots taken"}')
     assert serving.shown.zeros == 1
@@ -159,7 +159,9 @@ def test_allowed_buttons_work_and_say_what_they_did(serve: Serve) -> None:
         ({}, {'record': 'yes'}, 400),
     ],
 )
-def test_what_another_site_sends_is_refused(serve: Serve, headers: dict[str, str], body: object, status: int) -> None:
+def test_requests_from_another_site_are_refused(
+    serve: Serve, headers: dict[str, str], body: object, status: int
+) -> None:
     serving = serve(monitor_control=True)
     for path in ('api/zero', 'api/record'):
         assert ask(serving.url + path, body=body, headers=headers)[0] == status
@@ -188,7 +190,7 @@ def test_another_site_cannot_listen(serve: Serve, headers: dict[str, str]) -> No
         ('HEAD /', b'', 200),
     ],
 )
-def test_what_strangers_send_gets_an_answer_and_no_line_in_the_log(
+def test_bad_requests_get_an_answer_and_no_log_line(
     serve: Serve, caplog: pytest.LogCaptureFixture, request_line: str, rest: bytes, status: int
 ) -> None:
     serving = serve(monitor_control=True)
@@ -224,7 +226,7 @@ def test_idle_connections_do_not_use_up_the_daemons_files(serve: Serve) -> None:
     asyncio.run(asyncio.wait_for(go(), WAIT_S))
 
 
-def test_one_browser_too_many_is_told_why(serve: Serve) -> None:
+def test_one_browser_too_many_gets_the_reason(serve: Serve) -> None:
     serving = serve()
 
     async def go() -> tuple[int | None, str]:
@@ -271,7 +273,7 @@ def test_on_the_network_the_buttons_need_the_token(serve: Serve, monkeypatch: py
     assert serve(monitor_control=True, monitor_address='0.0.0.0').server.token == 'of my own'
 
 
-def test_a_port_in_use_is_told_and_another_taken(serve: Serve) -> None:
+def test_a_port_in_use_is_reported_and_another_taken(serve: Serve) -> None:
     first = serve()
     second = serve(monitor_port=first.port)
     assert second.port != first.port
@@ -287,7 +289,7 @@ def test_an_address_of_another_machine_is_refused() -> None:
     server.close()
 
 
-def test_browsers_are_told_when_it_ends_and_closing_twice_is_once(serve: Serve) -> None:
+def test_browsers_learn_of_the_end_and_close_is_idempotent(serve: Serve) -> None:
     serving = serve()
 
     async def go() -> int | None:

@@ -98,7 +98,7 @@ def test_what_cannot_be_is_one_line(
     assert err.strip().count('\n') == 0
 
 
-def test_without_aiohttp_the_way_out_is_told(
+def test_without_aiohttp_the_error_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr('psd_deflection.monitor.start.importlib.util.find_spec', lambda name: None)

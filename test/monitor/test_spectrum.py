@@ -66,7 +66,7 @@ def test_a_segment_never_spans_a_loss() -> None:
     assert density[0].max() < 1e-12
 
 
-def test_it_keeps_four_seconds_and_starts_anew_when_numbers_go_back() -> None:
+def test_it_keeps_four_seconds_and_restarts_when_numbers_go_back() -> None:
     spectrum = Spectrum(RIG)
     noisy = np.zeros(12_000)
     noisy[:6000] = np.random.default_rng(3).normal(0.0, 1.0, 6000)

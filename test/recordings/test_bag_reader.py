@@ -196,7 +196,7 @@ def test_a_change_that_is_not_readable_is_left_out(tmp_path: Path, entry: dict[s
     assert 'is left out' in recording.warnings[0]
 
 
-def test_a_device_that_starts_anew_does_not_mix_blocks(tmp_path: Path) -> None:
+def test_a_restarted_device_does_not_mix_blocks(tmp_path: Path) -> None:
     again = [block(i, t0=T0 + 5 * 10**9) for i in range(3)]
     recording = open_recording(write_mcap(tmp_path / 'a.mcap', [*(block(i) for i in range(5)), *again]))
     blocks = list(recording.blocks())
@@ -218,7 +218,7 @@ def test_a_block_in_two_messages_is_one_block_again(tmp_path: Path) -> None:
     )
 
 
-def test_another_block_size_cuts_the_same_samples_anew(bag: Path) -> None:
+def test_another_block_size_gives_the_same_samples(bag: Path) -> None:
     blocks = list(open_recording(bag, block_size=50).blocks())
     assert [b.index for b in blocks] == list(range(60))
     assert all(int(b.seq[0]) // 50 == int(b.seq[-1]) // 50 == b.index for b in blocks)

@@ -132,7 +132,7 @@ def test_samples_with_all_columns_come_back(tmp_path: Path) -> None:
     assert recording.topics()['/reference/deflection'] == 2
 
 
-def test_what_comes_between_two_samples_goes_to_the_later(tmp_path: Path) -> None:
+def test_records_between_two_samples_go_to_the_later_row(tmp_path: Path) -> None:
     sink = CsvSampleSink(tmp_path / 'a.csv', [AppliedLoad])
     sink.put(AppliedLoad(T0 + 3 * STEP + 1, 1.0, 0.0, 0.0))
     sink.put(block(0))
@@ -186,7 +186,7 @@ GOOD = [f'0.000,{ROW}', f'0.001,{ROW}']
         ([HEADER, 'x' * 20_000], ':2: is longer than 10000 characters'),
     ],
 )
-def test_what_is_wrong_is_named_with_file_line_and_column(tmp_path: Path, lines: list[str], message: str) -> None:
+def test_errors_name_file_line_and_column(tmp_path: Path, lines: list[str], message: str) -> None:
     path = tmp_path / 'run.csv'
     path.write_text('\n'.join(lines))
 
@@ -281,7 +281,7 @@ def test_cells_may_be_quoted(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('row', 'why'), [('0.004,1,2,3,4,5,"6', 'no row of a CSV'), ('0.004,1,2,3,4,5,"6"7', 'no row')]
 )
-def test_a_quote_that_does_not_end_is_told(tmp_path: Path, row: str, why: str) -> None:
+def test_an_unclosed_quote_is_reported(tmp_path: Path, row: str, why: str) -> None:
     path = tmp_path / 'q.csv'
     rows = [f'{0.001 * i:.3f},1,2,3,4,5,6' for i in range(4)]
     path.write_text('\n'.join([','.join(['t', *CHANNELS]), *rows, row]) + '\n')

@@ -81,7 +81,7 @@ def test_a_bag_cut_anywhere_opens_elsewhere_after_recover(
         assert (folder / 'run_0.mcap.cut').stat().st_size == int(part * len(content))
 
 
-def test_recover_says_what_it_did_and_leaves_alone_what_is_whole(
+def test_recover_reports_its_work_and_keeps_complete_files(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {p.name: p.read_bytes() for p in whole.iterdir()}
@@ -90,7 +90,7 @@ def test_recover_says_what_it_did_and_leaves_alone_what_is_whole(
     assert {p.name: p.read_bytes() for p in whole.iterdir()} == before
 
 
-def test_metadata_alone_is_made_anew_as_it_was(whole: Path, tmp_path: Path) -> None:
+def test_recover_rewrites_missing_metadata_identically(whole: Path, tmp_path: Path) -> None:
     folder = record(tmp_path / 'run')
     expected = yaml.safe_load((folder / 'metadata.yaml').read_text())
     (folder / 'metadata.yaml').unlink()
@@ -128,7 +128,7 @@ def test_a_lone_file_is_repaired(tmp_path: Path) -> None:
     assert open_recording(tmp_path / 'a.mcap').complete
 
 
-def test_a_damaged_chunk_costs_itself_and_is_told(tmp_path: Path) -> None:
+def test_only_a_damaged_chunk_is_lost_and_it_is_reported(tmp_path: Path) -> None:
     folder = record(tmp_path / 'run')
     content = bytearray((folder / 'run_0.mcap').read_bytes())
     content[len(content) // 2] ^= 0xFF
@@ -139,7 +139,7 @@ def test_a_damaged_chunk_costs_itself_and_is_told(tmp_path: Path) -> None:
     assert 120 <= len(theirs(folder)['/psd/samples']) < 200
 
 
-def test_what_is_being_recorded_is_refused(tmp_path: Path) -> None:
+def test_recover_refuses_a_running_recording(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / 'run', rig_values={})
     bag.write(block(0))
     bag.flush()
@@ -163,7 +163,7 @@ def test_an_earlier_repair_is_not_overwritten(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('content', 'said'), [(b'no mcap at all', 'not an MCAP'), (None, 'no such recording')])
-def test_what_is_no_recording_is_one_line(tmp_path: Path, content: bytes | None, said: str) -> None:
+def test_an_unreadable_recording_gives_one_line(tmp_path: Path, content: bytes | None, said: str) -> None:
     path = tmp_path / 'a.mcap'
     if content is not None:
         path.write_bytes(content)
@@ -232,7 +232,7 @@ def test_the_lock_goes_with_the_writer(tmp_path: Path) -> None:
     ],
     ids=['empty', 'malformed', 'another file'],
 )
-def test_a_metadata_yaml_that_does_not_describe_the_bag_is_made_anew(
+def test_recover_rewrites_a_metadata_yaml_that_does_not_match(
     text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = record(tmp_path / 'run')

@@ -52,7 +52,7 @@ def rows_of(name: str, out: Path) -> dict[str, list[tuple[int, Row]]]:
 @pytest.mark.usefixtures('no_rerun')
 @pytest.mark.parametrize('command', ['convert', 'replay'])
 @pytest.mark.parametrize('name', ['a.rrd', 'a.RRD'])
-def test_without_rerun_the_way_out_is_told(
+def test_without_rerun_the_error_says_how_to_install_it(
     command: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / name

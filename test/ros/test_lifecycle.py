@@ -174,7 +174,7 @@ def test_an_unforeseen_error_at_the_start_is_not_swallowed(domain: int, monkeypa
         estimator.run(['--ros-args'], {}, lambda text: None)
 
 
-def test_what_dds_refuses_is_one_line(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refusal_by_dds_is_one_line(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*args: Any, **options: Any) -> Any:
         raise RuntimeError('error creating node: no security libraries\nPlease compile')
 

@@ -77,7 +77,7 @@ def test_a_lost_dot_is_taken_away() -> None:
     assert now['psd', 1].action == now['link', 0].action == Marker.ADD
 
 
-def test_what_is_not_measured_is_not_drawn() -> None:
+def test_markers_are_removed_without_an_estimate() -> None:
     dots = spots((0.0, 0.0, 0.0, 0.0))
     assert {m.action for m in moving(RIG, None, dots, 10.0).markers} == {Marker.DELETE}
     # Nor is what was measured a while ago, when nothing comes any more; at rest stays.

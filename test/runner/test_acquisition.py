@@ -80,7 +80,7 @@ def test_samples_come_as_blocks_with_their_own_times(device: Any, run: Run, samp
     assert run.acquisition.hello.info['serial'] == 'T-1'
 
 
-def test_what_is_joined_in_the_middle_of_a_block_starts_with_the_next(device: Any, run: Run, sample: Any) -> None:
+def test_joining_within_a_block_starts_with_the_next_block(device: Any, run: Run, sample: Any) -> None:
     device.send_frames(*[sample(s) for s in range(33, 60)])
     assert numbers(take(run.acquisition, 20)) == list(range(40, 60))
     assert run.acquisition.counters.lost == 0
@@ -95,7 +95,7 @@ def test_garbage_gaps_repeats_and_flags_are_counted_and_cost_nothing_else(device
     assert (counters.lost, counters.repeated, counters.device_dropped, counters.bad) == (3, 2, 1, 2)
 
 
-def test_a_restart_of_the_device_goes_on_with_a_new_block(device: Any, run: Run, sample: Any) -> None:
+def test_a_device_restart_continues_with_a_new_block(device: Any, run: Run, sample: Any) -> None:
     device.send_frames(*[sample(s) for s in range(4000, 4030)], *[sample(s) for s in range(20)])
     items = take(run.acquisition, 50)
     assert numbers(items) == [*range(4000, 4030), *range(4040, 4060)]
@@ -105,7 +105,7 @@ def test_a_restart_of_the_device_goes_on_with_a_new_block(device: Any, run: Run,
     assert all(b > a for a, b in itertools.pairwise(t))
 
 
-def test_an_unplugged_device_is_waited_for_and_goes_on(device: Any, run: Run, sample: Any) -> None:
+def test_reader_waits_for_an_unplugged_device_and_resumes(device: Any, run: Run, sample: Any) -> None:
     device.send_frames(*[sample(s) for s in range(25)])
     take(run.acquisition, 20)
     device.unplug()
@@ -311,7 +311,7 @@ def test_a_silent_device_is_woken(device: Any, run: Run, short_wait: ModuleType,
 
 
 @pytest.mark.parametrize(('at', 'jump_us'), [(40, 10**9), (47, 10**9), (40, -(10**7)), (53, -(10**7))])
-def test_a_clock_jump_of_the_device_is_told_and_time_goes_on(
+def test_a_device_clock_jump_is_reported_and_stamps_increase(
     device: Any, run: Run, sample: Any, at: int, jump_us: int
 ) -> None:
     clock = [10**8 + s * 1000 + (jump_us if s >= at else 0) for s in range(80)]

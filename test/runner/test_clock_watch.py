@@ -71,7 +71,7 @@ def test_a_jump_is_seen_sample_by_sample() -> None:
     assert not watched.torn(6, 10**9 + 1000)
 
 
-def test_a_gap_in_the_numbers_is_no_jump() -> None:
+def test_a_gap_in_the_numbers_is_not_a_clock_jump() -> None:
     watched = watch()
     assert not watched.torn(0, 0)
     assert not watched.torn(5000, 5_000_000)

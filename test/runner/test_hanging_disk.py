@@ -208,7 +208,7 @@ def test_estimates_flow_while_the_disk_hangs_at_the_end_of_a_recording(live: Liv
     assert blocks_of(second) == list(range(3 * BLOCKS, 4 * BLOCKS))
 
 
-def test_a_recording_that_cannot_be_closed_is_not_called_ended(
+def test_stop_reports_a_recording_that_cannot_be_closed(
     live: Live, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(fd: int) -> None:
@@ -302,7 +302,7 @@ def test_a_disk_that_hangs_does_not_hold_up_the_start_of_a_run(
     assert blocks_of(folder) == list(range(BLOCKS, 2 * BLOCKS))
 
 
-def test_a_disk_that_refuses_late_is_told(
+def test_a_late_disk_error_is_reported(
     disk: Disk, device: ScriptedDevice, sample: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(session_module, 'OPEN_S', 0.01)

@@ -85,7 +85,7 @@ def test_a_request_that_was_begun_is_waited_for(
     processing.join(WAIT_S)
 
 
-def test_a_request_that_does_not_end_is_not_called_undone(
+def test_timeout_of_a_begun_request_says_that_it_was_begun(
     items: queue.SimpleQueue[Item], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     processing, held = Processing(items, Pipeline(load_rig()), print), Held()

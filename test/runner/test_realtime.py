@@ -39,7 +39,7 @@ class Clock:
         return self.now
 
 
-def test_systemd_is_told_twice_in_its_interval(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_watchdog_signals_twice_per_interval(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     systemd, clock = Systemd(tmp_path / 'notify'), Clock()
     monkeypatch.setenv('NOTIFY_SOCKET', str(tmp_path / 'notify'))
     monkeypatch.setenv('WATCHDOG_USEC', '4000000')
@@ -64,7 +64,7 @@ def test_systemd_is_told_twice_in_its_interval(tmp_path: Path, monkeypatch: pyte
         {'NOTIFY_SOCKET': 'ours', 'WATCHDOG_USEC': '4000000', 'WATCHDOG_PID': '1'},
     ],
 )
-def test_no_watchdog_is_fed_that_nobody_asked_for(
+def test_watchdog_does_nothing_without_systemd(
     environment: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     systemd, clock = Systemd(tmp_path / 'notify'), Clock()
@@ -83,7 +83,7 @@ def test_no_watchdog_is_fed_that_nobody_asked_for(
     systemd.socket.close()
 
 
-def test_what_the_system_refuses_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refused_system_resources_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*args: Any) -> None:
         raise PermissionError(errno.EPERM, 'Operation not permitted')
 

@@ -220,7 +220,7 @@ def test_a_slow_disk_holds_up_nothing_and_is_counted(tmp_path: Path, monkeypatch
     assert [c.block for c in recording.changes] == [7]
 
 
-def test_what_was_written_survives_without_an_end(tmp_path: Path) -> None:
+def test_flushed_messages_survive_a_missing_end(tmp_path: Path) -> None:
     """A chunk ends by itself where nothing more comes."""
     run = Run(rig_for(tmp_path))
     run.put(3)

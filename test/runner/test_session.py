@@ -56,7 +56,7 @@ def test_no_zero_is_taken_of_a_device_that_is_away(running: Running, device: Scr
         running.session.zero()
 
 
-def test_dots_of_a_device_that_is_away_are_not_called_seen(running: Running, device: ScriptedDevice) -> None:
+def test_diagnostics_report_no_dots_while_the_device_is_away(running: Running, device: ScriptedDevice) -> None:
     def said_of_dots() -> list[tuple[int, str]]:
         report = health.report(time.time_ns())
         return [(e.level, e.message) for e in report.entries if e.name.startswith('psd_deflection: psd_')]

@@ -89,7 +89,7 @@ def test_a_hang_up_that_is_to_be_passed_over_is() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
-def test_a_terminal_that_is_gone_holds_up_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_display_survives_a_closed_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     class Gone(io.StringIO):
         def write(self, text: str) -> int:
             raise OSError(errno.EIO, 'Input/output error')
@@ -103,7 +103,7 @@ def test_a_terminal_that_is_gone_holds_up_nobody(monkeypatch: pytest.MonkeyPatch
     assert heard.getvalue() == 'heard\n'
 
 
-def test_a_session_made_anew_counts_from_nought(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_display_of_a_new_session_counts_from_zero(monkeypatch: pytest.MonkeyPatch) -> None:
     now, counters = [100.0], SimpleNamespace(samples=0)
     rates: list[float] = []
 

@@ -19,7 +19,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
     return load_rig()
 
 
-def test_what_was_kept_comes_back_for_the_same_device_alone(rig: Rig) -> None:
+def test_kept_zero_applies_only_to_the_same_device(rig: Rig) -> None:
     assert ZeroStore(rig, 'A-1').save(replace_values(rig, ZERO)) == ''
     back, said = ZeroStore(rig, 'A-1').load(rig)
     assert 'zero of the last run' in said
@@ -97,7 +97,7 @@ def test_a_kept_zero_is_checked_like_any_parameter(rig: Rig, zero: object) -> No
     assert 'psd_1.zero' in said
 
 
-def test_a_place_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_unwritable_zero_file_is_reported(tmp_path: Path) -> None:
     (tmp_path / 'file').write_text('')
     rig = load_rig(overrides={'zero_file': str(tmp_path / 'file' / 'zero.json')})
     assert 'cannot be kept' in ZeroStore(rig, 'A').save(rig)
