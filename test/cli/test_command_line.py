@@ -137,7 +137,7 @@ def test_bad_parameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     rig.write_text('/**: [')
     status, err = refused(capsys, 'params', '--params-file', str(rig))
     assert status == 3
-    assert f'{rig}:1:' in err
+    assert f'{rig}:2:1: malformed YAML' in err
 
 
 def test_a_rig_that_cannot_be_solved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
