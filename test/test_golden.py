@@ -126,8 +126,9 @@ def test_csv_out_has_the_contracts_columns(tmp_path: Path) -> None:
     names = ['t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta']
     assert list(rows[0])[:7] == names
     assert list(rows[0])[-1] == 'chi_square'
-    # One number left of four readings and three unknowns: 1 on the average.
-    assert 0.7 < np.mean([float(r['chi_square']) for r in rows]) < 1.3
+    # One number left of four readings and three unknowns: half of a chi-square is below 0.455, and means of a ringing
+    # plate's dots give a little more.
+    assert 0.3 < np.median([float(r['chi_square']) for r in rows]) < 0.9
     for solver in ('exact', 'wls', 'iterative'):
         assert {f'{solver}_dx', f'{solver}_dy', f'{solver}_theta'} <= set(rows[0])
     assert len(rows) == 200
