@@ -29,9 +29,9 @@ from psd_deflection.protocol.apt import (
     INFO_REQUEST,
     READINGS_REQUEST,
     SUM_VOLTS,
+    Answer,
     AptDecoder,
     HardwareInfo,
-    Message,
     Readings,
     encode_info,
     encode_readings,
@@ -227,7 +227,7 @@ class ThorlabsPair(Source):
         }
 
 
-def _reading(messages: list[Message], events: list[Event]) -> Readings | None:
+def _reading(messages: list[Answer], events: list[Event]) -> Readings | None:
     found = None
     for message in messages:
         if isinstance(message, Readings):
