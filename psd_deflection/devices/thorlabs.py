@@ -29,8 +29,8 @@ from psd_deflection.protocol.apt import (
     INFO_REQUEST,
     READINGS_REQUEST,
     SUM_VOLTS,
-    Answer,
     AptDecoder,
+    AptMessage,
     HardwareInfo,
     Readings,
     encode_info,
@@ -227,7 +227,7 @@ class ThorlabsPair(Source):
         }
 
 
-def _reading(messages: list[Answer], events: list[Event]) -> Readings | None:
+def _reading(messages: list[AptMessage], events: list[Event]) -> Readings | None:
     found = None
     for message in messages:
         if isinstance(message, Readings):
