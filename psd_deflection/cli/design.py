@@ -147,21 +147,21 @@ def appendix_b() -> str:
 # ---- A rig's placement ----
 
 
-class Candidate(NamedTuple):
+class PlacementRow(NamedTuple):
     """A placement of two sensors, with what it is."""
 
     name: str
     centers: FloatArray
 
 
-def placements(rig: Rig, room: placement.Room) -> list[Candidate]:
+def placements(rig: Rig, room: placement.Room) -> list[PlacementRow]:
     """The rig's own placement, the same base line put opposite, and the best that the room holds."""
     own = rig.centers
     half = float(np.hypot(*(own[0] - own[1]))) / 2.0
     return [
-        Candidate('this rig', own),
-        Candidate('same base line, opposite', placement.opposite(half)),
-        Candidate('best in the room', placement.best_pair(room)),
+        PlacementRow('this rig', own),
+        PlacementRow('same base line, opposite', placement.opposite(half)),
+        PlacementRow('best in the room', placement.best_pair(room)),
     ]
 
 
@@ -179,7 +179,7 @@ def link_text(rig: Rig) -> str:
     )
 
 
-def figures(rig: Rig, candidates: list[Candidate], sigma: float) -> dict[str, Any]:
+def figures(rig: Rig, candidates: list[PlacementRow], sigma: float) -> dict[str, Any]:
     """The link and its placements for programs: m, N, rad; no number for what cannot be seen."""
     statics = LinkStatics.from_rig(rig)
     bend, _, twist = np.diag(statics.compliance).tolist()
@@ -211,7 +211,7 @@ def _spread(centers: FloatArray, sigma: float) -> placement.Spread:
     return placement.Spread(math.inf, math.inf, math.inf)
 
 
-def placement_text(candidates: list[Candidate], sigma: float) -> str:
+def placement_text(candidates: list[PlacementRow], sigma: float) -> str:
     """Spreads and condition numbers, and how much the best one gains."""
     head = ['placement', 'c1 mm', 'c2 mm', 'dX um', 'dY um', 'theta mdeg', 'cond (0.1 m rad)', 'cond (m, rad)']
     rows = [head]
@@ -279,7 +279,7 @@ def tied_text(rig: Rig, best: FloatArray, sigma: float) -> str:
     return columns(rows)
 
 
-def draw(candidates: list[Candidate], room: placement.Room, rig: Rig, path: Path) -> None:
+def draw(candidates: list[PlacementRow], room: placement.Room, rig: Rig, path: Path) -> None:
     """The placements seen from beyond the tip (X right, Y up), written to ``path``."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle, Rectangle

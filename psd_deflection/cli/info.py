@@ -56,7 +56,7 @@ def lacks(recording: Recording, topics: Mapping[str, int]) -> list[str]:
     return found
 
 
-def survey(recording: Recording, quiet: bool = True) -> dict[str, Any]:
+def summary(recording: Recording, quiet: bool = True) -> dict[str, Any]:
     """What ``info --json`` prints: times in s and ns, counts, metadata; reads the whole recording."""
     with told('counting messages', quiet=quiet):
         topics = recording.topics()
@@ -103,8 +103,8 @@ def survey(recording: Recording, quiet: bool = True) -> dict[str, Any]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the survey."""
-    found = survey(open_recording(Path(args.recording)), quiet=args.json)
+    """Print the summary."""
+    found = summary(open_recording(Path(args.recording)), quiet=args.json)
     if args.json:
         print_json(found, indent=2)
         return 0

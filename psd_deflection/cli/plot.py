@@ -32,7 +32,7 @@ from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.replay_engine import open_for_replay, replayed
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, Record, SampleBlock, SpotMeans
 
-SPECTRUM_S = 600.0
+SPECTRUM_OF_S = 600.0
 """The spectrum is of the last ten minutes: it does not get better after that, only slower."""
 
 COLORS = {'dx': '#0b6bcb', 'dy': '#c2570c', 'theta': '#0f7b4f', 'lost': '#c62828', 'quiet': '#5a6875'}
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
     out = Path(args.out) if args.out is not None else default_out(args.recording)
     need_folder(out)
     recording, rig = open_for_replay(args.recording, args.params_file)
-    drawn, spectrum = Drawn(), Spectrum(rig, SPECTRUM_S)
+    drawn, spectrum = Drawn(), Spectrum(rig, SPECTRUM_OF_S)
     for records in replayed(recording, Pipeline(rig), progress_of(recording.blocks(), quiet=args.json)):
         for record in records:
             drawn.add(record)

@@ -30,8 +30,8 @@ from psd_deflection.protocol.apt import (
     READINGS_REQUEST,
     SUM_VOLTS,
     AptDecoder,
+    AptMessage,
     HardwareInfo,
-    Message,
     Readings,
     encode_info,
     encode_readings,
@@ -227,7 +227,7 @@ class ThorlabsPair(Source):
         }
 
 
-def _reading(messages: list[Message], events: list[Event]) -> Readings | None:
+def _reading(messages: list[AptMessage], events: list[Event]) -> Readings | None:
     found = None
     for message in messages:
         if isinstance(message, Readings):

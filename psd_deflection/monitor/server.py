@@ -40,7 +40,7 @@ TOKEN_VARIABLE = 'PSD_DEFLECTION_MONITOR_TOKEN'
 TOKEN_HEADER = 'X-Monitor-Token'
 
 PUMP_S = 0.03
-SPECTRUM_S = 0.5
+SPECTRUM_EVERY_S = 0.5
 HEALTH_S = 0.9
 HISTORY_S = 60.0
 MESSAGES = 50
@@ -197,7 +197,7 @@ class MonitorServer:
                     self._spectrum.add(item)
             now = time.monotonic()
             if self._browsers and now >= due:
-                due = now + SPECTRUM_S
+                due = now + SPECTRUM_EVERY_S
                 self._density = (self._density[0] + 1, density_json(self._spectrum.density()))
                 new = True
             if new:

@@ -56,7 +56,7 @@ class HardwareInfo(NamedTuple):
     firmware: str
 
 
-Message = Readings | HardwareInfo | BadFrame
+AptMessage = Readings | HardwareInfo | BadFrame
 
 
 def readings_of(x_difference: int, y_difference: int, total: int) -> Readings:
@@ -90,9 +90,9 @@ class AptDecoder:
         self._rest = b''
         self._skipped = 0
 
-    def feed(self, received: bytes) -> list[Message]:
+    def feed(self, received: bytes) -> list[AptMessage]:
         """The messages that end in ``received``."""
-        out: list[Message] = []
+        out: list[AptMessage] = []
         stream, at = self._rest + received, 0
         while len(stream) - at >= HEADER.size:
             kind, length, destination, origin = HEADER.unpack_from(stream, at)
@@ -122,7 +122,7 @@ class AptDecoder:
         return size
 
 
-def _parse(kind: int, body: bytes, size: int) -> Message | None:
+def _parse(kind: int, body: bytes, size: int) -> AptMessage | None:
     """None for a message of no interest here."""
     if kind == READINGS_REPLY:
         if len(body) != READINGS.size:

@@ -39,8 +39,8 @@ LOOK_EVERY = 250
 
 ELSEWHERE = 'make room, or record elsewhere (parameter bag_dir)'
 
-Message = tuple[str, str, bytes, int]
-Item = Message | ParameterChange | None
+QueuedMessage = tuple[str, str, bytes, int]
+Item = QueuedMessage | ParameterChange | None
 
 
 def new_folder(parent: Path) -> Path:

@@ -32,7 +32,7 @@ CHUNK = 4096
 """Blocks worked on at once: their arrays stay in the processor's cache."""
 
 
-class Fit(NamedTuple):
+class Minimum(NamedTuple):
     """``covariance`` (p x p) rows; ``residual``: measured minus predicted."""
 
     parameters: list[float]
@@ -42,7 +42,7 @@ class Fit(NamedTuple):
     steps: int
 
 
-class Fits(NamedTuple):
+class Minima(NamedTuple):
     """(n, p), (n, p, p), (n, m), (n,) bool."""
 
     parameters: FloatArray
@@ -51,7 +51,7 @@ class Fits(NamedTuple):
     converged: npt.NDArray[np.bool_]
 
 
-def fit(model: Model, start: Sequence[float], measured: Sequence[float], variances: Sequence[float]) -> Fit:
+def fit(model: Model, start: Sequence[float], measured: Sequence[float], variances: Sequence[float]) -> Minimum:
     """One block. Raises SolverError if a variance is 0."""
     x = list(start)
     p = len(x)
@@ -75,7 +75,7 @@ def fit(model: Model, start: Sequence[float], measured: Sequence[float], varianc
         inverse = _invert(normal)
         if inverse is None:
             nan = float('nan')
-            return Fit(x, [[nan] * p for _ in range(p)], residual, False, steps)
+            return Minimum(x, [[nan] * p for _ in range(p)], residual, False, steps)
         largest = 0.0
         step = []
         for i in range(p):
@@ -91,9 +91,9 @@ def fit(model: Model, start: Sequence[float], measured: Sequence[float], varianc
             residual = [
                 r - sum([a * b for a, b in zip(row, step, strict=True)]) for r, row in zip(residual, rows, strict=True)
             ]
-            return Fit(x, inverse, residual, True, steps)
+            return Minimum(x, inverse, residual, True, steps)
         if not largest < float('inf') or steps == MAX_STEPS:
-            return Fit(x, inverse, residual, False, steps)
+            return Minimum(x, inverse, residual, False, steps)
 
 
 def _invert(lower: list[list[float]]) -> list[list[float]] | None:
@@ -131,11 +131,11 @@ def _invert(lower: list[list[float]]) -> list[list[float]] | None:
     return out
 
 
-def fit_many(model: ModelMany, start: FloatArray, measured: FloatArray, variances: FloatArray) -> Fits:
+def fit_many(model: ModelMany, start: FloatArray, measured: FloatArray, variances: FloatArray) -> Minima:
     """N blocks: ``start`` (n, p), ``measured`` (n, m), ``variances`` (m,) or (n, m), above 0 (SolverError)."""
     n, p = start.shape
     weights = np.broadcast_to(1.0 / positive(variances), measured.shape)
-    out = Fits(start.copy(), np.empty((n, p, p)), np.empty(measured.shape), np.zeros(n, dtype=bool))
+    out = Minima(start.copy(), np.empty((n, p, p)), np.empty(measured.shape), np.zeros(n, dtype=bool))
     for first in range(0, n, CHUNK):
         # Converged blocks are not changed, so an answer does not depend on its neighbours.
         active = np.arange(first, min(first + CHUNK, n))

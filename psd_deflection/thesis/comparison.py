@@ -162,7 +162,7 @@ SIDEBAR_POSE = np.array([0.12e-3, -2.2272e-3, np.radians(-0.9407)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cause:
+class Explanation:
     """A possible error of the rig, in addition to the algorithms' errors. Lengths m, angles rad.
 
     ``height``: of both surfaces. ``rotation``: of both PSDs in their plane. ``gain``: of all
@@ -185,28 +185,28 @@ class Cause:
     printed_matrix: bool = False
 
 
-CAUSES: tuple[Cause, ...] = (
-    Cause('the algorithms alone'),
-    Cause(
+CAUSES: tuple[Explanation, ...] = (
+    Explanation('the algorithms alone'),
+    Explanation(
         'twist, dY of Table B1 at 60 N, scaled',
         pose=np.array([0.12e-3, -3.38e-3, -13.0 / 585.0]) * (1.0, 50.0 / 60.0, 50.0 / 60.0),
     ),
-    Cause('PSDs 22 mm above the section', height=0.022, pose=np.array([0.132e-3, -2.2272e-3, np.radians(-1.0)])),
-    Cause('both PSDs rotated 1 deg', rotation=np.radians(1.0)),
-    Cause('both PSDs rotated 3 deg', rotation=np.radians(3.0)),
-    Cause('all gains +5 %', gain=1.05),
-    Cause('beam 1 inclined 1 deg in x', beam_1=(np.tan(np.radians(1.0)), 0.0)),
-    Cause('beam 1 inclined 1 deg in y', beam_1=(0.0, np.tan(np.radians(1.0)))),
-    Cause('pre-load 70/-50 um left in', offset=(70e-6, -50e-6)),
-    Cause('camera rolled +1 deg', camera_roll=np.radians(1.0)),
-    Cause('camera rolled -1 deg', camera_roll=np.radians(-1.0)),
-    Cause('plate centre off (2, 2) mm', center=(2e-3, 2e-3)),
-    Cause('no cantilever tilt', slope_ratio=0.0),
-    Cause("the code's matrix", printed_matrix=True),
+    Explanation('PSDs 22 mm above the section', height=0.022, pose=np.array([0.132e-3, -2.2272e-3, np.radians(-1.0)])),
+    Explanation('both PSDs rotated 1 deg', rotation=np.radians(1.0)),
+    Explanation('both PSDs rotated 3 deg', rotation=np.radians(3.0)),
+    Explanation('all gains +5 %', gain=1.05),
+    Explanation('beam 1 inclined 1 deg in x', beam_1=(np.tan(np.radians(1.0)), 0.0)),
+    Explanation('beam 1 inclined 1 deg in y', beam_1=(0.0, np.tan(np.radians(1.0)))),
+    Explanation('pre-load 70/-50 um left in', offset=(70e-6, -50e-6)),
+    Explanation('camera rolled +1 deg', camera_roll=np.radians(1.0)),
+    Explanation('camera rolled -1 deg', camera_roll=np.radians(-1.0)),
+    Explanation('plate centre off (2, 2) mm', center=(2e-3, 2e-3)),
+    Explanation('no cantilever tilt', slope_ratio=0.0),
+    Explanation("the code's matrix", printed_matrix=True),
 )
 
 
-def table_5_1(cause: Cause) -> tuple[FloatArray, FloatArray]:
+def table_5_1(cause: Explanation) -> tuple[FloatArray, FloatArray]:
     """Relative errors (3,) of theta, dX, dY: Appendix D's iteration, and least squares with the sidebar's Po."""
     nominal = thesis_geometry()
     dx, dy, theta = cause.pose
@@ -223,7 +223,7 @@ def table_5_1(cause: Cause) -> tuple[FloatArray, FloatArray]:
     return np.roll(iterative, 1) / seen - 1.0, np.roll(linear, 1) / seen - 1.0
 
 
-def _project(geometry: Geometry, pose: FloatArray, cause: Cause, offsets: FloatArray) -> FloatArray:
+def _project(geometry: Geometry, pose: FloatArray, cause: Explanation, offsets: FloatArray) -> FloatArray:
     """Readings (4,) of a rig with that cause: the crossing of each beam's line with the plate's plane."""
     plate = rotation(*pose[2:])
     own = rotation(cause.rotation, 0.0, 0.0)

@@ -144,7 +144,7 @@ ERRATA_B1: dict[tuple[int, str], str] = {
 """Cells of Table B1 that the stated inputs do not give, with the reason."""
 
 
-class Cell(NamedTuple):
+class TableCell(NamedTuple):
     """One cell of a table of the appendix: computed beside printed."""
 
     row: str
@@ -164,7 +164,7 @@ def round_as(value: float, printed: str) -> Decimal:
     return Decimal(repr(value)).quantize(Decimal(printed))
 
 
-def table_b1(youngs_modulus: float = YOUNGS_MODULUS) -> list[Cell]:
+def table_b1(youngs_modulus: float = YOUNGS_MODULUS) -> list[TableCell]:
     """Every cell of Table B1's theoretical rows, in the thesis's own units."""
     cells = []
     for number, _, link in table_b1_cases(youngs_modulus):
@@ -180,7 +180,7 @@ def table_b1(youngs_modulus: float = YOUNGS_MODULUS) -> list[Cell]:
             link.tip_total(FORCE) * 1e3,
         )
         for column, value, printed in zip(COLUMNS, computed, PRINTED_B1[number], strict=True):
-            cells.append(Cell(str(number), column, value, printed, ERRATA_B1.get((number, column), '')))
+            cells.append(TableCell(str(number), column, value, printed, ERRATA_B1.get((number, column), '')))
     return cells
 
 
@@ -206,10 +206,10 @@ MATERIALS = (
 ERRATA_B2 = {'E-glass/epoxy +-45': '1.5 x 12/11 is 1.636, so 1.64'}
 
 
-def table_b2() -> list[Cell]:
+def table_b2() -> list[TableCell]:
     """Every ratio of Table B2."""
     return [
-        Cell(
+        TableCell(
             m.name,
             'TBR',
             torsion_to_bending_ratio(m.youngs_modulus, m.shear_modulus),

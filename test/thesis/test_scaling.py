@@ -21,7 +21,7 @@ from psd_deflection.thesis.scaling import (
     MATERIALS,
     PRINTED_B1_EXPERIMENTAL,
     YOUNGS_MODULUS,
-    Cell,
+    TableCell,
     round_as,
     table_b1,
     table_b1_cases,
@@ -138,6 +138,6 @@ def test_doubling_everything_halves_the_deflection() -> None:
 
 
 def test_a_cell_is_compared_at_the_digits_that_are_printed() -> None:
-    assert Cell('', '', 0.0799, '0.08', '').agrees
-    assert not Cell('', '', 0.0799, '0.080001', '').agrees
+    assert TableCell('', '', 0.0799, '0.08', '').agrees
+    assert not TableCell('', '', 0.0799, '0.080001', '').agrees
     assert round_as(2.6726e-3, '2.68e-3') == Decimal('2.67e-3')
