@@ -65,7 +65,7 @@ class Fitted(NamedTuple):
 
 def basis(size: int) -> FloatArray:
     """Orthonormal polynomials (N, K) over the places 0 ... N - 1; at most one order for each four samples."""
-    orders = _orders(size)
+    orders = min(ORDER, (size - 1) // 4) + 1
     u = (np.arange(size) - 0.5 * (size - 1)) / max(0.5 * (size - 1), 0.5)
     columns: list[FloatArray] = []
     column: FloatArray
@@ -77,10 +77,6 @@ def basis(size: int) -> FloatArray:
                 column = column - (q * column).sum() * q
         columns.append(column / float((column * column).sum()) ** 0.5)
     return np.stack(columns, axis=1)
-
-
-def _orders(samples: int) -> int:
-    return min(ORDER, (samples - 1) // 4) + 1
 
 
 def combinations(beams: FloatArray) -> FloatArray:
@@ -109,7 +105,7 @@ class _Terms(NamedTuple):
 
 def _terms(q: FloatArray, precision: FloatArray) -> _Terms:
     samples, orders = q.shape
-    told = min(orders, _orders(samples))
+    told = min(orders, max(samples // 2, 1))
     u = np.einsum('ast,tk->ask', precision, q)
     information = np.einsum('sj,ask->ajk', q, u)
     inverted = inverse(information[:, :told, :told])
