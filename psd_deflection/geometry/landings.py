@@ -1,4 +1,4 @@
-"""Lasers on the tip plate, PSDs at the base (thesis 5.3): where each laser falls, scalar and for many poses.
+"""Lasers on the tip plate, PSDs at the base (thesis 5.3): where each laser falls.
 
 A beam leaves the plate at (lx, ly) along the plate's normal and meets the base plane of its PSD, ``height`` above the
 reference section (negative towards the base). The plate is turned by R = Ry(omega) Rx(phi) Rz(theta).
@@ -8,10 +8,7 @@ from __future__ import annotations
 
 from math import cos, sin, tan
 
-import numpy as np
-
 from psd_deflection.geometry.plate import Row
-from psd_deflection.records import FloatArray
 
 
 def landing(
@@ -38,27 +35,3 @@ def landing(
             -tp * (ax + height * sin(omega)) / (co * co),
         ),
     )
-
-
-def landings(beams: FloatArray, heights: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The same for n poses (n, 5): places (n, 2P) and derivatives (n, 2P, 5)."""
-    dx, dy, theta, phi, omega = (poses[:, i, None] for i in range(5))
-    ax = np.cos(theta) * beams[:, 0] - np.sin(theta) * beams[:, 1]
-    ay = np.sin(theta) * beams[:, 0] + np.cos(theta) * beams[:, 1]
-    co = np.cos(omega)
-    cp = np.cos(phi)
-    to = np.tan(omega)
-    tp = np.tan(phi)
-    n, count = ax.shape
-    place = np.empty((n, 2 * count))
-    place[:, 0::2] = dx + ax / co + heights * to
-    place[:, 1::2] = dy + ay / cp - ax * to * tp - heights * tp / co
-    j = np.zeros((n, 2 * count, 5))
-    j[:, 0::2, 0] = 1.0
-    j[:, 1::2, 1] = 1.0
-    j[:, 0::2, 2] = -ay / co
-    j[:, 1::2, 2] = ax / cp + ay * to * tp
-    j[:, 1::2, 3] = (ay * np.sin(phi) - ax * to - heights / co) / (cp * cp)
-    j[:, 0::2, 4] = (ax * np.sin(omega) + heights) / (co * co)
-    j[:, 1::2, 4] = -tp * (ax + heights * np.sin(omega)) / (co * co)
-    return place, j

@@ -14,9 +14,8 @@ import numpy as np
 
 from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.geometry.linear import design_matrix
-from psd_deflection.records import FloatArray
 from psd_deflection.solvers.fixed_gain import FixedGain
-from psd_deflection.solvers.interface import Solution, Solutions, Solver
+from psd_deflection.solvers.interface import Solution, Solver
 
 
 class OlsSolver(Solver):
@@ -33,7 +32,3 @@ class OlsSolver(Solver):
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
         return self._linear.solve(dots, variances)
-
-    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks. See :class:`Solver`."""
-        return self._linear.solve_many(dots, variances)

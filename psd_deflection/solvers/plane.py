@@ -7,8 +7,7 @@ pose moves dot i by
 
 the corrected rows of the thesis's design matrix (4.5, 4.6) with p_i for l_i. Each axis has its own
 weighted mean. This eliminates f and leaves one unknown, so neither the estimate nor its covariance
-needs a matrix. Each method's ``solve`` writes these formulas out in floats; this module has them
-for n blocks.
+needs a matrix.
 """
 
 from __future__ import annotations
@@ -46,41 +45,6 @@ def positive(variances: FloatArray) -> FloatArray:
     return v
 
 
-def split(dots: FloatArray, variances: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """x, y (n, P) and their variances, each (n, P) or (1, P). Raises SolverError as :func:`positive`."""
-    v = positive(variances)
-    m = np.atleast_2d(np.asarray(dots, dtype=np.float64))
-    return m[:, 0::2], m[:, 1::2], v[:, 0::2], v[:, 1::2]
-
-
-def interleave(x: FloatArray, y: FloatArray) -> FloatArray:
-    """(n, P) and (n, P) to (n, 2P): x1, y1, x2, y2, ..."""
-    out = np.empty((x.shape[0], 2 * x.shape[1]))
-    out[:, 0::2] = x
-    out[:, 1::2] = y
-    return out
-
-
-def weighted_covariance(
-    px: FloatArray, py: FloatArray, wx: FloatArray, wy: FloatArray, c: FloatArray, s: FloatArray
-) -> FloatArray:
-    """(J^T W J)^-1 of (dX, dY, theta), (n, 3, 3), for plate points (n, P), weights (n or 1, P).
-
-    ``c``, ``s`` (n,): cosine and sine of theta.
-    """
-    sum_x = wx.sum(axis=1)
-    sum_y = wy.sum(axis=1)
-    mean_y = (wx * py).sum(axis=1) / sum_x
-    mean_x = (wy * px).sum(axis=1) / sum_y
-    information = (wx * (py - mean_y[:, None]) ** 2).sum(axis=1) + (wy * (px - mean_x[:, None]) ** 2).sum(axis=1)
-    vtt = 1.0 / information
-    vxt = mean_y * vtt
-    vyt = -mean_x * vtt
-    return turn_covariance_many(
-        c, s, 1.0 / sum_x + mean_y * vxt, -mean_x * vxt, 1.0 / sum_y - mean_x * vyt, vxt, vyt, vtt
-    )
-
-
 def turn_covariance_many(
     c: FloatArray,
     s: FloatArray,
@@ -90,11 +54,9 @@ def turn_covariance_many(
     vxt: FloatArray,
     vyt: FloatArray,
     vtt: FloatArray,
-    out: FloatArray | None = None,
-) -> FloatArray:
-    """:func:`turn_covariance` for n blocks: (n, 3, 3), written into ``out`` if it is given."""
-    if out is None:
-        out = np.empty((c.shape[0], 3, 3))
+    out: FloatArray,
+) -> None:
+    """:func:`turn_covariance` for n blocks, written into ``out`` (n, 3, 3)."""
     cs = c * s
     mixed = 2.0 * cs * vxy
     cc = c * c
@@ -105,4 +67,3 @@ def turn_covariance_many(
     out[:, 0, 2] = out[:, 2, 0] = c * vxt - s * vyt
     out[:, 1, 2] = out[:, 2, 1] = s * vxt + c * vyt
     out[:, 2, 2] = vtt
-    return out

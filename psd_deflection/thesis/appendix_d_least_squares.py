@@ -17,7 +17,7 @@ from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers.fixed_gain import FixedGain
-from psd_deflection.solvers.interface import Solution, Solutions, Solver
+from psd_deflection.solvers.interface import Solution, Solver
 from psd_deflection.solvers.wls import THESIS_ROW_SCALING
 
 
@@ -47,10 +47,6 @@ class AppendixDOlsSolver(Solver):
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
         return self._linear.solve(dots, variances)
-
-    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks. See :class:`Solver`."""
-        return self._linear.solve_many(dots, variances)
 
 
 class AppendixDWlsSolver(AppendixDOlsSolver):

@@ -16,7 +16,7 @@ from matplotlib.patches import Arc, Circle, Ellipse, FancyArrowPatch, Rectangle
 
 from psd_deflection.calibration.sensors import Duolateral, Quadrant
 from psd_deflection.geometry import Geometry
-from psd_deflection.geometry.landings import landings
+from psd_deflection.geometry.landings import landing
 from psd_deflection.geometry.linear import design_matrix, gain_matrix
 from psd_deflection.geometry.plate import tied_pose
 from psd_deflection.solvers.registry import make_solver
@@ -361,8 +361,9 @@ def base_pair() -> Figure:
     poses = np.zeros((len(theta), 5))
     poses[:, 0], poses[:, 1], poses[:, 2] = 1e-3, -2e-3, theta
     poses = tied_pose(poses[:, :3], 1.5, nominal.link_length)
-    places, _ = landings(geometry.beams, geometry.heights, poses)
-    dots = places - geometry.centers.ravel()
+    rows = np.column_stack((geometry.beams, geometry.heights)).tolist()
+    places = np.array([[landing(*row, *pose)[:2] for row in rows] for pose in poses.tolist()])
+    dots = (places - geometry.centers).reshape(len(poses), -1)
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.4), layout='constrained')
     for assume, color in (('no_twist', _RED), ('beam', _GREEN)):
         found = make_solver('base_pair', geometry, assume=assume).solve_many(dots, VARIANCES).pose
