@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 from psd_deflection.config import BY_NAME
 from psd_deflection.errors import ConfigError, RecordingError, UsageError
@@ -20,6 +22,8 @@ _FOREIGN = """
 FOREIGN = frozenset(_FOREIGN.split())
 """Endings of other kinds of files. Any other ending is part of a folder's name, as in ``run_0.5N``."""
 
+N = TypeVar('N', int, float)
+
 PICTURES = ('.png', '.svg', '.pdf')
 
 
@@ -31,29 +35,25 @@ def seed(text: str) -> int:
 def whole(option: str, least: int, most: int | None = None) -> Callable[[str], int]:
     """Reads a whole number within bounds; what it gives raises UsageError."""
     bounds = f'at least {least}' + ('' if most is None else f' and at most {most}')
-
-    def read(text: str) -> int:
-        with contextlib.suppress(ValueError):
-            value = int(text)
-            if least <= value and (most is None or value <= most):
-                return value
-        raise UsageError(f'{option} {text}: must be a whole number of {bounds}')
-
-    return read
+    return functools.partial(
+        _within, option, int, f'a whole number of {bounds}', least, math.inf if most is None else most
+    )
 
 
 def number(option: str, least: float, most: float) -> Callable[[str], float]:
     """Reads a number within bounds; what it gives raises UsageError."""
+    return functools.partial(
+        _within, option, float, f'a number of at least {least:g} and at most {most:g}', least, most
+    )
 
-    def read(text: str) -> float:
-        with contextlib.suppress(ValueError):
-            value = float(text)
-            # NaN fails every comparison.
-            if least <= value <= most:
-                return value
-        raise UsageError(f'{option} {text}: must be a number of at least {least:g} and at most {most:g}')
 
-    return read
+def _within(option: str, kind: Callable[[str], N], words: str, least: float, most: float, text: str) -> N:
+    with contextlib.suppress(ValueError):
+        value = kind(text)
+        # NaN fails every comparison.
+        if least <= value <= most:
+            return value
+    raise UsageError(f'{option} {text}: must be {words}')
 
 
 def parameter_option(parser: argparse._ActionsContainer, option: str, name: str) -> None:

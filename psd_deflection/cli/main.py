@@ -17,7 +17,7 @@ import shutil
 import signal
 import sys
 import textwrap
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
 from psd_deflection import __version__
@@ -254,21 +254,9 @@ def _split_ros_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
     return own, for_ros
 
 
-def estimator() -> int:
-    """Console script of ``ros2 run psd_deflection estimator`` (colcon)."""
-    return main(['estimator', *sys.argv[1:]])
+def _executable(command: str) -> Callable[[], int]:
+    """Console script of ``ros2 run psd_deflection COMMAND`` (colcon)."""
+    return lambda: main([command, *sys.argv[1:]])
 
 
-def replay() -> int:
-    """Console script of ``ros2 run psd_deflection replay`` (colcon)."""
-    return main(['replay', *sys.argv[1:]])
-
-
-def simulate() -> int:
-    """Console script of ``ros2 run psd_deflection simulate`` (colcon)."""
-    return main(['simulate', *sys.argv[1:]])
-
-
-def discover() -> int:
-    """Console script of ``ros2 run psd_deflection discover`` (colcon)."""
-    return main(['discover', *sys.argv[1:]])
+estimator, replay, simulate, discover = map(_executable, ('estimator', 'replay', 'simulate', 'discover'))

@@ -12,7 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
-from psd_deflection.errors import RecordingError
+from psd_deflection.errors import RecordingError, creating
 from psd_deflection.recordings.csv_reader import LOAD_COLUMNS, REFERENCE_COLUMNS, REQUIRED, TEMPERATURE_COLUMN
 from psd_deflection.records import (
     AppliedLoad,
@@ -36,12 +36,8 @@ class _CsvFile:
     def __init__(self, path: str | Path, header: Sequence[str]) -> None:
         self.path = Path(path)
         self._stream: TextIO | None = None
-        try:
+        with creating(self.path):
             self._stream = self.path.open('x', encoding='ascii', newline='\n')
-        except FileExistsError:
-            raise RecordingError(f'{self.path}: exists already; a recording is never overwritten') from None
-        except OSError as error:
-            raise RecordingError(f'{self.path}: cannot be made ({error.strerror or error})') from None
         self._write([','.join(header)])
 
     def _write(self, lines: Sequence[str]) -> None:

@@ -25,6 +25,7 @@ import numpy as np
 from psd_deflection.errors import ConfigError, SolverError
 from psd_deflection.geometry.landings import landing
 from psd_deflection.geometry.layout import SMALLEST_BASE_LINE, Geometry, check_twist
+from psd_deflection.geometry.plate import tie_matrix
 from psd_deflection.solvers.beam import slope_per_metre
 from psd_deflection.solvers.gauss_newton import fit
 from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
@@ -62,28 +63,15 @@ class BasePairSolver(Solver):
         self._rows = tuple(map(tuple, np.column_stack((geometry.beams, heights)).tolist()))
         # From the unknowns that are solved for to (dX, dY, theta, phi, omega).
         if assume == 'beam':
-            tie = slope_per_metre(geometry)
-            spread: tuple[tuple[float, ...], ...] = (
-                (1.0, 0.0, 0.0),
-                (0.0, 1.0, 0.0),
-                (0.0, 0.0, 1.0),
-                (0.0, -tie, 0.0),
-                (tie, 0.0, 0.0),
-            )
+            slope_per_metre(geometry)
+            self._matrix = tie_matrix(geometry.slope_ratio, geometry.link_length)
         elif assume == 'no_twist':
-            spread = (
-                (1.0, 0.0, 0.0, 0.0),
-                (0.0, 1.0, 0.0, 0.0),
-                (0.0, 0.0, 0.0, 0.0),
-                (0.0, 0.0, 1.0, 0.0),
-                (0.0, 0.0, 0.0, 1.0),
-            )
+            self._matrix = np.eye(5)[:, [0, 1, 3, 4]]
         elif assume == 'nothing':
-            spread = tuple(tuple(float(i == j) for j in range(5)) for i in range(5))
+            self._matrix = np.eye(5)
         else:
             raise ConfigError(f'assume = {assume!r}: must be one of beam, no_twist, nothing')
-        self._spread = spread
-        self._unknowns = len(self._spread[0])
+        self._spread, self._columns = self._matrix.tolist(), self._matrix.T.tolist()
         self._refuse_what_is_unseen(geometry, assume)
 
     def _refuse_what_is_unseen(self, geometry: Geometry, assume: Assume) -> None:
@@ -114,7 +102,7 @@ class BasePairSolver(Solver):
                 )
         length = float(np.hypot(*np.ptp(geometry.beams, axis=0)))
         scale = np.array([1.0, 1.0, length, float(np.abs(heights).max()), float(np.abs(heights).max())])
-        seen = (jacobian / scale) @ (scale[:, None] * np.array(self._spread))
+        seen = (jacobian / scale) @ (scale[:, None] * self._matrix)
         seen /= np.linalg.norm(seen, axis=0)
         if np.linalg.svd(seen, compute_uv=False)[-1] < _SMALLEST_GAIN:
             raise SolverError(
@@ -125,20 +113,18 @@ class BasePairSolver(Solver):
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
         measured = [c + m for c, m in zip(self._centers, dots, strict=True)]
-        found = fit(self._model, (0.0,) * self._unknowns, measured, variances)
-        full = [sum([a * x for a, x in zip(row, found.parameters, strict=True)]) for row in self._spread]
-        spread = self._spread[:3]
-        half = [
-            [sum([a * v for a, v in zip(row, column, strict=True)]) for column in found.covariance] for row in spread
-        ]
-        v = [[sum([a * h for a, h in zip(row, line, strict=True)]) for row in spread] for line in half]
+        found = fit(self._model, (0.0,) * self._matrix.shape[1], measured, variances)
+        (vxx, vxy, vxt), (_, vyy, vyt), (_, _, vtt) = (
+            self._matrix[:3] @ found.covariance @ self._matrix[:3].T
+        ).tolist()
+        dx, dy, theta, phi, omega = (self._matrix @ found.parameters).tolist()
         return Solution(
-            full[0],
-            full[1],
-            full[2],
-            full[3],
-            full[4],
-            (v[0][0], v[0][1], v[0][2], v[1][0], v[1][1], v[1][2], v[2][0], v[2][1], v[2][2]),
+            dx,
+            dy,
+            theta,
+            phi,
+            omega,
+            (vxx, vxy, vxt, vxy, vyy, vyt, vxt, vyt, vtt),
             tuple(found.residual),
             SolverStatus.OK if found.converged else SolverStatus.NOT_CONVERGED,
             found.steps,
@@ -153,7 +139,5 @@ class BasePairSolver(Solver):
             predicted.append(px)
             predicted.append(py)
             for j in (jx, jy):
-                rows.append(
-                    [sum([a * row[i] for a, row in zip(j, self._spread, strict=True)]) for i in range(self._unknowns)]
-                )
+                rows.append([sum([a * b for a, b in zip(j, column, strict=True)]) for column in self._columns])
         return predicted, rows

@@ -17,6 +17,7 @@ method starts there and doubles its digits each time. The covariance is (J^T W J
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import atan2, cos, sin
 from typing import ClassVar
 
@@ -25,9 +26,10 @@ import numpy.typing as npt
 
 from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
+from psd_deflection.geometry.plate import Number
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus, flat_gain
-from psd_deflection.solvers.plane import positive, turn_covariance, turn_covariance_many
+from psd_deflection.solvers.plane import Four, Nine, positive, turn_covariance
 
 _MAX_STEPS = 30
 _LAST_STEP = 1e-10
@@ -91,6 +93,26 @@ class ExactSolver(Solver):
             )
         if theta != theta or steps == _MAX_STEPS:
             status = SolverStatus.NOT_CONVERGED
+        dx, dy, residual, covariance = self._answer(c, s, (q1x, q1y, qx, qy), (mx, my), variances)
+        return Solution(dx, dy, theta, 0.0, 0.0, covariance, residual, status, steps)
+
+    def _answer(
+        self,
+        c: Number,
+        s: Number,
+        points: tuple[Number, Number, Number, Number],
+        reduced: tuple[Number, Number],
+        variances: Sequence[Number],
+    ) -> tuple[Number, Number, Four[Number], Nine[Number]]:
+        """dX, dY, residual and covariance at the turn (``c``, ``s``), of one block or of arrays of them.
+
+        ``points``: plate point 1 and its difference from plate point 2; ``reduced``: weights of that difference.
+        """
+        q1x, q1y, qx, qy = points
+        mx, my = reduced
+        vx1, vy1, vx2, vy2 = variances
+        lx = self._l1x - self._l2x
+        ly = self._l1y - self._l2y
         # The base line under the beams, in plate axes, and the dots' difference from it.
         px = c * lx + s * ly
         py = c * ly - s * lx
@@ -101,8 +123,8 @@ class ExactSolver(Solver):
         # The plate point under beam 1: where dot 1 is, less its residual.
         p1x = q1x - rx1
         p1y = q1y - ry1
-        dx = l1x - c * p1x + s * p1y
-        dy = l1y - s * p1x - c * p1y
+        dx = self._l1x - c * p1x + s * p1y
+        dy = self._l1y - s * p1x - c * p1y
         vtt = 1.0 / (mx * py * py + my * px * px)
         # Weighted means of the plate points: of y with the weights of x, and vice versa.
         mean_y = p1y - py * vx1 * mx
@@ -112,7 +134,7 @@ class ExactSolver(Solver):
         covariance = turn_covariance(
             c, s, vx1 * vx2 * mx + mean_y * vxt, -mean_x * vxt, vy1 * vy2 * my - mean_x * vyt, vxt, vyt, vtt
         )
-        return Solution(dx, dy, theta, 0.0, 0.0, covariance, (rx1, ry1, -ex * vx2, -ey * vy2), status, steps)
+        return dx, dy, (rx1, ry1, -ex * vx2, -ey * vy2), covariance
 
     def _solve_any(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """Any number of PSDs."""
@@ -190,37 +212,14 @@ class ExactSolver(Solver):
             )
             c = np.cos(theta)
             s = np.sin(theta)
-        px = c * lx + s * ly
-        py = c * ly - s * lx
-        ex = (qx - px) * mx
-        ey = (qy - py) * my
-        residual = out.residual[part]
-        rx1 = residual[:, 0] = ex * vx1
-        ry1 = residual[:, 1] = ey * vy1
-        residual[:, 2] = -ex * vx2
-        residual[:, 3] = -ey * vy2
-        p1x = q1x - rx1
-        p1y = q1y - ry1
-        pose = out.pose[part]
-        pose[:, 0] = self._l1x - c * p1x + s * p1y
-        pose[:, 1] = self._l1y - s * p1x - c * p1y
-        pose[:, 2] = theta
-        vtt = 1.0 / (mx * py * py + my * px * px)
-        mean_y = p1y - py * (vx1 * mx)
-        mean_x = p1x - px * (vy1 * my)
-        vxt = mean_y * vtt
-        vyt = -mean_x * vtt
-        turn_covariance_many(
-            c,
-            s,
-            vx1 * vx2 * mx + mean_y * vxt,
-            -mean_x * vxt,
-            vy1 * vy2 * my - mean_x * vyt,
-            vxt,
-            vyt,
-            vtt,
-            out.covariance[part],
-        )
+        dx, dy, residual, covariance = self._answer(c, s, (q1x, q1y, qx, qy), (mx, my), tuple(v.T))
+        for where, values in (
+            (out.pose, (dx, dy, theta)),
+            (out.residual, residual),
+            (out.covariance.reshape(-1, 9), covariance),
+        ):
+            for i, value in enumerate(values):
+                where[part, i] = value
         out.status[part] = np.where(converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED)
 
 

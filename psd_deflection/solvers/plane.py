@@ -15,14 +15,18 @@ from __future__ import annotations
 import numpy as np
 
 from psd_deflection.errors import SolverError
+from psd_deflection.geometry.plate import Number
 from psd_deflection.records import FloatArray
 
-Covariance = tuple[float, float, float, float, float, float, float, float, float]
+Four = tuple[Number, Number, Number, Number]
+Nine = tuple[Number, Number, Number, Number, Number, Number, Number, Number, Number]
+
+Covariance = Nine[float]
 
 
 def turn_covariance(
-    c: float, s: float, vxx: float, vxy: float, vyy: float, vxt: float, vyt: float, vtt: float
-) -> Covariance:
+    c: Number, s: Number, vxx: Number, vxy: Number, vyy: Number, vxt: Number, vyt: Number, vtt: Number
+) -> Nine[Number]:
     """Turn a covariance of (f_x, f_y, theta) in plate axes into one of (dX, dY, theta): R(theta)."""
     # R V R^T, written out.
     cs = c * s
@@ -43,27 +47,3 @@ def positive(variances: FloatArray) -> FloatArray:
     if not (v > 0.0).all():
         raise SolverError('solve: variances must be above 0 m^2')
     return v
-
-
-def turn_covariance_many(
-    c: FloatArray,
-    s: FloatArray,
-    vxx: FloatArray,
-    vxy: FloatArray,
-    vyy: FloatArray,
-    vxt: FloatArray,
-    vyt: FloatArray,
-    vtt: FloatArray,
-    out: FloatArray,
-) -> None:
-    """:func:`turn_covariance` for n blocks, written into ``out`` (n, 3, 3)."""
-    cs = c * s
-    mixed = 2.0 * cs * vxy
-    cc = c * c
-    ss = s * s
-    out[:, 0, 0] = cc * vxx - mixed + ss * vyy
-    out[:, 1, 1] = ss * vxx + mixed + cc * vyy
-    out[:, 0, 1] = out[:, 1, 0] = cs * (vxx - vyy) + (cc - ss) * vxy
-    out[:, 0, 2] = out[:, 2, 0] = c * vxt - s * vyt
-    out[:, 1, 2] = out[:, 2, 1] = s * vxt + c * vyt
-    out[:, 2, 2] = vtt

@@ -43,7 +43,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('bags') / 'run'
     with BagWriter(folder, rig_values=load_rig(None, {'sum_min': 1.5}).values, device_hello=HELLO) as out:
         for r in run(150):
-            out.write(r)
+            out.put(r)
     return folder
 
 
