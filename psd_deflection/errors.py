@@ -34,7 +34,7 @@ class PsdDeflectionError(Exception):
 class UsageError(PsdDeflectionError):
     """An option is missing, has an invalid value, or contradicts another option.
 
-    Example: ``--out run.png: no .png is written; X.csv, X.mcap or a bag folder (X) is``.
+    Example: ``--out run.png: .png cannot be written; use X.csv, X.mcap or a bag folder (X)``.
     """
 
     exit_status = 2

@@ -84,13 +84,13 @@ def given_parameters(args: argparse.Namespace) -> dict[str, object]:
 
 
 def recording_name(*, rerun: bool = False) -> Callable[[str], str]:
-    """Reads the --out of a recording (an .rrd where ``rerun``) by its ending; what it gives raises UsageError."""
+    """Reads the --out of a recording (an .rrd too, if ``rerun``) by its ending; what it gives raises UsageError."""
 
     def read(text: str) -> str:
         suffix = Path(text).suffix.lower()
         if suffix in FOREIGN and not (rerun and suffix == '.rrd'):
             files = 'X.csv, X.mcap, X.rrd' if rerun else 'X.csv, X.mcap'
-            raise UsageError(f'--out {text}: no {suffix} is written; {files} or a bag folder (X) is')
+            raise UsageError(f'--out {text}: {suffix} cannot be written; use {files} or a bag folder (X)')
         return text
 
     return read

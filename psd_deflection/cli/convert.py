@@ -1,9 +1,9 @@
-"""Write the samples of a recording, and its loads, references and temperatures, in another form.
+"""Convert a recording to another format: samples, loads, reference poses and temperatures.
 
-OUT ending in .csv becomes a CSV recording, in .mcap a lone MCAP file, anything else a bag folder.
-Volts come through bit for bit. Estimates are not carried over: psd-deflection replay makes them.
-OUT ending in .rrd becomes a recording for the Rerun viewer (pip install rerun-sdk), for people to look at:
-the estimates that replay makes, dots, loads and losses, and how they are shown. It is not read again.
+The name OUT sets the format: X.csv is a CSV recording, X.mcap a single MCAP file, any other name a
+bag folder. The voltages stay the same bit for bit. Estimates are not copied; psd-deflection replay
+computes them. X.rrd is for the Rerun viewer only (pip install rerun-sdk): it has the computed
+estimates, dots, loads and losses with a layout, and cannot be read back.
 
   psd-deflection convert bags/clean --out clean.csv
   psd-deflection convert bags/lost_samples --out lost_samples.rrd
@@ -41,14 +41,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=recording_name(rerun=True),
         metavar='OUT',
         required=True,
-        help='what to make: X.csv, X.mcap, X.rrd or a bag folder (X)',
+        help='output: X.csv, X.mcap, X.rrd, or a bag folder (any other name)',
     )
     parser.add_argument(
         '--params-file',
         metavar='RIG.yaml',
-        help="the rig to note in a bag or to use for an .rrd; otherwise the recording's own",
+        help="the rig to store in a bag or to compute an .rrd with (default: the recording's own)",
     )
-    parser.add_argument('--json', action='store_true', help='for programs: the summary as one JSON object')
+    parser.add_argument('--json', action='store_true', help='print the summary as JSON')
 
 
 def _time(record: Convertible) -> int:

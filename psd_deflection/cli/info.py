@@ -1,6 +1,6 @@
-"""Say what is in a recording: how long, how many samples, what is lost, which topics, whose rig.
+"""Summarise a recording: duration, samples, losses, topics, device and changed parameters.
 
-The whole of it is read, so damage anywhere in it is found. Takes a bag folder, an .mcap or a .csv.
+The whole recording is read, so that damage anywhere is found.
 
   psd-deflection info bags/clean
   psd-deflection info recordings/psd_20260101_120000 --json
@@ -32,7 +32,7 @@ _BREAK = 0.5
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
-    parser.add_argument('--json', action='store_true', help='for programs: one JSON object')
+    parser.add_argument('--json', action='store_true', help='print the summary as JSON')
 
 
 def changed_parameters(parameters: Mapping[str, Any]) -> dict[str, Any]:

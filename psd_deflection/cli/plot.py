@@ -1,8 +1,7 @@
-"""Draw a recording: deflection and twist with their uncertainty, dots, sums, spectrum, what was lost.
+"""Draw a recording: deflection and twist with their uncertainty, dots, sums, spectrum and losses.
 
-REC (a bag folder, an .mcap or a .csv) runs through the same pipeline as in `replay`, with its own
-parameters or those of --params-file. The kind of picture is the ending of --out: .png, .svg, .pdf,
-or .html, one page without anything from elsewhere.
+The estimates are computed as by `replay`, with the recorded parameters or those of --params-file.
+The ending of --out sets the format: .png, .svg, .pdf or .html (one self-contained page).
 
   psd-deflection plot bags/lost_samples
   psd-deflection plot run.csv --params-file my_rig.yaml --out run.html
@@ -46,9 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--out',
         type=picture_name(*PICTURES, '.html'),
         metavar='OUT',
-        help='.png, .svg, .pdf or .html (default: REC.png, here)',
+        help='.png, .svg, .pdf or .html (default: REC.png in this folder)',
     )
-    parser.add_argument('--json', action='store_true', help='for programs: the summary as one JSON object, in SI units')
+    parser.add_argument('--json', action='store_true', help='print the summary as JSON, in SI units')
 
 
 @dataclass

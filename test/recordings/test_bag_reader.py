@@ -203,7 +203,7 @@ def test_a_restarted_device_does_not_mix_blocks(tmp_path: Path) -> None:
     assert [b.index for b in blocks] == list(range(8))
     assert [len(b.seq) for b in blocks] == [20] * 8
     np.testing.assert_array_equal(blocks[5].volts, again[0].volts)
-    assert any('start anew after 99' in w for w in recording.warnings)
+    assert any('start again after 99' in w for w in recording.warnings)
 
 
 def test_a_block_in_two_messages_is_one_block_again(tmp_path: Path) -> None:

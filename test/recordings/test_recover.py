@@ -86,7 +86,7 @@ def test_recover_reports_its_work_and_keeps_complete_files(
 ) -> None:
     before = {p.name: p.read_bytes() for p in whole.iterdir()}
     assert main(['recover', str(whole)]) == 0
-    assert 'was whole' in capsys.readouterr().out
+    assert 'was intact' in capsys.readouterr().out
     assert {p.name: p.read_bytes() for p in whole.iterdir()} == before
 
 
