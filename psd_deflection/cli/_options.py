@@ -135,7 +135,7 @@ def refuse(args: argparse.Namespace, defaults: Mapping[str, object], why: str) -
             raise UsageError(f'--{name.replace("_", "-")} {why}')
 
 
-def finite(option: str, values: tuple[float, ...]) -> None:
+def need_finite(option: str, values: tuple[float, ...]) -> None:
     """Raise UsageError unless all are finite."""
     if not all(map(math.isfinite, values)):
         raise UsageError(f'{option} {" ".join(f"{v:g}" for v in values)}: must be finite')

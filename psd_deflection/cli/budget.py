@@ -32,8 +32,8 @@ from psd_deflection.budget.inputs import INPUTS, read_inputs
 from psd_deflection.budget.term import Contribution, Kind, Situation
 from psd_deflection.cli._options import (
     PICTURES,
-    finite,
     given_as_option,
+    need_finite,
     need_folder,
     picture_name,
     refuse,
@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     method = args.method or method_of(rig)
     load = tuple(args.load) if args.load else (0.0, -SIDEBAR_FORCE, -SIDEBAR_FORCE * rig.link.length)
-    finite('--load', load)
+    need_finite('--load', load)
     out = Path(args.out or 'budget.png')
     if args.out is not None or not args.json:
         need_folder(out)
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
             print(f'\nMonte Carlo, {draws} draws of everything at once (seed {args.seed}):')
             print('total     ' + _figures_text(sampled))
     if args.out is not None or not args.json:
-        draw(budget, out)
+        draw_terms(budget, out)
         if not args.json:
             print(f'\n{out}')
     return 0
@@ -243,7 +243,7 @@ def as_json(budget: Budget, load: tuple[float, ...], sampled: Contribution | Non
     }
 
 
-def draw(budget: Budget, path: Path) -> None:
+def draw_terms(budget: Budget, path: Path) -> None:
     """Bars of every term, largest first, beside the total, written to ``path``."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch

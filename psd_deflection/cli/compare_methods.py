@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         except OSError as error:
             raise RecordingError(f'--out {args.out}: cannot be made a folder ({error.strerror or error})') from None
     if args.json:
-        print_json(figures())
+        print_json(errors_json())
     else:
         print('\n'.join([*error_table(), '', *linear_table(), '', *cause_table()]))
     if args.out is not None:
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def figures() -> dict[str, dict[str, dict[str, object]]]:
+def errors_json() -> dict[str, dict[str, dict[str, object]]]:
     """Method to condition to its errors, dX, dY in m and theta in rad; ``silent``: the share without an answer."""
     return {
         method.label: {

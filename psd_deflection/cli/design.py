@@ -90,9 +90,9 @@ def run(args: argparse.Namespace) -> int:
         room = placement.Room(radius, args.keep_out, tuple(args.box) if args.box else None)
         candidates = placements(rig, room)
     if args.out is not None:
-        draw(candidates, room, rig, Path(args.out))
+        draw_placements(candidates, room, rig, Path(args.out))
     if args.json:
-        print_json({**figures(rig, candidates, sigma), 'out': args.out})
+        print_json({**design_json(rig, candidates, sigma), 'out': args.out})
         return 0
     print(link_text(rig))
     print()
@@ -190,7 +190,7 @@ def link_text(rig: Rig) -> str:
     )
 
 
-def figures(rig: Rig, candidates: list[PlacementRow], sigma: float) -> dict[str, Any]:
+def design_json(rig: Rig, candidates: list[PlacementRow], sigma: float) -> dict[str, Any]:
     """The link and its placements for programs: m, N, rad; no number for what cannot be seen."""
     statics = LinkStatics.from_rig(rig)
     bend, _, twist = np.diag(statics.compliance).tolist()
@@ -290,7 +290,7 @@ def tied_text(rig: Rig, best: FloatArray, sigma: float) -> str:
     return columns(rows)
 
 
-def draw(candidates: list[PlacementRow], room: placement.Room, rig: Rig, path: Path) -> None:
+def draw_placements(candidates: list[PlacementRow], room: placement.Room, rig: Rig, path: Path) -> None:
     """The placements seen from beyond the tip (X right, Y up), written to ``path``."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle, Rectangle

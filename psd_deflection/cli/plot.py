@@ -134,13 +134,13 @@ def run(args: argparse.Namespace) -> int:
         raise RecordingError(f'{args.recording}: has no samples to draw')
     summary = summarise(drawn, rig)
     with told('drawing', quiet=args.json):
-        figure = draw(drawn, spectrum, rig, name)
+        figure = draw_recording(drawn, spectrum, rig, name)
         if out.suffix.lower() == '.html':
             write_html(figure, out, title, summary)
         else:
             save_figure(figure, out, dpi=150)
     if args.json:
-        print_json({**figures(drawn, rig), 'out': str(out)})
+        print_json({**plot_json(drawn, rig), 'out': str(out)})
         return 0
     for name, value in summary:
         print(f'{name:<24} {value}')
@@ -155,7 +155,7 @@ def default_out(recording: str) -> Path:
     return Path(f'{path.stem if is_file else path.name}.png')
 
 
-def figures(drawn: Drawn, rig: Rig) -> dict[str, Any]:
+def plot_json(drawn: Drawn, rig: Rig) -> dict[str, Any]:
     """What ``--json`` prints: counts, s, m and rad."""
     table = drawn.table()
     causes = Counter(s.status.name.lower() for s in drawn.spots if s.reason)
@@ -178,7 +178,7 @@ def figures(drawn: Drawn, rig: Rig) -> dict[str, Any]:
 
 def summarise(drawn: Drawn, rig: Rig) -> list[tuple[str, str]]:
     """Name and value, for the terminal and the page."""
-    f = figures(drawn, rig)
+    f = plot_json(drawn, rig)
     present, lost = f['samples'], f['lost']
     rows = [
         ('duration', f'{f["duration_s"]:.3f} s'),
@@ -200,7 +200,7 @@ _MDEG = 180e3 / np.pi
 _POSE = (('dx', 'ΔX', 1e6, 'µm'), ('dy', 'ΔY', 1e6, 'µm'), ('theta', 'θ', _MDEG, 'mdeg'))
 
 
-def draw(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any:
+def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any:
     """The figure: four traces on the left, both detectors and the spectrum on the right."""
     import matplotlib as mpl
     from matplotlib.figure import Figure

@@ -6,6 +6,7 @@ poses), times with nine decimals.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
@@ -50,11 +51,9 @@ class _CsvFile:
 
     def _give_up(self, error: OSError) -> None:
         stream, self._stream = self._stream, None
-        try:
+        with contextlib.suppress(OSError):
             if stream is not None:
                 stream.close()
-        except OSError:
-            pass
         raise RecordingError(f'{self.path}: cannot be written ({error.strerror or error})') from None
 
     def _finish(self) -> None:
@@ -65,9 +64,8 @@ class _CsvFile:
         if self._stream is None:
             return
         self._finish()
-        stream = self._stream
         try:
-            stream.close()
+            self._stream.close()
         except OSError as error:
             self._give_up(error)
         self._stream = None

@@ -29,7 +29,7 @@ from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.geometry.plate import Number
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus, flat_gain
-from psd_deflection.solvers.plane import Four, Nine, positive, turn_covariance
+from psd_deflection.solvers.plane import Four, Nine, checked_variances, turn_covariance
 
 _MAX_STEPS = 30
 _LAST_STEP = 1e-10
@@ -139,7 +139,7 @@ class ExactSolver(Solver):
     def _solve_any(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """Any number of PSDs."""
         (qx, qy), (lx, ly) = (self._centers + np.reshape(dots, (-1, 2))).T, self._beams.T
-        wx, wy = 1.0 / positive(np.array(variances)).reshape(-1, 2).T
+        wx, wy = 1.0 / checked_variances(np.array(variances)).reshape(-1, 2).T
         sum_x, sum_y = float(wx.sum()), float(wy.sum())
         # Each axis is centred with its own weights.
         xx, xy, xq = (a - wx @ a / sum_x for a in (lx, ly, qx))
@@ -172,7 +172,7 @@ class ExactSolver(Solver):
         if self._count != 2:
             return super().solve_many(dots, variances)
         m = np.atleast_2d(np.asarray(dots, dtype=np.float64))
-        v = positive(variances)
+        v = checked_variances(variances)
         n = len(m)
         out = Solutions(np.empty((n, 3)), np.zeros((n, 2)), np.empty((n, 3, 3)), np.empty((n, 4)), np.empty(n, np.int8))
         for start in range(0, n, _CHUNK):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from psd_deflection.geometry.linear import gain_matrix
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.interface import Solution, SolverStatus
+from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
 
 
-class FixedGain:
+class FixedGain(Solver):
     """x = G (m - m_0) for a gain that does not depend on the noise; covariance G V G^T."""
 
     def __init__(self, design: FloatArray, zeros: FloatArray, row_scaling: FloatArray) -> None:
@@ -19,7 +19,7 @@ class FixedGain:
         )
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
-        """One block, pure floats."""
+        """One block, pure floats. See :class:`Solver`."""
         dx = dy = theta = vxx = vxy = vxt = vyy = vyt = vtt = 0.0
         for m, v, (zero, x, y, t, _, _, _) in zip(dots, variances, self._columns, strict=True):
             b = m - zero

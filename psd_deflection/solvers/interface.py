@@ -24,7 +24,7 @@ import numpy.typing as npt
 from psd_deflection.config import Rig
 from psd_deflection.geometry.layout import Geometry
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.plane import positive
+from psd_deflection.solvers.plane import checked_variances
 
 _STEP = 1e-8
 """m. Of differences: far above rounding, far below what bends the answer."""
@@ -109,7 +109,7 @@ class Solver(abc.ABC):
         Raises SolverError if a variance is not above 0.
         """
         m = np.atleast_2d(np.asarray(dots, dtype=np.float64))
-        v = np.broadcast_to(positive(variances), m.shape)
+        v = np.broadcast_to(checked_variances(variances), m.shape)
         found = [self.solve(tuple(a), tuple(b)) for a, b in zip(m.tolist(), v.tolist(), strict=True)]
         return Solutions(
             np.array([f[:3] for f in found]),

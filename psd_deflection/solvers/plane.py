@@ -41,7 +41,7 @@ def turn_covariance(
     return (xx, xy, xt, xy, yy, yt, xt, yt, vtt)
 
 
-def positive(variances: FloatArray) -> FloatArray:
+def checked_variances(variances: FloatArray) -> FloatArray:
     """Variances as (n or 1, 2P). Raises SolverError if one is not above 0."""
     v = np.atleast_2d(np.asarray(variances, dtype=np.float64))
     if not (v > 0.0).all():
