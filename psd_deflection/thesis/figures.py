@@ -17,6 +17,7 @@ from matplotlib.patches import Ellipse
 from psd_deflection.calibration.sensors import Duolateral, Quadrant
 from psd_deflection.geometry import Geometry
 from psd_deflection.geometry.linear import design_matrix, gain_matrix
+from psd_deflection.geometry.placement import pose_spread
 from psd_deflection.geometry.plate import tied_pose
 from psd_deflection.solvers.base_pair import landing
 from psd_deflection.solvers.registry import make_solver
@@ -268,15 +269,11 @@ def pose() -> Figure:
     steps = np.geomspace(2e-3, 0.1, 25)
     turns = np.radians([0.0, 120.0, 240.0])
     centers = 0.1 * np.column_stack((np.cos(turns), np.sin(turns)))
-    rng = np.random.default_rng(3)
+    at = np.array([0.1e-3, -2e-3, -0.015, 0.0, 0.0])
     deviations = []
     for step in steps:
-        geometry = Geometry(centers, np.zeros((3, 2)), np.array([step, -step / 2, -step / 2]), 0.585)
-        poses = np.tile([0.1e-3, -2e-3, -0.015, 0.0, 0.0], (400, 1))
-        dots = dots_of(geometry, poses) + 2e-6 * rng.standard_normal((400, 6))
-        found = make_solver('pose', geometry).solve_many(dots, np.full(6, 4e-12))
-        good = found.status == 0
-        deviations.append([*(_MDEG * np.std(found.tilt[good], axis=0)), _MDEG * np.std(found.pose[good, 2])])
+        spread = pose_spread(at, centers, np.array([step, -step / 2, -step / 2]), 2e-6)
+        deviations.append(_MDEG * spread[[3, 4, 2]])
     figure, ax = plt.subplots(figsize=(5.8, 3.6), layout='constrained')
     for values, label, color in zip(
         np.transpose(deviations), ('phi', 'omega', 'theta'), (_BLUE, _ORANGE, _GREEN), strict=True
