@@ -17,6 +17,7 @@ from msg_adapters import (
     point_stamped,
     pose_stamped,
     pose_with_covariance_stamped,
+    string,
     temperature,
     wrench_stamped,
 )
@@ -30,6 +31,7 @@ from psd_deflection.records import (
     ParameterChange,
     Record,
     ReferencePose,
+    RigState,
     SampleBlock,
     SpotMeans,
     TemperatureReading,
@@ -43,6 +45,7 @@ SPOTS = ('/psd_1/spot', '/psd_2/spot')
 DEFLECTION = '/link_tip/deflection'
 DEFLECTION_WITH_COVARIANCE = '/link_tip/deflection_with_covariance'
 DIAGNOSTICS = '/diagnostics'
+RIG = '/link_tip/rig'
 LOAD = '/link_tip/load'
 REFERENCE = '/reference/deflection'
 TEMPERATURE = '/environment/temperature'
@@ -52,6 +55,7 @@ class Topic(NamedTuple):
     """One topic: the message on it and the record that it is made of.
 
     ``fields``: of a record. ``to_record``: back again, for a topic that the node subscribes to.
+    ``latched``: a late subscriber gets the last message (durability transient local).
     """
 
     name: str
@@ -59,6 +63,7 @@ class Topic(NamedTuple):
     record: type[Any]
     fields: Callable[[Any], Fields]
     to_record: Callable[[Mapping[str, Any]], Input] | None = None
+    latched: bool = False
 
 
 TOPICS = (
@@ -74,6 +79,7 @@ TOPICS = (
     ),
     Topic('/link_tip/wrench', wrench_stamped.MESSAGE, TipLoad, wrench_stamped.from_load),
     Topic(DIAGNOSTICS, diagnostic_array.MESSAGE, DiagnosticReport, diagnostic_array.from_report),
+    Topic(RIG, string.MESSAGE, RigState, string.from_rig, latched=True),
     Topic(LOAD, wrench_stamped.MESSAGE, AppliedLoad, wrench_stamped.from_load, wrench_stamped.to_applied_load),
     Topic(REFERENCE, pose_stamped.MESSAGE, ReferencePose, pose_stamped.from_reference, pose_stamped.to_reference),
     Topic(TEMPERATURE, temperature.MESSAGE, TemperatureReading, temperature.from_reading, temperature.to_reading),
@@ -84,6 +90,8 @@ TOPIC_TYPES: Mapping[str, str] = {t.name: t.message.name for t in TOPICS}
 MESSAGE_TYPES: Mapping[str, MessageType] = {t.message.name: t.message for t in TOPICS}
 INPUTS = tuple(t.name for t in TOPICS if t.to_record is not None)
 """The topics that the node subscribes to."""
+
+LATCHED = tuple(t.name for t in TOPICS if t.latched)
 
 _BY_NAME = {t.name: t for t in TOPICS}
 _OF_RECORD = {kind: tuple(t for t in TOPICS if t.record is kind) for kind in {t.record for t in TOPICS}}

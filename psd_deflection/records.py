@@ -9,6 +9,7 @@ Times are integer nanoseconds of ROS time; everything else SI.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
@@ -186,6 +187,22 @@ class ParameterChange(NamedTuple):
     values: tuple[tuple[str, float | str | tuple[float, ...]], ...]
 
 
+class RigState(NamedTuple):
+    """What a reader needs to evaluate the samples: sent at the start and after each change.
+
+    ``parameters``: all of them, flat, as they are from block ``block`` on. ``hello``: the device's, or None.
+    ``changed``: the values of the :class:`ParameterChange` that it was sent for, {} if there was none.
+    ``version``: of the software. ``t_ns``: time of the change, 0 at the start.
+    """
+
+    t_ns: int
+    block: int
+    parameters: Mapping[str, object]
+    hello: Mapping[str, object] | None
+    changed: Mapping[str, object]
+    version: str
+
+
 class DiagnosticEntry(NamedTuple):
     """One diagnostic status: ``level`` 0 OK, 1 WARN, 2 ERROR, 3 STALE, as diagnostic_msgs has
     them.
@@ -215,4 +232,5 @@ Record = (
     | TemperatureReading
     | DiagnosticReport
     | ParameterChange
+    | RigState
 )

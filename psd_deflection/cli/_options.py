@@ -83,6 +83,15 @@ def given_parameters(args: argparse.Namespace) -> dict[str, object]:
     return values
 
 
+def namespace_option(parser: argparse._ActionsContainer) -> None:
+    """Add ``--namespace``, for the commands that read a recording."""
+    parser.add_argument(
+        '--namespace',
+        metavar='/NAME',
+        help='namespace of the recorded node, for a bag of several rigs (the only one is found by itself)',
+    )
+
+
 def recording_name(*, rerun: bool = False) -> Callable[[str], str]:
     """Reads the --out of a recording (an .rrd too, if ``rerun``) by its ending; what it gives raises UsageError."""
 

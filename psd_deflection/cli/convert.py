@@ -16,7 +16,7 @@ import argparse
 import contextlib
 from pathlib import Path
 
-from psd_deflection.cli._options import recording_name
+from psd_deflection.cli._options import namespace_option, recording_name
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, warn
 from psd_deflection.config import load_rig
@@ -24,7 +24,7 @@ from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.conversion import Beside, convert
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.replay_engine import open_for_replay, replayed
+from psd_deflection.recordings.replay_engine import nominal_rig, open_for_replay, replayed
 from psd_deflection.recordings.sinks import open_sink
 
 
@@ -43,14 +43,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='RIG.yaml',
         help="the rig to store in a bag or to compute an .rrd with (default: the recording's own)",
     )
+    namespace_option(parser)
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
     """Convert and say what was written."""
     if Path(args.out).suffix.lower() == '.rrd':
-        return _to_rerun(args.recording, Path(args.out), args.params_file, args.json)
-    recording = open_recording(args.recording)
+        return _to_rerun(args)
+    recording = open_recording(args.recording, namespace=args.namespace)
     parameters: dict[str, object] = dict(recording.parameters)
     if args.params_file is not None:
         rig = load_rig(args.params_file)
@@ -63,12 +64,13 @@ def run(args: argparse.Namespace) -> int:
         print_json({'out': args.out, 'samples': samples, 'warnings': list(recording.warnings)})
     else:
         print(f'{args.out}: {samples} samples')
-    _warn(recording)
+    _warn(recording, args.params_file)
     return 0
 
 
-def _to_rerun(path: str, out: Path, params_file: str | None, in_json: bool) -> int:
-    recording, rig = open_for_replay(path, params_file)
+def _to_rerun(args: argparse.Namespace) -> int:
+    out, in_json = Path(args.out), args.json
+    recording, rig = open_for_replay(args.recording, args.params_file, args.namespace)
     pipeline = Pipeline(rig)
     bar = progress_of(recording.blocks(), quiet=in_json)
     with contextlib.closing(open_sink(out, rig.flat(), title=recording.path.stem)) as sink, bar:
@@ -81,10 +83,10 @@ def _to_rerun(path: str, out: Path, params_file: str | None, in_json: bool) -> i
         print_json(found)
     else:
         print(f'{out}: {estimates} estimates of {blocks} blocks; look at it: rerun {out}')
-    _warn(recording)
+    _warn(recording, args.params_file)
     return 0
 
 
-def _warn(recording: Recording) -> None:
-    for warning in recording.warnings:
+def _warn(recording: Recording, params_file: str | None) -> None:
+    for warning in [*recording.warnings, *nominal_rig(recording, params_file)]:
         warn(warning)

@@ -23,9 +23,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from psd_deflection.cli._options import seed
+from psd_deflection.cli._options import namespace_option, seed
 from psd_deflection.cli._progress import told
-from psd_deflection.cli._report import save
+from psd_deflection.cli._report import save, warn
 from psd_deflection.config import load_rig
 from psd_deflection.discovery.discover import discover
 from psd_deflection.discovery.report import report_html
@@ -55,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help='do not consider this effect; repeatable',
     )
+    namespace_option(parser)
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     parser.add_argument('--json', action='store_true', help='print the content of result.json')
 
@@ -66,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         if name not in effect_names():
             raise UsageError(f'--without {name}: no effect of that name; there are: {", ".join(effect_names())}')
     with told('reading', quiet=args.quiet or args.json):
-        observations = read_observations(args.recordings, given)
+        observations = read_observations(args.recordings, given, namespace=args.namespace, warn=warn)
     out = Path(args.out)
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from msg_adapters import SAMPLES
+from psd_deflection.cli._options import namespace_option
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import LONGEST_LINE, print_json
 from psd_deflection.errors import printable
@@ -28,12 +29,13 @@ _EPOCH_FROM_NS = 10**18
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
+    namespace_option(parser)
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the summary."""
-    recording = open_recording(Path(args.recording))
+    recording = open_recording(Path(args.recording), namespace=args.namespace)
     with told('counting messages', quiet=args.json):
         topics = recording.topics()
     found = summary(recording, topics, progress_of(recording.blocks(), topics.get(SAMPLES), quiet=args.json))
@@ -52,6 +54,8 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
 
     out = [f'{found["path"]}: {found["bytes"] / 1e6:.2f} MB']
     out.append(row('state', 'complete' if found['complete'] else 'INCOMPLETE, see below'))
+    if found['namespace']:
+        out.append(row('namespace', found['namespace']))
     if found['version']:
         out.append(row('recorded by', f'psd_deflection {found["version"]}'))
     if found['device_hello'] is not None:

@@ -21,7 +21,8 @@ import threading
 from collections.abc import Iterator
 
 from psd_deflection.cli._display import Display
-from psd_deflection.cli._options import given_as_option, given_parameters, parameter_option, refuse
+from psd_deflection.cli._options import given_as_option, given_parameters, namespace_option, parameter_option, refuse
+from psd_deflection.cli._report import warn
 from psd_deflection.config import read_parameter_file, replace_values, rig_from_values
 from psd_deflection.errors import UsageError
 from psd_deflection.monitor.feed import Feed
@@ -29,7 +30,7 @@ from psd_deflection.monitor.shown import ShownRecording
 from psd_deflection.monitor.start import need_server, start_monitor
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.replay_engine import open_for_replay, replayed
+from psd_deflection.recordings.replay_engine import nominal_rig, open_for_replay, replayed
 from psd_deflection.records import Record
 from psd_deflection.runner.headless import run_headless
 from psd_deflection.runner.simulated_rig import simulates, started_early
@@ -52,6 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--record', nargs='?', const='', metavar='FOLDER', help='record from the start, below FOLDER (recordings/)'
     )
     play = parser.add_argument_group('a recording (with REC)')
+    namespace_option(play)
     play.add_argument('--speed', type=float, default=1.0, metavar='X', help='times as fast as recorded (default 1)')
     play.add_argument('--loop', action='store_true', help='start again at the end')
 
@@ -60,7 +62,7 @@ def _check(args: argparse.Namespace) -> None:
     if not math.isfinite(args.speed) or args.speed <= 0.0:
         raise UsageError(f'--speed {args.speed:g}: must be above 0')
     if args.recording is None:
-        refuse(args, {'speed': 1.0, 'loop': False}, 'is for a recording: give REC')
+        refuse(args, {'speed': 1.0, 'loop': False, 'namespace': None}, 'is for a recording: give REC')
     for name in ('port', 'baud', 'record'):
         if args.recording is not None and getattr(args, name) is not None:
             raise UsageError(f'--{name} is for a rig; {args.recording} is played')
@@ -89,10 +91,13 @@ def run(args: argparse.Namespace) -> int:
 def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     from psd_deflection.monitor.server import MonitorServer
 
-    rig = replace_values(open_for_replay(args.recording, args.params_file)[1], overrides, 'command line')
+    opened, rig = open_for_replay(args.recording, args.params_file, args.namespace)
+    rig = replace_values(rig, overrides, 'command line')
+    for warning in nominal_rig(opened, args.params_file):
+        warn(warning)
 
     def open_steps() -> tuple[Pipeline, Iterator[list[Record]]]:
-        recording = open_recording(args.recording, block_size=rig.estimator.block_size)
+        recording = open_recording(args.recording, block_size=rig.estimator.block_size, namespace=args.namespace)
         pipeline = Pipeline(rig)
         return pipeline, replayed(recording, pipeline)
 

@@ -21,14 +21,14 @@ from typing import Any
 import numpy as np
 
 from psd_deflection import __version__
-from psd_deflection.cli._options import PICTURES, need_folder, picture_name
+from psd_deflection.cli._options import PICTURES, namespace_option, need_folder, picture_name
 from psd_deflection.cli._progress import progress_of, told
-from psd_deflection.cli._report import print_json, save, save_figure
+from psd_deflection.cli._report import print_json, save, save_figure, warn
 from psd_deflection.config import Rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.monitor.spectrum import Spectrum
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.replay_engine import open_for_replay, replayed
+from psd_deflection.recordings.replay_engine import nominal_rig, open_for_replay, replayed
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, Record, SampleBlock, SpotMeans
 
 SPECTRUM_OF_S = 600.0
@@ -47,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='OUT',
         help='.png, .svg, .pdf or .html (default: REC.png in this folder)',
     )
+    namespace_option(parser)
     parser.add_argument('--json', action='store_true', help='print the summary as JSON, in SI units')
 
 
@@ -123,7 +124,9 @@ def run(args: argparse.Namespace) -> int:
     )
     out = Path(args.out) if args.out is not None else default_out(args.recording)
     need_folder(out)
-    recording, rig = open_for_replay(args.recording, args.params_file)
+    recording, rig = open_for_replay(args.recording, args.params_file, args.namespace)
+    for warning in nominal_rig(recording, args.params_file):
+        warn(warning)
     drawn, spectrum = Drawn(), Spectrum(rig, SPECTRUM_OF_S)
     for records in replayed(recording, Pipeline(rig), progress_of(recording.blocks(), quiet=args.json)):
         for record in records:

@@ -35,6 +35,9 @@ DEFAULT_QOS: Qos = {
 }
 """Our publishers' profile, named as rosbag2 names it from version 9 on."""
 
+LATCHED_QOS: Qos = {**DEFAULT_QOS, 'depth': 1, 'durability': 'transient_local'}
+"""The profile of a topic whose last message a late subscriber gets."""
+
 
 def qos_text(qos: Qos) -> str:
     """The channel metadata ``offered_qos_profiles``."""

@@ -6,6 +6,7 @@ the writer (2^32 is not a multiple of 20).
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -17,13 +18,16 @@ import numpy.typing as npt
 
 from msg_adapters import (
     DEFLECTION_WITH_COVARIANCE,
+    DIAGNOSTICS,
     LOAD,
     REFERENCE,
+    RIG,
     SAMPLES,
     TEMPERATURE,
     TOPIC_TYPES,
     pose_stamped,
     pose_with_covariance_stamped,
+    string,
     temperature,
     wrench_stamped,
 )
@@ -55,13 +59,19 @@ T = TypeVar('T')
 
 
 class BagRecording(Recording):
-    """A bag folder or a single ``.mcap``. Raises RecordingError if nothing in it can be read."""
+    """A bag folder or a single ``.mcap``. Raises RecordingError if nothing in it can be read.
 
-    def __init__(self, path: Path, block_size: int | None = None) -> None:
+    ``namespace``: of the node that was recorded (``/arm``). None: it is found, and every call that reads messages
+    raises RecordingError if the bag holds several rigs. Topics have their own names here, without the namespace.
+    """
+
+    def __init__(self, path: Path, block_size: int | None = None, namespace: str | None = None) -> None:
         super().__init__(path, block_size)
         self._own_warnings: list[str] = []
         files = self._files_of(path) if path.is_dir() else [path]
         self._sources = [McapReader(f) for f in files]
+        bare = None if namespace is None else namespace.strip('/')
+        self._given_namespace = f'/{bare}' if bare else bare
         metadata: dict[str, dict[str, str]] = {}
         for source in self._sources:
             metadata.update(source.metadata)
@@ -69,6 +79,8 @@ class BagRecording(Recording):
         self.hello = from_json(metadata[META_HELLO]) if META_HELLO in metadata else None
         self.version = metadata.get(META_SOFTWARE, {}).get('version', '')
         self.changes = self._changes_in(metadata)
+        if META_PARAMETERS not in metadata:
+            self._take_rig_of_messages()
 
     def _files_of(self, folder: Path) -> list[Path]:
         """The bag's files in the order of ``metadata.yaml``, else of their numbers."""
@@ -119,17 +131,102 @@ class BagRecording(Recording):
         out = []
         for name in sorted(n for n in metadata if n.startswith(META_CHANGE)):
             try:
-                change = _to_change(metadata[name])
+                entry = metadata[name]
+                change = _to_change(int(entry['t_ns']), int(entry['block']), json.loads(entry['values']))
             except (KeyError, ValueError, TypeError, AttributeError, RecursionError):
                 self._warn(f'the change of parameters {name!r} is not readable and is left out')
             else:
                 out.append(change)
         return sorted(out, key=lambda change: change.block)
 
+    def _take_rig_of_messages(self) -> None:
+        """Parameters, hello and changes as the topic of the rig has them: rosbag2 keeps messages, and no metadata."""
+        changes: dict[ParameterChange, None] = {}
+        present: dict[str, object] = {}
+        for channel, log_time, message in self.messages([RIG]):
+            if channel.type != TOPIC_TYPES[RIG] or channel.encoding != 'cdr':
+                continue
+            try:
+                state = string.to_rig(cdr.decode(channel.type, message))
+                change = _to_change(state.t_ns, state.block, state.changed)
+            except (ValueError, TypeError) as error:
+                self._warn(f'{RIG} at log time {log_time} ns is not readable ({error}) and is left out')
+                continue
+            if not self.parameters:
+                self.parameters, self.version = state.parameters, state.version
+                self.rig_from_messages = True
+                present = dict(state.parameters)
+            if self.hello is None:
+                self.hello = state.hello
+            present |= {name: value for name, value in state.changed.items() if name in present}
+            if present != state.parameters and change not in changes:
+                self._warn(f'another rig starts at log time {log_time} ns; the first one is taken for all')
+            if change.values:
+                changes[change] = None
+        self.changes = sorted(changes, key=lambda change: change.block)
+
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Encoded messages of the files: (channel, log_time, cdr), of ``topics`` or of all."""
+        namespace = self.namespace
+        if not namespace:
+            for source in self._sources:
+                yield from source.messages(topics)
+            return
+        names = self._names
+        wanted = {name for name, ours in names.items() if topics is None or ours in topics}
         for source in self._sources:
-            yield from source.messages(topics)
+            for channel, log_time, message in source.messages(wanted):
+                yield RawMessage(channel._replace(topic=names[channel.topic]), log_time, message)
+
+    @functools.cached_property
+    def namespace(self) -> str:
+        """Namespace of the recorded node, '' if it has none. Raises RecordingError if there are several."""
+        if self._given_namespace is not None:
+            return self._given_namespace
+        known = self._recorded_topics()
+        if not any(topic.endswith(SAMPLES) for topic in known):
+            # A cut file names its topics where its chunks begin.
+            if self._first_of(SAMPLES) is not None:
+                return ''
+            known = self._recorded_topics()
+        if SAMPLES in known:
+            return ''
+        found = [topic for topic in sorted(known) if topic.endswith(SAMPLES) and self._has_samples(topic)]
+        if len(found) > 1:
+            choices = ', '.join(topic.removesuffix(SAMPLES) for topic in found)
+            raise RecordingError(
+                f'{self.path}: holds the samples of {len(found)} rigs; choose one with --namespace: {choices}'
+            )
+        return found[0].removesuffix(SAMPLES) if found else ''
+
+    def _recorded_topics(self) -> set[str]:
+        return {c.topic for s in self._sources for c in s.channels}
+
+    def _first_of(self, topic: str) -> RawMessage | None:
+        return next((m for s in self._sources for m in s.messages([topic])), None)
+
+    def _has_samples(self, topic: str) -> bool:
+        """Whether the messages of ``topic`` are ours, by the fields of the first one."""
+        first = self._first_of(topic)
+        if first is None or first.channel.type != TOPIC_TYPES[SAMPLES] or first.channel.encoding != 'cdr':
+            return False
+        try:
+            CloudDecoder().decode(first.cdr)
+        except ValueError:
+            return False
+        return True
+
+    @functools.cached_property
+    def _names(self) -> dict[str, str]:
+        """Recorded name -> our name. What the namespace lacks is taken from outside, unless another rig is there."""
+        if not self.complete:
+            self._first_of('')
+        recorded = self._recorded_topics()
+        inside = {t: t.removeprefix(self.namespace) for t in recorded if t.startswith(f'{self.namespace}/')}
+        rigs = [t for t in recorded if t.endswith(SAMPLES)]
+        if len(rigs) > 1:
+            return {DIAGNOSTICS: DIAGNOSTICS, **inside}
+        return {t: t for t in recorded if t not in inside.values()} | inside
 
     def topics(self) -> dict[str, int]:
         """Number of messages of each topic."""
@@ -144,6 +241,7 @@ class BagRecording(Recording):
         first = next(blocks, None)
         if first is None:
             cut = '' if self.complete else ' before the cut'
+            cut += f' in the namespace {self.namespace}' if self.namespace else ''
             raise RecordingError(
                 f'{self.path}: holds no samples{cut} (topic {SAMPLES}); `psd-deflection info` lists what it holds'
             )
@@ -298,7 +396,7 @@ class _SequenceCounter:
         self._moved += (last // size + 1 - first // size) * size
 
 
-def _to_change(entry: Mapping[str, str]) -> ParameterChange:
+def _to_change(t_ns: int, block: int, tree: Mapping[str, object]) -> ParameterChange:
     def number(value: object) -> float:
         # Unchanged: an integer must be read back as an integer.
         if isinstance(value, int | float):
@@ -306,12 +404,12 @@ def _to_change(entry: Mapping[str, str]) -> ParameterChange:
         raise TypeError
 
     values: list[tuple[str, float | str | tuple[float, ...]]] = []
-    for key, value in json.loads(entry['values']).items():
+    for key, value in tree.items():
         if isinstance(value, list):
             values.append((key, tuple(map(number, value))))
         else:
             values.append((key, value if isinstance(value, str) else number(value)))
-    return ParameterChange(int(entry['t_ns']), int(entry['block']), tuple(values))
+    return ParameterChange(t_ns, block, tuple(values))
 
 
 def _series(topic: str, rows: list[tuple[int, tuple[float, ...]]]) -> EstimateSeries:

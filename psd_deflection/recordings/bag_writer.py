@@ -22,12 +22,13 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import ChunkIndex
 from mcap.writer import CompressionType, Writer
 
-from msg_adapters import MESSAGE_TYPES, to_messages
+from msg_adapters import LATCHED, MESSAGE_TYPES, to_messages
 from psd_deflection import __version__
 from psd_deflection.errors import RecordingError, creating
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.bag_metadata import (
     DEFAULT_QOS,
+    LATCHED_QOS,
     FileCount,
     TopicCount,
     bag_information,
@@ -36,7 +37,7 @@ from psd_deflection.recordings.bag_metadata import (
     totals,
     write_metadata,
 )
-from psd_deflection.records import ParameterChange, Record
+from psd_deflection.records import ParameterChange, Record, RigState
 
 CHUNK_NS = 500_000_000
 """Largest log time that a chunk spans: together with the queues, a crash costs less than a second."""
@@ -149,6 +150,10 @@ class McapFile(_RecordSink):
         self._chunk_first: int | None = None
         self._chunk_last = 0
         self.changes: list[ParameterChange] = []
+        self._present = dict(rig_values)
+        self._hello = device_hello
+        # Written with the next message, whose time is then known.
+        self._untold = [self._state(0, 0, {})] if rig_values else []
         self._stream: BinaryIO | None = None
         self._spool: _IndexSpool | None = None
         parameters = _json_values(rig_values)
@@ -214,12 +219,30 @@ class McapFile(_RecordSink):
             self._writer.add_metadata(
                 f'{META_CHANGE}{len(self.changes):06d}', {**head, 'values': json.dumps(dict(change.values))}
             )
+        if self._present:
+            self._present |= {name: value for name, value in change.values if name in self._present}
+            self._untold.append(self._state(change.t_ns, change.block, dict(change.values)))
+
+    def _state(self, t_ns: int, block: int, changed: Mapping[str, object]) -> RigState:
+        return RigState(t_ns, block, dict(self._present), self._hello, changed, __version__)
+
+    def _tell_rig(self, t_ns: int) -> None:
+        """The rig as messages beside the metadata records: rosbag2 drops these when it converts a bag."""
+        untold, self._untold = self._untold, []
+        for state in untold:
+            for message in to_messages(state):
+                self._write(message.topic, message.type, cdr.encode(message.type, message.fields), t_ns)
 
     def write_encoded(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
         """Write one message that is already encoded as CDR, at log time ``t_ns``.
 
         Raises KeyError for a type that no adapter of :mod:`msg_adapters` declares.
         """
+        if self._untold:
+            self._tell_rig(t_ns)
+        self._write(topic, type_name, message, t_ns)
+
+    def _write(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
         with self._guard():
             channel = self._channels.get(topic)
             if channel is None:
@@ -244,11 +267,12 @@ class McapFile(_RecordSink):
         if schema is None:
             schema = self._writer.register_schema(type_name, 'ros2msg', message.definition.encode())
             self._schemas[type_name] = schema
+        qos = LATCHED_QOS if topic in LATCHED else DEFAULT_QOS
         channel: int = self._writer.register_channel(
-            topic, 'cdr', schema, {'offered_qos_profiles': qos_text(DEFAULT_QOS), 'topic_type_hash': message.type_hash}
+            topic, 'cdr', schema, {'offered_qos_profiles': qos_text(qos), 'topic_type_hash': message.type_hash}
         )
         self._channels[topic] = channel
-        self.topics[topic] = TopicCount(topic, type_name, DEFAULT_QOS, message.type_hash)
+        self.topics[topic] = TopicCount(topic, type_name, qos, message.type_hash)
         return channel
 
     def count(self) -> FileCount:
@@ -260,6 +284,8 @@ class McapFile(_RecordSink):
         """Write index and summary and close; a second call does nothing."""
         if self._stream is None:
             return
+        if self._untold and self.topics:
+            self._tell_rig(self.end_ns)
         with self._guard():
             information = bag_information([self.count()], list(self.topics.values()), CUSTOM)
             self._writer.add_metadata('rosbag2', {'serialized_metadata': to_yaml(information)})

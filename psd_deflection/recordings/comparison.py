@@ -1,7 +1,8 @@
 """Compares the messages of a replay with the recorded ones, byte by byte.
 
-Messages are matched by topic and stamp. Both sides are read as streams, so that recordings of any
-length are compared in little memory.
+Messages are matched by topic and stamp. A recording may be partial: topics that it does not have, and the time
+before the first and after the last message of a topic, are not compared. A recorder other than ours may also miss
+messages in between. Both sides are read as streams, so that recordings of any length are compared in little memory.
 """
 
 from __future__ import annotations
@@ -11,19 +12,22 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from msg_adapters import DIAGNOSTICS, INPUTS, SAMPLES, pose_stamped, to_messages
+from msg_adapters import DIAGNOSTICS, INPUTS, RIG, SAMPLES, pose_stamped, to_messages
 from psd_deflection.errors import RecordingError
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import ParameterChange, Record
 
-_NOT_ESTIMATED = {DIAGNOSTICS, SAMPLES, *INPUTS}
+_NOT_ESTIMATED = {DIAGNOSTICS, RIG, SAMPLES, *INPUTS}
 _LAG_NS = 2_000_000_000
 """How far the recorded side is read ahead of the replayed one."""
 
 
 class Comparison:
-    """Feed it the replay's records in order, then call ``finish``. ``same``: no bit differs.
+    """Feed it the replay's records in order, then call ``finish``.
+
+    ``only_recorded``, ``only_replayed``: messages that the other side lacks. ``missing``: how many of them neither the
+    edges of the recording nor a topic that it does not have explains.
 
     Raises RecordingError if the recording holds no estimates to compare with.
     """
@@ -36,6 +40,10 @@ class Comparison:
         self.different = 0
         self.only_recorded = 0
         self.only_replayed = 0
+        self.missing = 0
+        # A recorder of ours writes every message, or counts it; another one may lose some on the way.
+        self._gapless = recording.version != '' and not recording.rig_from_messages
+        self._between: dict[str, int] = {}
         self._recording = recording
         self._complete = True
         self._recorded: dict[str, deque[tuple[int, bytes]]] = {t: deque() for t in topics}
@@ -50,6 +58,11 @@ class Comparison:
 
     @property
     def same(self) -> bool:
+        """True if no bit differs in what both sides hold, and there is something that both hold."""
+        return self.equal > 0 and not (self.different or self.missing)
+
+    @property
+    def identical(self) -> bool:
         """True if each side has every message of the other, and no bit differs."""
         return not (self.different or self.only_recorded or self.only_replayed)
 
@@ -81,8 +94,7 @@ class Comparison:
                 if t_ns > self._newest and not self._complete:
                     # The cut removed the samples but not the estimates made from them.
                     continue
-                self.only_recorded += 1
-                self._note(f'{topic} at {t_ns} ns is recorded, the replay has none')
+                self._count_only_recorded(topic, t_ns)
             for t_ns, _ in self._replayed[topic]:
                 self._count_only_replayed(topic, t_ns)
 
@@ -90,6 +102,7 @@ class Comparison:
         """For programs: numbers of equal, different and unmatched messages, and ``same``."""
         return {
             'same': self.same,
+            'identical': self.identical,
             'equal': self.equal,
             'different': self.different,
             'only_recorded': self.only_recorded,
@@ -98,8 +111,14 @@ class Comparison:
 
     def summary(self) -> str:
         """One line, and the largest difference if there is one."""
-        if self.same:
+        if self.identical:
             return f'compared: {self.equal} messages, no bit differs'
+        if self.same:
+            return (
+                f'compared: {self.equal} messages that both hold, no bit differs\n'
+                f'  the recording is partial: {self.only_recorded} messages are only in it, '
+                f'{self.only_replayed} only in the replay (--strict counts them as differences)'
+            )
         lines = [
             f'compared: {self.equal} messages equal, {self.different} differ, '
             f'{self.only_recorded} only recorded, {self.only_replayed} only in the replay'
@@ -111,7 +130,22 @@ class Comparison:
 
     def _count_only_replayed(self, topic: str, t_ns: int) -> None:
         self.only_replayed += 1
+        self._unmatched(topic)
         self._note(f'{topic} at {t_ns} ns is in the replay and was not recorded')
+
+    def _count_only_recorded(self, topic: str, t_ns: int) -> None:
+        self.only_recorded += 1
+        self._unmatched(topic)
+        self._note(f'{topic} at {t_ns} ns is recorded, the replay has none')
+
+    def _unmatched(self, topic: str) -> None:
+        """Count it as missing once a later message of its topic has a counterpart, if an earlier one had."""
+        if self._gapless and topic in self._between:
+            self._between[topic] += 1
+
+    def _matched(self, topic: str) -> None:
+        self.missing += self._between.get(topic, 0)
+        self._between[topic] = 0
 
     def _note(self, text: str) -> None:
         if not self._first_difference:
@@ -136,14 +170,14 @@ class Comparison:
                 if t_a == t_b:
                     recorded.popleft()
                     replayed.popleft()
+                    self._matched(topic)
                     if a == b:
                         self.equal += 1
                     else:
                         self._differ(topic, t_a, a, b)
                 elif t_a < t_b:
                     recorded.popleft()
-                    self.only_recorded += 1
-                    self._note(f'{topic} at {t_a} ns is recorded, the replay has none')
+                    self._count_only_recorded(topic, t_a)
                 else:
                     replayed.popleft()
                     self._count_only_replayed(topic, t_b)

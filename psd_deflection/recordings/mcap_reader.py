@@ -116,6 +116,11 @@ class McapReader:
         except OSError as error:
             raise self._refuse(f'cannot be read ({error.strerror or error})') from None
 
+    @property
+    def channels(self) -> list[RecordedChannel]:
+        """The topics that are known by now; all of them if the file is complete, or once it was read."""
+        return list(self._channels.values())
+
     def _refuse(self, why: str) -> RecordingError:
         return RecordingError(f'{self.path}: {why}')
 

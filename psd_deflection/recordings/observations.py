@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +13,24 @@ from psd_deflection.discovery.observation import Observation
 from psd_deflection.errors import ConfigError, RecordingError
 from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
 from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.replay_engine import rig_at_end
+from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end
 from psd_deflection.records import CHANNELS, FloatArray, IntArray
 
 MAX_SAMPLES = 20_000_000
 
 
 def read_observation(
-    path: str | Path, rig: Rig | None = None, overrides: Mapping[str, object] | None = None, source: str = 'overrides'
+    path: str | Path,
+    rig: Rig | None = None,
+    overrides: Mapping[str, object] | None = None,
+    source: str = 'overrides',
+    *,
+    namespace: str | None = None,
+    warn: Callable[[str], None] | None = None,
 ) -> Observation:
     """One recording with its rig (by default from its own parameters), changed by ``overrides``.
+
+    ``namespace``: as in :func:`open_recording`. ``warn``: told if the recording names no rig.
 
     Raises RecordingError if it has no loads or cannot be read, ConfigError for a bad override.
 
@@ -31,10 +39,14 @@ def read_observation(
     """
     path = Path(path)
     if rig is None:
-        rig = rig_at_end(open_recording(path))
+        found = open_recording(path, namespace=namespace)
+        rig = rig_at_end(found)
+        if warn is not None:
+            for warning in nominal_rig(found):
+                warn(warning)
     if overrides:
         rig = replace_values(rig, overrides, source)
-    recording = open_recording(path, block_size=rig.estimator.block_size)
+    recording = open_recording(path, block_size=rig.estimator.block_size, namespace=namespace)
     samples = recording.samples
     rate = recording.sample_rate_hz
     if rate > 0.0 and abs(rate / rig.converter.sample_rate_hz - 1.0) > 0.01:
@@ -99,7 +111,13 @@ def _digest(path: Path) -> str:
     return digest.hexdigest()
 
 
-def read_observations(paths: Sequence[str | Path], rig: Rig | None = None) -> list[Observation]:
+def read_observations(
+    paths: Sequence[str | Path],
+    rig: Rig | None = None,
+    *,
+    namespace: str | None = None,
+    warn: Callable[[str], None] | None = None,
+) -> list[Observation]:
     """All of ``paths``: recordings, or ``.yaml`` lists of recordings with the parameters that differ in each::
 
         - recording: short.csv
@@ -111,10 +129,11 @@ def read_observations(paths: Sequence[str | Path], rig: Rig | None = None) -> li
     for text in paths:
         path = Path(text)
         if path.suffix.lower() not in ('.yaml', '.yml') or path.name == 'metadata.yaml':
-            out.append(read_observation(path, rig))
+            out.append(read_observation(path, rig, namespace=namespace, warn=warn))
             continue
         for i, (name, overrides) in enumerate(_listed(path)):
-            out.append(read_observation(path.parent / name, rig, overrides, f'{path}: entry {i + 1}'))
+            entry = f'{path}: entry {i + 1}'
+            out.append(read_observation(path.parent / name, rig, overrides, entry, namespace=namespace, warn=warn))
     return out
 
 

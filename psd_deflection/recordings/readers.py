@@ -12,19 +12,24 @@ from psd_deflection.recordings.recording import Recording
 
 
 def open_recording(
-    path: str | Path, *, block_size: int | None = None, sample_rate_hz: float | None = None
+    path: str | Path,
+    *,
+    block_size: int | None = None,
+    sample_rate_hz: float | None = None,
+    namespace: str | None = None,
 ) -> Recording:
     """Open ``path``: a bag folder, a lone ``.mcap`` or a ``.csv``.
 
     ``block_size``: samples per block; by default from the recording's own parameters (20 if it has
     none). ``sample_rate_hz``: for a CSV whose times do not determine it.
+    ``namespace``: of the recorded node, for a bag of several rigs.
     Raises RecordingError if it is none of the three, or cannot be read.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     try:
         if path.is_dir():
-            return BagRecording(path, block_size)
+            return BagRecording(path, block_size, namespace)
         if not path.exists():
             raise RecordingError(f'{path}: no such recording')
         if suffix == '.csv':
@@ -34,7 +39,7 @@ def open_recording(
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
     if is_mcap or suffix == '.mcap':
-        return BagRecording(path, block_size)
+        return BagRecording(path, block_size, namespace)
     if path.name == 'metadata.yaml':
-        return BagRecording(path.parent, block_size)
+        return BagRecording(path.parent, block_size, namespace)
     raise RecordingError(f'{path}: is no recording: a bag folder, an .mcap or a .csv is read')

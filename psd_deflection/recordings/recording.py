@@ -55,6 +55,7 @@ class Recording(abc.ABC):
 
     ``path``: what was opened. ``parameters``: the flat parameter set it was made with, {} if it holds
     none. ``hello``: the device's, or None. ``version``: of the software that recorded, or ''.
+    ``rig_from_messages``: whether these come from messages, because the file lacks our metadata.
     ``changes``: of parameters during the run, in order. ``warnings``: one line each, complete after the
     first full pass over the recording.
     """
@@ -64,8 +65,14 @@ class Recording(abc.ABC):
         self.parameters: Mapping[str, Any] = {}
         self.hello: Mapping[str, Any] | None = None
         self.version = ''
+        self.rig_from_messages = False
         self.changes: Sequence[ParameterChange] = ()
         self._block_size = block_size
+
+    @property
+    def namespace(self) -> str:
+        """Namespace of the recorded node, '' if it had none."""
+        return ''
 
     @property
     def block_size(self) -> int:

@@ -13,6 +13,7 @@ from psd_deflection.config import BY_NAME, Rig, load_rig, replace_values, rig_as
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.summary import NO_PARAMETERS
 from psd_deflection.records import ENVIRONMENT, RawChunk, Record, SampleBlock
 
 
@@ -34,15 +35,26 @@ def rig_at_end(recording: Recording) -> Rig:
     return rig
 
 
-def open_for_replay(path: str | Path, params_file: str | None = None) -> tuple[Recording, Rig]:
+def nominal_rig(recording: Recording, params_file: str | None = None) -> list[str]:
+    """The warning that the nominal rig is taken, if neither ``params_file`` nor the recording gives another."""
+    if recording.parameters or params_file is not None:
+        return []
+    return [f'{recording.path}: lacks {NO_PARAMETERS}']
+
+
+def open_for_replay(
+    path: str | Path, params_file: str | None = None, namespace: str | None = None
+) -> tuple[Recording, Rig]:
     """The recording, cut into the rig's blocks, and the rig: from ``params_file``, else from the recording.
+
+    ``namespace``: as :func:`open_recording` has it.
 
     Raises RecordingError and ConfigError.
     """
-    recording = open_recording(path)
+    recording = open_recording(path, namespace=namespace)
     rig = rig_at_start(recording) if params_file is None else load_rig(params_file)
     if recording.block_size != rig.estimator.block_size:
-        recording = open_recording(path, block_size=rig.estimator.block_size)
+        recording = open_recording(path, block_size=rig.estimator.block_size, namespace=namespace)
     return recording, rig
 
 

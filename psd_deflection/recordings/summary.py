@@ -10,6 +10,8 @@ from psd_deflection.config import BY_NAME
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import SampleBlock
 
+NO_PARAMETERS = 'parameters: the nominal rig is taken where --params-file gives no other'
+
 _BREAK = 0.5
 """If time and sample numbers disagree by this share, the device was stopped or restarted between two blocks."""
 
@@ -25,7 +27,7 @@ def lacks(recording: Recording, topics: Mapping[str, int]) -> list[str]:
     if not topics.get(SAMPLES):
         found.append(f'samples ({SAMPLES}): nothing can be computed from it')
     if not recording.parameters:
-        found.append('parameters: the nominal rig is taken where --params-file gives no other')
+        found.append(NO_PARAMETERS)
     if recording.hello is None:
         found.append('what the device says of itself')
     if not topics.get(DEFLECTION):
@@ -62,6 +64,7 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
     return {
         'path': str(path),
         'bytes': sum(f.stat().st_size for f in files),
+        'namespace': recording.namespace,
         'version': recording.version,
         'device_hello': recording.hello,
         'start_ns': first[1],

@@ -35,7 +35,7 @@ from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.names import RECORD, ZERO
 from psd_deflection.ros.parameters import LiveParameters, rig_of_node
-from psd_deflection.ros.wires import InputRecorder, PublisherWire, say_on_rosout
+from psd_deflection.ros.wires import InputRecorder, PublisherWire, RigPublisher, say_on_rosout
 from psd_deflection.runner.diagnostics import STALE, HealthReporter
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import Session, why_no_zero, zero_text
@@ -90,6 +90,7 @@ class EstimatorNode:
         self._alone = True
         self._health: HealthReporter | None = None
         self._monitor: MonitorServer | None = None
+        self._rig_told: RigPublisher | None = None
         try:
             self.node = _ManagedNode(
                 NODE_NAME,
@@ -204,6 +205,8 @@ class EstimatorNode:
             self._live.show(session.rig)
             self._health = HealthReporter(session)
             session.fanout.wires.insert(0, self._wire)
+            self._rig_told = RigPublisher(self._wire, session)
+            session.fanout.change_wires.append(self._rig_told)
             self._inputs.session = session
             session.start()
             self._monitor = start_monitor(session, self._say)
@@ -214,6 +217,8 @@ class EstimatorNode:
     def activate(self) -> None:
         """Publish."""
         self._wire.active = True
+        if self._rig_told is not None:
+            self._rig_told.tell()
         if self._markers is not None:
             self._markers.session = self.session
         domain = os.environ.get('ROS_DOMAIN_ID') or '0'
@@ -243,6 +248,7 @@ class EstimatorNode:
         self._inputs.session = None
         self._live.session = None
         self._health = None
+        self._rig_told = None
         monitor, self._monitor = self._monitor, None
         if monitor is not None:
             monitor.close()
@@ -305,6 +311,8 @@ class EstimatorNode:
         if self.session is not None and self._health is not None:
             # The page may have taken a zero as well.
             self._live.show(self.session.rig)
+            if self._rig_told is not None:
+                self._rig_told.tell(again=False)
             self.session.fanout.put(self._named(self._health.report(now)))
             return
         entry = DiagnosticEntry('psd_deflection: node', STALE, 'not configured', ())

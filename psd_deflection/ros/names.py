@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from msg_adapters import INPUTS, SAMPLES
+from msg_adapters import INPUTS, LATCHED, SAMPLES
 
 
 class Delivery(NamedTuple):
@@ -18,14 +18,15 @@ class Delivery(NamedTuple):
 
 MARKERS = '/link_tip/markers'
 MARKERS_AT_REST = '/link_tip/markers_at_rest'
-LATCHED = Delivery(depth=1, latched=True)
+_LATCHED = Delivery(depth=1, latched=True)
 
 _SAMPLES_DEPTH = 50
 """A second of raw blocks: a subscriber that pauses for less misses none."""
 
 _DELIVERY: Mapping[str, Delivery] = {
     SAMPLES: Delivery(_SAMPLES_DEPTH),
-    MARKERS_AT_REST: LATCHED,
+    MARKERS_AT_REST: _LATCHED,
+    **dict.fromkeys(LATCHED, _LATCHED),
     **{topic: Delivery(_SAMPLES_DEPTH, reliable=False) for topic in INPUTS},
 }
 

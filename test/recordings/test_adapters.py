@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
@@ -14,6 +15,7 @@ from msg_adapters import (
     DEFLECTION,
     DEFLECTION_WITH_COVARIANCE,
     MESSAGE_TYPES,
+    RIG,
     SAMPLES,
     SPOTS,
     TOPIC_TYPES,
@@ -21,6 +23,7 @@ from msg_adapters import (
     point_cloud2,
     pose_with_covariance_stamped,
     solver_topic,
+    string,
     to_messages,
 )
 from msg_adapters.header import header, stamp_ns
@@ -34,6 +37,7 @@ from psd_deflection.records import (
     DiagnosticReport,
     FloatArray,
     ReferencePose,
+    RigState,
     SampleBlock,
     TemperatureReading,
     TipLoad,
@@ -131,7 +135,7 @@ def test_an_independent_decoder_reads_every_message_as_the_fields_say() -> None:
             assert stamp.sec * 10**9 + stamp.nanosec == m.t_ns
             assert cdr.decode(m.type, raw) == m.fields
             seen.add(m.topic)
-    assert seen == {*TOPIC_TYPES, solver_topic('exact'), solver_topic('wls')}
+    assert seen | {RIG} == {*TOPIC_TYPES, solver_topic('exact'), solver_topic('wls')}
 
 
 @pytest.mark.parametrize('flags', [0, 1])
@@ -235,7 +239,9 @@ def test_bytes_are_a_message_or_refused(junk: bytes, name: str) -> None:
 
 
 # The library takes a text that is cut for a shorter one; diagnostics end with a text, and are read for nothing.
-@given(st.sampled_from(sorted({*MESSAGE_TYPES} - {'diagnostic_msgs/msg/DiagnosticArray'})), st.data())
+@given(
+    st.sampled_from(sorted({*MESSAGE_TYPES} - {'diagnostic_msgs/msg/DiagnosticArray', string.MESSAGE.name})), st.data()
+)
 def test_a_message_that_is_cut_is_refused(name: str, data: st.DataObject) -> None:
     record = next(m for r in run(60) for m in to_messages(r) if m.type == name)
     whole = cdr.encode(name, record.fields)
@@ -243,3 +249,18 @@ def test_a_message_that_is_cut_is_refused(name: str, data: st.DataObject) -> Non
     size = data.draw(st.integers(0, len(whole) - 1))
     with pytest.raises(ValueError, match=f'not a {name}'):
         cdr.decode(name, whole[:size])
+
+
+def test_an_independent_decoder_reads_the_rig() -> None:
+    state = RigState(5, 7, {'psd_1.zero': [0.1, 0.2], 'psd_2.zero': [0.0, 0.0]}, {'serial': 'ö'}, {'sum_min': 2.0}, '1')
+    (m,) = to_messages(state)
+    raw = cdr.encode(m.type, m.fields)
+    text = STORE.deserialize_cdr(raw, m.type).data
+    assert json.loads(text)['zero'] == {'psd_1': [0.1, 0.2], 'psd_2': [0.0, 0.0]}
+    assert string.to_rig(cdr.decode(m.type, raw)) == state
+
+
+@pytest.mark.parametrize('text', ['', '[]', '{"version": 1}', '[' * 100_000, 'x' * (string.MAX_CHARACTERS + 1)])
+def test_a_text_that_is_no_rig_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r'lacks|Expecting|nested|characters'):
+        string.to_rig({'data': text})

@@ -18,7 +18,7 @@ from mcap.records import Chunk, ChunkIndex
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
 
-from msg_adapters import TOPIC_TYPES, to_messages
+from msg_adapters import RIG, TOPIC_TYPES, to_messages
 from psd_deflection import __version__
 from psd_deflection.config import load_rig
 from psd_deflection.errors import RecordingError
@@ -53,6 +53,7 @@ def test_an_independent_reader_gets_every_byte_that_was_written(tmp_path: Path) 
         types = {c.topic: c.msgtype for c in reader.connections}
         for connection, t_ns, raw in reader.messages():
             got.setdefault(connection.topic, []).append((t_ns, bytes(raw)))
+    assert len(got.pop(RIG)) == 1
     assert got == expected
     assert {t: types[t] for t in TOPIC_TYPES} == TOPIC_TYPES
     assert {c for c in types if c not in TOPIC_TYPES} == {'/link_tip/exact/deflection', '/link_tip/wls/deflection'}

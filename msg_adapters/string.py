@@ -1,0 +1,63 @@
+"""std_msgs/String: the rig as JSON, so that a recording of any recorder can be evaluated with it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from msg_adapters.header import Fields
+from msg_adapters.message_type import MessageType
+from psd_deflection.records import RigState
+
+MESSAGE = MessageType(
+    'std_msgs/msg/String',
+    'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18',
+    'string data\n',
+)
+
+MAX_CHARACTERS = 1_000_000
+"""Longest text that is parsed; ours have some thousand characters."""
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Mapping):
+        return dict(value)
+    raise TypeError(f'{type(value).__name__} {value!r} has no JSON')
+
+
+def from_rig(state: RigState) -> Fields:
+    """Fields of one state of the rig; ``zero`` repeats two of the parameters, for those who look for them."""
+    tree = {
+        'version': state.version,
+        't_ns': state.t_ns,
+        'block': state.block,
+        'parameters': state.parameters,
+        'zero': {psd: state.parameters.get(f'{psd}.zero') for psd in ('psd_1', 'psd_2')},
+        'hello': state.hello,
+        'changed': state.changed,
+    }
+    return {'data': json.dumps(tree, default=_plain)}
+
+
+def to_rig(fields: Mapping[str, Any]) -> RigState:
+    """The record of a message. Raises ValueError if it is not one of ours."""
+    text = fields['data']
+    if len(text) > MAX_CHARACTERS:
+        raise ValueError(f'has {len(text)} characters, more than {MAX_CHARACTERS}')
+    try:
+        tree = json.loads(text)
+    except RecursionError:
+        raise ValueError('is nested too deeply') from None
+    kinds = {'version': str, 't_ns': int, 'block': int, 'parameters': dict, 'changed': dict}
+    if not isinstance(tree, dict) or not all(isinstance(tree.get(name), kind) for name, kind in kinds.items()):
+        raise ValueError('lacks one of ' + ', '.join(kinds))
+    hello = tree.get('hello')
+    return RigState(
+        tree['t_ns'],
+        tree['block'],
+        tree['parameters'],
+        hello if isinstance(hello, dict) else None,
+        tree['changed'],
+        tree['version'],
+    )
