@@ -123,7 +123,7 @@ def test_every_file_of_a_bag_tells_the_rig(run: Path, tmp_path: Path) -> None:
 def test_a_late_subscriber_of_a_played_bag_gets_the_rig(run: Path) -> None:
     with Reader(run) as bag:
         (connection,) = (c for c in bag.connections if c.topic == RIG)
-        (profile,) = connection.ext.offered_qos_profiles  # type: ignore[union-attr]
+        (profile,) = connection.ext.offered_qos_profiles
     assert profile.durability.name == 'TRANSIENT_LOCAL'
 
 

@@ -29,6 +29,7 @@ from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters 
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
@@ -39,6 +40,7 @@ MS = 1_000_000
 TOPICS = {
     '/link_tip/deflection': 'geometry_msgs/msg/PoseStamped',
     '/link_tip/deflection_with_covariance': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    '/link_tip/rig': 'std_msgs/msg/String',
     '/link_tip/wrench': 'geometry_msgs/msg/WrenchStamped',
     '/link_tip/exact/deflection': 'geometry_msgs/msg/PoseStamped',
     '/link_tip/wls/deflection': 'geometry_msgs/msg/PoseStamped',
@@ -171,6 +173,37 @@ def test_zero_and_record(start: Callable[..., Any], peer: Any, tmp_path: Path, s
     assert len(found) >= 50
     assert all(found[t] == received[t] for t in found if t in received)
     assert len(set(found) & set(received)) >= 50
+
+
+def test_the_rig_is_latched_and_told_again_when_it_changes(
+    start: Callable[..., Any], peer: Any, simulated_port: str
+) -> None:
+    start('--port', simulated_port, '--ros-args', '-p', 'link.length:=0.6', '-p', 'keep_zero:=false')
+    poses = peer.collect(PoseStamped, '/link_tip/deflection')
+    peer.until(lambda: len(poses) >= 30, 'estimates')
+    # A late subscriber gets what was sent at the start.
+    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    texts = peer.collect(String, '/link_tip/rig', latched)
+    peer.until(lambda: len(texts) >= 1, 'the rig')
+    first = json.loads(texts[0].data)
+    assert first['parameters']['link.length'] == 0.6
+    assert len(first['parameters']) >= 65
+    assert first['hello']['serial'] == 'SIM-0001'
+    assert first['zero'] == {'psd_1': [0.0, 0.0], 'psd_2': [0.0, 0.0]}
+    assert peer.call(Trigger, '/estimator/zero', Trigger.Request()).success
+    peer.until(lambda: len(texts) >= 2, 'the zero')
+    zeroed = json.loads(texts[1].data)
+    assert zeroed['zero'] != first['zero']
+    assert zeroed['zero'] == {psd: zeroed['changed'][f'{psd}.zero'] for psd in ('psd_1', 'psd_2')}
+    assert zeroed['block'] > first['block']
+    value = Parameter('sum_min', value=1.5).to_parameter_msg()
+    peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[value]))
+    peer.until(lambda: len(texts) >= 3, 'the change')
+    assert json.loads(texts[2].data)['parameters']['sum_min'] == 1.5
+    # Once a change, not once a second.
+    health = peer.collect(DiagnosticArray, '/diagnostics')
+    peer.until(lambda: len(health) >= 3, 'diagnostics')
+    assert len(texts) == 3
 
 
 def test_a_disk_that_hangs_holds_up_its_own_requests_alone(
