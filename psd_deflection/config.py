@@ -33,6 +33,8 @@ EFFECTS_PREFIX = 'effects.'
 """Keys below it describe simulated effects; ``psd_deflection.simulation`` checks them."""
 ROS_OWN = ('use_sim_time', 'start_type_description_service')
 QOS_OVERRIDES_PREFIX = 'qos_overrides.'
+LEAST_BITS, MOST_BITS = 8, 24
+AXES = ('x', '-x', 'y', '-y')
 SENSOR_TYPES = ('duolateral', 'tetralateral', 'pincushion', 'quadrant')
 
 
@@ -89,6 +91,13 @@ class PsdConfig:
     zero: tuple[float, float] = parameter(
         (0.0, 0.0), 'm', 'dot on the unloaded link (x, y); ~/zero sets it', minimum=-0.5, maximum=0.5, live=True
     )
+    axes: tuple[str, str] = parameter(
+        ('x', 'y'),
+        '',
+        'which channels of the device are its x and its y, with their signs: [-y, x] '
+        "(write 'y' in quotes: ROS takes a bare y for true)",
+        choices=AXES,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +113,7 @@ class AmplifierConfig:
 class ConverterConfig:
     """The analogue-to-digital converter."""
 
-    bits: int = parameter(16, '', 'bits of the converter', minimum=8, maximum=16)
+    bits: int = parameter(16, '', 'bits of the converter', minimum=LEAST_BITS, maximum=MOST_BITS)
     full_scale: float = parameter(10.0, 'V', 'range is +- this', above=0.0, maximum=1000.0)
     sample_rate_hz: float = parameter(1000.0, 'Hz', 'samples per second', minimum=1.0, maximum=10_000.0)
 
@@ -230,6 +239,7 @@ class AcquisitionConfig:
         '',
         'serial port (two with a comma between, if the device has two) or recording; empty starts the simulated rig',
     )
+    psds_exchanged: bool = parameter(False, '', "the device's x1 y1 sum1 come from PSD 2 and its x2 y2 sum2 from PSD 1")
     baud: int = parameter(921_600, 'baud', 'line speed (USB-CDC devices ignore it)', minimum=1200, maximum=12_000_000)
     latency_offset: float = parameter(
         0.0, 's', 'constant delay of the link to take off every stamp', minimum=-1.0, maximum=1.0
@@ -445,10 +455,18 @@ def _check_together(v: dict[str, Any], source: str) -> None:
         if not _COMPARE[relation](v[lower], v[upper]):
             low, high = (BY_NAME[name].with_value(v[name]) for name in (lower, upper))
             raise ConfigError(f'{source}: {low}: must be {relation} {high}')
+    _check_wiring(v, source)
     if v['solver'] not in v['solvers']:
         v['solvers'] = [v['solver'], *v['solvers']]
     if len(set(v['solvers'])) != len(v['solvers']):
         raise ConfigError(f'{source}: solvers = {v["solvers"]!r}: a name is there twice')
+
+
+def _check_wiring(v: Mapping[str, Any], source: str) -> None:
+    """Raise ConfigError if a channel is used twice."""
+    for p in (section.parameters['axes'] for section in PSDS):
+        if sorted(axis[-1] for axis in v[p.name]) != ['x', 'y']:
+            raise ConfigError(f'{source}: {p.with_value(v[p.name])}: must name x once and y once')
 
 
 def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[str, object]:

@@ -135,7 +135,7 @@ class Pipeline:
         readings = chunk.readings
         volts: npt.NDArray[np.float32]
         if chunk.volts_per_count is not None:
-            volts = counts_to_volts(readings.astype(np.int16, copy=False), chunk.volts_per_count)
+            volts = counts_to_volts(readings.astype(np.int32, copy=False), chunk.volts_per_count)
         else:
             volts = readings.astype(np.float32, copy=False)
         for block in self._cutter.add(chunk, volts):
@@ -234,7 +234,7 @@ class Pipeline:
         present = len(block.seq)
         self.counters.samples += present
         self.counters.blocks += 1
-        volts = block.volts
+        volts = self._calibration.seen(block.volts)
         sums = volts[:, 2::3].astype(np.float64)
         samples = self._calibration.dots(volts)
         if self._correction.active:
@@ -243,7 +243,7 @@ class Pipeline:
         dots: Dots = (x1, y1, x2, y2)
         if self._optics.refuses_frozen:
             self._count_still(volts)
-        verdict = self._optics.judge(block, dots, sums, self._frozen)
+        verdict = self._optics.judge(block, volts, dots, sums, self._frozen)
         status, reason = verdict.status, verdict.reason
         t_ns = block_middle_ns(block, size, self._period_ns)
         slots = block.seq - block.index * size
@@ -297,7 +297,7 @@ class Pipeline:
             self.stamped.suspect(block.index, dots, checked)
         if not self._optics.refuses_frozen:
             self._count_still(volts)
-        findings = verdict.findings + self._optics.late_findings(block, verdict, self._frozen)
+        findings = verdict.findings + self._optics.late_findings(volts, verdict, self._frozen)
         for finding in findings:
             name = finding.split(':')[0]
             self.counters.findings[name] = self.counters.findings.get(name, 0) + 1

@@ -140,6 +140,8 @@ def test_a_field_is_all_that_a_parameter_costs() -> None:
 
 def another(p: Parameter) -> Value:
     """A legal value beside the default."""
+    if p.choices is not None and p.kind == 'string_array':
+        return list(reversed(p.default))
     if p.choices is not None:
         return p.choices[-1]
     match p.default:

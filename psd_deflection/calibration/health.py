@@ -81,14 +81,23 @@ class OpticsHealth:
         same = (volts == volts[0]).all(axis=0)
         return (bool(same[:3].all()), bool(same[3:].all()))
 
-    def judge(self, block: SampleBlock, dots: tuple[float, ...], sums: FloatArray, frozen: tuple[int, int]) -> Verdict:
-        """The block's verdict, causes before consequences. ``frozen``: blocks in a row without change, per PSD."""
+    def judge(
+        self,
+        block: SampleBlock,
+        volts: npt.NDArray[np.float32],
+        dots: tuple[float, ...],
+        sums: FloatArray,
+        frozen: tuple[int, int],
+    ) -> Verdict:
+        """The block's verdict, causes before consequences. ``volts`` (n, 6): of the PSDs, x y sum of each.
+
+        ``frozen``: blocks in a row without change, per PSD. ``x1`` in a reason is PSD 1's x, whatever channel it is on.
+        """
         faults: dict[int, tuple[BlockStatus, str]] = {}
 
         def fault(psd: int, status: BlockStatus, reason: str) -> None:
             faults.setdefault(psd, (status, reason))
 
-        volts = block.volts
         present = len(block.seq)
         low = sums.min(axis=0).tolist()
         for psd, least in enumerate(low, start=1):
@@ -143,13 +152,15 @@ class OpticsHealth:
                     break
         return tuple(out)
 
-    def late_findings(self, block: SampleBlock, verdict: Verdict, frozen: tuple[int, int]) -> tuple[str, ...]:
+    def late_findings(
+        self, volts: npt.NDArray[np.float32], verdict: Verdict, frozen: tuple[int, int]
+    ) -> tuple[str, ...]:
         """Findings computed after the estimate: a noisy detector, a detector whose values do not change."""
         faulty = verdict.faults
         out = []
-        if len(block.seq) == self._size >= 10:
+        if len(volts) == self._size >= 10:
             # Third differences almost remove the link's own motion.
-            rough = np.diff(block.volts, n=3, axis=0)
+            rough = np.diff(volts, n=3, axis=0)
             level = np.sqrt(np.einsum('ij,ij->j', rough, rough) / (len(rough) * _THIRD_DIFFERENCE))
             for psd in (1, 2):
                 worst = float(level[3 * psd - 3 : 3 * psd].max())

@@ -428,7 +428,7 @@ class Acquisition:
             t_ns,
             np.array(gathered.readings, np.float32)
             if self._gate.volts_per_count is None
-            else np.array(gathered.readings, np.int16),
+            else np.array(gathered.readings, np.int32),
             np.array(gathered.flags, np.uint8),
             self._gate.volts_per_count,
         )

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.calibration import Wiring
 from psd_deflection.config import Rig
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.catalogue import effects_of_rig
@@ -29,11 +30,11 @@ from psd_deflection.simulation.physics import Physics
 class SimulatedChunk:
     """The result of :meth:`RigSimulator.step` for n samples.
 
-    ``counts`` int16 (n, 6): converter counts in the order of ``CHANNELS``. ``pose`` (n, 3): true
+    ``counts`` int32 (n, 6): converter counts in the order of ``CHANNELS``. ``pose`` (n, 3): true
     dX m, dY m, theta rad. ``dots`` (n, 4): true x1 y1 x2 y2 on the plate, m.
     """
 
-    counts: npt.NDArray[np.int16]
+    counts: npt.NDArray[np.int32]
     pose: FloatArray
     dots: FloatArray
 
@@ -126,12 +127,14 @@ class ForwardModel:
 class RigSimulator:
     """The rig with its noise and converter, sample after sample.
 
-    The same ``rig`` and ``seed`` give the same samples however the loads are cut into steps.
+    The same ``rig`` and ``seed`` give the same samples however the loads are cut into steps. ``rig`` is the true one:
+    its wiring says which channel a detector's volts really are on.
     """
 
     def __init__(self, rig: Rig, seed: int = 0) -> None:
         self._model = ForwardModel(rig)
         self._noise = np.random.default_rng(seed)
+        self._wiring = Wiring.from_rig(rig)
 
     def step(self, loads: FloatArray, temperature: FloatArray | None = None) -> SimulatedChunk:
         """The next n samples: ``loads`` (n, 3) Fx N, Fy N, Tz N m at the tip centroid.
@@ -143,7 +146,8 @@ class RigSimulator:
         chunk.volts += (p.noise * self._noise.standard_normal((len(loads), 6))).T
         self._model.finish(chunk)
         limit = round(p.full_scale / p.volts_per_count)
-        counts = np.clip(np.rint(chunk.volts / p.volts_per_count), -limit, limit - 1).astype(np.int16)
+        volts = self._wiring.to_device(chunk.volts.T)
+        counts = np.clip(np.rint(volts / p.volts_per_count), -limit, limit - 1).astype(np.int32)
         return SimulatedChunk(
-            np.ascontiguousarray(counts.T), np.ascontiguousarray(chunk.pose.T), np.ascontiguousarray(chunk.true_dots.T)
+            np.ascontiguousarray(counts), np.ascontiguousarray(chunk.pose.T), np.ascontiguousarray(chunk.true_dots.T)
         )

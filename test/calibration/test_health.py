@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.geometry import Geometry
 from psd_deflection.pipeline import FROZEN, HELD, Pipeline
-from psd_deflection.records import BlockStatus, DeflectionEstimate, ParameterChange, Record, SpotMeans, TipLoad
+from psd_deflection.records import BlockStatus, Counts, DeflectionEstimate, ParameterChange, Record, SpotMeans, TipLoad
 from psd_deflection.solvers.one_psd import OnePsd
 from test.test_pipeline import STEP, chunk_of, still
 
-Counts = npt.NDArray[np.int16]
 POSE = (4e-4, -3e-4, 0.004)
 SIZE = 20
 

@@ -21,7 +21,7 @@ from psd_deflection.config import Rig, load_rig
 from psd_deflection.correction import Correction
 from psd_deflection.errors import ConfigError
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.records import DeflectionEstimate, FloatArray, RawChunk
+from psd_deflection.records import Counts, DeflectionEstimate, FloatArray, RawChunk
 from psd_deflection.simulation import effects
 from psd_deflection.simulation.catalogue import FOLDERS, GROUP, catalogue, effect_names, effects_of_rig
 from psd_deflection.simulation.loads import sidebar
@@ -50,7 +50,7 @@ def rig(folder: Path) -> Rig:
     return load_rig(overrides=EFFECT)
 
 
-def poses(rig: Rig, counts: np.ndarray[tuple[int, ...], np.dtype[np.int16]]) -> FloatArray:
+def poses(rig: Rig, counts: Counts) -> FloatArray:
     """Estimates (blocks, 3) of a link that was at 20 degrees Celsius first and is at 30 now."""
     pipeline = Pipeline(rig)
     pipeline.temperature(20.0)
