@@ -38,6 +38,7 @@ COMMANDS: dict[str, str] = {
     'replay': 'run a recording through the same pipeline',
     'simulate': 'simulate the rig: as a recording, or as a device on a pseudo-terminal',
     'discover': 'name what the simulation lacks to explain a recording, and add it',
+    'check': 'check the wiring and set-up of a rig: guided, or from a recording with known loads',
     'devices': 'list serial ports, say what answers on each, suggest the parameters',
     'plot': 'draw a recording: PNG, SVG, PDF or HTML',
     'info': 'say what is in a recording',
@@ -272,3 +273,8 @@ def simulate() -> int:
 def discover() -> int:
     """Console script of ``ros2 run psd_deflection discover`` (colcon)."""
     return main(['discover', *sys.argv[1:]])
+
+
+def check() -> int:
+    """Console script of ``ros2 run psd_deflection check`` (colcon)."""
+    return main(['check', *sys.argv[1:]])
