@@ -56,6 +56,8 @@ NAMES = {
 }
 WIRED = ('channel_sign', 'axis_swap', 'psd_swap')
 BAR = 12
+TELLING_DRIFT = 5e-6 / 60.0
+"""m/s."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -154,14 +156,9 @@ def _pushes(rig: Rig, found: Checkup) -> list[str]:
     """How each channel answered, beside what the rig file expects of it."""
     rows = [['push', *(f'{c} um' for c in DOTS), '', *DOTS, 'size']]
     for push, size in zip(found.pushes, found.sizes, strict=True):
-        # What is expected is scaled to what was seen, so that the two halves can be compared at a glance.
         expected = on_channels(Wiring.from_rig(rig), push.expected)
-        scale = np.linalg.norm(push.channels) / np.linalg.norm(expected)
         told_size = f'{abs(size):.2f}' if push.sized and math.isfinite(size) else ''
-        if push.only_twist:
-            words = ['', '', '', '']
-        else:
-            words = [_arrow(v, float(np.linalg.norm(push.channels))) for v in (expected * scale).tolist()]
+        words = [_arrow(v, float(np.linalg.norm(expected))) for v in expected.tolist()]
         rows.append([push.name, *(f'{v * 1e6:+.1f}' for v in push.channels.tolist()), '  rig file:', *words, told_size])
     if not any(row[-1] for row in rows[1:]):
         rows = [row[:-1] for row in rows]
@@ -216,6 +213,9 @@ def _levels(rig: Rig, found: Checkup) -> list[str]:
         f'{c} {v * 60e6:+.1f} +- {sd * 60e6:.1f}'
         for c, v, sd in zip(DOTS, found.drift.tolist(), found.drift_sd.tolist(), strict=True)
     )
+    drift += '  um a minute'
+    if found.drift_sd.max() > TELLING_DRIFT:
+        drift = 'too short a time to tell'
     hum = 'none at 50 or 60 Hz'
     if measured.hum.max() > 0.0:
         sizes = '  '.join(f'{c} {v * 1e3:.1f}' for c, v in zip(CHANNELS, measured.hum.tolist(), strict=True))
@@ -225,7 +225,7 @@ def _levels(rig: Rig, found: Checkup) -> list[str]:
         f'noise    {noise}  mV rms a sample (rig file {measured.stated * 1e3:.2f})',
         f'hum      {hum}',
         f'light    {sums}  V (rig file {rig.amplifier.sum_nominal:g})',
-        f'drift    {drift}  um a minute',
+        f'drift    {drift}',
     ]
 
 

@@ -40,34 +40,35 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
     Raises RecordingError if there are too few blocks.
     """
     size, period = rig.estimator.block_size, 1.0 / rig.converter.sample_rate_hz
-    poses = _expected_poses(rig, loads, period)
+    static = loads @ LinkStatics.from_rig(rig).compliance
+    poses = _moved(rig, static, period)
     n = len(volts) // size
     dots = _block_means(volts[: n * size, DOT_CHANNELS], n) * rig.amplifier.sensitivity
-    means = poses[: n * size].reshape(n, size, 3).mean(axis=1)
+    means, held = (p[: n * size].reshape(n, size, 3).mean(axis=1) for p in (poses, static))
     present = np.isfinite(dots).all(axis=1)
     if int(present.sum()) < FEWEST_BLOCKS:
         raise RecordingError(f'{int(present.sum())} blocks of samples: at least {FEWEST_BLOCKS} are needed')
     t = np.arange(n) * size * period
-    groups = _groups(means[present], pattern(rig))
-    columns = [means[:, group[0]] / np.abs(means[present][:, group[0]]).max() for group in groups]
+    groups = _groups(held[present], pattern(rig))
+    peaks = [float(np.abs(means[present][:, group[0]]).max()) for group in groups]
+    columns = [means[:, group[0]] / peak for group, peak in zip(groups, peaks, strict=True)]
     design = np.column_stack([*columns, np.ones(n), t - t.mean()])[present]
     slopes, sd = _regression(design, dots[present])
     pushes = []
-    for i, group in enumerate(groups):
-        largest = np.array([_slope(design[:, i], means[present][:, k]) if k in group else 0.0 for k in range(3)])
-        # The sign of a push is that of its load: turned to positive, so that a row reads as "pushed along +X".
-        sign = 1.0 if largest[group[0]] > 0.0 else -1.0
+    for i, (group, peak) in enumerate(zip(groups, peaks, strict=True)):
+        # Loads that came together ring apart: their proportion is that of the held loads.
+        first = held[present][:, group[0]]
+        largest = [peak * _slope(first, held[present][:, k]) if k in group else 0.0 for k in range(3)]
         names = tuple(LOADS[k] for k in group)
-        pushes.append(Response(names, sign * slopes[i], sd[i], sign * pattern(rig) @ largest))
+        pushes.append(Response(names, slopes[i], sd[i], pattern(rig) @ np.array(largest)))
     return Responses(tuple(pushes), slopes[-1], sd[-1])
 
 
-def _expected_poses(rig: Rig, loads: FloatArray, period: float) -> FloatArray:
-    """dX by fx, dY by fy, theta by tz, (n, 3), m, m, rad."""
+def _moved(rig: Rig, static: FloatArray, period: float) -> FloatArray:
+    """What the link's modes make of the poses (n, 3) at which the loads would settle."""
     d = rig.dynamics
     bending = mode_coefficients(d.bending_frequency, d.bending_damping_ratio, period)
     torsion = mode_coefficients(d.torsion_frequency, d.torsion_damping_ratio, period)
-    static = loads @ LinkStatics.from_rig(rig).compliance
     return np.column_stack([Filter(c)(static[:, i]) for i, c in enumerate((bending, bending, torsion))])
 
 

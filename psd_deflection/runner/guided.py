@@ -31,6 +31,8 @@ def run_guided(rig: Rig, world: Rig, say: Say, show: Callable[[Guide], None]) ->
     ``say`` gets the prompts and what is told between them, ``show`` the guide after each chunk of samples. Raises
     DeviceError, ConfigError.
     """
+    # A few lost samples do no harm here, and a priority is one more thing to read about.
+    rig = replace_values(rig, {'realtime': False})
     process: SimulatedRigProcess | None = None
     if simulates(rig.values):
         process = SimulatedRigProcess(world)
