@@ -120,7 +120,7 @@ class Guide:
             case Step.REST:
                 said = self._resting(here, filled, max(quiet, LEAST_PUSH / STAND_OUT))
             case Step.PUSH:
-                said = self._pushed(here, filled, float(np.abs(volts[:, DOT_CHANNELS]).max()))
+                said = self._pushed(here, filled)
             case Step.RELEASE:
                 said = self._released(here, filled)
             case _:
@@ -151,7 +151,7 @@ class Guide:
         self._next(Step.PUSH)
         return ''
 
-    def _pushed(self, here: FloatArray, filled: float, highest: float) -> str:
+    def _pushed(self, here: FloatArray, filled: float) -> str:
         rest = self._rests[-1][1]
         moved = here.mean(axis=0) - rest
         far = float(np.linalg.norm(moved))
@@ -159,7 +159,7 @@ class Guide:
         wander = float(np.linalg.norm(here.std(axis=0)))
         held = far > needed and wander < STEADY * far
         self.progress = filled if held else 0.0
-        if highest >= self._rail:
+        if max(float(np.abs(v[:, DOT_CHANNELS]).max()) for v in self._samples) >= self._rail:
             return self._impatient('A dot is at the end of its PSD: push less.')
         if not held:
             if far <= needed:

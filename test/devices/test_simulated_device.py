@@ -193,3 +193,14 @@ def test_a_converter_of_12_bits_is_over_range_at_its_own_last_step() -> None:
     got = samples(SimulatedFrames(RigFeed(rig, no_load)).take(5 * MS, room=1 << 30))
     assert {f.counts[2] for f in got} == {2047}
     assert all(f.flags & FLAG_OVER_RANGE for f in got)
+
+
+def test_a_hand_takes_the_place_of_the_cycle() -> None:
+    hand = module.Hand(module.served_loads(1000.0))
+    before = hand.take(5)
+    assert before.shape == (5, 3)
+    hand.hold(b'[1.0, 2, -3]\n')
+    np.testing.assert_array_equal(hand.take(2), [[1.0, 2.0, -3.0]] * 2)
+    for bad in (b'[1, 2]', b'[1, 2, NaN]', b'nonsense'):
+        with pytest.raises(ValueError):
+            hand.hold(bad)
