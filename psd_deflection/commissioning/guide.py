@@ -97,7 +97,7 @@ class Guide:
         if self.step is Step.REST:
             return 'Leave the link alone.'
         if self.step is Step.PUSH:
-            return self._texts[self.number]
+            return f'{self.number + 1} of 3: {self._texts[self.number]}'
         return 'Let go.' if self.step is Step.RELEASE else 'Done.'
 
     def feed(self, volts: FloatArray) -> str:

@@ -19,6 +19,7 @@ import numpy as np
 
 from psd_deflection.calibration import Wiring
 from psd_deflection.config import Rig
+from psd_deflection.errors import ConfigError
 from psd_deflection.geometry.linear import design_matrix
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 
@@ -43,7 +44,9 @@ _BY_PUSH = {'fx': '+X', 'fy': '+Y', 'tz': '+theta'}
 
 
 def pattern(rig: Rig) -> FloatArray:
-    """Movement of x1 y1 x2 y2 (4, 3) per dX, dY (1) and theta (m/rad)."""
+    """Movement of x1 y1 x2 y2 (4, 3) per dX, dY (1) and theta (m/rad). Raises ConfigError for PSDs at the base."""
+    if rig.estimator.solver == 'base_pair':
+        raise ConfigError('solver = base_pair: check knows PSDs on the tip plate only, whose dots move otherwise')
     return design_matrix(rig.centers + rig.zeros)
 
 

@@ -22,6 +22,7 @@ from psd_deflection.commissioning.levels import levels
 from psd_deflection.commissioning.responses import responses
 from psd_deflection.commissioning.wirings import WIRINGS, differences, parameters
 from psd_deflection.config import Rig, load_rig, read_parameter_file, rig_from_values
+from psd_deflection.errors import ConfigError
 from psd_deflection.records import FloatArray
 
 CLOUD = 2e-3 * 0.5e-3
@@ -282,6 +283,13 @@ def test_a_line_is_one_that_ros_reads_as_well() -> None:
     # rcl takes a bare y for true.
     assert line('psd_1.axes', ['-x', 'y']) == "psd_1.axes: [-x, 'y']"
     assert line('psds_exchanged', True) == 'psds_exchanged: true'
+
+
+def test_psds_at_the_base_are_refused() -> None:
+    loads = pushes(10.0)
+    base = rig_from_values({'solver': 'base_pair', 'psd_1.height': -0.5, 'psd_2.height': -0.4})
+    with pytest.raises(ConfigError, match='PSDs on the tip plate only'):
+        checked(recorded(loads, 0), loads, base)
 
 
 # ---- the command

@@ -19,8 +19,16 @@ def test_the_simulated_rig_and_hand_show_a_wrong_wiring() -> None:
     found = run_guided(load_rig(), world, said.append, lambda guide: shown.append(guide.progress))
     assert found.verdict == WRONG
     assert dict(found.lines) == {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x']}
-    prompts = [text for text in said if text.startswith(('Leave', 'Push', 'Turn', 'Let go'))]
-    assert [p.split()[0] for p in prompts] == ['Leave', 'Push', 'Let', 'Push', 'Let', 'Turn', 'Let']
+    prompts = [text[:12] for text in said if text.startswith(('Leave', '1 of', '2 of', '3 of', 'Let go'))]
+    assert prompts == [
+        'Leave the li',
+        '1 of 3: Push',
+        'Let go.',
+        '2 of 3: Push',
+        'Let go.',
+        '3 of 3: Turn',
+        'Let go.',
+    ]
     assert max(shown) > 0.9
 
 
