@@ -8,8 +8,8 @@ Signs, exchanged axes and exchanged PSDs make 128 wirings of two PSDs. Each is h
 the wiring that fits, the lines to paste into the rig file, noise and hum against the rig file, the sums, and drift.
 If two causes would look the same, it names both. It changes nothing.
 
-  psd-deflection check                                    on the simulated rig, with a simulated hand
-  psd-deflection check --world 'psd_1.axes=[-y, x]'       on a simulated rig with a wiring to find
+  psd-deflection check                            the simulated rig and hand
+  psd-deflection check --world 'psd_1.axes=[-y,x]'   the same, wired wrong
   psd-deflection check --port /dev/ttyACM0 --params-file my_rig.yaml
   psd-deflection check pushes.csv --params-file my_rig.yaml
 

@@ -8,7 +8,7 @@ samples, the loads, the temperature where one is given, and with --reference the
   psd-deflection simulate --out run --loads thesis --temperature 20,24
   psd-deflection simulate --out odd.csv --effect axis_crosstalk,psd=1,xy=0.02
   psd-deflection simulate --out s.mcap --loads 'steps:0,0,0;0,-10,-5.85:2'
-  psd-deflection simulate --out s.mcap --world 'psd_1.axes=[x, -y]'    # wired otherwise than the rig file says
+  psd-deflection simulate --out wired.csv --world 'psd_1.axes=[x, -y]'
   psd-deflection simulate --serve --link rig_port
 """
 
