@@ -19,6 +19,9 @@ NOISE_FACTOR = 1.5
 SUM_FACTOR = 1.15
 """A sum that is so many times the nominal one, or so many times less, is told."""
 
+LONGEST = 1_000_000
+"""Samples that are looked at."""
+
 HUM_S = 60.0
 """Longest stretch in which hum is looked for, s."""
 
@@ -59,11 +62,14 @@ class Levels:
 
 
 def levels(rig: Rig, volts: FloatArray) -> Levels:
-    """``volts`` (n, 6) of the device's channels, NaN if a sample is lost; at least four in a row are there."""
+    """``volts`` (n, 6) of the device's channels, NaN if a sample is lost; some are there. Of a long run, its begin."""
+    volts = volts[:LONGEST]
     step = rig.converter.volts_per_count
     stated = float(np.hypot(rig.amplifier.noise, step / np.sqrt(12.0)))
     rough = np.diff(volts, n=3, axis=0)
     rough = rough[np.isfinite(rough).all(axis=1)]
+    if not len(rough):
+        rough = np.zeros((1, volts.shape[1]))
     # Steps of a load and glitches are cut off. The median alone would be as coarse as the converter.
     cut = _FAR * np.maximum(_TO_SD * np.median(np.abs(rough), axis=0), step)
     noise = np.sqrt((np.clip(rough, -cut, cut) ** 2).mean(axis=0)) / _THIRD

@@ -49,7 +49,7 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
     if int(present.sum()) < FEWEST_BLOCKS:
         raise RecordingError(f'{int(present.sum())} blocks of samples: at least {FEWEST_BLOCKS} are needed')
     t = np.arange(n) * size * period
-    groups = _groups(held[present], pattern(rig))
+    groups = _groups(held[present], means[present], pattern(rig))
     peaks = [float(np.abs(means[present][:, group[0]]).max()) for group in groups]
     columns = [means[:, group[0]] / peak for group, peak in zip(groups, peaks, strict=True)]
     design = np.column_stack([*columns, np.ones(n), t - t.mean()])[present]
@@ -81,10 +81,10 @@ def _block_means(samples: FloatArray, n: int) -> FloatArray:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _groups(poses: FloatArray, per_pose: FloatArray) -> list[list[int]]:
-    """The loads that were applied, those together that always came together; the one that moves most comes first."""
-    moved = np.ptp(poses, axis=0) * np.linalg.norm(per_pose, axis=0)
-    applied = [int(i) for i in np.argsort(-moved) if moved[i] > 0.0]
+def _groups(poses: FloatArray, moved: FloatArray, per_pose: FloatArray) -> list[list[int]]:
+    """The applied loads, those together that always came together. ``poses`` (n, 3): held; ``moved`` (n, 3): as rung."""
+    size = np.minimum(np.ptp(poses, axis=0), np.ptp(moved, axis=0)) * np.linalg.norm(per_pose, axis=0)
+    applied = [int(i) for i in np.argsort(-size) if size[i] > 0.0]
     out: list[list[int]] = []
     for i in applied:
         for group in out:

@@ -22,7 +22,7 @@ from psd_deflection.commissioning.levels import levels
 from psd_deflection.commissioning.responses import responses
 from psd_deflection.commissioning.wirings import WIRINGS, differences, parameters
 from psd_deflection.config import Rig, load_rig, read_parameter_file, rig_from_values
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, RecordingError
 from psd_deflection.records import FloatArray
 
 CLOUD = 2e-3 * 0.5e-3
@@ -283,6 +283,24 @@ def test_a_line_is_one_that_ros_reads_as_well() -> None:
     # rcl takes a bare y for true.
     assert line('psd_1.axes', ['-x', 'y']) == "psd_1.axes: [-x, 'y']"
     assert line('psds_exchanged', True) == 'psds_exchanged: true'
+
+
+def test_loads_that_say_nothing_and_samples_with_gaps_are_no_accident() -> None:
+    loads = pushes(10.0)
+    volts = recorded(loads, 1)
+    assert checked(volts, np.zeros_like(loads)).verdict == CANNOT_TELL
+    # A load that comes with the last sample has moved nothing yet.
+    late = np.zeros_like(loads)
+    late[-1, 1] = 1.0
+    assert checked(volts, late).verdict == CANNOT_TELL
+    gaps = volts.copy()
+    gaps[::3] = np.nan
+    found = checked(gaps, loads)
+    assert (found.verdict, dict(found.lines)) == (RIGHT, {})
+    lost = np.where(np.arange(len(volts))[:, None] % 40 < 20, volts, np.nan)
+    assert checked(lost, loads).verdict == RIGHT
+    with pytest.raises(RecordingError, match='at least 8 are needed'):
+        checked(volts[:100], loads[:100])
 
 
 def test_psds_at_the_base_are_refused() -> None:
