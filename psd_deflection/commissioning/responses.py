@@ -82,7 +82,7 @@ def _block_means(samples: FloatArray, n: int) -> FloatArray:
 
 
 def _groups(poses: FloatArray, moved: FloatArray, per_pose: FloatArray) -> list[list[int]]:
-    """The applied loads, those together that always came together. ``poses`` (n, 3): held; ``moved`` (n, 3): as rung."""
+    """The applied loads, those together that always came together. ``poses`` (n, 3): held; ``moved`` (n, 3): rung."""
     size = np.minimum(np.ptp(poses, axis=0), np.ptp(moved, axis=0)) * np.linalg.norm(per_pose, axis=0)
     applied = [int(i) for i in np.argsort(-size) if size[i] > 0.0]
     out: list[list[int]] = []
