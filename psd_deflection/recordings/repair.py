@@ -18,6 +18,7 @@ from mcap.writer import CompressionType, Writer
 
 from psd_deflection import __version__
 from psd_deflection.errors import RecordingError
+from psd_deflection.files import HeldFolder
 from psd_deflection.foreign_yaml import YamlError, parse_yaml
 from psd_deflection.recordings.bag_metadata import (
     DEFAULT_QOS,
@@ -230,5 +231,6 @@ def _recover_folder(folder: Path) -> Recovered:
             return Recovered(files, False, set_aside)
         metadata.replace(metadata.with_name(metadata.name + '.cut'))
     topics = totals(t for f in files for t in f.topics)
-    write_metadata(folder, bag_information([f.count for f in files], topics, CUSTOM))
+    with HeldFolder(folder) as held:
+        write_metadata(held, bag_information([f.count for f in files], topics, CUSTOM))
     return Recovered(files, True, set_aside)
