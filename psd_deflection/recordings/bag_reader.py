@@ -32,6 +32,7 @@ from psd_deflection.errors import RecordingError
 from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
 from psd_deflection.protocol.sequence import WRAP
 from psd_deflection.recordings import cdr
+from psd_deflection.recordings.allowance import Warnings
 from psd_deflection.recordings.bag_writer import META_CHANGE, META_HELLO, META_PARAMETERS, META_SOFTWARE
 from psd_deflection.recordings.clouds import CloudDecoder, Samples, joined_points
 from psd_deflection.recordings.mcap_reader import McapReader, RawMessage
@@ -59,7 +60,7 @@ class BagRecording(Recording):
 
     def __init__(self, path: Path, block_size: int | None = None) -> None:
         super().__init__(path, block_size)
-        self._own_warnings: list[str] = []
+        self._own_warnings = Warnings()
         files = self._files_of(path) if path.is_dir() else [path]
         self._sources = [McapReader(f) for f in files]
         metadata: dict[str, dict[str, str]] = {}
@@ -77,7 +78,7 @@ class BagRecording(Recording):
         if not meta_file.is_file():
             if not found:
                 raise RecordingError(f'{folder}: is no bag: it holds neither metadata.yaml nor an .mcap file')
-            self._own_warnings.append(f'{folder}: has no metadata.yaml (a recorder that was stopped hard?)')
+            self._own_warnings.add(f'{folder}: has no metadata.yaml (a recorder that was stopped hard?)')
             return found
         information = read_information(meta_file)
         storage = information.get('storage_identifier')
@@ -108,12 +109,10 @@ class BagRecording(Recording):
     @property
     def warnings(self) -> Sequence[str]:
         """One line for each cut or damage, and for samples that were left out."""
-        return [*self._own_warnings, *(w for s in self._sources for w in s.warnings)]
+        return [*self._own_warnings.lines(), *(w for s in self._sources for w in s.warnings)]
 
     def _warn(self, text: str) -> None:
-        line = f'{self.path}: {text}'
-        if line not in self._own_warnings:
-            self._own_warnings.append(line)
+        self._own_warnings.add(f'{self.path}: {text}')
 
     def _changes_in(self, metadata: Mapping[str, Mapping[str, str]]) -> list[ParameterChange]:
         out = []
