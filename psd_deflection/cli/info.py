@@ -87,7 +87,8 @@ def summary(recording: Recording, quiet: bool = True) -> dict[str, Any]:
         'start_ns': first[1],
         'duration_s': (last[1] - first[1]) * 1e-9,
         'samples': samples,
-        'lost': last[0] - first[0] + 1 - samples if samples else 0,
+        'lost': recording.lost(first[0], last[0], samples) if samples else 0,
+        'restarts': len(recording.restarts),
         'flagged': flagged,
         'sample_rate_hz': counted * 1e9 / lasted if lasted else 0.0,
         'blocks': blocks,
@@ -137,6 +138,8 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
             out.append(row('start', f'{start * 1e-9:.9f} s'))
         out.append(row('duration', f'{found["duration_s"]:.3f} s'))
         out.append(row('samples', f'{samples} present, {lost} lost ({share:.3g} %), {found["flagged"]} flagged'))
+        if found['restarts']:
+            out.append(row('restarts', f'{found["restarts"]} of the device'))
         out.append(row('rate', f'{found["sample_rate_hz"]:.6g} samples/s'))
         out.append(row('blocks', f'{found["blocks"]} of up to {found["block_size"]} samples'))
     out += [row('lacks' if i == 0 else '', text) for i, text in enumerate(found['lacks'])]

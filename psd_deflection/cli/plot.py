@@ -29,6 +29,7 @@ from psd_deflection.config import Rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.monitor.spectrum import Spectrum
 from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay_engine import open_for_replay, replayed
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, Record, SampleBlock, SpotMeans
 
@@ -59,6 +60,7 @@ class Drawn:
     start or a stop amid a block leaves unfinished.
     """
 
+    recording: Recording
     numbers: tuple[int, int] | None = None
     first: SampleBlock | None = None
     last: SampleBlock | None = None
@@ -103,7 +105,8 @@ class Drawn:
 
     def _lost(self, spots: SpotMeans) -> int:
         """Samples lost of a block: of one at an end those between its own first and last, as in ``gone``."""
-        lost = spots.lost
+        size = spots.present + spots.lost
+        lost = self.recording.lost(spots.index * size, (spots.index + 1) * size - 1, spots.present)
         for block in (self.first, self.last):
             if block is not None and block.index == spots.index:
                 lost = min(lost, int(block.seq[-1] - block.seq[0]) + 1 - len(block.seq))
@@ -113,7 +116,7 @@ class Drawn:
         """Samples that are missing between the first and the last one."""
         if self.numbers is None:
             return 0
-        return self.numbers[1] - self.numbers[0] + 1 - sum(s.present for s in self.spots)
+        return self.recording.lost(*self.numbers, sum(s.present for s in self.spots))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -125,7 +128,7 @@ def run(args: argparse.Namespace) -> int:
     out = Path(args.out) if args.out is not None else default_out(args.recording)
     need_folder(out)
     recording, rig = open_for_replay(args.recording, args.params_file)
-    drawn, spectrum = Drawn(), Spectrum(rig, SPECTRUM_OF_S)
+    drawn, spectrum = Drawn(recording), Spectrum(rig, SPECTRUM_OF_S)
     for records in replayed(recording, Pipeline(rig), progress_of(recording.blocks(), quiet=args.json)):
         for record in records:
             drawn.add(record)

@@ -55,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 class Totals:
     """What came out, for the summary."""
 
+    recording: Recording
     blocks: int = 0
     samples: int = 0
     first_seq: int | None = None
@@ -75,7 +76,7 @@ class Totals:
     @property
     def lost(self) -> int:
         """Samples missing between the first and the last."""
-        return self.last_seq - self.first_seq + 1 - self.samples if self.first_seq is not None else 0
+        return self.recording.lost(self.first_seq, self.last_seq, self.samples) if self.first_seq is not None else 0
 
 
 def run(args: argparse.Namespace) -> int:
@@ -87,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
     sink: Sink | None = None
     if args.out is not None:
         sink = open_sink(args.out, rig.flat(), device_hello=recording.hello)
-    totals = Totals()
+    totals = Totals(recording)
     began = time.perf_counter()
     bar = progress_of(recording.blocks(), quiet=args.json)
     try:

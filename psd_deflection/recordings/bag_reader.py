@@ -38,6 +38,7 @@ from psd_deflection.recordings.clouds import CloudDecoder, Samples, joined_point
 from psd_deflection.recordings.mcap_reader import McapReader, RawMessage
 from psd_deflection.recordings.recording import EstimateSeries, Recording, from_json
 from psd_deflection.records import (
+    RESTART,
     AppliedLoad,
     IntArray,
     ParameterChange,
@@ -48,6 +49,9 @@ from psd_deflection.records import (
 )
 
 MAX_YAML_BYTES = 16_000_000
+
+MAX_RESTARTS = 10_000
+"""Restarts of one recording that are counted."""
 
 _BATCH = 50
 """Number of messages whose samples are decoded at once: numpy's cost is per call."""
@@ -70,6 +74,7 @@ class BagRecording(Recording):
         self.hello = from_json(metadata[META_HELLO]) if META_HELLO in metadata else None
         self.version = metadata.get(META_SOFTWARE, {}).get('version', '')
         self.changes = self._changes_in(metadata)
+        self.restarts.update(r for change in self.changes if (r := _restart_in(change)) is not None)
 
     def _files_of(self, folder: Path) -> list[Path]:
         """The bag's files in the order of ``metadata.yaml``, else of their numbers."""
@@ -150,7 +155,7 @@ class BagRecording(Recording):
         yield from blocks
 
     def _chunks(self) -> Iterator[RawChunk]:
-        count = _SequenceCounter(self.block_size, self._warn)
+        count = _SequenceCounter(self.block_size, self._warn, self.restarts)
         for log_time, messages in self._clouds():
             together = joined_points(messages)
             parts = [together] if count.follows(together) else [joined_points([m]) for m in messages]
@@ -246,7 +251,8 @@ class _SequenceCounter:
 
     _FASTEST_HZ = 20_000
 
-    def __init__(self, block_size: int, warn: Callable[[str], None]) -> None:
+    def __init__(self, block_size: int, warn: Callable[[str], None], restarts: set[tuple[int, int]]) -> None:
+        self._restarts = restarts
         self._wrapped = 0
         self._moved = 0
         self._block_size = block_size
@@ -294,7 +300,18 @@ class _SequenceCounter:
             return
         self._warn(f'sample numbers start anew after {last}')
         size = self._block_size
-        self._moved += (last // size + 1 - first // size) * size
+        move = (last // size + 1 - first // size) * size
+        self._moved += move
+        if len(self._restarts) < MAX_RESTARTS:
+            self._restarts.add((last, first + move))
+
+
+def _restart_in(change: ParameterChange) -> tuple[int, int] | None:
+    value = dict(change.values).get(RESTART)
+    if not isinstance(value, tuple) or len(value) != 2 or not all(isinstance(n, int) for n in value):
+        return None
+    before, after = int(value[0]), int(value[1])
+    return (before, after) if 0 <= before < after < 2**62 else None
 
 
 def _to_change(entry: Mapping[str, str]) -> ParameterChange:

@@ -20,6 +20,7 @@ from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import Clock, Event, Received, Sample, Source, SourceEndedError
 from psd_deflection.errors import DeviceError
 from psd_deflection.protocol.frames import HelloFrame, PongFrame, encode
+from psd_deflection.records import RESTART
 from psd_deflection.runner import acquisition as module
 from psd_deflection.runner.acquisition import Acquisition, Arrival, Ended, Item, Restarted
 from psd_deflection.runner.pinger import UNANSWERED
@@ -99,7 +100,10 @@ def test_a_device_restart_continues_with_a_new_block(device: Any, run: Run, samp
     device.send_frames(*[sample(s) for s in range(4000, 4030)], *[sample(s) for s in range(20)])
     items = take(run.acquisition, 50)
     assert numbers(items) == [*range(4000, 4030), *range(4040, 4060)]
-    assert any(isinstance(i, Restarted) for i in items)
+    (restart,) = [i for i in items if isinstance(i, Restarted)]
+    assert restart.change is not None
+    assert restart.change.block == 202
+    assert dict(restart.change.values) == {RESTART: (4029, 4040)}
     assert run.acquisition.counters.restarts == 1
     t = [int(t) for i in items if isinstance(i, Arrival) for t in i.raw.t_ns]
     assert all(b > a for a, b in itertools.pairwise(t))

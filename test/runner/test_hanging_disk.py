@@ -57,7 +57,8 @@ class Disk:
             if not name.endswith('.mcap'):
                 return real_create(folder, name)
             disk.call('open')
-            return Stream(real_create(folder, name).detach())
+            real_create(folder, name).close()
+            return Stream(io.FileIO(folder.path / name, 'ab'))
 
         def synced(fd: int) -> None:
             disk.call('fsync')
