@@ -345,7 +345,7 @@ def files_in(folder: Path) -> list[Path]:
         found = re.search(r'_([0-9]{1,9})$', path.stem)
         return (int(found[1]) if found else -1, path.name)
 
-    return sorted(folder.glob('*.mcap'), key=number)
+    return sorted((f for f in folder.glob('*.mcap') if f.is_file()), key=number)
 
 
 def read_information(path: Path) -> dict[str, Any]:

@@ -141,6 +141,9 @@ class Acquisition:
         self._bad_since_sample = 0
         self._was_away = False
 
+        # Bad frames of each reason when a silence was last told.
+        self._bad_told: dict[str, int] = {}
+
         # The connection: whether there is one, and why the last try to have it back failed.
         self._connected = False
         self._refusal = ''
@@ -204,12 +207,16 @@ class Acquisition:
         """Offset and rate of the device's clock against the host's."""
         return self._clock.state()
 
+    def now_ns(self) -> int:
+        """Now, in the time of the stamps: a step of the system clock does not change it, ns."""
+        return time.monotonic_ns() + self.to_ros_ns
+
     def system_clock_step_ns(self) -> int:
         """How far the system clock has moved against CLOCK_MONOTONIC since the start, ns.
 
         Stamps do not follow it, because time would jump within a recording. The next start uses the new time.
         """
-        return time.time_ns() - time.monotonic_ns() - self.to_ros_ns
+        return time.time_ns() - self.now_ns()
 
     def _run(self) -> None:
         if self._rig.acquisition.realtime:
@@ -274,7 +281,13 @@ class Acquisition:
 
     def _silent(self, size: int, now: int) -> None:
         self.counters.silences += 1
-        what = 'bytes but no sample (is the baud rate right?)' if size else 'no sample'
+        what = 'no sample'
+        if size:
+            new = {reason: n - self._bad_told.get(reason, 0) for reason, n in self.counters.bad_frames.items()}
+            self._bad_told = dict(self.counters.bad_frames)
+            most = max(new, key=lambda reason: new[reason], default='')
+            why = f'{new[most]} bad frames: {most}' if most and new[most] else 'is the baud rate right?'
+            what = f'bytes but no sample ({why})'
         self._repeats.tell('silent', f'{self._name}: {what} for {SILENCE_S:g} s; still listening', now / 1e9)
         # It may have been stopped, by itself or by another program.
         self.source.wake()

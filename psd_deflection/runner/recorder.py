@@ -37,7 +37,7 @@ IDLE_S = 0.5
 LOOK_EVERY = 250
 """Messages between two checks of the file and of the room on its disk: half a second's worth."""
 
-ELSEWHERE = 'make room, or record elsewhere (parameter bag_dir)'
+ELSEWHERE = 'record elsewhere (parameter bag_dir)'
 
 QueuedMessage = tuple[str, str, bytes, int]
 Item = QueuedMessage | ParameterChange | None
@@ -257,7 +257,7 @@ class Recorder:
             folder = new_folder(Path(config.bag_dir).expanduser())
             missing = _missing_room(_nearest(folder), config.disk_reserve)
             if missing:
-                raise RecordingError(f'{folder}: {missing}; {ELSEWHERE}')
+                raise RecordingError(f'{folder}: {missing}; make room, or {ELSEWHERE}')
             try:
                 return BagWriter(
                     folder,
