@@ -16,9 +16,8 @@ from typing import Any
 
 from msg_adapters import DEFLECTION, LOAD, SAMPLES
 from psd_deflection.cli._progress import progress_of, told
-from psd_deflection.cli._report import LONGEST_LINE, print_json
+from psd_deflection.cli._report import print_json, show
 from psd_deflection.config import BY_NAME
-from psd_deflection.errors import printable
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 
@@ -109,9 +108,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(found, indent=2)
         return 0
-    for line in _lines(found):
-        # Names and values in a recording are a stranger's.
-        print(printable(line, LONGEST_LINE))
+    show(*_lines(found))
     return 0
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from psd_deflection import __version__
 from psd_deflection.cli._options import PICTURES, need_folder, picture_name
 from psd_deflection.cli._progress import progress_of, told
-from psd_deflection.cli._report import print_json, save, save_figure
+from psd_deflection.cli._report import print_json, save, save_figure, show
 from psd_deflection.config import Rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.monitor.spectrum import Spectrum
@@ -147,8 +147,8 @@ def run(args: argparse.Namespace) -> int:
         print_json({**figures(drawn, rig), 'out': str(out)})
         return 0
     for name, value in summary:
-        print(f'{name:<24} {value}')
-    print(f'written to {out}')
+        show(f'{name:<24} {value}')
+    show(f'written to {out}')
     return 0
 
 

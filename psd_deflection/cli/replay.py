@@ -12,7 +12,6 @@ anything differs. With --params-file another rig is used: what would it have mea
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +20,7 @@ import numpy as np
 
 from psd_deflection.cli._options import recording_name
 from psd_deflection.cli._progress import progress_of, told
-from psd_deflection.cli._report import print_json, warn
+from psd_deflection.cli._report import print_json, show, show_text, warn
 from psd_deflection.config import Rig
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.comparison import Comparison
@@ -111,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
     _print_summary(args, rig, pipeline, totals, seconds, comparison)
     if comparison is None:
         return 0
-    print(comparison.summary(), file=sys.stderr if args.json else sys.stdout)
+    show_text(comparison.summary(), aside=args.json)
     return 0 if comparison.same else DIFFERS
 
 
@@ -152,18 +151,18 @@ def _print_summary(
         }
         print_json(summary)
         return
-    print(
+    show(
         f'{args.recording}: {totals.samples} samples, {totals.lost} lost, {totals.blocks} blocks, '
         f'{counters.estimates} estimates ({rig.estimator.solver})'
     )
     for cause, count in sorted(counters.refused.items()):
-        print(f'  no estimate: {count} {"block" if count == 1 else "blocks"}, {cause.replace("_", " ")}')
+        show(f'  no estimate: {count} {"block" if count == 1 else "blocks"}, {cause.replace("_", " ")}')
     if len(poses):
         low, high = poses.min(axis=0), poses.max(axis=0)
-        print(
+        show(
             f'  ΔX {low[0] * 1e6:+.2f} … {high[0] * 1e6:+.2f} µm, ΔY {low[1] * 1e6:+.2f} … {high[1] * 1e6:+.2f} µm, '
             f'θ {np.rad2deg(low[2]) * 1e3:+.2f} … {np.rad2deg(high[2]) * 1e3:+.2f} mdeg'
         )
-    print(f'  {recorded_seconds:.1f} s of data in {seconds:.2f} s')
+    show(f'  {recorded_seconds:.1f} s of data in {seconds:.2f} s')
     if args.out is not None:
-        print(f'  written to {Path(args.out)}')
+        show(f'  written to {Path(args.out)}')
