@@ -79,7 +79,7 @@ class SolverError(PsdDeflectionError):
 class MachineError(PsdDeflectionError):
     """The operating system gives no more memory, or no further thread (``ulimit -v``, ``-u``, a container's limits).
 
-    Example: ``too little memory for this; see the limits of the shell, the container or the unit``.
+    Example: ``too little memory; see the limits of the shell (ulimit -v), the container or the unit``.
     """
 
     exit_status = 71

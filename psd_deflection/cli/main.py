@@ -152,12 +152,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _lack_of(error: MemoryError | RuntimeError) -> MachineError | None:
     """What the machine lacks, if that is what went wrong."""
     if isinstance(error, MemoryError):
-        what = 'too little memory for this'
-    elif str(error) == "can't start new thread":
-        what = 'the system gives no further thread'
-    else:
-        return None
-    return MachineError(f'{what}; see the limits of the shell (ulimit -a), the container or the unit')
+        return MachineError('too little memory; see the limits of the shell (ulimit -v), the container or the unit')
+    if str(error) == "can't start new thread":
+        return MachineError('no further thread; see the limits of the shell (ulimit -u, -v), the container or the unit')
+    return None
 
 
 def _tell(line: str) -> None:

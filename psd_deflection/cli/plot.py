@@ -26,7 +26,7 @@ from psd_deflection.cli._options import PICTURES, need_folder, picture_name
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, save, save_figure, show
 from psd_deflection.config import Rig
-from psd_deflection.errors import RecordingError
+from psd_deflection.errors import RecordingError, printable
 from psd_deflection.monitor.spectrum import Spectrum
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.recording import Recording
@@ -35,6 +35,9 @@ from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, 
 
 SPECTRUM_OF_S = 600.0
 """The spectrum is of the last ten minutes: it does not get better after that, only slower."""
+
+LONGEST_NAME = 200
+"""Characters of a recording's name in the figure."""
 
 COLORS = {'dx': '#0b6bcb', 'dy': '#c2570c', 'theta': '#0f7b4f', 'lost': '#c62828', 'quiet': '#5a6875'}
 
@@ -123,7 +126,8 @@ def run(args: argparse.Namespace) -> int:
     """Read, replay, draw."""
     # A name that is no text is shown as far as it is one.
     name, title = (
-        os.fsencode(n).decode(errors='replace') for n in (Path(args.recording).resolve().name, args.recording)
+        printable(os.fsencode(n).decode(errors='replace'), LONGEST_NAME)
+        for n in (Path(args.recording).resolve().name, args.recording)
     )
     out = Path(args.out) if args.out is not None else default_out(args.recording)
     need_folder(out)
