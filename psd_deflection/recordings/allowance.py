@@ -25,8 +25,9 @@ _UNPACKED_EACH = 100
 _OUTSIDE = 6
 """A record outside of any chunk counts as so many; a message or an index of one takes 31 bytes at least."""
 
+_DESCRIPTION = 4
 _BYTES_OF_TEXT = 100
-"""A schema, channel or metadata record counts as one record, and one more for each of so many bytes."""
+"""A schema, channel or metadata record counts as so many more, and one more for each of so many bytes."""
 
 
 class DamagedError(Exception):
@@ -62,7 +63,7 @@ class Allowance:
         """Allow for a schema, channel or metadata record of ``size`` bytes. Raises DamagedError."""
         if size > MAX_DESCRIPTION_BYTES:
             raise DamagedError(f'it has {size} bytes, more than {MAX_DESCRIPTION_BYTES}')
-        self.records -= size // _BYTES_OF_TEXT
+        self.records -= _DESCRIPTION + size // _BYTES_OF_TEXT
         self.check()
 
     def check(self) -> None:
