@@ -127,7 +127,9 @@ class HealthReporter:
         level, message = OK, f'skew {clock.skew_ppm:z.1f} ppm'
         if new.clock_jumps:
             level = WARN
-            message = f"the device's clock jumped or stood still: times were laid anew {new.clock_jumps} times"
+            message = (
+                f"the device's clock jumped or stood still: the time map was started again {new.clock_jumps} times"
+            )
         elif abs(clock.residual_ns) > OFF_NS:
             level = WARN
             off_ms = abs(clock.residual_ns) / 1e6
