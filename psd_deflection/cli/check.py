@@ -30,7 +30,7 @@ import numpy as np
 from psd_deflection.calibration import Wiring
 from psd_deflection.cli._options import given_parameters, in_the_world, parameter_option, refuse, world_option
 from psd_deflection.cli._progress import told
-from psd_deflection.cli._report import LONGEST_LINE, columns, print_json
+from psd_deflection.cli._report import LONGEST_LINE, columns, print_json, show
 from psd_deflection.commissioning.checkup import CANNOT_TELL, RIGHT, Checkup, check, line
 from psd_deflection.commissioning.guide import Guide
 from psd_deflection.commissioning.levels import levels
@@ -86,8 +86,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(as_json(found), indent=1)
         return 0
-    for text in (*title, *report(rig, found)):
-        print(printable(text, LONGEST_LINE))
+    show(*title, *report(rig, found))
     return 0
 
 
