@@ -89,15 +89,25 @@ class PsdConfig:
     zero: tuple[float, float] = parameter(
         (0.0, 0.0), 'm', 'dot on the unloaded link (x, y); ~/zero sets it', minimum=-0.5, maximum=0.5, live=True
     )
+    sensitivity: tuple[float, float] = parameter(
+        (0.0, 0.0), 'm/V', 'dot travel per volt on x and on y; 0: amplifier.sensitivity', minimum=0.0, maximum=1.0
+    )
+    noise: tuple[float, float] = parameter(
+        (0.0, 0.0), 'V', 'noise of x and of y, rms per sample; 0: amplifier.noise', minimum=0.0, maximum=10.0
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class AmplifierConfig:
     """The amplifier of both detectors."""
 
-    sensitivity: float = parameter(0.5e-3, 'm/V', 'dot travel per volt on x and y', above=0.0, maximum=1.0)
+    sensitivity: float = parameter(
+        0.5e-3, 'm/V', 'dot travel per volt on x and y, unless psd_N.sensitivity is set', above=0.0, maximum=1.0
+    )
     sum_nominal: float = parameter(5.0, 'V', 'sum signal with the laser on', above=0.0, maximum=100.0)
-    noise: float = parameter(2e-3, 'V', 'noise, rms per sample and channel', above=0.0, maximum=10.0)
+    noise: float = parameter(
+        2e-3, 'V', 'noise, rms per sample and channel, unless psd_N.noise is set', above=0.0, maximum=10.0
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -384,6 +394,16 @@ class Rig:
     def heights(self) -> FloatArray:
         """h_i, (number of PSDs,), m."""
         return np.array([p.height for p in self.psds], dtype=np.float64)
+
+    @property
+    def sensitivities(self) -> FloatArray:
+        """Dot travel per volt on x and y, (number of PSDs, 2), m/V."""
+        return np.array([[own or self.amplifier.sensitivity for own in p.sensitivity] for p in self.psds])
+
+    @property
+    def noises(self) -> FloatArray:
+        """Noise of x, y and sum, rms per sample, (number of PSDs, 3), V."""
+        return np.array([[own or self.amplifier.noise for own in (*p.noise, 0.0)] for p in self.psds])
 
 
 def rig_from_values(values: Mapping[str, object], source: str = 'parameters') -> Rig:

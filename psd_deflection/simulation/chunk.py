@@ -22,7 +22,7 @@ class Chunk:
     ``loads`` (3, n): Fx, Fy N, Tz N m. ``static`` (3, n): the pose these loads would settle at,
     without ``physics.static_offset``. ``pose`` (3, n): dX, dY m, theta rad. ``beams`` (4, n): l_1,
     l_2, m. ``true_dots`` (4, n): on the plate from the PSD centres. ``dots`` (4, n): as the PSDs
-    report them. ``sums`` (2, n), ``volts`` (6, n): V. ``noise``: V rms, when ``volts`` are to be the
+    report them. ``sums`` (2, n), ``volts`` (6, n): V. ``noise`` (6,): V rms, when ``volts`` are to be the
     mean over a noise that is not on them; 0 when they are samples as they are.
     """
 
@@ -37,4 +37,4 @@ class Chunk:
     dots: FloatArray = field(default_factory=_none)
     sums: FloatArray = field(default_factory=_none)
     volts: FloatArray = field(default_factory=_none)
-    noise: float = 0.0
+    noise: FloatArray = field(default_factory=lambda: np.zeros(6))

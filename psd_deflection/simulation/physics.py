@@ -18,7 +18,8 @@ class Physics:
     ``bending_stiffness`` EI, ``torsional_stiffness`` GJ, N m^2. ``clamp_bending`` and
     ``clamp_torsion``: clamp rotation per moment, rad/(N m). ``static_offset``: (dX, dY) of the
     link without load, m. ``slope_ratio``: k of phi = -k dY/L; 0 is the nominal, parallel planes.
-    ``beams``: l_i. ``half_area``: half width and height of the active areas.
+    ``beams``: l_i. ``half_area``: half width and height of the active areas. ``noise`` (6,), V rms
+    of each channel.
     """
 
     period: float
@@ -37,9 +38,9 @@ class Physics:
     beams: FloatArray
     heights: FloatArray
     half_area: FloatArray
-    sensitivity: float
+    sensitivity: FloatArray
     sum_nominal: float
-    noise: float
+    noise: FloatArray
     volts_per_count: float
     full_scale: float
 
@@ -63,9 +64,9 @@ class Physics:
             beams=rig.centers + rig.zeros,
             heights=rig.heights,
             half_area=0.5 * np.array([p.active_area for p in rig.psds], dtype=np.float64),
-            sensitivity=rig.amplifier.sensitivity,
+            sensitivity=rig.sensitivities,
             sum_nominal=rig.amplifier.sum_nominal,
-            noise=rig.amplifier.noise,
+            noise=rig.noises.ravel(),
             volts_per_count=rig.converter.volts_per_count,
             full_scale=rig.converter.full_scale,
         )

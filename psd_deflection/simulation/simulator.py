@@ -96,7 +96,7 @@ class ForwardModel:
         self._at('dots', chunk)
         chunk.volts = np.empty((6, n))
         for psd in range(2):
-            chunk.volts[3 * psd : 3 * psd + 2] = chunk.dots[2 * psd : 2 * psd + 2] / p.sensitivity
+            chunk.volts[3 * psd : 3 * psd + 2] = chunk.dots[2 * psd : 2 * psd + 2] / p.sensitivity[psd, :, None]
             chunk.volts[3 * psd + 2] = chunk.sums[psd]
         self._at('volts', chunk)
         return chunk

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_variances
 from psd_deflection.config import load_rig
 from psd_deflection.devices.serve import served_loads
 from psd_deflection.errors import RecordingError
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation import loads
+from psd_deflection.simulation.catalogue import make_active
 from psd_deflection.simulation.modes import Filter, mode_coefficients
 from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
 
@@ -125,3 +127,35 @@ def test_bad_load_file_is_refused_by_line(tmp_path: Path, text: str, said: str) 
         loads.from_csv(path)
     assert 'loads.csv' in str(error.value)
     assert said in str(error.value)
+
+
+OWN = {
+    'psd_1.noise': [1e-3, 2e-3],
+    'psd_2.noise': [4e-3, 3e-3],
+    'psd_1.sensitivity': [1e-3, 0.0],
+    'psd_2.sensitivity': [0.0, 0.25e-3],
+}
+
+
+def test_each_channel_has_its_own_noise_and_sensitivity() -> None:
+    rig = load_rig(overrides=OWN)
+    step = RigSimulator(rig, seed=4).step(loads.constant((3.0, -5.0, 1.0), 20.0).loads)
+    volts = counts_to_volts(step.counts, rig.converter.volts_per_count)
+    error = Calibration.from_rig(rig).dots(volts) - step.dots
+    assert np.abs(error.mean(axis=0)).max() < 1e-7
+    np.testing.assert_allclose(error.var(axis=0), dot_noise_variances(rig), rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ('name', 'values'),
+    [('quantisation', {'step': 0.01}), ('quantisation', {'step': 0.04}), ('amplifier_saturation', {'limit': 0.4})],
+)
+def test_the_mean_over_the_noise_is_over_each_channels_own(name: str, values: dict[str, float]) -> None:
+    history = loads.constant((3.0, -5.0, 1.0), 0.3).loads
+    effects = [make_active(name, values, 'test')]
+    mixed = ForwardModel(load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [4e-3, 2e-3]}), effects)
+    volts = mixed.expect(history).volts
+    for row, noise in enumerate((1e-3, 2e-3, 2e-3, 4e-3, 2e-3, 2e-3)):
+        same = ForwardModel(load_rig(overrides={'amplifier.noise': noise}), effects).expect(history).volts
+        assert (volts[row] == same[row]).all()
+        assert row in (1, 2, 4, 5) or (same[row] != ForwardModel(load_rig(), effects).expect(history).volts[row]).any()
