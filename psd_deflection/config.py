@@ -172,6 +172,13 @@ class EstimatorConfig:
         choices=('widen', 'refuse', 'report'),
         before='report',
     )
+    wrench: str = parameter(
+        'effects',
+        '',
+        'link behind /link_tip/wrench: with the effects of the rig file (stiffness, clamp, load ...), or nominal',
+        choices=('effects', 'nominal'),
+        before='nominal',
+    )
     splitter: bool = parameter(
         False, '', 'both detectors share two lasers over a beam splitter (thesis 5.4): one lost halves both sums'
     )

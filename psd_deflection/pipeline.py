@@ -5,9 +5,9 @@ calls, so ``replay`` reproduces it bit for bit. The steps are: counts -> volts -
 metres -> correction of the effects in the rig file -> health checks -> solvers -> estimates, and
 the tip load that the link model computes from them.
 
-It has some state from block to block: the twist that ``degraded: hold`` keeps, and for how long a
-detector's values have not changed. When a recording starts, this state is written as a record
-(:meth:`Pipeline.memory`).
+It has some state from block to block: the twist that ``degraded: hold`` keeps, for how long a
+detector's values have not changed, and what effects of the link remember of past loads. When a
+recording starts, this state is written as a record (:meth:`Pipeline.memory`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from psd_deflection.calibration.health import OpticsHealth, Verdict
 from psd_deflection.config import ZEROS, Rig, replace_values
 from psd_deflection.correction import Correction
 from psd_deflection.geometry import Geometry
-from psd_deflection.mechanics import LinkStatics
 from psd_deflection.records import (
     ENVIRONMENT,
     BlockStatus,
@@ -39,6 +38,8 @@ from psd_deflection.records import (
     SpotMeans,
     TipLoad,
 )
+from psd_deflection.simulation.catalogue import effects_of_rig
+from psd_deflection.simulation.tip_load import TipLoads
 from psd_deflection.solvers import solver_from_rig
 from psd_deflection.solvers.interface import Solution, SolverStatus
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
@@ -50,7 +51,7 @@ ZERO_BLOCKS = 25
 """Number of blocks that :meth:`Pipeline.zero` averages: half a second."""
 
 START, FIRST_TEMPERATURE, TEMPERATURE = ENVIRONMENT
-HELD, FROZEN = 'state.held_twist', 'state.frozen_blocks'
+HELD, FROZEN, TIP_LOADS = 'state.held_twist', 'state.frozen_blocks', 'state.tip_loads'
 REMEMBERED = (NOISE, FIT, HELD_RESIDUAL)
 """Names of the values in the record of :meth:`Pipeline.memory`."""
 
@@ -95,7 +96,7 @@ class Pipeline:
         config = rig.estimator
         self._cutter = BlockCutter(config.block_size)
         self._period_ns = 1e9 / rig.converter.sample_rate_hz
-        self._statics = LinkStatics.from_rig(rig)
+        self.tip_loads = TipLoads(rig, effects_of_rig(rig) if config.wrench == 'effects' else ())
         self._recent: list[Dots] = []
         self._environment: dict[str, float] = {}
         self._held: _Held | None = None
@@ -177,12 +178,16 @@ class Pipeline:
             value = values.pop(name, None)
             if isinstance(value, (int, float)):
                 self._environment[name] = float(value)
-        held, frozen = values.pop(HELD, None), values.pop(FROZEN, None)
+        held, frozen, loads = values.pop(HELD, None), values.pop(FROZEN, None), values.pop(TIP_LOADS, None)
         told = {name: tuple(v) for name in REMEMBERED if isinstance(v := values.pop(name, None), list)}
         if isinstance(held, list) and len(held) == 3:
             self._held = _Held(int(held[0]), held[1], held[2])
         if isinstance(frozen, list) and len(frozen) == 2:
             self._frozen = (int(frozen[0]), int(frozen[1]))
+        if any(name in ZEROS for name in values):
+            self.tip_loads.zeroed = True
+        if isinstance(loads, list):
+            self.tip_loads.restore(tuple(loads))
         if values:
             self._build(replace_values(self.rig, values, 'change'))
             self.stamped.set_zeros(self.rig)
@@ -202,6 +207,8 @@ class Pipeline:
             values.append((HELD, tuple(self._held)))
         if self._frozen != (0, 0):
             values.append((FROZEN, self._frozen))
+        if loads := self.tip_loads.memory():
+            values.append((TIP_LOADS, loads))
         if self.last_spots is not None:
             values += self.stamped.memory().items()
         if not values:
@@ -274,8 +281,7 @@ class Pipeline:
             self.counters.degraded += degraded
             yield best
         if best is not None and not degraded:
-            fx, fy, tz = self._statics.tip_load(best.dx, best.dy, best.theta)
-            yield TipLoad(t_ns, fx, fy, tz)
+            yield TipLoad(t_ns, *self.tip_loads.tip_load(block.index, best.dx, best.dy, best.theta))
             # The zero must not be a mean across an outage.
             last = self.last_spots
             if last is not None and t_ns - last.t_ns > ZERO_BLOCKS * size * self._period_ns:

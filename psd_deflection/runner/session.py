@@ -90,6 +90,7 @@ class Session:
                 if about:
                     say(about)
                     pipeline = Pipeline(rig)
+                    pipeline.tip_loads.zeroed = self._store.loaded
             say('; '.join(f'{name}: {what}' for name, what in self.acquisition.source.describe().items()))
             self.processing = Processing(self.acquisition.queue, pipeline, say)
             self.recorder = Recorder(rig.acquisition.queue_blocks, say, self.processing.request)

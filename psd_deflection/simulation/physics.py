@@ -72,15 +72,18 @@ class Physics:
         )
 
     @property
-    def _statics(self) -> LinkStatics:
-        return LinkStatics(self.length, self.bending_stiffness, self.torsional_stiffness)
+    def statics(self) -> LinkStatics:
+        """The link with these constants."""
+        return LinkStatics(
+            self.length, self.bending_stiffness, self.torsional_stiffness, self.clamp_bending, self.clamp_torsion
+        )
 
     @property
     def force_compliance(self) -> float:
-        """Tip deflection per force at the tip, m/N: L^3/3EI, plus the clamp's rotation by F L times L."""
-        return self._statics.deflection(1.0, 0.0, 0.0)[0] + self.clamp_bending * self.length**2
+        """Tip deflection per force at the tip, m/N."""
+        return self.statics.deflection(1.0, 0.0, 0.0)[0]
 
     @property
     def torque_compliance(self) -> float:
-        """Twist per torque, rad/(N m): L/GJ plus the clamp's compliance."""
-        return self._statics.deflection(0.0, 0.0, 1.0)[2] + self.clamp_torsion
+        """Twist per torque, rad/(N m)."""
+        return self.statics.deflection(0.0, 0.0, 1.0)[2]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from psd_deflection.simulation.chunk import Chunk
-from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
 from psd_deflection.simulation.modes import Filter, mode_coefficients
 from psd_deflection.simulation.physics import Physics
 
@@ -28,6 +28,12 @@ def _apply(chunk: Chunk, values: Values, state: State) -> None:
         elif values['shares'] == 2:
             ringing = ringing - chunk.static[row]
         chunk.pose[row] += values['gain'] * ringing
+
+
+def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:
+    if values['shares'] == 0:
+        block.pose[0] /= 1.0 + values['gain']
+        block.pose[1] /= 1.0 + values['gain']
 
 
 EFFECT = Effect(
@@ -68,4 +74,5 @@ EFFECT = Effect(
     ),
     point='pose',
     apply=_apply,
+    trace_back=_trace_back,
 )
