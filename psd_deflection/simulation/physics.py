@@ -19,7 +19,7 @@ class Physics:
     ``clamp_torsion``: clamp rotation per moment, rad/(N m). ``static_offset``: (dX, dY) of the
     link without load, m. ``slope_ratio``: k of phi = -k dY/L; 0 is the nominal, parallel planes.
     ``beams``: l_i. ``half_area``: half width and height of the active areas. ``noise`` (6,), V rms
-    of each channel.
+    of each channel. ``phase``: how long after each sample the quantities are taken, below ``period``, s.
     """
 
     period: float
@@ -43,6 +43,7 @@ class Physics:
     noise: FloatArray
     volts_per_count: float
     full_scale: float
+    phase: float = 0.0
 
     @classmethod
     def of(cls, rig: Rig) -> Physics:

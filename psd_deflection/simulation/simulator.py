@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -41,18 +42,22 @@ class SimulatedChunk:
 class ForwardModel:
     """The stages without noise and converter; keeps its state between calls.
 
-    ``effects``: the active effects; by default those of the rig file.
+    ``effects``: the active effects; by default those of the rig file. ``phase``: quantities are taken this
+    long after each sample, s.
     """
 
-    def __init__(self, rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> None:
+    def __init__(self, rig: Rig, effects: Sequence[ActiveEffect] | None = None, phase: float = 0.0) -> None:
         self.effects = tuple(effects_of_rig(rig) if effects is None else effects)
         self.physics = Physics.of(rig)
+        self.physics.phase = phase
+        self._rig = rig
+        self._between: dict[tuple[int, float], ForwardModel] = {}
         for active in self.effects:
             if active.effect.configure is not None:
                 active.effect.configure(self.physics, active.values)
         p = self.physics
-        bending = mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period)
-        torsion = mode_coefficients(p.torsion_frequency, p.torsion_damping_ratio, p.period)
+        bending = mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period, phase)
+        torsion = mode_coefficients(p.torsion_frequency, p.torsion_damping_ratio, p.period, phase)
         self._modes = (
             Filter(bending, float(p.static_offset[0])),
             Filter(bending, float(p.static_offset[1])),
@@ -75,6 +80,8 @@ class ForwardModel:
                 self._first_temperature = float(temperature[0])
             warmer = temperature - self._first_temperature
         t = np.arange(self._count, self._count + n, dtype=np.float64) * p.period
+        if p.phase > 0.0:
+            t += p.phase
         self._count += n
         chunk = Chunk(t, warmer, np.array(np.asarray(loads, dtype=np.float64).T, order='C'), p)
         self._at('load', chunk)
@@ -98,8 +105,22 @@ class ForwardModel:
         for psd in range(2):
             chunk.volts[3 * psd : 3 * psd + 2] = chunk.dots[2 * psd : 2 * psd + 2] / p.sensitivity[psd, :, None]
             chunk.volts[3 * psd + 2] = chunk.sums[psd]
-        self._at('volts', chunk)
+        for i, active in enumerate(self.effects):
+            if active.effect.point == 'volts':
+                chunk.between = partial(self._volts_between, i, chunk, loads, temperature)
+                self._apply(i, chunk)
         return chunk
+
+    def _volts_between(
+        self, before: int, chunk: Chunk, loads: FloatArray, temperature: FloatArray | None, phase: float
+    ) -> FloatArray:
+        """The volts (6, n) ``phase`` s after each sample, by the effects before effect number ``before``."""
+        if phase == self.physics.phase:
+            return chunk.volts.copy()
+        key = (before, phase)
+        if key not in self._between:
+            self._between[key] = ForwardModel(self._rig, self.effects[:before], phase)
+        return self._between[key].run(loads, temperature).volts
 
     def finish(self, chunk: Chunk) -> None:
         """Apply the effects that act on the noisy signal: clipping and coarse steps."""
@@ -118,9 +139,14 @@ class ForwardModel:
         return chunk
 
     def _at(self, point: str, chunk: Chunk) -> None:
-        for active, state in zip(self.effects, self._states, strict=True):
-            if active.effect.point == point and active.effect.apply is not None:
-                active.effect.apply(chunk, active.values, state)
+        for i, active in enumerate(self.effects):
+            if active.effect.point == point:
+                self._apply(i, chunk)
+
+    def _apply(self, number: int, chunk: Chunk) -> None:
+        active = self.effects[number]
+        if active.effect.apply is not None:
+            active.effect.apply(chunk, active.values, self._states[number])
 
 
 class RigSimulator:

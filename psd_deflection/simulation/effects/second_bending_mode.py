@@ -20,8 +20,9 @@ def _apply(chunk: Chunk, values: Values, state: State) -> None:
         key = str(row)
         if key not in state:
             p = chunk.physics
-            state[key] = Filter(mode_coefficients(values['frequency'], values['damping_ratio'], p.period))
-            state['first' + key] = Filter(mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period))
+            state[key] = Filter(mode_coefficients(values['frequency'], values['damping_ratio'], p.period, p.phase))
+            first = mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period, p.phase)
+            state['first' + key] = Filter(first)
         ringing = state[key](chunk.static[row])
         if values['shares'] == 1:
             ringing = ringing - state['first' + key](chunk.static[row])
