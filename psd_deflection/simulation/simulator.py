@@ -52,6 +52,7 @@ class ForwardModel:
         self.physics.phase = phase
         self._rig = rig
         self._between: dict[tuple[int, float], ForwardModel] = {}
+        self._asked: dict[tuple[int, float], FloatArray] = {}
         for active in self.effects:
             if active.effect.configure is not None:
                 active.effect.configure(self.physics, active.values)
@@ -83,6 +84,7 @@ class ForwardModel:
         if p.phase > 0.0:
             t += p.phase
         self._count += n
+        self._asked = {}
         chunk = Chunk(t, warmer, np.array(np.asarray(loads, dtype=np.float64).T, order='C'), p)
         self._at('load', chunk)
         chunk.static = np.empty((3, n))
@@ -120,7 +122,9 @@ class ForwardModel:
         key = (before, phase)
         if key not in self._between:
             self._between[key] = ForwardModel(self._rig, self.effects[:before], phase)
-        return self._between[key].run(loads, temperature).volts
+        if key not in self._asked:
+            self._asked[key] = self._between[key].run(loads, temperature).volts
+        return self._asked[key].copy()
 
     def finish(self, chunk: Chunk) -> None:
         """Apply the effects that act on the noisy signal: clipping and coarse steps."""
