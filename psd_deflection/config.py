@@ -223,6 +223,14 @@ class EstimatorConfig:
         name='wls.weights',
         choices=('inverse_variance', 'thesis'),
     )
+    minimum_tilt_angles: str = parameter(
+        'rotation',
+        '',
+        "what minimum_tilt publishes: twist and tilts of one rotation, or the base line's azimuth as the twist",
+        name='minimum_tilt.angles',
+        choices=('rotation', 'azimuth'),
+        before='azimuth',
+    )
     wls_row_scaling: tuple[float, float, float, float] = parameter(
         (0.03, 0.5, 10.0, 0.1),
         '',

@@ -103,11 +103,11 @@ def test_the_sag_is_in_a_zero_that_was_taken() -> None:
 
 def test_a_recording_from_before_has_the_mean_and_the_rig_files_noise() -> None:
     named = dict(load_rig().values)
-    for name in ('block_fit', 'covariance', 'consistency', 'wrench'):
+    for name in ('block_fit', 'covariance', 'consistency', 'wrench', 'minimum_tilt.angles'):
         del named[name]
     then = rig_as_recorded(named, 'test').estimator
     assert (then.block_fit, then.covariance, then.consistency) == ('mean', 'file', 'report')
-    assert then.wrench == 'nominal'
+    assert (then.wrench, then.minimum_tilt_angles) == ('nominal', 'azimuth')
     # What it does name stays, and a recording that names nothing has today's defaults.
     assert rig_as_recorded({**named, 'covariance': 'measured'}, 'test').estimator.covariance == 'measured'
     assert rig_as_recorded({}, 'test').estimator == load_rig().estimator
