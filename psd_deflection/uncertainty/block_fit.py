@@ -46,7 +46,7 @@ _MISFIT = 5.0
 _ANY = 1e30
 """m^2: nothing is known of order 0 beforehand."""
 
-_LARGEST = 64
+LARGEST = 64
 """Samples a block up to which the colour of the noise makes the weights; of larger ones it makes the variance alone."""
 
 _ORDERS = np.arange(ORDER + 1)
@@ -87,6 +87,33 @@ def combinations(beams: FloatArray) -> FloatArray:
     return np.asarray(rows * 0.5**0.5)
 
 
+class _Terms(NamedTuple):
+    """What the samples that are present say of the coefficients, for K orders of which ``len(v[0])`` can be told.
+
+    ``q`` (n, K). ``precision`` (4, n, n). ``u`` (4, n, K): precision times q. ``information`` (4, K, K): of the
+    coefficients; ``inverse`` (4, k, k) and ``v`` (4, k): covariance and variances of the first k.
+    ``all`` (4, n, K + k + n): u, u times inverse, precision.
+    """
+
+    q: FloatArray
+    u: FloatArray
+    information: FloatArray
+    inverse: FloatArray
+    v: FloatArray
+    all: FloatArray
+
+
+def _terms(q: FloatArray, precision: FloatArray) -> _Terms:
+    samples, orders = q.shape
+    told = min(orders, max(samples // 2, 1))
+    u = np.einsum('ast,tk->ask', precision, q)
+    information = np.einsum('sj,ask->ajk', q, u)
+    inverted = inverse(information[:, :told, :told])
+    v = np.einsum('akk->ak', inverted).copy()
+    estimate = np.einsum('ask,akj->asj', u[:, :, :told], inverted)
+    return _Terms(q, u, information, inverted, v, np.concatenate((u, estimate, precision), axis=2))
+
+
 class BlockFit:
     """Fits block after block; see the module's text. It remembers how much motion there was."""
 
@@ -123,12 +150,9 @@ class BlockFit:
         whole[:, :, self._fft - self._size + 1 :] = turned.transpose(1, 0, 2)[:, :, :0:-1]
         self._spectrum = np.fft.fft(whole)[:, :, : self._fft // 2 + 1] * self._folds
         own = turned[range(4), range(4)]
-        self._precision = _precision(own, white=not self._poly or self._size > _LARGEST)
-        self._u = np.einsum('ast,tk->ask', self._precision, self._q)
-        self._information = np.einsum('sj,ask->ajk', self._q, self._u)
-        self._inverse = inverse(self._information)
-        self._v = np.einsum('akk->ak', self._inverse).copy()
-        f = np.fft.rfft(self._u, self._fft, axis=1)
+        self._precision = _precision(own, white=not self._poly or self._size > LARGEST)
+        self._whole = _terms(self._q, self._precision)
+        f = np.fft.rfft(self._whole.u, self._fft, axis=1)
         self._of_whole = np.einsum('afk,abf,bfj->akbj', f, self._spectrum, np.conj(f)).real
 
     def fit(self, slots: IntArray, dots: FloatArray) -> Fitted:
@@ -140,57 +164,42 @@ class BlockFit:
         offset = z.sum(axis=1) / len(slots)
         z -= offset[:, None]
         whole = len(slots) == self._size
-        if whole:
-            q, precision, u, information, inverted, v = (
-                self._q,
-                self._precision,
-                self._u,
-                self._information,
-                self._inverse,
-                self._v,
-            )
-        else:
-            q = self._q[slots]
-            precision = self._without(slots)
-            u = np.einsum('ast,tk->ask', precision, q)
-            information = np.einsum('sj,ask->ajk', q, u)
-            inverted = inverse(information)
-            v = np.einsum('akk->ak', inverted)
-        h = np.einsum('ask,as->ak', u, z)
-        c = np.einsum('akj,aj->ak', inverted, h)
-        if self._orders > 1:
-            motion = self._motion(c, v)
+        terms = self._whole if whole else _terms(self._q[slots], self._without(slots))
+        orders, told = self._orders, terms.v.shape[1]
+        seen = np.einsum('asj,as->aj', terms.all, z)
+        h, c, weighted = seen[:, :orders], seen[:, orders : orders + told], seen[:, orders + told :]
+        x = np.zeros((4, orders))
+        motion = None
+        if orders > 1:
+            motion = self._motion(c, terms.v)
             # In a whole block odd orders are 0 in the middle and uncorrelated with even ones.
             step = 2 if whole else 1
-            known = information[:, ::step, ::step].copy()
-            diagonal = _ORDERS[: known.shape[1]]
-            known[:, diagonal, diagonal] += 1.0 / motion[:, ::step]
-            x = np.zeros((4, self._orders))
-            x[:, ::step] = (inverse(known) * self._middle[::step]).sum(axis=2)
+            known = terms.information[:, :told:step, :told:step].copy()
+            np.einsum('akk->ak', known)[:] += 1.0 / motion[:, :told:step]
+            x[:, :told:step] = _solved(known, self._middle[:told:step])
         else:
-            motion = v
-            x = inverted[:, :, 0] * self._middle
-        value = np.einsum('ak,ak->a', x, h) + offset
+            x[:, 0] = terms.inverse[:, 0, 0] * self._middle[0]
+        value = (x * h).sum(axis=1) + offset
         if whole:
             covariance = np.einsum('ak,akb->ab', x, np.einsum('akbj,bj->akb', self._of_whole, x))
         else:
             weights = np.zeros((4, self._size))
-            weights[:, slots] = np.einsum('ask,ak->as', u, x)
+            weights[:, slots] = np.einsum('ask,ak->as', terms.u, x)
             covariance = self._spread(weights)
         misfit = False
-        left = len(slots) - self._orders
-        if self._orders > 1 and left > 0:
-            missed = self._middle - np.einsum('akj,aj->ak', information, x)
+        left = len(slots) - told
+        if motion is not None and left > 0:
+            missed = self._middle - np.einsum('akj,aj->ak', terms.information, x)
             missed[:, 0] = 0.0
-            more = np.einsum('ak,ak->a', missed * missed, motion)
+            more = (missed * missed * motion).sum(axis=1)
             # In units of the noise: a chi-square of n - K degrees of freedom.
-            squares = np.einsum('as,as->a', z, np.einsum('ast,at->as', precision, z)) - np.einsum('ak,ak->a', h, c)
+            squares = (z * weighted).sum(axis=1) - (h[:, :told] * c).sum(axis=1)
             outside = squares > left + _MISFIT * (2.0 * left) ** 0.5
             misfit = bool(outside.any())
             if misfit:
-                rest = z - np.einsum('sk,ak->as', q, c)
+                rest = z - np.einsum('sk,ak->as', terms.q[:, :told], c)
                 more += np.where(outside, _WIDEN**2 * (rest * rest).sum(axis=1) / left, 0.0)
-            covariance[_ORDERS[:4], _ORDERS[:4]] += more
+            np.einsum('aa->a', covariance)[:] += more
         # Back from the length to the part along the base line at rest.
         length, across = float(value[3]) + self._base_line, float(value[2]) + self._across
         along = max(length * length - across * across, 1e-4 * length * length) ** 0.5
@@ -229,16 +238,24 @@ class BlockFit:
         )
 
     def _motion(self, c: FloatArray, v: FloatArray) -> FloatArray:
-        """tau^2 (4, K) after this block; infinite for order 0, of which nothing is known beforehand."""
+        """tau^2 (4, K) after this block; infinite for order 0, of which nothing is known beforehand.
+
+        ``c``, ``v`` (4, k): coefficients and their variances of the orders that this block tells of.
+        """
+        own = self._whole.v
+        told = v.shape[1]
+        squares, weight = self._squares[:, :told], self._weight[:, :told]
         excess = c * c - v
         # A block with gaps says less the more noise its coefficients have.
-        sure = np.minimum(self._v / v, 1.0) ** 2
-        self._squares += _FORGET * (sure * excess - self._squares)
-        self._weight += _FORGET * (sure - self._weight)
-        tau = np.maximum(self._squares / np.maximum(self._weight, 1e-3) - _BIAS * self._v, 0.0)
-        tau = np.where(c * c > _SUDDEN * (v + tau), np.maximum(excess, tau), tau)
+        sure = np.minimum(own[:, :told] / v, 1.0) ** 2
+        squares += _FORGET * (sure * excess - squares)
+        weight += _FORGET * (sure - weight)
+        tau = np.maximum(self._squares / np.maximum(self._weight, 1e-3) - _BIAS * own, own * 1e-9)
+        tau[:, :told] = np.where(
+            c * c > _SUDDEN * (v + tau[:, :told]), np.maximum(excess, tau[:, :told]), tau[:, :told]
+        )
         tau[:, 0] = _ANY
-        return np.asarray(np.maximum(tau, self._v * 1e-9))
+        return tau
 
     def _spread(self, weights: FloatArray) -> FloatArray:
         """Covariance (4, 4) of the weighted sums; ``weights`` (4, N)."""
@@ -262,6 +279,22 @@ def inverse(matrices: FloatArray) -> FloatArray:
         out[:, :, i] = -column * pivot[:, None]
         out[:, i, i] = pivot
     return out
+
+
+def _solved(matrices: FloatArray, right: FloatArray) -> FloatArray:
+    """x (n, k) of ``matrices`` (n, k, k), positive definite, times x = ``right`` (k,); ``matrices`` are used up."""
+    count, size, _ = matrices.shape
+    x = np.empty((count, size))
+    x[:] = right
+    for i in range(size - 1):
+        factor = matrices[:, i + 1 :, i] / matrices[:, i, i, None]
+        matrices[:, i + 1 :, i + 1 :] -= factor[:, :, None] * matrices[:, i, None, i + 1 :]
+        x[:, i + 1 :] -= factor * x[:, i, None]
+    for i in range(size - 1, -1, -1):
+        if i < size - 1:
+            x[:, i] -= (matrices[:, i, i + 1 :] * x[:, i + 1 :]).sum(axis=1)
+        x[:, i] /= matrices[:, i, i]
+    return x
 
 
 def _precision(gamma: FloatArray, white: bool) -> FloatArray:

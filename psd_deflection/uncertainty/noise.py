@@ -25,7 +25,7 @@ from math import exp, pi
 import numpy as np
 
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.uncertainty.block_fit import basis, combinations, inverse
+from psd_deflection.uncertainty.block_fit import LARGEST, basis, combinations, inverse
 
 SEGMENT_BLOCKS = 50
 """Blocks of one segment: a second at 50 blocks a second."""
@@ -36,8 +36,21 @@ STATED_SEGMENTS = 2
 _LEAST_SHARE = 0.5
 """A segment of which fewer samples are present tells nothing."""
 
+_PAIRS = 0.4
+"""Least share of pairs of samples that are both present, of the samples that are."""
+
+_SHARES = (0.0, 0.03, 0.1, 0.3, 1.0)
+"""Parts of the sure autocovariance that are tried."""
+
 _LONGEST = 20
 """Segments that the running mean remembers."""
+
+_OWN_SHARE = 1e-3
+"""Share of the loudest reading's variance that each reading has for itself: readings that say the same leave no
+combination without noise, which nothing could be weighted by."""
+
+_LEAST = 1e-24
+"""m^2: (1 pm)^2. A stream of constant numbers has that much noise too."""
 
 _MOTION = 4.0
 """Times more variance of the block means than roughness explains: motion. Chance does it once in 10^6."""
@@ -176,17 +189,18 @@ class StreamNoise:
         series = np.column_stack((dots, fixed))
         lags = _autocovariance(places, series, SEGMENT_BLOCKS * size, size)
         # Mean and slope of the segment were taken off, and with them 2 of its 50 blocks' variance.
-        lags += np.einsum('cdl,l->cd', lags, self._mean_of)[:, :, None] * (2.0 / (SEGMENT_BLOCKS - 2))
+        taken = np.einsum('cdl,l->cd', lags, self._mean_of)
+        lags += (taken + taken.T)[:, :, None] / (SEGMENT_BLOCKS - 2)
         self._seen += 1
         rough = _roughness(places, np.column_stack((np.einsum('sc,ac->sa', dots, self._turn[:3]), series)), self._q)
-        self._judge(lags[:4, :4], lags[4, 4], rough + self._step**2 / 12.0)
+        self._judge(lags[:4, :4], lags[4, 4], rough + (self._step**2 / 12.0 + _LEAST))
         self.gamma = self._in_use()
         return True
 
     def _judge(self, gamma: FloatArray, fixed: FloatArray, rough: FloatArray) -> None:
         """``rough`` (8,): of three combinations, four readings and the one that does not move, m^2."""
         turned = np.einsum('ac,cdl,ad->al', self._turn[:3], gamma, self._turn[:3])
-        least = self._step**2 / 12.0
+        least = self._step**2 / 12.0 + _LEAST
         means = turned @ self._mean_of + least / self._size
         fixed_mean = float(fixed @ self._mean_of) + least / self._size
         fixed_rough = float(rough[7])
@@ -256,7 +270,10 @@ def _roughness(places: IntArray, series: FloatArray, q: FloatArray) -> FloatArra
 
 
 def _autocovariance(places: IntArray, series: FloatArray, length: int, lags: int) -> FloatArray:
-    """(c, c, lags) of ``series`` (n, c) at ``places`` (n,) below ``length``, less mean and slope; gaps are left out."""
+    """(c, c, lags) of ``series`` (n, c) at ``places`` (n,) below ``length``, less mean and slope; gaps are left out.
+
+    It is that of the first c - 1 together and that of the last: neither gives a weighted sum a negative variance.
+    """
     at = places - places.sum() / len(places)
     centred = series - series.sum(axis=0) / len(series)
     centred -= at[:, None] * (np.einsum('t,tc->c', at, centred) / float((at * at).sum()))
@@ -268,7 +285,41 @@ def _autocovariance(places: IntArray, series: FloatArray, length: int, lags: int
     pairs = np.fft.irfft(np.conj(spectra[:count, None]) * spectra[None, :count])[:, :, :lags]
     present = np.fft.irfft(np.abs(spectra[count]) ** 2)[:lags]
     # Where two samples are never that far apart, nothing is known: taken as independent.
-    return np.asarray(np.where(present > 0.5, pairs / np.maximum(present, 1.0), 0.0))
+    each = np.where(present > 0.5, pairs / np.maximum(present, 1.0), 0.0)
+    # Products with 0 for what is absent are those of a covariance whatever the samples are, and stay so over one
+    # divisor: that of the lag at which gaps cost most, so that none is too small.
+    whole = present / (1.0 - np.arange(lags) / length)
+    sure = pairs / max(float(whole.min()), _PAIRS * float(whole[0]))
+    out = np.zeros_like(pairs)
+    for part in (slice(0, count - 1), slice(count - 1, count)):
+        out[part, part] = _covariance(each[part, part], sure[part, part])
+    return out
+
+
+def _covariance(each: FloatArray, sure: FloatArray) -> FloatArray:
+    """The autocovariance (c, c, N) ``each``, and as much of ``sure`` as makes the covariance of N samples of it."""
+    count, _, size = each.shape
+    own = _OWN_SHARE * float(each[range(count), range(count), 0].max()) + _LEAST
+    for share in _SHARES if size <= LARGEST else (1.0,):
+        mixed = each + share * (sure - each)
+        mixed[range(count), range(count), 0] += own
+        if share == 1.0 or _positive(mixed):
+            break
+    return mixed
+
+
+def _positive(gamma: FloatArray) -> bool:
+    """Whether no weighted sum of N samples of each reading has a variance of 0 or below, by elimination."""
+    count, _, size = gamma.shape
+    both = np.concatenate((gamma.transpose(1, 0, 2)[:, :, :0:-1], gamma), axis=2)
+    lags = np.arange(size) - np.arange(size)[:, None] + size - 1
+    left = both[:, :, lags].transpose(0, 2, 1, 3).reshape(count * size, count * size)
+    for _ in range(count * size):
+        pivot = float(left[0, 0])
+        if not pivot > 0.0:
+            return False
+        left = left[1:, 1:] - left[1:, :1] * (left[:1, 1:] / pivot)
+    return True
 
 
 def _undithered(variance: float, step: float) -> float:
