@@ -223,6 +223,13 @@ class EstimatorConfig:
         name='wls.weights',
         choices=('inverse_variance', 'thesis'),
     )
+    base_pair_assume: str = parameter(
+        'beam',
+        '',
+        'what base_pair assumes: tilts that follow the deflection (beam), or no twist (needs two planes)',
+        name='base_pair.assume',
+        choices=('beam', 'no_twist'),
+    )
     minimum_tilt_angles: str = parameter(
         'rotation',
         '',

@@ -44,6 +44,7 @@ from psd_deflection.solvers import solver_from_rig
 from psd_deflection.solvers.interface import Solution, SolverStatus
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 from psd_deflection.solvers.one_psd import OnePsd
+from psd_deflection.solvers.registry import psds_at_base
 from psd_deflection.uncertainty.consistency import Checked, widened
 from psd_deflection.uncertainty.stamped import FIT, HELD_RESIDUAL, NOISE, StampedDots
 
@@ -105,7 +106,7 @@ class Pipeline:
         self._variances = [tuple(float(v) / n for v in variances) for n in range(1, config.block_size + 1)]
         self._build(rig)
         # After the solvers, which refuse a geometry that cannot be solved.
-        self.stamped = StampedDots(rig)
+        self.stamped = StampedDots(rig, flat=not psds_at_base(rig))
 
     def _build(self, rig: Rig) -> None:
         self.rig = rig
@@ -271,7 +272,7 @@ class Pipeline:
             elif best is not None:
                 self._held = _Held(t_ns, best.theta, best.variances[2])
         elif verdict.faulty:
-            if self.rig.estimator.covariance == 'measured':
+            if self.rig.estimator.covariance == 'measured' and self.stamped.flat:
                 variances = self.stamped.mean_variances(present)
             best = self._from_the_other(verdict.faulty, t_ns, block.index, dots, variances)
             degraded = best is not None
@@ -335,8 +336,10 @@ class Pipeline:
         solution, failure = self._solve(0, dots, variances)
         if solution is None:
             return None, None, (BlockStatus.NOT_SOLVED, failure)
-        checked = self.stamped.check(dots, solution.residual, np.diag(variances) if spread is None else spread)
-        if checked.contradict and self.rig.estimator.consistency == 'refuse':
+        checked: Checked | None = None
+        if self.stamped.flat:
+            checked = self.stamped.check(dots, solution.residual, np.diag(variances) if spread is None else spread)
+        if checked is not None and checked.contradict and self.rig.estimator.consistency == 'refuse':
             reason = f'the four readings contradict each other: chi-square {checked.chi_square:.0f} of 1'
             return None, checked, (BlockStatus.INCONSISTENT, reason)
         return self._estimate(0, t_ns, block, solution, dots, variances, spread, checked), checked, None

@@ -43,16 +43,14 @@ def landing(
 def landings(beams: FloatArray, heights: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The same for n poses (n, 5): places (n, 2P) and derivatives (n, 2P, 5)."""
     dx, dy, theta, phi, omega = (poses[:, i, None] for i in range(5))
-    ax = np.cos(theta) * beams[:, 0] - np.sin(theta) * beams[:, 1]
-    ay = np.sin(theta) * beams[:, 0] + np.cos(theta) * beams[:, 1]
+    ax, ay = _turned(beams[:, 0], beams[:, 1], theta)
     co = np.cos(omega)
     cp = np.cos(phi)
     to = np.tan(omega)
     tp = np.tan(phi)
     n, count = ax.shape
     place = np.empty((n, 2 * count))
-    place[:, 0::2] = dx + ax / co + heights * to
-    place[:, 1::2] = dy + ay / cp - ax * to * tp - heights * tp / co
+    place[:, 0::2], place[:, 1::2] = landing_places(beams[:, 0], beams[:, 1], heights, dx, dy, theta, phi, omega)
     j = np.zeros((n, 2 * count, 5))
     j[:, 0::2, 0] = 1.0
     j[:, 1::2, 1] = 1.0
@@ -62,3 +60,25 @@ def landings(beams: FloatArray, heights: FloatArray, poses: FloatArray) -> tuple
     j[:, 0::2, 4] = (ax * np.sin(omega) + heights) / (co * co)
     j[:, 1::2, 4] = -tp * (ax + heights * np.sin(omega)) / (co * co)
     return place, j
+
+
+def landing_places(
+    lx: FloatArray,
+    ly: FloatArray,
+    height: FloatArray,
+    dx: FloatArray,
+    dy: FloatArray,
+    theta: FloatArray,
+    phi: FloatArray,
+    omega: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """x and y of the places alone, m, one array for each coordinate, of any shapes that broadcast."""
+    ax, ay = _turned(lx, ly, theta)
+    tilt = np.tan(phi)
+    lean = np.tan(omega)
+    co = np.cos(omega)
+    return dx + ax / co + height * lean, dy + ay / np.cos(phi) - ax * lean * tilt - height * tilt / co
+
+
+def _turned(lx: FloatArray, ly: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return np.cos(theta) * lx - np.sin(theta) * ly, np.sin(theta) * lx + np.cos(theta) * ly

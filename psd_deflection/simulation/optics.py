@@ -1,9 +1,10 @@
-"""Where parallel beams fall on a plate that has moved, twisted and tilted."""
+"""Where the beams fall: on a plate that has moved, twisted and tilted, or from such a plate on PSDs at the base."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from psd_deflection.geometry.landings import landing_places
 from psd_deflection.geometry.plate import points_under
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.physics import Physics
@@ -16,7 +17,8 @@ def dots_on_plate(pose: FloatArray, beams: FloatArray, physics: Physics) -> Floa
     """
     k = physics.slope_ratio / physics.length
     phi, omega = (-k * pose[1], k * pose[0]) if k != 0.0 else (np.zeros(1), np.zeros(1))
-    qx, qy = points_under(beams[0::2], beams[1::2], physics.heights[:, None], pose[0], pose[1], pose[2], phi, omega)
+    fall = landing_places if physics.psds_at_base else points_under
+    qx, qy = fall(beams[0::2], beams[1::2], physics.heights[:, None], pose[0], pose[1], pose[2], phi, omega)
     dots = np.empty_like(beams)
     np.subtract(qx, physics.centers[:, :1], out=dots[0::2])
     np.subtract(qy, physics.centers[:, 1:], out=dots[1::2])

@@ -9,6 +9,7 @@ import numpy as np
 from psd_deflection.config import Rig
 from psd_deflection.mechanics import LinkStatics
 from psd_deflection.records import FloatArray
+from psd_deflection.solvers.registry import psds_at_base
 
 
 @dataclass(slots=True)
@@ -18,8 +19,9 @@ class Physics:
     ``bending_stiffness`` EI, ``torsional_stiffness`` GJ, N m^2. ``clamp_bending`` and
     ``clamp_torsion``: clamp rotation per moment, rad/(N m). ``static_offset``: (dX, dY) of the
     link without load, m. ``slope_ratio``: k of phi = -k dY/L; 0 is the nominal, parallel planes.
-    ``beams``: l_i. ``half_area``: half width and height of the active areas. ``noise`` (6,), V rms
-    of each channel. ``phase``: how long after each sample the quantities are taken, below ``period``, s.
+    ``beams``: l_i, on the plate if ``psds_at_base``. ``half_area``: half width and height of the
+    active areas. ``noise`` (6,), V rms of each channel. ``phase``: how long after each sample the
+    quantities are taken, below ``period``, s.
     """
 
     period: float
@@ -44,10 +46,12 @@ class Physics:
     volts_per_count: float
     full_scale: float
     phase: float = 0.0
+    psds_at_base: bool = False
 
     @classmethod
     def of(cls, rig: Rig) -> Physics:
         """The nominal constants of a rig file, without effects."""
+        at_base = psds_at_base(rig)
         return cls(
             period=1.0 / rig.converter.sample_rate_hz,
             length=rig.link.length,
@@ -60,7 +64,8 @@ class Physics:
             bending_damping_ratio=rig.dynamics.bending_damping_ratio,
             torsion_frequency=rig.dynamics.torsion_frequency,
             torsion_damping_ratio=rig.dynamics.torsion_damping_ratio,
-            slope_ratio=0.0,
+            # PSDs at the base see little but the tilt.
+            slope_ratio=rig.link.slope_ratio if at_base else 0.0,
             centers=rig.centers,
             beams=rig.centers + rig.zeros,
             heights=rig.heights,
@@ -70,6 +75,7 @@ class Physics:
             noise=rig.noises.ravel(),
             volts_per_count=rig.converter.volts_per_count,
             full_scale=rig.converter.full_scale,
+            psds_at_base=at_base,
         )
 
     @property

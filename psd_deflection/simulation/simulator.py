@@ -24,6 +24,7 @@ from psd_deflection.simulation.declaration import ActiveEffect, State
 from psd_deflection.simulation.modes import Filter, mode_coefficients
 from psd_deflection.simulation.optics import dots_on_plate
 from psd_deflection.simulation.physics import Physics
+from psd_deflection.solvers.registry import check_arrangement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,10 +157,12 @@ class ForwardModel:
 class RigSimulator:
     """The rig with its noise and converter, sample after sample.
 
-    The same ``rig`` and ``seed`` give the same samples however the loads are cut into steps.
+    The same ``rig`` and ``seed`` give the same samples however the loads are cut into steps. Raises ConfigError if
+    the rig contradicts itself about where the PSDs are.
     """
 
     def __init__(self, rig: Rig, seed: int = 0) -> None:
+        check_arrangement(rig)
         self._model = ForwardModel(rig)
         self._noise = np.random.default_rng(seed)
 

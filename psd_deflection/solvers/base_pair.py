@@ -18,10 +18,11 @@ assumption: ``no_twist`` (5.3's own assumption: dX, dY, phi, omega), or ``beam``
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, SolverError
 from psd_deflection.geometry.landings import landing, landings
 from psd_deflection.geometry.layout import SMALLEST_BASE_LINE, Geometry, check_twist
@@ -45,6 +46,7 @@ class BasePairSolver(Solver):
 
     name: ClassVar[str] = 'base_pair'
     budgeted_as: ClassVar[str] = ''
+    psds_at: ClassVar[Literal['tip', 'base']] = 'base'
 
     def __init__(self, geometry: Geometry, assume: Assume = 'beam') -> None:
         """Bind to ``geometry`` under the assumption ``assume`` (see the module).
@@ -94,6 +96,11 @@ class BasePairSolver(Solver):
         self._unknowns = len(self._spread[0])
         self._matrix = np.array(self._spread)
         self._refuse_what_is_unseen(geometry, assume)
+
+    @classmethod
+    def options_from_rig(cls, rig: Rig) -> dict[str, Any]:
+        """``base_pair.assume``."""
+        return {'assume': rig.estimator.base_pair_assume}
 
     def _refuse_what_is_unseen(self, geometry: Geometry, assume: Assume) -> None:
         heights = self._heights

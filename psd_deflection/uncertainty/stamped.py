@@ -30,10 +30,13 @@ class StampedDots:
     of the last block's readings.
     """
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, flat: bool = True) -> None:
+        """``flat``: the PSDs are on the plate, and the base line between the dots keeps its length."""
         config = rig.estimator
+        self.flat = flat
         poly = config.block_fit == 'poly'
-        self._measures = config.covariance == 'measured'
+        # What does not move with the link tells the noise.
+        self._measures = flat and config.covariance == 'measured'
         self.active = poly or self._measures
         self._beams = rig.centers + rig.zeros
         variances = dot_noise_variances(rig)
