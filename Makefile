@@ -8,6 +8,7 @@
 # make fuzz     coverage-guided fuzzing of all that reads strangers' bytes, FUZZ_SECONDS=600 each; 10^7 damaged frames
 # make soak     SOAK_MINUTES=30 in real time, then SOAK_HOURS=24 of simulated time (a quarter of an hour on an idle core)
 # make firmware build the example firmware, run it in qemu, join it to the daemon (installs what it needs with apt-get)
+# make mutants  break the numerics line by line and see whether the tests notice (two hours; MUTANTS="--rooms solvers" for one room)
 # make golden   make the recordings in bags/ anew
 # make colcon   build with colcon in a virtual environment of its own and look at what it installed
 # make docs     the documentation as a web site, in build/site
@@ -30,7 +31,7 @@ PYTEST ?=
 WORKERS ?= 2
 BIN := $(VENV)/bin
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware golden docs shots blind demo-discover colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs shots blind demo-discover colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -105,6 +106,11 @@ firmware: $(VENV)/.installed
 	(command -v arm-none-eabi-gcc && command -v qemu-system-arm) || ($(SUDO) apt-get update -qq && $(SUDO) apt-get install -y -qq --no-install-recommends gcc-arm-none-eabi qemu-system-arm)
 	$(MAKE) -C docs/firmware OUT=$(CURDIR)/build/firmware
 	$(BIN)/python -m tools.check_firmware build/firmware/psd_synthetic.elf
+
+mutants: $(VENV)/.installed
+	test -x build/mutants/bin/python || $(PYTHON) -m venv build/mutants
+	build/mutants/bin/python -m pip install --quiet --disable-pip-version-check 'cosmic-ray>=8.4,<9'
+	build/mutants/bin/python -m tools.mutants --python $(abspath $(BIN)/python) $(MUTANTS)
 
 golden: $(VENV)/.installed
 	$(BIN)/python bags/make.py

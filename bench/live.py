@@ -267,7 +267,7 @@ def make_recording(folder: Path, minutes: float) -> tuple[Path, int]:
             flags = np.zeros(step, np.uint8)
             chunk = RawChunk(seq, seq * 1_000_000 + 10**18, counts, flags, rig.converter.volts_per_count)
             for record in pipeline.process(chunk):
-                bag.write(record)
+                bag.put(record)
     return path, n
 
 

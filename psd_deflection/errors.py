@@ -6,8 +6,9 @@ of this package and ends with a traceback.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 INTERRUPTED = 130
 
@@ -33,7 +34,7 @@ class PsdDeflectionError(Exception):
 class UsageError(PsdDeflectionError):
     """An option is missing, has an invalid value, or contradicts another option.
 
-    Example: ``--out run.png: no .png is written; X.csv, X.mcap or a bag folder (X) is``.
+    Example: ``--out run.png: .png cannot be written; use X.csv, X.mcap or a bag folder (X)``.
     """
 
     exit_status = 2
@@ -100,3 +101,14 @@ def printable(text: str, longest: int) -> str:
     while length > longest - 1:
         length -= len(pieces.pop())
     return ''.join(pieces) + '\N{HORIZONTAL ELLIPSIS}'
+
+
+@contextlib.contextmanager
+def creating(path: object) -> Iterator[None]:
+    """Raise RecordingError if the recording ``path`` exists already or cannot be made inside."""
+    try:
+        yield
+    except FileExistsError:
+        raise RecordingError(f'{path}: exists already; a recording is never overwritten') from None
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be made ({error.strerror or error})') from None

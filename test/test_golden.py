@@ -105,13 +105,13 @@ def test_a_zero_that_was_taken_while_recording_is_taken_again(
     with BagWriter(folder, rig_values=dict(rig.values)) as bag:
         for block in recording.blocks():
             for record in pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags)):
-                bag.write(record)
+                bag.put(record)
             if block.index in (40, 120):
                 change = pipeline.zero()
                 assert change is not None
-                bag.write(change)
+                bag.put(change)
             if block.index == 150:
-                bag.write(pipeline.change({'sum_min': 6.0}))
+                bag.put(pipeline.change({'sum_min': 6.0}))
     assert main(['replay', str(folder), '--compare']) == 0
     out = capsys.readouterr().out
     assert 'no bit differs' in out

@@ -107,7 +107,7 @@ def bag_target() -> tuple[Target, list[bytes]]:
     with tempfile.TemporaryDirectory() as name:
         seed = Path(name) / 'seed.mcap'
         with McapFile(seed, rig_values=dict(list(load_rig().values.items())[:3]), device_hello={'serial': 'A'}) as out:
-            out.write(AppliedLoad(1, 1.0, 2.0, 3.0))
+            out.put(AppliedLoad(1, 1.0, 2.0, 3.0))
         small = seed.read_bytes()
     golden = next(iter(sorted((ROOT / 'bags').glob('*/*.mcap')))).read_bytes()
     target = _file_target(

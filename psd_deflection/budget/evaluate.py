@@ -16,9 +16,6 @@ from psd_deflection.records import FloatArray
 CAUSES: tuple[Cause, ...] = (*sensor.TERMS, *environment.TERMS, *installation.TERMS, COMPUTATION)
 """Every line of the budget."""
 
-TABLE_3_1 = ('E_LP', 'E_DC', 'E_R', 'E_TH', 'E_RF', 'E_EMF', 'E_Algn', 'E_Tilt', 'E_C')
-"""The rows of the thesis's Table 3.1."""
-
 _CHUNK = 10_000
 """Number of draws computed at once; it limits memory."""
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 from psd_deflection.config import BY_NAME
 from psd_deflection.errors import ConfigError, RecordingError, UsageError
@@ -20,6 +22,8 @@ _FOREIGN = """
 FOREIGN = frozenset(_FOREIGN.split())
 """Endings of other kinds of files. Any other ending is part of a folder's name, as in ``run_0.5N``."""
 
+N = TypeVar('N', int, float)
+
 PICTURES = ('.png', '.svg', '.pdf')
 
 
@@ -31,29 +35,25 @@ def seed(text: str) -> int:
 def whole(option: str, least: int, most: int | None = None) -> Callable[[str], int]:
     """Reads a whole number within bounds; what it gives raises UsageError."""
     bounds = f'at least {least}' + ('' if most is None else f' and at most {most}')
-
-    def read(text: str) -> int:
-        with contextlib.suppress(ValueError):
-            value = int(text)
-            if least <= value and (most is None or value <= most):
-                return value
-        raise UsageError(f'{option} {text}: must be a whole number of {bounds}')
-
-    return read
+    return functools.partial(
+        _within, option, int, f'a whole number of {bounds}', least, math.inf if most is None else most
+    )
 
 
 def number(option: str, least: float, most: float) -> Callable[[str], float]:
     """Reads a number within bounds; what it gives raises UsageError."""
+    return functools.partial(
+        _within, option, float, f'a number of at least {least:g} and at most {most:g}', least, most
+    )
 
-    def read(text: str) -> float:
-        with contextlib.suppress(ValueError):
-            value = float(text)
-            # NaN fails every comparison.
-            if least <= value <= most:
-                return value
-        raise UsageError(f'{option} {text}: must be a number of at least {least:g} and at most {most:g}')
 
-    return read
+def _within(option: str, kind: Callable[[str], N], words: str, least: float, most: float, text: str) -> N:
+    with contextlib.suppress(ValueError):
+        value = kind(text)
+        # NaN fails every comparison.
+        if least <= value <= most:
+            return value
+    raise UsageError(f'{option} {text}: must be {words}')
 
 
 def parameter_option(parser: argparse._ActionsContainer, option: str, name: str) -> None:
@@ -84,13 +84,13 @@ def given_parameters(args: argparse.Namespace) -> dict[str, object]:
 
 
 def recording_name(*, rerun: bool = False) -> Callable[[str], str]:
-    """Reads the --out of a recording (an .rrd where ``rerun``) by its ending; what it gives raises UsageError."""
+    """Reads the --out of a recording (an .rrd too, if ``rerun``) by its ending; what it gives raises UsageError."""
 
     def read(text: str) -> str:
         suffix = Path(text).suffix.lower()
         if suffix in FOREIGN and not (rerun and suffix == '.rrd'):
             files = 'X.csv, X.mcap, X.rrd' if rerun else 'X.csv, X.mcap'
-            raise UsageError(f'--out {text}: no {suffix} is written; {files} or a bag folder (X) is')
+            raise UsageError(f'--out {text}: {suffix} cannot be written; use {files} or a bag folder (X)')
         return text
 
     return read
@@ -135,7 +135,7 @@ def refuse(args: argparse.Namespace, defaults: Mapping[str, object], why: str) -
             raise UsageError(f'--{name.replace("_", "-")} {why}')
 
 
-def finite(option: str, values: tuple[float, ...]) -> None:
+def need_finite(option: str, values: tuple[float, ...]) -> None:
     """Raise UsageError unless all are finite."""
     if not all(map(math.isfinite, values)):
         raise UsageError(f'{option} {" ".join(f"{v:g}" for v in values)}: must be finite')

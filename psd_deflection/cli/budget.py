@@ -1,8 +1,8 @@
-"""Error budget of a rig: what each cause does to dX, dY and theta at a load, and what is worth improving.
+"""Compute the error budget of a rig: how much each cause adds to the error of dX, dY and theta.
 
-Every row of the thesis's Table 3.1 with its equations corrected, and the causes it leaves out. The
-figures are standard deviations; what follows from the pose itself, because the method's model leaves
-it out, is a known bias and is marked so. The shares are of the mean square of the total.
+The causes are those of the thesis's Table 3.1, with corrected equations, and those that it leaves
+out. Numbers are standard deviations, except for known biases: errors that follow from the pose
+because the method ignores something. Percentages are shares of the mean square of the total.
 
   psd-deflection budget --params-file config/thesis_rig.yaml
   psd-deflection budget --set rotation_tolerance=0.001 --method beam --json
@@ -32,8 +32,8 @@ from psd_deflection.budget.inputs import INPUTS, read_inputs
 from psd_deflection.budget.term import Contribution, Kind, Situation
 from psd_deflection.cli._options import (
     PICTURES,
-    finite,
     given_as_option,
+    need_finite,
     need_folder,
     picture_name,
     refuse,
@@ -66,22 +66,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs=3,
         metavar=('FX', 'FY', 'TZ'),
-        help='where the budget is drawn up: tip load, N, N, N m (default: 50 N on the sidebar)',
+        help='tip load at which the errors are computed, N, N, N m (default: 50 N on the sidebar)',
     )
-    parser.add_argument('--method', choices=METHODS, help='whose errors (default: that of the rig file)')
-    parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE', help='set one input (repeat)')
+    parser.add_argument(
+        '--method', choices=METHODS, help='method whose errors are computed (default: that of the rig file)'
+    )
+    parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE', help='set one input; repeatable')
     parser.add_argument('--inputs', metavar='FILE.yaml', help='a file of inputs')
     parser.add_argument(
         '--monte-carlo',
         type=whole('--monte-carlo', 100, MAX_DRAWS),
         metavar='N',
-        help='check the totals by N draws of everything (at least 100)',
+        help='check the totals with N random draws of all causes (at least 100)',
     )
-    parser.add_argument('--seed', type=seed, default=1, help='of the draws (default 1)')
+    parser.add_argument('--seed', type=seed, default=1, help='seed of the random draws (default 1)')
     parser.add_argument(
-        '--out', type=picture_name(*PICTURES), metavar='FILE.png|svg|pdf', help='the chart (default: budget.png here)'
+        '--out',
+        type=picture_name(*PICTURES),
+        metavar='FILE.png|svg|pdf',
+        help='the chart (default: budget.png in this folder)',
     )
-    parser.add_argument('--json', action='store_true', help='print JSON in SI units; draws only with --out')
+    parser.add_argument(
+        '--json', action='store_true', help='print JSON in SI units; the chart is drawn only with --out'
+    )
     parser.add_argument('--explain', action='store_true', help='print formulas, inputs and their sources, and stop')
 
 
@@ -99,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     method = args.method or method_of(rig)
     load = tuple(args.load) if args.load else (0.0, -SIDEBAR_FORCE, -SIDEBAR_FORCE * rig.link.length)
-    finite('--load', load)
+    need_finite('--load', load)
     out = Path(args.out or 'budget.png')
     if args.out is not None or not args.json:
         need_folder(out)
@@ -119,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
             print(f'\nMonte Carlo, {draws} draws of everything at once (seed {args.seed}):')
             print('total     ' + _figures_text(sampled))
     if args.out is not None or not args.json:
-        draw(budget, out)
+        draw_terms(budget, out)
         if not args.json:
             print(f'\n{out}')
     return 0
@@ -243,7 +250,7 @@ def as_json(budget: Budget, load: tuple[float, ...], sampled: Contribution | Non
     }
 
 
-def draw(budget: Budget, path: Path) -> None:
+def draw_terms(budget: Budget, path: Path) -> None:
     """Bars of every term, largest first, beside the total, written to ``path``."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch

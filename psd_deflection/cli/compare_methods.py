@@ -1,9 +1,9 @@
-"""How far each method is off, by condition, and where the figures of the thesis's Table 5.1 come from.
+"""Compare the errors of all methods, and explain Table 5.1 of the thesis.
 
-Exact readings of the thesis's rig go through every method; no noise. The first table has the rms
-error over a grid of poses (flat plate, independent tilts, tilts of a cantilever), then the largest.
-Then come noise, condition and error bound of the linear methods, and Table 5.1 taken apart by cause.
---out draws the figures of docs/methods.md as well.
+Every method gets exact readings of the thesis's rig, without noise. The first table has the rms and
+the largest error over a grid of poses (flat plate, independent tilts, tilts of a cantilever). The
+others have noise, condition number and error bound of the linear methods, and what each possible
+cause adds to Table 5.1. --out also draws the figures of docs/methods.md.
 
   psd-deflection compare-methods
   psd-deflection compare-methods --out figures
@@ -52,18 +52,18 @@ _UNITS = (1e6, 1e6, _MDEG_PER_RAD)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('--out', metavar='DIR', help='draw the figures into this folder')
-    parser.add_argument('--json', action='store_true', help='the errors of every method as JSON in SI units')
+    parser.add_argument('--json', action='store_true', help='print the errors of all methods as JSON in SI units')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the tables; draw where asked."""
+    """Print the tables; draw the figures with --out."""
     if args.out is not None:
         try:
             Path(args.out).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise RecordingError(f'--out {args.out}: cannot be made a folder ({error.strerror or error})') from None
     if args.json:
-        print_json(figures())
+        print_json(errors_json())
     else:
         print('\n'.join([*error_table(), '', *linear_table(), '', *cause_table()]))
     if args.out is not None:
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def figures() -> dict[str, dict[str, dict[str, object]]]:
+def errors_json() -> dict[str, dict[str, dict[str, object]]]:
     """Method to condition to its errors, dX, dY in m and theta in rad; ``silent``: the share without an answer."""
     return {
         method.label: {

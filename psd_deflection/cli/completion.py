@@ -1,6 +1,6 @@
-"""Print what makes your shell complete psd-deflection's commands and options.
+"""Print a script with which your shell completes commands and options.
 
-The output goes where your shell looks for it: for bash
+Save the output where your shell looks for it. For bash this is the file
 ~/.local/share/bash-completion/completions/psd-deflection, for zsh _psd-deflection in a folder of $fpath.
 
   psd-deflection completion bash

@@ -1,9 +1,9 @@
-"""Write the samples of a recording, and its loads, references and temperatures, in another form.
+"""Convert a recording to another format: samples, loads, reference poses and temperatures.
 
-OUT ending in .csv becomes a CSV recording, in .mcap a lone MCAP file, anything else a bag folder.
-Volts come through bit for bit. Estimates are not carried over: psd-deflection replay makes them.
-OUT ending in .rrd becomes a recording for the Rerun viewer (pip install rerun-sdk), for people to look at:
-the estimates that replay makes, dots, loads and losses, and how they are shown. It is not read again.
+The name OUT sets the format: X.csv is a CSV recording, X.mcap a single MCAP file, any other name a
+bag folder. The voltages stay the same bit for bit. Estimates are not copied; psd-deflection replay
+computes them. X.rrd is for the Rerun viewer only (pip install rerun-sdk): it has the computed
+estimates, dots, loads and losses with a layout, and cannot be read back.
 
   psd-deflection convert bags/clean --out clean.csv
   psd-deflection convert bags/lost_samples --out lost_samples.rrd
@@ -14,9 +14,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import heapq
-import itertools
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from psd_deflection.cli._options import recording_name
@@ -24,13 +21,11 @@ from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, warn
 from psd_deflection.config import load_rig
 from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.conversion import Beside, convert
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay_engine import open_for_replay, replayed
-from psd_deflection.recordings.sinks import is_csv, open_sink
-from psd_deflection.records import AppliedLoad, ParameterChange, Record, ReferencePose, SampleBlock, TemperatureReading
-
-Convertible = SampleBlock | ParameterChange | AppliedLoad | ReferencePose | TemperatureReading
+from psd_deflection.recordings.sinks import open_sink
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,44 +36,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=recording_name(rerun=True),
         metavar='OUT',
         required=True,
-        help='what to make: X.csv, X.mcap, X.rrd or a bag folder (X)',
+        help='output: X.csv, X.mcap, X.rrd, or a bag folder (any other name)',
     )
     parser.add_argument(
         '--params-file',
         metavar='RIG.yaml',
-        help="the rig to note in a bag or to use for an .rrd; otherwise the recording's own",
+        help="the rig to store in a bag or to compute an .rrd with (default: the recording's own)",
     )
-    parser.add_argument('--json', action='store_true', help='for programs: the summary as one JSON object')
-
-
-def _time(record: Convertible) -> int:
-    return int(record.t_ns[0]) if isinstance(record, SampleBlock) else record.t_ns
-
-
-def convert(recording: Recording, out: Path, parameters: dict[str, object], quiet: bool = False) -> int:
-    """Write ``recording`` to ``out``; returns the number of samples. Raises RecordingError."""
-    with told('reading loads, references, temperatures', quiet=quiet):
-        changes, loads = recording.changes, recording.loads()
-        references, temperatures = recording.references(), recording.temperatures()
-    blocks = progress_of(recording.blocks(), quiet=quiet)
-    records: Iterable[Convertible] = heapq.merge(changes, loads, references, temperatures, blocks, key=_time)
-    if is_csv(out):
-        # A row takes what is waiting, and a block's last row what came during the block.
-        records = itertools.chain(loads, references, temperatures, blocks)
-    beside: dict[type[Record], Sequence[Record]] = {
-        AppliedLoad: loads,
-        ReferencePose: references,
-        TemperatureReading: temperatures,
-    }
-    sink = open_sink(
-        out, parameters, device_hello=recording.hello, samples_with=[k for k, found in beside.items() if found]
-    )
-    samples = 0
-    with contextlib.closing(sink), blocks:
-        for record in records:
-            sink.put(record)
-            samples += len(record.seq) if isinstance(record, SampleBlock) else 0
-    return samples
+    parser.add_argument('--json', action='store_true', help='print the summary as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -90,7 +55,10 @@ def run(args: argparse.Namespace) -> int:
     if args.params_file is not None:
         rig = load_rig(args.params_file)
         parameters = rig.flat()
-    samples = convert(recording, Path(args.out), parameters, args.json)
+    with told('reading loads, references, temperatures', quiet=args.json):
+        beside = Beside.of(recording)
+    with progress_of(recording.blocks(), quiet=args.json) as blocks:
+        samples = convert(recording, Path(args.out), parameters, beside, blocks)
     if args.json:
         print_json({'out': args.out, 'samples': samples, 'warnings': list(recording.warnings)})
     else:

@@ -1,8 +1,9 @@
-"""Size a link and place its sensors.
+"""Compute the stiffness of a link and compare sensor placements.
 
-Without a rig file: Tables B1 and B2 of the thesis recomputed, each cell beside what is printed,
-each that differs with the reason. With one: its link's stiffness, and which sensor placement is
-best conditioned inside the room that --radius, --keep-out and --box leave (m, in link_tip).
+Without --params-file it recomputes Tables B1 and B2 of the thesis and explains every difference.
+With it, it prints the stiffness of the rig's link and searches for the placement of the two sensors
+with the smallest errors, inside the space that --radius, --keep-out and --box allow (m, in the
+frame link_tip).
 
   psd-deflection design
   psd-deflection design --params-file config/thesis_rig.yaml --out placement.png
@@ -38,25 +39,35 @@ SIDEBAR_FORCE = 50.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('--params-file', metavar='RIG.yaml', help='a ROS 2 parameter file: study its placement')
+    parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig')
     parser.add_argument(
         '--sigma',
         type=float,
         metavar='M',
-        help='deviation of one dot reading, m (default: amplifier noise of one block mean)',
+        help='standard deviation of a dot reading, m (default: amplifier noise of a block mean)',
     )
     parser.add_argument(
         '--radius',
         type=float,
         metavar='M',
-        help='sensor centres within this disc, m (default: as far out as the rig has them)',
+        help='sensor centres at most this far from the tip centre, m (default: as in the rig)',
     )
-    parser.add_argument('--keep-out', type=float, default=0.0, metavar='M', help='and outside this one, m (default 0)')
     parser.add_argument(
-        '--box', type=float, nargs=4, metavar=('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX'), help='and inside this box, m'
+        '--keep-out',
+        type=float,
+        default=0.0,
+        metavar='M',
+        help='sensor centres at least this far from it, m (default 0)',
+    )
+    parser.add_argument(
+        '--box',
+        type=float,
+        nargs=4,
+        metavar=('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX'),
+        help='sensor centres inside this box, m',
     )
     parser.add_argument('--out', type=picture_name(*PICTURES), metavar='FILE.png|svg|pdf', help='draw the placements')
-    parser.add_argument('--json', action='store_true', help='of a rig: link and placements as JSON in SI units')
+    parser.add_argument('--json', action='store_true', help='print link and placements as JSON in SI units')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -80,9 +91,9 @@ def run(args: argparse.Namespace) -> int:
         room = placement.Room(radius, args.keep_out, tuple(args.box) if args.box else None)
         candidates = placements(rig, room)
     if args.out is not None:
-        draw(candidates, room, rig, Path(args.out))
+        draw_placements(candidates, room, rig, Path(args.out))
     if args.json:
-        print_json({**figures(rig, candidates, sigma), 'out': args.out})
+        print_json({**design_json(rig, candidates, sigma), 'out': args.out})
         return 0
     print(link_text(rig))
     print()
@@ -180,7 +191,7 @@ def link_text(rig: Rig) -> str:
     )
 
 
-def figures(rig: Rig, candidates: list[PlacementRow], sigma: float) -> dict[str, Any]:
+def design_json(rig: Rig, candidates: list[PlacementRow], sigma: float) -> dict[str, Any]:
     """The link and its placements for programs: m, N, rad; no number for what cannot be seen."""
     statics = LinkStatics.from_rig(rig)
     bend, _, twist = np.diag(statics.compliance).tolist()
@@ -280,7 +291,7 @@ def tied_text(rig: Rig, best: FloatArray, sigma: float) -> str:
     return columns(rows)
 
 
-def draw(candidates: list[PlacementRow], room: placement.Room, rig: Rig, path: Path) -> None:
+def draw_placements(candidates: list[PlacementRow], room: placement.Room, rig: Rig, path: Path) -> None:
     """The placements seen from beyond the tip (X right, Y up), written to ``path``."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle, Rectangle

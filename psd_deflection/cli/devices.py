@@ -1,8 +1,8 @@
-"""List the serial ports, ask what is on each, and print the parameter lines for it.
+"""List the serial ports, find out which device is on each, and print parameters for it.
 
-Without a name, every port that the system lists; with names, only those (a pseudo-terminal is in no list).
-Ports that another program has open are named and left alone. Exit status 5: a port that you named is missing, in use
-or cannot be opened.
+Without PORT it tries every port that the system lists; a pseudo-terminal must be named. A port that
+another program has open is listed but not tried. Exit status 5: a port that you named is missing, in
+use or cannot be opened.
 
   psd-deflection devices
   psd-deflection devices /dev/ttyACM0 --json
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     devices, _ = known_devices()
     parser.epilog = epilog(devices)
     parser.add_argument('ports', nargs='*', metavar='PORT', help='only these, e.g. /dev/ttyACM0 or /dev/pts/3')
-    parser.add_argument('--json', action='store_true', help='for programs: one JSON object')
+    parser.add_argument('--json', action='store_true', help='print the result as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -69,9 +69,9 @@ def epilog(devices: Sequence[Device]) -> str:
     width = max(len(device.name) for device in devices)
     lines = []
     for device in devices:
-        remark = '' if device.probe is not None else ' (not asked for)'
+        remark = '' if device.probe is not None else ' (cannot be recognised)'
         lines.append(f'  {device.name:{width}}  {device.help}{remark}')
-    return '\n'.join(['what source: may say, and which devices the ports are asked for:', *lines])
+    return '\n'.join(['values of the parameter source:', *lines])
 
 
 def parameter_lines(values: dict[str, object]) -> str:

@@ -1,13 +1,13 @@
-"""Find where simulation and measurement disagree, name the missing effect, add it, show the gap shrink.
+"""Find the physical effect that the simulation of a recording lacks, and add it to the model.
 
-REC is a bag folder, an .mcap or a .csv, with the loads (and temperatures) in it; several may be
-given, or a .yaml list of recordings with what differs in each:
+REC is a bag folder, an .mcap or a .csv that contains the loads (and the temperatures). You may give
+several, or a .yaml list of recordings with the parameters that differ in each:
 
   - recording: short.csv
     overrides: {link.length: 0.4}
 
-DIR gets model.yaml (the rig with what was found: a --params-file for every command), report.html
-and result.json. Any verdict is a success.
+DIR gets model.yaml (the rig with the effects found; use it as --params-file), report.html and
+result.json. The exit status is 0 whatever was found.
 
   psd-deflection discover odd.csv --out found
   psd-deflection discover a.csv b.csv --params-file my_rig.yaml --out found
@@ -53,10 +53,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='EFFECT',
         action='append',
         default=[],
-        help='leave an effect out of the library; repeatable',
+        help='do not consider this effect; repeatable',
     )
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
-    parser.add_argument('--json', action='store_true', help='print what result.json holds')
+    parser.add_argument('--json', action='store_true', help='print the content of result.json')
 
 
 def run(args: argparse.Namespace) -> int:

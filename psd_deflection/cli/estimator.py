@@ -1,7 +1,7 @@
 """Acquire, estimate, publish on ROS 2 and record: the daemon.
 
-Without --port it starts a simulated rig of its own and says so, so that everything can be tried
-without hardware. Ctrl-C ends it and says how to replay what was recorded.
+Without --port it starts a simulated rig, so that you can try everything without hardware. Ctrl-C
+ends it; if it recorded, it prints the command that replays the recording.
 
   psd-deflection estimator                                   the simulated rig
   psd-deflection estimator --port /dev/ttyACM0 --record      a device, recorded
@@ -36,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parameter_option(parser, '--port', 'port')
     parser.add_argument(
         '--source',
-        help=f'what the device speaks: {", ".join(DEVICES)}, or the name of a plug-in '
-        '(`psd-deflection devices --help` says what these are)',
+        help=f'protocol of the device: {", ".join(DEVICES)}, or the name of a plug-in '
+        '(`psd-deflection devices --help` describes them)',
     )
     parameter_option(parser, '--baud', 'baud')
     parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig')
@@ -53,7 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--monitor', action='store_true', help='serve the live page and print its address')
     parser.add_argument('--no-ros', action='store_true', help='acquire and record without ROS')
-    parser.add_argument('--ros-args', action='store_true', help='what follows is for ROS (ros2 run, ros2 launch)')
+    parser.add_argument(
+        '--ros-args', action='store_true', help='arguments after this go to ROS (ros2 run, ros2 launch)'
+    )
 
 
 def _live_solver(name: str) -> str:

@@ -17,7 +17,7 @@ import shutil
 import signal
 import sys
 import textwrap
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
 from psd_deflection import __version__
@@ -34,20 +34,20 @@ from psd_deflection.errors import (
 
 COMMANDS: dict[str, str] = {
     'estimator': 'acquire, estimate, publish on ROS 2 and record (the daemon)',
-    'monitor': 'serve a live page: of the rig, or of a recording that plays',
-    'replay': 'run a recording through the same pipeline',
-    'simulate': 'simulate the rig: as a recording, or as a device on a pseudo-terminal',
-    'discover': 'name what the simulation lacks to explain a recording, and add it',
-    'devices': 'list serial ports, say what answers on each, suggest the parameters',
-    'plot': 'draw a recording: PNG, SVG, PDF or HTML',
-    'info': 'say what is in a recording',
-    'convert': 'write the samples of a recording as a CSV, an .mcap or a bag',
-    'recover': 'make a recording whole that a crash left without its end',
-    'budget': 'error budget: what each cause does to dX, dY and theta (chapter 3)',
-    'design': 'size the link and place the sensors (appendix B, condition numbers)',
-    'compare-methods': 'how far each method is off, and where the figures of Table 5.1 come from',
+    'monitor': 'serve a web page that shows the rig live, or plays a recording',
+    'replay': 'compute the estimates of a recording again, as the daemon did',
+    'simulate': 'simulate the rig: write a recording, or act as a device on a pseudo-terminal',
+    'discover': 'find the physical effect that the simulation of a recording lacks',
+    'devices': 'list the serial ports and the devices on them, and suggest parameters',
+    'plot': 'draw a recording as PNG, SVG, PDF or HTML',
+    'info': 'summarise a recording',
+    'convert': 'convert a recording to CSV, MCAP, a bag or Rerun',
+    'recover': 'repair a recording that a crash cut off',
+    'budget': 'compute the error budget: what each cause adds to the error of dX, dY and theta',
+    'design': 'compute link stiffness and compare sensor placements',
+    'compare-methods': 'compare the errors of all methods, and explain Table 5.1 of the thesis',
     'params': 'list every parameter with unit, bounds and default',
-    'completion': 'print what makes your shell complete these commands',
+    'completion': 'print a completion script for bash, zsh or tcsh',
 }
 """Command name to one-line summary; the module is ``psd_deflection.cli.NAME`` (``-`` as ``_``)."""
 
@@ -56,9 +56,9 @@ ROS_OPTIONS = ('-p', '--param', '-r', '--remap')
 
 EPILOG = """\
 where to begin:
-  psd-deflection estimator                    a first look, without hardware
-  psd-deflection replay RECORDING --compare   what it measured, once more
-  psd-deflection COMMAND --help               each command explains itself
+  psd-deflection estimator                    try it without hardware
+  psd-deflection replay RECORDING --compare   compute it again, compare
+  psd-deflection COMMAND --help               options and examples of a command
 
 exit status:
 """ + '\n'.join(f'  {status:<5}{meaning}' for status, meaning in EXIT_STATUSES.items())
@@ -254,21 +254,9 @@ def _split_ros_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
     return own, for_ros
 
 
-def estimator() -> int:
-    """Console script of ``ros2 run psd_deflection estimator`` (colcon)."""
-    return main(['estimator', *sys.argv[1:]])
+def _executable(command: str) -> Callable[[], int]:
+    """Console script of ``ros2 run psd_deflection COMMAND`` (colcon)."""
+    return lambda: main([command, *sys.argv[1:]])
 
 
-def replay() -> int:
-    """Console script of ``ros2 run psd_deflection replay`` (colcon)."""
-    return main(['replay', *sys.argv[1:]])
-
-
-def simulate() -> int:
-    """Console script of ``ros2 run psd_deflection simulate`` (colcon)."""
-    return main(['simulate', *sys.argv[1:]])
-
-
-def discover() -> int:
-    """Console script of ``ros2 run psd_deflection discover`` (colcon)."""
-    return main(['discover', *sys.argv[1:]])
+estimator, replay, simulate, discover = map(_executable, ('estimator', 'replay', 'simulate', 'discover'))

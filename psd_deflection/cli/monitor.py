@@ -1,9 +1,9 @@
-"""Serve a live page: both detectors, deflection and twist, spectrum, rates, losses, clock, health.
+"""Serve a web page: both detectors, deflection and twist, spectrum, rates, losses, clock and health.
 
 Without REC it acquires, without ROS, from --port or from a simulated rig of its own. With REC (a bag
-folder, an .mcap or a .csv) it plays that recording. The page is for this machine alone unless
---address says otherwise; its buttons (zero, record) are off unless --control allows them, and need
-the token in the printed address where others can reach the page. Ctrl-C ends it.
+folder, an .mcap or a .csv) it plays that recording. Only this machine can open the page, unless
+--address is given. The buttons (zero, record) need --control; if other machines can reach the page,
+they also need the token in the printed address. Ctrl-C ends it.
 
   psd-deflection monitor                                 the simulated rig
   psd-deflection monitor --port /dev/ttyACM0 --control   a device, with buttons
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parameter_option(page, '--http-port', 'monitor_port')
     parameter_option(page, '--address', 'monitor_address')
     page.add_argument(
-        '--control', dest='monitor_control', action='store_true', help='let the page take the zero and record'
+        '--control', dest='monitor_control', action='store_true', help='enable the buttons for zero and record'
     )
     live = parser.add_argument_group('the rig (without REC)')
     parameter_option(live, '--port', 'port')
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     play = parser.add_argument_group('a recording (with REC)')
     play.add_argument('--speed', type=float, default=1.0, metavar='X', help='times as fast as recorded (default 1)')
-    play.add_argument('--loop', action='store_true', help='start anew at its end')
+    play.add_argument('--loop', action='store_true', help='start again at the end')
 
 
 def _check(args: argparse.Namespace) -> None:

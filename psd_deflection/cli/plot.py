@@ -1,8 +1,7 @@
-"""Draw a recording: deflection and twist with their uncertainty, dots, sums, spectrum, what was lost.
+"""Draw a recording: deflection and twist with their uncertainty, dots, sums, spectrum and losses.
 
-REC (a bag folder, an .mcap or a .csv) runs through the same pipeline as in `replay`, with its own
-parameters or those of --params-file. The kind of picture is the ending of --out: .png, .svg, .pdf,
-or .html, one page without anything from elsewhere.
+The estimates are computed as by `replay`, with the recorded parameters or those of --params-file.
+The ending of --out sets the format: .png, .svg, .pdf or .html (one self-contained page).
 
   psd-deflection plot bags/lost_samples
   psd-deflection plot run.csv --params-file my_rig.yaml --out run.html
@@ -46,9 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--out',
         type=picture_name(*PICTURES, '.html'),
         metavar='OUT',
-        help='.png, .svg, .pdf or .html (default: REC.png, here)',
+        help='.png, .svg, .pdf or .html (default: REC.png in this folder)',
     )
-    parser.add_argument('--json', action='store_true', help='for programs: the summary as one JSON object, in SI units')
+    parser.add_argument('--json', action='store_true', help='print the summary as JSON, in SI units')
 
 
 @dataclass
@@ -135,13 +134,13 @@ def run(args: argparse.Namespace) -> int:
         raise RecordingError(f'{args.recording}: has no samples to draw')
     summary = summarise(drawn, rig)
     with told('drawing', quiet=args.json):
-        figure = draw(drawn, spectrum, rig, name)
+        figure = draw_recording(drawn, spectrum, rig, name)
         if out.suffix.lower() == '.html':
             write_html(figure, out, title, summary)
         else:
             save_figure(figure, out, dpi=150)
     if args.json:
-        print_json({**figures(drawn, rig), 'out': str(out)})
+        print_json({**plot_json(drawn, rig), 'out': str(out)})
         return 0
     for name, value in summary:
         print(f'{name:<24} {value}')
@@ -156,7 +155,7 @@ def default_out(recording: str) -> Path:
     return Path(f'{path.stem if is_file else path.name}.png')
 
 
-def figures(drawn: Drawn, rig: Rig) -> dict[str, Any]:
+def plot_json(drawn: Drawn, rig: Rig) -> dict[str, Any]:
     """What ``--json`` prints: counts, s, m and rad."""
     table = drawn.table()
     causes = Counter(s.status.name.lower() for s in drawn.spots if s.reason)
@@ -179,7 +178,7 @@ def figures(drawn: Drawn, rig: Rig) -> dict[str, Any]:
 
 def summarise(drawn: Drawn, rig: Rig) -> list[tuple[str, str]]:
     """Name and value, for the terminal and the page."""
-    f = figures(drawn, rig)
+    f = plot_json(drawn, rig)
     present, lost = f['samples'], f['lost']
     rows = [
         ('duration', f'{f["duration_s"]:.3f} s'),
@@ -201,7 +200,7 @@ _MDEG = 180e3 / np.pi
 _POSE = (('dx', 'ΔX', 1e6, 'µm'), ('dy', 'ΔY', 1e6, 'µm'), ('theta', 'θ', _MDEG, 'mdeg'))
 
 
-def draw(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any:
+def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any:
     """The figure: four traces on the left, both detectors and the spectrum on the right."""
     import matplotlib as mpl
     from matplotlib.figure import Figure

@@ -1,9 +1,9 @@
-"""Make a recording whole that a crash or a power cut left without its end.
+"""Repair recordings that a crash or a power cut left without their end.
 
-Each cut file is written anew beside the old one, with everything that lies whole in it, an index
-and a summary; the old one is kept as NAME.mcap.cut. Then metadata.yaml is made, so that
-`ros2 bag play` and other readers take the bag. Files that are whole are not touched, and neither is
-a recording that is still being made.
+For each damaged file a new one is written: all intact messages, an index and a summary. The damaged
+file is kept as NAME.mcap.cut. In a bag folder metadata.yaml is written too, so that `ros2 bag play`
+and other readers accept the bag. Intact files stay as they are. A recording that is still being
+written is refused.
 
   psd-deflection recover recordings/psd_20260101_120000
   psd-deflection recover lone.mcap
@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     """Repair and say what was done."""
     found = []
     for path in args.recording:
-        with told(f'reading {path}, and writing anew what is cut', quiet=args.json):
+        with told(f'reading and repairing {path}', quiet=args.json):
             done = recover(path)
         for warning in (w for file in done.files for w in file.warnings):
             warn(warning)
@@ -64,7 +64,7 @@ def in_json(done: Recovered) -> dict[str, Any]:
 def _lines(path: str, done: Recovered) -> Iterator[str]:
     for file in done.files:
         span = (file.count.end_ns - file.count.start_ns) * 1e-9
-        what = f'repaired, the old one is {file.path.name}.cut' if file.repaired else 'was whole'
+        what = f'repaired, the old one is {file.path.name}.cut' if file.repaired else 'was intact'
         yield f'{file.path}: {file.count.messages} messages, {span:.3f} s; {what}'
     for aside in done.set_aside:
         yield f'{aside}: held nothing and is set aside'

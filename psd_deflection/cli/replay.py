@@ -1,8 +1,8 @@
-"""Run a recording through the same pipeline as the live node.
+"""Compute the estimates of a recording again, in the same way as the live node.
 
-REC is a bag folder, an .mcap or a .csv. With the parameters of the recording itself (the default)
-the estimates come out bit for bit as they were published; --compare shows it and exits 1 where
-anything differs. With --params-file another rig is used: what would it have measured?
+With the recorded parameters (the default) the estimates are the published ones, bit for bit.
+--compare checks this and ends with status 1 if anything differs. With --params-file you see what
+another rig would have estimated from the same samples.
 
   psd-deflection replay recordings/psd_20260101_120000 --compare
   psd-deflection replay run.csv --params-file my_rig.yaml --out estimates.csv
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='write the estimates: X.csv, X.mcap, X.rrd or a bag folder (X)',
     )
     parser.add_argument(
-        '--compare', action='store_true', help='compare with the recorded estimates; exit 1 where a bit differs'
+        '--compare', action='store_true', help='compare with the recorded estimates; exit status 1 if a bit differs'
     )
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')
 

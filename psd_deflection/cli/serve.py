@@ -25,15 +25,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what --serve takes besides the rig."""
     group = parser.add_argument_group('as a device (--serve)')
     group.add_argument(
-        '--serve', action='store_true', help='be a device on a pseudo-terminal, in real time, and print its port'
+        '--serve', action='store_true', help='act as a device on a pseudo-terminal in real time; print its port'
     )
     group.add_argument(
         '--device',
         choices=SIMULATED,
         metavar='NAME',
-        help='what it speaks, named as source: names it: %(choices)s (default: what source: of the rig says)',
+        help='kind of device: %(choices)s (default: the parameter source of the rig)',
     )
-    group.add_argument('--link', metavar='PATH', help='a symbolic link to the port, for a name that stays')
+    group.add_argument(
+        '--link', metavar='PATH', help='make a symbolic link to the port, so that its name stays the same'
+    )
     group.add_argument(
         '--skew-ppm',
         type=number('--skew-ppm', -MAX_SKEW_PPM, MAX_SKEW_PPM),

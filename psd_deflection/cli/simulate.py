@@ -1,8 +1,9 @@
-"""Simulate the rig: as a recording (--out), or as a device on a pseudo-terminal (--serve).
+"""Simulate the rig: write a recording (--out), or act as a device on a pseudo-terminal (--serve).
 
-The rig file says what the rig is and which effects are known of; --effect adds one that nobody knows
-of: neither the estimates nor the parameters in the recording tell of it. A recording holds the
-samples, the loads, the temperature where one is given, and with --reference the true pose.
+The rig file describes the rig and its known effects. --effect adds a hidden effect: the samples
+contain it, but the estimates do not correct for it and the recorded parameters do not list it.
+A recording contains the samples, the estimates and the loads, the temperature if --temperature is
+given, and the true pose with --reference. A .csv has no estimates.
 
   psd-deflection simulate --out run --loads thesis --temperature 20,24
   psd-deflection simulate --out odd.csv --effect axis_crosstalk,psd=1,xy=0.02
@@ -41,7 +42,7 @@ OF_A_RECORDING: dict[str, object] = {
     'reference': False,
     'json': False,
 }
-"""Options of a recording, and what they are where they are not given."""
+"""Options of a recording and their defaults."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,10 +63,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='NAME,KEY=VALUE,...',
         action='append',
         default=[],
-        help='hide an effect in it; repeatable',
+        help='add a hidden effect; repeatable',
     )
-    group.add_argument('--reference', action='store_true', help='record the true pose as an independent measurement')
-    group.add_argument('--json', action='store_true', help='for programs: the summary as one JSON object')
+    group.add_argument('--reference', action='store_true', help='record the true pose as a reference measurement')
+    group.add_argument('--json', action='store_true', help='print the summary as JSON')
     serve.add_arguments(parser)
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from psd_deflection import __version__
 from psd_deflection.config import Rig
 from psd_deflection.devices.device import OUTPUT_LIMIT, Answer, Device, PowerUp, Probe, converter_parameters
-from psd_deflection.devices.port_search import candidates, is_pattern, matching
+from psd_deflection.devices.port_search import candidate_ports, is_pattern, matching
 from psd_deflection.devices.port_source import PortSource
 from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import REOPEN_S, Event, Received
@@ -130,7 +130,7 @@ class ContractFrames(PortSource):
         try:
             return self._open(name, REOPEN_S)
         except DeviceError:
-            others = [c for c in candidates(self._given, self._wanted) if c != name]
+            others = [c for c in candidate_ports(self._given, self._wanted) if c != name]
             if not others:
                 raise
             self._next_candidate = (self._next_candidate + 1) % len(others)

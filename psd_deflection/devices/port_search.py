@@ -23,7 +23,7 @@ def matching(pattern: str) -> list[str]:
     return sorted(glob.glob(pattern))[:MAX_PORTS]  # noqa: PTH207 - the pattern is a whole path
 
 
-def candidates(port: str, wanted_serial: str) -> list[str]:
+def candidate_ports(port: str, wanted_serial: str) -> list[str]:
     """Other ports where the device may have come back, the likeliest first.
 
     A port whose USB descriptor has ``wanted_serial`` goes first.

@@ -171,11 +171,8 @@ def _credible(
         if result.delta_chi2[weakest] >= left.excess:
             break
         search.trace.append(f'{fit.effects[weakest].label} explains less than what remains unknown')
-        rest = [a for j, a in enumerate(fit.effects) if j != weakest]
-        fit = refit(ws, rest, iterations=6) if rest else result.null
+        fit = _without(ws, result, fit, weakest)
         heldout = [h for j, h in enumerate(heldout) if j != weakest]
-        for listed in (result.p, result.delta_bic, result.delta_chi2):
-            del listed[weakest]
     return fit, heldout, left
 
 
@@ -217,11 +214,16 @@ def _accept(search: Search, result: SearchResult, rng: np.random.Generator) -> t
             break
         _, worst = min(fails)
         search.trace.append(f'{fit.effects[worst].label} fails the joint rule')
-        rest = [a for j, a in enumerate(fit.effects) if j != worst]
-        fit = refit(ws, rest, iterations=6) if rest else result.null
-        for listed in (result.p, result.delta_bic, result.delta_chi2):
-            del listed[worst]
+        fit = _without(ws, result, fit, worst)
     return heldout, fit
+
+
+def _without(ws: Workspace, result: SearchResult, fit: Fit, index: int) -> Fit:
+    """``fit`` refitted without one effect, which is taken out of ``result`` too."""
+    for listed in (result.p, result.delta_bic, result.delta_chi2):
+        del listed[index]
+    rest = [a for j, a in enumerate(fit.effects) if j != index]
+    return refit(ws, rest, iterations=6) if rest else result.null
 
 
 def _answer(

@@ -125,18 +125,16 @@ def regressors(workspace: Workspace) -> list[dict[str, list[FloatArray]]]:
             history[row] = changes[row][last]
         history = fine_means(history, size)
         time = np.arange(n) / n
+        warmer = np.zeros(n) if o.temperature is None else fine_means(chunk.warmer[None, :], size)[0]
+        axes = ('fx', 'fy', 'tz')
         for psd in range(2):
             x, y = dots[2 * psd], dots[2 * psd + 1]
             named = {
                 'constant': np.ones(n),
                 'time': time,
                 'time^2': time**2,
-                'load_fx': loads[0],
-                'load_fy': loads[1],
-                'load_tz': loads[2],
-                'load_fx^2': loads[0] ** 2,
-                'load_fy^2': loads[1] ** 2,
-                'load_tz^2': loads[2] ** 2,
+                **{f'load_{axis}': load for axis, load in zip(axes, loads, strict=True)},
+                **{f'load_{axis}^2': load**2 for axis, load in zip(axes, loads, strict=True)},
                 'dot_x': x,
                 'dot_y': y,
                 'dot_x^2': x * x,
@@ -150,17 +148,10 @@ def regressors(workspace: Workspace) -> list[dict[str, list[FloatArray]]]:
                 'rate of dot_y': np.gradient(y),
                 '|rate of dot_x|': np.abs(np.gradient(x)),
                 '|rate of dot_y|': np.abs(np.gradient(y)),
-                'history of load_fx': history[0],
-                'history of load_fy': history[1],
-                'history of load_tz': history[2],
+                **{f'history of load_{axis}': last for axis, last in zip(axes, history, strict=True)},
+                'temperature': warmer,
+                'temperature^2': warmer**2,
             }
-            if o.temperature is not None:
-                warmer = fine_means(chunk.warmer[None, :], size)[0]
-                named['temperature'] = warmer
-                named['temperature^2'] = warmer**2
-            else:
-                named['temperature'] = np.zeros(n)
-                named['temperature^2'] = np.zeros(n)
             for name, values in named.items():
                 out[psd].setdefault(name, []).append(values)
     return out

@@ -130,7 +130,7 @@ def sentence(discovery: Discovery) -> str:
     """The verdict in one sentence."""
     floor, after, before = (1e6 * v for v in (discovery.gap_floor, discovery.gap_after, discovery.gap_before))
     if discovery.verdict == 'nothing_missing':
-        return f'Nothing is missing: the gap of {before:.3f} µm is what noise alone leaves ({floor:.3f} µm).'
+        return f'Nothing is missing: the gap of {before:.3f} µm is that of noise alone ({floor:.3f} µm).'
     parts = []
     for e in discovery.effects:
         text = e.active.label
@@ -152,4 +152,4 @@ def sentence(discovery: Discovery) -> str:
     lead = (
         f'{named} explains part, but an unknown effect remains' if named else 'An effect that is not in the catalogue'
     )
-    return f'{lead}: the gap is {after:.3f} µm where noise alone leaves {floor:.3f} µm.'
+    return f'{lead}: the gap is {after:.3f} µm (noise alone: {floor:.3f} µm).'

@@ -110,7 +110,7 @@ def candidates(
                     yield Candidate(effect, start, free, off)
 
 
-def columns(
+def signature_columns(
     candidate: Candidate, workspace: Workspace, nominal: list[FloatArray], base: Sequence[ActiveEffect]
 ) -> Columns:
     """The candidate's signatures: change of the fine-block volts for one ``scale`` of each parameter.
@@ -166,6 +166,6 @@ class SignatureBank:
         """The candidate's columns, simulated once."""
         found = self._kept.get(candidate.key)
         if found is None:
-            found = columns(candidate, workspace, self.nominal(workspace), self._base)
+            found = signature_columns(candidate, workspace, self.nominal(workspace), self._base)
             self._kept[candidate.key] = found
         return found

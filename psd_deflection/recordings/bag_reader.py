@@ -293,7 +293,7 @@ class _SequenceCounter:
         if not whole and 0 < step <= 1000 + (t_ns - self._last_t) * self._FASTEST_HZ // 1_000_000_000:
             self._wrapped += last + step - first
             return
-        self._warn(f'sample numbers start anew after {last}')
+        self._warn(f'sample numbers start again after {last}')
         size = self._block_size
         self._moved += (last // size + 1 - first // size) * size
 

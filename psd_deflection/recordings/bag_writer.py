@@ -8,6 +8,7 @@ cut, and :mod:`psd_deflection.recordings.repair` repairs it.
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import fcntl
 import json
@@ -23,7 +24,7 @@ from mcap.writer import CompressionType, Writer
 
 from msg_adapters import MESSAGE_TYPES, to_messages
 from psd_deflection import __version__
-from psd_deflection.errors import RecordingError
+from psd_deflection.errors import RecordingError, creating
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.bag_metadata import (
     DEFAULT_QOS,
@@ -94,11 +95,25 @@ class _IndexSpool:
         self._file.close()
 
 
-class _Closing:
-    """What ``with`` closes."""
+class _RecordSink(abc.ABC):
+    """A sink of records that ``with`` closes."""
 
-    def close(self) -> None:
-        raise NotImplementedError
+    @abc.abstractmethod
+    def close(self) -> None: ...
+
+    @abc.abstractmethod
+    def _change(self, change: ParameterChange) -> None: ...
+
+    @abc.abstractmethod
+    def write_encoded(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None: ...
+
+    def put(self, record: Record) -> None:
+        """Write all messages of one record; the log time is the record's own stamp."""
+        if isinstance(record, ParameterChange):
+            self._change(record)
+            return
+        for message in to_messages(record):
+            self.write_encoded(message.topic, message.type, cdr.encode(message.type, message.fields), message.t_ns)
 
     def __enter__(self) -> Self:
         return self
@@ -107,7 +122,7 @@ class _Closing:
         self.close()
 
 
-class McapFile(_Closing):
+class McapFile(_RecordSink):
     """One MCAP file being written; common to bags and single files.
 
     ``write`` takes the records of one thread. Raises RecordingError if the file exists, cannot be
@@ -138,12 +153,8 @@ class McapFile(_Closing):
         self._spool: _IndexSpool | None = None
         parameters = _json_values(rig_values)
         hello = None if device_hello is None else _json_values(device_hello)
-        try:
+        with creating(path):
             self._stream = path.open('xb')
-        except FileExistsError:
-            raise RecordingError(f'{path}: exists already; a recording is never overwritten') from None
-        except OSError as error:
-            raise RecordingError(f'{path}: cannot be made ({error.strerror or error})') from None
         with contextlib.suppress(OSError):
             fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._writer = Writer(self._stream, compression=CompressionType.ZSTD, enable_crcs=True)
@@ -196,18 +207,13 @@ class McapFile(_Closing):
                 with contextlib.suppress(OSError):
                     one.close()
 
-    def write(self, record: Record) -> None:
-        """Write all messages of one record; the log time is the record's own stamp."""
-        if isinstance(record, ParameterChange):
-            with self._guard():
-                self.changes.append(record)
-                head = {'t_ns': str(record.t_ns), 'block': str(record.block)}
-                self._writer.add_metadata(
-                    f'{META_CHANGE}{len(self.changes):06d}', {**head, 'values': json.dumps(dict(record.values))}
-                )
-            return
-        for message in to_messages(record):
-            self.write_encoded(message.topic, message.type, cdr.encode(message.type, message.fields), message.t_ns)
+    def _change(self, change: ParameterChange) -> None:
+        with self._guard():
+            self.changes.append(change)
+            head = {'t_ns': str(change.t_ns), 'block': str(change.block)}
+            self._writer.add_metadata(
+                f'{META_CHANGE}{len(self.changes):06d}', {**head, 'values': json.dumps(dict(change.values))}
+            )
 
     def write_encoded(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
         """Write one message that is already encoded as CDR, at log time ``t_ns``.
@@ -266,17 +272,14 @@ class McapFile(_Closing):
                 self._spool.close()
         self._stream = None
 
-    # A recorder is a sink like any other.
-    put = write
 
-
-class BagWriter(_Closing):
+class BagWriter(_RecordSink):
     """A rosbag2 bag being written: ``NAME/NAME_0.mcap`` and so on, ``NAME/metadata.yaml`` at the end.
 
     ``rig_values``: the flat parameter set, effects included.
     ``max_bytes``, ``max_s``: a file of this size, or with this span of log time, is closed and the
     next one begun (0: never); each file can be read alone. Raises RecordingError if the folder
-    exists already or cannot be created; :meth:`write` and the others raise it as in :class:`McapFile`.
+    exists already or cannot be created; the calls raise it as in :class:`McapFile`.
     """
 
     def __init__(
@@ -290,12 +293,8 @@ class BagWriter(_Closing):
         durable: bool = False,
     ) -> None:
         self.folder = Path(folder)
-        try:
+        with creating(self.folder):
             self.folder.mkdir(parents=True)
-        except FileExistsError:
-            raise RecordingError(f'{self.folder}: exists already; a recording is never overwritten') from None
-        except OSError as error:
-            raise RecordingError(f'{self.folder}: cannot be made ({error.strerror or error})') from None
         self._name = self.folder.resolve().name
         self._rig_values, self._hello = rig_values, device_hello
         self._max_bytes, self._max_ns, self._durable = max_bytes, round(max_s * 1e9), durable
@@ -323,13 +322,8 @@ class BagWriter(_Closing):
         self._number += 1
         return file
 
-    def write(self, record: Record) -> None:
-        """Write all messages of one record; the log time is the record's own stamp."""
-        if isinstance(record, ParameterChange):
-            self._file.write(record)
-            return
-        for message in to_messages(record):
-            self.write_encoded(message.topic, message.type, cdr.encode(message.type, message.fields), message.t_ns)
+    def _change(self, change: ParameterChange) -> None:
+        self._file.put(change)
 
     def write_encoded(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
         """Write one message that is already encoded as CDR, at log time ``t_ns``; begin a new file if it is due."""
@@ -346,7 +340,7 @@ class BagWriter(_Closing):
         self._ended.append((before.count(), list(before.topics.values())))
         self._file = self._begin()
         for change in before.changes:
-            self._file.write(change)
+            self._file.put(change)
 
     def drop_oldest(self) -> Path | None:
         """Delete the oldest complete file; None if there is only the one being written."""
@@ -390,6 +384,3 @@ class BagWriter(_Closing):
         self._file.close()
         self.path.unlink()
         self.folder.rmdir()
-
-    # A recorder is a sink like any other.
-    put = write

@@ -139,25 +139,12 @@ class CsvRecording(Recording):
 
     def _nanoseconds(self, cell: str, line: int) -> int:
         text = cell.strip()
-        whole, _, part = text.partition('.')
-        if whole.isdecimal() and whole.isascii() and len(whole) <= 10 and len(part) <= 9:
-            if not part:
-                t_ns = int(whole) * 1_000_000_000
-            elif part.isdecimal() and part.isascii():
-                t_ns = int(whole) * 1_000_000_000 + int(part.ljust(9, '0'))
-            else:
-                t_ns = -1
-        else:
-            t_ns = -1
-        if t_ns < 0:
-            try:
-                seconds = Decimal(text)
-            except InvalidOperation:
-                raise self._refuse(f'column t holds {text!r}, which is not a number', line) from None
-            if not seconds.is_finite() or not 0 <= seconds < MAX_SECONDS:
-                raise self._refuse(f'column t holds {text!r}; seconds from 0 to {MAX_SECONDS} are read', line)
-            t_ns = int((seconds * 1_000_000_000).to_integral_value())
-        if t_ns >= MAX_SECONDS * 1_000_000_000:
+        try:
+            seconds = Decimal(text)
+        except InvalidOperation:
+            raise self._refuse(f'column t holds {text!r}, which is not a number', line) from None
+        t_ns = int((seconds * 1_000_000_000).to_integral_value()) if 0 <= seconds < MAX_SECONDS else -1
+        if not 0 <= t_ns < MAX_SECONDS * 1_000_000_000:
             raise self._refuse(f'column t holds {text!r}; seconds from 0 to {MAX_SECONDS} are read', line)
         return t_ns
 

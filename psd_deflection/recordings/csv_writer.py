@@ -6,13 +6,14 @@ poses), times with nine decimals.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
-from psd_deflection.errors import RecordingError
+from psd_deflection.errors import RecordingError, creating
 from psd_deflection.recordings.csv_reader import LOAD_COLUMNS, REFERENCE_COLUMNS, REQUIRED, TEMPERATURE_COLUMN
 from psd_deflection.records import (
     AppliedLoad,
@@ -36,12 +37,8 @@ class _CsvFile:
     def __init__(self, path: str | Path, header: Sequence[str]) -> None:
         self.path = Path(path)
         self._stream: TextIO | None = None
-        try:
+        with creating(self.path):
             self._stream = self.path.open('x', encoding='ascii', newline='\n')
-        except FileExistsError:
-            raise RecordingError(f'{self.path}: exists already; a recording is never overwritten') from None
-        except OSError as error:
-            raise RecordingError(f'{self.path}: cannot be made ({error.strerror or error})') from None
         self._write([','.join(header)])
 
     def _write(self, lines: Sequence[str]) -> None:
@@ -54,11 +51,9 @@ class _CsvFile:
 
     def _give_up(self, error: OSError) -> None:
         stream, self._stream = self._stream, None
-        try:
+        with contextlib.suppress(OSError):
             if stream is not None:
                 stream.close()
-        except OSError:
-            pass
         raise RecordingError(f'{self.path}: cannot be written ({error.strerror or error})') from None
 
     def _finish(self) -> None:
@@ -69,9 +64,8 @@ class _CsvFile:
         if self._stream is None:
             return
         self._finish()
-        stream = self._stream
         try:
-            stream.close()
+            self._stream.close()
         except OSError as error:
             self._give_up(error)
         self._stream = None

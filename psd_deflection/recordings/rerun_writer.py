@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.errors import ConfigError, RecordingError, creating
+from psd_deflection.geometry.scene import bend, tip_boxes
 from psd_deflection.records import DeflectionEstimate, Record, SpotMeans, TipLoad
 
 APPLICATION = 'psd_deflection'
@@ -62,12 +62,8 @@ class RerunFile:
         import rerun as rr
 
         self.path = Path(path)
-        try:
+        with creating(self.path):
             self.path.open('xb').close()
-        except FileExistsError:
-            raise RecordingError(f'{self.path}: exists already; a recording is never overwritten') from None
-        except OSError as error:
-            raise RecordingError(f'{self.path}: cannot be made ({error.strerror or error})') from None
         self._rr = rr
         self._rig = rig
         self._magnify = rig.monitor.markers_magnify
@@ -183,10 +179,9 @@ class RerunFile:
             return rr.Points3D.columns(positions=values.reshape(-1, 3)), 1
         if path == 'rig/link':
             dx, dy, _ = values.reshape(-1, 3).T
-            # A cantilever under a force at its tip.
-            bend = _STATIONS**2 * (3.0 - _STATIONS) / 2.0
-            z = np.broadcast_to(_STATIONS * rig.link.length, (len(dx), len(bend)))
-            return rr.LineStrips3D.columns(strips=np.stack([np.outer(dx, bend), np.outer(dy, bend), z], axis=-1)), 1
+            shape = bend(_STATIONS)
+            z = np.broadcast_to(_STATIONS * rig.link.length, (len(dx), len(shape)))
+            return rr.LineStrips3D.columns(strips=np.stack([np.outer(dx, shape), np.outer(dy, shape), z], axis=-1)), 1
         if path == 'rig/tip':
             dx, dy, theta = values.reshape(-1, 3).T
             nothing = np.zeros_like(theta)
@@ -194,9 +189,9 @@ class RerunFile:
             turn = np.stack([nothing, nothing, np.sin(theta / 2.0), np.cos(theta / 2.0)], axis=-1)
             return rr.Transform3D.columns(translation=at, quaternion=turn), 1
         if path == 'rig/tip/plate':
-            boxes = _plate(rig)
-            centers, halves = ([b[i] for b in boxes] * len(values) for i in (0, 1))
-            return rr.Boxes3D.columns(centers=centers, half_sizes=halves), len(boxes)
+            centers, sizes = zip(*tip_boxes(rig), strict=True)
+            halves = [[side / 2.0 for side in size] for size in sizes]
+            return rr.Boxes3D.columns(centers=centers * len(values), half_sizes=halves * len(values)), len(sizes)
         return rr.Scalars.columns(scalars=values.reshape(-1)), values.shape[1] if values.size else 1
 
     def _static(self, path: str, *what: Any) -> None:
@@ -240,18 +235,6 @@ class RerunFile:
                 f'rig/laser_{n}', rr.Boxes3D(centers=(x, y, -0.02), sizes=(0.016, 0.016, 0.04), colors=_SENSOR)
             )
             self._static(f'rig/tip/dot_{n}', rr.Points3D.from_fields(colors=_LIGHT, radii=2.0 * psd.spot_radius))
-
-
-def _plate(rig: Rig) -> list[tuple[Sequence[float], Sequence[float]]]:
-    """Centre and half size of the tip plate and of both detectors, m, in the plate's axes."""
-    xs, ys = ([0.0, *(p.center[i] for p in rig.psds)] for i in (0, 1))
-    half = ((max(xs) - min(xs)) / 2 + 0.015, (max(ys) - min(ys)) / 2 + 0.015, 0.002)
-    out: list[tuple[Sequence[float], Sequence[float]]] = [
-        (((max(xs) + min(xs)) / 2, (max(ys) + min(ys)) / 2, 0.003), half)
-    ]
-    for psd in rig.psds:
-        out.append(((*psd.center, psd.height), (psd.active_area[0] / 2, psd.active_area[1] / 2, 0.001)))
-    return out
 
 
 def blueprint(rig: Rig, speed: float = 1.0) -> Any:

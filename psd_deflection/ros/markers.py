@@ -14,6 +14,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import Point, Quaternion, TransformStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -21,6 +22,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from msg_adapters.orientation import quaternion
 from psd_deflection.config import Rig
+from psd_deflection.geometry.scene import Vector, bend, tip_boxes
 from psd_deflection.records import DeflectionEstimate, SpotMeans
 from psd_deflection.ros.names import BASE, MARKERS, MARKERS_AT_REST, REST, TIP
 from psd_deflection.ros.wires import qos, relative
@@ -35,8 +37,6 @@ _METAL, _PLATE, _SENSOR, _LASER = (
     (0.1, 0.1, 0.12, 1.0),
     (1.0, 0.2, 0.15, 1.0),
 )
-
-Vector = tuple[float, float, float]
 
 
 def _marker(
@@ -80,24 +80,18 @@ def moving(rig: Rig, estimate: DeflectionEstimate | None, spots: SpotMeans, magn
     def placed(x: float, y: float, z: float) -> Vector:
         return dx + c * x - s * y, dy + s * x + c * y, length + z
 
-    turn = Quaternion(z=math.sin(theta / 2), w=math.cos(theta / 2))
+    turn = Quaternion(**quaternion(theta))
     link = _marker(0, 'link', Marker.LINE_STRIP, _METAL, (2 * rig.link.outer_radius, 0.0, 0.0))
-    for k in range(21):
-        u = k / 20.0
-        # A cantilever under a force at its tip.
-        bend = u * u * (3.0 - u) / 2.0
-        link.points.append(Point(x=dx * bend, y=dy * bend, z=length * u))
-    xs = [0.0, *(p.center[0] for p in rig.psds)]
-    ys = [0.0, *(p.center[1] for p in rig.psds)]
-    side = 0.03
-    size = (max(xs) - min(xs) + side, max(ys) - min(ys) + side, 0.004)
-    middle = placed((max(xs) + min(xs)) / 2, (max(ys) + min(ys)) / 2, 0.003)
-    plate = _marker(0, 'plate', Marker.CUBE, _PLATE, size, middle)
+    places = np.linspace(0.0, 1.0, 21)
+    for u, part in zip(places.tolist(), bend(places).tolist(), strict=True):
+        link.points.append(Point(x=dx * part, y=dy * part, z=length * u))
+    (middle, size), *sensors = tip_boxes(rig)
+    plate = _marker(0, 'plate', Marker.CUBE, _PLATE, size, placed(*middle))
     plate.pose.orientation = turn
     out = [link, plate]
     for i, psd in enumerate(rig.psds):
-        (cx, cy), (width, height), (zx, zy) = psd.center, psd.active_area, psd.zero
-        sensor = _marker(i + 1, 'psd', Marker.CUBE, _SENSOR, (width, height, 0.002), placed(cx, cy, psd.height))
+        (cx, cy), (zx, zy) = psd.center, psd.zero
+        sensor = _marker(i + 1, 'psd', Marker.CUBE, _SENSOR, sensors[i][1], placed(*sensors[i][0]))
         sensor.pose.orientation = turn
         mx, my = spots.dots[2 * i], spots.dots[2 * i + 1]
         radius = 2.0 * psd.spot_radius

@@ -343,7 +343,7 @@ class Acquisition:
                     self._repeats.tell(
                         'lag',
                         f"{self._name}: the device's clock stands still, or falls behind its sample numbers; "
-                        'times are laid anew',
+                        'the time map starts again',
                         now / 1e9,
                         NEWS,
                     )
@@ -363,7 +363,9 @@ class Acquisition:
 
     def _jumped(self, now: int) -> None:
         self.counters.clock_jumps += 1
-        self._repeats.tell('jump', f"{self._name}: the device's clock jumped; times are laid anew", now / 1e9, NEWS)
+        self._repeats.tell(
+            'jump', f"{self._name}: the device's clock jumped; the time map starts again", now / 1e9, NEWS
+        )
 
     def _unusual(self, number: int, step: Step, missing: int, flags: int, now: int) -> bool:
         """Count a sample that does not directly follow the last one; False if it is to be skipped."""

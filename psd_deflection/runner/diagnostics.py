@@ -123,7 +123,9 @@ class HealthReporter:
         level, message = OK, f'skew {clock.skew_ppm:z.1f} ppm'
         if new.clock_jumps:
             level = WARN
-            message = f"the device's clock jumped or stood still: times were laid anew {new.clock_jumps} times"
+            message = (
+                f"the device's clock jumped or stood still: the time map was started again {new.clock_jumps} times"
+            )
         if abs(stepped) > CLOCK_STEP_NS:
             level = WARN
             message = f'the system clock was set by {stepped / 1e9:+.3f} s; stamps go on as before until the next start'

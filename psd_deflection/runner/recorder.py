@@ -318,7 +318,7 @@ class Recorder:
             if item is None:
                 return
             if isinstance(item, ParameterChange):
-                bag.write(item)
+                bag.put(item)
             else:
                 bag.write_encoded(*item)
                 with self._lock:

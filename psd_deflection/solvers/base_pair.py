@@ -18,18 +18,18 @@ assumption: ``no_twist`` (5.3's own assumption: dX, dY, phi, omega), or ``beam``
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import cos, sin, tan
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, SolverError
-from psd_deflection.geometry.landings import landing, landings
 from psd_deflection.geometry.layout import SMALLEST_BASE_LINE, Geometry, check_twist
-from psd_deflection.records import FloatArray
+from psd_deflection.geometry.plate import Row, tie_matrix
 from psd_deflection.solvers.beam import slope_per_metre
-from psd_deflection.solvers.gauss_newton import fit, fit_many
-from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
+from psd_deflection.solvers.gauss_newton import fit
+from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
 
 Assume = Literal['beam', 'no_twist', 'nothing']
 
@@ -61,40 +61,19 @@ class BasePairSolver(Solver):
                     f'psd_{i + 1}.height = {height:g} m: a PSD at the base stands below the tip section; '
                     'base_pair takes psd_N.height = -(its distance from the lasers)'
                 )
-        self._centers = np.asarray(geometry.centers, dtype=np.float64)
-        self._beams = np.asarray(geometry.beams, dtype=np.float64)
-        self._heights = heights
-        self._rows = tuple(
-            (cx, cy, lx, ly, h)
-            for (cx, cy), (lx, ly), h in zip(
-                self._centers.tolist(), self._beams.tolist(), heights.tolist(), strict=True
-            )
-        )
+        self._centers = np.asarray(geometry.centers).ravel().tolist()
+        self._rows = tuple(map(tuple, np.column_stack((geometry.beams, heights)).tolist()))
         # From the unknowns that are solved for to (dX, dY, theta, phi, omega).
         if assume == 'beam':
-            tie = slope_per_metre(geometry)
-            spread: tuple[tuple[float, ...], ...] = (
-                (1.0, 0.0, 0.0),
-                (0.0, 1.0, 0.0),
-                (0.0, 0.0, 1.0),
-                (0.0, -tie, 0.0),
-                (tie, 0.0, 0.0),
-            )
+            slope_per_metre(geometry)
+            self._matrix = tie_matrix(geometry.slope_ratio, geometry.link_length)
         elif assume == 'no_twist':
-            spread = (
-                (1.0, 0.0, 0.0, 0.0),
-                (0.0, 1.0, 0.0, 0.0),
-                (0.0, 0.0, 0.0, 0.0),
-                (0.0, 0.0, 1.0, 0.0),
-                (0.0, 0.0, 0.0, 1.0),
-            )
+            self._matrix = np.eye(5)[:, [0, 1, 3, 4]]
         elif assume == 'nothing':
-            spread = tuple(tuple(float(i == j) for j in range(5)) for i in range(5))
+            self._matrix = np.eye(5)
         else:
             raise ConfigError(f'assume = {assume!r}: must be one of beam, no_twist, nothing')
-        self._spread = spread
-        self._unknowns = len(self._spread[0])
-        self._matrix = np.array(self._spread)
+        self._spread, self._columns = self._matrix.tolist(), self._matrix.T.tolist()
         self._refuse_what_is_unseen(geometry, assume)
 
     @classmethod
@@ -103,10 +82,11 @@ class BasePairSolver(Solver):
         return {'assume': rig.estimator.base_pair_assume}
 
     def _refuse_what_is_unseen(self, geometry: Geometry, assume: Assume) -> None:
-        heights = self._heights
+        heights = np.asarray(geometry.heights)
+        at_rest = [landing(lx, ly, h, 0.0, 0.0, 0.0, 0.0, 0.0) for lx, ly, h in self._rows]
+        jacobian = np.array([row for rows in at_rest for row in rows[2:]])
         if assume == 'nothing' and self._count == 2:
-            _, jacobian = landings(self._beams, heights, np.zeros((1, 5)))
-            null = np.linalg.svd(jacobian[0])[2][4]
+            null = np.linalg.svd(jacobian)[2][4]
             per_degree = abs(null[1] / null[2]) * np.pi / 180.0
             raise SolverError(
                 'two PSDs at the base give 4 readings for 5 unknowns: with torsion, one degree of twist looks like '
@@ -127,10 +107,9 @@ class BasePairSolver(Solver):
                     'dot back by what the deflection moved it (Fig. 5.9): the deflection cannot be seen; '
                     'put the PSDs in another plane'
                 )
-        _, jacobian = landings(self._beams, heights, np.zeros((1, 5)))
-        length = float(np.hypot(*np.ptp(self._beams, axis=0)))
+        length = float(np.hypot(*np.ptp(geometry.beams, axis=0)))
         scale = np.array([1.0, 1.0, length, float(np.abs(heights).max()), float(np.abs(heights).max())])
-        seen = (jacobian[0] / scale) @ (scale[:, None] * self._matrix)
+        seen = (jacobian / scale) @ (scale[:, None] * self._matrix)
         seen /= np.linalg.norm(seen, axis=0)
         if np.linalg.svd(seen, compute_uv=False)[-1] < _SMALLEST_GAIN:
             raise SolverError(
@@ -140,24 +119,19 @@ class BasePairSolver(Solver):
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
-        measured: list[float] = []
-        for i, (cx, cy, _, _, _) in enumerate(self._rows):
-            measured.append(cx + dots[2 * i])
-            measured.append(cy + dots[2 * i + 1])
-        found = fit(self._model, (0.0,) * self._unknowns, measured, variances)
-        full = [sum([a * x for a, x in zip(row, found.parameters, strict=True)]) for row in self._spread]
-        spread = self._spread[:3]
-        half = [
-            [sum([a * v for a, v in zip(row, column, strict=True)]) for column in found.covariance] for row in spread
-        ]
-        v = [[sum([a * h for a, h in zip(row, line, strict=True)]) for row in spread] for line in half]
+        measured = [c + m for c, m in zip(self._centers, dots, strict=True)]
+        found = fit(self._model, (0.0,) * self._matrix.shape[1], measured, variances)
+        (vxx, vxy, vxt), (_, vyy, vyt), (_, _, vtt) = (
+            self._matrix[:3] @ found.covariance @ self._matrix[:3].T
+        ).tolist()
+        dx, dy, theta, phi, omega = (self._matrix @ found.parameters).tolist()
         return Solution(
-            full[0],
-            full[1],
-            full[2],
-            full[3],
-            full[4],
-            (v[0][0], v[0][1], v[0][2], v[1][0], v[1][1], v[1][2], v[2][0], v[2][1], v[2][2]),
+            dx,
+            dy,
+            theta,
+            phi,
+            omega,
+            (vxx, vxy, vxt, vxy, vyy, vyt, vxt, vyt, vtt),
             tuple(found.residual),
             SolverStatus.OK if found.converged else SolverStatus.NOT_CONVERGED,
             found.steps,
@@ -167,27 +141,36 @@ class BasePairSolver(Solver):
         dx, dy, theta, phi, omega = [sum([a * b for a, b in zip(row, x, strict=True)]) for row in self._spread]
         predicted: list[float] = []
         rows: list[Sequence[float]] = []
-        for _, _, lx, ly, height in self._rows:
+        for lx, ly, height in self._rows:
             px, py, jx, jy = landing(lx, ly, height, dx, dy, theta, phi, omega)
             predicted.append(px)
             predicted.append(py)
             for j in (jx, jy):
-                rows.append(
-                    [sum([a * row[i] for a, row in zip(j, self._spread, strict=True)]) for i in range(self._unknowns)]
-                )
+                rows.append([sum([a * b for a, b in zip(j, column, strict=True)]) for column in self._columns])
         return predicted, rows
 
-    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks. See :class:`Solver`."""
-        measured = np.asarray(dots, dtype=np.float64) + self._centers.ravel()
-        spread = self._matrix
 
-        def model(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-            predicted, jacobian = landings(self._beams, self._heights, x @ spread.T)
-            return predicted, jacobian @ spread
-
-        found = fit_many(model, np.zeros((len(measured), self._unknowns)), measured, variances)
-        full = found.parameters @ spread.T
-        covariance = spread[:3] @ found.covariance @ spread[:3].T
-        status = np.where(found.converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED).astype(np.int8)
-        return Solutions(full[:, :3].copy(), full[:, 3:].copy(), covariance, found.residual, status)
+def landing(
+    lx: float, ly: float, height: float, dx: float, dy: float, theta: float, phi: float, omega: float
+) -> tuple[float, float, Row, Row]:
+    """Where the laser at (lx, ly) on the plate falls in the plane at ``height``, and the derivatives of that place."""
+    ct = cos(theta)
+    st = sin(theta)
+    ax = ct * lx - st * ly
+    ay = st * lx + ct * ly
+    co = cos(omega)
+    cp = cos(phi)
+    to = tan(omega)
+    tp = tan(phi)
+    return (
+        dx + ax / co + height * to,
+        dy + ay / cp - ax * to * tp - height * tp / co,
+        (1.0, 0.0, -ay / co, 0.0, (ax * sin(omega) + height) / (co * co)),
+        (
+            0.0,
+            1.0,
+            ax / cp + ay * to * tp,
+            (ay * sin(phi) - ax * to - height / co) / (cp * cp),
+            -tp * (ax + height * sin(omega)) / (co * co),
+        ),
+    )

@@ -16,10 +16,10 @@ import numpy as np
 
 from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
-from psd_deflection.geometry.plate import crossing, crossings, flat_pose, flat_poses
+from psd_deflection.geometry.plate import crossing, flat_pose
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.gauss_newton import fit, fit_many
-from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus, flat_gain
+from psd_deflection.solvers.gauss_newton import fit
+from psd_deflection.solvers.interface import Solution, Solver, SolverStatus, flat_gain
 
 
 class BeamSolver(Solver):
@@ -43,24 +43,14 @@ class BeamSolver(Solver):
                     f'{geometry.slope_ratio:g}) moves the dot back by as much as the deflection moves it: '
                     'the deflection cannot be seen'
                 )
-        self._centers = np.asarray(geometry.centers, dtype=np.float64)
-        self._beams = np.asarray(geometry.beams, dtype=np.float64)
-        self._heights = np.asarray(geometry.heights, dtype=np.float64)
-        self._rows = tuple(
-            (cx, cy, lx, ly, h)
-            for (cx, cy), (lx, ly), h in zip(
-                self._centers.tolist(), self._beams.tolist(), self._heights.tolist(), strict=True
-            )
-        )
-        self._places = [(lx, ly) for _, _, lx, ly, _ in self._rows]
+        self._centers = tuple(np.asarray(geometry.centers).ravel().tolist())
+        self._beams = [(lx, ly) for lx, ly in np.asarray(geometry.beams).tolist()]
+        self._heights = np.asarray(geometry.heights).tolist()
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
-        q: list[float] = []
-        for i, (cx, cy, _, _, _) in enumerate(self._rows):
-            q.append(cx + dots[2 * i])
-            q.append(cy + dots[2 * i + 1])
-        found = fit(self._model, flat_pose(q, self._places), q, variances)
+        q = [c + m for c, m in zip(self._centers, dots, strict=True)]
+        found = fit(self._model, flat_pose(q, self._beams), q, variances)
         dx, dy, theta = found.parameters
         (vxx, vxy, vxt), (_, vyy, vyt), (_, _, vtt) = found.covariance
         return Solution(
@@ -80,7 +70,7 @@ class BeamSolver(Solver):
         tie = self._tie
         predicted: list[float] = []
         rows: list[Sequence[float]] = []
-        for _, _, lx, ly, height in self._rows:
+        for (lx, ly), height in zip(self._beams, self._heights, strict=True):
             qx, qy, jx, jy = crossing(lx, ly, height, dx, dy, theta, -tie * dy, tie * dx)
             predicted.append(qx)
             predicted.append(qy)
@@ -90,25 +80,7 @@ class BeamSolver(Solver):
 
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
         """As of a flat plate: the tilts change it by their own size, some thousandths. See :class:`Solver`."""
-        return flat_gain(tuple(self._centers.ravel().tolist()), dots, variances, solution)
-
-    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks. See :class:`Solver`."""
-        points = np.asarray(dots, dtype=np.float64).reshape(len(dots), -1, 2) + self._centers
-        start = flat_poses(points, self._beams)
-        found = fit_many(self._model_many, start, points.reshape(len(points), -1), variances)
-        tilt = np.column_stack((-self._tie * found.parameters[:, 1], self._tie * found.parameters[:, 0]))
-        status = np.where(found.converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED).astype(np.int8)
-        return Solutions(found.parameters, tilt, found.covariance, found.residual, status)
-
-    def _model_many(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        tie = self._tie
-        full = np.column_stack((x, -tie * x[:, 1], tie * x[:, 0]))
-        points, j = crossings(full, self._beams, self._heights)
-        rows = j[..., :3].copy()
-        rows[..., 0] += tie * j[..., 4]
-        rows[..., 1] -= tie * j[..., 3]
-        return points.reshape(len(x), -1), rows.reshape(len(x), -1, 3)
+        return flat_gain(self._centers, dots, variances, solution)
 
 
 def slope_per_metre(geometry: Geometry) -> float:

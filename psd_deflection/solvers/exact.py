@@ -17,6 +17,7 @@ method starts there and doubles its digits each time. The covariance is (J^T W J
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import atan2, cos, sin
 from typing import ClassVar
 
@@ -25,16 +26,10 @@ import numpy.typing as npt
 
 from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
+from psd_deflection.geometry.plate import Number
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus, flat_gain
-from psd_deflection.solvers.plane import (
-    interleave,
-    positive,
-    split,
-    turn_covariance,
-    turn_covariance_many,
-    weighted_covariance,
-)
+from psd_deflection.solvers.plane import Four, Nine, checked_variances, turn_covariance
 
 _MAX_STEPS = 30
 _LAST_STEP = 1e-10
@@ -66,7 +61,7 @@ class ExactSolver(Solver):
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block; pure floats for two PSDs. See :class:`Solver`."""
         if self._count != 2:
-            return _one(self.solve_many(np.array([dots]), np.array(variances)))
+            return self._solve_any(dots, variances)
         x1, y1, x2, y2 = dots
         vx1, vy1, vx2, vy2 = variances
         try:
@@ -98,6 +93,26 @@ class ExactSolver(Solver):
             )
         if theta != theta or steps == _MAX_STEPS:
             status = SolverStatus.NOT_CONVERGED
+        dx, dy, residual, covariance = self._answer(c, s, (q1x, q1y, qx, qy), (mx, my), variances)
+        return Solution(dx, dy, theta, 0.0, 0.0, covariance, residual, status, steps)
+
+    def _answer(
+        self,
+        c: Number,
+        s: Number,
+        points: tuple[Number, Number, Number, Number],
+        reduced: tuple[Number, Number],
+        variances: Sequence[Number],
+    ) -> tuple[Number, Number, Four[Number], Nine[Number]]:
+        """dX, dY, residual and covariance at the turn (``c``, ``s``), of one block or of arrays of them.
+
+        ``points``: plate point 1 and its difference from plate point 2; ``reduced``: weights of that difference.
+        """
+        q1x, q1y, qx, qy = points
+        mx, my = reduced
+        vx1, vy1, vx2, vy2 = variances
+        lx = self._l1x - self._l2x
+        ly = self._l1y - self._l2y
         # The base line under the beams, in plate axes, and the dots' difference from it.
         px = c * lx + s * ly
         py = c * ly - s * lx
@@ -108,8 +123,8 @@ class ExactSolver(Solver):
         # The plate point under beam 1: where dot 1 is, less its residual.
         p1x = q1x - rx1
         p1y = q1y - ry1
-        dx = l1x - c * p1x + s * p1y
-        dy = l1y - s * p1x - c * p1y
+        dx = self._l1x - c * p1x + s * p1y
+        dy = self._l1y - s * p1x - c * p1y
         vtt = 1.0 / (mx * py * py + my * px * px)
         # Weighted means of the plate points: of y with the weights of x, and vice versa.
         mean_y = p1y - py * vx1 * mx
@@ -119,31 +134,53 @@ class ExactSolver(Solver):
         covariance = turn_covariance(
             c, s, vx1 * vx2 * mx + mean_y * vxt, -mean_x * vxt, vy1 * vy2 * my - mean_x * vyt, vxt, vyt, vtt
         )
-        return Solution(dx, dy, theta, 0.0, 0.0, covariance, (rx1, ry1, -ex * vx2, -ey * vy2), status, steps)
+        return dx, dy, (rx1, ry1, -ex * vx2, -ey * vy2), covariance
+
+    def _solve_any(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
+        """Any number of PSDs."""
+        (qx, qy), (lx, ly) = (self._centers + np.reshape(dots, (-1, 2))).T, self._beams.T
+        wx, wy = 1.0 / checked_variances(np.array(variances)).reshape(-1, 2).T
+        sum_x, sum_y = float(wx.sum()), float(wy.sum())
+        # Each axis is centred with its own weights.
+        xx, xy, xq = (a - wx @ a / sum_x for a in (lx, ly, qx))
+        yx, yy, yq = (a - wy @ a / sum_y for a in (lx, ly, qy))
+        along = float(wx @ (xq * xx) + wy @ (yq * yy))
+        across = float(wx @ (xq * xy) - wy @ (yq * yx))
+        difference = float(wx @ (xy * xy - xx * xx) + wy @ (yx * yx - yy * yy))
+        mixed = float(wx @ (xx * xy) - wy @ (yx * yy))
+        theta, c, s, steps = _newton(atan2(across, along), difference, mixed, along, across)
+        rx = xq - c * xx - s * xy
+        ry = yq - c * yy + s * yx
+        px, py = qx - rx, qy - ry
+        fx, fy = float(c * lx[0] + s * ly[0] - px[0]), float(c * ly[0] - s * lx[0] - py[0])
+        mean_x, mean_y = float(wy @ px) / sum_y, float(wx @ py) / sum_x
+        vtt = 1.0 / float(wx @ (py - mean_y) ** 2 + wy @ (px - mean_x) ** 2)
+        vxt, vyt = mean_y * vtt, -mean_x * vtt
+        covariance = turn_covariance(
+            c, s, 1.0 / sum_x + mean_y * vxt, -mean_x * vxt, 1.0 / sum_y - mean_x * vyt, vxt, vyt, vtt
+        )
+        residual = tuple(np.column_stack((rx, ry)).ravel().tolist())
+        status = SolverStatus.NOT_CONVERGED if steps == _MAX_STEPS else SolverStatus.OK
+        return Solution(c * fx - s * fy, s * fx + c * fy, theta, 0.0, 0.0, covariance, residual, status, steps)
 
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
         """In closed form. See :class:`Solver`."""
         return flat_gain(self._places, dots, variances, solution)
 
     def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks. See :class:`Solver`."""
+        """N blocks; vectorised for two PSDs. See :class:`Solver`."""
+        if self._count != 2:
+            return super().solve_many(dots, variances)
         m = np.atleast_2d(np.asarray(dots, dtype=np.float64))
-        v = positive(variances)
+        v = checked_variances(variances)
         n = len(m)
-        out = Solutions(
-            np.empty((n, 3)),
-            np.zeros((n, 2)),
-            np.empty((n, 3, 3)),
-            np.empty((n, 2 * self._count)),
-            np.empty(n, dtype=np.int8),
-        )
-        chunk = self._chunk_of_two if self._count == 2 else self._chunk
+        out = Solutions(np.empty((n, 3)), np.zeros((n, 2)), np.empty((n, 3, 3)), np.empty((n, 4)), np.empty(n, np.int8))
         for start in range(0, n, _CHUNK):
             part = slice(start, start + _CHUNK)
-            chunk(m[part], v[part] if len(v) > 1 else v, out, part)
+            self._chunk(m[part], v[part] if len(v) > 1 else v, out, part)
         return out
 
-    def _chunk_of_two(self, m: FloatArray, v: FloatArray, out: Solutions, part: slice) -> None:
+    def _chunk(self, m: FloatArray, v: FloatArray, out: Solutions, part: slice) -> None:
         """The lines of :meth:`solve`, for arrays."""
         x1, y1, x2, y2 = m.T
         vx1, vy1, vx2, vy2 = v.T
@@ -175,99 +212,15 @@ class ExactSolver(Solver):
             )
             c = np.cos(theta)
             s = np.sin(theta)
-        px = c * lx + s * ly
-        py = c * ly - s * lx
-        ex = (qx - px) * mx
-        ey = (qy - py) * my
-        residual = out.residual[part]
-        rx1 = residual[:, 0] = ex * vx1
-        ry1 = residual[:, 1] = ey * vy1
-        residual[:, 2] = -ex * vx2
-        residual[:, 3] = -ey * vy2
-        p1x = q1x - rx1
-        p1y = q1y - ry1
-        pose = out.pose[part]
-        pose[:, 0] = self._l1x - c * p1x + s * p1y
-        pose[:, 1] = self._l1y - s * p1x - c * p1y
-        pose[:, 2] = theta
-        vtt = 1.0 / (mx * py * py + my * px * px)
-        mean_y = p1y - py * (vx1 * mx)
-        mean_x = p1x - px * (vy1 * my)
-        vxt = mean_y * vtt
-        vyt = -mean_x * vtt
-        turn_covariance_many(
-            c,
-            s,
-            vx1 * vx2 * mx + mean_y * vxt,
-            -mean_x * vxt,
-            vy1 * vy2 * my - mean_x * vyt,
-            vxt,
-            vyt,
-            vtt,
-            out.covariance[part],
-        )
+        dx, dy, residual, covariance = self._answer(c, s, (q1x, q1y, qx, qy), (mx, my), tuple(v.T))
+        for where, values in (
+            (out.pose, (dx, dy, theta)),
+            (out.residual, residual),
+            (out.covariance.reshape(-1, 9), covariance),
+        ):
+            for i, value in enumerate(values):
+                where[part, i] = value
         out.status[part] = np.where(converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED)
-
-    def _chunk(self, m: FloatArray, v: FloatArray, out: Solutions, part: slice) -> None:
-        """Any number of PSDs."""
-        x, y, vx, vy = split(m, v)
-        wx = 1.0 / vx
-        wy = 1.0 / vy
-        qx = self._centers[:, 0] + x
-        qy = self._centers[:, 1] + y
-        lx = self._beams[:, 0]
-        ly = self._beams[:, 1]
-        theta = _procrustes(qx, qy, lx, ly, wx * wy / (wx + wy))
-        sum_x = wx.sum(axis=1, keepdims=True)
-        sum_y = wy.sum(axis=1, keepdims=True)
-        converged = np.isfinite(theta)
-        if (wx != wy).any():
-            # Each axis of the residual is centred with its own weights.
-            xx, xy, xq = (a - (wx * a).sum(axis=1, keepdims=True) / sum_x for a in (lx, ly, qx))
-            yx, yy, yq = (a - (wy * a).sum(axis=1, keepdims=True) / sum_y for a in (lx, ly, qy))
-            difference = (wx * (xy * xy - xx * xx) + wy * (yx * yx - yy * yy)).sum(axis=1)
-            mixed = (wx * xx * xy - wy * yx * yy).sum(axis=1)
-            along = (wx * xq * xx + wy * yq * yy).sum(axis=1)
-            across = (wx * xq * xy - wy * yq * yx).sum(axis=1)
-            theta, converged = _newton_many(theta, difference, mixed, along, across)
-        c = np.cos(theta)
-        s = np.sin(theta)
-        c1 = c[:, None]
-        s1 = s[:, None]
-        rx = qx - (c1 * lx + s1 * ly)
-        ry = qy - (c1 * ly - s1 * lx)
-        fx = -(wx * rx).sum(axis=1, keepdims=True) / sum_x
-        fy = -(wy * ry).sum(axis=1, keepdims=True) / sum_y
-        rx += fx
-        ry += fy
-        out.pose[part] = np.column_stack((c * fx[:, 0] - s * fy[:, 0], s * fx[:, 0] + c * fy[:, 0], theta))
-        out.covariance[part] = weighted_covariance(qx - rx, qy - ry, wx, wy, c, s)
-        out.residual[part] = interleave(rx, ry)
-        out.status[part] = np.where(converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED)
-
-
-def _one(many: Solutions) -> Solution:
-    dx, dy, theta = many.pose[0].tolist()
-    return Solution(
-        dx,
-        dy,
-        theta,
-        0.0,
-        0.0,
-        tuple(many.covariance[0].ravel().tolist()),
-        tuple(many.residual[0].tolist()),
-        SolverStatus(int(many.status[0])),
-        0,
-    )
-
-
-def _procrustes(qx: FloatArray, qy: FloatArray, lx: FloatArray, ly: FloatArray, w: FloatArray) -> FloatArray:
-    """The turn (n,) of q (n, P) onto l (P,) with weights (n or 1, P)."""
-    total = w.sum(axis=1, keepdims=True)
-    ax = w * (lx - (w * lx).sum(axis=1, keepdims=True) / total)
-    ay = w * (ly - (w * ly).sum(axis=1, keepdims=True) / total)
-    theta: FloatArray = np.arctan2((qx * ay - qy * ax).sum(axis=1), (qx * ax + qy * ay).sum(axis=1))
-    return theta
 
 
 def _newton(

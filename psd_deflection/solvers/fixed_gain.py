@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from psd_deflection.geometry.linear import gain_matrix
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.interface import Solution, Solutions, SolverStatus
-from psd_deflection.solvers.plane import interleave, split
+from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
 
 
-class FixedGain:
+class FixedGain(Solver):
     """x = G (m - m_0) for a gain that does not depend on the noise; covariance G V G^T."""
 
     def __init__(self, design: FloatArray, zeros: FloatArray, row_scaling: FloatArray) -> None:
         """``design`` (2P, 3); ``zeros`` (P, 2) m, subtracted first; ``row_scaling`` (2P,)."""
-        self.design = design
-        self.gain = gain_matrix(design, row_scaling)
-        self._zeros = zeros.ravel()
+        gains = gain_matrix(design, row_scaling)
         self._columns = tuple(
             (zero, *gain, *row)
-            for zero, gain, row in zip(self._zeros.tolist(), self.gain.T.tolist(), design.tolist(), strict=True)
+            for zero, gain, row in zip(zeros.ravel().tolist(), gains.T.tolist(), design.tolist(), strict=True)
         )
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
-        """One block, pure floats."""
+        """One block, pure floats. See :class:`Solver`."""
         dx = dy = theta = vxx = vxy = vxt = vyy = vyt = vtt = 0.0
         for m, v, (zero, x, y, t, _, _, _) in zip(dots, variances, self._columns, strict=True):
             b = m - zero
@@ -48,17 +43,3 @@ class FixedGain:
         status = SolverStatus.OK if theta - theta == 0.0 else SolverStatus.NOT_CONVERGED
         covariance = (vxx, vxy, vxt, vxy, vyy, vyt, vxt, vyt, vtt)
         return Solution(dx, dy, theta, 0.0, 0.0, covariance, residual, status, 0)
-
-    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks."""
-        x, y, vx, vy = split(dots, variances)
-        b = interleave(x, y) - self._zeros
-        v = interleave(np.broadcast_to(vx, x.shape), np.broadcast_to(vy, x.shape))
-        pose = b @ self.gain.T
-        covariance = np.einsum('ij,nj,kj->nik', self.gain, v, self.gain)
-        return Solutions(pose, np.zeros((len(b), 2)), covariance, b - pose @ self.design.T, status_of(pose))
-
-
-def status_of(pose: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.int8]]:
-    """OK if the pose (n, 3) is finite, int8 (n,)."""
-    return np.where(np.isfinite(pose).all(axis=1), SolverStatus.OK, SolverStatus.NOT_CONVERGED).astype(np.int8)

@@ -1,4 +1,4 @@
-"""Gauss-Newton in floats for one block and vectorised for n blocks; several methods use it.
+"""Gauss-Newton in floats for one block; several methods use it.
 
 A model gives predicted readings and their derivatives; the driver repeats x <- x + (J^T W J)^-1 J^T W r
 until a step no longer matters. The residuals are micrometres and the rig is decimetres, so each
@@ -11,25 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from psd_deflection.errors import SolverError
-from psd_deflection.records import FloatArray
-from psd_deflection.solvers.plane import positive
 
 Model = Callable[[Sequence[float]], tuple[list[float], list[Sequence[float]]]]
 """Parameters (p) to predicted readings (m) and rows of derivatives (m of p)."""
 
-ModelMany = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""Parameters (n, p) to predicted readings (n, m) and derivatives (n, m, p)."""
-
 MAX_STEPS = 50
 LAST_STEP = 1e-12
 """m and rad. The step after it would be below the last digit that matters."""
-
-CHUNK = 4096
-"""Blocks worked on at once: their arrays stay in the processor's cache."""
 
 
 class Minimum(NamedTuple):
@@ -40,15 +29,6 @@ class Minimum(NamedTuple):
     residual: list[float]
     converged: bool
     steps: int
-
-
-class Minima(NamedTuple):
-    """(n, p), (n, p, p), (n, m), (n,) bool."""
-
-    parameters: FloatArray
-    covariance: FloatArray
-    residual: FloatArray
-    converged: npt.NDArray[np.bool_]
 
 
 def fit(model: Model, start: Sequence[float], measured: Sequence[float], variances: Sequence[float]) -> Minimum:
@@ -129,39 +109,3 @@ def _invert(lower: list[list[float]]) -> list[list[float]] | None:
                 total += factor[k][i] * factor[k][j]
             out[i][j] = out[j][i] = total
     return out
-
-
-def fit_many(model: ModelMany, start: FloatArray, measured: FloatArray, variances: FloatArray) -> Minima:
-    """N blocks: ``start`` (n, p), ``measured`` (n, m), ``variances`` (m,) or (n, m), above 0 (SolverError)."""
-    n, p = start.shape
-    weights = np.broadcast_to(1.0 / positive(variances), measured.shape)
-    out = Minima(start.copy(), np.empty((n, p, p)), np.empty(measured.shape), np.zeros(n, dtype=bool))
-    for first in range(0, n, CHUNK):
-        # Converged blocks are not changed, so an answer does not depend on its neighbours.
-        active = np.arange(first, min(first + CHUNK, n))
-        for _ in range(MAX_STEPS):
-            predicted, rows = model(out.parameters[active])
-            residual = measured[active] - predicted
-            weighted = rows * weights[active][:, :, None]
-            inverse = _invert_many(np.einsum('nmi,nmj->nij', weighted, rows))
-            step = np.einsum('nij,nj->ni', inverse, np.einsum('nmi,nm->ni', weighted, residual))
-            out.parameters[active] += step
-            out.covariance[active] = inverse
-            out.residual[active] = residual - np.einsum('nmi,ni->nm', rows, step)
-            largest = np.abs(step).max(axis=1)
-            out.converged[active] = largest < LAST_STEP
-            active = active[(largest >= LAST_STEP) & (largest < np.inf)]
-            if not active.size:
-                break
-    return out
-
-
-def _invert_many(normal: FloatArray) -> FloatArray:
-    """Inverses (n, p, p); NaN if a block is singular, so that it does not spoil its neighbours."""
-    try:
-        return np.asarray(np.linalg.inv(normal))
-    except np.linalg.LinAlgError:
-        singular = np.linalg.matrix_rank(normal, hermitian=True) < normal.shape[1]
-        out = np.full(normal.shape, np.nan)
-        out[~singular] = np.linalg.inv(normal[~singular])
-        return out

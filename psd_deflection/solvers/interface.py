@@ -7,7 +7,7 @@ theta about +Z has q_i = Rz(-theta)(l_i - d); a solver inverts this, or the full
 phi (about X) and omega (about Y), R = Ry(omega) Rx(phi) Rz(theta).
 
 ``solve`` takes and returns plain floats: it is called once per block in real time, and numpy's cost
-per call would dominate. ``solve_many`` is vectorised over n blocks.
+per call would dominate. ``solve_many`` takes and returns arrays of n blocks.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy.typing as npt
 from psd_deflection.config import Rig
 from psd_deflection.geometry.layout import Geometry
 from psd_deflection.records import FloatArray
+from psd_deflection.solvers.plane import checked_variances
 
 _STEP = 1e-8
 """m. Of differences: far above rounding, far below what bends the answer."""
@@ -104,9 +105,21 @@ class Solver(abc.ABC):
         not subtracted). ``variances``: of those means, m^2, all > 0.
         """
 
-    @abc.abstractmethod
     def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """Solve n blocks at once: ``dots`` (n, 2P) m, ``variances`` (2P,) or (n, 2P) m^2."""
+        """Solve n blocks: ``dots`` (n, 2P) m, ``variances`` (2P,) or (n, 2P) m^2.
+
+        Raises SolverError if a variance is not above 0.
+        """
+        m = np.atleast_2d(np.asarray(dots, dtype=np.float64))
+        v = np.broadcast_to(checked_variances(variances), m.shape)
+        found = [self.solve(tuple(a), tuple(b)) for a, b in zip(m.tolist(), v.tolist(), strict=True)]
+        return Solutions(
+            np.array([f[:3] for f in found]),
+            np.array([f[3:5] for f in found]),
+            np.array([f.covariance for f in found]).reshape(-1, 3, 3),
+            np.array([f.residual for f in found]),
+            np.array([f.status for f in found], dtype=np.int8),
+        )
 
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
         """How the answer goes with each dot, d(dX, dY, theta)/d(dots), (3, 2P): 1 and rad/m.

@@ -20,9 +20,8 @@ from typing import ClassVar
 import numpy as np
 
 from psd_deflection.geometry.layout import Geometry, check_twist
-from psd_deflection.records import FloatArray
-from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
-from psd_deflection.solvers.plane import Covariance, interleave, split, turn_covariance, turn_covariance_many
+from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.solvers.plane import Covariance, turn_covariance
 
 _MAX_TRIALS = 50
 _LAST_STEP = 1e-8
@@ -45,17 +44,11 @@ class IterativeSolver(Solver):
     def __init__(self, geometry: Geometry) -> None:
         """Bind to ``geometry``. Raises SolverError if the beams coincide."""
         self._count = check_twist(geometry)
-        self._centers = np.asarray(geometry.centers, dtype=np.float64)
-        self._beams = np.asarray(geometry.beams, dtype=np.float64)
-        middle = self._beams.mean(axis=0)
-        mx, my = middle.tolist()
-        self._spread = float(((self._beams - middle) ** 2).sum())
-        self._lx = mx
-        self._ly = my
-        self._rows = tuple(
-            (cx, cy, lx - mx, ly - my)
-            for (cx, cy), (lx, ly) in zip(self._centers.tolist(), self._beams.tolist(), strict=True)
-        )
+        beams = np.asarray(geometry.beams)
+        middle = beams.mean(axis=0)
+        self._lx, self._ly = middle.tolist()
+        self._spread = float(((beams - middle) ** 2).sum())
+        self._rows = tuple(map(tuple, np.hstack((geometry.centers, beams - middle)).tolist()))
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
@@ -125,51 +118,3 @@ class IterativeSolver(Solver):
             -mx * vtt - with_y,
             vtt,
         )
-
-    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks. See :class:`Solver`."""
-        x, y, vx, vy = split(dots, variances)
-        n = x.shape[0]
-        qx = self._centers[:, 0] + x
-        qy = self._centers[:, 1] + y
-        lx = self._beams[:, 0] - self._lx
-        ly = self._beams[:, 1] - self._ly
-        mx = qx.mean(axis=1)
-        my = qy.mean(axis=1)
-        along = ((qx - mx[:, None]) * lx + (qy - my[:, None]) * ly).sum(axis=1)
-        across = ((qx - mx[:, None]) * ly - (qy - my[:, None]) * lx).sum(axis=1)
-        theta = np.zeros(n)
-        converged = np.zeros(n, dtype=bool)
-        for _ in range(_MAX_TRIALS):
-            c = np.cos(theta)
-            s = np.sin(theta)
-            agreement = np.abs(along * c + across * s)
-            step = np.divide(across * c - along * s, agreement, out=np.ones(n), where=agreement != 0.0)
-            step = np.where(converged, 0.0, np.clip(step, -_LARGEST_STEP, _LARGEST_STEP))
-            theta += step
-            converged = np.abs(step) < _LAST_STEP
-            if converged.all():
-                break
-        c = np.cos(theta)
-        s = np.sin(theta)
-        pose = np.column_stack((self._lx - c * mx + s * my, self._ly - s * mx - c * my, theta))
-        c1 = c[:, None]
-        s1 = s[:, None]
-        residual = interleave(qx - mx[:, None] - c1 * lx - s1 * ly, qy - my[:, None] + s1 * lx - c1 * ly)
-        px = (c1 * lx + s1 * ly) / self._spread
-        py = (c1 * ly - s1 * lx) / self._spread
-        with_x = (py * vx).mean(axis=1)
-        with_y = -(px * vy).mean(axis=1)
-        vtt = (py * py * vx + px * px * vy).sum(axis=1)
-        covariance = turn_covariance_many(
-            c,
-            s,
-            vx.mean(axis=1) / self._count - 2.0 * my * with_x + my * my * vtt,
-            mx * with_x - my * with_y - mx * my * vtt,
-            vy.mean(axis=1) / self._count + 2.0 * mx * with_y + mx * mx * vtt,
-            my * vtt - with_x,
-            -mx * vtt - with_y,
-            vtt,
-        )
-        status = np.where(converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED).astype(np.int8)
-        return Solutions(pose, np.zeros((n, 2)), covariance, residual, status)

@@ -2,7 +2,7 @@
 
 Section 2.3 looks for two tilts besides dX, dY and theta. Four readings cannot give five unknowns:
 one dot fixes the translation, and M(q_1 - q_2) = l_1 - l_2 is two equations for three angles. With
-its errors corrected (``thesis.tilt_branches``), the method reproduces all four readings for *any*
+its errors corrected (docs/methods.md), the method reproduces all four readings for *any*
 admissible trial angle. So its stopping test (2.46-2.49) has no meaning.
 
 Two things can be measured: the azimuth alpha of the base line, and its foreshortening |l_12| = |q_12| cos beta.
@@ -28,10 +28,9 @@ import numpy as np
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
-from psd_deflection.records import FloatArray
 from psd_deflection.solvers.exact import ExactSolver
-from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
-from psd_deflection.solvers.plane import Covariance, split, turn_covariance
+from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.solvers.plane import Covariance, turn_covariance
 
 Angles = Literal['rotation', 'azimuth']
 
@@ -167,67 +166,3 @@ class MinimumTiltSolver(Solver):
             nt += n_across * (t_across * across + t_along * mixed)
             tt += t_across * t_across * across + t_along * (t_along * along + 2.0 * t_across * mixed)
         return turn_covariance(self._ex, self._ey, ee, en, nn, et, nt, tt)
-
-    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks. See :class:`Solver`."""
-        out = self._flat.solve_many(dots, variances)
-        x, y, vx, vy = split(dots, variances)
-        n = len(x)
-        ex = self._ex
-        ey = self._ey
-        q1x = self._c1x + x[:, 0]
-        q1y = self._c1y + y[:, 0]
-        qx = q1x - self._c2x - x[:, 1]
-        qy = q1y - self._c2y - y[:, 1]
-        long = np.hypot(qx, qy)
-        with np.errstate(divide='ignore', invalid='ignore'):
-            cos_beta = np.minimum(self._length / long, 1.0)
-        tilted = long > self._length
-        theta = np.arctan2(qx * ey - qy * ex, qx * ex + qy * ey)
-        c = np.cos(theta)
-        s = np.sin(theta)
-        px = c * q1x - s * q1y
-        py = s * q1x + c * q1y
-        reach = px * ex + py * ey
-        off = py * ex - px * ey
-        back_e = self._l1x * ex + self._l1y * ey - cos_beta * reach
-        back_n = self._l1y * ex - self._l1x * ey - off
-        ax = (c * ex + s * ey)[:, None]
-        ay = (c * ey - s * ex)[:, None]
-        # Noise of each dot along and across the base line, (n, 2 dots, 2, 2).
-        noise = np.empty((n, 2, 2, 2))
-        noise[..., 0, 0] = ax * ax * vx + ay * ay * vy
-        noise[..., 1, 1] = ay * ay * vx + ax * ax * vy
-        noise[..., 0, 1] = noise[..., 1, 0] = ax * ay * (vy - vx)
-        too_short = (self._length - long) ** 2 > _TOO_SHORT**2 * noise[..., 0, 0].sum(axis=1)
-        # Sensitivities of (along, across, theta), (n, 2 dots, 3, 2).
-        gain = np.zeros((n, 2, 3, 2))
-        lever = reach / self._length * cos_beta
-        side = cos_beta * off / self._length * cos_beta
-        gain[:, 0, 0, 0] = -cos_beta * (1.0 - lever)
-        gain[:, 1, 0, 0] = -cos_beta * lever
-        gain[:, 0, 0, 1] = -side
-        gain[:, 1, 0, 1] = side
-        gain[:, 0, 1, 1] = lever - 1.0
-        gain[:, 1, 1, 1] = -lever
-        gain[:, 0, 2, 1] = -cos_beta / self._length
-        gain[:, 1, 2, 1] = cos_beta / self._length
-        if self._rotation:
-            leaning = (1.0 - cos_beta * cos_beta) * ey * ey
-            gain[:, 0, 2, 0] = -cos_beta * cos_beta / self._length * ex * ey / (1.0 - leaning)
-            gain[:, 1, 2, 0] = -gain[:, 0, 2, 0]
-        turn = np.array([[ex, -ey, 0.0], [ey, ex, 0.0], [0.0, 0.0, 1.0]])
-        gain = turn @ gain
-        covariance = np.einsum('ndij,ndjk,ndlk->nil', gain, noise, gain)
-        sin_beta = np.sqrt((1.0 - cos_beta) * (1.0 + cos_beta))
-        psi = np.arctan2((cos_beta - 1.0) * ex * ey, ex * ex + cos_beta * ey * ey) if self._rotation else 0.0
-        pose = np.column_stack((back_e * ex - back_n * ey, back_e * ey + back_n * ex, theta + psi))
-        tilt = np.column_stack((-np.arcsin(sin_beta * ey), np.arctan2(sin_beta * ex, cos_beta)))
-        inadmissible = ~tilted & too_short & (out.status == SolverStatus.OK)
-        return Solutions(
-            np.where(tilted[:, None], pose, out.pose),
-            np.where(tilted[:, None], tilt, out.tilt),
-            np.where(tilted[:, None, None], covariance, out.covariance),
-            np.where(tilted[:, None], 0.0, out.residual),
-            np.where(inadmissible, SolverStatus.INADMISSIBLE, out.status).astype(np.int8),
-        )

@@ -14,12 +14,10 @@ import numpy as np
 
 from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.geometry.linear import design_matrix
-from psd_deflection.records import FloatArray
 from psd_deflection.solvers.fixed_gain import FixedGain
-from psd_deflection.solvers.interface import Solution, Solutions, Solver
 
 
-class OlsSolver(Solver):
+class OlsSolver(FixedGain):
     """Unweighted linear least squares, P >= 2 PSDs; covariance G V G^T with V the dots' own."""
 
     name: ClassVar[str] = 'ols'
@@ -28,12 +26,4 @@ class OlsSolver(Solver):
     def __init__(self, geometry: Geometry) -> None:
         """Bind to ``geometry``. Raises SolverError if the beams coincide."""
         count = check_twist(geometry)
-        self._linear = FixedGain(design_matrix(geometry.beams), np.asarray(geometry.zeros), np.ones(2 * count))
-
-    def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
-        """One block, pure floats. See :class:`Solver`."""
-        return self._linear.solve(dots, variances)
-
-    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks. See :class:`Solver`."""
-        return self._linear.solve_many(dots, variances)
+        super().__init__(design_matrix(geometry.beams), np.asarray(geometry.zeros), np.ones(2 * count))

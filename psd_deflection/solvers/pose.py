@@ -16,10 +16,9 @@ import numpy as np
 
 from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import SMALLEST_BASE_LINE, Geometry, check_twist
-from psd_deflection.geometry.plate import crossing, crossings, flat_poses
-from psd_deflection.records import FloatArray
-from psd_deflection.solvers.gauss_newton import fit, fit_many
-from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
+from psd_deflection.geometry.plate import crossing, flat_poses
+from psd_deflection.solvers.gauss_newton import fit
+from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
 
 
 class PoseSolver(Solver):
@@ -54,10 +53,7 @@ class PoseSolver(Solver):
             )
         self._centers = np.asarray(geometry.centers, dtype=np.float64)
         self._beams = np.asarray(geometry.beams, dtype=np.float64)
-        self._heights = heights
-        self._rows = tuple(
-            (lx, ly, h) for (lx, ly), h in zip(self._beams.tolist(), self._heights.tolist(), strict=True)
-        )
+        self._rows = tuple(map(tuple, places.tolist()))
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block. See :class:`Solver`."""
@@ -89,21 +85,3 @@ class PoseSolver(Solver):
             rows.append(jx)
             rows.append(jy)
         return predicted, rows
-
-    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks. See :class:`Solver`."""
-        points = np.asarray(dots, dtype=np.float64).reshape(len(dots), -1, 2) + self._centers
-        start = np.column_stack((flat_poses(points, self._beams), np.zeros((len(points), 2))))
-        found = fit_many(self._model_many, start, points.reshape(len(points), -1), variances)
-        status = np.where(found.converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED).astype(np.int8)
-        return Solutions(
-            found.parameters[:, :3].copy(),
-            found.parameters[:, 3:].copy(),
-            found.covariance[:, :3, :3].copy(),
-            found.residual,
-            status,
-        )
-
-    def _model_many(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        points, jacobian = crossings(x, self._beams, self._heights)
-        return points.reshape(len(x), -1), jacobian.reshape(len(x), -1, 5)

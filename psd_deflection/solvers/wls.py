@@ -20,10 +20,8 @@ from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.geometry.linear import design_matrix
-from psd_deflection.records import FloatArray
-from psd_deflection.solvers.fixed_gain import FixedGain, status_of
-from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
-from psd_deflection.solvers.plane import interleave, split, weighted_covariance
+from psd_deflection.solvers.fixed_gain import FixedGain
+from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
 
 THESIS_ROW_SCALING = (0.03, 0.5, 10.0, 0.1)
 """Po of x1, y1, x2, y2 for the thesis's loads on the sidebar (section 5.5, Figs 5.12-5.20)."""
@@ -53,12 +51,9 @@ class WlsSolver(Solver):
         ``row_scaling`` (2P,), each above 0. Raises SolverError if the beams coincide and
         ConfigError for a row scaling of another length.
         """
-        self._count = check_twist(geometry)
-        self._beams = np.asarray(geometry.beams, dtype=np.float64)
-        self._zeros = np.asarray(geometry.zeros, dtype=np.float64)
-        self._rows = tuple(
-            (lx, ly, x0, y0) for (lx, ly), (x0, y0) in zip(self._beams.tolist(), self._zeros.tolist(), strict=True)
-        )
+        check_twist(geometry)
+        beams, zeros = np.asarray(geometry.beams).tolist(), np.asarray(geometry.zeros).tolist()
+        self._rows = tuple((lx, ly, x0, y0) for (lx, ly), (x0, y0) in zip(beams, zeros, strict=True))
         self._fixed = fixed_weights(geometry, weights, row_scaling)
 
     @classmethod
@@ -119,37 +114,6 @@ class WlsSolver(Solver):
             SolverStatus.OK if theta - theta == 0.0 else SolverStatus.NOT_CONVERGED,
             0,
         )
-
-    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks. See :class:`Solver`."""
-        if self._fixed is not None:
-            return self._fixed.solve_many(dots, variances)
-        x, y, vx, vy = split(dots, variances)
-        n = x.shape[0]
-        bx = x - self._zeros[:, 0]
-        by = y - self._zeros[:, 1]
-        lx = self._beams[:, 0]
-        ly = self._beams[:, 1]
-        wx = 1.0 / vx
-        wy = 1.0 / vy
-        sum_x = wx.sum(axis=1)
-        sum_y = wy.sum(axis=1)
-        mean_y = (wx * ly).sum(axis=1) / sum_x
-        mean_x = (wy * lx).sum(axis=1) / sum_y
-        tx = lx - mean_x[:, None]
-        ty = ly - mean_y[:, None]
-        information = (wx * ty * ty + wy * tx * tx).sum(axis=1)
-        theta = (wx * ty * bx - wy * tx * by).sum(axis=1) / information
-        shift_x = (wx * bx).sum(axis=1) / sum_x
-        shift_y = (wy * by).sum(axis=1) / sum_y
-        pose = np.column_stack((mean_y * theta - shift_x, -mean_x * theta - shift_y, theta))
-        shape = wx.shape
-        covariance = weighted_covariance(
-            np.broadcast_to(lx, shape), np.broadcast_to(ly, shape), wx, wy, np.ones(len(wx)), np.zeros(len(wx))
-        )
-        residual = interleave(bx + pose[:, :1] - ly * pose[:, 2:], by + pose[:, 1:2] + lx * pose[:, 2:])
-        covariance = np.broadcast_to(covariance, (n, 3, 3)).copy()
-        return Solutions(pose, np.zeros((n, 2)), covariance, residual, status_of(pose))
 
 
 def fixed_weights(geometry: Geometry, weights: Weights, row_scaling: tuple[float, ...]) -> FixedGain | None:

@@ -21,9 +21,8 @@ import numpy as np
 
 from psd_deflection.config import Rig
 from psd_deflection.geometry.layout import Geometry
-from psd_deflection.records import FloatArray
-from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
-from psd_deflection.solvers.plane import split, turn_covariance, turn_covariance_many
+from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.solvers.plane import turn_covariance
 from psd_deflection.solvers.wls import THESIS_ROW_SCALING, Weights, WlsSolver
 
 
@@ -45,13 +44,8 @@ class WlsExactSolver(Solver):
     ) -> None:
         """Bind to ``geometry``; same options and errors as :class:`WlsSolver`."""
         self._wls = WlsSolver(geometry, weights, row_scaling)
-        self._beams = np.asarray(geometry.beams, dtype=np.float64)
-        self._rows = tuple((lx, ly) for lx, ly in self._beams.tolist())
-        self._fixed: tuple[float, ...] | None = None
-        self._weights: FloatArray | None = None
-        if weights == 'thesis':
-            self._weights = np.square(np.array([row_scaling], dtype=np.float64))
-            self._fixed = tuple(self._weights[0].tolist())
+        self._rows = tuple((lx, ly) for lx, ly in np.asarray(geometry.beams).tolist())
+        self._fixed = tuple([s * s for s in row_scaling]) if weights == 'thesis' else None
 
     @classmethod
     def options_from_rig(cls, rig: Rig) -> dict[str, Any]:
@@ -110,49 +104,3 @@ class WlsExactSolver(Solver):
             vtt * slope * slope,
         )
         return linear._replace(dx=c * fx - s * fy, dy=s * fx + c * fy, theta=theta, covariance=covariance)
-
-    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks. See :class:`Solver`."""
-        linear = self._wls.solve_many(dots, variances)
-        _, _, wx, wy = split(dots, self._weights if self._weights is not None else 1.0 / np.asarray(variances))
-        lx = self._beams[:, 0]
-        ly = self._beams[:, 1]
-        xx, xy = ((wx * a).sum(axis=1) / wx.sum(axis=1) for a in (lx, ly))
-        yx, yy = ((wy * a).sum(axis=1) / wy.sum(axis=1) for a in (lx, ly))
-        across = ly - xy[:, None]
-        along = lx - yx[:, None]
-        kappa = (wx * across * lx - wy * along * ly).sum(axis=1) / (wx * across**2 + wy * along**2).sum(axis=1)
-        rough = linear.pose[:, 2]
-        sine = (rough + kappa) / np.hypot(1.0, kappa)
-        admissible = np.abs(sine) <= 1.0
-        theta = np.arcsin(np.where(admissible, sine, 0.0)) - np.arctan(kappa)
-        c = np.cos(theta)
-        s = np.sin(theta)
-        versine = 2.0 * np.sin(0.5 * theta) ** 2
-        fx = linear.pose[:, 0] + xy * (s - rough) - xx * versine
-        fy = linear.pose[:, 1] - yx * (s - rough) - yy * versine
-        slope = 1.0 / (c - kappa * s)
-        tx = -fy * slope + xy * (c * slope - 1.0) - xx * s * slope
-        ty = fx * slope - yx * (c * slope - 1.0) - yy * s * slope
-        v = linear.covariance
-        covariance = turn_covariance_many(
-            c,
-            s,
-            v[:, 0, 0] + 2.0 * tx * v[:, 0, 2] + tx * tx * v[:, 2, 2],
-            v[:, 0, 1] + tx * v[:, 1, 2] + ty * v[:, 0, 2] + tx * ty * v[:, 2, 2],
-            v[:, 1, 1] + 2.0 * ty * v[:, 1, 2] + ty * ty * v[:, 2, 2],
-            (v[:, 0, 2] + tx * v[:, 2, 2]) * slope,
-            (v[:, 1, 2] + ty * v[:, 2, 2]) * slope,
-            v[:, 2, 2] * slope * slope,
-        )
-        pose = np.column_stack((c * fx - s * fy, s * fx + c * fy, theta))
-        status = np.where(admissible, linear.status, SolverStatus.INADMISSIBLE)
-        status = np.where(np.isfinite(sine), status, SolverStatus.NOT_CONVERGED).astype(np.int8)
-        ok = admissible[:, None]
-        return Solutions(
-            np.where(ok, pose, linear.pose),
-            linear.tilt,
-            np.where(ok[:, :, None], covariance, linear.covariance),
-            linear.residual,
-            status,
-        )

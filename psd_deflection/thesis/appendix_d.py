@@ -22,9 +22,7 @@ import numpy as np
 from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.geometry.plate import flat_points
-from psd_deflection.records import FloatArray
-from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
-from psd_deflection.solvers.plane import interleave, split
+from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
 from psd_deflection.thesis.iterative_printed import NO_COVARIANCE
 
 Branch = Literal['A', 'B', 'none']
@@ -111,51 +109,6 @@ class AppendixDSolver(Solver):
         dy = got.vert_disp / _MM
         theta = -got.angle_of_twist * pi / 180.0 + 0.0
         status = SolverStatus.NO_HIT if got.branch == 'none' else SolverStatus.OK
-        residual = self._residual(np.array([dots]), np.array([[dx, dy, theta]]))[0].tolist()
+        points = np.reshape(dots, (2, 2)) + self._centers
+        residual = (points - flat_points(np.array([dx, dy, theta]), self._beams)).ravel().tolist()
         return Solution(dx, dy, theta, 0.0, 0.0, NO_COVARIANCE, tuple(residual), status, got.trials)
-
-    def _residual(self, dots: FloatArray, pose: FloatArray) -> FloatArray:
-        return dots + self._centers.ravel() - flat_points(pose, self._beams).reshape(len(pose), -1)
-
-    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks: the trials one after the other, all blocks at each. See :class:`Solver`."""
-        x, y, _, _ = split(dots, variances)
-        n = len(x)
-        cx1, cy1, cx2, cy2 = self._centers_mm
-        ix1, iy1, ix2, iy2 = (c + m for c, m in zip(self._centers_mm, self._init_mm, strict=True))
-        x1 = cx1 + x[:, 0] * _MM
-        y1 = cy1 + y[:, 0] * _MM
-        x2 = cx2 + x[:, 1] * _MM
-        y2 = cy2 + y[:, 1] * _MM
-        d1 = np.sqrt(x1**2 + y1**2)
-        d2 = np.sqrt(x2**2 + y2**2)
-        start_1 = np.arctan(x1 / y1)
-        start_2 = np.where((y2 != 0.0) & (x2 < 0.0), -1.0, 1.0) * np.arctan(y2 / x2)
-        pose = np.zeros((n, 3))
-        open_ = np.isfinite(start_1) & np.isfinite(start_2)
-        status = np.where(open_, SolverStatus.NO_HIT, SolverStatus.NOT_CONVERGED).astype(np.int8)
-        for a in range(401):
-            turn = 0.01 * pi / 180.0 * a
-            trial = []
-            for sign in (1.0, -1.0):
-                tx1 = d1 * np.sin(start_1 + sign * turn)
-                ty1 = d1 * np.cos(start_1 + sign * turn)
-                tx2 = -d2 * np.cos(start_2 + sign * turn)
-                ty2 = d2 * np.sin(start_2 + sign * turn)
-                near = np.abs((tx1 - ix1) - (tx2 - ix2)) < 0.1
-                far = np.abs(ty1 - iy1)
-                ratio = (far > np.abs(0.97 * (ty2 - iy2))) & (far < np.abs(1.03 * (ty2 - iy2)))
-                trial.append((near, ratio, tx1, ty1))
-            (near_a, ratio_a, ax, ay), (near_b, ratio_b, bx, by) = trial
-            hit_a = open_ & (near_a | (near_b & ratio_a))
-            hit_b = open_ & ~hit_a & near_b & ratio_b
-            for hit, tx, ty, sign in ((hit_a, ax, ay, -1.0), (hit_b, bx, by, 1.0)):
-                pose[hit, 0] = (ix1 - tx[hit]) / _MM
-                pose[hit, 1] = (iy1 - ty[hit]) / _MM
-                pose[hit, 2] = sign * (0.01 * a) * pi / 180.0
-                status[hit] = SolverStatus.OK
-            open_ &= ~(hit_a | hit_b)
-            if not open_.any():
-                break
-        residual = self._residual(interleave(x, y), pose)
-        return Solutions(pose, np.zeros((n, 2)), np.full((n, 3, 3), np.nan), residual, status)

@@ -17,7 +17,6 @@ from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers.fixed_gain import FixedGain
-from psd_deflection.solvers.interface import Solution, Solutions, Solver
 from psd_deflection.solvers.wls import THESIS_ROW_SCALING
 
 
@@ -31,7 +30,7 @@ def printed_design_matrix(geometry: Geometry) -> FloatArray:
     return np.array([[-1.0, 0.0, r1], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, -r2]])
 
 
-class AppendixDOlsSolver(Solver):
+class AppendixDOlsSolver(FixedGain):
     """Appendix D, "Simple Least Squares". theta is the code's angle, clockwise, with its sign changed."""
 
     name: ClassVar[str] = 'appendix_d_ols'
@@ -42,15 +41,7 @@ class AppendixDOlsSolver(Solver):
         if check_twist(geometry) != 2:
             raise SolverError(f'{self.name} takes two PSDs')
         design = printed_design_matrix(geometry) * np.array([1.0, 1.0, -1.0])
-        self._linear = FixedGain(design, np.zeros((2, 2)), np.array(row_scaling, dtype=np.float64))
-
-    def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
-        """One block, pure floats. See :class:`Solver`."""
-        return self._linear.solve(dots, variances)
-
-    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
-        """N blocks. See :class:`Solver`."""
-        return self._linear.solve_many(dots, variances)
+        super().__init__(design, np.zeros((2, 2)), np.array(row_scaling, dtype=np.float64))
 
 
 class AppendixDWlsSolver(AppendixDOlsSolver):

@@ -24,9 +24,6 @@ YOUNGS_MODULUS = 69e9
 SHEAR_MODULUS = 24e9
 """Pa, aluminium 6061 as in Table B2. E/G = 2.875 would need a Poisson ratio of 0.44; data sheets say G = 26 GPa."""
 
-FITTED_YOUNGS_MODULUS = 68.9e9
-"""Pa: the value that Table B1's bending deflections of cases 1 and 5 were computed with (an erratum)."""
-
 BASE_LENGTH = 0.585
 BASE_SECTION = TubeSection(0.0159, 0.0138)
 
@@ -124,9 +121,6 @@ PRINTED_B1: dict[int, tuple[str, ...]] = {
     6: ('3.47e-7', '6.94e-7', '0.0318', '0.0276', '1.34e-3', '0.005', '5.8', '7.1'),
 }
 """What the thesis prints for the theoretical rows."""
-
-PRINTED_B1_EXPERIMENTAL = ('2.17e-8', '4.34e-8', '0.0159', '0.0138', '3.38e-3', '0.022', '13.0', '29.45')
-"""Row "1 Experimental": measured, so only its own sum can be checked."""
 
 EXPERIMENTAL_ERRATUM = (
     'measured row: 3.38 + 13.0 mm are 16.38 mm, not 29.45; 13.07 mm are unaccounted for by the row itself '

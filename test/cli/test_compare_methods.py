@@ -73,9 +73,9 @@ def test_a_folder_that_cannot_be_made(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_a_figure_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / 'sign_convention.png').mkdir()
+    (tmp_path / 'comparison.png').mkdir()
     assert main(['compare-methods', '--out', str(tmp_path)]) == 4
-    assert f'--out {tmp_path / "sign_convention.png"}: cannot be written' in capsys.readouterr().err
+    assert f'--out {tmp_path / "comparison.png"}: cannot be written' in capsys.readouterr().err
 
 
 def test_the_page_has_every_method_and_every_figure() -> None:

@@ -97,7 +97,7 @@ def test_a_recording_is_not_written_under_the_ending_of_something_else(
         for name in (f'run{suffix}', f'run_0.5N{suffix.upper()}'):
             status, err = refused(capsys, command, *arguments, '--out', name)
             assert status == 2
-            assert f'--out {name}: no {suffix} is written; X.csv, X.mcap' in err
+            assert f'--out {name}: {suffix} cannot be written; use X.csv, X.mcap' in err
             assert ('X.rrd' in err) == bool(also)
     assert list(folder.iterdir()) == []
 

@@ -85,7 +85,7 @@ def assert_same(got: Sequence[SampleBlock], expected: Sequence[SampleBlock]) -> 
 def write_mcap(path: Path, records: Sequence[Record], **kwargs: Any) -> Path:
     with McapFile(path, rig_values=kwargs.pop('rig_values', {}), **kwargs) as out:
         for r in records:
-            out.write(r)
+            out.put(r)
     return path
 
 

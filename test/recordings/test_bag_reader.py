@@ -43,7 +43,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('bags') / 'run'
     with BagWriter(folder, rig_values=load_rig(None, {'sum_min': 1.5}).values, device_hello=HELLO) as out:
         for r in run(150):
-            out.write(r)
+            out.put(r)
     return folder
 
 
@@ -203,7 +203,7 @@ def test_a_restarted_device_does_not_mix_blocks(tmp_path: Path) -> None:
     assert [b.index for b in blocks] == list(range(8))
     assert [len(b.seq) for b in blocks] == [20] * 8
     np.testing.assert_array_equal(blocks[5].volts, again[0].volts)
-    assert any('start anew after 99' in w for w in recording.warnings)
+    assert any('start again after 99' in w for w in recording.warnings)
 
 
 def test_a_block_in_two_messages_is_one_block_again(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ HELLO = {'serial': 'A1', 'firmware': '1.2', 'sample_rate_hz': 1000, 'channels': 
 def record(folder: Path, blocks: int = 120) -> Path:
     with BagWriter(folder, rig_values=load_rig().values, device_hello=HELLO) as bag:
         for r in run(blocks):
-            bag.write(r)
+            bag.put(r)
     return folder
 
 
@@ -120,7 +120,7 @@ def test_the_index_of_a_long_recording_is_whole_and_does_not_wait_in_memory(tmp_
     path = tmp_path / 'a.mcap'
     with McapFile(path, rig_values={}) as out:
         for number in range(300):
-            out.write(block(number))
+            out.put(block(number))
             out.flush()
         assert not [o for o in gc.get_objects() if isinstance(o, ChunkIndex)]
     with path.open('rb') as f:
@@ -136,9 +136,9 @@ def test_the_index_of_a_long_recording_is_whole_and_does_not_wait_in_memory(tmp_
 
 def test_a_late_message_does_not_stretch_a_chunk(tmp_path: Path) -> None:
     with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
-        out.write(block(100))
-        out.write(block(0))
-        out.write(block(101))
+        out.put(block(100))
+        out.put(block(0))
+        out.put(block(101))
     with (tmp_path / 'a.mcap').open('rb') as f:
         spans = [
             r.message_end_time - r.message_start_time
@@ -199,10 +199,10 @@ def test_a_full_disk_ends_the_recording_with_one_line(tmp_path: Path, monkeypatc
     monkeypatch.undo()
     records = list(run(1000))
     with pytest.raises(RecordingError, match=r'run_0.mcap: cannot be written \(No space left on device\)'):
-        collections.deque(map(bag.write, records), maxlen=0)
+        collections.deque(map(bag.put, records), maxlen=0)
     assert bag.closed
     with pytest.raises(RecordingError, match='is closed'):
-        bag.write(records[0])
+        bag.put(records[0])
     bag.close()
     assert not (tmp_path / 'run' / 'metadata.yaml').exists()
     with bag.path.open('rb') as f:

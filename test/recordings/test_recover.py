@@ -29,7 +29,7 @@ HELLO = {'serial': 'A1', 'sample_rate_hz': 1000}
 def record(folder: Path, **kwargs: float) -> Path:
     with BagWriter(folder, rig_values=load_rig().values, device_hello=HELLO, **kwargs) as bag:  # type: ignore[arg-type]
         for r in run(200):
-            bag.write(r)
+            bag.put(r)
     return folder
 
 
@@ -86,7 +86,7 @@ def test_recover_reports_its_work_and_keeps_complete_files(
 ) -> None:
     before = {p.name: p.read_bytes() for p in whole.iterdir()}
     assert main(['recover', str(whole)]) == 0
-    assert 'was whole' in capsys.readouterr().out
+    assert 'was intact' in capsys.readouterr().out
     assert {p.name: p.read_bytes() for p in whole.iterdir()} == before
 
 
@@ -122,7 +122,7 @@ def test_a_file_that_was_only_begun_is_set_aside(tmp_path: Path) -> None:
 def test_a_lone_file_is_repaired(tmp_path: Path) -> None:
     with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
         for r in run(100):
-            out.write(r)
+            out.put(r)
     (tmp_path / 'a.mcap').write_bytes((tmp_path / 'a.mcap').read_bytes()[:-1000])
     assert recover(tmp_path / 'a.mcap').files[0].repaired
     assert open_recording(tmp_path / 'a.mcap').complete
@@ -141,7 +141,7 @@ def test_only_a_damaged_chunk_is_lost_and_it_is_reported(tmp_path: Path) -> None
 
 def test_recover_refuses_a_running_recording(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / 'run', rig_values={})
-    bag.write(block(0))
+    bag.put(block(0))
     bag.flush()
     # The lock of one process does not keep itself out: ask from another.
     answer = subprocess.run(
@@ -177,8 +177,8 @@ def test_rotation_by_size_and_what_each_file_holds(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'run', rig_values=rig.values, device_hello=HELLO, max_bytes=100_000) as bag:
         for i, r in enumerate(run(400)):
             if i == 20:
-                bag.write(change)
-            bag.write(r)
+                bag.put(change)
+            bag.put(r)
     files = sorted((tmp_path / 'run').glob('*.mcap'))
     assert len(files) >= 3
     assert all(f.stat().st_size >= 100_000 for f in files[:-1])
@@ -196,7 +196,7 @@ def test_rotation_by_size_and_what_each_file_holds(tmp_path: Path) -> None:
 def test_the_oldest_file_can_go(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'run', rig_values={}, max_s=1.0) as bag:
         for i in range(200):
-            bag.write(block(i))
+            bag.put(block(i))
         assert bag.drop_oldest() == tmp_path / 'run' / 'run_0.mcap'
         assert sorted(p.name for p in bag.folder.glob('*.mcap')) == ['run_1.mcap', 'run_2.mcap', 'run_3.mcap']
     assert [b.index for b in open_recording(tmp_path / 'run').blocks()] == list(range(50, 200))
@@ -206,7 +206,7 @@ def test_the_oldest_file_can_go(tmp_path: Path) -> None:
 def test_chunks_are_on_the_disk_within_half_a_second_of_log_time(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'run', rig_values={}, durable=True) as bag:
         for i in range(100):
-            bag.write(block(i))
+            bag.put(block(i))
             if i < 26:
                 continue
             # What a kill at this moment would leave.

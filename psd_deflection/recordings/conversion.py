@@ -1,0 +1,52 @@
+"""Copies the samples of a recording, and what was recorded beside them, to a recording of another format."""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import itertools
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.sinks import is_csv, open_sink
+from psd_deflection.records import AppliedLoad, ParameterChange, Record, ReferencePose, SampleBlock, TemperatureReading
+
+Convertible = SampleBlock | ParameterChange | AppliedLoad | ReferencePose | TemperatureReading
+
+
+def _time(record: Convertible) -> int:
+    return int(record.t_ns[0]) if isinstance(record, SampleBlock) else record.t_ns
+
+
+class Beside(NamedTuple):
+    """What a recording holds beside its samples."""
+
+    loads: list[AppliedLoad]
+    references: list[ReferencePose]
+    temperatures: list[TemperatureReading]
+
+    @classmethod
+    def of(cls, recording: Recording) -> Beside:
+        """Read them."""
+        return cls(recording.loads(), recording.references(), recording.temperatures())
+
+
+def convert(
+    recording: Recording, out: Path, parameters: Mapping[str, object], beside: Beside, blocks: Iterable[SampleBlock]
+) -> int:
+    """Write ``recording`` and its ``blocks`` to ``out``; returns the number of samples. Raises RecordingError."""
+    loads, references, temperatures = beside
+    records: Iterable[Convertible] = heapq.merge(recording.changes, loads, references, temperatures, blocks, key=_time)
+    if is_csv(out):
+        # A row takes what is waiting, and a block's last row what came during the block.
+        records = itertools.chain(loads, references, temperatures, blocks)
+    kinds: list[type[Record]] = [type(found[0]) for found in beside if found]
+    sink = open_sink(out, parameters, device_hello=recording.hello, samples_with=kinds)
+    samples = 0
+    with contextlib.closing(sink):
+        for record in records:
+            sink.put(record)
+            samples += len(record.seq) if isinstance(record, SampleBlock) else 0
+    return samples
