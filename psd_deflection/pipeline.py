@@ -28,6 +28,7 @@ from psd_deflection.correction import Correction
 from psd_deflection.geometry import Geometry
 from psd_deflection.records import (
     ENVIRONMENT,
+    RESTART,
     BlockStatus,
     DeflectionEstimate,
     FloatArray,
@@ -179,6 +180,8 @@ class Pipeline:
             value = values.pop(name, None)
             if isinstance(value, (int, float)):
                 self._environment[name] = float(value)
+        # It says which numbers belong to no sample; no estimate depends on it.
+        values.pop(RESTART, None)
         held, frozen, loads = values.pop(HELD, None), values.pop(FROZEN, None), values.pop(TIP_LOADS, None)
         told = {name: tuple(v) for name in REMEMBERED if isinstance(v := values.pop(name, None), list)}
         if isinstance(held, list) and len(held) == 3:

@@ -173,10 +173,16 @@ now.
 """
 
 
+RESTART = 'device.restart'
+"""Recorded with the block in which a restarted device went on: the last sample number before, the first after.
+The numbers between belong to no sample.
+"""
+
+
 class ParameterChange(NamedTuple):
     """A value that affects the estimates and was changed during the run.
 
-    These are parameters (set by ``~/zero`` or live) and the names in :data:`ENVIRONMENT`.
+    These are parameters (set by ``~/zero`` or live), the names in :data:`ENVIRONMENT`, and :data:`RESTART`.
     ``values``: names and checked values; they apply from block ``block`` on. The change is
     recorded, and replay applies it at the same block.
     """

@@ -40,7 +40,7 @@ from psd_deflection.cli._options import (
     seed,
     whole,
 )
-from psd_deflection.cli._report import columns, print_json, save_figure
+from psd_deflection.cli._report import columns, print_json, save_figure, show, show_text
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import UsageError
 from psd_deflection.records import FloatArray
@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
     with given_as_option():
         inputs = read_inputs(args.inputs, _settings(args.set), '--set')
     if args.explain:
-        print(explain(rig, inputs))
+        show_text(explain(rig, inputs))
         return 0
     method = args.method or method_of(rig)
     load = tuple(args.load) if args.load else (0.0, -SIDEBAR_FORCE, -SIDEBAR_FORCE * rig.link.length)
@@ -121,14 +121,14 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(as_json(budget, load, sampled), indent=1)
     else:
-        print(table(budget, load))
+        show_text(table(budget, load))
         if sampled is not None:
-            print(f'\nMonte Carlo, {draws} draws of everything at once (seed {args.seed}):')
-            print('total     ' + _figures_text(sampled))
+            show('', f'Monte Carlo, {draws} draws of everything at once (seed {args.seed}):')
+            show('total     ' + _figures_text(sampled))
     if args.out is not None or not args.json:
         draw_terms(budget, out)
         if not args.json:
-            print(f'\n{out}')
+            show('', f'{out}')
     return 0
 
 

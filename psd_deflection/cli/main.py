@@ -25,6 +25,7 @@ from psd_deflection.cli._report import LONGEST_LINE
 from psd_deflection.errors import (
     EXIT_STATUSES,
     INTERRUPTED,
+    MachineError,
     PsdDeflectionError,
     RecordingError,
     UsageError,
@@ -132,6 +133,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         # `psd-deflection ... | head` is not an error.
         _discard_output()
+    except (MemoryError, RuntimeError) as error:
+        machine = _lack_of(error)
+        if machine is None:
+            raise
+        _tell(f'psd-deflection: {machine}')
+        return machine.exit_status
     except OSError as error:
         if error.errno not in _REFUSED_OUTPUT or error.filename is not None:
             raise
@@ -140,6 +147,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         _tell(f'psd-deflection: {refused}')
         return refused.exit_status
     return status
+
+
+def _lack_of(error: MemoryError | RuntimeError) -> MachineError | None:
+    """What the machine lacks, if that is what went wrong."""
+    if isinstance(error, MemoryError):
+        return MachineError('too little memory; see the limits of the shell (ulimit -v), the container or the unit')
+    if str(error) == "can't start new thread":
+        return MachineError('no further thread; see the limits of the shell (ulimit -u, -v), the container or the unit')
+    return None
 
 
 def _tell(line: str) -> None:

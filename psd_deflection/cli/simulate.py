@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from psd_deflection.cli import serve
 from psd_deflection.cli._options import given_as_option, recording_name, refuse, seed
-from psd_deflection.cli._report import print_json
+from psd_deflection.cli._report import print_json, show
 from psd_deflection.config import load_rig
 from psd_deflection.errors import UsageError
 from psd_deflection.recordings.simulated_run import BAG_START_NS, SimulatedRun
@@ -107,5 +107,5 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json({'out': args.out, 'samples': count, 'duration_s': count / rate, 'effects': names})
     else:
-        print(f'{Path(args.out)}: {count} samples, {count / rate:.1f} s; effects: {", ".join(names) or "none"}')
+        show(f'{Path(args.out)}: {count} samples, {count / rate:.1f} s; effects: {", ".join(names) or "none"}')
     return 0
