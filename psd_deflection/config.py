@@ -91,6 +91,12 @@ class PsdConfig:
     zero: tuple[float, float] = parameter(
         (0.0, 0.0), 'm', 'dot on the unloaded link (x, y); ~/zero sets it', minimum=-0.5, maximum=0.5, live=True
     )
+    sensitivity: tuple[float, float] = parameter(
+        (0.0, 0.0), 'm/V', 'dot travel per volt on x and on y; 0: amplifier.sensitivity', minimum=0.0, maximum=1.0
+    )
+    noise: tuple[float, float] = parameter(
+        (0.0, 0.0), 'V', 'noise of x and of y, rms per sample; 0: amplifier.noise', minimum=0.0, maximum=10.0
+    )
     axes: tuple[str, str] = parameter(
         ('x', 'y'),
         '',
@@ -104,9 +110,13 @@ class PsdConfig:
 class AmplifierConfig:
     """The amplifier of both detectors."""
 
-    sensitivity: float = parameter(0.5e-3, 'm/V', 'dot travel per volt on x and y', above=0.0, maximum=1.0)
+    sensitivity: float = parameter(
+        0.5e-3, 'm/V', 'dot travel per volt on x and y, unless psd_N.sensitivity is set', above=0.0, maximum=1.0
+    )
     sum_nominal: float = parameter(5.0, 'V', 'sum signal with the laser on', above=0.0, maximum=100.0)
-    noise: float = parameter(2e-3, 'V', 'noise, rms per sample and channel', above=0.0, maximum=10.0)
+    noise: float = parameter(
+        2e-3, 'V', 'noise, rms per sample and channel, unless psd_N.noise is set', above=0.0, maximum=10.0
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +181,13 @@ class EstimatorConfig:
         choices=('widen', 'refuse', 'report'),
         before='report',
     )
+    wrench: str = parameter(
+        'effects',
+        '',
+        'link behind /link_tip/wrench: with the effects of the rig file (stiffness, clamp, load ...), or nominal',
+        choices=('effects', 'nominal'),
+        before='nominal',
+    )
     splitter: bool = parameter(
         False, '', 'both detectors share two lasers over a beam splitter (thesis 5.4): one lost halves both sums'
     )
@@ -214,6 +231,21 @@ class EstimatorConfig:
         'weights of wls: from the noise, or the row scaling of the thesis',
         name='wls.weights',
         choices=('inverse_variance', 'thesis'),
+    )
+    base_pair_assume: str = parameter(
+        'beam',
+        '',
+        'what base_pair assumes: tilts that follow the deflection (beam), or no twist (needs two planes)',
+        name='base_pair.assume',
+        choices=('beam', 'no_twist'),
+    )
+    minimum_tilt_angles: str = parameter(
+        'rotation',
+        '',
+        "what minimum_tilt publishes: twist and tilts of one rotation, or the base line's azimuth as the twist",
+        name='minimum_tilt.angles',
+        choices=('rotation', 'azimuth'),
+        before='azimuth',
     )
     wls_row_scaling: tuple[float, float, float, float] = parameter(
         (0.03, 0.5, 10.0, 0.1),
@@ -394,6 +426,16 @@ class Rig:
     def heights(self) -> FloatArray:
         """h_i, (number of PSDs,), m."""
         return np.array([p.height for p in self.psds], dtype=np.float64)
+
+    @property
+    def sensitivities(self) -> FloatArray:
+        """Dot travel per volt on x and y, (number of PSDs, 2), m/V."""
+        return np.array([[own or self.amplifier.sensitivity for own in p.sensitivity] for p in self.psds])
+
+    @property
+    def noises(self) -> FloatArray:
+        """Noise of x, y and sum, rms per sample, (number of PSDs, 3), V."""
+        return np.array([[own or self.amplifier.noise for own in (*p.noise, 0.0)] for p in self.psds])
 
 
 def rig_from_values(values: Mapping[str, object], source: str = 'parameters') -> Rig:

@@ -71,15 +71,15 @@ class OpticsHealth:
         self._half = tuple(half / 2.0 for psd in rig.psds for half in psd.active_area)
         self._radius = tuple(psd.spot_radius for psd in rig.psds for _ in range(2))
         # If the noise is below one step, constant values are normal.
-        self._moves = rig.amplifier.noise > step
-        self._noise = NOISY * (rig.amplifier.noise**2 + step**2 / 12.0) ** 0.5
+        self._moves = [bool((own > step).any()) for own in rig.noises]
+        self._noise = NOISY * np.sqrt(rig.noises**2 + step**2 / 12.0)
 
     def still(self, volts: npt.NDArray[np.float32]) -> tuple[bool, bool]:
         """For PSD 1 and PSD 2: whether x, y and sum are identical in all samples."""
-        if not self._moves or len(volts) < max(self._min_samples, 2):
+        if len(volts) < max(self._min_samples, 2):
             return (False, False)
         same = (volts == volts[0]).all(axis=0)
-        return (bool(same[:3].all()), bool(same[3:].all()))
+        return (self._moves[0] and bool(same[:3].all()), self._moves[1] and bool(same[3:].all()))
 
     def judge(
         self,
@@ -163,9 +163,10 @@ class OpticsHealth:
             rough = np.diff(volts, n=3, axis=0)
             level = np.sqrt(np.einsum('ij,ij->j', rough, rough) / (len(rough) * _THIRD_DIFFERENCE))
             for psd in (1, 2):
-                worst = float(level[3 * psd - 3 : 3 * psd].max())
-                if psd not in faulty and worst > self._noise:
-                    out.append(f'psd_{psd} is noisy: {worst * 1e3:.1f} mV a sample')
+                own = level[3 * psd - 3 : 3 * psd]
+                noisy = own[own > self._noise[psd - 1]]
+                if psd not in faulty and noisy.size:
+                    out.append(f'psd_{psd} is noisy: {float(noisy.max()) * 1e3:.1f} mV a sample')
         if not self.refuses_frozen:
             out += [reason for psd, reason in _long(frozen) if psd not in faulty]
         return tuple(out)

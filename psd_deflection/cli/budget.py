@@ -43,6 +43,7 @@ from psd_deflection.cli._options import (
 from psd_deflection.cli._report import columns, print_json, save_figure, show, show_text
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import UsageError
+from psd_deflection.records import FloatArray
 
 MICRO_MILLIDEGREE = np.array([1e6, 1e6, math.degrees(1e3)])
 
@@ -168,18 +169,24 @@ def _derived(rig: Rig, inputs: dict[str, float]) -> list[str]:
     step = optics.boundary_shift(inputs['air_step_angle'], index, warm, length)
     rate, block = rig.converter.sample_rate_hz, rig.estimator.block_size
     hum = averaging_gain(block, inputs['interference_frequency'], rate)
+    noise = rig.noises[:, :2] * rig.sensitivities
     window = stop_window(rig.centers + rig.zeros, inputs['iteration_tolerance'])
     return [
         f'  spot on the sensor (3.1): {spot * 1e3:.4f} mm',
         f'  index of air (3.3) at 50 % humidity: {index:.9f}, dn/dT {per_kelvin:.3e} 1/K',
         f'  shift by a gradient across the beam: {per_gradient * 1e6:.3f} um per K/m',
         f'  shift behind a boundary (3.4): {step * 1e6:.3f} um',
-        f'  noise of a dot: {rig.amplifier.noise * rig.amplifier.sensitivity * 1e6:.3f} um a sample, '
-        f'{rig.amplifier.noise * rig.amplifier.sensitivity * 1e6 / math.sqrt(block):.3f} um a mean of {block}',
-        f'  step of the converter: {rig.converter.volts_per_count * rig.amplifier.sensitivity * 1e6:.4f} um',
+        f'  noise of a dot: {_each(noise, 3)} um a sample, {_each(noise / math.sqrt(block), 3)} um a mean of {block}',
+        f'  step of the converter: {_each(rig.converter.volts_per_count * rig.sensitivities, 4)} um',
         f'  hum that a mean of {block} leaves at {inputs["interference_frequency"]:g} Hz: {hum:.3f}',
         f'  stop window of thesis_iteration: {math.degrees(window) * 1e3:.2f} mdeg',
     ]
+
+
+def _each(metres: FloatArray, digits: int) -> str:
+    """The values of x1, y1, x2, y2 in um; one if all are the same."""
+    words = [f'{value * 1e6:.{digits}f}' for value in metres.ravel()]
+    return words[0] if len(set(words)) == 1 else ', '.join(words)
 
 
 def table(budget: Budget, load: tuple[float, ...]) -> str:

@@ -102,9 +102,9 @@ def error_table() -> list[str]:
     for title, largest in (('rms', False), ('largest', True)):
         lines += ['', f'{title:{width}}  ' + ''.join(f'{t:25}' for t in titles) + 'no answer']
         for label, row in cells.items():
-            silent = max(c.silent for c in row)
+            silent = sorted({f'{100.0 * c.silent:.2f}' for c in row}, key=float)
             lines.append(
-                f'{label:{width}}  ' + ''.join(f'{_cell(c, largest):25}' for c in row) + f'{100.0 * silent:.1f} %'
+                f'{label:{width}}  ' + ''.join(f'{_cell(c, largest):25}' for c in row) + f'{" to ".join(silent)} %'
             )
     for name, why in refused().items():
         lines += textwrap.wrap(f'{name} is not in the table: {why}', 118, subsequent_indent='  ')

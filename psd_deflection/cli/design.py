@@ -78,7 +78,8 @@ def run(args: argparse.Namespace) -> int:
         show_text(appendix_b())
         return 0
     rig = load_rig(args.params_file)
-    sigma = rig.amplifier.noise * rig.amplifier.sensitivity / math.sqrt(rig.estimator.block_size)
+    each = rig.noises[:, :2] * rig.sensitivities
+    sigma = float(np.sqrt((each * each).mean() / rig.estimator.block_size))
     if args.sigma is not None:
         sigma = args.sigma
     if not (sigma > 0.0 and math.isfinite(sigma)):

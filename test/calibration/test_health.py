@@ -235,6 +235,14 @@ def test_noise_is_told_and_motion_is_not_taken_for_it() -> None:
     assert findings_of(load_rig(), swinging)[0].findings == ()
 
 
+def test_noise_is_held_against_the_readings_own() -> None:
+    counts = moving(1)
+    counts[:, 3] += np.rint(np.random.default_rng(2).normal(0, 0.05 / STEP, SIZE)).astype(np.int16)
+    assert findings_of(load_rig(overrides={'psd_2.noise': [0.05, 0.0]}), counts)[0].findings == ()
+    (finding,) = findings_of(load_rig(overrides={'psd_2.noise': [0.0, 0.05]}), counts)[0].findings
+    assert finding.startswith('psd_2 is noisy')
+
+
 def test_a_spot_at_the_edge_is_told() -> None:
     counts = moving(1)
     counts[:, 4] += np.int16(round(4.6e-3 / 5e-4 / STEP))
