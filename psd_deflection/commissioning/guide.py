@@ -11,7 +11,7 @@ from enum import Enum
 
 import numpy as np
 
-from psd_deflection.commissioning.wirings import DOTS, Response, pattern
+from psd_deflection.commissioning.wirings import DOTS, Response, pattern, scales_of
 from psd_deflection.config import Rig
 from psd_deflection.records import DOT_CHANNELS, FloatArray
 
@@ -185,7 +185,9 @@ class Guide:
         sd = np.sqrt(self._rest_sd**2 + 0.25 * (after - before) ** 2 + self._held_sd**2 / max(len(here), 1))
         load = ('fx', 'fy', 'tz')[self.number]
         expected = self._expected[:, self.number]
-        self.pushes.append(Response((load,), moved, sd, expected, sized=False, only_twist=load == 'tz'))
+        self.pushes.append(
+            Response((load,), moved, sd, expected, sized=False, only_twist=load == 'tz', scales=scales_of(self._rig))
+        )
         self._rests.append((self._t, after))
         self.number += 1
         self._next(Step.PUSH if self.number < 3 else Step.DONE)

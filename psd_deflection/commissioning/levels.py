@@ -65,7 +65,7 @@ def levels(rig: Rig, volts: FloatArray) -> Levels:
     """``volts`` (n, 6) of the device's channels, NaN if a sample is lost; some are there. Of a long run, its begin."""
     volts = volts[:LONGEST]
     step = rig.converter.volts_per_count
-    stated = float(np.hypot(rig.amplifier.noise, step / np.sqrt(12.0)))
+    stated = float(np.hypot(np.sqrt(np.mean(rig.noises[:, :2] ** 2)), step / np.sqrt(12.0)))
     rough = np.diff(volts, n=3, axis=0)
     rough = rough[np.isfinite(rough).all(axis=1)]
     if not len(rough):

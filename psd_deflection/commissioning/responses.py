@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.commissioning.wirings import Response, pattern
+from psd_deflection.commissioning.wirings import Response, pattern, scales_of
 from psd_deflection.config import Rig
 from psd_deflection.errors import RecordingError
 from psd_deflection.mechanics import LinkStatics
@@ -60,7 +60,7 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
         first = held[present][:, group[0]]
         largest = [peak * _slope(first, held[present][:, k]) if k in group else 0.0 for k in range(3)]
         names = tuple(LOADS[k] for k in group)
-        pushes.append(Response(names, slopes[i], sd[i], pattern(rig) @ np.array(largest)))
+        pushes.append(Response(names, slopes[i], sd[i], pattern(rig) @ np.array(largest), scales=scales_of(rig)))
     return Responses(tuple(pushes), slopes[-1], sd[-1])
 
 

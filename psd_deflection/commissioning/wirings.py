@@ -50,6 +50,11 @@ def pattern(rig: Rig) -> FloatArray:
     return design_matrix(rig.centers + rig.zeros)
 
 
+def scales_of(rig: Rig) -> tuple[float, ...]:
+    """Sensitivity of x1 y1 x2 y2 of the PSDs over the amplifier's."""
+    return tuple((rig.sensitivities.ravel() / rig.amplifier.sensitivity).tolist())
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Response:
     """How the dots answered to one push.
@@ -57,7 +62,8 @@ class Response:
     ``loads``: which of fx, fy, tz it was; several if they always came together. ``channels`` (4,): movement on the
     device's channels x1 y1 x2 y2, m. ``sd`` (4,): its standard deviation, m. ``expected`` (4,): movement of x1 y1 x2 y2
     of the PSDs by the rig file, m; only its direction counts if ``sized`` is False. ``only_twist``: the movement that
-    both dots share is ignored, as for a turn by hand, which shifts the tip as well.
+    both dots share is ignored, as for a turn by hand, which shifts the tip as well. ``scales``: of x1 y1 x2 y2 of the
+    PSDs, their sensitivity over the amplifier's, by which ``channels`` are in metres.
     """
 
     loads: tuple[str, ...]
@@ -66,6 +72,7 @@ class Response:
     expected: FloatArray
     sized: bool = True
     only_twist: bool = False
+    scales: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
 
     @property
     def name(self) -> str:
@@ -84,7 +91,7 @@ class Response:
 
         The size is negative if the push went the other way.
         """
-        seen = _pattern(_dots(wiring, self.channels), self.only_twist)
+        seen = _pattern(_dots(wiring, self.channels) * np.array(self.scales), self.only_twist)
         expected = _pattern(self.expected, self.only_twist)
         size = float(seen @ expected / (expected @ expected))
         left = seen - size * expected
