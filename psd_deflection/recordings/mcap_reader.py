@@ -56,7 +56,7 @@ class _WholeFields(ReadDataStream):
         """The next ``length`` bytes. Raises DamagedError if the record ends before them."""
         try:
             piece = super().read(length)
-        except EndOfFile:
+        except (EndOfFile, OverflowError):
             piece = b''
         if len(piece) != length:
             raise DamagedError('a field is longer than its record')
