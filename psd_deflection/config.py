@@ -379,6 +379,13 @@ SECTIONS: tuple[Section[Any], ...] = (
 PARAMETERS: tuple[Parameter, ...] = tuple(p for section in SECTIONS for p in section.parameters.values())
 """All parameters, in the order in which they are listed."""
 BY_NAME: Mapping[str, Parameter] = MappingProxyType({p.name: p for p in PARAMETERS})
+_DESCRIBED = tuple(
+    p
+    for section in (LINK, *PSDS, AMPLIFIER, CONVERTER, DYNAMICS)
+    for p in section.parameters.values()
+    # A default of 0 says that there is nothing; any other one is a measure of the thesis rig.
+    if p.kind.startswith('double') and np.any(p.default)
+)
 ZEROS = tuple(section.parameters['zero'].name for section in PSDS)
 """The parameters that ``~/zero`` sets, one for each detector."""
 
@@ -559,6 +566,16 @@ def _flatten(tree: Mapping[Any, Any], prefix: str, out: dict[str, object], path:
             out[name] = value
         if len(out) > MAX_KEYS:
             raise ConfigError(f'{path}: more than {MAX_KEYS} parameters')
+
+
+def left_as_in_the_thesis(values: Mapping[str, object]) -> tuple[str, ...]:
+    """Measures of the thesis rig that ``values`` (flat) still have, each as ``NAME = VALUE UNIT``.
+
+    Somebody who describes another rig forgets some of them, and each then counts as measured. Empty if ``values``
+    describe no other rig: nothing of them differs.
+    """
+    same = [p.with_value(p.default) for p in _DESCRIBED if values.get(p.name, p.default) == p.default]
+    return tuple(same) if len(same) < len(_DESCRIBED) else ()
 
 
 def load_rig(path: str | Path | None = None, overrides: Mapping[str, object] | None = None) -> Rig:

@@ -79,6 +79,9 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     elif found['parameters']:
         out.append('  parameters that are not at their defaults')
         out += [f'    {k} = {v}' for k, v in sorted(found['changed_parameters'].items())]
+    if found['as_in_the_thesis']:
+        out.append('  parameters as in the thesis rig, unless they were measured to be the same')
+        out += [f'    {text}' for text in found['as_in_the_thesis']]
     out += [
         f'  from block {c["block"]} on: ' + ', '.join(f'{k} = {v}' for k, v in c['values'].items())
         for c in found['changes']

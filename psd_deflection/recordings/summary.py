@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from msg_adapters import DEFLECTION, LOAD, SAMPLES
-from psd_deflection.config import BY_NAME
+from psd_deflection.config import BY_NAME, left_as_in_the_thesis
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import SampleBlock
 
@@ -76,6 +76,7 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
         'topics': topics,
         'parameters': dict(recording.parameters),
         'changed_parameters': changed_parameters(recording.parameters),
+        'as_in_the_thesis': list(left_as_in_the_thesis(recording.parameters)) if recording.parameters else [],
         'changes': [{'t_ns': c.t_ns, 'block': c.block, 'values': dict(c.values)} for c in recording.changes],
         'lacks': lacks(recording, topics),
         'complete': recording.complete,

@@ -13,7 +13,7 @@ from concurrent.futures import Future, wait
 from pathlib import Path
 
 from msg_adapters import TOPIC_TYPES
-from psd_deflection.config import ZEROS, Rig, replace_values
+from psd_deflection.config import ZEROS, Rig, left_as_in_the_thesis, replace_values
 from psd_deflection.errors import printable
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings import cdr
@@ -79,6 +79,9 @@ class Session:
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)
             say(f'no port given: started the simulated rig on {self._simulated.port} (parameter port names a real one)')
+        same = left_as_in_the_thesis(rig.values)
+        if same:
+            say(f'as in the thesis rig, unless you measured the same: {"; ".join(same)}')
         try:
             self.acquisition = Acquisition(rig, say)
             self.acquisition.open()

@@ -87,3 +87,14 @@ def test_no_zero_is_taken_of_a_device_that_has_said_nothing_for_long(
     monkeypatch.setattr(module, 'SILENT_S', -1e3)
     with pytest.raises(TimeoutError, match='no data flows'):
         running.session.zero()
+
+
+def test_the_start_says_what_another_rig_has_as_in_the_thesis(device: ScriptedDevice) -> None:
+    said: list[str] = []
+    rig = load_rig(
+        overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False, 'dynamics.torsion_frequency': 9.0}
+    )
+    Session(rig, said.append).close()
+    (line,) = [text for text in said if 'as in the thesis rig' in text]
+    assert 'dynamics.bending_frequency = 14.0 Hz' in line
+    assert 'torsion_frequency' not in line
