@@ -93,7 +93,7 @@ FUZZ_FRAMES ?= 10000000
 fuzz: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check atheris
 	$(BIN)/python -m bench.campaign.fuzz corrupted $(FUZZ_FRAMES)
-	for target in frames bag csv parameters; do $(BIN)/python -m bench.campaign.fuzz $$target -max_total_time=$(FUZZ_SECONDS) || exit 1; done
+	for target in frames hello bag records csv parameters yaml; do $(BIN)/python -m bench.campaign.fuzz $$target -max_total_time=$(FUZZ_SECONDS) || exit 1; done
 
 SOAK_MINUTES ?= 30
 SOAK_HOURS ?= 24

@@ -11,6 +11,7 @@ import sys
 
 import numpy as np
 
+from psd_deflection.calibration import dot_noise_variances
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import DeflectionEstimate, FloatArray, RawChunk
@@ -37,8 +38,8 @@ def bound(rig: Rig, pose: FloatArray) -> FloatArray:
     steps = (1e-7, 1e-7, 1e-6)
     columns = [(dots(rig, pose + h) - dots(rig, pose - h)) / (2 * h.sum()) for h in np.diag(steps)]
     jacobian = np.stack(columns, axis=1)
-    variance = (rig.amplifier.noise**2 + rig.converter.volts_per_count**2 / 12) / rig.estimator.block_size
-    information = jacobian.T @ jacobian / (variance * rig.amplifier.sensitivity**2)
+    variances = dot_noise_variances(rig) / rig.estimator.block_size
+    information = (jacobian.T / variances) @ jacobian
     return np.asarray(np.sqrt(np.linalg.inv(information).diagonal()))
 
 

@@ -262,7 +262,7 @@ def make_recording(folder: Path, minutes: float) -> tuple[Path, int]:
     n, step = round(minutes * 60_000), 2000
     with BagWriter(path, rig_values=dict(rig.values)) as bag:
         for first in range(0, n, step):
-            counts: npt.NDArray[np.int16] = simulator.step(loads.take(step)).counts
+            counts: npt.NDArray[np.int32] = simulator.step(loads.take(step)).counts
             seq = np.arange(first, first + step)
             flags = np.zeros(step, np.uint8)
             chunk = RawChunk(seq, seq * 1_000_000 + 10**18, counts, flags, rig.converter.volts_per_count)

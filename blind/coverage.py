@@ -35,7 +35,10 @@ LOSSES = {'none': (0.0, 0), '2 %': (0.02, 0), '20 %': (0.2, 0), 'bursts of 8': (
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One rig: rms noise of each channel V, AR(1) memory, tails, hum V, converter, offsets of x1, y1, x2, y2 V."""
+    """One rig: rms noise of each channel V, AR(1) memory, tails, hum V, converter, offsets of x1, y1, x2, y2 V.
+
+    ``stated``: the rig file names the noise of each channel.
+    """
 
     label: str
     sigmas: tuple[float, ...] = (2e-3,) * 6
@@ -44,6 +47,7 @@ class Row:
     hum: float = 0.0
     bits: int = 16
     offsets: tuple[float, ...] = ()
+    stated: bool = False
 
 
 ROWS = (
@@ -58,7 +62,9 @@ ROWS = (
     Row('heavy tails', heavy=True),
     Row('offsets, zeroed', offsets=(1e-3, -2e-3, 0.5e-3, 1.5e-3)),
     Row('1, 2, 4, 2 mV', sigmas=(1e-3, 2e-3, 2e-3, 4e-3, 2e-3, 2e-3)),
+    Row('unequal channels', sigmas=(1e-3, 2e-3, 2e-3, 4e-3, 2e-3, 2e-3), stated=True),
 )
+UNEQUAL = ROWS[-1]
 
 
 class Inside(NamedTuple):
@@ -90,11 +96,13 @@ def inside(error: Array, covariance: Array) -> Inside:
 
 
 def rig(row: Row, **overrides: object) -> Rig:
-    """The nominal rig with that converter; its noise stays 2 mV, white."""
+    """The nominal rig with that converter; its noise stays 2 mV, white, unless the row's is stated."""
     values: dict[str, object] = {'solver': 'exact', 'solvers': ['exact'], 'converter.bits': min(row.bits, 16)}
     for i, (shift, place) in enumerate(zip(SHIFTS, generator.PLACES, strict=True), start=1):
         values[f'psd_{i}.center'] = [p + s for p, s in zip(place, shift, strict=True)]
         values[f'psd_{i}.zero'] = [-s for s in shift]
+        if row.stated:
+            values[f'psd_{i}.noise'] = list(row.sigmas[3 * i - 3 : 3 * i - 1])
     return load_rig(overrides={**values, **overrides})
 
 
@@ -238,12 +246,29 @@ def faults() -> int:
     return 0
 
 
-def bound() -> Array:
-    """Least rms error (3,) that white noise of 2 mV and 16 bits leave in a mean of 20 samples (Cramer-Rao)."""
+def bound(row: Row) -> Array:
+    """Least rms error (3,) that white noise of that size and 16 bits leave in a mean of 20 samples (Cramer-Rao)."""
     (ax, ay), (bx, by) = generator.PLACES
     a = np.array([[-1.0, 0.0, ay], [0.0, -1.0, -ax], [-1.0, 0.0, by], [0.0, -1.0, -bx]])
-    variance = generator.MM_PER_V**2 * (generator.SIGMA**2 + generator.LSB**2 / 12.0) / SIZE
-    return np.sqrt(variance * np.linalg.inv(a.T @ a).diagonal())
+    sigmas = np.array(row.sigmas)[[0, 1, 3, 4]]
+    variances = generator.MM_PER_V**2 * (sigmas**2 + generator.LSB**2 / 12.0) / SIZE
+    return np.asarray(np.sqrt(np.linalg.inv((a.T / variances) @ a).diagonal()))
+
+
+def over_the_bound(
+    row: Row, solvers: Sequence[str], rest_s: int = 400, seed: int = 1, **more: object
+) -> dict[str, Array]:
+    """rms error (3,) of each solver on a link at rest over :func:`bound`; the thesis's mean of a block."""
+    n = rest_s * 1000
+    volts = volts_of(row, _optics(np.zeros((n * generator.FINER, 3))), seed).astype(np.float32)
+    chosen = {'block_fit': 'mean', 'solver': solvers[0], 'solvers': list(solvers), **more}
+    seq = np.arange(n)
+    chunk = RawChunk(seq, seq * 1_000_000, volts, np.zeros(n, np.uint8))
+    poses: dict[str, list[tuple[float, float, float]]] = {name: [] for name in solvers}
+    for r in Pipeline(rig(row, **chosen)).process(chunk):
+        if isinstance(r, DeflectionEstimate):
+            poses[r.solver].append((r.dx, r.dy, r.theta))
+    return {name: np.sqrt(np.square(found).mean(axis=0)) / bound(row) for name, found in poses.items()}
 
 
 HEAD = '| noise | loss | rest: ΔX | ΔY | θ | joint | ringing: ΔX | ΔY | θ | joint | within 3 sd | alarms |'
@@ -277,13 +302,20 @@ def main(argv: Sequence[str] | None = None) -> int:
             tail = f'{s.ringing.three:.4f} | {s.alarms:.5f}'
             print(f'| {name} | {loss} | {_cells(s.rest)} | {_cells(s.ringing)} | {tail} |', flush=True)
             if cost is None:
-                cost = np.array(s.rest.rms) / bound()
+                cost = np.array(s.rest.rms) / bound(row)
         r = rough.result()
     print(f'| 10 bit, no dither | none | {_cells(r)} | | | | | {r.three:.4f} | |')
     if cost is not None:
-        words = ', '.join(f'{c:.3f}' for c in cost)
-        print(f'\nrms error at rest over the Cramér–Rao bound (white, no loss): {words}')
+        print('\nrms error at rest over the Cramér–Rao bound, dX, dY, theta:')
+        print(f'- white, no loss: {_three(cost)}')
+        for fit in ('mean', 'poly'):
+            for name, ratio in over_the_bound(UNEQUAL, ('wls', 'exact', 'ols'), block_fit=fit).items():
+                print(f'- unequal channels, block_fit: {fit}, {name}: {_three(ratio)}')
     return 0
+
+
+def _three(ratios: Array) -> str:
+    return ', '.join(f'{r:.3f}' for r in ratios)
 
 
 if __name__ == '__main__':

@@ -38,7 +38,7 @@ def settled(rig: Rig, load: tuple[float, float, float], effects: list[ActiveEffe
     """Pose (3,) and dots (4,) at the end of a long hold, from rest."""
     history = loads.constant((0.0, 0.0, 0.0), 0.5).then(loads.constant(load, SETTLE))
     chunk = ForwardModel(rig, effects).run(history.loads, np.linspace(20.0, 21.0, len(history)))
-    return chunk.pose[:, -1].copy(), chunk.volts[[0, 1, 3, 4], -1] * chunk.physics.sensitivity
+    return chunk.pose[:, -1].copy(), chunk.volts[[0, 1, 3, 4], -1] * chunk.physics.sensitivity.ravel()
 
 
 def knobs(rig: Rig) -> Iterator[tuple[str, Callable[[float], ActiveEffect], float, float]]:

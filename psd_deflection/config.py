@@ -33,6 +33,8 @@ EFFECTS_PREFIX = 'effects.'
 """Keys below it describe simulated effects; ``psd_deflection.simulation`` checks them."""
 ROS_OWN = ('use_sim_time', 'start_type_description_service')
 QOS_OVERRIDES_PREFIX = 'qos_overrides.'
+LEAST_BITS, MOST_BITS = 8, 24
+AXES = ('x', '-x', 'y', '-y')
 SENSOR_TYPES = ('duolateral', 'tetralateral', 'pincushion', 'quadrant')
 
 
@@ -89,22 +91,39 @@ class PsdConfig:
     zero: tuple[float, float] = parameter(
         (0.0, 0.0), 'm', 'dot on the unloaded link (x, y); ~/zero sets it', minimum=-0.5, maximum=0.5, live=True
     )
+    sensitivity: tuple[float, float] = parameter(
+        (0.0, 0.0), 'm/V', 'dot travel per volt on x and on y; 0: amplifier.sensitivity', minimum=0.0, maximum=1.0
+    )
+    noise: tuple[float, float] = parameter(
+        (0.0, 0.0), 'V', 'noise of x and of y, rms per sample; 0: amplifier.noise', minimum=0.0, maximum=10.0
+    )
+    axes: tuple[str, str] = parameter(
+        ('x', 'y'),
+        '',
+        'which channels of the device are its x and its y, with their signs: [-y, x] '
+        "(write 'y' in quotes: ROS takes a bare y for true)",
+        choices=AXES,
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class AmplifierConfig:
     """The amplifier of both detectors."""
 
-    sensitivity: float = parameter(0.5e-3, 'm/V', 'dot travel per volt on x and y', above=0.0, maximum=1.0)
+    sensitivity: float = parameter(
+        0.5e-3, 'm/V', 'dot travel per volt on x and y, unless psd_N.sensitivity is set', above=0.0, maximum=1.0
+    )
     sum_nominal: float = parameter(5.0, 'V', 'sum signal with the laser on', above=0.0, maximum=100.0)
-    noise: float = parameter(2e-3, 'V', 'noise, rms per sample and channel', above=0.0, maximum=10.0)
+    noise: float = parameter(
+        2e-3, 'V', 'noise, rms per sample and channel, unless psd_N.noise is set', above=0.0, maximum=10.0
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class ConverterConfig:
     """The analogue-to-digital converter."""
 
-    bits: int = parameter(16, '', 'bits of the converter', minimum=8, maximum=16)
+    bits: int = parameter(16, '', 'bits of the converter', minimum=LEAST_BITS, maximum=MOST_BITS)
     full_scale: float = parameter(10.0, 'V', 'range is +- this', above=0.0, maximum=1000.0)
     sample_rate_hz: float = parameter(1000.0, 'Hz', 'samples per second', minimum=1.0, maximum=10_000.0)
 
@@ -162,6 +181,13 @@ class EstimatorConfig:
         choices=('widen', 'refuse', 'report'),
         before='report',
     )
+    wrench: str = parameter(
+        'effects',
+        '',
+        'link behind /link_tip/wrench: with the effects of the rig file (stiffness, clamp, load ...), or nominal',
+        choices=('effects', 'nominal'),
+        before='nominal',
+    )
     splitter: bool = parameter(
         False, '', 'both detectors share two lasers over a beam splitter (thesis 5.4): one lost halves both sums'
     )
@@ -206,6 +232,21 @@ class EstimatorConfig:
         name='wls.weights',
         choices=('inverse_variance', 'thesis'),
     )
+    base_pair_assume: str = parameter(
+        'beam',
+        '',
+        'what base_pair assumes: tilts that follow the deflection (beam), or no twist (needs two planes)',
+        name='base_pair.assume',
+        choices=('beam', 'no_twist'),
+    )
+    minimum_tilt_angles: str = parameter(
+        'rotation',
+        '',
+        "what minimum_tilt publishes: twist and tilts of one rotation, or the base line's azimuth as the twist",
+        name='minimum_tilt.angles',
+        choices=('rotation', 'azimuth'),
+        before='azimuth',
+    )
     wls_row_scaling: tuple[float, float, float, float] = parameter(
         (0.03, 0.5, 10.0, 0.1),
         '',
@@ -230,6 +271,7 @@ class AcquisitionConfig:
         '',
         'serial port (two with a comma between, if the device has two) or recording; empty starts the simulated rig',
     )
+    psds_exchanged: bool = parameter(False, '', "the device's x1 y1 sum1 come from PSD 2 and its x2 y2 sum2 from PSD 1")
     baud: int = parameter(921_600, 'baud', 'line speed (USB-CDC devices ignore it)', minimum=1200, maximum=12_000_000)
     latency_offset: float = parameter(
         0.0, 's', 'constant delay of the link to take off every stamp', minimum=-1.0, maximum=1.0
@@ -337,6 +379,13 @@ SECTIONS: tuple[Section[Any], ...] = (
 PARAMETERS: tuple[Parameter, ...] = tuple(p for section in SECTIONS for p in section.parameters.values())
 """All parameters, in the order in which they are listed."""
 BY_NAME: Mapping[str, Parameter] = MappingProxyType({p.name: p for p in PARAMETERS})
+_DESCRIBED = tuple(
+    p
+    for section in (LINK, *PSDS, AMPLIFIER, CONVERTER, DYNAMICS)
+    for p in section.parameters.values()
+    # A default of 0 says that there is nothing; any other one is a measure of the thesis rig.
+    if p.kind.startswith('double') and np.any(p.default)
+)
 ZEROS = tuple(section.parameters['zero'].name for section in PSDS)
 """The parameters that ``~/zero`` sets, one for each detector."""
 
@@ -384,6 +433,16 @@ class Rig:
     def heights(self) -> FloatArray:
         """h_i, (number of PSDs,), m."""
         return np.array([p.height for p in self.psds], dtype=np.float64)
+
+    @property
+    def sensitivities(self) -> FloatArray:
+        """Dot travel per volt on x and y, (number of PSDs, 2), m/V."""
+        return np.array([[own or self.amplifier.sensitivity for own in p.sensitivity] for p in self.psds])
+
+    @property
+    def noises(self) -> FloatArray:
+        """Noise of x, y and sum, rms per sample, (number of PSDs, 3), V."""
+        return np.array([[own or self.amplifier.noise for own in (*p.noise, 0.0)] for p in self.psds])
 
 
 def rig_from_values(values: Mapping[str, object], source: str = 'parameters') -> Rig:
@@ -445,10 +504,18 @@ def _check_together(v: dict[str, Any], source: str) -> None:
         if not _COMPARE[relation](v[lower], v[upper]):
             low, high = (BY_NAME[name].with_value(v[name]) for name in (lower, upper))
             raise ConfigError(f'{source}: {low}: must be {relation} {high}')
+    _check_wiring(v, source)
     if v['solver'] not in v['solvers']:
         v['solvers'] = [v['solver'], *v['solvers']]
     if len(set(v['solvers'])) != len(v['solvers']):
         raise ConfigError(f'{source}: solvers = {v["solvers"]!r}: a name is there twice')
+
+
+def _check_wiring(v: Mapping[str, Any], source: str) -> None:
+    """Raise ConfigError if a channel is used twice."""
+    for p in (section.parameters['axes'] for section in PSDS):
+        if sorted(axis[-1] for axis in v[p.name]) != ['x', 'y']:
+            raise ConfigError(f'{source}: {p.with_value(v[p.name])}: must name x once and y once')
 
 
 def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[str, object]:
@@ -499,6 +566,16 @@ def _flatten(tree: Mapping[Any, Any], prefix: str, out: dict[str, object], path:
             out[name] = value
         if len(out) > MAX_KEYS:
             raise ConfigError(f'{path}: more than {MAX_KEYS} parameters')
+
+
+def left_as_in_the_thesis(values: Mapping[str, object]) -> tuple[str, ...]:
+    """Measures of the thesis rig that ``values`` (flat) still have, each as ``NAME = VALUE UNIT``.
+
+    Somebody who describes another rig forgets some of them, and each then counts as measured. Empty if ``values``
+    describe no other rig: nothing of them differs.
+    """
+    same = [p.with_value(p.default) for p in _DESCRIBED if values.get(p.name, p.default) == p.default]
+    return tuple(same) if len(same) < len(_DESCRIBED) else ()
 
 
 def load_rig(path: str | Path | None = None, overrides: Mapping[str, object] | None = None) -> Rig:

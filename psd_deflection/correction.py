@@ -48,6 +48,8 @@ class Correction:
         for active in effects:
             try:
                 corrects = self._add(active)
+            except ConfigError:
+                raise
             except Exception as error:
                 # The effect may be a user's own file. Fail here, not at the first block of a run.
                 raise ConfigError(
@@ -88,6 +90,8 @@ class Correction:
             effect.correct(Reading(np.full((4, 2), 1e-3), sums, warmer, t), active.values)
             self._sensors.insert(0, (effect.correct, active.values))
         moves = effect.point == 'beam' or _optics(self._true) != before
+        if moves and self._nominal.psds_at_base:
+            raise ConfigError(f'effects: {active.label}: moves the optics, which is not corrected for PSDs at the base')
         self._moves_optics |= moves
         return moves or effect.correct is not None
 

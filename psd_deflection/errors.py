@@ -20,6 +20,7 @@ EXIT_STATUSES: Mapping[int, str] = {
     4: 'a recording or an output that cannot be read or written',
     5: 'the device: missing, in use, silent, or of another protocol',
     6: 'the geometry of the rig cannot be solved',
+    71: 'the machine: too little memory, or no further thread',
     INTERRUPTED: 'Ctrl-C before it was done (estimator and monitor then end with 0)',
 }
 """What each exit status of ``psd-deflection`` means; its help and the documentation are made from this table."""
@@ -74,6 +75,15 @@ class SolverError(PsdDeflectionError):
     """
 
     exit_status = 6
+
+
+class MachineError(PsdDeflectionError):
+    """The operating system gives no more memory, or no further thread (``ulimit -v``, ``-u``, a container's limits).
+
+    Example: ``too little memory; see the limits of the shell (ulimit -v), the container or the unit``.
+    """
+
+    exit_status = 71
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

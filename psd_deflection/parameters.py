@@ -217,6 +217,8 @@ def _strings(parameter: Parameter, value: object) -> list[str]:
     names = [item for item in items if isinstance(item, str)]
     if not names or len(names) != len(items):
         raise _RefusedError('must be a list of names')
+    if parameter.choices is not None and not set(names) <= set(parameter.choices):
+        raise _RefusedError(f'each must be {parameter.bound_text()}')
     return names
 
 

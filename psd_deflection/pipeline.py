@@ -5,9 +5,9 @@ calls, so ``replay`` reproduces it bit for bit. The steps are: counts -> volts -
 metres -> correction of the effects in the rig file -> health checks -> solvers -> estimates, and
 the tip load that the link model computes from them.
 
-It has some state from block to block: the twist that ``degraded: hold`` keeps, and for how long a
-detector's values have not changed. When a recording starts, this state is written as a record
-(:meth:`Pipeline.memory`).
+It has some state from block to block: the twist that ``degraded: hold`` keeps, for how long a
+detector's values have not changed, and what effects of the link remember of past loads. When a
+recording starts, this state is written as a record (:meth:`Pipeline.memory`).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from psd_deflection.calibration.health import OpticsHealth, Verdict
 from psd_deflection.config import ZEROS, Rig, replace_values
 from psd_deflection.correction import Correction
 from psd_deflection.geometry import Geometry
-from psd_deflection.mechanics import LinkStatics
 from psd_deflection.records import (
     ENVIRONMENT,
+    RESTART,
     BlockStatus,
     DeflectionEstimate,
     FloatArray,
@@ -39,10 +39,13 @@ from psd_deflection.records import (
     SpotMeans,
     TipLoad,
 )
+from psd_deflection.simulation.catalogue import effects_of_rig
+from psd_deflection.simulation.tip_load import TipLoads
 from psd_deflection.solvers import solver_from_rig
 from psd_deflection.solvers.interface import Solution, SolverStatus
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 from psd_deflection.solvers.one_psd import OnePsd
+from psd_deflection.solvers.registry import psds_at_base
 from psd_deflection.uncertainty.consistency import Checked, widened
 from psd_deflection.uncertainty.stamped import FIT, HELD_RESIDUAL, NOISE, StampedDots
 
@@ -50,7 +53,7 @@ ZERO_BLOCKS = 25
 """Number of blocks that :meth:`Pipeline.zero` averages: half a second."""
 
 START, FIRST_TEMPERATURE, TEMPERATURE = ENVIRONMENT
-HELD, FROZEN = 'state.held_twist', 'state.frozen_blocks'
+HELD, FROZEN, TIP_LOADS = 'state.held_twist', 'state.frozen_blocks', 'state.tip_loads'
 REMEMBERED = (NOISE, FIT, HELD_RESIDUAL)
 """Names of the values in the record of :meth:`Pipeline.memory`."""
 
@@ -95,7 +98,7 @@ class Pipeline:
         config = rig.estimator
         self._cutter = BlockCutter(config.block_size)
         self._period_ns = 1e9 / rig.converter.sample_rate_hz
-        self._statics = LinkStatics.from_rig(rig)
+        self.tip_loads = TipLoads(rig, effects_of_rig(rig) if config.wrench == 'effects' else ())
         self._recent: list[Dots] = []
         self._environment: dict[str, float] = {}
         self._held: _Held | None = None
@@ -104,7 +107,7 @@ class Pipeline:
         self._variances = [tuple(float(v) / n for v in variances) for n in range(1, config.block_size + 1)]
         self._build(rig)
         # After the solvers, which refuse a geometry that cannot be solved.
-        self.stamped = StampedDots(rig)
+        self.stamped = StampedDots(rig, flat=not psds_at_base(rig))
 
     def _build(self, rig: Rig) -> None:
         self.rig = rig
@@ -135,7 +138,7 @@ class Pipeline:
         readings = chunk.readings
         volts: npt.NDArray[np.float32]
         if chunk.volts_per_count is not None:
-            volts = counts_to_volts(readings.astype(np.int16, copy=False), chunk.volts_per_count)
+            volts = counts_to_volts(readings.astype(np.int32, copy=False), chunk.volts_per_count)
         else:
             volts = readings.astype(np.float32, copy=False)
         for block in self._cutter.add(chunk, volts):
@@ -177,12 +180,18 @@ class Pipeline:
             value = values.pop(name, None)
             if isinstance(value, (int, float)):
                 self._environment[name] = float(value)
-        held, frozen = values.pop(HELD, None), values.pop(FROZEN, None)
+        # It says which numbers belong to no sample; no estimate depends on it.
+        values.pop(RESTART, None)
+        held, frozen, loads = values.pop(HELD, None), values.pop(FROZEN, None), values.pop(TIP_LOADS, None)
         told = {name: tuple(v) for name in REMEMBERED if isinstance(v := values.pop(name, None), list)}
         if isinstance(held, list) and len(held) == 3:
             self._held = _Held(int(held[0]), held[1], held[2])
         if isinstance(frozen, list) and len(frozen) == 2:
             self._frozen = (int(frozen[0]), int(frozen[1]))
+        if any(name in ZEROS for name in values):
+            self.tip_loads.zeroed = True
+        if isinstance(loads, list):
+            self.tip_loads.restore(tuple(loads))
         if values:
             self._build(replace_values(self.rig, values, 'change'))
             self.stamped.set_zeros(self.rig)
@@ -202,6 +211,8 @@ class Pipeline:
             values.append((HELD, tuple(self._held)))
         if self._frozen != (0, 0):
             values.append((FROZEN, self._frozen))
+        if loads := self.tip_loads.memory():
+            values.append((TIP_LOADS, loads))
         if self.last_spots is not None:
             values += self.stamped.memory().items()
         if not values:
@@ -234,7 +245,7 @@ class Pipeline:
         present = len(block.seq)
         self.counters.samples += present
         self.counters.blocks += 1
-        volts = block.volts
+        volts = self._calibration.seen(block.volts)
         sums = volts[:, 2::3].astype(np.float64)
         samples = self._calibration.dots(volts)
         if self._correction.active:
@@ -243,7 +254,7 @@ class Pipeline:
         dots: Dots = (x1, y1, x2, y2)
         if self._optics.refuses_frozen:
             self._count_still(volts)
-        verdict = self._optics.judge(block, dots, sums, self._frozen)
+        verdict = self._optics.judge(block, volts, dots, sums, self._frozen)
         status, reason = verdict.status, verdict.reason
         t_ns = block_middle_ns(block, size, self._period_ns)
         slots = block.seq - block.index * size
@@ -264,7 +275,7 @@ class Pipeline:
             elif best is not None:
                 self._held = _Held(t_ns, best.theta, best.variances[2])
         elif verdict.faulty:
-            if self.rig.estimator.covariance == 'measured':
+            if self.rig.estimator.covariance == 'measured' and self.stamped.flat:
                 variances = self.stamped.mean_variances(present)
             best = self._from_the_other(verdict.faulty, t_ns, block.index, dots, variances)
             degraded = best is not None
@@ -274,8 +285,7 @@ class Pipeline:
             self.counters.degraded += degraded
             yield best
         if best is not None and not degraded:
-            fx, fy, tz = self._statics.tip_load(best.dx, best.dy, best.theta)
-            yield TipLoad(t_ns, fx, fy, tz)
+            yield TipLoad(t_ns, *self.tip_loads.tip_load(block.index, best.dx, best.dy, best.theta))
             # The zero must not be a mean across an outage.
             last = self.last_spots
             if last is not None and t_ns - last.t_ns > ZERO_BLOCKS * size * self._period_ns:
@@ -297,7 +307,7 @@ class Pipeline:
             self.stamped.suspect(block.index, dots, checked)
         if not self._optics.refuses_frozen:
             self._count_still(volts)
-        findings = verdict.findings + self._optics.late_findings(block, verdict, self._frozen)
+        findings = verdict.findings + self._optics.late_findings(volts, verdict, self._frozen)
         for finding in findings:
             name = finding.split(':')[0]
             self.counters.findings[name] = self.counters.findings.get(name, 0) + 1
@@ -329,8 +339,10 @@ class Pipeline:
         solution, failure = self._solve(0, dots, variances)
         if solution is None:
             return None, None, (BlockStatus.NOT_SOLVED, failure)
-        checked = self.stamped.check(dots, solution.residual, np.diag(variances) if spread is None else spread)
-        if checked.contradict and self.rig.estimator.consistency == 'refuse':
+        checked: Checked | None = None
+        if self.stamped.flat:
+            checked = self.stamped.check(dots, solution.residual, np.diag(variances) if spread is None else spread)
+        if checked is not None and checked.contradict and self.rig.estimator.consistency == 'refuse':
             reason = f'the four readings contradict each other: chi-square {checked.chi_square:.0f} of 1'
             return None, checked, (BlockStatus.INCONSISTENT, reason)
         return self._estimate(0, t_ns, block, solution, dots, variances, spread, checked), checked, None

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+Counts = npt.NDArray[np.int16] | npt.NDArray[np.int32]
 
 CHANNELS = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
 """The order of the six channels everywhere: on the wire, in recordings, in arrays."""
@@ -51,14 +52,14 @@ class RawChunk:
     """Samples as they arrived, in order; not necessarily a whole block.
 
     ``seq`` int64 (n,): the sample number, extended beyond the 32 bits of the protocol. ``t_ns``
-    int64 (n,): when each sample was taken, ROS time, ns. ``readings`` (n, 6): int16 converter
+    int64 (n,): when each sample was taken, ROS time, ns. ``readings`` (n, 6): int16 or int32 converter
     counts, or float32 volts, in the order of ``CHANNELS``. ``flags`` uint8 (n,): as in the
     protocol. ``volts_per_count``: V per count; None if ``readings`` are already volts.
     """
 
     seq: IntArray
     t_ns: IntArray
-    readings: npt.NDArray[np.int16] | npt.NDArray[np.float32]
+    readings: Counts | npt.NDArray[np.float32]
     flags: npt.NDArray[np.uint8]
     volts_per_count: float | None = None
 
@@ -174,10 +175,16 @@ now.
 """
 
 
+RESTART = 'device.restart'
+"""Recorded with the block in which a restarted device went on: the last sample number before, the first after.
+The numbers between belong to no sample.
+"""
+
+
 class ParameterChange(NamedTuple):
     """A value that affects the estimates and was changed during the run.
 
-    These are parameters (set by ``~/zero`` or live) and the names in :data:`ENVIRONMENT`.
+    These are parameters (set by ``~/zero`` or live), the names in :data:`ENVIRONMENT`, and :data:`RESTART`.
     ``values``: names and checked values; they apply from block ``block`` on. The change is
     recorded, and replay applies it at the same block.
     """

@@ -7,7 +7,8 @@ the lower edge of these points: the edge of their lower convex hull that spans t
 (``test/test_timing.py`` checks that stamps stay within 50 us of the true times.) Until there are
 ``FIT_AFTER_S`` points, a one-sided filter is used instead (Olson, "A passive solution to the sensor
 synchronization problem", IROS 2010). It takes the smallest delay so far, after raising each older
-one by the most that the clocks may have drifted apart since (``MAX_SKEW``).
+one by the most that the clocks may have drifted apart since (``MAX_SKEW``). A clock that is off by more than
+that is fitted as soon as it shows (``STRAY_NS``).
 
 Samples at 1 kHz beat with the 1 ms polling of USB, so the smallest delay of a second may stay high
 for many seconds. If the device answers pings, the answers arrive at random phase and enter the same
@@ -35,9 +36,15 @@ SETTLING_S = 10
 STEER_SETTLING = 2e-3
 """Largest extra slope in the first ``SETTLING_S``: 20 ms between blocks stay 20 ms within 40 us."""
 STEER_RUNNING = 2e-4
+FAR_NS = 1_000_000
+"""If the map is this far from the fit, it approaches it as in the first ``SETTLING_S``."""
 EARLY_NS = 50_000_000
 """A sample that arrives this much earlier than the map allows: the device's clock jumped ahead."""
 MAX_SKEW = 1e-4
+STRAY_POINTS = 3
+STRAY_NS = 2_000_000
+"""A clock that runs off by this much over the points so far, ``STRAY_POINTS`` at least and all on one line, is
+fitted before ``FIT_AFTER_S``: it is worse than ``MAX_SKEW``."""
 LATE_NS = 5 * SECOND_NS
 """A whole second of samples this late: the device's clock jumped back, or stood still."""
 
@@ -170,7 +177,10 @@ class ClockMap:
         points = [*self._minima, self._bucket_min] if self._bucket_min is not None else list(self._minima)
         if not points:
             return
-        if len(self._minima) < FIT_AFTER_S:
+        stray = self._stray() if STRAY_POINTS <= len(self._minima) < FIT_AFTER_S else None
+        if stray is not None:
+            skew, intercept = stray
+        elif len(self._minima) < FIT_AFTER_S:
             skew, intercept = 0.0, float(min(delay + MAX_SKEW * max(now - device, 0) for device, delay in points))
         else:
             skew, intercept = lower_line([(d - self._origin, y) for d, y in self._minima])
@@ -181,10 +191,19 @@ class ClockMap:
         host = self._host(turn)
         error = target - host
         self._residual = error
-        settling = now - self._origin < SETTLING_S * SECOND_NS
+        settling = now - self._origin < SETTLING_S * SECOND_NS or abs(error) > FAR_NS
         limit = STEER_SETTLING if settling else STEER_RUNNING
         steer = min(max(error / (1.0 if settling else 5.0) / SECOND_NS, -limit), limit)
         self._anchor_device, self._anchor_host, self._slope = turn, host, skew + steer
+
+    def _stray(self) -> tuple[float, float] | None:
+        """Slope and intercept if the clock is evidently worse than ``MAX_SKEW``."""
+        points = [(d - self._origin, y) for d, y in self._minima]
+        slope, intercept = lower_line(points)
+        if abs(slope) <= MAX_SKEW or abs(slope) * (points[-1][0] - points[0][0]) < STRAY_NS:
+            return None
+        # A start that came late, or a stall, is no rate.
+        return (slope, intercept) if all(y - slope * x - intercept < FAR_NS for x, y in points) else None
 
 
 def lower_line(points: list[tuple[int, int]]) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from psd_deflection.config import (
     LINK,
     LinkConfig,
     Rig,
+    left_as_in_the_thesis,
     load_rig,
     read_parameter_file,
     replace_values,
@@ -140,6 +141,8 @@ def test_a_field_is_all_that_a_parameter_costs() -> None:
 
 def another(p: Parameter) -> Value:
     """A legal value beside the default."""
+    if p.choices is not None and p.kind == 'string_array':
+        return list(reversed(p.default))
     if p.choices is not None:
         return p.choices[-1]
     match p.default:
@@ -191,3 +194,12 @@ def test_one_message_for_a_file_and_for_an_override(tmp_path: Path) -> None:
         load_rig(path)
     with pytest.raises(ConfigError, match=rf'^override: {why}'):
         load_rig(RIG, {'converter.full_scale': -1})
+
+
+def test_what_another_rig_leaves_as_in_the_thesis_is_said() -> None:
+    assert left_as_in_the_thesis(load_rig().values) == ()
+    # A parameter that measures nothing of the rig makes it no other one.
+    assert left_as_in_the_thesis(load_rig(overrides={'block_size': 30}).values) == ()
+    said = left_as_in_the_thesis(load_rig(overrides={'link.length': 0.4}).values)
+    assert 'dynamics.bending_frequency = 14.0 Hz' in said
+    assert not [text for text in said if text.startswith(('link.length', 'psd_1.zero', 'port'))]

@@ -17,6 +17,7 @@ from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import (
     BlockStatus,
+    Counts,
     DeflectionEstimate,
     RawChunk,
     Record,
@@ -31,12 +32,12 @@ from psd_deflection.simulation.simulator import RigSimulator
 STEP = 10.0 / 32768
 
 
-def chunk_of(counts: npt.NDArray[np.int16], first: int = 0) -> RawChunk:
+def chunk_of(counts: Counts, first: int = 0) -> RawChunk:
     seq = np.arange(first, first + len(counts))
     return RawChunk(seq, seq * 1_000_000, counts, np.zeros(len(counts), np.uint8), STEP)
 
 
-def still(pose: tuple[float, float, float], n: int, seed: int) -> npt.NDArray[np.int16]:
+def still(pose: tuple[float, float, float], n: int, seed: int) -> Counts:
     """Counts of a flat plate at rest in ``pose``: m = R(-theta)(l - d) - c, 2 mV noise, 16 bits."""
     dx, dy, theta = pose
     c, s = np.cos(theta), np.sin(theta)

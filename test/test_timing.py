@@ -41,6 +41,24 @@ def test_stamps_follow_the_truth_within_50_us_after_three_minutes(skew: float) -
     assert clock.resets == 0
 
 
+@pytest.mark.parametrize('skew', [500.0, -500.0, 5000.0, -5000.0])
+def test_a_clock_far_off_its_rate_is_followed_within_twenty_seconds(skew: float) -> None:
+    clock = ClockMap()
+    stamps, truth = observe_usb(clock, 40, skew, 1)
+    error = stamps - truth
+    assert abs(error).max() < 20 * MS
+    assert abs(error[20 * 50 :]).max() < 1 * MS
+    assert clock.resets == 0
+
+
+def test_a_late_start_or_a_stall_is_no_rate() -> None:
+    clock = ClockMap()
+    for k in range(5000):
+        late = 40 * MS if k < 1000 or 3000 <= k < 3990 else 0
+        clock.observe(1000 * k, k * MS + 200_000 + late)
+    assert clock.state().skew_ppm == 0.0
+
+
 def test_stamps_rise_evenly_from_the_first_second_on() -> None:
     stamps, _ = observe_usb(ClockMap(), 30, 30.0, 2)
     spacing = np.diff(stamps)

@@ -108,8 +108,8 @@ def check_dots(written: Written, recording: Recording, rig: Rig) -> None:
         light = np.add.reduceat(samples[f'sum{n}'].astype(np.float64), first) / present
         seen = light >= rig.estimator.sum_min
         dots = [
-            np.add.reduceat(samples[f'{axis}{n}'].astype(np.float64), first) / present * rig.amplifier.sensitivity
-            for axis in 'xy'
+            np.add.reduceat(samples[f'{axis}{n}'].astype(np.float64), first) / present * sensitivity
+            for axis, sensitivity in zip('xy', rig.sensitivities[n - 1], strict=True)
         ]
         _, _, found = written.rows(f'psd_{n}/plane/dot', 'Points2D:positions')
         need(len(found) == int(seen.sum()), f'PSD {n}: {len(found)} dots, {seen.sum()} blocks with light')

@@ -50,7 +50,14 @@ ROOMS: Mapping[str, Room] = {
     'calibration': Room(('psd_deflection/calibration',), ('test/calibration', *_WHOLE)),
     'uncertainty': Room(('psd_deflection/uncertainty',), ('test/uncertainty', 'test/blind/test_coverage.py')),
     'adapters': Room(('msg_adapters',), ('test/recordings/test_adapters.py', 'test/recordings/test_contract.py')),
-    'protocol': Room(('psd_deflection/protocol',), ('test/protocol', 'test/runner/test_hello.py')),
+    'protocol': Room(
+        ('psd_deflection/protocol',),
+        (
+            'test/protocol',
+            'test/runner/test_hello.py',
+            *(f'test/devices/test_{n}.py' for n in ('dataq', 'text_lines', 'thorlabs')),
+        ),
+    ),
     'effects': Room(
         ('psd_deflection/simulation/effects',),
         ('test/simulation/test_effect_formulas.py', 'test/simulation/test_effects.py'),

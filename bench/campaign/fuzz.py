@@ -6,17 +6,23 @@ within a second and 256 MB. Inputs that were found to break it become tests (``t
   python -m bench.campaign.fuzz frames -max_total_time=600
   python -m bench.campaign.fuzz corrupted 10000000
 
-Targets: frames, bag, csv, parameters; ``corrupted N`` counts damaged frames instead.
+Targets: frames, hello, bag, records, csv, parameters, yaml; ``corrupted N`` counts damaged frames instead. In hello,
+records and yaml the input chooses among what a grammar allows, so that it gets past CRCs, lengths and syntax.
 """
 
 from __future__ import annotations
 
+import json
 import random
+import struct
 import sys
 import tempfile
 import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
+
+import zstandard
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMITS = ['-timeout=60', '-rss_limit_mb=256', '-max_len=65536']
@@ -156,11 +162,199 @@ def parameters_target() -> tuple[Target, list[bytes]]:
     ]
 
 
+class Choices:
+    """The bytes of an input, taken as decisions; zeros when they are used up."""
+
+    def __init__(self, content: bytes) -> None:
+        self._content = content
+        self._at = 0
+
+    def __bool__(self) -> bool:
+        return self._at < len(self._content)
+
+    def take(self, size: int) -> bytes:
+        """The next bytes."""
+        piece = self._content[self._at : self._at + size]
+        self._at += size
+        return piece.ljust(size, b'\0')
+
+    def below(self, limit: int) -> int:
+        """A number from 0 to ``limit`` - 1."""
+        return int.from_bytes(self.take(1 if limit <= 256 else 4), 'little') % limit
+
+    def text(self) -> str:
+        """A short text of any characters, lone surrogates among them."""
+        return ''.join(chr(int.from_bytes(self.take(2), 'little')) for _ in range(self.below(7)))
+
+    def value(self, depth: int = 0) -> object:
+        """What JSON and YAML can say."""
+        kind = self.below(9 if depth < 4 else 7)
+        if kind < 3:
+            return (None, True, False)[kind]
+        if kind == 3:
+            return int.from_bytes(self.take(4), 'little', signed=True) * 10 ** (self.below(2) * self.below(400))
+        if kind == 4:
+            (number,) = struct.unpack('<d', self.take(8))
+            return number
+        if kind < 7:
+            return self.text() if kind == 5 else 'x' * self.below(3000)
+        if kind == 7:
+            return [self.value(depth + 1) for _ in range(self.below(6))]
+        return {self.text(): self.value(depth + 1) for _ in range(self.below(6))}
+
+
+def hello_target() -> tuple[Target, list[bytes]]:
+    """A HELLO of any words, as a frame, through the gate: what is taken is printable, bounded, and can be recorded."""
+    from psd_deflection.config import load_rig
+    from psd_deflection.errors import DeviceError
+    from psd_deflection.protocol.frames import FrameDecoder, HelloFrame, encode
+    from psd_deflection.records import CHANNELS
+    from psd_deflection.runner.hello import HelloGate
+
+    rig = load_rig()
+    good: dict[str, object] = {
+        'serial': 'A',
+        'firmware': '1',
+        'sample_rate_hz': 1000.0,
+        'channels': list(CHANNELS),
+        'volts_per_count': rig.converter.volts_per_count,
+    }
+
+    def target(content: bytes) -> list[str]:
+        choices = Choices(content)
+        gate = HelloGate(rig)
+        refused = []
+        while choices:
+            info = dict(good)
+            for _ in range(choices.below(3)):
+                key = [*good, choices.text()][choices.below(len(good) + 1)]
+                info[key] = choices.value()
+            try:
+                frames = FrameDecoder().feed(b'\0' + encode(HelloFrame(1, info)))
+            except (ValueError, OverflowError):
+                # It does not fit into a frame.
+                continue
+            for frame in frames:
+                if not isinstance(frame, HelloFrame):
+                    continue
+                try:
+                    gate.take(frame, 'port', volts=False)
+                except DeviceError as error:
+                    refused.append(str(error)[:300])
+            if gate.hello is not None:
+                words = json.dumps(gate.hello.info, allow_nan=False, ensure_ascii=False)
+                rate = gate.hello.info['sample_rate_hz']
+                if not words.isprintable() or not isinstance(rate, int | float) or not abs(rate - 1000.0) <= 1.0:
+                    raise AssertionError(f'taken: {words!r}')
+        return refused
+
+    return target, [b'\0\0', bytes(range(256))]
+
+
+def _records(choices: Choices, channels: int, depth: int = 0) -> bytes:
+    """MCAP records whose lengths and CRCs are right, of contents that mostly are."""
+
+    def text() -> bytes:
+        known = (b'/psd/samples', b'/link_tip/load', b'cdr', b'sensor_msgs/msg/PointCloud2', b'psd_deflection.change.1')
+        content = known[choices.below(5)] if choices.below(4) else choices.take(choices.below(20))
+        return struct.pack('<I', len(content)) + content
+
+    def pairs() -> bytes:
+        content = b''.join(text() + text() for _ in range(choices.below(3)))
+        return struct.pack('<I', len(content)) + content
+
+    out = []
+    for _ in range(choices.below(12)):
+        if not choices:
+            break
+        kind = choices.below(8)
+        number = struct.pack('<H', choices.below(channels))
+        if kind == 0:
+            opcode, content = 3, number + text() + text() + struct.pack('<I', 0)
+        elif kind == 1:
+            opcode, content = 4, number + number + text() + text() + pairs()
+        elif kind == 2:
+            opcode, content = 12, text() + pairs()
+        elif kind < 6:
+            body = choices.take(choices.below(120)) * (1 + choices.below(200) * (kind == 5))
+            opcode, content = 5, number + choices.take(20) + body
+        elif kind == 6 and depth == 0:
+            plain = _records(choices, channels, 1) * (1 + choices.below(2000))
+            head = struct.pack('<QQQI', 0, 0, len(plain), zlib.crc32(plain))
+            packed = zstandard.compress(plain)
+            opcode = 6
+            content = head + struct.pack('<I', 4) + b'zstd' + struct.pack('<Q', len(packed)) + packed
+        else:
+            opcode, content = choices.below(256), choices.take(choices.below(30))
+        out.append(struct.pack('<BQ', opcode, len(content)) + content)
+    return b''.join(out)
+
+
+def records_target() -> tuple[Target, list[bytes]]:
+    """As ``bag``, of records with right lengths and CRCs, packed in chunks and many times over."""
+    target, _ = bag_target()
+    start = b'\x89MCAP0\r\n'
+
+    def built(content: bytes) -> list[str]:
+        choices = Choices(content[:4096])
+        tail = start if choices.below(2) else b''
+        return target(start + b''.join(_records(choices, 4) for _ in range(4)) + tail)
+
+    return built, [bytes(range(256)), bytes([1, 11, 1, 1, 0, 0, 0, 1, 3, 5] * 40)]
+
+
+def yaml_target() -> tuple[Target, list[bytes]]:
+    """A parameter file and a ``metadata.yaml`` that are YAML, with anchors, aliases, merge keys and tags."""
+    from psd_deflection.config import PARAMETERS, load_rig
+    from psd_deflection.errors import PsdDeflectionError
+    from psd_deflection.recordings.bag_reader import read_information
+
+    names = [p.name for p in PARAMETERS]
+    tags = ('', '!!int ', '!!float ', '!!bool ', '!!timestamp ', '!!binary ', '!!set ', '!!python/name:os.system ')
+
+    def said(choices: Choices, depth: int, anchors: list[str]) -> str:
+        kind = choices.below(10)
+        if anchors and kind == 0:
+            return '*' + anchors[choices.below(len(anchors))]
+        anchor = ''
+        if kind == 1:
+            anchors.append(f'a{len(anchors)}')
+            anchor = f'&{anchors[-1]} '
+        if depth < 8 and kind in (2, 3):
+            return anchor + '[' + ', '.join(said(choices, depth + 1, anchors) for _ in range(choices.below(8))) + ']'
+        if depth < 8 and kind in (4, 5):
+            keys = (names[choices.below(len(names))] if choices.below(3) else '<<' for _ in range(choices.below(8)))
+            return anchor + '{' + ', '.join(f'{k}: {said(choices, depth + 1, anchors)}' for k in keys) + '}'
+        return anchor + tags[choices.below(len(tags))] + json.dumps(choices.value(4))
+
+    folder = Path(tempfile.mkdtemp(dir='/dev/shm' if Path('/dev/shm').is_dir() else None))
+
+    def target(content: bytes) -> list[str]:
+        text = said(Choices(content), 0, [])
+        refused = []
+        for head, read in (('/**: {ros__parameters: ', load_rig), ('rosbag2_bagfile_information: ', read_information)):
+            path = folder / 'input.yaml'
+            path.write_text(head + text + ('}' if head.startswith('/') else ''), errors='replace')
+            try:
+                read(path)
+            except PsdDeflectionError as error:
+                refused.append(str(error))
+        return refused
+
+    return target, [bytes([4, 3, 1, 5, 2, 0, 4, 1]) * 20, bytes(range(256))]
+
+
+GRAMMARS = ('hello', 'records', 'yaml')
+"""Targets whose input is a list of choices: any bytes are an input."""
+
 TARGETS: dict[str, Callable[[], tuple[Target, list[bytes]]]] = {
     'frames': frames_target,
+    'hello': hello_target,
     'bag': bag_target,
+    'records': records_target,
     'csv': csv_target,
     'parameters': parameters_target,
+    'yaml': yaml_target,
 }
 """Each target with inputs to begin from, of which the first is whole."""
 

@@ -64,7 +64,7 @@ def averaging_gain(block_size: int, frequency: float, sample_rate_hz: float) -> 
 def _interference(at: Situation) -> FloatArray:
     rig = at.rig
     gain = averaging_gain(rig.estimator.block_size, at['interference_frequency'], rig.converter.sample_rate_hz)
-    return np.full(4, at['interference'] * rig.amplifier.sensitivity / math.sqrt(2.0) * gain)
+    return np.asarray(at['interference'] * rig.sensitivities.ravel() / math.sqrt(2.0) * gain)
 
 
 INTERFERENCE = Term(

@@ -117,15 +117,15 @@ THERMAL_DRIFT = Term(
 
 
 def _amplifier_noise(at: Situation) -> FloatArray:
-    amplifier = at.rig.amplifier
-    return np.full(4, averaged(amplifier.noise * amplifier.sensitivity, at))
+    each = at.rig.noises[:, :2] * at.rig.sensitivities
+    return np.array([averaged(float(noise), at) for noise in each.ravel()])
 
 
 AMPLIFIER_NOISE = Term(
     'amplifier_noise',
     '',
     Kind.PER_ESTIMATE,
-    'amplifier.noise x amplifier.sensitivity / sqrt(block_size)',
+    'noise x sensitivity of the channel / sqrt(block_size)',
     (),
     _amplifier_noise,
     adds_to('reading_shift'),
@@ -134,10 +134,13 @@ AMPLIFIER_NOISE = Term(
 
 def _quantisation(at: Situation) -> FloatArray:
     step = at.rig.converter.volts_per_count
-    deviation = step * at.rig.amplifier.sensitivity / math.sqrt(12.0)
-    # Noise of half a step or more makes the rounding errors of successive samples independent.
-    dithered = at.rig.amplifier.noise >= step / 2.0
-    return np.full(4, averaged(deviation, at) if dithered else deviation)
+    out = []
+    channels = zip(at.rig.noises[:, :2].ravel().tolist(), at.rig.sensitivities.ravel().tolist(), strict=True)
+    for noise, sensitivity in channels:
+        deviation = step * sensitivity / math.sqrt(12.0)
+        # Noise of half a step or more makes the rounding errors of successive samples independent.
+        out.append(averaged(deviation, at) if noise >= step / 2.0 else deviation)
+    return np.array(out)
 
 
 QUANTISATION = Term(

@@ -9,6 +9,7 @@ from psd_deflection.calibration.sensors import (
     make_sensor,
 )
 from psd_deflection.calibration.volts import Calibration, counts_to_volts, dot_noise_variances
+from psd_deflection.calibration.wiring import Wiring
 
 __all__ = [
     'Calibration',
@@ -17,6 +18,7 @@ __all__ = [
     'Quadrant',
     'Sensor',
     'Tetralateral',
+    'Wiring',
     'counts_to_volts',
     'dot_noise_variances',
     'make_sensor',

@@ -71,24 +71,33 @@ class OpticsHealth:
         self._half = tuple(half / 2.0 for psd in rig.psds for half in psd.active_area)
         self._radius = tuple(psd.spot_radius for psd in rig.psds for _ in range(2))
         # If the noise is below one step, constant values are normal.
-        self._moves = rig.amplifier.noise > step
-        self._noise = NOISY * (rig.amplifier.noise**2 + step**2 / 12.0) ** 0.5
+        self._moves = [bool((own > step).any()) for own in rig.noises]
+        self._noise = NOISY * np.sqrt(rig.noises**2 + step**2 / 12.0)
 
     def still(self, volts: npt.NDArray[np.float32]) -> tuple[bool, bool]:
         """For PSD 1 and PSD 2: whether x, y and sum are identical in all samples."""
-        if not self._moves or len(volts) < max(self._min_samples, 2):
+        if len(volts) < max(self._min_samples, 2):
             return (False, False)
         same = (volts == volts[0]).all(axis=0)
-        return (bool(same[:3].all()), bool(same[3:].all()))
+        return (self._moves[0] and bool(same[:3].all()), self._moves[1] and bool(same[3:].all()))
 
-    def judge(self, block: SampleBlock, dots: tuple[float, ...], sums: FloatArray, frozen: tuple[int, int]) -> Verdict:
-        """The block's verdict, causes before consequences. ``frozen``: blocks in a row without change, per PSD."""
+    def judge(
+        self,
+        block: SampleBlock,
+        volts: npt.NDArray[np.float32],
+        dots: tuple[float, ...],
+        sums: FloatArray,
+        frozen: tuple[int, int],
+    ) -> Verdict:
+        """The block's verdict, causes before consequences. ``volts`` (n, 6): of the PSDs, x y sum of each.
+
+        ``frozen``: blocks in a row without change, per PSD. ``x1`` in a reason is PSD 1's x, whatever channel it is on.
+        """
         faults: dict[int, tuple[BlockStatus, str]] = {}
 
         def fault(psd: int, status: BlockStatus, reason: str) -> None:
             faults.setdefault(psd, (status, reason))
 
-        volts = block.volts
         present = len(block.seq)
         low = sums.min(axis=0).tolist()
         for psd, least in enumerate(low, start=1):
@@ -143,18 +152,21 @@ class OpticsHealth:
                     break
         return tuple(out)
 
-    def late_findings(self, block: SampleBlock, verdict: Verdict, frozen: tuple[int, int]) -> tuple[str, ...]:
+    def late_findings(
+        self, volts: npt.NDArray[np.float32], verdict: Verdict, frozen: tuple[int, int]
+    ) -> tuple[str, ...]:
         """Findings computed after the estimate: a noisy detector, a detector whose values do not change."""
         faulty = verdict.faults
         out = []
-        if len(block.seq) == self._size >= 10:
+        if len(volts) == self._size >= 10:
             # Third differences almost remove the link's own motion.
-            rough = np.diff(block.volts, n=3, axis=0)
+            rough = np.diff(volts, n=3, axis=0)
             level = np.sqrt(np.einsum('ij,ij->j', rough, rough) / (len(rough) * _THIRD_DIFFERENCE))
             for psd in (1, 2):
-                worst = float(level[3 * psd - 3 : 3 * psd].max())
-                if psd not in faulty and worst > self._noise:
-                    out.append(f'psd_{psd} is noisy: {worst * 1e3:.1f} mV a sample')
+                own = level[3 * psd - 3 : 3 * psd]
+                noisy = own[own > self._noise[psd - 1]]
+                if psd not in faulty and noisy.size:
+                    out.append(f'psd_{psd} is noisy: {float(noisy.max()) * 1e3:.1f} mV a sample')
         if not self.refuses_frozen:
             out += [reason for psd, reason in _long(frozen) if psd not in faulty]
         return tuple(out)

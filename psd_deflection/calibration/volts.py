@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.calibration.sensors import Quadrant, Sensor, make_sensor
+from psd_deflection.calibration.wiring import Wiring
 from psd_deflection.config import Rig
-from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.records import DOT_CHANNELS, Counts, FloatArray
 
 
-def counts_to_volts(counts: npt.NDArray[np.int16], volts_per_count: float) -> npt.NDArray[np.float32]:
+def counts_to_volts(counts: Counts, volts_per_count: float) -> npt.NDArray[np.float32]:
     """Volts (n, 6) of converter counts (n, 6); ``volts_per_count`` V.
 
     The product is computed in double precision and rounded once to float32, as in a recording. So a
@@ -25,27 +26,34 @@ def counts_to_volts(counts: npt.NDArray[np.int16], volts_per_count: float) -> np
 class Calibration:
     """Readings to the places of the dots.
 
-    ``sensitivity``: m/V on x and y, at the centre. ``sensors``: one for each PSD.
+    ``sensitivities``: m/V on x1, y1, x2, y2, at the centre. ``sensors``: one for each PSD. ``wiring``: which channel
+    of the device is which axis of which PSD.
     """
 
-    sensitivity: float
+    sensitivities: tuple[float, ...]
     sensors: tuple[Sensor, Sensor]
+    wiring: Wiring = field(default_factory=Wiring)
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Calibration:
         """The calibration of the rig's parameters."""
         return cls(
-            sensitivity=rig.amplifier.sensitivity,
+            sensitivities=tuple(rig.sensitivities.ravel().tolist()),
             sensors=(make_sensor(rig.psds[0]), make_sensor(rig.psds[1])),
+            wiring=Wiring.from_rig(rig),
         )
 
-    def dots(self, volts: npt.NDArray[np.float32]) -> FloatArray:
-        """Places (n, 4), m: x1, y1, x2, y2, each from its PSD's centre; ``volts`` (n, 6) float32.
+    def seen(self, volts: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Volts (n, 6) of the PSDs, x y sum of each, from those of the device's channels."""
+        return self.wiring.to_psds(volts)
 
-        The amplifier divides by the sum, so a voltage is the place over ``sensitivity``. The
+    def dots(self, volts: npt.NDArray[np.float32]) -> FloatArray:
+        """Places (n, 4), m: x1, y1, x2, y2, each from its PSD's centre; ``volts`` (n, 6) float32 as :meth:`seen`.
+
+        The amplifier divides by the sum, so a voltage is the place over the sensitivity. The
         nonlinear curve of a segmented sensor is inverted.
         """
-        dots = np.multiply(volts[:, DOT_CHANNELS], self.sensitivity, dtype=np.float64)
+        dots = np.multiply(volts[:, DOT_CHANNELS], self.sensitivities, dtype=np.float64)
         for i, sensor in enumerate(self.sensors):
             if isinstance(sensor, Quadrant):
                 dots[:, 2 * i : 2 * i + 2] = sensor.from_linear(dots[:, 2 * i : 2 * i + 2])
@@ -71,5 +79,5 @@ def dot_noise_variances(rig: Rig) -> FloatArray:
     at the centre.
     """
     step = rig.converter.volts_per_count
-    variance = rig.amplifier.sensitivity**2 * (rig.amplifier.noise**2 + step**2 / 12.0)
-    return np.full(4, variance)
+    channels = zip(rig.sensitivities.ravel().tolist(), rig.noises[:, :2].ravel().tolist(), strict=True)
+    return np.array([sensitivity**2 * (noise**2 + step**2 / 12.0) for sensitivity, noise in channels])

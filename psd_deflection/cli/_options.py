@@ -7,12 +7,13 @@ import contextlib
 import functools
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from psd_deflection.config import BY_NAME
+from psd_deflection.config import BY_NAME, Rig, replace_values
 from psd_deflection.errors import ConfigError, RecordingError, UsageError
+from psd_deflection.foreign_yaml import YamlError, parse_yaml
 
 _FOREIGN = """
 .7z .arrow .avi .bag .bmp .bz2 .db .db3 .eps .feather .gif .gz .h5 .hdf .hdf5 .htm .html .jpeg .jpg .json .jsonl .log
@@ -90,6 +91,33 @@ def namespace_option(parser: argparse._ActionsContainer) -> None:
         metavar='/NAME',
         help='namespace of the recorded node, for a bag of several rigs (the only one is found by itself)',
     )
+
+
+def world_option(parser: argparse._ActionsContainer) -> None:
+    """Add --world, which :func:`in_the_world` reads."""
+    parser.add_argument(
+        '--world',
+        metavar='NAME=VALUE',
+        action='append',
+        default=[],
+        help='what a parameter really is on the simulated rig, if the rig file has it wrong; repeatable: '
+        "--world 'psd_1.axes=[x, -y]'",
+    )
+
+
+def in_the_world(rig: Rig, words: Sequence[str]) -> Rig:
+    """The simulated rig: ``rig`` with the values of --world. Raises UsageError."""
+    values: dict[str, object] = {}
+    for word in words:
+        name, equals, text = word.partition('=')
+        if not equals:
+            raise UsageError(f'--world {word}: must be NAME=VALUE')
+        try:
+            values[name.strip()] = parse_yaml(text)
+        except YamlError as error:
+            raise UsageError(f'--world {word}: {error}') from None
+    with given_as_option():
+        return replace_values(rig, values, '--world')
 
 
 def recording_name(*, rerun: bool = False) -> Callable[[str], str]:

@@ -19,7 +19,21 @@ LONGEST_LINE = 2000
 
 def warn(warning: str) -> None:
     """One warning on the standard error. It may hold words of a file."""
-    print(f'warning: {printable(warning, LONGEST_LINE)}', file=sys.stderr)
+    show(f'warning: {warning}', aside=True)
+
+
+def show(*lines: str, aside: bool = False) -> None:
+    """Print lines for a person, on the standard error if ``aside``; an empty one if there are none.
+
+    Each may hold words of a file or a device and is made printable: a line end in it is shown as an escape.
+    """
+    for line in lines or ('',):
+        print(printable(line, LONGEST_LINE), file=sys.stderr if aside else sys.stdout)
+
+
+def show_text(text: str, *, aside: bool = False) -> None:
+    """Print a text of several lines that was made here, as :func:`show` does."""
+    show(*text.split('\n'), aside=aside)
 
 
 def columns(rows: Sequence[Sequence[str]], left: int = 1) -> str:

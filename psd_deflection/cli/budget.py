@@ -40,9 +40,10 @@ from psd_deflection.cli._options import (
     seed,
     whole,
 )
-from psd_deflection.cli._report import columns, print_json, save_figure
+from psd_deflection.cli._report import columns, print_json, save_figure, show, show_text
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import UsageError
+from psd_deflection.records import FloatArray
 
 MICRO_MILLIDEGREE = np.array([1e6, 1e6, math.degrees(1e3)])
 
@@ -101,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
     with given_as_option():
         inputs = read_inputs(args.inputs, _settings(args.set), '--set')
     if args.explain:
-        print(explain(rig, inputs))
+        show_text(explain(rig, inputs))
         return 0
     method = args.method or method_of(rig)
     load = tuple(args.load) if args.load else (0.0, -SIDEBAR_FORCE, -SIDEBAR_FORCE * rig.link.length)
@@ -120,14 +121,14 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(as_json(budget, load, sampled), indent=1)
     else:
-        print(table(budget, load))
+        show_text(table(budget, load))
         if sampled is not None:
-            print(f'\nMonte Carlo, {draws} draws of everything at once (seed {args.seed}):')
-            print('total     ' + _figures_text(sampled))
+            show('', f'Monte Carlo, {draws} draws of everything at once (seed {args.seed}):')
+            show('total     ' + _figures_text(sampled))
     if args.out is not None or not args.json:
         draw_terms(budget, out)
         if not args.json:
-            print(f'\n{out}')
+            show('', f'{out}')
     return 0
 
 
@@ -168,18 +169,24 @@ def _derived(rig: Rig, inputs: dict[str, float]) -> list[str]:
     step = optics.boundary_shift(inputs['air_step_angle'], index, warm, length)
     rate, block = rig.converter.sample_rate_hz, rig.estimator.block_size
     hum = averaging_gain(block, inputs['interference_frequency'], rate)
+    noise = rig.noises[:, :2] * rig.sensitivities
     window = stop_window(rig.centers + rig.zeros, inputs['iteration_tolerance'])
     return [
         f'  spot on the sensor (3.1): {spot * 1e3:.4f} mm',
         f'  index of air (3.3) at 50 % humidity: {index:.9f}, dn/dT {per_kelvin:.3e} 1/K',
         f'  shift by a gradient across the beam: {per_gradient * 1e6:.3f} um per K/m',
         f'  shift behind a boundary (3.4): {step * 1e6:.3f} um',
-        f'  noise of a dot: {rig.amplifier.noise * rig.amplifier.sensitivity * 1e6:.3f} um a sample, '
-        f'{rig.amplifier.noise * rig.amplifier.sensitivity * 1e6 / math.sqrt(block):.3f} um a mean of {block}',
-        f'  step of the converter: {rig.converter.volts_per_count * rig.amplifier.sensitivity * 1e6:.4f} um',
+        f'  noise of a dot: {_each(noise, 3)} um a sample, {_each(noise / math.sqrt(block), 3)} um a mean of {block}',
+        f'  step of the converter: {_each(rig.converter.volts_per_count * rig.sensitivities, 4)} um',
         f'  hum that a mean of {block} leaves at {inputs["interference_frequency"]:g} Hz: {hum:.3f}',
         f'  stop window of thesis_iteration: {math.degrees(window) * 1e3:.2f} mdeg',
     ]
+
+
+def _each(metres: FloatArray, digits: int) -> str:
+    """The values of x1, y1, x2, y2 in um; one if all are the same."""
+    words = [f'{value * 1e6:.{digits}f}' for value in metres.ravel()]
+    return words[0] if len(set(words)) == 1 else ', '.join(words)
 
 
 def table(budget: Budget, load: tuple[float, ...]) -> str:

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import textwrap
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from psd_deflection.cli._report import print_json, save_figure
+from psd_deflection.cli._report import print_json, save_figure, show
 from psd_deflection.errors import RecordingError
 from psd_deflection.geometry import Geometry
 from psd_deflection.geometry.linear import condition_number, design_matrix, error_bound
@@ -65,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(errors_json())
     else:
-        print('\n'.join([*error_table(), '', *linear_table(), '', *cause_table()]))
+        show(*error_table(), '', *linear_table(), '', *cause_table())
     if args.out is not None:
         # matplotlib takes a second to import; who only reads the tables need not wait for it.
         from psd_deflection.thesis.figures import drawn
@@ -74,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
             path = Path(args.out) / f'{name}.png'
             # No date or version in the file: the same figure is the same bytes.
             save_figure(figure, path, metadata={'Software': None})
-            print(f'wrote {path}', file=sys.stderr if args.json else sys.stdout)
+            show(f'wrote {path}', aside=args.json)
     return 0
 
 
@@ -103,9 +102,9 @@ def error_table() -> list[str]:
     for title, largest in (('rms', False), ('largest', True)):
         lines += ['', f'{title:{width}}  ' + ''.join(f'{t:25}' for t in titles) + 'no answer']
         for label, row in cells.items():
-            silent = max(c.silent for c in row)
+            silent = sorted({f'{100.0 * c.silent:.2f}' for c in row}, key=float)
             lines.append(
-                f'{label:{width}}  ' + ''.join(f'{_cell(c, largest):25}' for c in row) + f'{100.0 * silent:.1f} %'
+                f'{label:{width}}  ' + ''.join(f'{_cell(c, largest):25}' for c in row) + f'{" to ".join(silent)} %'
             )
     for name, why in refused().items():
         lines += textwrap.wrap(f'{name} is not in the table: {why}', 118, subsequent_indent='  ')

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from psd_deflection.cli._options import namespace_option, recording_name
 from psd_deflection.cli._progress import progress_of, told
-from psd_deflection.cli._report import print_json, warn
+from psd_deflection.cli._report import print_json, show, warn
 from psd_deflection.config import load_rig
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.conversion import Beside, convert
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json({'out': args.out, 'samples': samples, 'warnings': list(recording.warnings)})
     else:
-        print(f'{args.out}: {samples} samples')
+        show(f'{args.out}: {samples} samples')
     _warn(recording, args.params_file)
     return 0
 
@@ -82,7 +82,7 @@ def _to_rerun(args: argparse.Namespace) -> int:
         found = {'out': str(out), 'blocks': blocks, 'estimates': estimates, 'warnings': list(recording.warnings)}
         print_json(found)
     else:
-        print(f'{out}: {estimates} estimates of {blocks} blocks; look at it: rerun {out}')
+        show(f'{out}: {estimates} estimates of {blocks} blocks; look at it: rerun {out}')
     _warn(recording, args.params_file)
     return 0
 

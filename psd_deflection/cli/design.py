@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from psd_deflection.cli._options import PICTURES, given_as_option, need_folder, picture_name, refuse
-from psd_deflection.cli._report import columns, print_json, save_figure
+from psd_deflection.cli._report import columns, print_json, save_figure, show, show_text
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import UsageError
 from psd_deflection.geometry import placement
@@ -75,10 +75,11 @@ def run(args: argparse.Namespace) -> int:
     if args.params_file is None:
         placing = {'out': None, 'sigma': None, 'radius': None, 'keep_out': 0.0, 'box': None, 'json': False}
         refuse(args, placing, 'is for the placement of a rig: give --params-file RIG.yaml')
-        print(appendix_b())
+        show_text(appendix_b())
         return 0
     rig = load_rig(args.params_file)
-    sigma = rig.amplifier.noise * rig.amplifier.sensitivity / math.sqrt(rig.estimator.block_size)
+    each = rig.noises[:, :2] * rig.sensitivities
+    sigma = float(np.sqrt((each * each).mean() / rig.estimator.block_size))
     if args.sigma is not None:
         sigma = args.sigma
     if not (sigma > 0.0 and math.isfinite(sigma)):
@@ -94,15 +95,15 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json({**design_json(rig, candidates, sigma), 'out': args.out})
         return 0
-    print(link_text(rig))
-    print()
-    print(placement_text(candidates, sigma))
-    print()
-    print(tilt_text(rig, radius, sigma))
-    print()
-    print(tied_text(rig, candidates[-1].centers, sigma))
+    show_text(link_text(rig))
+    show()
+    show_text(placement_text(candidates, sigma))
+    show()
+    show_text(tilt_text(rig, radius, sigma))
+    show()
+    show_text(tied_text(rig, candidates[-1].centers, sigma))
     if args.out is not None:
-        print(f'\n{args.out}')
+        show('', args.out)
     return 0
 
 

@@ -12,16 +12,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 
 from psd_deflection.cli._progress import told
-from psd_deflection.cli._report import LONGEST_LINE, print_json
+from psd_deflection.cli._report import print_json, show, show_text
 from psd_deflection.devices.device import Device
 from psd_deflection.devices.registry import known_devices
 from psd_deflection.devices.survey import Port, suggestions, survey
-from psd_deflection.errors import DeviceError, printable
+from psd_deflection.errors import DeviceError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the survey; the exit status is 0 unless a named port could not be asked."""
     devices, refusals = known_devices()
     for refusal in refusals:
-        print(printable(f'psd-deflection devices: not asked for: {refusal}', LONGEST_LINE), file=sys.stderr)
+        show(f'psd-deflection devices: not asked for: {refusal}', aside=True)
     with told('asking; a port that stays silent takes some seconds', quiet=args.json):
         ports = survey(devices, args.ports)
     if args.json:
@@ -44,16 +43,17 @@ def run(args: argparse.Namespace) -> int:
         _refuse_unasked(args.ports, ports)
         return 0
     if not ports:
-        print('no serial ports; is the device plugged in? (a pseudo-terminal has to be named)')
+        show('no serial ports; is the device plugged in? (a pseudo-terminal has to be named)')
         return 0
     for port in ports:
         if args.ports and not port.asked:
             continue
         about = f' ({port.description})' if port.description and port.description != 'n/a' else ''
         # What stands in a USB descriptor is the device's word as well.
-        print(f'{port.port}{printable(about, LONGEST_LINE)}\n  {printable(port.answer, LONGEST_LINE)}')
+        show(f'{port.port}{about}', f'  {port.answer}')
     for suggested in suggestions(devices, ports):
-        print('\n' + parameter_lines(suggested))
+        show('')
+        show_text(parameter_lines(suggested))
     _refuse_unasked(args.ports, ports)
     return 0
 

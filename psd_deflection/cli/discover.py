@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from psd_deflection.cli._options import namespace_option, seed
 from psd_deflection.cli._progress import told
-from psd_deflection.cli._report import save, warn
+from psd_deflection.cli._report import save, show, warn
 from psd_deflection.config import load_rig
 from psd_deflection.discovery.discover import discover
 from psd_deflection.discovery.report import report_html
@@ -100,13 +100,13 @@ def run(args: argparse.Namespace) -> int:
     for name, text in files.items():
         save(text.encode(errors='replace'), out / name)
     if args.json:
-        print(in_json)
+        print(in_json)  # noqa: T201 - JSON has no control characters, and its lines may be long
         return 0
-    print(sentence(found))
+    show(sentence(found))
     for effect in found.effects:
         if effect.suggestion is not None:
-            print(f'to tell {effect.active.effect.name} from {", ".join(effect.equivalent)}: {effect.suggestion.text}')
+            show(f'to tell {effect.active.effect.name} from {", ".join(effect.equivalent)}: {effect.suggestion.text}')
     for unknown in found.unknown:
-        print(f'unknown: {unknown.signature}')
-    print(f'{found.simulations} forward simulations; see {out / "report.html"}')
+        show(f'unknown: {unknown.signature}')
+    show(f'{found.simulations} forward simulations; see {out / "report.html"}')
     return 0

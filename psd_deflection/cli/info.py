@@ -17,8 +17,7 @@ from typing import Any
 from msg_adapters import SAMPLES
 from psd_deflection.cli._options import namespace_option
 from psd_deflection.cli._progress import progress_of, told
-from psd_deflection.cli._report import LONGEST_LINE, print_json
-from psd_deflection.errors import printable
+from psd_deflection.cli._report import print_json, show
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.summary import summary
 
@@ -42,9 +41,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(found, indent=2)
         return 0
-    for line in _lines(found):
-        # Names and values in a recording are a stranger's.
-        print(printable(line, LONGEST_LINE))
+    show(*_lines(found))
     return 0
 
 
@@ -73,6 +70,8 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
             out.append(row('start', f'{start * 1e-9:.9f} s'))
         out.append(row('duration', f'{found["duration_s"]:.3f} s'))
         out.append(row('samples', f'{samples} present, {lost} lost ({share:.3g} %), {found["flagged"]} flagged'))
+        if found['restarts']:
+            out.append(row('restarts', f'{found["restarts"]} of the device'))
         out.append(row('rate', f'{found["sample_rate_hz"]:.6g} samples/s'))
         out.append(row('blocks', f'{found["blocks"]} of up to {found["block_size"]} samples'))
     out += [row('lacks' if i == 0 else '', text) for i, text in enumerate(found['lacks'])]
@@ -84,6 +83,9 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     elif found['parameters']:
         out.append('  parameters that are not at their defaults')
         out += [f'    {k} = {v}' for k, v in sorted(found['changed_parameters'].items())]
+    if found['as_in_the_thesis']:
+        out.append('  parameters as in the thesis rig, unless they were measured to be the same')
+        out += [f'    {text}' for text in found['as_in_the_thesis']]
     out += [
         f'  from block {c["block"]} on: ' + ', '.join(f'{k} = {v}' for k, v in c['values'].items())
         for c in found['changes']

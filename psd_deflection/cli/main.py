@@ -25,6 +25,7 @@ from psd_deflection.cli._report import LONGEST_LINE
 from psd_deflection.errors import (
     EXIT_STATUSES,
     INTERRUPTED,
+    MachineError,
     PsdDeflectionError,
     RecordingError,
     UsageError,
@@ -38,6 +39,7 @@ COMMANDS: dict[str, str] = {
     'replay': 'compute the estimates of a recording again, as the daemon did',
     'simulate': 'simulate the rig: write a recording, or act as a device on a pseudo-terminal',
     'discover': 'find the physical effect that the simulation of a recording lacks',
+    'check': 'check the wiring of a rig: guided by hand, or from a recording with known loads',
     'devices': 'list the serial ports and the devices on them, and suggest parameters',
     'plot': 'draw a recording as PNG, SVG, PDF or HTML',
     'info': 'summarise a recording',
@@ -132,6 +134,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         # `psd-deflection ... | head` is not an error.
         _discard_output()
+    except (MemoryError, RuntimeError) as error:
+        machine = _lack_of(error)
+        if machine is None:
+            raise
+        _tell(f'psd-deflection: {machine}')
+        return machine.exit_status
     except OSError as error:
         if error.errno not in _REFUSED_OUTPUT or error.filename is not None:
             raise
@@ -140,6 +148,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         _tell(f'psd-deflection: {refused}')
         return refused.exit_status
     return status
+
+
+def _lack_of(error: MemoryError | RuntimeError) -> MachineError | None:
+    """What the machine lacks, if that is what went wrong."""
+    if isinstance(error, MemoryError):
+        return MachineError('too little memory; see the limits of the shell (ulimit -v), the container or the unit')
+    if str(error) == "can't start new thread":
+        return MachineError('no further thread; see the limits of the shell (ulimit -u, -v), the container or the unit')
+    return None
 
 
 def _tell(line: str) -> None:
@@ -259,4 +276,6 @@ def _executable(command: str) -> Callable[[], int]:
     return lambda: main([command, *sys.argv[1:]])
 
 
-estimator, replay, simulate, discover = map(_executable, ('estimator', 'replay', 'simulate', 'discover'))
+estimator, replay, simulate, discover, check = map(
+    _executable, ('estimator', 'replay', 'simulate', 'discover', 'check')
+)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 
-from psd_deflection.cli._report import print_json
+from psd_deflection.cli._report import print_json, show
 from psd_deflection.config import PARAMETERS, load_rig
 
 
@@ -29,6 +29,6 @@ def run(args: argparse.Namespace) -> int:
     for p in PARAMETERS:
         bounds = p.bound_text()
         unit = f' {p.unit}' if p.unit else ''
-        print(f'{p.name} = {rig.values[p.name]}{unit}')
-        print(f'    {p.description}' + (f' ({bounds})' if bounds else ''))
+        show(f'{p.name} = {rig.values[p.name]}{unit}')
+        show(f'    {p.description}' + (f' ({bounds})' if bounds else ''))
     return 0

@@ -23,16 +23,20 @@ import numpy as np
 from psd_deflection import __version__
 from psd_deflection.cli._options import PICTURES, namespace_option, need_folder, picture_name
 from psd_deflection.cli._progress import progress_of, told
-from psd_deflection.cli._report import print_json, save, save_figure, warn
+from psd_deflection.cli._report import print_json, save, save_figure, show, warn
 from psd_deflection.config import Rig
-from psd_deflection.errors import RecordingError
+from psd_deflection.errors import RecordingError, printable
 from psd_deflection.monitor.spectrum import Spectrum
 from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay_engine import nominal_rig, open_for_replay, replayed
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, Record, SampleBlock, SpotMeans
 
 SPECTRUM_OF_S = 600.0
 """The spectrum is of the last ten minutes: it does not get better after that, only slower."""
+
+LONGEST_NAME = 200
+"""Characters of a recording's name in the figure."""
 
 COLORS = {'dx': '#0b6bcb', 'dy': '#c2570c', 'theta': '#0f7b4f', 'lost': '#c62828', 'quiet': '#5a6875'}
 
@@ -59,6 +63,7 @@ class Drawn:
     start or a stop amid a block leaves unfinished.
     """
 
+    recording: Recording
     numbers: tuple[int, int] | None = None
     first: SampleBlock | None = None
     last: SampleBlock | None = None
@@ -103,7 +108,8 @@ class Drawn:
 
     def _lost(self, spots: SpotMeans) -> int:
         """Samples lost of a block: of one at an end those between its own first and last, as in ``gone``."""
-        lost = spots.lost
+        size = spots.present + spots.lost
+        lost = self.recording.lost(spots.index * size, (spots.index + 1) * size - 1, spots.present)
         for block in (self.first, self.last):
             if block is not None and block.index == spots.index:
                 lost = min(lost, int(block.seq[-1] - block.seq[0]) + 1 - len(block.seq))
@@ -113,21 +119,22 @@ class Drawn:
         """Samples that are missing between the first and the last one."""
         if self.numbers is None:
             return 0
-        return self.numbers[1] - self.numbers[0] + 1 - sum(s.present for s in self.spots)
+        return self.recording.lost(*self.numbers, sum(s.present for s in self.spots))
 
 
 def run(args: argparse.Namespace) -> int:
     """Read, replay, draw."""
     # A name that is no text is shown as far as it is one.
     name, title = (
-        os.fsencode(n).decode(errors='replace') for n in (Path(args.recording).resolve().name, args.recording)
+        printable(os.fsencode(n).decode(errors='replace'), LONGEST_NAME)
+        for n in (Path(args.recording).resolve().name, args.recording)
     )
     out = Path(args.out) if args.out is not None else default_out(args.recording)
     need_folder(out)
     recording, rig = open_for_replay(args.recording, args.params_file, args.namespace)
     for warning in nominal_rig(recording, args.params_file):
         warn(warning)
-    drawn, spectrum = Drawn(), Spectrum(rig, SPECTRUM_OF_S)
+    drawn, spectrum = Drawn(recording), Spectrum(rig, SPECTRUM_OF_S)
     for records in replayed(recording, Pipeline(rig), progress_of(recording.blocks(), quiet=args.json)):
         for record in records:
             drawn.add(record)
@@ -146,8 +153,8 @@ def run(args: argparse.Namespace) -> int:
         print_json({**plot_json(drawn, rig), 'out': str(out)})
         return 0
     for name, value in summary:
-        print(f'{name:<24} {value}')
-    print(f'written to {out}')
+        show(f'{name:<24} {value}')
+    show(f'written to {out}')
     return 0
 
 

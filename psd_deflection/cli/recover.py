@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from psd_deflection.cli._progress import told
-from psd_deflection.cli._report import print_json, warn
+from psd_deflection.cli._report import print_json, show, warn
 from psd_deflection.recordings.repair import Recovered, recover
 
 
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
             warn(warning)
         found.append({'path': path, **in_json(done)})
         if not args.json:
-            print('\n'.join(_lines(path, done)))
+            show(*_lines(path, done))
     if args.json:
         print_json({'recordings': found})
     return 0

@@ -13,7 +13,6 @@ another rig would have estimated from the same samples.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +21,7 @@ import numpy as np
 
 from psd_deflection.cli._options import namespace_option, recording_name, refuse
 from psd_deflection.cli._progress import progress_of, told
-from psd_deflection.cli._report import print_json, warn
+from psd_deflection.cli._report import print_json, show, show_text, warn
 from psd_deflection.config import Rig
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.comparison import Comparison
@@ -60,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 class Totals:
     """What came out, for the summary."""
 
+    recording: Recording
     blocks: int = 0
     samples: int = 0
     first_seq: int | None = None
@@ -80,7 +80,7 @@ class Totals:
     @property
     def lost(self) -> int:
         """Samples missing between the first and the last."""
-        return self.last_seq - self.first_seq + 1 - self.samples if self.first_seq is not None else 0
+        return self.recording.lost(self.first_seq, self.last_seq, self.samples) if self.first_seq is not None else 0
 
 
 def run(args: argparse.Namespace) -> int:
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     sink: Sink | None = None
     if args.out is not None:
         sink = open_sink(args.out, rig.flat(), device_hello=recording.hello)
-    totals = Totals()
+    totals = Totals(recording)
     began = time.perf_counter()
     bar = progress_of(recording.blocks(), quiet=args.json)
     try:
@@ -120,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
     text = comparison.summary()
     if comparison.different and args.params_file is None and not recording.parameters:
         text += '\n  the recording names no rig and was evaluated with the nominal one: give its own with --params-file'
-    print(text, file=sys.stderr if args.json else sys.stdout)
+    show_text(text, aside=args.json)
     return 0 if comparison.identical or (comparison.same and not args.strict) else DIFFERS
 
 
@@ -161,18 +161,18 @@ def _print_summary(
         }
         print_json(summary)
         return
-    print(
+    show(
         f'{args.recording}: {totals.samples} samples, {totals.lost} lost, {totals.blocks} blocks, '
         f'{counters.estimates} estimates ({rig.estimator.solver})'
     )
     for cause, count in sorted(counters.refused.items()):
-        print(f'  no estimate: {count} {"block" if count == 1 else "blocks"}, {cause.replace("_", " ")}')
+        show(f'  no estimate: {count} {"block" if count == 1 else "blocks"}, {cause.replace("_", " ")}')
     if len(poses):
         low, high = poses.min(axis=0), poses.max(axis=0)
-        print(
+        show(
             f'  ΔX {low[0] * 1e6:+.2f} … {high[0] * 1e6:+.2f} µm, ΔY {low[1] * 1e6:+.2f} … {high[1] * 1e6:+.2f} µm, '
             f'θ {np.rad2deg(low[2]) * 1e3:+.2f} … {np.rad2deg(high[2]) * 1e3:+.2f} mdeg'
         )
-    print(f'  {recorded_seconds:.1f} s of data in {seconds:.2f} s')
+    show(f'  {recorded_seconds:.1f} s of data in {seconds:.2f} s')
     if args.out is not None:
-        print(f'  written to {Path(args.out)}')
+        show(f'  written to {Path(args.out)}')

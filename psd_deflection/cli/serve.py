@@ -7,7 +7,7 @@ import contextlib
 import shlex
 import sys
 
-from psd_deflection.cli._options import given_as_option, number, whole
+from psd_deflection.cli._options import given_as_option, in_the_world, number, whole
 from psd_deflection.cli._program import program
 from psd_deflection.config import load_rig
 from psd_deflection.devices.device import PowerUp
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_device(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
-    rig = load_rig(args.params_file)
+    rig = in_the_world(load_rig(args.params_file), args.world)
     stop = stopped_by_signals()
     name = args.device or rig.acquisition.source
     devices = simulated_devices(name, rig, args.seed, PowerUp(args.skew_ppm, args.first_seq))

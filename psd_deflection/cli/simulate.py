@@ -2,12 +2,14 @@
 
 The rig file describes the rig and its known effects. --effect adds a hidden effect: the samples
 contain it, but the estimates do not correct for it and the recorded parameters do not list it.
+--world sets a parameter of the simulated rig alone, so that the rig file has it wrong.
 A recording contains the samples, the estimates and the loads, the temperature if --temperature is
 given, and the true pose with --reference. A .csv has no estimates.
 
   psd-deflection simulate --out run --loads thesis --temperature 20,24
   psd-deflection simulate --out odd.csv --effect axis_crosstalk,psd=1,xy=0.02
   psd-deflection simulate --out s.mcap --loads 'steps:0,0,0;0,-10,-5.85:2'
+  psd-deflection simulate --out wired.csv --world 'psd_1.axes=[x, -y]'
   psd-deflection simulate --serve --link rig_port
 """
 
@@ -20,8 +22,8 @@ from pathlib import Path
 from tqdm import tqdm
 
 from psd_deflection.cli import serve
-from psd_deflection.cli._options import given_as_option, recording_name, refuse, seed
-from psd_deflection.cli._report import print_json
+from psd_deflection.cli._options import given_as_option, in_the_world, recording_name, refuse, seed, world_option
+from psd_deflection.cli._report import print_json, show
 from psd_deflection.config import load_rig
 from psd_deflection.errors import UsageError
 from psd_deflection.recordings.simulated_run import BAG_START_NS, SimulatedRun
@@ -50,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = HELP
     parser.add_argument('--params-file', metavar='RIG.yaml', help='the rig and its known effects')
     parser.add_argument('--seed', type=seed, default=0, help='seed of the noise (default 0)')
+    world_option(parser)
     group = parser.add_argument_group('as a recording (--out)')
     group.add_argument('--out', type=recording_name(), metavar='OUT', help='X.csv, X.mcap or a bag folder (X)')
     group.add_argument(
@@ -81,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     # With its own effects first, so that what is wrong in the file is not laid to the options.
     known = with_effects(load_rig(args.params_file), (), '')
     with given_as_option():
-        rig = with_effects(known, args.effect, '--effect')
+        rig = with_effects(in_the_world(known, args.world), args.effect, '--effect')
         rate = rig.converter.sample_rate_hz
         parts = [load_history(words, rate, '--loads') for words in args.loads or ['thesis']]
         history = parts[0].then(*parts[1:])
@@ -107,5 +110,5 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json({'out': args.out, 'samples': count, 'duration_s': count / rate, 'effects': names})
     else:
-        print(f'{Path(args.out)}: {count} samples, {count / rate:.1f} s; effects: {", ".join(names) or "none"}')
+        show(f'{Path(args.out)}: {count} samples, {count / rate:.1f} s; effects: {", ".join(names) or "none"}')
     return 0

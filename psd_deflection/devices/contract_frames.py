@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING
 
 from psd_deflection import __version__
 from psd_deflection.config import Rig
-from psd_deflection.devices.device import OUTPUT_LIMIT, Answer, Device, PowerUp, Probe, converter_parameters
+from psd_deflection.devices.device import (
+    OUTPUT_LIMIT,
+    WIRE_BITS,
+    Answer,
+    Device,
+    PowerUp,
+    Probe,
+    converter_parameters,
+    described_bits,
+)
 from psd_deflection.devices.port_search import candidate_ports, is_pattern, matching
 from psd_deflection.devices.port_source import PortSource
 from psd_deflection.devices.serial_port import SerialPort
@@ -192,6 +201,7 @@ class SimulatedFrames:
         skew_ppm, self._first_seq = power_up or PowerUp()
         self._feed = feed
         self._rate = feed.rig.converter.sample_rate_hz
+        self._bits = feed.rig.converter.bits
         self._period_device_us = 1e6 / self._rate
         self._period_host_ns = 1e9 / self._rate / (1.0 + skew_ppm * 1e-6)
         self._lose = lose
@@ -207,6 +217,7 @@ class SimulatedFrames:
                 'sample_rate_hz': self._rate,
                 'channels': list(CHANNELS),
                 'volts_per_count': feed.rig.converter.volts_per_count,
+                **described_bits(self._bits),
             },
         )
 
@@ -248,6 +259,7 @@ class SimulatedFrames:
         If no room is left, a sample is taken and dropped.
         """
         out = bytearray()
+        top, wide = 2 ** (self._bits - 1) - 1, self._bits > WIRE_BITS
         while self.due_in_ns(since_power_up_ns) <= 0:
             number = self._feed.taken
             x1, y1, sum1, x2, y2, sum2 = row = self._feed.next()
@@ -256,11 +268,11 @@ class SimulatedFrames:
                 self._overruns += 1
                 self._dropped = True
             elif self._streaming and number not in self._lose:
-                over = any(c in (-32768, 32767) for c in row)
+                over = max(row) == top or min(row) == -top - 1
                 flags = (FLAG_OVER_RANGE if over else 0) | (FLAG_DEVICE_DROPPED if self._dropped else 0)
                 self._dropped = False
                 t_us = round((self._first_seq + number) * self._period_device_us)
-                out += encode(SampleFrame(flags, seq, t_us, (x1, y1, sum1, x2, y2, sum2)))
+                out += encode(SampleFrame(flags, seq, t_us, (x1, y1, sum1, x2, y2, sum2)), wide=wide)
             if number % round(self._rate) == 0 and len(out) < room:
                 out += encode(self.hello) + encode(StatusFrame(self._overruns, 2150))
         return bytes(out)

@@ -11,12 +11,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from psd_deflection.config import LEAST_BITS, MOST_BITS
 from psd_deflection.protocol.text_lines import positive
 
 if TYPE_CHECKING:
     from psd_deflection.config import Rig
     from psd_deflection.devices.rig_feed import RigFeed
     from psd_deflection.devices.source import Source
+
+WIRE_BITS = 16
+"""Bits of a count unless the device says otherwise."""
 
 OUTPUT_LIMIT = 4096
 """Bytes that a simulated device buffers for a host that does not read: about 0.12 s of our own frames."""
@@ -104,6 +108,11 @@ class Device:
     probe: Probe | None = None
 
 
+def described_bits(bits: int) -> dict[str, object]:
+    """What a simulated device says of its converter beside ``volts_per_count``."""
+    return {'bits': bits} if bits != WIRE_BITS else {}
+
+
 def converter_parameters(info: Mapping[str, object]) -> dict[str, object]:
     """The ``converter.*`` parameters that a device's description ``info`` contains."""
     out: dict[str, object] = {}
@@ -111,5 +120,10 @@ def converter_parameters(info: Mapping[str, object]) -> dict[str, object]:
     if rate is not None:
         out['converter.sample_rate_hz'] = rate
     if volts is not None:
-        out['converter.full_scale'] = round(volts * 32768, 6)
+        bits = info.get('bits', WIRE_BITS)
+        if not isinstance(bits, int) or not LEAST_BITS <= bits <= MOST_BITS:
+            bits = WIRE_BITS
+        if bits != WIRE_BITS:
+            out['converter.bits'] = bits
+        out['converter.full_scale'] = round(volts * 2.0 ** (bits - 1), 6)
     return out

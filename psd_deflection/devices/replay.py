@@ -108,13 +108,24 @@ class Replay(Source):
         times = block.t_ns.tolist()
         if self.clock is Clock.HOST:
             times = [self._pacer.host_ns(t) for t in times]
+        numbers = (block.seq - self._begin_of(block)).tolist()
         events: list[Event] = [
             Sample(flags, seq, t, tuple(volts))
             for flags, seq, t, volts in zip(
-                block.flags.tolist(), block.seq.tolist(), times, block.volts.tolist(), strict=True
+                block.flags.tolist(),
+                numbers,
+                times,
+                block.volts.tolist(),
+                strict=True,
             )
         ]
         return Received(events, time.monotonic_ns(), max(1, block.volts.nbytes))
+
+    def _begin_of(self, block: SampleBlock) -> int:
+        """What to take off the block's numbers: after a restart the device counts anew, as it did then."""
+        restarts = self._recording.restarts if self._recording is not None else ()
+        first = max((after for _, after in restarts if after <= int(block.seq[0])), default=0)
+        return first - first % self._block_size
 
     def close(self) -> None:
         """End a read that waits; there is nothing else to close."""

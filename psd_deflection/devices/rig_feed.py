@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
+from psd_deflection.calibration import Wiring
 from psd_deflection.config import Rig
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.simulator import RigSimulator
@@ -33,6 +34,7 @@ class RigFeed:
         self._simulator = RigSimulator(rig, seed)
         self._loads = loads
         self._dark = dark
+        self._wiring = Wiring.from_rig(rig)
         self._batch: Iterator[list[int]] = iter(())
         self._row: list[int] = []
 
@@ -58,7 +60,8 @@ class RigFeed:
         numbers = np.arange(self.taken, self.taken + BATCH)
         for psd, start, stop in self._dark:
             off = (numbers >= start) & (numbers < stop)
-            columns = slice(0, 3) if psd == 1 else slice(3, 6)
+            first = 3 * (self._wiring.input_of(psd) - 1)
+            columns = slice(first, first + 3)
             # Without light the quotient is undefined: only noise is left.
             counts[off, columns] = counts[off, columns] % 13 - 6
         if self.poses is not None:

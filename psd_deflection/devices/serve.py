@@ -2,7 +2,7 @@
 
 Like a USB device it sends nothing while no one has its port open. A daemon starts
 ``python -m psd_deflection.devices.serve`` if no port is named: this process reads the parameters as a line of
-JSON, prints its ports, and ends when its standard input closes.
+JSON, prints its ports, and ends when its standard input closes. Each further line is a load that holds from then on.
 """
 
 from __future__ import annotations
@@ -17,12 +17,15 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from psd_deflection.config import Rig, rig_from_values
 from psd_deflection.devices.device import OUTPUT_LIMIT, LineDevice, PowerUp
 from psd_deflection.devices.pseudo_terminal import PORT_LINE, PseudoTerminal, link_names, open_terminals
 from psd_deflection.devices.registry import SIMULATED, find_device
 from psd_deflection.devices.rig_feed import RigFeed
 from psd_deflection.errors import ConfigError, PsdDeflectionError
+from psd_deflection.records import FloatArray
 from psd_deflection.simulation.loads import CyclicLoads, thesis_load_cases
 
 CATCH_UP_NS = 20_000_000
@@ -37,15 +40,38 @@ def served_loads(rate: float) -> CyclicLoads:
     return CyclicLoads(thesis_load_cases(DWELL_S, rate), start=round((DWELL_S - FIRST_LOAD_S) * rate))
 
 
-def simulated_devices(name: str, rig: Rig, seed: int = 0, power_up: PowerUp | None = None) -> Sequence[LineDevice]:
-    """The twins of the device ``name``, one per port, that measure ``rig`` under :func:`served_loads`.
+class Hand:
+    """Loads of a rig that is served: the cycle, until another thread holds a load."""
 
+    def __init__(self, cycle: CyclicLoads) -> None:
+        self._cycle = cycle
+        self._held: FloatArray | None = None
+
+    def hold(self, line: bytes) -> None:
+        """Hold the load of a line of JSON: Fx, Fy, N, Tz, N m. Raises ValueError if it is none."""
+        held = np.array(json.loads(line), dtype=np.float64)
+        if held.shape != (3,) or not np.isfinite(held).all():
+            raise ValueError('a load has three finite numbers')
+        self._held = held
+
+    def take(self, n: int) -> FloatArray:
+        """The next n loads (n, 3)."""
+        held = self._held
+        return self._cycle.take(n) if held is None else np.tile(held, (n, 1))
+
+
+def simulated_devices(
+    name: str, rig: Rig, seed: int = 0, power_up: PowerUp | None = None, hand: Hand | None = None
+) -> Sequence[LineDevice]:
+    """The twins of the device ``name``, one per port, that measure ``rig`` under the loads of ``hand``.
+
+    Without it, under :func:`served_loads`.
     Raises ConfigError if there is no such device, or it cannot be simulated.
     """
     simulate = find_device(name).simulate
     if simulate is None:
         raise ConfigError(f'source = {name!r}: cannot be simulated; {", ".join(SIMULATED)} can')
-    loads = served_loads(rig.converter.sample_rate_hz)
+    loads = hand or served_loads(rig.converter.sample_rate_hz)
     return simulate(RigFeed(rig, lambda _, n: loads.take(n), seed=seed), power_up or PowerUp())
 
 
@@ -118,17 +144,18 @@ def main() -> int:
         # The daemon that started us ended before it sent parameters.
         return 0
     stop = stopped_by_signals()
-
-    def until_the_end() -> None:
-        with contextlib.suppress(OSError, ValueError):
-            while os.read(sys.stdin.fileno(), 4096):
-                pass
-        stop.set()
-
-    threading.Thread(target=until_the_end, name='parent', daemon=True).start()
     try:
         rig = _rig_of(line)
-        devices = simulated_devices(rig.acquisition.source, rig)
+        hand = Hand(served_loads(rig.converter.sample_rate_hz))
+
+        def until_the_end() -> None:
+            with contextlib.suppress(OSError, ValueError):
+                for held in sys.stdin.buffer:
+                    hand.hold(held)
+            stop.set()
+
+        threading.Thread(target=until_the_end, name='parent', daemon=True).start()
+        devices = simulated_devices(rig.acquisition.source, rig, hand=hand)
         with open_terminals(link_names(None, len(devices))) as ports:
             print(f'{PORT_LINE}{",".join(port.name for port in ports)}', flush=True)
             serve_all(devices, ports, stop.is_set)

@@ -46,7 +46,7 @@ class Sample(NamedTuple):
 
     ``flags``, ``seq``: as in ``protocol.frames.SampleFrame``. ``t``: in the unit of the source's
     :class:`Clock`. ``readings``: x1 y1 sum1 x2 y2 sum2; volts if :attr:`Source.volts` is True, else
-    converter counts (whole, -32768 to 32767).
+    converter counts (whole, of at most 32 bits).
     """
 
     flags: int

@@ -14,7 +14,15 @@ from typing import TYPE_CHECKING
 
 from psd_deflection import __version__
 from psd_deflection.config import Rig
-from psd_deflection.devices.device import OUTPUT_LIMIT, Answer, Device, PowerUp, Probe, converter_parameters
+from psd_deflection.devices.device import (
+    OUTPUT_LIMIT,
+    Answer,
+    Device,
+    PowerUp,
+    Probe,
+    converter_parameters,
+    described_bits,
+)
 from psd_deflection.devices.port_source import PortSource
 from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import Event, Received, Sample
@@ -47,6 +55,8 @@ class TextLines(PortSource):
         self._decoder = LineDecoder()
         self._time = TimeExtender()
         self.volts = True
+        self._top = 2 ** (rig.converter.bits - 1) - 1
+        self._bits = rig.converter.bits
 
     def open(self, timeout: float) -> HelloFrame:
         """Open the port and wait for the line that describes the device."""
@@ -101,10 +111,11 @@ class TextLines(PortSource):
             if max(map(abs, line.readings)) > MAX_VOLTS:
                 return BadFrame('a reading is out of all bounds', 0)
             return Sample(0, line.seq, self._time.extend(line), line.readings)
-        if not all(r.is_integer() and -32768 <= r <= 32767 for r in line.readings):
-            return BadFrame('counts are whole numbers of 16 bits', 0)
+        top = self._top
+        if not all(r.is_integer() and -top - 1 <= r <= top for r in line.readings):
+            return BadFrame(f'counts are whole numbers of {self._bits} bits', 0)
         counts = tuple(int(r) for r in line.readings)
-        over = max(counts) == 32767 or min(counts) == -32768
+        over = max(counts) == top or min(counts) == -top - 1
         return Sample(FLAG_OVER_RANGE if over else 0, line.seq, self._time.extend(line), counts)
 
     def describe(self) -> Mapping[str, str]:
@@ -125,7 +136,7 @@ def _hello(info: Mapping[str, object]) -> HelloFrame:
         'volts_per_count': None,
     }
     # Only what is known is kept: the line is a stranger's and goes into recordings.
-    known = ('firmware', 'sample_rate_hz', 'channels', 'volts_per_count')
+    known = ('firmware', 'sample_rate_hz', 'channels', 'volts_per_count', 'bits')
     return HelloFrame(PROTOCOL_VERSION, own | {k: v for k, v in info.items() if k in known})
 
 
@@ -142,6 +153,7 @@ class SimulatedLines:
             'firmware': f'psd_deflection simulated lines {__version__}',
             'sample_rate_hz': self._rate,
             'volts_per_count': feed.rig.converter.volts_per_count,
+            **described_bits(feed.rig.converter.bits),
         }
 
     def greeting(self) -> bytes:

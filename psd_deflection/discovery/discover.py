@@ -101,7 +101,7 @@ class Discovery:
 def _proposals(workspace: Workspace) -> dict[str, list[float]]:
     raw = workspace.raw_residual(workspace.base)
     observations = workspace.observations
-    noise = observations[0].rig.amplifier.noise
+    noise = float(observations[0].rig.noises.max())
     sigmas, periods = [n.sigma for n in workspace.noise], [o.period for o in observations]
     peaks = propose.spectral_peaks(raw, sigmas, periods)
     return {

@@ -117,10 +117,10 @@ def _block_autocovariance(acov: FloatArray, size: int, lags: int) -> FloatArray:
     return out
 
 
-def estimate_noise(observation: Observation, residual: FloatArray, fine: int, floor: float) -> NoiseModel:
+def estimate_noise(observation: Observation, residual: FloatArray, fine: int, floors: FloatArray) -> NoiseModel:
     """Noise of ``residual`` (n, 6) V, measured minus simulated; NaN where samples are lost.
 
-    ``fine``: samples a fine block. ``floor``: V, smallest noise that is assumed for a channel.
+    ``fine``: samples a fine block. ``floors`` (6,): V, smallest noise that is assumed of each channel.
     """
     block = observation.rig.estimator.block_size
     windows = rest_windows(observation)
@@ -135,6 +135,7 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
     for c in range(6):
         power = np.abs(np.fft.rfft(filled[:, c] * np.hanning(n))) ** 2 / (0.375 * n) / max(present, 0.1)
         level = _level(power[upper])
+        floor = float(floors[c])
         white = max(np.sqrt(level), floor)
         rest = [detrend(filled[w, c]) for w in windows if np.all(np.isfinite(residual[w, c]))]
         rest = [strip_lines(r) for r in rest if len(r) > 100]

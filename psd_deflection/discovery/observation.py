@@ -21,7 +21,7 @@ QUIET = 0.25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """``volts`` (n, 6) V, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held.
+    """``volts`` (n, 6) V of the PSDs, x y sum of each, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held.
 
     ``temperature`` (n,) degrees Celsius or None. ``rig``: the rig with this recording's own
     overrides. ``digest``: of its source.

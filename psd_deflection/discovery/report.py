@@ -96,7 +96,7 @@ def _spectrum_figure(discovery: Discovery) -> Figure:
         (discovery.search.null, BEFORE, 'before'),
         (discovery.fit, AFTER, 'after'),
     ):
-        dots = fit.difference[0][rows] * o.rig.amplifier.sensitivity
+        dots = fit.difference[0][rows] * o.rig.sensitivities.reshape(4, 1)
         f, p = _spectrum(dots, o.period * size)
         axis.loglog(f, np.sqrt(p) * 1e6, color=color, lw=1.2, label=name)
     axis.set_xlabel('frequency / Hz')

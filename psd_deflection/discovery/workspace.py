@@ -44,7 +44,6 @@ class Workspace:
         self.valid: list[np.ndarray[tuple[int], np.dtype[np.bool_]]] = []
         self.case: list[IntArray] = []
         self.noise: list[NoiseModel] = []
-        self._noise_sigma: list[float] = []
         next_case = 0
         longest = sum(o.duration for o in self.observations) / MAX_FINE
         for o in self.observations:
@@ -61,7 +60,6 @@ class Workspace:
             case = load_cases(o.loads, o.period)[: means.shape[1] * size : size] + next_case
             next_case = int(case.max()) + 1
             self.case.append(case)
-            self._noise_sigma.append(o.rig.amplifier.noise)
         self.estimate_noise(self.base)
         self.data = self.whiten(self.measured)
 
@@ -71,8 +69,8 @@ class Workspace:
         self.simulations += 1
         for o, size in zip(self.observations, self.fine, strict=True):
             chunk = ForwardModel(o.rig, sort_effects(effects)).expect(o.loads, o.temperature)
-            floor = 0.25 * o.rig.amplifier.noise
-            self.noise.append(estimate_noise(o, o.volts - chunk.volts.T, size, floor))
+            floors = 0.25 * o.rig.noises.ravel()
+            self.noise.append(estimate_noise(o, o.volts - chunk.volts.T, size, floors))
 
     def raw_residual(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
         """Measured minus simulated (n, 6) V of each recording, samples, 0 if lost."""
@@ -127,7 +125,7 @@ class Workspace:
         out = []
         for f, v, s, o in zip(fine, self.valid, self.fine, self.observations, strict=True):
             rows = np.where(v, f[list(DOT_CHANNELS)], np.nan)
-            out.append(fine_means(rows, o.rig.estimator.block_size // s) * o.rig.amplifier.sensitivity)
+            out.append(fine_means(rows, o.rig.estimator.block_size // s) * o.rig.sensitivities.reshape(4, 1))
         return out
 
     def gap(self, residual: Sequence[FloatArray]) -> float:
@@ -145,7 +143,7 @@ class Workspace:
         total, count = 0.0, 0.0
         for w, o, v in zip(self.noise, self.observations, self.valid, strict=True):
             n = float(v.sum())
-            total += n * float(np.mean(w.block_sigma[list(DOT_CHANNELS)] ** 2)) * o.rig.amplifier.sensitivity**2
+            total += n * float(np.mean((w.block_sigma[list(DOT_CHANNELS)] * o.rig.sensitivities.ravel()) ** 2))
             count += n
         return float(np.sqrt(total / max(count, 1.0)))
 

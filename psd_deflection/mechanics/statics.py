@@ -24,17 +24,22 @@ class LinkStatics:
     """Tip compliance of one link.
 
     ``length`` L, m; ``bending_stiffness`` EI, N m^2; ``torsional_stiffness`` GJ, N m^2; all > 0.
+    ``clamp_bending`` and ``clamp_torsion``: turn of the clamp per moment at the root, rad/(N m).
     """
 
     length: float
     bending_stiffness: float
     torsional_stiffness: float
+    clamp_bending: float = 0.0
+    clamp_torsion: float = 0.0
     _force: float = field(init=False, repr=False, compare=False)
     _twist: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, '_force', self.length**3 / (3.0 * self.bending_stiffness))
-        object.__setattr__(self, '_twist', self.length / self.torsional_stiffness)
+        # A force F turns the clamp by its moment F L, which moves the tip by L times that.
+        bending = self.length**3 / (3.0 * self.bending_stiffness) + self.clamp_bending * self.length**2
+        object.__setattr__(self, '_force', bending)
+        object.__setattr__(self, '_twist', self.length / self.torsional_stiffness + self.clamp_torsion)
 
     @classmethod
     def from_rig(cls, rig: Rig) -> LinkStatics:

@@ -11,17 +11,17 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import re
 import socket
 from collections.abc import Mapping
-from urllib.parse import urlsplit
+
+_HOST = re.compile(r'(?:\[([0-9a-f:.]+(?:%[a-z0-9._-]+)?)\]|([a-z0-9._-]+))(?::[0-9]{1,5})?')
 
 
 def host_name(host_header: str) -> str:
     """The name in a Host header, without port and brackets, lower case; '' if it is malformed."""
-    try:
-        return (urlsplit('//' + host_header).hostname or '').rstrip('.')
-    except ValueError:
-        return ''
+    found = _HOST.fullmatch(host_header.lower())
+    return (found[1] or found[2]).rstrip('.') if found is not None else ''
 
 
 def is_address(name: str) -> bool:
@@ -37,7 +37,7 @@ def is_loopback(address: str) -> bool:
     """Whether only this machine can reach a server bound to ``address``."""
     if address == 'localhost':
         return True
-    return is_address(address) and ipaddress.ip_address(address).is_loopback
+    return is_address(address) and ipaddress.ip_address(address.partition('%')[0]).is_loopback
 
 
 def is_own_host(host_header: str, address: str) -> bool:

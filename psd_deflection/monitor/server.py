@@ -251,6 +251,8 @@ class MonitorServer:
             return web.Response(status=403, text='this is not the name of this machine')
         if (request.method != 'GET' or request.path == '/ws') and not access.is_own_page(request.headers):
             return web.Response(status=403, text='refused: asked for by another site')
+        if 'Content-Encoding' in request.headers:
+            return web.Response(status=415, text='refused: a body must not be encoded')
         if len(request.path) > PATH_CHARACTERS:
             return web.Response(status=404, text='not found')
         try:
@@ -342,12 +344,14 @@ class MonitorServer:
         }
 
     async def _zero(self, request: web.Request) -> web.StreamResponse:
-        return await self._act(request, lambda wanted: asyncio.to_thread(self._shown.zero))
+        return await self._act(request, 'zero', lambda wanted: asyncio.to_thread(self._shown.zero))
 
     async def _record(self, request: web.Request) -> web.StreamResponse:
-        return await self._act(request, self._shown.record)
+        return await self._act(request, 'record', self._shown.record)
 
-    async def _act(self, request: web.Request, action: Callable[[bool], Awaitable[str]]) -> web.StreamResponse:
+    async def _act(
+        self, request: web.Request, name: str, action: Callable[[bool], Awaitable[str]]
+    ) -> web.StreamResponse:
         if not self._config.control:
             return _answer(403, 'refused: the buttons are off; the parameter monitor_control allows them')
         if self.token and not access.is_token(request.headers.get(TOKEN_HEADER), self.token):
@@ -359,14 +363,17 @@ class MonitorServer:
             body = json.loads(await request.read() or b'{}')
         except (ValueError, RecursionError):
             return _answer(400, 'refused: not JSON')
-        wanted = body.get('record', True) if isinstance(body, dict) else None
+        # Nothing is recorded unless it was asked for in so many words.
+        unsaid = True if name == 'zero' else None
+        wanted = body.get('record', unsaid) if isinstance(body, dict) else None
         if not isinstance(wanted, bool):
             return _answer(400, 'refused: expected {"record": true} or {"record": false}')
         try:
             text = await action(wanted)
         except RefusedError as error:
             return _answer(409, str(error))
-        self._say(f'monitor: {text} (asked for by {request.remote})')
+        # What came of it is told by the run itself.
+        self._say(f'monitor: {name} was asked for by {request.remote}')
         if self._browsers:
             self._take_health()
         return _answer(200, text)

@@ -14,7 +14,7 @@ from psd_deflection.config import Rig
 from psd_deflection.errors import PsdDeflectionError
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.records import DiagnosticEntry, DiagnosticReport, Record, SpotMeans
+from psd_deflection.records import RESTART, DiagnosticEntry, DiagnosticReport, ParameterChange, Record, SpotMeans
 from psd_deflection.runner.diagnostics import ERROR, OK, WARN, HealthReporter
 from psd_deflection.runner.session import Session, why_no_zero, zero_text
 
@@ -240,6 +240,11 @@ class ShownRecording:
         last_block = -1
         for records in self._steps:
             for record in records:
+                if isinstance(record, ParameterChange):
+                    # The numbers that a restart left out belong to no sample.
+                    before_after = dict(record.values).get(RESTART)
+                    if isinstance(before_after, tuple):
+                        self._lost -= int(before_after[1] - before_after[0]) - 1
                 if isinstance(record, SpotMeans):
                     if last_t_ns is not None:
                         due += min((record.t_ns - last_t_ns) / 1e9 / self._speed, LONGEST_WAIT_S)

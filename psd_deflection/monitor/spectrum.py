@@ -55,7 +55,7 @@ class Spectrum:
         if not self._blocks:
             return None
         seq = np.concatenate([b.seq for b in self._blocks])
-        volts = np.concatenate([b.volts for b in self._blocks])
+        volts = self._calibration.seen(np.concatenate([b.volts for b in self._blocks]))
         dots = self._calibration.dots(volts).astype(np.float64)
         for psd in (0, 1):
             dots[~(volts[:, 3 * psd + 2] >= self._sum_min), 2 * psd : 2 * psd + 2] = np.nan

@@ -33,6 +33,7 @@ class FrameType(IntEnum):
 
     SAMPLE = 0x01
     STATUS = 0x02
+    WIDE_SAMPLE = 0x03
     HELLO = 0x10
     HELLO_REQUEST = 0x11
     PING = 0x12
@@ -54,7 +55,7 @@ class BadReason(StrEnum):
 
 
 class SampleFrame(NamedTuple):
-    """SAMPLE: ``counts`` are x1 y1 sum1 x2 y2 sum2; ``t_device_us`` microseconds of device time."""
+    """SAMPLE and WIDE SAMPLE: ``counts`` are x1 y1 sum1 x2 y2 sum2; ``t_device_us`` microseconds of device time."""
 
     flags: int
     seq: int
@@ -126,6 +127,8 @@ MAX_DEVICE_US = 1 << 53
 """285 years: a later device time is not plausible and would overflow the host's nanoseconds."""
 
 _SAMPLE = struct.Struct('<BBIQ6h')
+_WIDE_SAMPLE = struct.Struct('<BBIQ6i')
+_SAMPLES = {FrameType.SAMPLE: _SAMPLE, FrameType.WIDE_SAMPLE: _WIDE_SAMPLE}
 _STATUS = struct.Struct('<BIh')
 _PING = struct.Struct('<BQ')
 _PONG = struct.Struct('<BQQ')
@@ -137,15 +140,16 @@ def _seal(payload: bytes) -> bytes:
     return sealed + b'\x00'
 
 
-def encode(frame: GoodFrame) -> bytes:
-    """The bytes of one frame, closing zero included.
+def encode(frame: GoodFrame, *, wide: bool = False) -> bytes:
+    """The bytes of one frame, closing zero included. ``wide``: a sample goes as WIDE SAMPLE, with 32 bits a count.
 
     Raises ValueError if a field does not fit or a HELLO is longer than 512 bytes encoded.
     """
     try:
         match frame:
             case SampleFrame(flags, seq, t_device_us, counts):
-                return _seal(_SAMPLE.pack(FrameType.SAMPLE, flags, seq, t_device_us, *counts))
+                kind = FrameType.WIDE_SAMPLE if wide else FrameType.SAMPLE
+                return _seal(_SAMPLES[kind].pack(kind, flags, seq, t_device_us, *counts))
             case StatusFrame(overruns, temperature):
                 value = NO_TEMPERATURE if temperature is None else temperature
                 return _seal(_STATUS.pack(FrameType.STATUS, overruns, value))
@@ -177,10 +181,11 @@ def _parse(payload: bytes, size: int) -> Frame:
     if zlib.crc32(body) != _CRC.unpack_from(payload, len(payload) - 4)[0]:
         return BadFrame(BadReason.CRC, size)
     kind = body[0]
-    if kind == FrameType.SAMPLE:
-        if len(body) != _SAMPLE.size:
+    if kind == FrameType.SAMPLE or kind == FrameType.WIDE_SAMPLE:
+        layout = _SAMPLE if kind == FrameType.SAMPLE else _WIDE_SAMPLE
+        if len(body) != layout.size:
             return BadFrame(BadReason.LENGTH, size)
-        _, flags, seq, t_device_us, *counts = _SAMPLE.unpack(body)
+        _, flags, seq, t_device_us, *counts = layout.unpack(body)
         if t_device_us > MAX_DEVICE_US:
             return BadFrame(BadReason.BODY, size)
         return SampleFrame(flags, seq, t_device_us, tuple(counts))

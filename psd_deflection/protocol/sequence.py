@@ -1,8 +1,9 @@
 """Extends sequence numbers beyond 32 bits and interprets jumps in them.
 
 The wire's ``seq`` wraps at 2^32 (49 days at 1 kHz). Blocks are cut by the extended number, which
-always increases. If a device restarts from zero, its numbers continue at the next multiple of
-``alignment`` above the last sample. So its blocks stay aligned to its own numbers.
+always increases. If a device restarts, from any number, its numbers continue in the next block of
+``alignment`` above the last sample, at the same place in the block. So its blocks stay aligned to its own
+numbers. The few numbers between belong to no sample.
 """
 
 from __future__ import annotations
@@ -58,16 +59,21 @@ class SequenceExtender:
         behind = -ahead % WRAP
         if behind == 0 or (behind < NEARBY and t_device_us <= self._last_time):
             return last - behind, Step.REPEAT, 0
-        base = self._next_base()
-        self._offset = base % WRAP
-        self._last, self._last_time = base + seq, t_device_us
-        return base + seq, Step.RESTART, 0
+        number = self._next_base() + seq % self._alignment
+        self._offset = (number - seq) % WRAP
+        self._last, self._last_time = number, t_device_us
+        return number, Step.RESTART, 0
 
-    def restart(self) -> None:
-        """The next sample is number 0 again; for devices whose samples the host numbers."""
-        if self._last is not None:
-            base = self._next_base()
-            self._offset, self._last, self._last_time = base % WRAP, base - 1, -1
+    def restart(self) -> int | None:
+        """The next sample is number 0 again; for devices whose samples the host numbers.
+
+        Returns the extended number that 0 will have, None if there was no sample yet.
+        """
+        if self._last is None:
+            return None
+        base = self._next_base()
+        self._offset, self._last, self._last_time = base % WRAP, base - 1, -1
+        return base
 
     def _next_base(self) -> int:
         return -(-((self._last or 0) + 1) // self._alignment) * self._alignment

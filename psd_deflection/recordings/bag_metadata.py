@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import yaml
 
-from psd_deflection.files import replace_file
+from psd_deflection.files import HeldFolder
 
 METADATA_VERSION = 9
 
@@ -130,7 +129,7 @@ def bag_information(
     }
 
 
-def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:
+def write_metadata(folder: HeldFolder, information: Mapping[str, Any]) -> None:
     """Write ``metadata.yaml`` completely or not at all. Raises OSError."""
     text = to_yaml({'rosbag2_bagfile_information': information})
-    replace_file(folder / 'metadata.yaml', text.encode())
+    folder.replace('metadata.yaml', text.encode())

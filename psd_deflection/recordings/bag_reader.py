@@ -36,11 +36,13 @@ from psd_deflection.errors import RecordingError
 from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
 from psd_deflection.protocol.sequence import WRAP
 from psd_deflection.recordings import cdr
+from psd_deflection.recordings.allowance import Warnings
 from psd_deflection.recordings.bag_writer import META_CHANGE, META_HELLO, META_PARAMETERS, META_SOFTWARE
 from psd_deflection.recordings.clouds import CloudDecoder, Samples, joined_points
 from psd_deflection.recordings.mcap_reader import McapReader, RawMessage
 from psd_deflection.recordings.recording import EstimateSeries, Recording, from_json
 from psd_deflection.records import (
+    RESTART,
     AppliedLoad,
     IntArray,
     ParameterChange,
@@ -51,6 +53,9 @@ from psd_deflection.records import (
 )
 
 MAX_YAML_BYTES = 16_000_000
+
+MAX_RESTARTS = 10_000
+"""Restarts of one recording that are counted."""
 
 _BATCH = 50
 """Number of messages whose samples are decoded at once: numpy's cost is per call."""
@@ -67,7 +72,7 @@ class BagRecording(Recording):
 
     def __init__(self, path: Path, block_size: int | None = None, namespace: str | None = None) -> None:
         super().__init__(path, block_size)
-        self._own_warnings: list[str] = []
+        self._own_warnings = Warnings()
         files = self._files_of(path) if path.is_dir() else [path]
         self._sources = [McapReader(f) for f in files]
         bare = None if namespace is None else namespace.strip('/')
@@ -81,6 +86,7 @@ class BagRecording(Recording):
         self.changes = self._changes_in(metadata)
         if META_PARAMETERS not in metadata:
             self._take_rig_of_messages()
+        self.restarts.update(r for change in self.changes if (r := _restart_in(change)) is not None)
 
     def _files_of(self, folder: Path) -> list[Path]:
         """The bag's files in the order of ``metadata.yaml``, else of their numbers."""
@@ -89,7 +95,7 @@ class BagRecording(Recording):
         if not meta_file.is_file():
             if not found:
                 raise RecordingError(f'{folder}: is no bag: it holds neither metadata.yaml nor an .mcap file')
-            self._own_warnings.append(f'{folder}: has no metadata.yaml (a recorder that was stopped hard?)')
+            self._own_warnings.add(f'{folder}: has no metadata.yaml (a recorder that was stopped hard?)')
             return found
         information = read_information(meta_file)
         storage = information.get('storage_identifier')
@@ -120,12 +126,10 @@ class BagRecording(Recording):
     @property
     def warnings(self) -> Sequence[str]:
         """One line for each cut or damage, and for samples that were left out."""
-        return [*self._own_warnings, *(w for s in self._sources for w in s.warnings)]
+        return [*self._own_warnings.lines(), *(w for s in self._sources for w in s.warnings)]
 
     def _warn(self, text: str) -> None:
-        line = f'{self.path}: {text}'
-        if line not in self._own_warnings:
-            self._own_warnings.append(line)
+        self._own_warnings.add(f'{self.path}: {text}')
 
     def _changes_in(self, metadata: Mapping[str, Mapping[str, str]]) -> list[ParameterChange]:
         out = []
@@ -249,7 +253,7 @@ class BagRecording(Recording):
         yield from blocks
 
     def _chunks(self) -> Iterator[RawChunk]:
-        count = _SequenceCounter(self.block_size, self._warn)
+        count = _SequenceCounter(self.block_size, self._warn, self.restarts)
         for log_time, messages in self._clouds():
             together = joined_points(messages)
             parts = [together] if count.follows(together) else [joined_points([m]) for m in messages]
@@ -345,7 +349,8 @@ class _SequenceCounter:
 
     _FASTEST_HZ = 20_000
 
-    def __init__(self, block_size: int, warn: Callable[[str], None]) -> None:
+    def __init__(self, block_size: int, warn: Callable[[str], None], restarts: set[tuple[int, int]]) -> None:
+        self._restarts = restarts
         self._wrapped = 0
         self._moved = 0
         self._block_size = block_size
@@ -393,7 +398,18 @@ class _SequenceCounter:
             return
         self._warn(f'sample numbers start again after {last}')
         size = self._block_size
-        self._moved += (last // size + 1 - first // size) * size
+        move = (last // size + 1 - first // size) * size
+        self._moved += move
+        if len(self._restarts) < MAX_RESTARTS:
+            self._restarts.add((last, first + move))
+
+
+def _restart_in(change: ParameterChange) -> tuple[int, int] | None:
+    value = dict(change.values).get(RESTART)
+    if not isinstance(value, tuple) or len(value) != 2 or not all(isinstance(n, int) for n in value):
+        return None
+    before, after = int(value[0]), int(value[1])
+    return (before, after) if 0 <= before < after < 2**62 else None
 
 
 def _to_change(t_ns: int, block: int, tree: Mapping[str, object]) -> ParameterChange:
@@ -427,7 +443,7 @@ def files_in(folder: Path) -> list[Path]:
         found = re.search(r'_([0-9]{1,9})$', path.stem)
         return (int(found[1]) if found else -1, path.name)
 
-    return sorted(folder.glob('*.mcap'), key=number)
+    return sorted((f for f in folder.glob('*.mcap') if f.is_file()), key=number)
 
 
 def read_information(path: Path) -> dict[str, Any]:

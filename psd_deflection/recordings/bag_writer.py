@@ -13,7 +13,6 @@ import contextlib
 import fcntl
 import json
 import os
-import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, Self
@@ -25,6 +24,7 @@ from mcap.writer import CompressionType, Writer
 from msg_adapters import LATCHED, MESSAGE_TYPES, to_messages
 from psd_deflection import __version__
 from psd_deflection.errors import RecordingError, creating
+from psd_deflection.files import HeldFolder
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.bag_metadata import (
     DEFAULT_QOS,
@@ -68,13 +68,13 @@ def _json_values(values: Mapping[str, object]) -> dict[str, str]:
 
 
 class _IndexSpool:
-    """Keeps the chunk indexes of a recording until its end, in an unnamed file beside it.
+    """Keeps the chunk indexes of a recording until its end, in ``file``, which is unnamed.
 
     The writer would keep them in a list: a kilobyte per chunk, 180 MB a day.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - open as long as the recording
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
 
     def append(self, index: ChunkIndex) -> None:
         """Append one chunk index."""
@@ -130,6 +130,7 @@ class McapFile(_RecordSink):
     created, or the disk refuses to write. After such an error the file is closed and holds all
     complete chunks. While it is being written the file is locked (``flock``), so that no program repairs it.
     ``durable``: each chunk is written to the disk, not only to the operating system, before the next begins.
+    ``folder``: where the file is made, if its caller holds that folder.
     """
 
     def __init__(
@@ -139,6 +140,7 @@ class McapFile(_RecordSink):
         rig_values: Mapping[str, object],
         device_hello: Mapping[str, object] | None = None,
         durable: bool = False,
+        folder: HeldFolder | None = None,
     ) -> None:
         self.path = path
         self._durable = durable
@@ -158,13 +160,14 @@ class McapFile(_RecordSink):
         self._spool: _IndexSpool | None = None
         parameters = _json_values(rig_values)
         hello = None if device_hello is None else _json_values(device_hello)
-        with creating(path):
-            self._stream = path.open('xb')
-        with contextlib.suppress(OSError):
-            fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with creating(path), HeldFolder(path.parent) if folder is None else contextlib.nullcontext(folder) as held:
+            self._stream = held.create(path.name)
+            with contextlib.suppress(OSError):
+                fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            spool = _IndexSpool(held.unnamed(f'.{path.name}.index'))
         self._writer = Writer(self._stream, compression=CompressionType.ZSTD, enable_crcs=True)
         with self._guard():
-            self._spool = vars(self._writer)[_CHUNK_INDICES] = _IndexSpool(path.parent)
+            self._spool = vars(self._writer)[_CHUNK_INDICES] = spool
             self._writer.start(profile='ros2', library=f'psd_deflection {__version__}')
             self._writer.add_metadata(META_SOFTWARE, {'version': __version__})
             self._writer.add_metadata(META_PARAMETERS, parameters)
@@ -176,6 +179,10 @@ class McapFile(_RecordSink):
     def closed(self) -> bool:
         """True once nothing more can be written, be it after ``close`` or after an error."""
         return self._stream is None
+
+    def within(self, folder: HeldFolder) -> bool:
+        """Whether the file still has its name in ``folder``."""
+        return self._stream is not None and folder.holds(self.path.name, self._stream)
 
     @property
     def size(self) -> int:
@@ -321,6 +328,7 @@ class BagWriter(_RecordSink):
         self.folder = Path(folder)
         with creating(self.folder):
             self.folder.mkdir(parents=True)
+            self._held = HeldFolder(self.folder, follow=False)
         self._name = self.folder.resolve().name
         self._rig_values, self._hello = rig_values, device_hello
         self._max_bytes, self._max_ns, self._durable = max_bytes, round(max_s * 1e9), durable
@@ -338,12 +346,18 @@ class BagWriter(_RecordSink):
         """True once nothing more can be written, be it after ``close`` or after an error."""
         return self._file.closed
 
+    @property
+    def in_place(self) -> bool:
+        """Whether the path of the file that is written still leads to it: neither it nor the folder was moved."""
+        return self._held.in_place() and self._file.within(self._held)
+
     def _begin(self) -> McapFile:
         file = McapFile(
             self.folder / f'{self._name}_{self._number}.mcap',
             rig_values=self._rig_values,
             device_hello=self._hello,
             durable=self._durable,
+            folder=self._held,
         )
         self._number += 1
         return file
@@ -375,7 +389,7 @@ class BagWriter(_RecordSink):
         count, _ = self._ended.pop(0)
         path = self.folder / count.path
         try:
-            path.unlink()
+            self._held.remove(count.path)
         except OSError as error:
             raise RecordingError(f'{path}: cannot be deleted ({error.strerror or error})') from None
         return path
@@ -393,20 +407,29 @@ class BagWriter(_RecordSink):
     def close(self) -> None:
         """Close the file, then write ``metadata.yaml``; a second call does nothing.
 
-        A bag whose file ended with an error gets no ``metadata.yaml``: ``psd-deflection recover``
-        makes one from the files, and our reader needs none.
+        A bag whose file ended with an error, or was deleted, gets no ``metadata.yaml``: ``psd-deflection
+        recover`` makes one from the files, and our reader needs none. All is written in the folder that the
+        bag was made in, wherever that has been moved.
         """
         if self.closed:
+            self._held.close()
             return
-        self._file.close()
+        there = self._file.within(self._held)
         try:
-            write_metadata(self.folder, self.information())
+            self._file.close()
+            if there:
+                write_metadata(self._held, self.information())
         except OSError as error:
             reason = error.strerror or error
             raise RecordingError(f'{self.folder / "metadata.yaml"}: cannot be written ({reason})') from None
+        finally:
+            self._held.close()
 
     def discard(self) -> None:
         """Close and delete a bag into which nothing was written. Raises OSError, RecordingError if the disk refuses."""
+        ours = self.in_place
         self._file.close()
-        self.path.unlink()
-        self.folder.rmdir()
+        self._held.remove(self.path.name)
+        self._held.close()
+        if ours:
+            self.folder.rmdir()

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from msg_adapters import point_cloud2
 from psd_deflection.recordings import cdr
+from psd_deflection.recordings.allowance import MAX_FIELDS
 from psd_deflection.records import CHANNELS, IntArray
 
 _LITTLE = b'\x00\x01'
@@ -54,10 +55,23 @@ class CloudDecoder:
                     return sec * 1_000_000_000 + nanosec, np.frombuffer(message, dtype, width, row_step_at + 8)
                 except (struct.error, ValueError):
                     raise ValueError('is shorter than it declares') from None
+        if _declared_fields(message) > MAX_FIELDS:
+            raise ValueError(f'it declares more than {MAX_FIELDS} fields')
         stamp, points = point_cloud2.to_points(cdr.decode(point_cloud2.MESSAGE.name, message))
         if message[:2] == _LITTLE and len(self._layouts) < self._MOST:
             self._layouts.append(_learn(message, points.dtype))
         return stamp, points
+
+
+def _declared_fields(message: bytes) -> int:
+    """How many fields a PointCloud2 declares, before any is decoded; 0 if the message ends before that."""
+    order = '<I' if message[:2] == _LITTLE else '>I'
+    try:
+        (length,) = struct.unpack_from(order, message, 12)
+        (count,) = struct.unpack_from(order, message, 16 + (length + 3) // 4 * 4 + 8)
+    except struct.error:
+        return 0
+    return int(count)
 
 
 def _learn(message: bytes, dtype: np.dtype[np.void]) -> _Layout:

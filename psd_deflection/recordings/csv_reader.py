@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Collection, Iterator, Sequence
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
@@ -35,6 +36,10 @@ MAX_SECONDS = 2**31
 """A ROS stamp has 31 bits of seconds."""
 
 MAX_VOLTS = 1e6
+
+_NUMBER = re.compile(
+    r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?|[+-]?(?:nan|inf|infinity)', re.ASCII | re.IGNORECASE
+)
 
 _RATE_ROWS = 10_000
 
@@ -139,21 +144,20 @@ class CsvRecording(Recording):
 
     def _nanoseconds(self, cell: str, line: int) -> int:
         text = cell.strip()
-        try:
-            seconds = Decimal(text)
-        except InvalidOperation:
-            raise self._refuse(f'column t holds {text!r}, which is not a number', line) from None
-        t_ns = int((seconds * 1_000_000_000).to_integral_value()) if 0 <= seconds < MAX_SECONDS else -1
+        if _NUMBER.fullmatch(text) is None:
+            raise self._refuse(f'column t holds {text!r}, which is not a number', line)
+        seconds = Decimal(text)
+        finite = seconds.is_finite() and 0 <= seconds < MAX_SECONDS
+        t_ns = int((seconds * 1_000_000_000).to_integral_value()) if finite else -1
         if not 0 <= t_ns < MAX_SECONDS * 1_000_000_000:
             raise self._refuse(f'column t holds {text!r}; seconds from 0 to {MAX_SECONDS} are read', line)
         return t_ns
 
     def _number(self, row: _Row, name: str, largest: float = math.inf) -> float:
         cell = row.cells[self._columns[name]].strip()
-        try:
-            value = float(cell)
-        except ValueError:
-            raise self._refuse(f'column {name} holds {cell!r}, which is not a number', row.line) from None
+        if _NUMBER.fullmatch(cell) is None:
+            raise self._refuse(f'column {name} holds {cell!r}, which is not a number', row.line)
+        value = float(cell)
         if not math.isfinite(value):
             raise self._refuse(f'column {name} holds {cell!r}, which is not finite', row.line)
         if abs(value) > largest:
@@ -200,9 +204,14 @@ class CsvRecording(Recording):
                     left_over = 0.9 * (passed - steps)
                     seq += steps
                 last_t = row.t_ns
+                cells = take(row.cells)
                 try:
-                    values = list(map(float, take(row.cells)))
+                    values = list(map(float, cells))
                 except ValueError:
+                    values = [math.nan]
+                # Python takes `1_000` and digits of every script; in a recording they are typing errors.
+                together = ''.join(cells)
+                if '_' in together or not together.isascii():
                     values = [math.nan]
                 # NaN and values beyond the bound show in the sum; only then the cell is searched.
                 if not sum(map(abs, values)) <= MAX_VOLTS:

@@ -2,7 +2,8 @@
 
 It differs from the readers of the ``mcap`` package in two ways. If a file lost its end, or a chunk is
 damaged, everything else is read, with a warning. Every size that a file declares is compared with the
-file's own size or a bound before it is used. ``mcap.records`` parses the content of a record.
+file's own size or with the :mod:`~psd_deflection.recordings.allowance` before it is used. ``mcap.records``
+parses the content of a record.
 The format: https://mcap.dev/spec.
 """
 
@@ -24,13 +25,9 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
 
 from psd_deflection.errors import RecordingError
+from psd_deflection.recordings.allowance import MAX_CHUNK_BYTES, Allowance, DamagedError, Warnings
 
 MAGIC = b'\x89MCAP0\r\n'
-
-MAX_CHUNK_BYTES = 256 * 2**20
-"""Bound of one chunk, uncompressed; writers make chunks of 1 to 4 MiB."""
-
-MAX_METADATA_BYTES = 16 * 2**20
 
 _RECORD = struct.Struct('<BQ')
 _MESSAGE_HEAD = struct.Struct('<HIQQ')
@@ -52,10 +49,6 @@ class RawMessage(NamedTuple):
     cdr: bytes
 
 
-class DamagedError(Exception):
-    """The bytes contradict themselves."""
-
-
 class _WholeFields(ReadDataStream):
     """The library's field reader with a check: the library accepts a field that is longer than its record."""
 
@@ -63,7 +56,7 @@ class _WholeFields(ReadDataStream):
         """The next ``length`` bytes. Raises DamagedError if the record ends before them."""
         try:
             piece = super().read(length)
-        except EndOfFile:
+        except (EndOfFile, OverflowError):
             piece = b''
         if len(piece) != length:
             raise DamagedError('a field is longer than its record')
@@ -106,7 +99,7 @@ class McapReader:
         self.path = path
         self.metadata: dict[str, dict[str, str]] = {}
         self.cut_at: int | None = None
-        self.warnings: list[str] = []
+        self._warnings = Warnings()
         self._types: dict[int, str] = {}
         self._channels: dict[int, RecordedChannel] = {}
         try:
@@ -124,15 +117,22 @@ class McapReader:
     def _refuse(self, why: str) -> RecordingError:
         return RecordingError(f'{self.path}: {why}')
 
-    def _warn(self, text: str) -> None:
-        line = f'{self.path}: {text}'
-        if line not in self.warnings:
-            self.warnings.append(line)
+    @property
+    def warnings(self) -> list[str]:
+        """One line for each cut or damage found so far."""
+        return self._warnings.lines()
 
-    def _records(self, stream: BinaryIO) -> Iterator[tuple[int, int, int]]:
+    def warn(self, text: str) -> None:
+        """Add a warning about this file."""
+        self._warnings.add(f'{self.path}: {text}')
+
+    def _records(self, stream: BinaryIO, allowance: Allowance) -> Iterator[tuple[int, int, int]]:
         """(opcode, offset of the content, its length) of every complete record."""
         at = len(MAGIC)
         while True:
+            if not allowance.outside():
+                self.warn(f'holds more than a file of {self._size} bytes can need; what follows byte {at} is left out')
+                return
             stream.seek(at)
             head = stream.read(_RECORD.size)
             if len(head) < _RECORD.size:
@@ -140,7 +140,8 @@ class McapReader:
                 return
             opcode, length = _RECORD.unpack(head)
             at += _RECORD.size
-            if length > self._size - at:
+            # No record has opcode 0: these are the zeros that a file system leaves after a power cut.
+            if length > self._size - at or opcode == 0:
                 self._cut(at - _RECORD.size)
                 return
             yield opcode, at, length
@@ -154,7 +155,7 @@ class McapReader:
     def _cut(self, at: int) -> None:
         if self.cut_at is None:
             self.cut_at = at
-            self._warn(f'ends at byte {at} before its end (a recorder that was stopped hard?); all before is read')
+            self.warn(f'ends at byte {at} before its end (a recorder that was stopped hard?); all before is read')
 
     def _scan(self, stream: BinaryIO) -> None:
         """Look at every record's head; read the records that describe the file."""
@@ -166,17 +167,16 @@ class McapReader:
         if len(magic) < len(MAGIC):
             self._cut(len(magic))
             return
-        for opcode, at, length in self._records(stream):
+        allowance = Allowance(self._size)
+        for opcode, at, length in self._records(stream, allowance):
             if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
-                continue
-            if length > MAX_METADATA_BYTES:
-                self._warn(f'the record at byte {at} has {length} bytes and is left out')
                 continue
             stream.seek(at)
             try:
+                allowance.describe(length)
                 self._note(_parsed(opcode, stream.read(length)))
             except DamagedError as error:
-                self._warn(f'the record at byte {at} is damaged ({error}) and is left out')
+                self.warn(f'the record at byte {at} is damaged ({error}) and is left out')
 
     def _note(self, record: McapRecord) -> None:
         if isinstance(record, Metadata):
@@ -189,14 +189,17 @@ class McapReader:
                 type_name = type_name.replace('/', '/msg/')
             self._channels[record.id] = RecordedChannel(record.topic, type_name, record.message_encoding)
 
-    def _parts(self, opcodes: Collection[int]) -> Iterator[tuple[int, bytes]]:
+    def _parts(self, opcodes: Collection[int], allowance: Allowance) -> Iterator[tuple[int, bytes]]:
         """(offset, records) of each chunk, unpacked, and of each record outside of any, as in a chunk."""
         try:
             with self.path.open('rb') as stream:
-                for opcode, at, length in self._records(stream):
+                for opcode, at, length in self._records(stream, allowance):
                     if opcode == Opcode.DATA_END:
                         return
                     if opcode not in opcodes:
+                        continue
+                    if length > MAX_CHUNK_BYTES:
+                        self.warn(f'the record at byte {at} has {length} bytes and is left out')
                         continue
                     stream.seek(at)
                     content = stream.read(length)
@@ -204,7 +207,7 @@ class McapReader:
                         yield at, _RECORD.pack(opcode, length) + content
                         continue
                     with self._damage_told(at):
-                        yield at, _unpacked(content)
+                        yield at, _unpacked(content, allowance)
         except OSError as error:
             raise self._refuse(f'cannot be read ({error.strerror or error})') from None
 
@@ -213,22 +216,29 @@ class McapReader:
         try:
             yield
         except DamagedError as error:
-            self._warn(f'the chunk at byte {at} is damaged ({error}); what it held is missing')
+            self.warn(f'the chunk at byte {at} is damaged ({error}); what it held is missing')
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Messages in the order of the file, of ``topics`` or of all.
 
         A damaged chunk is left out with a warning. Raises RecordingError if the disk fails.
         """
-        for at, records in self._parts((Opcode.CHUNK, Opcode.MESSAGE)):
+        allowance = Allowance(self._size)
+        wanted = {n: c for n, c in self._channels.items() if topics is None or c.topic in topics}
+        for at, records in self._parts((Opcode.CHUNK, Opcode.MESSAGE), allowance):
             with self._damage_told(at):
-                yield from self._messages_in(records, topics)
+                yield from self._messages_in(records, topics, wanted, allowance)
 
-    def _messages_in(self, records: bytes, topics: Collection[str] | None) -> Iterator[RawMessage]:
-        wanted = self._wanted(topics)
+    def _messages_in(
+        self,
+        records: bytes,
+        topics: Collection[str] | None,
+        wanted: dict[int, RecordedChannel],
+        allowance: Allowance,
+    ) -> Iterator[RawMessage]:
         # The library's Message is ten times slower, and this loop handles every message of a replay.
         unpack, head = _MESSAGE_HEAD.unpack_from, _MESSAGE_HEAD.size
-        for opcode, at, end in _records_in(records):
+        for opcode, at, end in _records_in(records, allowance):
             if opcode == Opcode.MESSAGE:
                 if end - at < head:
                     raise DamagedError('a message in it has no head')
@@ -237,11 +247,14 @@ class McapReader:
                 if channel is not None:
                     yield RawMessage(channel, log_time, records[at + head : end])
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._note(_parsed(opcode, records[at:end]))
-                wanted = self._wanted(topics)
-
-    def _wanted(self, topics: Collection[str] | None) -> dict[int, RecordedChannel]:
-        return {n: c for n, c in self._channels.items() if topics is None or c.topic in topics}
+                allowance.describe(end - at)
+                record = _parsed(opcode, records[at:end])
+                self._note(record)
+                if isinstance(record, Channel):
+                    if topics is None or record.topic in topics:
+                        wanted[record.id] = self._channels[record.id]
+                    else:
+                        wanted.pop(record.id, None)
 
     def contents(self) -> Iterator[McapRecord]:
         """Every complete schema, channel, metadata record and message, in the order of the file.
@@ -249,35 +262,43 @@ class McapReader:
         Damage is left out with a warning. Raises RecordingError if the disk fails.
         """
         kinds = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.MESSAGE)
-        for at, records in self._parts((*kinds, Opcode.CHUNK)):
+        allowance = Allowance(self._size)
+        for at, records in self._parts((*kinds, Opcode.CHUNK), allowance):
             with self._damage_told(at):
-                for opcode, start, end in _records_in(records):
+                for opcode, start, end in _records_in(records, allowance):
                     if opcode in kinds:
+                        if opcode != Opcode.MESSAGE:
+                            allowance.describe(end - start)
                         yield _parsed(opcode, records[start:end])
 
 
-def _records_in(records: bytes) -> Iterator[tuple[int, int, int]]:
+def _records_in(records: bytes, allowance: Allowance) -> Iterator[tuple[int, int, int]]:
     """(opcode, offset of the content, its end) of each record of a chunk. Raises DamagedError."""
     at, size = 0, len(records)
     unpack, head = _RECORD.unpack_from, _RECORD.size
     while at < size:
+        allowance.records -= 1
+        if allowance.records < 0:
+            allowance.check()
         if at + head > size:
             raise DamagedError('it ends within a record')
         opcode, length = unpack(records, at)
         at += head
         if length > size - at:
             raise DamagedError('a record in it is longer than the chunk')
+        if opcode == 0:
+            raise DamagedError('a record in it has opcode 0')
         yield opcode, at, at + length
         at += length
 
 
-def _unpacked(content: bytes) -> bytes:
-    """The records of a chunk record's content. Raises DamagedError if it contradicts itself."""
+def _unpacked(content: bytes, allowance: Allowance) -> bytes:
+    """The records of a chunk record's content. Raises DamagedError if it contradicts itself, or declares too much."""
     chunk: Chunk = _read(Chunk.read, content)
     size = chunk.uncompressed_size
-    if size > MAX_CHUNK_BYTES:
-        raise DamagedError(f'it declares {size} bytes, more than {MAX_CHUNK_BYTES}')
+    allowance.may_unpack(size)
     plain = _decompress(chunk.data, chunk.compression, size)
+    allowance.unpacked(len(plain))
     if len(plain) != size:
         raise DamagedError(f'it holds {len(plain)} bytes and declares {size}')
     if chunk.uncompressed_crc and zlib.crc32(plain) != chunk.uncompressed_crc:

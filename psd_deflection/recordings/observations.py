@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from psd_deflection.calibration import Wiring
 from psd_deflection.config import MAX_FILE_BYTES, Rig, replace_values
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.errors import ConfigError, RecordingError
@@ -70,7 +71,7 @@ def read_observation(
     applied = recording.loads()
     if not applied:
         raise RecordingError(
-            f'{path}: holds no loads; discover compares with a simulation and needs them '
+            f'{path}: holds no loads; they are needed to compare it with a simulation '
             f'(CSV columns load_fx, load_fy, load_tz, or the topic /link_tip/load)'
         )
     times = np.array([a.t_ns - start for a in applied], dtype=np.int64)
@@ -85,7 +86,7 @@ def read_observation(
             warm = _held(at, celsius, t_ns, grace, celsius[0])
         else:
             warm = np.interp(t_ns, at.astype(np.float64), celsius)
-    return Observation(path.name, rig, volts, held, warm, digest=_digest(path))
+    return Observation(path.name, rig, Wiring.from_rig(rig).to_psds(volts), held, warm, digest=_digest(path))
 
 
 def _held(

@@ -32,6 +32,9 @@ def open_recording(
             return BagRecording(path, block_size, namespace)
         if not path.exists():
             raise RecordingError(f'{path}: no such recording')
+        if not path.is_file():
+            # A pipe would wait for its writer, and it cannot be read twice.
+            raise RecordingError(f'{path}: is no file; write it to one first')
         if suffix == '.csv':
             return CsvRecording(path, block_size, sample_rate_hz)
         with path.open('rb') as stream:

@@ -56,8 +56,9 @@ class Recording(abc.ABC):
     ``path``: what was opened. ``parameters``: the flat parameter set it was made with, {} if it holds
     none. ``hello``: the device's, or None. ``version``: of the software that recorded, or ''.
     ``rig_from_messages``: whether these come from messages, because the file lacks our metadata.
-    ``changes``: of parameters during the run, in order. ``warnings``: one line each, complete after the
-    first full pass over the recording.
+    ``changes``: of parameters during the run, in order. ``restarts``: of the device, each as the last sample
+    number before and the first after; the numbers between belong to no sample. ``restarts`` and ``warnings``
+    (one line each) are complete after the first full pass over the recording.
     """
 
     def __init__(self, path: Path, block_size: int | None) -> None:
@@ -67,6 +68,7 @@ class Recording(abc.ABC):
         self.version = ''
         self.rig_from_messages = False
         self.changes: Sequence[ParameterChange] = ()
+        self.restarts: set[tuple[int, int]] = set()
         self._block_size = block_size
 
     @property
@@ -101,6 +103,14 @@ class Recording(abc.ABC):
         for chunk in self._chunks():
             yield from cutter.add(chunk, chunk.readings.astype(np.float32, copy=False))
         yield from cutter.flush()
+
+    def lost(self, first: int, last: int, present: int) -> int:
+        """Samples lost from number ``first`` to ``last``, of which ``present`` are there."""
+        missing = last - first + 1 - present
+        if missing and self.restarts:
+            before, after = np.array(list(self.restarts), np.int64).T
+            missing -= int(np.clip(np.minimum(last + 1, after) - np.maximum(first, before + 1), 0, None).sum())
+        return max(missing, 0)
 
     @abc.abstractmethod
     def _chunks(self) -> Iterator[RawChunk]:

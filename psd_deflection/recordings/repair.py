@@ -18,7 +18,9 @@ from mcap.writer import CompressionType, Writer
 
 from psd_deflection import __version__
 from psd_deflection.errors import RecordingError
+from psd_deflection.files import HeldFolder
 from psd_deflection.foreign_yaml import YamlError, parse_yaml
+from psd_deflection.recordings.allowance import DamagedError
 from psd_deflection.recordings.bag_metadata import (
     DEFAULT_QOS,
     FileCount,
@@ -30,9 +32,9 @@ from psd_deflection.recordings.bag_metadata import (
 )
 from psd_deflection.recordings.bag_reader import files_in, read_information
 from psd_deflection.recordings.bag_writer import CHUNK_NS, CUSTOM
-from psd_deflection.recordings.mcap_reader import MAGIC, DamagedError, McapReader
+from psd_deflection.recordings.mcap_reader import MAGIC, McapReader
 
-_MAX_QOS_TEXT = 100_000
+_MAX_QOS_TEXT = 10_000
 
 
 @dataclass(slots=True)
@@ -142,7 +144,7 @@ class _Copy:
 def _recover_file(path: Path) -> RecoveredFile:
     source = McapReader(path)
     if path.stat().st_size <= len(MAGIC):
-        return RecoveredFile(path, False, FileCount(path.name, 0, 0, 0), [], [*source.warnings])
+        return RecoveredFile(path, False, FileCount(path.name, 0, 0, 0), [], source.warnings)
     cut = source.cut_at is not None
     partial = path.with_name(path.name + '.partial')
     partial.unlink(missing_ok=True)
@@ -152,7 +154,7 @@ def _recover_file(path: Path) -> RecoveredFile:
             try:
                 copy.add(record)
             except DamagedError as error:
-                source.warnings.append(f'{path}: {error}; it is left out')
+                source.warn(f'{error}; it is left out')
         copy.finish()
     except BaseException:
         copy.abandon()
@@ -166,7 +168,7 @@ def _recover_file(path: Path) -> RecoveredFile:
             raise RecordingError(f'{aside}: is there already, from an earlier repair; move it away first')
         path.rename(aside)
         partial.rename(path)
-    return RecoveredFile(path, cut, count, list(copy.topics.values()), list(source.warnings))
+    return RecoveredFile(path, cut, count, list(copy.topics.values()), source.warnings)
 
 
 def _refuse_if_written(path: Path) -> None:
@@ -230,5 +232,6 @@ def _recover_folder(folder: Path) -> Recovered:
             return Recovered(files, False, set_aside)
         metadata.replace(metadata.with_name(metadata.name + '.cut'))
     topics = totals(t for f in files for t in f.topics)
-    write_metadata(folder, bag_information([f.count for f in files], topics, CUSTOM))
+    with HeldFolder(folder) as held:
+        write_metadata(held, bag_information([f.count for f in files], topics, CUSTOM))
     return Recovered(files, True, set_aside)

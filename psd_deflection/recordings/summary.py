@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from msg_adapters import DEFLECTION, LOAD, SAMPLES
-from psd_deflection.config import BY_NAME
+from psd_deflection.config import BY_NAME, left_as_in_the_thesis
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import SampleBlock
 
@@ -70,7 +70,8 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
         'start_ns': first[1],
         'duration_s': (last[1] - first[1]) * 1e-9,
         'samples': samples,
-        'lost': last[0] - first[0] + 1 - samples if samples else 0,
+        'lost': recording.lost(first[0], last[0], samples) if samples else 0,
+        'restarts': len(recording.restarts),
         'flagged': flagged,
         'sample_rate_hz': counted * 1e9 / lasted if lasted else 0.0,
         'blocks': blocks,
@@ -78,6 +79,7 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
         'topics': topics,
         'parameters': dict(recording.parameters),
         'changed_parameters': changed_parameters(recording.parameters),
+        'as_in_the_thesis': list(left_as_in_the_thesis(recording.parameters)) if recording.parameters else [],
         'changes': [{'t_ns': c.t_ns, 'block': c.block, 'values': dict(c.values)} for c in recording.changes],
         'lacks': lacks(recording, topics),
         'complete': recording.complete,

@@ -307,14 +307,15 @@ class EstimatorNode:
 
     def _report(self) -> None:
         self._look_for_others()
-        now = time.time_ns()
         if self.session is not None and self._health is not None:
             # The page may have taken a zero as well.
             self._live.show(self.session.rig)
             if self._rig_told is not None:
                 self._rig_told.tell(again=False)
-            self.session.fanout.put(self._named(self._health.report(now)))
+            # In the time of the samples, so that a recording has one time even if the system clock is set.
+            self.session.fanout.put(self._named(self._health.report(self.session.acquisition.now_ns())))
             return
+        now = time.time_ns()
         entry = DiagnosticEntry('psd_deflection: node', STALE, 'not configured', ())
         (message,) = to_messages(self._named(DiagnosticReport(now, (entry,))))
         self._wire.put(message.topic, message.type, cdr.encode(message.type, message.fields), now)

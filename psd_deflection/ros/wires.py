@@ -148,7 +148,7 @@ class InputRecorder:
         if len(message) > MAX_INPUT_BYTES:
             self.refused += 1
         elif self.session is not None:
-            self.session.recorder.put(topic, TOPIC_TYPES[topic], bytes(message), time.time_ns())
+            self.session.recorder.put(topic, TOPIC_TYPES[topic], bytes(message), self.session.acquisition.now_ns())
             if topic == TEMPERATURE and self.session.pipeline.needs_temperature:
                 self._correct_for(message, self.session)
 

@@ -24,7 +24,7 @@ from psd_deflection.devices.source import Clock, Event, Sample, Source, SourceEn
 from psd_deflection.errors import DeviceError
 from psd_deflection.protocol.frames import BadFrame, BadReason, HelloFrame, PongFrame, SampleFrame, StatusFrame
 from psd_deflection.protocol.sequence import SequenceExtender, Step
-from psd_deflection.records import FLAG_DEVICE_DROPPED, IntArray, RawChunk
+from psd_deflection.records import FLAG_DEVICE_DROPPED, RESTART, IntArray, ParameterChange, RawChunk
 from psd_deflection.runner.clock_watch import ClockWatch
 from psd_deflection.runner.counters import AWAY, BY_DEVICE, DAMAGED, UNSEEN, AcquisitionCounters
 from psd_deflection.runner.hello import AnotherDeviceError, HelloGate
@@ -47,6 +47,9 @@ GIVE_UP_TIMES = 5
 NEWS = 3
 """Events of one kind that are told one by one, before they are counted and told together."""
 
+RECORDED_RESTARTS = 10_000
+"""Restarts of one run that are recorded: a device that does nothing else must not fill the disk."""
+
 GATHER_S = 0.004
 """Longest time that the reader lets samples gather: waking up costs more than reading a sample."""
 
@@ -61,8 +64,14 @@ class Arrival:
     read_ns: int
 
 
+@dataclass(slots=True)
 class Restarted:
-    """On the queue: the device restarted; the unfinished block gets no more samples."""
+    """On the queue: the device restarted; the unfinished block gets no more samples.
+
+    ``change``: what the recording says of it; None if no sample was taken before, or after ``RECORDED_RESTARTS``.
+    """
+
+    change: ParameterChange | None
 
 
 class Ended:
@@ -132,6 +141,9 @@ class Acquisition:
         self._bad_since_sample = 0
         self._was_away = False
 
+        # Bad frames of each reason when a silence was last told.
+        self._bad_told: dict[str, int] = {}
+
         # The connection: whether there is one, and why the last try to have it back failed.
         self._connected = False
         self._refusal = ''
@@ -195,12 +207,16 @@ class Acquisition:
         """Offset and rate of the device's clock against the host's."""
         return self._clock.state()
 
+    def now_ns(self) -> int:
+        """Now, in the time of the stamps: a step of the system clock does not change it, ns."""
+        return time.monotonic_ns() + self.to_ros_ns
+
     def system_clock_step_ns(self) -> int:
         """How far the system clock has moved against CLOCK_MONOTONIC since the start, ns.
 
         Stamps do not follow it, because time would jump within a recording. The next start uses the new time.
         """
-        return time.time_ns() - time.monotonic_ns() - self.to_ros_ns
+        return time.time_ns() - self.now_ns()
 
     def _run(self) -> None:
         if self._rig.acquisition.realtime:
@@ -265,7 +281,13 @@ class Acquisition:
 
     def _silent(self, size: int, now: int) -> None:
         self.counters.silences += 1
-        what = 'bytes but no sample (is the baud rate right?)' if size else 'no sample'
+        what = 'no sample'
+        if size:
+            new = {reason: n - self._bad_told.get(reason, 0) for reason, n in self.counters.bad_frames.items()}
+            self._bad_told = dict(self.counters.bad_frames)
+            most = max(new, key=lambda reason: new[reason], default='')
+            why = f'{new[most]} bad frames: {most}' if most and new[most] else 'is the baud rate right?'
+            what = f'bytes but no sample ({why})'
         self._repeats.tell('silent', f'{self._name}: {what} for {SILENCE_S:g} s; still listening', now / 1e9)
         # It may have been stopped, by itself or by another program.
         self.source.wake()
@@ -302,8 +324,7 @@ class Acquisition:
         self._name = self.source.name
         self._bad_since_sample = 0
         if not self.source.numbered:
-            self._sequence.restart()
-            self._restarted()
+            self._restarted(self._sequence.restart())
         self._repeats.tell('back', f'{self._name}: the device is back', time.monotonic(), NEWS)
 
     def feed(self, events: Sequence[Event], now: int) -> bool:
@@ -384,14 +405,19 @@ class Acquisition:
                 cause = DAMAGED if self._bad_since_sample else UNSEEN
             self.counters.count_lost(missing, cause)
         elif step is Step.RESTART:
-            self._restarted()
+            self._restarted(number)
             self._repeats.tell('restart', f'{self._name}: the device started anew', now / 1e9, NEWS)
         return True
 
-    def _restarted(self) -> None:
+    def _restarted(self, number: int | None) -> None:
+        """``number``: of the next sample."""
         self.counters.restarts += 1
         self._hand_over(time.monotonic_ns())
-        self.queue.put(Restarted())
+        change = None
+        if number is not None and self._last_number >= 0 and self.counters.restarts <= RECORDED_RESTARTS:
+            values = ((RESTART, (self._last_number, number)),)
+            change = ParameterChange(self._last_t_ns, number // self._block_size, values)
+        self.queue.put(Restarted(change))
 
     def _other(self, frame: Event, now: int) -> None:
         if isinstance(frame, PongFrame):
@@ -430,7 +456,7 @@ class Acquisition:
             t_ns,
             np.array(gathered.readings, np.float32)
             if self._gate.volts_per_count is None
-            else np.array(gathered.readings, np.int16),
+            else np.array(gathered.readings, np.int32),
             np.array(gathered.flags, np.uint8),
             self._gate.volts_per_count,
         )

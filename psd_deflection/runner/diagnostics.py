@@ -13,6 +13,10 @@ CLOCK_STEP_NS = 20_000_000
 """A system clock that has moved by more than this against CLOCK_MONOTONIC was set."""
 
 
+OFF_NS = 1_000_000
+"""If the map of the device's clock is this far from its fit, the stamps are wrong by as much."""
+
+
 class _Seen(NamedTuple):
     t_ns: int
     samples: int
@@ -126,6 +130,10 @@ class HealthReporter:
             message = (
                 f"the device's clock jumped or stood still: the time map was started again {new.clock_jumps} times"
             )
+        elif abs(clock.residual_ns) > OFF_NS:
+            level = WARN
+            off_ms = abs(clock.residual_ns) / 1e6
+            message = f'times are {off_ms:.1f} ms off: the map still approaches a clock of {clock.skew_ppm:z.0f} ppm'
         if abs(stepped) > CLOCK_STEP_NS:
             level = WARN
             message = f'the system clock was set by {stepped / 1e9:+.3f} s; stamps go on as before until the next start'

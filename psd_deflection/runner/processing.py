@@ -169,6 +169,8 @@ class Processing:
                         self._tell_refusals()
                 elif isinstance(item, Restarted):
                     self.give(self.pipeline.flush())
+                    if item.change is not None:
+                        self.give([item.change])
                 else:
                     self.give(self.pipeline.flush())
                     self._carry_out()

@@ -37,7 +37,7 @@ IDLE_S = 0.5
 LOOK_EVERY = 250
 """Messages between two checks of the file and of the room on its disk: half a second's worth."""
 
-ELSEWHERE = 'make room, or record elsewhere (parameter bag_dir)'
+ELSEWHERE = 'record elsewhere (parameter bag_dir)'
 
 QueuedMessage = tuple[str, str, bytes, int]
 Item = QueuedMessage | ParameterChange | None
@@ -190,11 +190,14 @@ class Recorder:
         return none
 
     def close(self) -> Path | None:
-        """End for good; wait at most ``JOIN_S`` for the disk. Return the folder of the recording that ran, if any."""
+        """End for good; wait at most ``JOIN_S`` for the disk.
+
+        Return the folder of the recording that ran, None if there was none or if its end went wrong.
+        """
         folder = self.folder
         with self._lock:
             self._ended = True
-        self.stop()
+        ended = self.stop()
         until = time.monotonic() + JOIN_S
         for take, thread in tuple(self._writing.items()):
             thread.join(max(until - time.monotonic(), 0.0))
@@ -203,7 +206,7 @@ class Recorder:
                     f'{take.folder}: the disk is slow; it is not waited for. '
                     f'If the end is missing, `psd-deflection recover {take.folder}` makes it whole'
                 )
-        return folder
+        return None if ended.done() and ended.exception() is not None else folder
 
     def _run(
         self,
@@ -254,7 +257,7 @@ class Recorder:
             folder = new_folder(Path(config.bag_dir).expanduser())
             missing = _missing_room(_nearest(folder), config.disk_reserve)
             if missing:
-                raise RecordingError(f'{folder}: {missing}; {ELSEWHERE}')
+                raise RecordingError(f'{folder}: {missing}; make room, or {ELSEWHERE}')
             try:
                 return BagWriter(
                     folder,
@@ -290,12 +293,15 @@ class Recorder:
                 # The reserve leaves room for index and summary.
                 bag.close()
                 return f'{bag.folder}: {error}; it is complete up to here'
+            _look_for(bag)
             bag.close()
         except _GoneError as error:
             with contextlib.suppress(RecordingError):
                 bag.close()
             return str(error)
         except RecordingError as error:
+            with contextlib.suppress(RecordingError):
+                bag.close()
             return f'{error}; `psd-deflection recover {bag.folder}` makes it whole'
         except Exception as error:
             # Any error at all: a recorder that died without a message would be worse.
@@ -327,8 +333,7 @@ class Recorder:
             since_look += 1
             if since_look >= LOOK_EVERY:
                 since_look = 0
-                if not bag.path.exists():
-                    raise _GoneError(f'{bag.path}: was deleted or moved while it was recorded; start another recording')
+                _look_for(bag)
                 self._make_room(bag, config)
 
     def _make_room(self, bag: BagWriter, config: AcquisitionConfig) -> None:
@@ -340,6 +345,11 @@ class Recorder:
                 raise _FullError(f'{missing} and there is no older file of this recording to delete')
             self.files_deleted += 1
             self._say(f'{deleted}: deleted, {missing} (disk_full is delete_oldest)')
+
+
+def _look_for(bag: BagWriter) -> None:
+    if not bag.in_place:
+        raise _GoneError(f'{bag.path}: was deleted or moved while it was recorded; start another recording')
 
 
 def _nearest(folder: Path) -> Path:

@@ -13,7 +13,7 @@ from concurrent.futures import Future, wait
 from pathlib import Path
 
 from msg_adapters import TOPIC_TYPES
-from psd_deflection.config import ZEROS, Rig, replace_values
+from psd_deflection.config import ZEROS, Rig, left_as_in_the_thesis, replace_values
 from psd_deflection.errors import printable
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings import cdr
@@ -25,7 +25,7 @@ from psd_deflection.runner.realtime import lock_memory
 from psd_deflection.runner.recorder import Recorder
 from psd_deflection.runner.simulated_rig import SimulatedRigProcess, simulates
 from psd_deflection.runner.zero_store import ZeroStore
-from psd_deflection.solvers.registry import check_live
+from psd_deflection.solvers.registry import check_arrangement, check_live
 
 HUNG_S = 5.0
 """A thread that has completed no round for this long hangs: the watchdog gets no more signals."""
@@ -71,6 +71,7 @@ class Session:
         self.listeners: list[Callable[[str], None]] = [say]
         say = self._tell
         check_live(rig.estimator.solver)
+        check_arrangement(rig)
         # The geometry first: a rig that cannot be solved must not open a port.
         pipeline = Pipeline(rig)
         if simulates(rig.values):
@@ -78,6 +79,9 @@ class Session:
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)
             say(f'no port given: started the simulated rig on {self._simulated.port} (parameter port names a real one)')
+        same = left_as_in_the_thesis(rig.values)
+        if same:
+            say(f'as in the thesis rig, unless you measured the same: {"; ".join(same)}')
         try:
             self.acquisition = Acquisition(rig, say)
             self.acquisition.open()
@@ -90,6 +94,7 @@ class Session:
                 if about:
                     say(about)
                     pipeline = Pipeline(rig)
+                    pipeline.tip_loads.zeroed = self._store.loaded
             say('; '.join(f'{name}: {what}' for name, what in self.acquisition.source.describe().items()))
             self.processing = Processing(self.acquisition.queue, pipeline, say)
             self.recorder = Recorder(rig.acquisition.queue_blocks, say, self.processing.request)

@@ -7,7 +7,7 @@ import json
 import select
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from psd_deflection.config import Rig
 from psd_deflection.devices.pseudo_terminal import PORT_LINE
@@ -71,6 +71,12 @@ class SimulatedRigProcess:
             self.close()
             raise DeviceError('the simulated rig did not start; `python -m psd_deflection.devices.serve` says why')
         self.port = line[len(PORT_LINE) :].strip()
+
+    def push(self, load: Sequence[float]) -> None:
+        """Hold ``load`` (Fx, Fy N, Tz N m) from now on, instead of the cycle that it starts with."""
+        if self._process.stdin is not None:
+            self._process.stdin.write(json.dumps(list(load)).encode() + b'\n')
+            self._process.stdin.flush()
 
     def hang_up(self) -> None:
         """Tell the process to end; does not wait."""

@@ -32,7 +32,10 @@ def state_folder() -> Path:
 
 
 class ZeroStore:
-    """The kept zero of one device. ``configured``: the rig from its file, without a kept zero."""
+    """The kept zero of one device. ``configured``: the rig from its file, without a kept zero.
+
+    ``loaded``: whether :meth:`load` found one that holds.
+    """
 
     def __init__(self, configured: Rig, serial: object) -> None:
         self._configured = {name: configured.values[name] for name in ZEROS}
@@ -44,6 +47,7 @@ class ZeroStore:
             # Serial numbers that differ only in characters that were replaced or cut need two files.
             safe += '_' + hashlib.sha256(self._serial.encode(errors='backslashreplace')).hexdigest()[:12]
         self.path = Path(named).expanduser() if named else state_folder() / f'zero_{safe}.json'
+        self.loaded = False
         self._saving = threading.Lock()
         self._wanted: Rig | None = None
         self._thread: threading.Thread | None = None
@@ -67,6 +71,7 @@ class ZeroStore:
             return rig, f'{self.path}: the kept zero is that of another device; the rig file holds'
         if kept['configured'] != self._configured:
             return rig, f'{self.path}: the rig file has another zero than when this one was kept; the rig file holds'
+        self.loaded = True
         return replace_values(rig, zeros, str(self.path)), f'zero of the last run, from {self.path}'
 
     def save(self, rig: Rig) -> str:

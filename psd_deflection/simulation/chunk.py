@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,8 +23,10 @@ class Chunk:
     ``loads`` (3, n): Fx, Fy N, Tz N m. ``static`` (3, n): the pose these loads would settle at,
     without ``physics.static_offset``. ``pose`` (3, n): dX, dY m, theta rad. ``beams`` (4, n): l_1,
     l_2, m. ``true_dots`` (4, n): on the plate from the PSD centres. ``dots`` (4, n): as the PSDs
-    report them. ``sums`` (2, n), ``volts`` (6, n): V. ``noise``: V rms, when ``volts`` are to be the
-    mean over a noise that is not on them; 0 when they are samples as they are.
+    report them. ``sums`` (2, n), ``volts`` (6, n): V. ``noise`` (6,): V rms, when ``volts`` are to be the
+    mean over a noise that is not on them; 0 when they are samples as they are. ``between``: during an
+    effect on ``volts``, gives these (6, n) as they are ``phase`` s after each sample, below the period;
+    ask for the same phases with each chunk.
     """
 
     t: FloatArray
@@ -37,4 +40,5 @@ class Chunk:
     dots: FloatArray = field(default_factory=_none)
     sums: FloatArray = field(default_factory=_none)
     volts: FloatArray = field(default_factory=_none)
-    noise: float = 0.0
+    noise: FloatArray = field(default_factory=lambda: np.zeros(6))
+    between: Callable[[float], FloatArray] = lambda phase: np.empty((6, 0))

@@ -24,6 +24,8 @@ Use = Literal['time', 'temperature']
 State = dict[str, Any]
 Values = Mapping[str, float]
 
+POINTS: tuple[Point, ...] = typing.get_args(Point)
+"""In the order in which they are passed."""
 STAGES: tuple[Stage, ...] = typing.get_args(Stage)
 """In the order in which they act."""
 
@@ -113,6 +115,20 @@ class Reading:
     t: FloatArray
 
 
+@dataclass(slots=True, eq=False)
+class Traced:
+    """One block on the way back from the tip's pose to the load. Changed in place.
+
+    ``pose``: [dX m, dY m, theta rad], without the constants' ``static_offset``. ``loads``: [Fx N, Fy N, Tz N m], set
+    after the last effect on a pose. ``seconds``: since the last block. ``physics``: the constants with all effects.
+    """
+
+    pose: list[float]
+    loads: list[float]
+    seconds: float
+    physics: Physics
+
+
 @dataclass(frozen=True, slots=True)
 class Effect:
     """One physical effect: its description, where it acts, and how.
@@ -121,6 +137,9 @@ class Effect:
     ``configure`` changes the constants before a run; ``apply`` changes a chunk at ``point``;
     ``correct`` undoes it on a reading, if that is possible without the load. An effect that moves
     the beams (``point`` is ``beam``) or changes the constants of the optics needs no ``correct``.
+    ``trace_back`` undoes it on a block's pose (``point`` is ``static`` or ``pose``) or on the loads (``load``), for the
+    published wrench; it needs to be right for a link that has come to rest. Its list is what it remembers between
+    blocks: empty at first, then always as many numbers. What ``configure`` changes needs no ``trace_back``.
     ``uses``: inputs of the correction besides dots and sums. ``order``: among the effects of one
     stage. ``finite``: the signature at the nominal value vanishes, so exactly the values of
     ``grid`` are probed. Raises ValueError if the declaration contradicts itself.
@@ -137,6 +156,7 @@ class Effect:
     configure: Callable[[Physics, Values], None] | None = None
     apply: Callable[[Chunk, Values, State], None] | None = None
     correct: Callable[[Reading, Values], None] | None = None
+    trace_back: Callable[[Traced, Values, list[float]], None] | None = None
     uses: frozenset[Use] = frozenset()
     finite: bool = False
     order: int = 0
@@ -146,10 +166,12 @@ class Effect:
         amplitudes = [p.name for p in self.parameters if p.kind == 'amplitude']
         if self.stage not in STAGES:
             raise ValueError(f'stage = {self.stage!r}: must be one of {", ".join(STAGES)}')
-        if self.point not in typing.get_args(Point):
-            raise ValueError(f'point = {self.point!r}: must be one of {", ".join(typing.get_args(Point))}')
+        if self.point not in POINTS:
+            raise ValueError(f'point = {self.point!r}: must be one of {", ".join(POINTS)}')
         if (self.configure if self.point == 'configure' else self.apply) is None:
             raise ValueError(f'point = {self.point!r} needs {"configure" if self.point == "configure" else "apply"}')
+        if self.trace_back is not None and self.point not in ('load', 'static', 'pose'):
+            raise ValueError(f'point = {self.point!r}: trace_back is for the points load, static and pose')
         if not self.uses <= set(typing.get_args(Use)):
             raise ValueError(f'uses = {set(self.uses)!r}: must be of {", ".join(typing.get_args(Use))}')
         if len(set(names)) < len(names) or not amplitudes:

@@ -15,30 +15,47 @@ from scipy.signal import lfilter
 from psd_deflection.records import FloatArray
 
 
-def mode_coefficients(frequency: float, damping_ratio: float, period: float) -> tuple[FloatArray, FloatArray]:
+def mode_coefficients(
+    frequency: float, damping_ratio: float, period: float, phase: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
     """Numerator (3,) and denominator (3,) of one mode; ``frequency`` Hz, ``period`` s.
 
-    Zero-order-hold discretisation of the second-order system, closed form; needs
-    0 <= ``damping_ratio`` < 1.
+    ``phase``: the output is taken this long after each sample, below ``period``, s. Zero-order-hold
+    discretisation of the second-order system, closed form; needs 0 <= ``damping_ratio`` < 1.
     """
     w = 2.0 * math.pi * frequency
     wd = w * math.sqrt(1.0 - damping_ratio**2)
     e = math.exp(-damping_ratio * w * period)
     c, s = math.cos(wd * period), math.sin(wd * period)
     r = damping_ratio * w / wd * s
-    numerator = np.array([0.0, 1.0 - e * (c + r), e * e + e * (r - c)])
-    return numerator, np.array([1.0, -2.0 * e * c, e * e])
+    denominator = np.array([1.0, -2.0 * e * c, e * e])
+    if phase == 0.0:
+        return np.array([0.0, 1.0 - e * (c + r), e * e + e * (r - c)]), denominator
+    # From place and speed at the sample, x+ = phi x + gamma u, the output is x's free motion and u's share.
+    decay = math.exp(-damping_ratio * w * phase)
+    speed = decay * math.sin(wd * phase) / wd
+    place = decay * math.cos(wd * phase) + damping_ratio * w * speed
+    kept, moved = e * (c + r), e * s / wd
+    phi = ((kept, moved), (-w * w * moved, kept - 2.0 * damping_ratio * w * moved))
+    gamma = (1.0 - kept, w * w * moved)
+    numerator = (1.0 - place) * denominator
+    numerator[1] += place * gamma[0] + speed * gamma[1]
+    numerator[2] += place * (phi[0][1] * gamma[1] - phi[1][1] * gamma[0])
+    numerator[2] += speed * (phi[1][0] * gamma[0] - phi[0][0] * gamma[1])
+    return numerator, denominator
 
 
-def lag_coefficients(time_constant: float, period: float) -> tuple[FloatArray, FloatArray]:
-    """First-order low-pass tau y' = u - y of a smooth input: numerator (4,), denominator (2,).
+LAG_NODES = (0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0)
+"""Where in an interval the input of a lag is read. Held loads leave kinks between intervals, and none inside."""
 
-    Exact for an input that is a cubic through its last four samples: for modes of tens of hertz at
-    1 kHz, linear interpolation between samples would cause an error of 1 % of the lag.
+
+def lag_weights(time_constant: float, interval: float) -> FloatArray:
+    """What inputs at ``LAG_NODES`` of an interval (s) add to tau y' = u - y at its end, (4,).
+
+    y at its start counts exp(-interval/tau). Exact for an input that is a cubic there.
     """
-    a = period / time_constant
-    e = math.exp(-a)
-    # Moments of (s/T)^n under the kernel exp(-(T - s)/tau)/tau over one period.
+    a = interval / time_constant
+    # Moments of s^n under the kernel a exp(-a (1 - s)) over the interval.
     if a < 1.0:
         nodes, weights = np.polynomial.legendre.leggauss(12)
         s = 0.5 * (nodes + 1.0)
@@ -48,17 +65,8 @@ def lag_coefficients(time_constant: float, period: float) -> tuple[FloatArray, F
         moments = [-math.expm1(-a)]
         for n in range(1, 4):
             moments.append(1.0 - n / a * moments[-1])
-    numerator = np.empty(4)
-    places = (1.0, 0.0, -1.0, -2.0)
-    for j, place in enumerate(places):
-        polynomial = np.polynomial.Polynomial([1.0])
-        for other in places:
-            if other != place:
-                polynomial *= np.polynomial.Polynomial([-other, 1.0]) / (place - other)
-        coefficients = np.zeros(4)
-        coefficients[: len(polynomial.coef)] = polynomial.coef
-        numerator[j] = float(coefficients @ moments)
-    return numerator, np.array([1.0, -e])
+    # The weights that give these moments.
+    return np.linalg.solve(np.vander(LAG_NODES, increasing=True).T, moments)
 
 
 def held_lag_coefficients(time_constant: float, period: float) -> tuple[FloatArray, FloatArray]:

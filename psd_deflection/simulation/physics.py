@@ -9,6 +9,7 @@ import numpy as np
 from psd_deflection.config import Rig
 from psd_deflection.mechanics import LinkStatics
 from psd_deflection.records import FloatArray
+from psd_deflection.solvers.registry import psds_at_base
 
 
 @dataclass(slots=True)
@@ -18,7 +19,9 @@ class Physics:
     ``bending_stiffness`` EI, ``torsional_stiffness`` GJ, N m^2. ``clamp_bending`` and
     ``clamp_torsion``: clamp rotation per moment, rad/(N m). ``static_offset``: (dX, dY) of the
     link without load, m. ``slope_ratio``: k of phi = -k dY/L; 0 is the nominal, parallel planes.
-    ``beams``: l_i. ``half_area``: half width and height of the active areas.
+    ``beams``: l_i, on the plate if ``psds_at_base``. ``half_area``: half width and height of the
+    active areas. ``noise`` (6,), V rms of each channel. ``phase``: how long after each sample the
+    quantities are taken, below ``period``, s.
     """
 
     period: float
@@ -37,15 +40,18 @@ class Physics:
     beams: FloatArray
     heights: FloatArray
     half_area: FloatArray
-    sensitivity: float
+    sensitivity: FloatArray
     sum_nominal: float
-    noise: float
+    noise: FloatArray
     volts_per_count: float
     full_scale: float
+    phase: float = 0.0
+    psds_at_base: bool = False
 
     @classmethod
     def of(cls, rig: Rig) -> Physics:
         """The nominal constants of a rig file, without effects."""
+        at_base = psds_at_base(rig)
         return cls(
             period=1.0 / rig.converter.sample_rate_hz,
             length=rig.link.length,
@@ -58,28 +64,33 @@ class Physics:
             bending_damping_ratio=rig.dynamics.bending_damping_ratio,
             torsion_frequency=rig.dynamics.torsion_frequency,
             torsion_damping_ratio=rig.dynamics.torsion_damping_ratio,
-            slope_ratio=0.0,
+            # PSDs at the base see little but the tilt.
+            slope_ratio=rig.link.slope_ratio if at_base else 0.0,
             centers=rig.centers,
             beams=rig.centers + rig.zeros,
             heights=rig.heights,
             half_area=0.5 * np.array([p.active_area for p in rig.psds], dtype=np.float64),
-            sensitivity=rig.amplifier.sensitivity,
+            sensitivity=rig.sensitivities,
             sum_nominal=rig.amplifier.sum_nominal,
-            noise=rig.amplifier.noise,
+            noise=rig.noises.ravel(),
             volts_per_count=rig.converter.volts_per_count,
             full_scale=rig.converter.full_scale,
+            psds_at_base=at_base,
         )
 
     @property
-    def _statics(self) -> LinkStatics:
-        return LinkStatics(self.length, self.bending_stiffness, self.torsional_stiffness)
+    def statics(self) -> LinkStatics:
+        """The link with these constants."""
+        return LinkStatics(
+            self.length, self.bending_stiffness, self.torsional_stiffness, self.clamp_bending, self.clamp_torsion
+        )
 
     @property
     def force_compliance(self) -> float:
-        """Tip deflection per force at the tip, m/N: L^3/3EI, plus the clamp's rotation by F L times L."""
-        return self._statics.deflection(1.0, 0.0, 0.0)[0] + self.clamp_bending * self.length**2
+        """Tip deflection per force at the tip, m/N."""
+        return self.statics.deflection(1.0, 0.0, 0.0)[0]
 
     @property
     def torque_compliance(self) -> float:
-        """Twist per torque, rad/(N m): L/GJ plus the clamp's compliance."""
-        return self._statics.deflection(0.0, 0.0, 1.0)[2] + self.clamp_torsion
+        """Twist per torque, rad/(N m)."""
+        return self.statics.deflection(0.0, 0.0, 1.0)[2]

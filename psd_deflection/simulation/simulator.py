@@ -11,10 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.calibration import Wiring
 from psd_deflection.config import Rig
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.catalogue import effects_of_rig
@@ -23,17 +25,18 @@ from psd_deflection.simulation.declaration import ActiveEffect, State
 from psd_deflection.simulation.modes import Filter, mode_coefficients
 from psd_deflection.simulation.optics import dots_on_plate
 from psd_deflection.simulation.physics import Physics
+from psd_deflection.solvers.registry import check_arrangement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedChunk:
     """The result of :meth:`RigSimulator.step` for n samples.
 
-    ``counts`` int16 (n, 6): converter counts in the order of ``CHANNELS``. ``pose`` (n, 3): true
+    ``counts`` int32 (n, 6): converter counts in the order of ``CHANNELS``. ``pose`` (n, 3): true
     dX m, dY m, theta rad. ``dots`` (n, 4): true x1 y1 x2 y2 on the plate, m.
     """
 
-    counts: npt.NDArray[np.int16]
+    counts: npt.NDArray[np.int32]
     pose: FloatArray
     dots: FloatArray
 
@@ -41,18 +44,23 @@ class SimulatedChunk:
 class ForwardModel:
     """The stages without noise and converter; keeps its state between calls.
 
-    ``effects``: the active effects; by default those of the rig file.
+    ``effects``: the active effects; by default those of the rig file. ``phase``: quantities are taken this
+    long after each sample, s.
     """
 
-    def __init__(self, rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> None:
+    def __init__(self, rig: Rig, effects: Sequence[ActiveEffect] | None = None, phase: float = 0.0) -> None:
         self.effects = tuple(effects_of_rig(rig) if effects is None else effects)
         self.physics = Physics.of(rig)
+        self.physics.phase = phase
+        self._rig = rig
+        self._between: dict[tuple[int, float], ForwardModel] = {}
+        self._asked: dict[tuple[int, float], FloatArray] = {}
         for active in self.effects:
             if active.effect.configure is not None:
                 active.effect.configure(self.physics, active.values)
         p = self.physics
-        bending = mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period)
-        torsion = mode_coefficients(p.torsion_frequency, p.torsion_damping_ratio, p.period)
+        bending = mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period, phase)
+        torsion = mode_coefficients(p.torsion_frequency, p.torsion_damping_ratio, p.period, phase)
         self._modes = (
             Filter(bending, float(p.static_offset[0])),
             Filter(bending, float(p.static_offset[1])),
@@ -75,7 +83,10 @@ class ForwardModel:
                 self._first_temperature = float(temperature[0])
             warmer = temperature - self._first_temperature
         t = np.arange(self._count, self._count + n, dtype=np.float64) * p.period
+        if p.phase > 0.0:
+            t += p.phase
         self._count += n
+        self._asked = {}
         chunk = Chunk(t, warmer, np.array(np.asarray(loads, dtype=np.float64).T, order='C'), p)
         self._at('load', chunk)
         chunk.static = np.empty((3, n))
@@ -96,10 +107,26 @@ class ForwardModel:
         self._at('dots', chunk)
         chunk.volts = np.empty((6, n))
         for psd in range(2):
-            chunk.volts[3 * psd : 3 * psd + 2] = chunk.dots[2 * psd : 2 * psd + 2] / p.sensitivity
+            chunk.volts[3 * psd : 3 * psd + 2] = chunk.dots[2 * psd : 2 * psd + 2] / p.sensitivity[psd, :, None]
             chunk.volts[3 * psd + 2] = chunk.sums[psd]
-        self._at('volts', chunk)
+        for i, active in enumerate(self.effects):
+            if active.effect.point == 'volts':
+                chunk.between = partial(self._volts_between, i, chunk, loads, temperature)
+                self._apply(i, chunk)
         return chunk
+
+    def _volts_between(
+        self, before: int, chunk: Chunk, loads: FloatArray, temperature: FloatArray | None, phase: float
+    ) -> FloatArray:
+        """The volts (6, n) ``phase`` s after each sample, by the effects before effect number ``before``."""
+        if phase == self.physics.phase:
+            return chunk.volts.copy()
+        key = (before, phase)
+        if key not in self._between:
+            self._between[key] = ForwardModel(self._rig, self.effects[:before], phase)
+        if key not in self._asked:
+            self._asked[key] = self._between[key].run(loads, temperature).volts
+        return self._asked[key].copy()
 
     def finish(self, chunk: Chunk) -> None:
         """Apply the effects that act on the noisy signal: clipping and coarse steps."""
@@ -118,20 +145,29 @@ class ForwardModel:
         return chunk
 
     def _at(self, point: str, chunk: Chunk) -> None:
-        for active, state in zip(self.effects, self._states, strict=True):
-            if active.effect.point == point and active.effect.apply is not None:
-                active.effect.apply(chunk, active.values, state)
+        for i, active in enumerate(self.effects):
+            if active.effect.point == point:
+                self._apply(i, chunk)
+
+    def _apply(self, number: int, chunk: Chunk) -> None:
+        active = self.effects[number]
+        if active.effect.apply is not None:
+            active.effect.apply(chunk, active.values, self._states[number])
 
 
 class RigSimulator:
     """The rig with its noise and converter, sample after sample.
 
-    The same ``rig`` and ``seed`` give the same samples however the loads are cut into steps.
+    The same ``rig`` and ``seed`` give the same samples however the loads are cut into steps. ``rig`` is the true one:
+    its wiring says which channel a detector's volts really are on. Raises ConfigError if the rig contradicts itself
+    about where the PSDs are.
     """
 
     def __init__(self, rig: Rig, seed: int = 0) -> None:
+        check_arrangement(rig)
         self._model = ForwardModel(rig)
         self._noise = np.random.default_rng(seed)
+        self._wiring = Wiring.from_rig(rig)
 
     def step(self, loads: FloatArray, temperature: FloatArray | None = None) -> SimulatedChunk:
         """The next n samples: ``loads`` (n, 3) Fx N, Fy N, Tz N m at the tip centroid.
@@ -143,7 +179,8 @@ class RigSimulator:
         chunk.volts += (p.noise * self._noise.standard_normal((len(loads), 6))).T
         self._model.finish(chunk)
         limit = round(p.full_scale / p.volts_per_count)
-        counts = np.clip(np.rint(chunk.volts / p.volts_per_count), -limit, limit - 1).astype(np.int16)
+        volts = self._wiring.to_device(chunk.volts.T)
+        counts = np.clip(np.rint(volts / p.volts_per_count), -limit, limit - 1).astype(np.int32)
         return SimulatedChunk(
-            np.ascontiguousarray(counts.T), np.ascontiguousarray(chunk.pose.T), np.ascontiguousarray(chunk.true_dots.T)
+            np.ascontiguousarray(counts), np.ascontiguousarray(chunk.pose.T), np.ascontiguousarray(chunk.true_dots.T)
         )

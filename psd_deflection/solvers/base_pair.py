@@ -19,10 +19,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import cos, sin, tan
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, SolverError
 from psd_deflection.geometry.layout import SMALLEST_BASE_LINE, Geometry, check_twist
 from psd_deflection.geometry.plate import Row, tie_matrix
@@ -45,6 +46,7 @@ class BasePairSolver(Solver):
 
     name: ClassVar[str] = 'base_pair'
     budgeted_as: ClassVar[str] = ''
+    psds_at: ClassVar[Literal['tip', 'base']] = 'base'
 
     def __init__(self, geometry: Geometry, assume: Assume = 'beam') -> None:
         """Bind to ``geometry`` under the assumption ``assume`` (see the module).
@@ -73,6 +75,11 @@ class BasePairSolver(Solver):
             raise ConfigError(f'assume = {assume!r}: must be one of beam, no_twist, nothing')
         self._spread, self._columns = self._matrix.tolist(), self._matrix.T.tolist()
         self._refuse_what_is_unseen(geometry, assume)
+
+    @classmethod
+    def options_from_rig(cls, rig: Rig) -> dict[str, Any]:
+        """``base_pair.assume``."""
+        return {'assume': rig.estimator.base_pair_assume}
 
     def _refuse_what_is_unseen(self, geometry: Geometry, assume: Assume) -> None:
         heights = np.asarray(geometry.heights)

@@ -16,7 +16,7 @@ import abc
 from dataclasses import dataclass
 from enum import IntEnum
 from math import cos, sin
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -80,11 +80,13 @@ class Solver(abc.ABC):
     """One method, bound to one geometry; holds no state between blocks.
 
     ``name``: as in the registry. ``budgeted_as``: the model of the error budget (``budget.estimate.METHODS``)
-    whose errors the method has; '' if there is none.
+    whose errors the method has; '' if there is none. ``psds_at``: ``tip`` (on the plate, lasers at the base) or
+    ``base`` (lasers on the plate).
     """
 
     name: ClassVar[str]
     budgeted_as: ClassVar[str]
+    psds_at: ClassVar[Literal['tip', 'base']] = 'tip'
 
     @abc.abstractmethod
     def __init__(self, geometry: Geometry) -> None:

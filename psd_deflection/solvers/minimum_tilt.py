@@ -5,25 +5,34 @@ one dot fixes the translation, and M(q_1 - q_2) = l_1 - l_2 is two equations for
 its errors corrected (docs/methods.md), the method reproduces all four readings for *any*
 admissible trial angle. So its stopping test (2.46-2.49) has no meaning.
 
-Two things can be measured: the azimuth of the base line, which is theta to within phi omega / 2, and
-the foreshortening of the base line, |l_12| = |q_12| cos beta. The smallest tilt that explains it leans
-the plate by beta along the base line, one way *or the other*: the dots are the same for (phi, omega)
-and (-phi, -omega). A tilt about the base line does not change the dots. The answer gives the branch
-that leans PSD 1 towards the base; dX, dY and theta are the same for both.
+Two things can be measured: the azimuth alpha of the base line, and its foreshortening |l_12| = |q_12| cos beta.
+The smallest tilt that explains it leans the plate by beta along the base line, one way *or the other*: the dots
+are the same for (phi, omega) and (-phi, -omega). A tilt about the base line does not change the dots. The answer
+gives the branch that leans PSD 1 towards the base; dX, dY and theta are the same for both.
+
+The plate is turned by alpha and then leaned by B, which carries e = l_12/|l_12| to cos beta e - sin beta z and
+keeps what is across. In R = Ry(omega) Rx(phi) Rz(theta) that is theta = alpha + psi with B = Ry Rx Rz(psi),
+
+    tan psi = (cos beta - 1) e_x e_y / (e_x^2 + cos beta e_y^2),       psi = -phi omega/2 to second order,
+
+so that the published angles have the dots that were read. alpha itself is theta with ``angles='azimuth'``.
 """
 
 from __future__ import annotations
 
 from math import asin, atan2, cos, hypot, sin, sqrt
-from typing import ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from psd_deflection.errors import SolverError
+from psd_deflection.config import Rig
+from psd_deflection.errors import ConfigError, SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.solvers.exact import ExactSolver
 from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
 from psd_deflection.solvers.plane import Covariance, turn_covariance
+
+Angles = Literal['rotation', 'azimuth']
 
 _TOO_SHORT = 3.0
 """The base line may be shorter than the distance of the beams by this many standard deviations."""
@@ -32,7 +41,7 @@ _TOO_SHORT = 3.0
 class MinimumTiltSolver(Solver):
     """The least tilt along the base line that explains its length; two PSDs at height 0.
 
-    ``theta`` is the turn of the base line's projection. ``INADMISSIBLE``: the base line on the plate
+    ``INADMISSIBLE``: the base line on the plate
     is shorter than between the beams by more than three standard deviations, which no tilt
     explains. Within that, the tilt is 0 and the answer is the flat plate's. The covariance holds
     away from zero tilt; near it the tilt is not a smooth function of the readings.
@@ -41,8 +50,15 @@ class MinimumTiltSolver(Solver):
     name: ClassVar[str] = 'minimum_tilt'
     budgeted_as: ClassVar[str] = 'exact'
 
-    def __init__(self, geometry: Geometry) -> None:
-        """Bind to ``geometry``. Raises SolverError if the beams coincide or there are not two."""
+    def __init__(self, geometry: Geometry, angles: Angles = 'rotation') -> None:
+        """Bind to ``geometry``.
+
+        ``angles``: theta, phi and omega of one rotation, or theta as the base line's azimuth. Raises SolverError if the
+        beams coincide or there are not two, ConfigError for other angles.
+        """
+        if angles not in ('rotation', 'azimuth'):
+            raise ConfigError(f'minimum_tilt.angles = {angles!r}: must be one of rotation, azimuth')
+        self._rotation = angles == 'rotation'
         if check_twist(geometry) != 2:
             raise SolverError('minimum_tilt takes two PSDs; with three at different heights use pose')
         if np.any(geometry.heights):
@@ -58,6 +74,11 @@ class MinimumTiltSolver(Solver):
         self._length = hypot(lx, ly)
         self._ex = lx / self._length
         self._ey = ly / self._length
+
+    @classmethod
+    def options_from_rig(cls, rig: Rig) -> dict[str, Any]:
+        """``minimum_tilt.angles``."""
+        return {'angles': rig.estimator.minimum_tilt_angles}
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
@@ -87,10 +108,11 @@ class MinimumTiltSolver(Solver):
         back_e = self._l1x * ex + self._l1y * ey - cos_beta * reach
         back_n = self._l1y * ex - self._l1x * ey - off
         covariance = self._covariance(c * ex + s * ey, c * ey - s * ex, reach, off, cos_beta, long, variances)
+        psi = atan2((cos_beta - 1.0) * ex * ey, ex * ex + cos_beta * ey * ey) if self._rotation else 0.0
         return Solution(
             back_e * ex - back_n * ey,
             back_e * ey + back_n * ex,
-            theta,
+            theta + psi,
             -asin(sin_beta * ey),
             atan2(sin_beta * ex, cos_beta),
             covariance,
@@ -119,11 +141,16 @@ class MinimumTiltSolver(Solver):
         """Sensitivities to noise along (e) and across (n) the base line, dot by dot; (ax, ay) is e."""
         lever = reach / long
         side = cos_beta * off / long
+        # Of psi, by the length of the base line on the plate.
+        turn = 0.0
+        if self._rotation:
+            leaning = (1.0 - cos_beta * cos_beta) * self._ey * self._ey
+            turn = -cos_beta / long * self._ex * self._ey / (1.0 - leaning)
         ee = en = et = nn = nt = tt = 0.0
-        for i, (e_along, e_across, n_across, t_across) in enumerate(
+        for i, (e_along, e_across, n_across, t_along, t_across) in enumerate(
             (
-                (-cos_beta * (1.0 - lever), -side, lever - 1.0, -1.0 / long),
-                (-cos_beta * lever, side, -lever, 1.0 / long),
+                (-cos_beta * (1.0 - lever), -side, lever - 1.0, turn, -1.0 / long),
+                (-cos_beta * lever, side, -lever, -turn, 1.0 / long),
             )
         ):
             vx = variances[2 * i]
@@ -134,8 +161,8 @@ class MinimumTiltSolver(Solver):
             ee += e_along * e_along * along + 2.0 * e_along * e_across * mixed + e_across * e_across * across
             e_to_across = e_along * mixed + e_across * across
             en += n_across * e_to_across
-            et += t_across * e_to_across
+            et += t_across * e_to_across + t_along * (e_along * along + e_across * mixed)
             nn += n_across * n_across * across
-            nt += n_across * t_across * across
-            tt += t_across * t_across * across
+            nt += n_across * (t_across * across + t_along * mixed)
+            tt += t_across * t_across * across + t_along * (t_along * along + 2.0 * t_across * mixed)
         return turn_covariance(self._ex, self._ey, ee, en, nn, et, nt, tt)

@@ -70,6 +70,34 @@ def solver_from_rig(name: str, rig: Rig) -> Solver:
     return make_solver(name, Geometry.from_rig(rig), **solver_class(name).options_from_rig(rig))
 
 
+def psds_at_base(rig: Rig) -> bool:
+    """Whether the PSDs are at the base and the lasers on the tip plate, as the rig's solver has them.
+
+    Raises ConfigError for an unknown solver.
+    """
+    return solver_class(rig.estimator.solver).psds_at == 'base'
+
+
+def check_arrangement(rig: Rig) -> None:
+    """Raise ConfigError if parts of the rig contradict each other about where the PSDs are."""
+    config = rig.estimator
+    at = solver_class(config.solver).psds_at
+    others = [name for name in config.solvers if solver_class(name).psds_at != at]
+    if others:
+        raise ConfigError(
+            f'solver = {config.solver!r} has the PSDs at the {at}; {", ".join(others)} of solvers have not: '
+            f'set solvers: [{config.solver}]'
+        )
+    if at == 'base' and config.degraded != 'off':
+        raise ConfigError(f'degraded = {config.degraded!r}: one PSD at the base gives no pose; set degraded: off')
+    for i, psd in enumerate(rig.psds, start=1):
+        if at == 'tip' and psd.height < -0.5 * rig.link.length:
+            raise ConfigError(
+                f'psd_{i}.height = {psd.height:g} m: that is nearer to the base than to the tip; PSDs at the base, '
+                'with the lasers on the tip plate, need solver: base_pair and solvers: [base_pair]'
+            )
+
+
 def check_live(name: str) -> None:
     """Raise ConfigError if ``name`` is for comparison only: its answer must not be ``/link_tip/deflection``.
 

@@ -73,12 +73,23 @@ class StreamNoise:
     seen at rest.
     """
 
-    def __init__(self, size: int, centers: FloatArray, beams: FloatArray, variance: float, step: float) -> None:
-        """``size``: N. ``centers``, ``beams`` (2, 2) m. ``variance`` m^2 of a sample by the rig file; ``step`` m."""
+    def __init__(
+        self,
+        size: int,
+        centers: FloatArray,
+        beams: FloatArray,
+        variances: FloatArray | float,
+        steps: FloatArray | float,
+    ) -> None:
+        """``size``: N. ``centers``, ``beams`` (2, 2) m. Of each reading (4,), or of all: ``variances`` m^2 of a sample
+        by the rig file, ``steps`` m of the converter.
+        """
         self._size = size
         self._wanted = 4 + 16 * size
-        self._stated = variance
-        self._step = step
+        self._stated = np.broadcast_to(variances, (4,))
+        self._steps = np.broadcast_to(steps, (4,))
+        # Motion is judged with the largest.
+        self._step = float(self._steps.max())
         self.set_geometry(centers, beams)
         self._mean_of = _mean_weights(size)
         self._q = basis(size)
@@ -155,13 +166,13 @@ class StreamNoise:
 
     def _with_steps(self, gamma: FloatArray) -> FloatArray:
         out = gamma.copy()
-        rounding = self._step**2 / 12.0
-        for c in range(4):
+        for c, (stated, step) in enumerate(zip(self._stated.tolist(), self._steps.tolist(), strict=True)):
+            rounding = step**2 / 12.0
             level = max(float(out[c, c, 0]), rounding)
             out[c, c, 0] = level
             # More than the rig file's noise does not dither with certainty: a reading on the edge between
             # two steps varies by half a step with next to no noise.
-            out[c, c] += _undithered(min(level, self._stated) - rounding, self._step)
+            out[c, c] += _undithered(min(level, stated) - rounding, step)
         return out
 
     def _close(self) -> bool:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from psd_deflection.calibration import dot_noise_variances
 from psd_deflection.config import Rig
 from psd_deflection.records import FloatArray, IntArray
@@ -28,16 +30,19 @@ class StampedDots:
     of the last block's readings.
     """
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, flat: bool = True) -> None:
+        """``flat``: the PSDs are on the plate, and the base line between the dots keeps its length."""
         config = rig.estimator
+        self.flat = flat
         poly = config.block_fit == 'poly'
-        self._measures = config.covariance == 'measured'
+        # What does not move with the link tells the noise.
+        self._measures = flat and config.covariance == 'measured'
         self.active = poly or self._measures
         self._beams = rig.centers + rig.zeros
-        variance = float(dot_noise_variances(rig)[0])
-        step = rig.converter.volts_per_count * rig.amplifier.sensitivity
-        self.noise = StreamNoise(config.block_size, rig.centers, self._beams, variance, step)
-        self._stated_sd = variance**0.5
+        variances = dot_noise_variances(rig)
+        steps = rig.converter.volts_per_count * rig.sensitivities.ravel()
+        self.noise = StreamNoise(config.block_size, rig.centers, self._beams, variances, steps)
+        self._stated_sd = np.sqrt(variances)
         self._fit = BlockFit(config.block_size, rig.centers, self._beams, poly)
         self._fit.set_noise(self.noise.gamma)
         self._consistency = Consistency()
@@ -113,13 +118,13 @@ class StampedDots:
     def noise_words(self) -> tuple[tuple[str, str], ...]:
         """Of each reading, the noise of a sample and of a block's mean against the rig file's, um."""
         stated = self._stated_sd * 1e6
-        mean = stated / self._size**0.5
+        rows = zip(NAMES, self.noise.sample_sd(), self.noise.mean_sd(), stated, stated / self._size**0.5, strict=True)
         return tuple(
             (
                 f'noise of {name} (um)',
-                f'{a * 1e6:.3f} a sample (rig file {stated:.3f}), {b * 1e6:.3f} a block ({mean:.3f})',
+                f'{a * 1e6:.3f} a sample (rig file {file:.3f}), {b * 1e6:.3f} a block ({mean:.3f})',
             )
-            for name, a, b in zip(NAMES, self.noise.sample_sd(), self.noise.mean_sd(), strict=True)
+            for name, a, b, file, mean in rows
         )
 
     def memory(self) -> dict[str, tuple[float, ...]]:

@@ -15,7 +15,7 @@ import serial
 from bench.campaign import fuzz, soak
 from bench.campaign.crash import judge, left_by_a_kill
 from bench.campaign.faults import Row, report
-from bench.campaign.fuzz import TARGETS, corrupted, judged
+from bench.campaign.fuzz import GRAMMARS, TARGETS, corrupted, judged
 from bench.campaign.kinds import FAULTS
 from bench.campaign.line import DIGIT, VOLTS_PER_COUNT, Line, identities
 from psd_deflection.config import Rig, load_rig
@@ -154,7 +154,15 @@ def test_simulated_minutes_lose_nothing_and_keep_time(capsys: pytest.CaptureFixt
     assert 'wrapped past 2^32' in capsys.readouterr().out
 
 
-@pytest.mark.parametrize('name', TARGETS)
+@pytest.mark.parametrize('name', GRAMMARS)
+def test_any_choice_within_a_grammar_is_answered(name: str) -> None:
+    target, seeds = TARGETS[name]()
+    chance = random.Random(7)
+    refused = [judged(target, c) for c in [*seeds, b'', *(chance.randbytes(200) for _ in range(10))]]
+    assert any(refused)
+
+
+@pytest.mark.parametrize('name', [n for n in TARGETS if n not in GRAMMARS])
 def test_fuzz_targets_take_what_is_good_and_refuse_what_was_found_bad(name: str) -> None:
     target, seeds = TARGETS[name]()
     assert judged(target, seeds[0]) == []

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from blind.coverage import ROWS, fault, score
+from blind.coverage import ROWS, UNEQUAL, fault, over_the_bound, score
 
-LABELS = ('white', 'AR(1) 0.9', 'twice the noise', '1, 2, 4, 2 mV')
+LABELS = ('white', 'AR(1) 0.9', 'twice the noise', '1, 2, 4, 2 mV', 'unequal channels')
 
 
 @pytest.mark.parametrize('label', LABELS)
@@ -19,6 +19,13 @@ def test_the_truth_is_inside(label: str) -> None:
         assert all(0.92 < share < 0.98 for share in (*part.axes, part.joint))
     assert s.ringing.three > 0.99
     assert s.alarms == 0.0
+
+
+def test_weights_from_the_stated_noise_reach_the_bound() -> None:
+    ratios = over_the_bound(UNEQUAL, ('wls', 'exact', 'ols'), rest_s=240)
+    assert (ratios['wls'] < 1.02).all()
+    assert (ratios['exact'] < 1.02).all()
+    assert ratios['ols'][0] > 1.4
 
 
 def test_what_was_published_before_was_not_inside() -> None:

@@ -125,6 +125,16 @@ def test_noise_is_that_of_the_placement() -> None:
     assert ZEROING.contribution(_at((0.0, 0.0, 0.0), zero_blocks=4.0)).rms == pytest.approx(both / 2.0, rel=1e-9)
 
 
+def test_each_channel_counts_with_its_own_noise() -> None:
+    own = {'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [4e-3, 1e-6], 'psd_2.sensitivity': [1e-3, 0.0]}
+    at = _at(rig=replace_values(RIG, own))
+    expected = np.array([1e-3 * 0.5e-3, 2e-3 * 0.5e-3, 4e-3 * 1e-3, 1e-6 * 0.5e-3]) / math.sqrt(20.0)
+    assert AMPLIFIER_NOISE.deviations(at) == pytest.approx(expected)
+    rounding = 10.0 / 2**15 * np.array([0.5e-3, 0.5e-3, 1e-3, 0.5e-3]) / math.sqrt(12.0)
+    # The last one has no noise that would average the rounding.
+    assert QUANTISATION.deviations(at) == pytest.approx(rounding / (*[math.sqrt(20.0)] * 3, 1.0))
+
+
 def test_quantisation_without_noise_is_not_averaged() -> None:
     quiet = _at(rig=replace_values(RIG, {'amplifier.noise': 1e-6}))
     assert QUANTISATION.contribution(quiet).rms == pytest.approx(QUANTISATION.contribution(_at()).rms * math.sqrt(20.0))

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.geometry import Geometry
 from psd_deflection.pipeline import FROZEN, HELD, Pipeline
-from psd_deflection.records import BlockStatus, DeflectionEstimate, ParameterChange, Record, SpotMeans, TipLoad
+from psd_deflection.records import BlockStatus, Counts, DeflectionEstimate, ParameterChange, Record, SpotMeans, TipLoad
 from psd_deflection.solvers.one_psd import OnePsd
 from test.test_pipeline import STEP, chunk_of, still
 
-Counts = npt.NDArray[np.int16]
 POSE = (4e-4, -3e-4, 0.004)
 SIZE = 20
 
@@ -235,6 +233,14 @@ def test_noise_is_told_and_motion_is_not_taken_for_it() -> None:
     swing = 1e-3 / 5e-4 * np.sin(2 * np.pi * 14.0 * np.arange(SIZE) * 1e-3)
     swinging[:, 0] += np.rint(swing / STEP).astype(np.int16)
     assert findings_of(load_rig(), swinging)[0].findings == ()
+
+
+def test_noise_is_held_against_the_readings_own() -> None:
+    counts = moving(1)
+    counts[:, 3] += np.rint(np.random.default_rng(2).normal(0, 0.05 / STEP, SIZE)).astype(np.int16)
+    assert findings_of(load_rig(overrides={'psd_2.noise': [0.05, 0.0]}), counts)[0].findings == ()
+    (finding,) = findings_of(load_rig(overrides={'psd_2.noise': [0.0, 0.05]}), counts)[0].findings
+    assert finding.startswith('psd_2 is noisy')
 
 
 def test_a_spot_at_the_edge_is_told() -> None:

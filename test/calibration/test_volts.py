@@ -52,6 +52,15 @@ def test_noise_is_the_amplifiers_and_the_converters() -> None:
     np.testing.assert_allclose(dot_noise_variances(rig), np.var((read - clean) * 0.5e-3), rtol=0.02)
 
 
+def test_each_channel_has_its_own_noise_and_sensitivity_and_zero_means_the_amplifiers() -> None:
+    rig = rig_from_values({'psd_1.noise': [1e-3, 0.0], 'psd_2.noise': [4e-3, 3e-3], 'psd_2.sensitivity': [0.0, 1e-3]})
+    step = 20.0 / 65536.0
+    expected = [s**2 * (n**2 + step**2 / 12.0) for s, n in ((5e-4, 1e-3), (5e-4, 2e-3), (5e-4, 4e-3), (1e-3, 3e-3))]
+    np.testing.assert_allclose(dot_noise_variances(rig), expected, rtol=1e-12)
+    dots = Calibration.from_rig(rig).dots(volts(2.0, 2.0, 5.0, 2.0, 2.0, 5.0))
+    np.testing.assert_allclose(dots, [[1e-3, 1e-3, 1e-3, 2e-3]], rtol=1e-15)
+
+
 @pytest.mark.parametrize('kind', SENSOR_TYPES)
 @settings(deadline=None)
 @given(x=st.floats(-0.7e-3, 0.7e-3), y=st.floats(-0.7e-3, 0.7e-3), total=st.floats(1e-9, 1e-3))

@@ -36,6 +36,13 @@ def test_info_says_what_is_in_it(bag: Path, capsys: pytest.CaptureFixture[str]) 
         assert part in text
 
 
+def test_info_says_what_another_rig_has_as_in_the_thesis(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['info', str(write_bag(tmp_path / 'run', {'link.length': 0.4}))]) == 0
+    assert 'dynamics.bending_frequency = 14.0 Hz' in capsys.readouterr().out
+    assert main(['info', str(write_bag(tmp_path / 'thesis', {'sum_min': 1.5}))]) == 0
+    assert 'as in the thesis rig' not in capsys.readouterr().out
+
+
 def test_info_reads_a_cut_file_and_says_so(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = bag / 'run_0.mcap'
     path.write_bytes(path.read_bytes()[:-3000])

@@ -359,3 +359,29 @@ def test_json_is_all_that_is_on_stdout(
         assert file['messages'] > 500
     # A verdict and a warning are for whoever reads the log.
     assert (err == '') == ('--compare' not in argv and argv[0] != 'recover')
+
+
+@pytest.mark.parametrize(
+    ('error', 'why'),
+    [(MemoryError(), 'too little memory'), (RuntimeError("can't start new thread"), 'no further thread')],
+)
+def test_a_machine_that_gives_no_more_is_one_line(
+    error: Exception, why: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr('psd_deflection.cli.info.open_recording', fail)
+    assert main(['info', 'x.csv']) == 71
+    said = capsys.readouterr().err
+    assert why in said
+    assert said.count('\n') == 1
+
+
+def test_another_error_of_ours_is_still_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError('a defect')
+
+    monkeypatch.setattr('psd_deflection.cli.info.open_recording', fail)
+    with pytest.raises(RuntimeError, match='a defect'):
+        main(['info', 'x.csv'])

@@ -44,7 +44,7 @@ def test_losses_and_missing_estimates_are_marked() -> None:
     from psd_deflection.recordings.replay_engine import replayed, rig_at_start
 
     recording = open_recording(BAGS / 'lost_samples')
-    drawn = Drawn()
+    drawn = Drawn(recording)
     for records in replayed(recording, Pipeline(rig_at_start(recording)), recording.blocks()):
         for record in records:
             drawn.add(record)
@@ -76,7 +76,7 @@ def test_blocks_cut_by_start_and_stop_have_lost_nothing(tmp_path: Path, capsys: 
         for b in itertools.islice(recording.blocks(), 4):
             kept = np.isin(b.seq, numbers)
             blocks.append(SampleBlock(b.index, b.seq[kept], b.t_ns[kept], b.volts[kept], b.flags[kept]))
-        drawn = Drawn()
+        drawn = Drawn(recording)
         for records in replayed(recording, Pipeline(rig_at_start(recording)), blocks):
             for record in records:
                 drawn.add(record)

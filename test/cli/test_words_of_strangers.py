@@ -37,6 +37,24 @@ def test_info_prints_no_control_characters(monkeypatch: pytest.MonkeyPatch, caps
     assert '\\x1b[31mred' in out
 
 
+def test_names_of_files_reach_the_terminal_in_printable_lines(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / 'copy\x1b[31m\nstate complete'
+    shutil.copytree(CLEAN, copy)
+    (copy / 'metadata.yaml').unlink()
+    for command in (
+        ['recover', str(copy)],
+        ['replay', str(copy), '--out', str(copy) + '.csv'],
+        ['convert', str(copy), '--out', str(copy) + '.mcap'],
+        ['plot', str(copy), '--out', str(copy) + '.svg'],
+    ):
+        assert main(command) == 0
+        said = capsys.readouterr()
+        clean_of(said.out)
+        assert '\\x1b[31m\\nstate' in said.out, command
+
+
 def test_a_message_about_a_file_prints_none_either(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = tmp_path / 'rig.yaml'
     rig.write_text('/**: {ros__parameters: {"\\e[31mRED": 1}}')

@@ -15,6 +15,7 @@ from psd_deflection.config import load_rig
 from psd_deflection.devices import PowerUp
 from psd_deflection.devices import serve as module
 from psd_deflection.devices.contract_frames import SimulatedFrames
+from psd_deflection.devices.device import converter_parameters
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal, link_names, open_terminals
 from psd_deflection.devices.rig_feed import RigFeed
 from psd_deflection.devices.serve import serve
@@ -32,7 +33,7 @@ from psd_deflection.protocol.frames import (
     StopFrame,
     encode,
 )
-from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.records import CHANNELS, FLAG_OVER_RANGE, FloatArray
 
 MS = 1_000_000
 
@@ -169,3 +170,37 @@ def test_the_ports_of_a_pair_have_links_of_their_own_and_all_go_when_one_cannot_
     with pytest.raises(ConfigError, match='rig_2: no link'), open_terminals(links):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ['rig_2']
+
+
+def test_a_converter_of_24_bits_sends_wide_samples_and_says_so() -> None:
+    rig = load_rig(overrides={'converter.bits': 24})
+    got = frames(SimulatedFrames(RigFeed(rig, no_load)).take(500 * MS, room=1 << 30))
+    hello = next(f for f in got if isinstance(f, HelloFrame))
+    assert converter_parameters(hello.info) == {
+        'converter.sample_rate_hz': 1000.0,
+        'converter.bits': 24,
+        'converter.full_scale': 10.0,
+    }
+    volts = np.array([f.counts for f in got if isinstance(f, SampleFrame)]) * rig.converter.volts_per_count
+    assert volts.shape == (501, 6)
+    assert np.abs(volts.mean(axis=0) - [0.0, 0.0, 5.0, 0.0, 0.0, 5.0]).max() < 5e-4
+    # The noise of 2 mV is a handful of steps of 16 bits, and thousands of 24.
+    assert len(np.unique(volts[:, 0])) > 450
+
+
+def test_a_converter_of_12_bits_is_over_range_at_its_own_last_step() -> None:
+    rig = load_rig(overrides={'converter.bits': 12, 'amplifier.sum_nominal': 20.0})
+    got = samples(SimulatedFrames(RigFeed(rig, no_load)).take(5 * MS, room=1 << 30))
+    assert {f.counts[2] for f in got} == {2047}
+    assert all(f.flags & FLAG_OVER_RANGE for f in got)
+
+
+def test_a_hand_takes_the_place_of_the_cycle() -> None:
+    hand = module.Hand(module.served_loads(1000.0))
+    before = hand.take(5)
+    assert before.shape == (5, 3)
+    hand.hold(b'[1.0, 2, -3]\n')
+    np.testing.assert_array_equal(hand.take(2), [[1.0, 2.0, -3.0]] * 2)
+    for bad in (b'[1, 2]', b'[1, 2, NaN]', b'nonsense'):
+        with pytest.raises(ValueError):
+            hand.hold(bad)

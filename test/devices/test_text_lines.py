@@ -13,10 +13,12 @@ from hypothesis import strategies as st
 from psd_deflection.config import load_rig
 from psd_deflection.devices import PowerUp
 from psd_deflection.devices.registry import make_source
+from psd_deflection.devices.source import Sample
 from psd_deflection.devices.text_lines import SimulatedLines
 from psd_deflection.errors import DeviceError
 from psd_deflection.protocol.frames import BadFrame
 from psd_deflection.protocol.text_lines import Description, Line, LineDecoder, TimeExtender, parse, with_check
+from psd_deflection.records import FLAG_OVER_RANGE
 
 VALUES = (0.1, -0.2, 5.0, 0.0, 1.5, 4.75)
 LINE = Line(7, 7000, VALUES)
@@ -166,6 +168,18 @@ def test_another_device_is_refused_by_name(wired: Any, text: bytes, said: str) -
     port = wired(Says(text))
     with pytest.raises(DeviceError, match=said):
         make_source(load_rig(overrides={'source': 'lines', 'port': str(port.link)})).open(2.0)
+
+
+def test_counts_of_24_bits(wired: Any) -> None:
+    device = Says(b'\n#{"sample_rate_hz": 1000, "volts_per_count": %r}\n' % (10.0 / 2**23))
+    device.take = lambda since_power_up_ns, room=4096: b'1,1000,8388607,-8388608,4000000,0,1,5\n'  # type: ignore[method-assign]
+    rig = load_rig(overrides={'source': 'lines', 'port': str(wired(device).link), 'converter.bits': 24})
+    source = make_source(rig)
+    source.open(2.0)
+    source.start()
+    events = [event for _ in range(10) for event in source.read(1.0).events]
+    source.close()
+    assert events[0] == Sample(FLAG_OVER_RANGE, 1, 1000, (8388607, -8388608, 4000000, 0, 1, 5))
 
 
 @pytest.mark.parametrize(

@@ -205,7 +205,7 @@ def test_noise_is_known_whatever_it_is(memory: float, level: float) -> None:
     noise[0] = e[0]
     for i in range(1, len(e)):
         noise[i] = memory * noise[i - 1] + e[i]
-    model = estimate_noise(seen, noise, 4, 1e-5)
+    model = estimate_noise(seen, noise, 4, np.full(6, 1e-5))
     assert set(model.coloured) == {memory > 0}
     np.testing.assert_allclose(model.sigma, level, rtol=0.06)
     blocks = noise.reshape(-1, 20, 6).mean(axis=1).std(axis=0)

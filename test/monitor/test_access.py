@@ -30,6 +30,12 @@ OWN = socket.gethostname().lower()
         (f'{OWN}:8790', '0.0.0.0', True),
         (f'{OWN}.local', '0.0.0.0', True),
         ('rig.example', 'rig.example', True),
+        ('127.0.0.1%25x', '127.0.0.1', False),
+        ('[::1%eth0]:8790', '127.0.0.1', True),
+        ('127.0.0.1/.evil.example', '127.0.0.1', False),
+        ('127.0.0.1#.evil.example', '127.0.0.1', False),
+        ('evil.example@127.0.0.1', '127.0.0.1', False),
+        ('127.0.0.1:8790:1', '127.0.0.1', False),
     ],
 )
 def test_a_host_header_must_name_this_machine(host: str, address: str, own: bool) -> None:
@@ -57,6 +63,7 @@ def test_a_request_must_come_from_our_own_page_or_from_none(headers: dict[str, s
 
 def test_only_loopback_is_loopback() -> None:
     assert all(map(is_loopback, ('127.0.0.1', '127.1.2.3', '::1', 'localhost')))
+    assert is_loopback('127.0.0.1%x') is True
     assert not any(map(is_loopback, ('0.0.0.0', '::', '192.0.2.1', 'rig', '')))
 
 

@@ -138,7 +138,11 @@ def test_allowed_buttons_work_and_report_the_result(serve: Serve) -> None:
     assert serving.shown.recordings == ['recordings/test']
     assert ask(serving.url + 'api/record', body={'record': False})[0] == 200
     assert serving.shown.recordings == ['recordings/test', None]
-    assert any('unloaded dots taken' in line for line in serving.said)
+    # The run tells what came of it, once; here it is told who wanted it.
+    assert [line for line in serving.said if 'dots' in line or 'asked for' in line] == [
+        'monitor: zero was asked for by 127.0.0.1',
+        *['monitor: record was asked for by 127.0.0.1'] * 2,
+    ]
     serving.shown.refusal = 'no good block yet'
     status, text, _ = ask(serving.url + 'api/zero')
     assert (status, json.loads(text)) == (409, {'ok': False, 'message': 'no good block yet'})
@@ -155,6 +159,7 @@ def test_allowed_buttons_work_and_report_the_result(serve: Serve) -> None:
         ({'Content-Type': 'text/plain'}, '{}', 415),
         ({'Content-Type': 'application/x-www-form-urlencoded'}, 'record=true', 415),
         ({'Content-Type': 'application/json'}, '{', 400),
+        ({'Content-Encoding': 'gzip'}, '{}', 415),
         ({}, [], 400),
         ({}, {'record': 'yes'}, 400),
     ],
@@ -185,6 +190,8 @@ def test_another_site_cannot_listen(serve: Serve, headers: dict[str, str]) -> No
         ('\x16\x03\x01\x02', b'', 400),
         ('POST /api/record', b'[' * 4000, 400),
         ('POST /api/record', b'\xff\xfe', 400),
+        ('POST /api/record', b'', 400),
+        ('POST /api/record', b'{}', 400),
         ('POST /api/record', b'x' * 5000, 413),
         ('PUT /', b'', 405),
         ('HEAD /', b'', 200),

@@ -29,12 +29,20 @@ from psd_deflection.protocol.frames import (
 SAMPLE = SampleFrame(0, 1, 1000, (1, -1, 16384, 0, 0, 16384))
 SAMPLE_BYTES = bytes.fromhex('020102010101 03e803 01010101 01 0201 03ffff 0240 01010101 0640713ed6b200')
 
+WIDE = 'a wide sample'
+
 GOOD: list[tuple[str, str, GoodFrame]] = [
     ('a sample', SAMPLE_BYTES.hex(), SAMPLE),
     (
         'a sample with both flags, the last seq and the rails',
         '0e 01 03 ff ff ff ff 08 07 06 05 04 03 02 03 ff 7f 02 80 01 02 01 02 02 02 03 05 78 eb d9 5f 00',
         SampleFrame(3, 0xFFFFFFFF, 566265752454920, (32767, -32768, 0, 1, 2, 3)),
+    ),
+    (
+        WIDE,
+        '02 03 02 01 01 01 03 e8 03 01 01 01 01 01 04 ff ff 7f 05 ff ff ff ff 01 02 40 01 02 01 01 01 01 03 80 ff 01 02'
+        '40 05 12 9f 49 04 00',
+        SampleFrame(0, 1, 1000, (8388607, -1, 4194304, 256, -8388608, 4194304)),
     ),
     ('status', '0302070101076608fcba8a2a00', StatusFrame(7, 2150)),
     ('status without a thermometer', '020201010107ff7f885f6d5900', StatusFrame(0, None)),
@@ -75,7 +83,7 @@ def test_a_frame_and_its_bytes(label: str, wire: str, frame: GoodFrame) -> None:
     received = bytes.fromhex(wire)
     assert decode(received) == [frame]
     if not (isinstance(frame, HelloFrame) and frame.version != 1):
-        assert encode(frame) == received
+        assert encode(frame, wide=label == WIDE) == received
 
 
 @pytest.mark.parametrize(('label', 'wire', 'reason'), BAD, ids=[c[0] for c in BAD])

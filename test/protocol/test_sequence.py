@@ -42,6 +42,18 @@ def test_a_restart_keeps_the_blocks_aligned_to_the_device() -> None:
     assert s.extend(1, 1000) == (100_021, Step.NEXT, 0)
 
 
+@given(st.integers(0, 2**40), st.integers(0, WRAP - 1))
+def test_a_restart_from_any_number_leaves_out_less_than_two_blocks(last: int, seq: int) -> None:
+    s = SequenceExtender(20)
+    s.extend(last % WRAP, 10**6)
+    before, _, _ = s.extend((last + 1) % WRAP, 10**6 + 1000)
+    number, step, _ = s.extend(seq, 0)
+    if step is Step.RESTART:
+        assert number // 20 == before // 20 + 1
+        assert number % 20 == seq % 20
+        assert s.extend((seq + 1) % WRAP, 1000) == (number + 1, Step.NEXT, 0)
+
+
 def test_a_clock_that_jumps_while_the_count_goes_on_is_no_restart() -> None:
     s = SequenceExtender(20)
     s.extend(5000, 5_000_000)
@@ -72,9 +84,9 @@ def test_whatever_comes_a_number_that_is_kept_is_above_those_before(samples: lis
 
 def test_numbers_given_anew_go_on_at_the_next_block() -> None:
     sequence = SequenceExtender(20)
-    sequence.restart()
+    assert sequence.restart() is None
     assert sequence.extend(0, 0) == (0, Step.FIRST, 0)
     assert sequence.extend(1, 1000) == (1, Step.NEXT, 0)
-    sequence.restart()
+    assert sequence.restart() == 20
     assert sequence.extend(0, 0) == (20, Step.NEXT, 0)
     assert sequence.extend(3, 3000) == (23, Step.GAP, 2)

@@ -206,6 +206,29 @@ def test_a_restarted_device_does_not_mix_blocks(tmp_path: Path) -> None:
     assert any('start again after 99' in w for w in recording.warnings)
 
 
+def test_numbers_left_out_at_a_restart_are_not_lost(tmp_path: Path) -> None:
+    # The device was started at another number, of which the first in the recording is amid a block.
+    again = [block(i, lost=(0, 1, 2) if i == 1 else (), t0=T0 + 5 * 10**9) for i in (1, 2)]
+    recording = open_recording(write_mcap(tmp_path / 'a.mcap', [*(block(i) for i in range(5)), *again]))
+    samples = recording.samples
+    assert recording.restarts == {(99, 103)}
+    assert recording.lost(int(samples['seq'][0]), int(samples['seq'][-1]), len(samples)) == 0
+    assert recording.lost(90, 110, 15) == 3
+
+
+@pytest.mark.parametrize('value', ['[1]', '[5, 4]', '[0.5, 7]', '[1, 1e300]', '"x"', '[-1, 3]', f'[1, {2**70}]'])
+def test_a_restart_that_makes_no_sense_is_none(tmp_path: Path, value: str) -> None:
+    entry = {'t_ns': '0', 'block': '0', 'values': f'{{"device.restart": {value}}}'}
+    with (tmp_path / 'a.mcap').open('wb') as stream:
+        writer = Writer(stream)
+        writer.start('ros2')
+        writer.add_metadata(META_CHANGE + '000001', entry)
+        writer.finish()
+    recording = open_recording(tmp_path / 'a.mcap')
+    assert recording.restarts == set()
+    assert recording.lost(0, 9, 8) == 2
+
+
 def test_a_block_in_two_messages_is_one_block_again(tmp_path: Path) -> None:
     whole = block(1)
     t_ns = whole.t_ns.copy()

@@ -22,6 +22,7 @@ from msg_adapters import RIG, TOPIC_TYPES, to_messages
 from psd_deflection import __version__
 from psd_deflection.config import load_rig
 from psd_deflection.errors import RecordingError
+from psd_deflection.files import HeldFolder
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.bag_writer import META_HELLO, META_PARAMETERS, META_SOFTWARE, BagWriter, McapFile
 
@@ -195,7 +196,9 @@ class SmallDisk(io.FileIO):
 
 
 def test_a_full_disk_ends_the_recording_with_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Path, 'open', lambda path, mode: io.BufferedWriter(SmallDisk(path, mode)))
+    monkeypatch.setattr(
+        HeldFolder, 'create', lambda folder, name: io.BufferedWriter(SmallDisk(folder.path / name, 'xb'))
+    )
     bag = BagWriter(tmp_path / 'run', rig_values={})
     monkeypatch.undo()
     records = list(run(1000))

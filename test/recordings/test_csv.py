@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 from decimal import Decimal
 from pathlib import Path
 
@@ -179,6 +180,11 @@ GOOD = [f'0.000,{ROW}', f'0.001,{ROW}']
         ([HEADER, *GOOD, f'1e30,{ROW}'], ":4: column t holds '1e30'; seconds from 0"),
         ([HEADER, *GOOD, f'inf,{ROW}'], ":4: column t holds 'inf'; seconds from 0"),
         ([HEADER, *GOOD, f'4294967296.0,{ROW}'], ":4: column t holds '4294967296.0'; seconds from 0"),
+        # Python reads these as numbers; in a recording they are typing errors.
+        ([HEADER, *GOOD, '0.002,1,1_000,3,4,5,6'], ":4: column y1 holds '1_000', which is not a number"),
+        ([HEADER, *GOOD, '0.002,1,٣,3,4,5,6'], ":4: column y1 holds '٣', which is not a number"),
+        ([HEADER, *GOOD, f'0.00_2,{ROW}'], ":4: column t holds '0.00_2', which is not a number"),
+        ([HEADER, *GOOD, f'٣,{ROW}'], ":4: column t holds '٣', which is not a number"),
         ([HEADER, *GOOD, f'soon,{ROW}'], ":4: column t holds 'soon', which is not a number"),
         ([HEADER, *GOOD, f'1.2.3,{ROW}'], ":4: column t holds '1.2.3', which is not a number"),
         ([HEADER + ',temperature', *(g + ',x' for g in GOOD)], ":2: column temperature holds 'x', which is not"),
@@ -279,6 +285,28 @@ def test_cells_may_be_quoted(tmp_path: Path) -> None:
     recording = open_recording(path)
     assert [s['x1'] for s in recording.samples] == [0.5 * i for i in range(40)]
     assert recording.warnings == [f'{path}:1: columns that are not read: note, of the operator']
+
+
+def test_a_text_in_a_column_that_is_not_read_is_no_matter(tmp_path: Path) -> None:
+    path = write(tmp_path / 'a.csv', HEADER + ',note', *(f'{line},half_way ٣' for line in GOOD))
+    assert len(open_recording(path).samples) == len(GOOD)
+
+
+def test_spaces_and_exponents_are_read(tmp_path: Path) -> None:
+    path = write(tmp_path / 'a.csv', HEADER, *GOOD, ' 2E-3 , +1.5,-.25e1,5.,0.5,0,5')
+    assert open_recording(path).samples[-1]['y1'] == -2.5
+
+
+@pytest.mark.parametrize('name', ['run.csv', 'run.mcap', 'run'])
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(RecordingError, match='is no file'):
+        open_recording(tmp_path / name)
+    folder = tmp_path / 'bag'
+    folder.mkdir()
+    os.mkfifo(folder / 'a.mcap')
+    with pytest.raises(RecordingError, match='is no bag'):
+        open_recording(folder)
 
 
 @pytest.mark.parametrize(

@@ -273,3 +273,15 @@ def test_a_repair_that_fails_leaves_the_file_as_it_was(tmp_path: Path, monkeypat
         recover(folder)
     assert [p.name for p in folder.iterdir()] == ['run_0.mcap']
     assert (folder / 'run_0.mcap').read_bytes() == before
+
+
+def test_metadata_is_not_written_through_a_link(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'run', rig_values={}) as bag:
+        bag.put(block(0))
+    theirs = tmp_path / 'theirs'
+    metadata = tmp_path / 'run' / 'metadata.yaml'
+    metadata.unlink()
+    metadata.symlink_to(theirs)
+    assert recover(tmp_path / 'run').metadata_written
+    assert not theirs.exists()
+    assert not metadata.is_symlink()

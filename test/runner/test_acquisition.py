@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import queue
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +20,8 @@ from psd_deflection.devices import contract_frames
 from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import Clock, Event, Received, Sample, Source, SourceEndedError
 from psd_deflection.errors import DeviceError
-from psd_deflection.protocol.frames import HelloFrame, PongFrame, encode
+from psd_deflection.protocol.frames import FrameDecoder, HelloFrame, PongFrame, encode
+from psd_deflection.records import RESTART
 from psd_deflection.runner import acquisition as module
 from psd_deflection.runner.acquisition import Acquisition, Arrival, Ended, Item, Restarted
 from psd_deflection.runner.pinger import UNANSWERED
@@ -99,7 +101,10 @@ def test_a_device_restart_continues_with_a_new_block(device: Any, run: Run, samp
     device.send_frames(*[sample(s) for s in range(4000, 4030)], *[sample(s) for s in range(20)])
     items = take(run.acquisition, 50)
     assert numbers(items) == [*range(4000, 4030), *range(4040, 4060)]
-    assert any(isinstance(i, Restarted) for i in items)
+    (restart,) = [i for i in items if isinstance(i, Restarted)]
+    assert restart.change is not None
+    assert restart.change.block == 202
+    assert dict(restart.change.values) == {RESTART: (4029, 4040)}
     assert run.acquisition.counters.restarts == 1
     t = [int(t) for i in items if isinstance(i, Arrival) for t in i.raw.t_ns]
     assert all(b > a for a, b in itertools.pairwise(t))
@@ -450,3 +455,24 @@ def test_a_device_that_answers_no_ping_is_left_in_peace(monkeypatch: pytest.Monk
 def test_a_device_that_cannot_be_asked_is_not_asked_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     source = Asked(30, knows=False, can_be_asked=False)
     assert (pinged(source, monkeypatch).counters.pings, source.asked) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ('t_us', 'why'), [(None, r'no sample for'), (2**53 + 1, r'bytes but no sample \(5 bad frames: body does not fit')]
+)
+def test_a_silence_says_which_frames_came_instead(
+    device: Any, run: Run, sample: Any, monkeypatch: pytest.MonkeyPatch, t_us: int | None, why: str
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(run.acquisition._repeats, 'tell', lambda name, line, *_: said.append(line))
+    size = 0
+    if t_us is not None:
+        frames = FrameDecoder().feed(b'\x00' + b''.join(encode(sample(s, t_us)) for s in range(5)))
+        run.acquisition.feed(frames, 0)
+        size = 100
+    monkeypatch.setattr(run.acquisition.source, 'wake', lambda: None)
+    run.acquisition._silent(size, 0)
+    assert re.search(why, said[0])
+    run.acquisition._silent(size, 0)
+    # The frames are those since the last line.
+    assert ('baud rate' in said[1]) == bool(size)

@@ -18,6 +18,7 @@ import pytest
 from psd_deflection.cli.main import main
 from psd_deflection.config import load_rig
 from psd_deflection.errors import RecordingError
+from psd_deflection.files import HeldFolder
 from psd_deflection.protocol.frames import SampleFrame
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import DeflectionEstimate, Record
@@ -41,7 +42,7 @@ class Disk:
         self.hangs_at = ''
         self.reached = threading.Event()
         self.go_on = threading.Event()
-        disk, real_open, real_fsync = self, Path.open, os.fsync
+        disk, real_create, real_fsync = self, HeldFolder.create, os.fsync
 
         class Stream(io.BufferedWriter):
             def write(self, content: Any) -> int:
@@ -52,17 +53,18 @@ class Disk:
                 disk.call('close')
                 super().close()
 
-        def opened(path: Path, mode: str = 'r', *arguments: Any, **named: Any) -> Any:
-            if mode != 'xb':
-                return real_open(path, mode, *arguments, **named)
+        def created(folder: HeldFolder, name: str) -> Any:
+            if not name.endswith('.mcap'):
+                return real_create(folder, name)
             disk.call('open')
-            return Stream(io.FileIO(path, mode))
+            real_create(folder, name).close()
+            return Stream(io.FileIO(folder.path / name, 'ab'))
 
         def synced(fd: int) -> None:
             disk.call('fsync')
             real_fsync(fd)
 
-        monkeypatch.setattr(Path, 'open', opened)
+        monkeypatch.setattr(HeldFolder, 'create', created)
         monkeypatch.setattr(os, 'fsync', synced)
 
     def call(self, what: str) -> None:

@@ -16,6 +16,7 @@ from rosbags.rosbag2 import Reader
 from msg_adapters import to_messages
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import RecordingError
+from psd_deflection.files import HeldFolder
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.repair import recover
@@ -118,9 +119,30 @@ def test_a_recording_that_is_taken_away_ends_with_one_line(tmp_path: Path, how: 
     assert run.recorder.folder is None
     if how == 'moved':
         assert [b.index for b in open_recording(tmp_path / 'elsewhere').blocks()][:1] == [0]
+        assert (tmp_path / 'elsewhere' / 'metadata.yaml').is_file()
     # The next one starts in a folder of its own.
     assert run.start(rig_for(tmp_path)).is_dir()
     run.stop()
+
+
+@pytest.mark.parametrize('noticed', ['while it runs', 'at its end'])
+def test_nothing_is_written_through_a_link_in_place_of_the_folder(tmp_path: Path, noticed: str) -> None:
+    run = Run(rig_for(tmp_path))
+    run.put(1)
+    run.folder.rename(tmp_path / 'elsewhere')
+    target = tmp_path / 'not ours'
+    target.mkdir()
+    (target / 'metadata.yaml').write_text('theirs')
+    run.folder.symlink_to(target)
+    if noticed == 'while it runs':
+        run.put(module.LOOK_EVERY)
+    else:
+        # It is told of no recording that is not there.
+        assert run.recorder.close() is None
+    assert 'was deleted or moved' in run.heard()
+    assert [p.name for p in target.iterdir()] == ['metadata.yaml']
+    assert (target / 'metadata.yaml').read_text() == 'theirs'
+    assert open_recording(tmp_path / 'elsewhere').complete
 
 
 def test_no_error_ends_a_recording_in_silence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,12 +169,12 @@ def test_a_folder_that_cannot_be_made_says_the_way_out(tmp_path: Path) -> None:
 def test_the_oldest_file_is_deleted_where_that_was_asked_for(
     tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def after_deletion(path: Path, *args: object) -> None:
-        disk.free += 100 * MB
-        unlink(path)
+    def after_deletion(folder: HeldFolder, name: str) -> None:
+        disk.free += 100 * MB * name.endswith('.mcap')
+        remove(folder, name)
 
-    unlink = Path.unlink
-    monkeypatch.setattr(Path, 'unlink', after_deletion)
+    remove = HeldFolder.remove
+    monkeypatch.setattr(HeldFolder, 'remove', after_deletion)
     mine = tmp_path / 'bags' / 'other' / 'other_0.mcap'
     mine.parent.mkdir(parents=True)
     mine.write_text('not of this recording')

@@ -70,9 +70,31 @@ def test_diagnostics_report_no_dots_while_the_device_is_away(running: Running, d
     assert said_of_dots() == [(STALE, 'no samples')] * 2
 
 
+def test_a_step_of_the_system_clock_moves_no_stamp_of_the_run(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    acquisition = running.session.acquisition
+    before = acquisition.now_ns()
+    real = time.time_ns
+    monkeypatch.setattr(time, 'time_ns', lambda: real() - 3600 * 10**9)
+    assert before <= acquisition.now_ns() < before + 600 * 10**9
+    assert acquisition.system_clock_step_ns() == pytest.approx(-3600e9, abs=1e9)
+
+
 def test_no_zero_is_taken_of_a_device_that_has_said_nothing_for_long(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, 'SILENT_S', -1e3)
     with pytest.raises(TimeoutError, match='no data flows'):
         running.session.zero()
+
+
+def test_the_start_says_what_another_rig_has_as_in_the_thesis(device: ScriptedDevice) -> None:
+    said: list[str] = []
+    rig = load_rig(
+        overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False, 'dynamics.torsion_frequency': 9.0}
+    )
+    Session(rig, said.append).close()
+    (line,) = [text for text in said if 'as in the thesis rig' in text]
+    assert 'dynamics.bending_frequency = 14.0 Hz' in line
+    assert 'torsion_frequency' not in line

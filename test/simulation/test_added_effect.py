@@ -20,8 +20,9 @@ from psd_deflection.cli.main import main
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.correction import Correction
 from psd_deflection.errors import ConfigError
+from psd_deflection.mechanics import LinkStatics
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.records import DeflectionEstimate, FloatArray, RawChunk
+from psd_deflection.records import Counts, DeflectionEstimate, FloatArray, RawChunk
 from psd_deflection.simulation import effects
 from psd_deflection.simulation.catalogue import FOLDERS, GROUP, catalogue, effect_names, effects_of_rig
 from psd_deflection.simulation.loads import sidebar
@@ -50,7 +51,7 @@ def rig(folder: Path) -> Rig:
     return load_rig(overrides=EFFECT)
 
 
-def poses(rig: Rig, counts: np.ndarray[tuple[int, ...], np.dtype[np.int16]]) -> FloatArray:
+def poses(rig: Rig, counts: Counts) -> FloatArray:
     """Estimates (blocks, 3) of a link that was at 20 degrees Celsius first and is at 30 now."""
     pipeline = Pipeline(rig)
     pipeline.temperature(20.0)
@@ -134,6 +135,30 @@ EFFECT = Effect('taller', 'optics', 's', 'e', 's', 'n', (EffectParameter('by', '
     assert not Correction.from_rig(load_rig(overrides={'effects.taller.by': 0.0})).active
 
 
+LOADED = """
+from psd_deflection.simulation.declaration import Effect, EffectParameter
+
+def _apply(chunk, values, state):
+    chunk.loads *= 1.0 + values['by']
+
+def _trace_back(block, values, remembered):
+    block.loads[:] = [load / (1.0 + values['by']) for load in block.loads]
+
+EFFECT = Effect('heavier', 'load', 's', 'e', 's', 'n', (EffectParameter('by', '', -0.5, 1.0, 1e-3, 'd'),),
+                'load', apply=_apply, trace_back=_trace_back)
+"""
+
+
+def test_its_load_is_traced_back_and_a_trace_that_fails_is_refused(folder: Path) -> None:
+    (folder / 'heavier.py').write_text(LOADED)
+    rig = load_rig(overrides={'effects.heavier.by': 0.25})
+    load = Pipeline(rig).tip_loads.tip_load(0, *LinkStatics.from_rig(rig).deflection(10.0, -20.0, 5.0))
+    assert load == pytest.approx((8.0, -16.0, 4.0))
+    (folder / 'broken.py').write_text(LOADED.replace('block.loads', 'block.forces').replace('heavier', 'broken'))
+    with pytest.raises(ConfigError, match=r'broken: trace_back fails on a pose .*forces'):
+        Pipeline(load_rig(overrides={'effects.broken.by': 0.25}))
+
+
 BROKEN = [
     ('def', 'SyntaxError'),
     ('import no_such_module', 'no_such_module'),
@@ -146,6 +171,7 @@ BROKEN = [
     (CODE.replace("point='dots'", "point='dot'"), "point = 'dot'"),
     (CODE.replace('    apply=_apply,\n', ''), 'needs apply'),
     (CODE.replace("{'temperature'}", "{'weather'}"), 'weather'),
+    (CODE.replace('correct=', 'trace_back='), 'trace_back is for the points load, static and pose'),
     (CODE.replace("'relative growth per kelvin'", "'', kind='phase'"), 'amplitude'),
 ]
 

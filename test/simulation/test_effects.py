@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import yaml
 
-from psd_deflection.config import load_rig, rig_from_values
+from psd_deflection.config import Rig, load_rig, replace_values, rig_from_values
 from psd_deflection.correction import Correction
 from psd_deflection.errors import ConfigError
-from psd_deflection.records import FloatArray
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import FloatArray, RawChunk, TipLoad
 from psd_deflection.simulation import loads
 from psd_deflection.simulation.catalogue import catalogue, effects_of_rig, effects_to_values, make_active
 from psd_deflection.simulation.declaration import ActiveEffect, Effect
@@ -34,7 +35,7 @@ HISTORY = loads.steps([(0, 0, 0), (5, -50, -29), (60, 10, 20), (20, -25, 10)], 0
 WARM = 20.0 + 5.0 * np.linspace(0, 1, len(HISTORY)) ** 2
 
 
-def typical(effect: Effect, choice: dict[str, float]) -> ActiveEffect:
+def typical(effect: Effect, choice: dict[str, float], probes: float = 10.0) -> ActiveEffect:
     """Every amplitude ten probes away from off, so that the effect shows."""
     values = effect.off_values(Physics.of(RIG), choice)
     for p in effect.parameters:
@@ -44,7 +45,7 @@ def typical(effect: Effect, choice: dict[str, float]) -> ActiveEffect:
             elif effect.finite and p.grid:
                 values[p.name] = p.grid[-1]
             else:
-                values[p.name] = min(max(values[p.name] + 10.0 * p.scale, p.minimum), p.maximum)
+                values[p.name] = min(max(values[p.name] + probes * p.scale, p.minimum), p.maximum)
         elif p.kind == 'coupled':
             values[p.name] = p.scale
     return ActiveEffect(effect, values)
@@ -55,6 +56,18 @@ EVERY = [
     for name, effect in catalogue().items()
     for choice in effect.variants()
 ]
+
+
+STRONG = [
+    pytest.param(typical(effect, choice, 100.0), id=f'{name}-{[int(v) for v in choice.values()]}')
+    for name, effect in catalogue().items()
+    if effect.stage in ('load', 'link')
+    for choice in effect.variants()
+]
+
+
+def rig_values(effects: list[ActiveEffect]) -> dict[str, object]:
+    return {f'effects.{k}.{n}': v for k, body in effects_to_values(effects).items() for n, v in body.items()}
 
 
 def volts_of(effects: list[ActiveEffect]) -> FloatArray:
@@ -82,9 +95,7 @@ def test_on_is_on_and_off_is_off(active: ActiveEffect) -> None:
 
 @pytest.mark.parametrize('active', EVERY)
 def test_in_pieces_bit_for_bit(active: ActiveEffect) -> None:
-    rig = rig_from_values(
-        {f'effects.{k}.{n}': v for k, body in effects_to_values([active]).items() for n, v in body.items()}
-    )
+    rig = rig_from_values(rig_values([active]))
     whole = RigSimulator(rig, 5).step(HISTORY, WARM)
     pieces = RigSimulator(rig, 5)
     cuts = [0, 1, 2, 3, 10, 299, 301, 640, len(HISTORY)]
@@ -169,6 +180,35 @@ def test_all_corrections_together() -> None:
     after = Correction.from_rig(rig).apply(seen.dots.T, seen.sums.T, seen.warmer, seen.t).T
     assert np.abs(after - nominal.dots).max() < 1e-7
     assert np.abs(seen.dots - nominal.dots).max() > 1e-5
+
+
+LOADS = ((10.0, -25.0, -12.0), (20.0, -40.0, -20.0), (-5.0, 10.0, 8.0))
+HELD_S = 12
+
+
+def wrenches(rig: Rig, volts: FloatArray) -> FloatArray:
+    """The published load (3, 3), N, N, N m, at the end of each of ``LOADS``, of volts (n, 6)."""
+    seq = np.arange(len(volts))
+    chunk = RawChunk(seq, seq * 1_000_000, volts.astype(np.float32), np.zeros(len(seq), np.uint8))
+    found = [(r.fx, r.fy, r.tz) for r in Pipeline(rig).process(chunk) if isinstance(r, TipLoad)]
+    return np.array(found)[np.arange(1, 4) * 50 * HELD_S - 1]
+
+
+@pytest.mark.parametrize('active', STRONG)
+def test_the_wrench_is_the_load(active: ActiveEffect) -> None:
+    """Within 0.1 % of it, once the link rests; where the effect displaces the tip, only if it is traced back."""
+    calm = {'block_fit': 'mean', 'covariance': 'file', 'solvers': ['exact']}
+    known = load_rig(overrides={**calm, **rig_values([active])})
+    volts, nominal = (
+        ForwardModel(load_rig(), effects).run(loads.steps(list(LOADS), HELD_S).loads).volts.T
+        for effects in ([active], [])
+    )
+    found, blind = wrenches(known, volts), wrenches(load_rig(overrides=calm), volts)
+    size = np.linalg.norm(LOADS, axis=1, keepdims=True)
+    assert (np.abs(found - LOADS) < 1e-3 * size).all()
+    moved = np.abs(volts[-1] - nominal[-1]).max() > 0.05
+    assert not moved or (np.abs(blind - LOADS) > 1e-3 * size).any()
+    assert (wrenches(replace_values(known, {'wrench': 'nominal'}), volts) == blind).all()
 
 
 def test_a_rig_without_effects_corrects_nothing() -> None:

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_variances
 from psd_deflection.config import load_rig
 from psd_deflection.devices.serve import served_loads
 from psd_deflection.errors import RecordingError
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation import loads
+from psd_deflection.simulation.catalogue import make_active
+from psd_deflection.simulation.declaration import ActiveEffect
 from psd_deflection.simulation.modes import Filter, mode_coefficients
 from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
 
@@ -73,7 +76,6 @@ def test_dots_obey_the_contract_equation() -> None:
 def test_converter_rounds_and_clips() -> None:
     far = loads.constant((4000.0, -4000.0, 0.0), 1.0)
     counts = RigSimulator(load_rig()).step(far.loads).counts
-    assert counts.dtype == np.int16
     assert counts.min() == -32768
     assert counts.max() == 32767
 
@@ -125,3 +127,92 @@ def test_bad_load_file_is_refused_by_line(tmp_path: Path, text: str, said: str) 
         loads.from_csv(path)
     assert 'loads.csv' in str(error.value)
     assert said in str(error.value)
+
+
+OWN = {
+    'psd_1.noise': [1e-3, 2e-3],
+    'psd_2.noise': [4e-3, 3e-3],
+    'psd_1.sensitivity': [1e-3, 0.0],
+    'psd_2.sensitivity': [0.0, 0.25e-3],
+}
+
+
+def test_each_channel_has_its_own_noise_and_sensitivity() -> None:
+    rig = load_rig(overrides=OWN)
+    step = RigSimulator(rig, seed=4).step(loads.constant((3.0, -5.0, 1.0), 20.0).loads)
+    volts = counts_to_volts(step.counts, rig.converter.volts_per_count)
+    error = Calibration.from_rig(rig).dots(volts) - step.dots
+    assert np.abs(error.mean(axis=0)).max() < 1e-7
+    np.testing.assert_allclose(error.var(axis=0), dot_noise_variances(rig), rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ('name', 'values'),
+    [('quantisation', {'step': 0.01}), ('quantisation', {'step': 0.04}), ('amplifier_saturation', {'limit': 0.4})],
+)
+def test_the_mean_over_the_noise_is_over_each_channels_own(name: str, values: dict[str, float]) -> None:
+    history = loads.constant((3.0, -5.0, 1.0), 0.3).loads
+    effects = [make_active(name, values, 'test')]
+    mixed = ForwardModel(load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [4e-3, 2e-3]}), effects)
+    volts = mixed.expect(history).volts
+    for row, noise in enumerate((1e-3, 2e-3, 2e-3, 4e-3, 2e-3, 2e-3)):
+        same = ForwardModel(load_rig(overrides={'amplifier.noise': noise}), effects).expect(history).volts
+        assert (volts[row] == same[row]).all()
+        assert row in (1, 2, 4, 5) or (same[row] != ForwardModel(load_rig(), effects).expect(history).volts[row]).any()
+
+
+STEPS = [(0.0, 0.0, 0.0), (5.0, -40.0, -20.0), (-10.0, 0.0, 10.0)]
+FINER = 10
+
+
+def fine_volts() -> FloatArray:
+    """Volts (6, n FINER + 1) of the nominal rig at 10 kHz, the loads held for 1 ms."""
+    fine = load_rig(overrides={'converter.sample_rate_hz': 1e3 * FINER})
+    history = np.repeat(loads.steps(STEPS, 0.05).loads, FINER, axis=0)
+    return ForwardModel(fine).run(np.concatenate((history, history[-1:]))).volts
+
+
+def effect_volts(*effects: ActiveEffect) -> FloatArray:
+    return ForwardModel(load_rig(), effects).run(loads.steps(STEPS, 0.05).loads).volts
+
+
+@pytest.mark.parametrize('delay', [0.4e-3, 1e-3, 3.7e-3])
+def test_a_delay_is_exact_just_after_a_load_step_too(delay: float) -> None:
+    late = round(delay * 1e3 * FINER)
+    fine = fine_volts()
+    expected = fine[:, :-1:FINER].copy()
+    expected[3:] = np.concatenate((np.repeat(fine[3:, :1], late, axis=1), fine[3:]), axis=1)[:, : -1 - late : FINER]
+    found = effect_volts(make_active('channel_skew', {'psd': 2, 'delay': delay}, 'test'))
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-10)
+    assert np.abs(expected - fine[:, :-1:FINER]).max() > 1e-2
+
+
+def lagged(fine: FloatArray, tau: float) -> FloatArray:
+    """tau y' = u - y at all places of ``fine``; in each millisecond u is the polynomial through its 11 values."""
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    places = np.linspace(0.0, 1.0, FINER + 1)
+    out = np.empty_like(fine)
+    out[:, 0] = fine[:, 0]
+    # The whole milliseconds first: the others begin with them.
+    for step in range(FINER, 0, -1):
+        end = places[step]
+        s = 0.5 * end * (nodes + 1.0)
+        kernel = 0.5 * end * weights * 1e-3 / tau * np.exp(-1e-3 / tau * (end - s))
+        basis = np.array([np.prod([(s - b) / (a - b) for b in places if b != a], axis=0) for a in places])
+        for start in range(0, fine.shape[1] - 1, FINER):
+            kept = np.exp(-1e-3 / tau * end) * out[:, start]
+            out[:, start + step] = kept + fine[:, start : start + FINER + 1] @ basis @ kernel
+    return out
+
+
+@pytest.mark.parametrize('tau', [0.3e-3, 3e-3])
+def test_a_lag_is_exact_just_after_a_load_step_too(tau: float) -> None:
+    fine = fine_volts()
+    expected = lagged(fine, tau)
+    lag = make_active('amplifier_lag', {'time_constant': tau}, 'test')
+    np.testing.assert_allclose(effect_volts(lag), expected[:, :-1:FINER], rtol=0.0, atol=3e-7)
+    assert np.abs(expected - fine).max() > 1e-2
+    # And read late.
+    skew = make_active('channel_skew', {'psd': 1, 'delay': 0.4e-3}, 'test')
+    late = np.concatenate((np.repeat(fine[:3, :1], 4, axis=1), expected[:3, :-4]), axis=1)
+    np.testing.assert_allclose(effect_volts(lag, skew)[:3], late[:, :-1:FINER], rtol=0.0, atol=3e-7)

@@ -25,7 +25,7 @@ METHODS: list[tuple[str, dict[str, Any], str]] = [
     ('wls', {'weights': 'thesis'}, 'wls_sidebar'),
     ('wls', {'weights': 'thesis', 'row_scaling': SIDEBAR}, 'wls_sidebar'),
     ('wls', {'weights': 'thesis', 'row_scaling': DIRECT}, 'wls_direct'),
-    ('minimum_tilt', {}, 'min_tilt'),
+    ('minimum_tilt', {'angles': 'azimuth'}, 'min_tilt'),
     ('beam', {}, 'beam_gn_k1.5'),
     ('iterative_printed', {}, 'iter_22_printed'),
     ('iterative_printed', {'criterion': 'absolute'}, 'iter_22_abs'),

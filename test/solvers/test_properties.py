@@ -171,9 +171,11 @@ def test_turning_or_mirroring_the_rig_does_so_to_the_answer(
     dots = rays.tip_dots(geometry, (*pose, 0.0, 0.0)) + noise
     c, s = np.cos(angle), np.sin(angle)
     matrix = np.array([[c, -s], [s, c]]) @ np.diag([-1.0 if flip else 1.0, 1.0])
-    here = make_solver(method, geometry).solve(tuple(dots.tolist()), ISOTROPIC)
+    # The angles of one rotation turn with it as a whole, not one by one.
+    options = {'angles': 'azimuth'} if method == 'minimum_tilt' else {}
+    here = make_solver(method, geometry, **options).solve(tuple(dots.tolist()), ISOTROPIC)
     there_dots = (dots.reshape(-1, 2) @ matrix.T).ravel()
-    there = make_solver(method, turned(geometry, matrix)).solve(tuple(there_dots.tolist()), ISOTROPIC)
+    there = make_solver(method, turned(geometry, matrix), **options).solve(tuple(there_dots.tolist()), ISOTROPIC)
     np.testing.assert_allclose(there[:2], matrix @ here[:2], rtol=0.0, atol=1e-9)
     assert there.theta == pytest.approx(-here.theta if flip else here.theta, abs=1e-9)
     if (here.phi == here.omega == 0.0) != (there.phi == there.omega == 0.0):
@@ -226,13 +228,12 @@ def test_minimum_tilt_explains_the_dots_with_no_more_tilt_than_there_was(
     one = make_solver('minimum_tilt', geometry).solve(tuple(dots.tolist()), ISOTROPIC)
     lean = np.arccos(np.cos(one.phi) * np.cos(one.omega))
     assert lean <= np.arccos(np.cos(tilt[0]) * np.cos(tilt[1])) + 1e-7
-    # The plate leaned by (phi, omega) and turned so that its base line lies as found has these very dots.
-    normal = rays.rotation(0.0, one.phi, one.omega)[:, 2]
-    axis = np.cross([0.0, 0.0, 1.0], normal)
-    size = np.linalg.norm(axis)
-    lean_matrix = np.eye(3)
-    if size > 1e-9:
-        lean_matrix = Rotation.from_rotvec(axis / size * lean).as_matrix()
-    r = lean_matrix @ rays.rotation(one.theta, 0.0, 0.0)
+    # The plate at the published pose has these very dots.
+    r = rays.rotation(one.theta, one.phi, one.omega)
+    np.testing.assert_allclose(rays.tip_dots(geometry, one[:5]), dots, rtol=0.0, atol=1e-9)
+    azimuth = make_solver('minimum_tilt', geometry, angles='azimuth').solve(tuple(dots.tolist()), ISOTROPIC)
+    assert azimuth[:2] + azimuth[3:5] == one[:2] + one[3:5]
+    quaternion = Rotation.from_matrix(r).as_quat()
+    assert azimuth.theta == pytest.approx(2.0 * np.arctan2(quaternion[2], quaternion[3]), abs=1e-9)
     for i, q in enumerate(geometry.centers + dots.reshape(2, 2)):
         np.testing.assert_allclose(r[:2, :2] @ q + one[:2], geometry.beams[i], rtol=0.0, atol=1e-9)

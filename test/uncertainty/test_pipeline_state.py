@@ -7,8 +7,9 @@ import pytest
 
 from blind import generator
 from psd_deflection.config import Rig, load_rig, rig_as_recorded
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.records import BlockStatus, DeflectionEstimate, RawChunk, Record, SpotMeans
+from psd_deflection.pipeline import TIP_LOADS, Pipeline
+from psd_deflection.records import BlockStatus, DeflectionEstimate, RawChunk, Record, SpotMeans, TipLoad
+from psd_deflection.simulation.simulator import RigSimulator
 
 
 def volts(seconds: int, seed: int, dead: int | None = None) -> generator.Array:
@@ -51,12 +52,62 @@ def test_a_recording_begun_at_any_block_replays_to_the_bit(start: int, dead: int
     assert estimates(list(Pipeline(rig).process(rest))) != expected
 
 
+EFFECTS = {
+    'effects.a.name': 'creep',
+    'effects.a.amplitude': 0.1,
+    'effects.b.name': 'clamp_friction',
+    'effects.b.width': 1e-3,
+    'effects.c.name': 'self_weight',
+    'effects.c.weight_per_length': 2.0,
+}
+
+
+def loads_of(records: list[Record]) -> list[TipLoad]:
+    return [r for r in records if isinstance(r, TipLoad)]
+
+
+@pytest.mark.parametrize('start', [1, 151, 251])
+@pytest.mark.parametrize('zeroed', [False, True])
+def test_what_effects_of_the_link_remember_replays_to_the_bit(start: int, zeroed: bool) -> None:
+    rig = load_rig(overrides=EFFECTS)
+    samples = volts(7, 1)
+    live = Pipeline(rig)
+    list(live.process(chunk(samples[: 20 * start])))
+    if zeroed:
+        live.tip_loads.zeroed = True
+    memory = live.memory(rig)
+    rest = chunk(samples[20 * start :], 20 * start)
+    expected = loads_of(list(live.process(rest)))
+    replay = Pipeline(rig)
+    assert memory is not None
+    replay.apply(memory)
+    assert loads_of(list(replay.process(rest))) == expected
+    without = Pipeline(rig)
+    without.apply(memory._replace(values=tuple(v for v in memory.values if v[0] != TIP_LOADS)))
+    assert loads_of(list(without.process(rest))) != expected
+
+
+def test_the_sag_is_in_a_zero_that_was_taken() -> None:
+    rig = load_rig(overrides={'effects.c.name': 'self_weight', 'effects.c.weight_per_length': 2.0})
+    pipeline = Pipeline(rig)
+    counts = RigSimulator(rig, 1).step(np.zeros((4000, 3))).counts
+    for half in (slice(0, 2000), slice(2000, 4000)):
+        seq = np.arange(half.start, half.stop)
+        raw = RawChunk(seq, seq * 1_000_000, counts[half], np.zeros(len(seq), np.uint8), rig.converter.volts_per_count)
+        records = list(pipeline.process(raw))
+        assert np.mean([r.fy for r in loads_of(records)]) == pytest.approx(0.0, abs=2e-3)
+        assert pipeline.zero() is not None
+    # The sag of 20 um is in the zero now.
+    assert np.mean([e.dy for e in estimates(records)]) == pytest.approx(0.0, abs=1e-7)
+
+
 def test_a_recording_from_before_has_the_mean_and_the_rig_files_noise() -> None:
     named = dict(load_rig().values)
-    for name in ('block_fit', 'covariance', 'consistency'):
+    for name in ('block_fit', 'covariance', 'consistency', 'wrench', 'minimum_tilt.angles'):
         del named[name]
     then = rig_as_recorded(named, 'test').estimator
     assert (then.block_fit, then.covariance, then.consistency) == ('mean', 'file', 'report')
+    assert (then.wrench, then.minimum_tilt_angles) == ('nominal', 'azimuth')
     # What it does name stays, and a recording that names nothing has today's defaults.
     assert rig_as_recorded({**named, 'covariance': 'measured'}, 'test').estimator.covariance == 'measured'
     assert rig_as_recorded({}, 'test').estimator == load_rig().estimator

@@ -2,21 +2,45 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
+from scipy.signal import lfilter
+
+from psd_deflection.records import FloatArray
 from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
-from psd_deflection.simulation.modes import Filter, lag_coefficients
+from psd_deflection.simulation.modes import LAG_NODES, lag_weights
 
 
 def _apply(chunk: Chunk, values: Values, state: State) -> None:
-    if chunk.t.size == 0 or values['time_constant'] <= 1e-9:
+    tau, p = values['time_constant'], chunk.physics
+    if chunk.t.size == 0 or tau <= 1e-9:
         return
-    for row in range(6):
-        key = str(row)
-        if key not in state:
-            state[key] = Filter(
-                lag_coefficients(values['time_constant'], chunk.physics.period), float(chunk.volts[row, 0])
-            )
-        chunk.volts[row] = state[key](chunk.volts[row])
+    first, *weights, last = lag_weights(tau, p.period)
+    here = chunk.between(0.0)
+    # What each interval's inputs add at its end, but for the one there.
+    added = first * here
+    for weight, node in zip(weights, LAG_NODES[1:], strict=False):
+        added += weight * chunk.between(node * p.period)
+    kept = math.exp(-p.period / tau)
+    if not state:
+        # Settled until the first sample.
+        state['added'] = (1.0 - last - kept) * here[:, :1]
+        state['lag'] = kept * here[:, :1]
+    drive = np.concatenate((state['added'], added[:, :-1]), axis=1) + last * here
+    lagging, state['lag'] = lfilter([1.0], [1.0, -kept], drive, zi=state['lag'])
+    state['added'] = added[:, -1:]
+    chunk.volts[:] = lagging if p.phase == 0.0 else _later(chunk, lagging, tau)
+
+
+def _later(chunk: Chunk, lagging: FloatArray, tau: float) -> FloatArray:
+    """The output ``phase`` after the samples at which it is ``lagging`` (6, n)."""
+    phase = chunk.physics.phase
+    out = math.exp(-phase / tau) * lagging
+    for weight, node in zip(lag_weights(tau, phase), LAG_NODES, strict=True):
+        out += weight * chunk.between(node * phase)
+    return np.asarray(out)
 
 
 EFFECT = Effect(

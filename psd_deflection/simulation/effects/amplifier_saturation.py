@@ -25,8 +25,8 @@ def _excess(v: FloatArray, sigma: float) -> FloatArray:
 def _apply(chunk: Chunk, values: Values, state: State) -> None:
     rows = range(6) if values['sums'] else DOT_CHANNELS
     for row in rows:
-        v = chunk.volts[row]
-        chunk.volts[row] = v - _excess(v - values['limit'], chunk.noise) + _excess(-v - values['limit'], chunk.noise)
+        v, noise = chunk.volts[row], float(chunk.noise[row])
+        chunk.volts[row] = v - _excess(v - values['limit'], noise) + _excess(-v - values['limit'], noise)
 
 
 EFFECT = Effect(

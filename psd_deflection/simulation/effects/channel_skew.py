@@ -1,7 +1,7 @@
 """The samples of one PSD are late.
 
-Values between samples come from a cubic through four samples. Future samples are not used, so a
-live device can do the same.
+Volts between samples come from the model at that time, so a delay of any size is exact, just after a
+load step too. No future sample is used: a value before a sample is one after the sample before.
 """
 
 from __future__ import annotations
@@ -17,30 +17,21 @@ from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, 
 def _apply(chunk: Chunk, values: Values, state: State) -> None:
     if chunk.t.size == 0:
         return
-    steps = values['delay'] / chunk.physics.period
-    whole = math.floor(steps)
-    part = steps - whole
-    # Four nodes around the wanted time; one-sided if a centred cubic would need the next sample.
-    first = whole - 1 if whole >= 1 else 0
-    where = steps - first
+    p = chunk.physics
+    steps = (values['delay'] - p.phase) / p.period
+    whole = math.ceil(steps)
+    if abs(steps - round(steps)) < 1e-9:
+        whole = round(steps)
+        steps = float(whole)
     psd = int(values['psd']) - 1
-    for row in range(3 * psd, 3 * psd + 3):
-        now = chunk.volts[row]
-        if part == 0.0 and whole == 0:
-            continue
-        before = state.get(str(row))
-        if before is None:
-            before = np.full(first + 3, now[0])
-        line = np.concatenate((before, now))
-        state[str(row)] = line[len(line) - (first + 3) :].copy()
-        late = np.zeros(len(now))
-        for node in range(4):
-            weight = 1.0
-            for other in range(4):
-                if other != node:
-                    weight *= (where - other) / (node - other)
-            late += weight * line[3 - node : 3 - node + len(now)]
-        chunk.volts[row] = late
+    rows = slice(3 * psd, 3 * psd + 3)
+    now = chunk.between((whole - steps) * p.period)[rows]
+    if 'before' not in state:
+        # At rest until the first sample.
+        state['before'] = np.repeat(chunk.between(0.0)[rows, :1], whole, axis=1)
+    line = np.concatenate((state['before'], now), axis=1)
+    state['before'] = line[:, line.shape[1] - whole :].copy()
+    chunk.volts[rows] = line[:, : now.shape[1]]
 
 
 EFFECT = Effect(

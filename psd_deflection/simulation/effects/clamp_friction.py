@@ -10,7 +10,7 @@ import numpy as np
 
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.chunk import Chunk
-from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
 
 
 def play(x: FloatArray, half_width: float, start: float) -> FloatArray:
@@ -29,16 +29,46 @@ def play(x: FloatArray, half_width: float, start: float) -> FloatArray:
     return np.repeat(settled, np.diff(np.concatenate((kept, [len(x)]))))
 
 
+_REST_BLOCKS = 12
+"""Blocks in which the link is at rest if it has not moved by more than a quarter of the loop."""
+
+
+def _levers(axis: float, length: float) -> tuple[float, float, float]:
+    """m or rad of dX, dY, theta per rad of the clamp; 0 where the clamp does not stick."""
+    bending, torsion = (length if axis != 2 else 0.0), (1.0 if axis != 1 else 0.0)
+    return bending, bending, torsion
+
+
+def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:
+    """The deflection without friction: half a loop further on, the way the link last moved from rest to rest.
+
+    The load of a link that sticks can be anywhere in the loop. ``remembered``, of each axis: where the link last
+    rested, which way it came there (-1, 0, 1), then its last blocks.
+    """
+    length = 2 + _REST_BLOCKS
+    if not remembered:
+        # Unloaded until now.
+        remembered += [0.0] * (3 * length)
+    for row, lever in enumerate(_levers(values['axis'], block.physics.length)):
+        half = 0.5 * values['width'] * lever
+        rested, way, _, *recent = remembered[length * row : length * (row + 1)]
+        place = block.pose[row]
+        recent.append(place)
+        if abs(place - rested) > 0.5 * half:
+            now = 1.0 if place > rested else -1.0
+            if max(recent) - min(recent) <= 0.5 * half:
+                rested, way = place, now
+        else:
+            now = way
+        remembered[length * row : length * (row + 1)] = [rested, way, *recent]
+        block.pose[row] += now * half
+
+
 def _apply(chunk: Chunk, values: Values, state: State) -> None:
     if chunk.t.size == 0 or values['width'] <= 0.0:
         return
-    axis = int(values['axis'])
-    for row, on, lever in (
-        (0, axis != 2, chunk.physics.length),
-        (1, axis != 2, chunk.physics.length),
-        (2, axis != 1, 1.0),
-    ):
-        if on:
+    for row, lever in enumerate(_levers(values['axis'], chunk.physics.length)):
+        if lever > 0.0:
             lagging = play(chunk.static[row], 0.5 * values['width'] * lever, state.get(str(row), 0.0))
             state[str(row)] = float(lagging[-1])
             chunk.static[row] = lagging
@@ -59,5 +89,6 @@ EFFECT = Effect(
     ),
     point='static',
     apply=_apply,
+    trace_back=_trace_back,
     order=3,
 )

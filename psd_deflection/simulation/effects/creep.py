@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 from psd_deflection.simulation.chunk import Chunk
-from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
 from psd_deflection.simulation.modes import Filter, held_lag_coefficients
 
 
@@ -13,6 +15,18 @@ def _apply(chunk: Chunk, values: Values, state: State) -> None:
         if key not in state:
             state[key] = Filter(held_lag_coefficients(values['time_constant'], chunk.physics.period))
         chunk.static[row] += values['amplitude'] * state[key](chunk.static[row])
+
+
+def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:
+    """The deflection before creep, held over the block: p = q + amplitude y, tau y' = q - y."""
+    if not remembered:
+        # Unloaded until now.
+        remembered += [0.0, 0.0, 0.0]
+    amplitude, kept = values['amplitude'], math.exp(-block.seconds / values['time_constant'])
+    for row in range(3):
+        grown = block.pose[row] - amplitude * kept * remembered[row]
+        block.pose[row] = grown / (1.0 + amplitude * (1.0 - kept))
+        remembered[row] = kept * remembered[row] + (1.0 - kept) * block.pose[row]
 
 
 EFFECT = Effect(
@@ -38,5 +52,6 @@ EFFECT = Effect(
     ),
     point='static',
     apply=_apply,
+    trace_back=_trace_back,
     order=4,
 )

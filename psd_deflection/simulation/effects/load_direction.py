@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from psd_deflection.simulation.chunk import Chunk
-from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
 
 
 def _apply(chunk: Chunk, values: Values, state: State) -> None:
@@ -13,6 +13,12 @@ def _apply(chunk: Chunk, values: Values, state: State) -> None:
     fx, fy = chunk.loads[0].copy(), chunk.loads[1].copy()
     chunk.loads[0] = c * fx - s * fy
     chunk.loads[1] = s * fx + c * fy
+
+
+def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:
+    c, s = math.cos(values['angle']), math.sin(values['angle'])
+    fx, fy, _ = block.loads
+    block.loads[:2] = c * fx + s * fy, c * fy - s * fx
 
 
 EFFECT = Effect(
@@ -25,5 +31,6 @@ EFFECT = Effect(
     parameters=(EffectParameter('angle', 'rad', -3.2, 3.2, 1e-3, 'turn of the force about +Z'),),
     point='load',
     apply=_apply,
+    trace_back=_trace_back,
     order=0,
 )

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from psd_deflection.simulation.chunk import Chunk
-from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
 
 
 def _apply(chunk: Chunk, values: Values, state: State) -> None:
     chunk.loads[2] += values['x'] * chunk.loads[1] - values['y'] * chunk.loads[0]
+
+
+def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:
+    block.loads[2] -= values['x'] * block.loads[1] - values['y'] * block.loads[0]
 
 
 EFFECT = Effect(
@@ -23,5 +27,6 @@ EFFECT = Effect(
     ),
     point='load',
     apply=_apply,
+    trace_back=_trace_back,
     order=1,
 )

@@ -10,31 +10,34 @@ import math
 
 import numpy as np
 
+from psd_deflection.records import FloatArray
 from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
-    step = values['step']
-    if step <= 0.0:
-        return
-    if chunk.noise <= 0.0:
-        chunk.volts[:] = np.rint(chunk.volts / step) * step
-        return
-    if step > 8.0 * chunk.noise:
+def _rounded(volts: FloatArray, noise: float, step: float) -> FloatArray:
+    """``volts`` (n,) to multiples of ``step``; the mean over ``noise`` if that is above 0. V."""
+    if noise <= 0.0:
+        return np.asarray(np.rint(volts / step) * step)
+    if step > 8.0 * noise:
         # The series converges slowly here: average the rounding over the noise directly.
         nodes, weights = np.polynomial.hermite_e.hermegauss(41)
-        mean = np.zeros_like(chunk.volts)
+        mean = np.zeros_like(volts)
         for node, weight in zip(nodes, weights, strict=True):
-            mean += weight / math.sqrt(2.0 * math.pi) * np.rint((chunk.volts + chunk.noise * node) / step)
-        chunk.volts[:] = mean * step
-        return
-    bias = np.zeros_like(chunk.volts)
+            mean += weight / math.sqrt(2.0 * math.pi) * np.rint((volts + noise * node) / step)
+        return mean * step
+    bias = np.zeros_like(volts)
     for k in range(1, 12):
-        size = (-1.0) ** k / k * math.exp(-2.0 * (math.pi * k * chunk.noise / step) ** 2)
+        size = (-1.0) ** k / k * math.exp(-2.0 * (math.pi * k * noise / step) ** 2)
         if abs(size) > 1e-9:
-            bias += size * np.sin(2.0 * math.pi * k / step * chunk.volts)
-    chunk.volts += step / math.pi * bias
+            bias += size * np.sin(2.0 * math.pi * k / step * volts)
+    return volts + step / math.pi * bias
+
+
+def _apply(chunk: Chunk, values: Values, state: State) -> None:
+    if values['step'] > 0.0:
+        for row, noise in enumerate(chunk.noise.tolist()):
+            chunk.volts[row] = _rounded(chunk.volts[row], noise, values['step'])
 
 
 EFFECT = Effect(

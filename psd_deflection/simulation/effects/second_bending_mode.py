@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from psd_deflection.simulation.chunk import Chunk
-from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
 from psd_deflection.simulation.modes import Filter, mode_coefficients
 from psd_deflection.simulation.physics import Physics
 
@@ -20,14 +20,21 @@ def _apply(chunk: Chunk, values: Values, state: State) -> None:
         key = str(row)
         if key not in state:
             p = chunk.physics
-            state[key] = Filter(mode_coefficients(values['frequency'], values['damping_ratio'], p.period))
-            state['first' + key] = Filter(mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period))
+            state[key] = Filter(mode_coefficients(values['frequency'], values['damping_ratio'], p.period, p.phase))
+            first = mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period, p.phase)
+            state['first' + key] = Filter(first)
         ringing = state[key](chunk.static[row])
         if values['shares'] == 1:
             ringing = ringing - state['first' + key](chunk.static[row])
         elif values['shares'] == 2:
             ringing = ringing - chunk.static[row]
         chunk.pose[row] += values['gain'] * ringing
+
+
+def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:
+    if values['shares'] == 0:
+        block.pose[0] /= 1.0 + values['gain']
+        block.pose[1] /= 1.0 + values['gain']
 
 
 EFFECT = Effect(
@@ -68,4 +75,5 @@ EFFECT = Effect(
     ),
     point='pose',
     apply=_apply,
+    trace_back=_trace_back,
 )

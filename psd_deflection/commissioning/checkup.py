@@ -1,0 +1,241 @@
+"""The check of a rig: what its rig file has wrong, how sure that is, and the lines that put it right."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from psd_deflection.calibration import Wiring
+from psd_deflection.commissioning.levels import NOISE_FACTOR, SUM_FACTOR, Levels
+from psd_deflection.commissioning.wirings import (
+    DOTS,
+    LIMIT,
+    MARGIN,
+    Candidate,
+    Difference,
+    Response,
+    candidates,
+    differences,
+    misfit,
+    parameters,
+)
+from psd_deflection.config import Rig
+from psd_deflection.records import FloatArray
+
+RIGHT, WRONG, CANNOT_TELL = 'right', 'wrong', 'cannot_tell'
+
+DEAD = 0.1
+"""A channel that moves less than this share of every push does not answer."""
+
+SIZE_FACTOR = 1.1
+"""A movement that is so many times the expected one, or so many times less, is told."""
+
+UNITS = {9.80665: 'kg for N', 1.0 / 9.80665: 'N for kg', 1000.0: 'kN for N', 1e-3: 'mN for N'}
+UNIT_TOLERANCE = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is not as the rig file or the recording says.
+
+    ``name``: channel_sign, axis_swap, psd_swap, load_sign, load_unit, load_coverage, stuck_channel, noise_level.
+    ``where``: channel, PSD or load. ``value``: -1 for a turned sign, or a factor. ``fix``: the line for the rig file,
+    or what to do. ``evidence``: how much more of the movement (summed over the pushes) the rig file leaves unexplained.
+    ``equivalent``: other causes that look the same to first order.
+    """
+
+    name: str
+    where: str
+    value: float | None
+    fix: str
+    evidence: float = 0.0
+    equivalent: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checkup:
+    """``findings``: what is wrong. ``lines``: parameters for the rig file. ``sizes``: movement of each push over the
+    expected one, NaN if it was not seen. ``found``: the wirings that explain the pushes. ``drift``, ``drift_sd`` (4,):
+    m/s, of the device's channels x1 y1 x2 y2. ``notes``: what else is worth a look.
+    """
+
+    verdict: str
+    findings: tuple[Finding, ...]
+    lines: Mapping[str, object]
+    pushes: tuple[Response, ...]
+    sizes: tuple[float, ...]
+    found: tuple[Candidate, ...]
+    levels: Levels
+    drift: FloatArray
+    drift_sd: FloatArray
+    notes: tuple[str, ...] = field(default=())
+
+
+def check(rig: Rig, pushes: Sequence[Response], measured: Levels, drift: FloatArray, drift_sd: FloatArray) -> Checkup:
+    """Hold the pushes, the noise and the light against the rig file."""
+    file = Wiring.from_rig(rig)
+    seen = tuple(p for p in pushes if p.seen)
+    dead = [*measured.stuck, *(c for c in _dead(seen) if c not in measured.stuck)]
+    found = candidates(seen) if seen else []
+    findings: list[Finding] = []
+    lines: dict[str, object] = {}
+    for channel in dead:
+        findings.append(Finding('stuck_channel', channel, None, f'{channel} does not answer: look at its cable'))
+    best = min(found, key=lambda c: len(differences(c.wiring, file)), default=Candidate(file, 0.0))
+    if not dead and found:
+        findings += _wiring_findings(file, seen, found, best, lines)
+        findings += _load_findings(seen, best)
+    findings += _level_findings(rig, measured, lines)
+    told = not dead and len(found) == 1
+    if not told and not dead:
+        findings += _coverage(pushes, seen, found)
+    verdict = WRONG if any(f.name != 'load_coverage' for f in findings) else RIGHT if told else CANNOT_TELL
+    sizes = tuple(p.misfit(best.wiring)[1] if p.seen else math.nan for p in pushes)
+    return Checkup(
+        verdict,
+        tuple(findings),
+        lines,
+        tuple(pushes),
+        sizes,
+        tuple(found),
+        measured,
+        drift,
+        drift_sd,
+        tuple(_notes(rig, measured, best.wiring, pushes, sizes, drift, drift_sd)),
+    )
+
+
+def _dead(seen: Sequence[Response]) -> list[str]:
+    """Channels that answer to no push although pushes along X and along Y moved others."""
+    if not {('fx',), ('fy',)} <= {p.loads for p in seen}:
+        return []
+    share = np.max([np.abs(p.channels) / np.linalg.norm(p.channels) for p in seen if not p.only_twist], axis=0)
+    return [name for name, most in zip(DOTS, share.tolist(), strict=True) if most < DEAD]
+
+
+def _wiring_findings(
+    file: Wiring, seen: Sequence[Response], found: Sequence[Candidate], best: Candidate, lines: dict[str, object]
+) -> list[Finding]:
+    """How ``best`` differs from the rig file's wiring; nothing if that explains the pushes too."""
+    if any(c.wiring == file for c in found):
+        return []
+    right = parameters(best.wiring, file)
+    gained = misfit(file, seen, best.reversed_loads)[0] - best.misfit
+    also = _same_to_first_order(file, seen, best)
+    if len(found) == 1:
+        lines.update(right)
+    else:
+        also += (f'{len(found) - 1} other wirings that these pushes cannot tell from it',)
+    return [
+        Finding(
+            d.name,
+            d.where,
+            -1.0 if d.name == 'channel_sign' else None,
+            _fix(d, best.wiring, right),
+            gained,
+            also,
+        )
+        for d in differences(best.wiring, file)
+    ]
+
+
+def _same_to_first_order(file: Wiring, seen: Sequence[Response], best: Candidate) -> tuple[str, ...]:
+    """Whether the rig file's wiring explains the pushes as well if some went the other way than was said."""
+    turned = tuple(load for p in seen if p.misfit(file)[1] < 0.0 for load in p.loads)
+    total, worst = misfit(file, seen, turned)
+    same = worst <= LIMIT and total <= best.misfit + MARGIN
+    return (f'load_sign of {" ".join(turned)}',) if same else ()
+
+
+def _fix(difference: Difference, wiring: Wiring, right: Mapping[str, object]) -> str:
+    """The line of the rig file that puts one difference right."""
+    if difference.name == 'psd_swap':
+        return line('psds_exchanged', right['psds_exchanged'])
+    if difference.name == 'axis_swap':
+        name = f'{difference.where}.axes'
+    else:
+        name = next(f'psd_{psd}.axes' for psd in (1, 2) if wiring.input_of(psd) == int(difference.where[-1]))
+    return line(name, right[name] if name in right else list(wiring.axes[int(name[4]) - 1]))
+
+
+def _load_findings(seen: Sequence[Response], found: Candidate) -> list[Finding]:
+    out = [Finding('load_sign', load, -1.0, f'the sign of load_{load} is turned') for load in found.reversed_loads]
+    sizes = [p.misfit(found.wiring)[1] for p in seen if p.sized]
+    for factor, words in UNITS.items():
+        if sizes and all(abs(abs(s) / factor - 1.0) < UNIT_TOLERANCE for s in sizes):
+            out.append(Finding('load_unit', ' '.join(k for p in seen for k in p.loads), factor, f'loads say {words}'))
+    return out
+
+
+def _level_findings(rig: Rig, measured: Levels, lines: dict[str, object]) -> list[Finding]:
+    factor = measured.noise_factor
+    if not factor or 1.0 / NOISE_FACTOR <= factor <= NOISE_FACTOR:
+        return []
+    level = float(f'{factor * rig.amplifier.noise:.2g}')
+    lines['amplifier.noise'] = level
+    return [Finding('noise_level', 'x1 y1 x2 y2', round(factor, 3), line('amplifier.noise', level))]
+
+
+def _coverage(pushes: Sequence[Response], seen: Sequence[Response], found: Sequence[Candidate]) -> list[Finding]:
+    missing = [load for load in ('fx', 'fy', 'tz') if (load,) not in {p.loads for p in seen}]
+    weak = [p.name for p in pushes if not p.seen]
+    if seen and not found:
+        text = 'no wiring explains these pushes: push one way at a time, along +X, along +Y, then turn about +theta'
+    elif weak:
+        text = f'pushes that do not stand out of the noise: {", ".join(weak)}; push harder'
+    else:
+        text = f'needed alone, one after the other: {" ".join(missing)}'
+    return [Finding('load_coverage', ' '.join(missing) or 'fx fy tz', None, text)]
+
+
+def _notes(
+    rig: Rig,
+    measured: Levels,
+    wiring: Wiring,
+    pushes: Sequence[Response],
+    sizes: Sequence[float],
+    drift: FloatArray,
+    drift_sd: FloatArray,
+) -> list[str]:
+    out = []
+    for push, size in zip(pushes, sizes, strict=True):
+        if push.sized and math.isfinite(size) and not 1.0 / SIZE_FACTOR <= abs(size) <= SIZE_FACTOR:
+            out.append(
+                f'{push.name}: the dots move {abs(size):.2f} times what the rig file expects; see its link and '
+                'amplifier.sensitivity (`psd-deflection discover` names the cause)'
+            )
+    nominal = rig.amplifier.sum_nominal
+    for psd in (1, 2):
+        level = float(measured.sums[wiring.input_of(psd) - 1])
+        if not rig.estimator.sum_min <= level <= rig.estimator.sum_max:
+            what = 'no light, or the wrong input' if level < rig.estimator.sum_min else 'other light, or a wrong gain'
+            out.append(
+                f'psd_{psd}: sum {level:.2f} V, outside sum_min {rig.estimator.sum_min:g} to sum_max '
+                f'{rig.estimator.sum_max:g} V: {what}'
+            )
+        elif not 1.0 / SUM_FACTOR <= level / nominal <= SUM_FACTOR:
+            out.append(f'psd_{psd}: sum {level:.2f} V, the rig file says {nominal:g} V; see amplifier.sum_nominal')
+    if measured.hum.max() > 0.0:
+        worst = int(np.argmax(measured.hum))
+        names = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
+        out.append(
+            f'hum: {measured.hum[worst] * 1e3:.1f} mV at {measured.hum_hz:g} Hz on {names[worst]}; '
+            'look at shielding and ground'
+        )
+    per_minute = np.abs(drift) * 60e6
+    far = (per_minute > 5.0) & (np.abs(drift) > 5.0 * drift_sd)
+    if far.any():
+        worst = int(np.argmax(np.where(far, per_minute, 0.0)))
+        out.append(f'drift: {drift[worst] * 60e6:+.1f} um a minute on {DOTS[worst]}; let lasers and amplifier warm up')
+    return out
+
+
+def line(name: str, value: object) -> str:
+    """``name: value`` as YAML that ROS reads as well, which takes a bare ``y`` for true."""
+    if isinstance(value, list):
+        text = ', '.join(("'y'" if item == 'y' else str(item)) for item in value)
+        return f'{name}: [{text}]'
+    return f'{name}: {str(value).lower() if isinstance(value, bool) else value}'

@@ -1,0 +1,203 @@
+"""Which of all wirings of a two-PSD rig explain how the dots answered to pushes.
+
+A push along +X moves both dots along -x, one along +Y both along -y, and a turn about +Z moves dot i by theta times
+(l_iy, -l_ix): the columns of :func:`psd_deflection.geometry.linear.design_matrix`. The size is left open, because
+nobody knows the stiffness of a new rig: only direction and proportion count. Four signs, two orders of the axes of each
+PSD and the exchange of the PSDs are 128 wirings. Each is held against each push.
+
+The misfit of a wiring to a push is the share of the squared movement that the expected pattern leaves over when its
+size is fitted, 0 to 1. One wrong sign leaves half of a push or more. A push that is 25 degrees off leaves a fifth.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from psd_deflection.calibration import Wiring
+from psd_deflection.config import Rig
+from psd_deflection.errors import ConfigError
+from psd_deflection.geometry.linear import design_matrix
+from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
+
+_PAIRS = tuple(itertools.product(('x', '-x'), ('y', '-y')))
+_AXES = (*_PAIRS, *((y, x) for x, y in _PAIRS))
+WIRINGS = tuple(
+    Wiring(exchanged, (first, second)) for exchanged in (False, True) for first in _AXES for second in _AXES
+)
+"""All 128, the nominal one first."""
+
+MARGIN = 0.35
+"""A wiring whose misfit is larger than the best one's by more than this is ruled out."""
+
+LIMIT = 0.35
+"""A wiring with a larger misfit to any one push does not explain it."""
+
+SEEN = 6.0
+"""A movement below so many of its standard deviations says nothing."""
+
+DOTS = tuple(CHANNELS[i] for i in DOT_CHANNELS)
+_BY_PUSH = {'fx': '+X', 'fy': '+Y', 'tz': '+theta'}
+
+
+def pattern(rig: Rig) -> FloatArray:
+    """Movement of x1 y1 x2 y2 (4, 3) per dX, dY (1) and theta (m/rad). Raises ConfigError for PSDs at the base."""
+    if rig.estimator.solver == 'base_pair':
+        raise ConfigError('solver = base_pair: check knows PSDs on the tip plate only, whose dots move otherwise')
+    return design_matrix(rig.centers + rig.zeros)
+
+
+def scales_of(rig: Rig) -> tuple[float, ...]:
+    """Sensitivity of x1 y1 x2 y2 of the PSDs over the amplifier's."""
+    return tuple((rig.sensitivities.ravel() / rig.amplifier.sensitivity).tolist())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Response:
+    """How the dots answered to one push.
+
+    ``loads``: which of fx, fy, tz it was; several if they always came together. ``channels`` (4,): movement on the
+    device's channels x1 y1 x2 y2, m. ``sd`` (4,): its standard deviation, m. ``expected`` (4,): movement of x1 y1 x2 y2
+    of the PSDs by the rig file, m; only its direction counts if ``sized`` is False. ``only_twist``: the movement that
+    both dots share is ignored, as for a turn by hand, which shifts the tip as well. ``scales``: of x1 y1 x2 y2 of the
+    PSDs, their sensitivity over the amplifier's, by which ``channels`` are in metres.
+    """
+
+    loads: tuple[str, ...]
+    channels: FloatArray
+    sd: FloatArray
+    expected: FloatArray
+    sized: bool = True
+    only_twist: bool = False
+    scales: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
+
+    @property
+    def name(self) -> str:
+        """``+X``, or ``+Y with +theta``."""
+        return ' with '.join(_BY_PUSH[load] for load in self.loads)
+
+    @property
+    def seen(self) -> bool:
+        """Whether it stands out of the noise. What a turn moves both dots alike does not count."""
+        moved = _pattern(self.channels, self.only_twist)
+        variance = float(np.mean(self.sd**2)) * (2.0 if self.only_twist else 1.0)
+        return bool(moved @ moved > SEEN**2 * variance)
+
+    def misfit(self, wiring: Wiring) -> tuple[float, float]:
+        """Share of the movement that ``wiring`` leaves unexplained, and the size of the movement over the expected one.
+
+        The size is negative if the push went the other way.
+        """
+        seen = _pattern(_dots(wiring, self.channels) * np.array(self.scales), self.only_twist)
+        expected = _pattern(self.expected, self.only_twist)
+        size = float(seen @ expected / (expected @ expected))
+        left = seen - size * expected
+        return float(left @ left / (seen @ seen)), size
+
+
+def on_channels(wiring: Wiring, dots: FloatArray) -> FloatArray:
+    """Movements (4,) of the PSDs' x1 y1 x2 y2 as the device's channels show them."""
+    volts = np.zeros((1, 6))
+    volts[0, DOT_CHANNELS] = dots
+    return wiring.to_device(volts)[0, DOT_CHANNELS]
+
+
+def _dots(wiring: Wiring, channels: FloatArray) -> FloatArray:
+    """Movements of the PSDs' x1 y1 x2 y2 from those of the device's."""
+    volts = np.zeros((1, 6))
+    volts[0, DOT_CHANNELS] = channels
+    return wiring.to_psds(volts)[0, DOT_CHANNELS]
+
+
+def _pattern(dots: FloatArray, only_twist: bool) -> FloatArray:
+    """What of x1 y1 x2 y2 is compared: all, or how the dots move against each other.
+
+    An exchange of the PSDs turns the difference around, every axis map of one PSD acts on it as on the dots.
+    """
+    return np.array([dots[0] - dots[2], dots[1] - dots[3]]) if only_twist else dots
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A wiring that explains the pushes, if ``reversed_loads`` went the other way; ``misfit`` is summed over them."""
+
+    wiring: Wiring
+    misfit: float
+    reversed_loads: tuple[str, ...] = ()
+
+
+def misfit(wiring: Wiring, responses: Sequence[Response], reversed_loads: Sequence[str] = ()) -> tuple[float, float]:
+    """(sum over the pushes, worst push) of the misfit, with the sign of some loads turned."""
+    shares = []
+    for response in responses:
+        share, size = response.misfit(wiring)
+        backwards = set(response.loads) <= set(reversed_loads)
+        # A movement against the push is not explained at all.
+        shares.append(share if (size < 0.0) == backwards else 1.0)
+    return sum(shares), max(shares, default=0.0)
+
+
+def candidates(responses: Sequence[Response]) -> list[Candidate]:
+    """The wirings that explain the pushes about as well as the best one does, best first; [] if none does.
+
+    First with the loads as they are said to be. Only if no wiring explains these, with the sign of loads turned.
+    """
+    told = [response.loads for response in responses]
+    for turned in range(len(told) + 1):
+        found: list[Candidate] = []
+        for some in itertools.combinations(told, turned):
+            loads = tuple(itertools.chain.from_iterable(some))
+            for wiring in WIRINGS:
+                total, worst = misfit(wiring, responses, loads)
+                if worst <= LIMIT:
+                    found.append(Candidate(wiring, total, loads))
+        if found:
+            found.sort(key=lambda c: c.misfit)
+            return [c for c in found if c.misfit <= found[0].misfit + MARGIN]
+    return []
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One way in which a wiring differs from another: ``name`` channel_sign, axis_swap or psd_swap; ``where``: the
+    channel of the device, the PSD of the rig file, or both PSDs."""
+
+    name: str
+    where: str
+
+
+def differences(wiring: Wiring, file: Wiring) -> list[Difference]:
+    """What of ``wiring`` is not as the rig file has it."""
+    out = []
+    if wiring.exchanged != file.exchanged:
+        out.append(Difference('psd_swap', 'psd_1 psd_2'))
+    now, then = _of_channels(wiring), _of_channels(file)
+    for number in (1, 2):
+        psd, axis, _ = now[f'x{number}']
+        if axis != then[f'x{number}'][1]:
+            out.append(Difference('axis_swap', f'psd_{psd}'))
+    out += [Difference('channel_sign', channel) for channel in DOTS if now[channel][2] != then[channel][2]]
+    return out
+
+
+def _of_channels(wiring: Wiring) -> dict[str, tuple[int, str, bool]]:
+    """Of each channel of the device: the PSD, the axis, and whether its sign is turned."""
+    out = {}
+    for psd, axes in enumerate(wiring.axes, start=1):
+        for axis, of in zip('xy', axes, strict=True):
+            out[f'{of[-1]}{wiring.input_of(psd)}'] = (psd, axis, of.startswith('-'))
+    return out
+
+
+def parameters(wiring: Wiring, file: Wiring) -> dict[str, object]:
+    """The parameters of ``wiring`` that are others in the rig file."""
+    out: dict[str, object] = {}
+    if wiring.exchanged != file.exchanged:
+        out['psds_exchanged'] = wiring.exchanged
+    for psd, (axes, then) in enumerate(zip(wiring.axes, file.axes, strict=True), start=1):
+        if axes != then:
+            out[f'psd_{psd}.axes'] = list(axes)
+    return out

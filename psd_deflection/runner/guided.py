@@ -1,0 +1,100 @@
+"""A guided check of a live rig: reads the device while a person (or the simulated hand) pushes the tip."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Callable
+
+import numpy as np
+
+from psd_deflection.calibration import counts_to_volts
+from psd_deflection.commissioning.checkup import Checkup, check
+from psd_deflection.commissioning.guide import Guide, Step
+from psd_deflection.commissioning.levels import levels
+from psd_deflection.config import Rig, replace_values
+from psd_deflection.errors import DeviceError
+from psd_deflection.mechanics import LinkStatics
+from psd_deflection.runner.acquisition import Acquisition, Arrival, Ended
+from psd_deflection.runner.simulated_rig import SimulatedRigProcess, simulates
+
+LOOK_S = 0.2
+SILENT_LOOKS = 50
+SIMULATED_PUSH = 0.5e-3
+"""m: how far the simulated hand moves a dot."""
+
+Say = Callable[[str], None]
+
+
+def run_guided(rig: Rig, world: Rig, say: Say, show: Callable[[Guide], None]) -> Checkup:
+    """Lead through the pushes on the device of ``rig``; without a port, on a simulated rig that is really ``world``.
+
+    ``say`` gets the prompts and what is told between them, ``show`` the guide after each chunk of samples. Raises
+    DeviceError, ConfigError.
+    """
+    # A few lost samples do no harm here, and a priority is one more thing to read about.
+    rig = replace_values(rig, {'realtime': False})
+    process: SimulatedRigProcess | None = None
+    if simulates(rig.values):
+        process = SimulatedRigProcess(world)
+        process.push((0.0, 0.0, 0.0))
+        rig = replace_values(rig, {'port': process.port})
+        say('No port is given: a simulated rig, and a simulated hand that does what is asked.')
+    acquisition = Acquisition(rig, say)
+    try:
+        acquisition.open()
+        acquisition.start()
+        return _lead(rig, acquisition, process, say, show)
+    finally:
+        if process is not None:
+            process.hang_up()
+        acquisition.stop()
+        if process is not None:
+            process.close()
+
+
+def _lead(
+    rig: Rig,
+    acquisition: Acquisition,
+    process: SimulatedRigProcess | None,
+    say: Say,
+    show: Callable[[Guide], None],
+) -> Checkup:
+    guide = Guide(rig)
+    prompt = ''
+    silent = 0
+    while guide.step is not Step.DONE:
+        if guide.prompt() != prompt:
+            prompt = guide.prompt()
+            say(prompt)
+            if process is not None:
+                process.push(_simulated_push(rig, guide))
+        try:
+            item = acquisition.queue.get(timeout=LOOK_S)
+        except queue.Empty:
+            silent += 1
+            if silent >= SILENT_LOOKS:
+                raise DeviceError(f'{acquisition.source.name}: no samples for {silent * LOOK_S:g} s') from None
+            continue
+        silent = 0
+        if isinstance(item, Ended):
+            raise acquisition.failed or DeviceError(f'{acquisition.source.name}: ended before the check was done')
+        if isinstance(item, Arrival):
+            raw = item.raw
+            scale = raw.volts_per_count
+            volts = raw.readings if scale is None else counts_to_volts(raw.readings.astype(np.int32, copy=False), scale)
+            told = guide.feed(volts.astype(float))
+            show(guide)
+            if told:
+                say(told)
+    drift, sd = guide.drift()
+    return check(rig, guide.pushes, levels(rig, guide.rest()), drift, sd)
+
+
+def _simulated_push(rig: Rig, guide: Guide) -> tuple[float, float, float]:
+    """The load that a helpful hand holds now: N, N, N m."""
+    if guide.step is not Step.PUSH:
+        return (0.0, 0.0, 0.0)
+    statics = LinkStatics.from_rig(rig)
+    lever = float(abs(rig.centers + rig.zeros).max())
+    poses = ((SIMULATED_PUSH, 0.0, 0.0), (0.0, SIMULATED_PUSH, 0.0), (0.0, 0.0, SIMULATED_PUSH / lever))
+    return statics.tip_load(*poses[guide.number])

@@ -1,0 +1,111 @@
+"""The wiring of a rig file: which channel is which axis, applied alike to live samples and recorded ones."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psd_deflection.calibration import Calibration, Wiring
+from psd_deflection.cli.main import main
+from psd_deflection.config import Rig, load_rig, rig_as_recorded, rig_from_values
+from psd_deflection.devices.rig_feed import RigFeed
+from psd_deflection.errors import ConfigError
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import DeflectionEstimate, RawChunk, SampleBlock
+from psd_deflection.simulation.loads import constant
+from psd_deflection.simulation.simulator import RigSimulator
+
+PAIRS = list(itertools.product(('x', '-x'), ('y', '-y')))
+AXES = [*PAIRS, *((y, x) for x, y in PAIRS)]
+WIRINGS = [Wiring(exchanged, axes) for exchanged in (False, True) for axes in itertools.product(AXES, AXES)]
+
+
+def values_of(wiring: Wiring) -> dict[str, object]:
+    axes: dict[str, object] = {f'psd_{number}.axes': list(own) for number, own in enumerate(wiring.axes, start=1)}
+    return {'psds_exchanged': wiring.exchanged, **axes}
+
+
+def records_of(world: Rig, known: Rig) -> tuple[list[DeflectionEstimate], list[SampleBlock]]:
+    counts = RigSimulator(world, seed=4).step(constant((8.0, -20.0, 3.0), 0.4, 1000.0).loads).counts
+    seq = np.arange(len(counts))
+    chunk = RawChunk(seq, seq * 1_000_000, counts, np.zeros(len(seq), np.uint8), known.converter.volts_per_count)
+    out = list(Pipeline(known).process(chunk))
+    return [r for r in out if isinstance(r, DeflectionEstimate)], [r for r in out if isinstance(r, SampleBlock)]
+
+
+def test_there_are_128_wirings_of_two_detectors_and_each_is_undone() -> None:
+    assert len(set(WIRINGS)) == 128
+    assert [w for w in WIRINGS if w.nominal] == [Wiring()]
+    volts = np.arange(1, 13, dtype=np.float32).reshape(2, 6)
+    seen = set()
+    for wiring in WIRINGS:
+        out = wiring.to_psds(volts)
+        assert out.dtype == np.float32
+        np.testing.assert_array_equal(wiring.to_device(out), volts)
+        seen.add(tuple(out[0].tolist()))
+    assert len(seen) == 128
+
+
+def test_each_axis_is_the_channel_that_the_rig_file_names() -> None:
+    rig = rig_from_values({'psd_1.axes': ['-y', 'x'], 'psd_2.axes': ['x', '-y'], 'psds_exchanged': True})
+    device = np.array([[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]], dtype=np.float32)
+    assert Calibration.from_rig(rig).seen(device).tolist() == [[-5.0, 4.0, 6.0, 1.0, -2.0, 3.0]]
+
+
+@pytest.mark.parametrize('wiring', [WIRINGS[1], WIRINGS[22], WIRINGS[77], WIRINGS[127]], ids=str)
+def test_a_rig_file_that_knows_the_wiring_gives_the_estimates_of_the_nominal_rig(wiring: Wiring) -> None:
+    nominal, straight = records_of(load_rig(), load_rig())
+    known = rig_from_values(values_of(wiring))
+    wired, blocks = records_of(known, known)
+    assert wired == nominal
+    # What is published and recorded stays as the device sends it.
+    np.testing.assert_array_equal(wiring.to_psds(blocks[0].volts), straight[0].volts)
+    assert not np.array_equal(blocks[0].volts, straight[0].volts)
+    mistaken, _ = records_of(known, load_rig())
+    assert mistaken != nominal
+
+
+def test_a_dark_detector_is_dark_on_the_input_that_it_is_wired_to() -> None:
+    rig = rig_from_values({'psds_exchanged': True})
+    feed = RigFeed(rig, lambda first, n: np.zeros((n, 3)), dark=[(1, 0, 10)])
+    _, _, sum1, _, _, sum2 = feed.next()
+    assert abs(sum2) < 20 < sum1
+
+
+def test_a_recording_from_before_means_the_nominal_wiring() -> None:
+    assert Wiring.from_rig(rig_as_recorded({'link.length': 0.4}, 'old bag')).nominal
+    assert Wiring.from_rig(load_rig()).nominal
+
+
+@pytest.mark.parametrize(
+    ('values', 'said'),
+    [
+        ({'psd_1.axes': ['x', 'z']}, r"psd_1.axes = \['x', 'z'\]: each must be one of x, -x, y, -y"),
+        ({'psd_2.axes': ['x', '-x']}, r'psd_2.axes = .*: must name x once and y once'),
+        ({'psd_1.axes': ['x']}, r'must have 2 elements'),
+        ({'psd_1.axes': [True, 'x']}, r'list of names'),
+    ],
+)
+def test_a_wiring_that_cannot_be_is_refused(values: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        rig_from_values(values, 'rig.yaml')
+
+
+def test_a_recording_of_a_rig_with_its_own_wiring_replays_bit_for_bit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = tmp_path / 'rig.yaml'
+    rig.write_text("""
+/**:
+  ros__parameters:
+    psds_exchanged: true
+    psd_1: {axes: [-y, x]}
+    psd_2: {axes: [x, -y]}
+""")
+    out = str(tmp_path / 'run')
+    assert main(['simulate', '--params-file', str(rig), '--loads', 'steps:0,0,0;0,-10,-5.85:1', '--out', out]) == 0
+    assert main(['replay', out, '--compare']) == 0
+    assert 'no bit differs' in capsys.readouterr().out

@@ -1,0 +1,383 @@
+"""The check names every wrong wiring and accuses no right one; recordings come from the second generator."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from blind import generator
+from psd_deflection.calibration import Wiring
+from psd_deflection.cli.main import main
+from psd_deflection.commissioning.checkup import CANNOT_TELL, RIGHT, WRONG, Checkup, check, line
+from psd_deflection.commissioning.levels import levels
+from psd_deflection.commissioning.responses import responses
+from psd_deflection.commissioning.wirings import WIRINGS, differences, parameters
+from psd_deflection.config import Rig, load_rig, read_parameter_file, rig_from_values
+from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.records import FloatArray
+
+CLOUD = 2e-3 * 0.5e-3
+"""Noise of one sample, m."""
+
+FORCE = CLOUD / (0.585**3 / (3.0 * generator.EI))
+"""N that move a dot by the noise of a sample."""
+
+TORQUE = CLOUD / (0.070 * 0.585 / generator.GJ)
+"""N m that turn the nearer dot by the noise of a sample."""
+
+BLOCK = 1.0 / math.sqrt(20.0)
+"""Noise of a block's mean over that of a sample."""
+
+Turn = Mapping[str, tuple[str, int]]
+"""Of each channel of the device, the channel of the nominal rig whose signal it carries, and its sign."""
+
+
+def pushes(size: float, signs: Sequence[float] = (1.0, 1.0, 1.0)) -> FloatArray:
+    """A second each of +X, +Y and +theta of ``size`` times the noise, with a second of rest about each."""
+    loads = np.zeros((7000, 3))
+    for i, unit in enumerate((FORCE, FORCE, TORQUE)):
+        loads[1000 + 2000 * i : 2000 + 2000 * i, i] = signs[i] * size * unit
+    return loads
+
+
+@cache
+def clean(key: bytes, effects: str = '[]') -> FloatArray:
+    """Volts (n, 6) without noise of the loads ``key`` on a rig that is wired as it should be."""
+    loads = np.frombuffer(key).reshape(-1, 3)
+    specs: list[dict[str, Any]] = json.loads(effects)
+    none = np.zeros(len(loads) * 5)
+    t = np.arange(len(none), dtype=np.float64) * generator.STEP
+    dots = generator.optics(generator.motion(loads, 0.585, specs), t, none, 0.585, specs)
+    m, light = generator.sensors(dots, t, none, specs)
+    return generator.electronics(m, light, t, specs)
+
+
+def recorded(
+    loads: FloatArray, seed: int, turn: Turn | None = None, effects: Sequence[Any] = (), **noise: Any
+) -> FloatArray:
+    """What the converter gives, (n, 6) V, with the channels as ``turn`` has them."""
+    volts = clean(np.ascontiguousarray(loads).tobytes(), json.dumps(list(effects)))
+    volts = volts + generator.electronic_noise(len(volts), seed, **noise)
+    if turn is not None:
+        names = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
+        volts = np.column_stack([sign * volts[:, names.index(of)] for of, sign in (turn[name] for name in names)])
+    return generator.output(volts, [])
+
+
+def every_turn() -> list[Turn]:
+    """128 ways to wire two PSDs to two inputs of three channels, written without the product's own wirings."""
+    out: list[Turn] = []
+    for swapped in (False, True):
+        for kinds in itertools.product(itertools.product((False, True), (1, -1), (1, -1)), repeat=2):
+            turn: dict[str, tuple[str, int]] = {}
+            for number, (crossed, sx, sy) in enumerate(kinds, start=1):
+                of = 3 - number if swapped else number
+                turn[f'x{number}'] = (f'y{of}' if crossed else f'x{of}', sx)
+                turn[f'y{number}'] = (f'x{of}' if crossed else f'y{of}', sy)
+                turn[f'sum{number}'] = (f'sum{of}', 1)
+            out.append(turn)
+    return out
+
+
+def checked(volts: FloatArray, loads: FloatArray, rig: Rig | None = None) -> Checkup:
+    rig = rig or load_rig()
+    answered = responses(rig, volts, loads)
+    return check(rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd)
+
+
+def lines_of(turn: Turn) -> dict[str, object]:
+    """The lines that put the nominal rig file right, from the turn alone."""
+    swapped = turn['sum1'][0] == 'sum2'
+    out: dict[str, object] = {'psds_exchanged': True} if swapped else {}
+    for psd in (1, 2):
+        axes = []
+        for axis in ('x', 'y'):
+            channel, sign = next((c, s) for c, (of, s) in turn.items() if of == f'{axis}{psd}')
+            axes.append(('-' if sign < 0 else '') + channel[0])
+        if axes != ['x', 'y']:
+            out[f'psd_{psd}.axes'] = axes
+    return out
+
+
+@pytest.mark.parametrize('size', [10.0, 10.0 * BLOCK], ids=['of a sample', 'of a block'])
+def test_each_of_the_127_wrong_wirings_is_named_from_three_pushes_at_ten_times_the_noise(size: float) -> None:
+    turns = every_turn()
+    assert len(turns) == 128
+    loads = pushes(size)
+    misnamed = []
+    for seed, turn in enumerate(turns):
+        found = checked(recorded(loads, seed, turn), loads)
+        wanted = lines_of(turn)
+        if found.verdict != (WRONG if wanted else RIGHT) or found.lines != wanted or len(found.found) != 1:
+            misnamed.append((turn, found.verdict, found.lines))
+    assert not misnamed
+
+
+def test_a_right_rig_is_accused_by_none_of_20_seeds() -> None:
+    for size, seed in itertools.product((10.0, 10.0 * BLOCK), range(20)):
+        loads = pushes(size)
+        found = checked(recorded(loads, seed), loads)
+        assert (found.verdict, found.findings, dict(found.lines)) == (RIGHT, (), {})
+
+
+@pytest.mark.parametrize(
+    'effects',
+    [
+        [{'name': 'bending_stiffness', 'scale': -0.4}, {'name': 'torsional_stiffness', 'scale': 0.5}],
+        [{'name': 'load_direction', 'angle': 0.3}],
+        [{'name': 'load_offset', 'x': 0.02, 'y': -0.02}],
+        [{'name': 'sensor_rotation', 'psd': 2, 'angle': 0.2}],
+        [{'name': 'sensor_gain', 'psd': 1, 'x': 0.15, 'y': -0.15}],
+        [{'name': 'axis_crosstalk', 'psd': 1, 'xy': 0.2, 'yx': -0.1}],
+        [{'name': 'mains_interference', 'frequency': 50.0, 'amplitude': [5e-3] * 6, 'phase': [0.0] * 6}],
+        [{'name': 'laser_pointing_drift', 'psd': 1, 'rate_x': 2e-6, 'rate_y': -2e-6}],
+    ],
+    ids=lambda effects: effects[0]['name'],
+)
+def test_a_rig_that_is_wired_right_is_not_accused_for_what_else_is_wrong_with_it(effects: list[Any]) -> None:
+    loads = pushes(50.0)
+    for seed in range(3):
+        found = checked(recorded(loads, seed, effects=effects), loads)
+        assert found.verdict == RIGHT, found.findings
+        assert not found.lines
+
+
+@pytest.mark.parametrize('noise', [{'memory': 0.9}, {'heavy': True}, {'sigmas': (1e-3, 2e-3, 2e-3, 3e-3, 2e-3, 2e-3)}])
+def test_coloured_heavy_and_unequal_noise_accuse_no_wiring(noise: dict[str, Any]) -> None:
+    loads = pushes(30.0)
+    for seed in range(5):
+        found = checked(recorded(loads, seed, **noise), loads)
+        assert [f.name for f in found.findings if f.name != 'noise_level'] == []
+        assert [c.wiring for c in found.found] == [Wiring()]
+
+
+def test_a_rig_file_that_knows_its_wiring_is_right_and_the_nominal_one_is_then_wrong() -> None:
+    loads = pushes(10.0)
+    for seed, turn in enumerate(every_turn()[1::9]):
+        rig = rig_from_values(lines_of(turn))
+        assert checked(recorded(loads, seed, turn), loads, rig).verdict == RIGHT
+        nominal = checked(recorded(loads, seed), loads, rig)
+        assert nominal.verdict == WRONG
+        assert rig_from_values({**lines_of(turn), **nominal.lines}).values == load_rig().values
+
+
+def test_all_four_signs_wrong_could_be_the_load_too_and_both_are_said() -> None:
+    loads = pushes(10.0)
+    turn = {name: (name, 1 if name.startswith('sum') else -1) for name in ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')}
+    found = checked(recorded(loads, 0, turn), loads)
+    assert [(f.name, f.where, f.value) for f in found.findings] == [
+        ('channel_sign', c, -1.0) for c in ('x1', 'y1', 'x2', 'y2')
+    ]
+    assert {f.equivalent for f in found.findings} == {('load_sign of fx fy tz',)}
+    assert dict(found.lines) == {'psd_1.axes': ['-x', '-y'], 'psd_2.axes': ['-x', '-y']}
+    # Pushed the other way on a rig that is wired right: the same evidence, the same two answers.
+    other = checked(recorded(pushes(10.0, (-1.0, -1.0, -1.0)), 0), loads)
+    assert [(f.name, f.where, f.equivalent) for f in other.findings] == [
+        (f.name, f.where, f.equivalent) for f in found.findings
+    ]
+    # One sign alone has no second reading.
+    lone = checked(recorded(loads, 0, {**{n: (n, 1) for n in turn}, 'y1': ('y1', -1)}), loads)
+    assert [(f.name, f.where, f.fix, f.equivalent) for f in lone.findings] == [
+        ('channel_sign', 'y1', 'psd_1.axes: [x, -y]', ())
+    ]
+    assert lone.findings[0].evidence > 0.5
+
+
+@pytest.mark.parametrize(('i', 'load'), list(enumerate(('fx', 'fy', 'tz'))))
+def test_the_sign_of_one_load_is_named_and_no_wire(i: int, load: str) -> None:
+    signs = [1.0, 1.0, 1.0]
+    signs[i] = -1.0
+    found = checked(recorded(pushes(10.0, signs), 1), pushes(10.0))
+    assert [(f.name, f.where, f.value) for f in found.findings] == [('load_sign', load, -1.0)]
+    assert not found.lines
+
+
+def test_loads_in_kilograms_are_named() -> None:
+    loads = pushes(50.0)
+    found = checked(recorded(loads, 1), loads / 9.80665)
+    assert [(f.name, round(f.value or 0.0, 2)) for f in found.findings] == [('load_unit', 9.81)]
+    assert found.verdict == WRONG
+
+
+@pytest.mark.parametrize('channel', ['x1', 'y1', 'x2', 'y2'])
+@pytest.mark.parametrize('stuck', [False, True])
+def test_a_dead_channel_is_named_and_no_wiring(channel: str, stuck: bool) -> None:
+    loads = pushes(10.0)
+    volts = recorded(loads, 2)
+    column = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2').index(channel)
+    volts[:, column] = 0.1 if stuck else generator.electronic_noise(len(volts), 9)[:, column]
+    found = checked(volts, loads)
+    assert [(f.name, f.where) for f in found.findings] == [('stuck_channel', channel)]
+    assert not found.lines
+
+
+def test_loads_that_leave_a_wire_untouched_cannot_tell_and_say_what_is_needed() -> None:
+    loads = pushes(10.0)
+    loads[:, 0] = 0.0
+    found = checked(recorded(loads, 3), loads)
+    assert found.verdict == CANNOT_TELL
+    assert [f.name for f in found.findings] == ['load_coverage']
+    assert 'fx' in found.findings[0].fix
+    assert Wiring() in [c.wiring for c in found.found]
+    assert not found.lines
+    # Weights on a sidebar: a force along Y and its torque, always together.
+    together = np.zeros((6000, 3))
+    together[2000:4000] = (0.0, -10.0, -5.85)
+    found = checked(recorded(together, 4), together)
+    assert [p.name for p in found.pushes] == ['+Y with +theta']
+    assert found.verdict == CANNOT_TELL
+
+
+def test_pushes_below_the_noise_accuse_nobody() -> None:
+    loads = pushes(0.02)
+    for seed in range(10):
+        found = checked(recorded(loads, seed, every_turn()[77]), loads)
+        assert found.verdict == CANNOT_TELL
+        assert 'push harder' in found.findings[0].fix
+
+
+def test_noise_hum_and_light_are_held_against_the_rig_file() -> None:
+    loads = pushes(50.0)
+    hum = {'name': 'mains_interference', 'frequency': 60.0, 'amplitude': [0, 4e-3, 0, 0, 1e-3, 0], 'phase': [0.0] * 6}
+    volts = recorded(loads, 5, effects=[hum], sigmas=(6e-3,) * 6)
+    volts[:, 5] *= 0.7
+    found = checked(volts, loads)
+    (noisy,) = found.findings
+    assert (noisy.name, noisy.fix) == ('noise_level', f'amplifier.noise: {found.lines["amplifier.noise"]}')
+    assert found.lines['amplifier.noise'] == pytest.approx(6e-3, rel=0.05)
+    np.testing.assert_allclose(found.levels.noise[[0, 1, 3, 4]], 6e-3, rtol=0.05)
+    assert found.levels.hum_hz == 60.0
+    assert found.levels.hum[1] == pytest.approx(4e-3, rel=0.1)
+    assert any('psd_2: sum 3.50 V' in note for note in found.notes)
+    assert any(note.startswith('hum: 4.') for note in found.notes)
+    quiet = checked(recorded(loads, 5), loads)
+    assert not quiet.levels.hum.any()
+    assert not quiet.notes
+
+
+def test_drift_is_told_with_its_sign() -> None:
+    loads = pushes(50.0)
+    drifting = {'name': 'laser_pointing_drift', 'psd': 2, 'rate_x': 1e-6, 'rate_y': 0.0}
+    found = checked(recorded(loads, 6, effects=[drifting]), loads)
+    assert found.drift[2] == pytest.approx(1e-6, rel=0.1)
+    (note,) = found.notes
+    assert re.match(r'drift: \+(59|6\d)\.\d um a minute on x2', note)
+
+
+def test_every_wiring_differs_from_each_file_in_what_its_parameters_say() -> None:
+    assert len(set(WIRINGS)) == 128
+    for wiring, file in itertools.product(WIRINGS[::7], WIRINGS[::5]):
+        assert bool(differences(wiring, file)) == (wiring != file) == bool(parameters(wiring, file))
+
+
+def test_a_line_is_one_that_ros_reads_as_well() -> None:
+    # rcl takes a bare y for true.
+    assert line('psd_1.axes', ['-x', 'y']) == "psd_1.axes: [-x, 'y']"
+    assert line('psds_exchanged', True) == 'psds_exchanged: true'
+
+
+def test_loads_that_say_nothing_and_samples_with_gaps_are_no_accident() -> None:
+    loads = pushes(10.0)
+    volts = recorded(loads, 1)
+    assert checked(volts, np.zeros_like(loads)).verdict == CANNOT_TELL
+    # A load that comes with the last sample has moved nothing yet.
+    late = np.zeros_like(loads)
+    late[-1, 1] = 1.0
+    assert checked(volts, late).verdict == CANNOT_TELL
+    gaps = volts.copy()
+    gaps[::3] = np.nan
+    found = checked(gaps, loads)
+    assert (found.verdict, dict(found.lines)) == (RIGHT, {})
+    lost = np.where(np.arange(len(volts))[:, None] % 40 < 20, volts, np.nan)
+    assert checked(lost, loads).verdict == RIGHT
+    with pytest.raises(RecordingError, match='at least 8 are needed'):
+        checked(volts[:100], loads[:100])
+
+
+def test_psds_at_the_base_are_refused() -> None:
+    loads = pushes(10.0)
+    base = rig_from_values({'solver': 'base_pair', 'psd_1.height': -0.5, 'psd_2.height': -0.4})
+    with pytest.raises(ConfigError, match='PSDs on the tip plate only'):
+        checked(recorded(loads, 0), loads, base)
+
+
+# ---- the command
+
+
+def written(path: Path, volts: FloatArray, loads: FloatArray) -> Path:
+    t = np.arange(len(volts)) * 1e-3
+    head = 't,x1,y1,sum1,x2,y2,sum2,load_fx,load_fy,load_tz'
+    np.savetxt(path, np.column_stack((t, volts, loads)), '%.9g', ',', header=head, comments='')
+    return path
+
+
+def test_the_printed_lines_put_the_rig_file_right(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    loads = pushes(10.0)
+    recording = str(written(tmp_path / 'pushes.csv', recorded(loads, 7, every_turn()[100]), loads))
+    assert main(['check', recording]) == 0
+    said = capsys.readouterr().out
+    assert 'WRONG: one wiring of 128 fits' in said
+    pasted = [text for text in said.splitlines() if text.startswith('    ')]
+    rig = tmp_path / 'rig.yaml'
+    rig.write_text('\n'.join(['/**:', '  ros__parameters:', *pasted]) + '\n')
+    assert read_parameter_file(rig) == lines_of(every_turn()[100])
+    assert main(['check', recording, '--params-file', str(rig)]) == 0
+    assert 'RIGHT: of 128 wirings only that of the rig file fits.' in capsys.readouterr().out
+
+
+def test_json_has_the_names_that_programs_rely_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    loads = pushes(10.0)
+    turn = {**{n: (n, 1) for n in ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')}, 'y1': ('y1', -1)}
+    recording = str(written(tmp_path / 'pushes.csv', recorded(loads, 8, turn), loads))
+    assert main(['check', recording, '--json']) == 0
+    got = json.loads(capsys.readouterr().out)
+    assert got['verdict'] == 'wrong'
+    (entry,) = got['setup']
+    assert entry.pop('evidence') > 0.0
+    assert entry == {
+        'name': 'channel_sign',
+        'where': 'y1',
+        'value': -1.0,
+        'fix': 'psd_1.axes: [x, -y]',
+        'equivalent': [],
+    }
+    assert got['lines'] == {'psd_1.axes': ['x', '-y']}
+    assert got['wirings_that_fit'] == [{'psds_exchanged': False, 'psd_1.axes': ['x', '-y'], 'psd_2.axes': ['x', 'y']}]
+
+
+def test_a_simulated_recording_can_be_wired_otherwise_than_its_rig_file_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = str(tmp_path / 'run.mcap')
+    loads = 'steps:0,0,0;2,0,0;0,0,0;0,2,0;0,0,0;0,0,2;0,0,0:1'
+    world = ['--world', 'psds_exchanged=true', '--world', 'psd_2.axes=[-x, y]']
+    assert main(['simulate', '--out', out, '--loads', loads, *world]) == 0
+    capsys.readouterr()
+    assert main(['check', out, '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['lines'] == {'psds_exchanged': True, 'psd_2.axes': ['-x', 'y']}
+
+
+@pytest.mark.parametrize(
+    ('args', 'status', 'said'),
+    [
+        (['check', 'x.csv', '--port', '/dev/null'], 2, '--port is for the guide'),
+        (['check', 'bags/clean'], 4, 'holds no loads'),
+        (['check', '--world', 'psd_1.axes'], 2, 'must be NAME=VALUE'),
+        (['check', '--world', 'psd_1.axes=[x, x]'], 2, 'must name x once and y once'),
+        (['check', '--port', '/dev/null', '--world', 'link.length=1'], 2, '--world is for the simulated rig'),
+    ],
+)
+def test_what_cannot_be_checked_is_refused(
+    args: list[str], status: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(args) == status
+    assert said in capsys.readouterr().err

@@ -1,0 +1,38 @@
+"""The guided check on a live rig: the simulated one on its pseudo-terminal, and a port where nothing is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from psd_deflection.commissioning.checkup import WRONG
+from psd_deflection.config import load_rig
+from psd_deflection.errors import DeviceError
+from psd_deflection.runner.guided import run_guided
+
+
+def test_the_simulated_rig_and_hand_show_a_wrong_wiring() -> None:
+    said: list[str] = []
+    shown: list[float] = []
+    world = load_rig(overrides={'psd_1.axes': ['-y', 'x'], 'psds_exchanged': True})
+    found = run_guided(load_rig(), world, said.append, lambda guide: shown.append(guide.progress))
+    assert found.verdict == WRONG
+    assert dict(found.lines) == {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x']}
+    prompts = [text[:12] for text in said if text.startswith(('Leave', '1 of', '2 of', '3 of', 'Let go'))]
+    assert prompts == [
+        'Leave the li',
+        '1 of 3: Push',
+        'Let go.',
+        '2 of 3: Push',
+        'Let go.',
+        '3 of 3: Turn',
+        'Let go.',
+    ]
+    assert max(shown) > 0.9
+
+
+def test_a_port_where_nothing_is_is_refused(tmp_path: Any) -> None:
+    rig = load_rig(overrides={'port': str(tmp_path / 'nothing')})
+    with pytest.raises(DeviceError, match='no such port'):
+        run_guided(rig, rig, lambda text: None, lambda guide: None)
