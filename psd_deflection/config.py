@@ -192,10 +192,12 @@ class EstimatorConfig:
         False, '', 'both detectors share two lasers over a beam splitter (thesis 5.4): one lost halves both sums'
     )
     degraded: str = parameter(
-        'off',
+        'none',
         '',
-        'with one detector lost: off (no estimate), hold (translation with the last twist), zero (with no twist)',
-        choices=('off', 'hold', 'zero'),
+        'with one detector lost: none (no estimate), hold (translation with the last twist), zero (with no twist)',
+        choices=('none', 'hold', 'zero'),
+        # YAML, and so ROS, reads off as false.
+        synonyms=(('off', 'none'), (False, 'none')),
         live=True,
     )
     frozen: str = parameter(

@@ -42,7 +42,7 @@ _KINDS: Mapping[object, Kind] = {float: 'double', int: 'integer', bool: 'bool', 
 class Parameter:
     """One parameter. ``minimum`` and ``maximum`` apply to each element of an array.
 
-    ``above``: an exclusive lower bound. ``live``: the parameter may be changed while the node runs. ``before``: the
+    ``above``: an exclusive lower bound. ``synonyms``: other words, each with the one of ``choices`` that it means. ``live``: the parameter may be changed while the node runs. ``before``: the
     value for recordings that were made before this parameter existed and do not name it; None: the default.
     """
 
@@ -56,6 +56,7 @@ class Parameter:
     above: float | None = None
     length: int | None = None
     choices: tuple[str, ...] | None = None
+    synonyms: tuple[tuple[str | bool, str], ...] = ()
     live: bool = False
     before: Any = None
 
@@ -67,6 +68,11 @@ class Parameter:
         # Whole numbers in full: 1000000 bytes, not 1e+06.
         form = '.0f' if self.kind == 'integer' else 'g'
         return ' and '.join(f'{word} {bound:{form}}' for word, bound in words if bound is not None)
+
+    def meant(self, value: object) -> object:
+        """The one of ``choices`` of which ``value`` is a synonym, else ``value``."""
+        # By type as well: 0 equals False.
+        return next((word for other, word in self.synonyms if type(other) is type(value) and other == value), value)
 
     def with_value(self, value: object) -> str:
         """``NAME = VALUE UNIT``, for a message."""
@@ -83,6 +89,7 @@ def parameter(
     maximum: float | None = None,
     above: float | None = None,
     choices: tuple[str, ...] | None = None,
+    synonyms: tuple[tuple[str | bool, str], ...] = (),
     live: bool = False,
     before: T | None = None,
 ) -> T:
@@ -92,7 +99,7 @@ def parameter(
     field's name. :class:`Parameter` explains the rest.
     """
     declared = {'unit': unit, 'description': description, 'minimum': minimum, 'maximum': maximum, 'above': above}
-    metadata = {**declared, 'name': name, 'choices': choices, 'live': live, 'before': before}
+    metadata = {**declared, 'name': name, 'choices': choices, 'synonyms': synonyms, 'live': live, 'before': before}
     declaration: T = field(default=default, metadata=metadata)
     return declaration
 
@@ -190,6 +197,7 @@ def _bool(parameter: Parameter, value: object) -> bool:
 
 
 def _string(parameter: Parameter, value: object) -> str:
+    value = parameter.meant(value)
     if not isinstance(value, str):
         raise _RefusedError('must be text')
     if not value.isprintable():

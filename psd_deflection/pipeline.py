@@ -409,7 +409,7 @@ class Pipeline:
         """The translation from the remaining detector, by the rule that ``degraded`` names."""
         config = self.rig.estimator
         theta, variance = 0.0, config.twist_sd**2
-        if config.degraded == 'off':
+        if config.degraded == 'none':
             return None
         if config.degraded == 'hold':
             held = self._held

@@ -17,6 +17,7 @@ from psd_deflection.config import (
     load_rig,
     read_parameter_file,
     replace_values,
+    rig_as_recorded,
     rig_from_values,
 )
 from psd_deflection.errors import ConfigError
@@ -203,3 +204,19 @@ def test_what_another_rig_leaves_as_in_the_thesis_is_said() -> None:
     said = left_as_in_the_thesis(load_rig(overrides={'link.length': 0.4}).values)
     assert 'dynamics.bending_frequency = 14.0 Hz' in said
     assert not [text for text in said if text.startswith(('link.length', 'psd_1.zero', 'port'))]
+
+
+@pytest.mark.parametrize('word', ['none', 'off', False])
+def test_no_estimate_from_one_detector_has_three_words(tmp_path: Path, word: str | bool) -> None:
+    assert load_rig(None, {'degraded': word}).values['degraded'] == 'none'
+    assert load_rig().estimator.degraded == 'none'
+    file = tmp_path / 'rig.yaml'
+    file.write_text(f'/**:\n  ros__parameters:\n    degraded: {word}\n')
+    assert load_rig(file).estimator.degraded == 'none'
+    assert rig_as_recorded({'degraded': word}, 'a recording').estimator.degraded == 'none'
+
+
+@pytest.mark.parametrize('word', [True, 0, 'no', None])
+def test_other_words_for_it_are_refused(word: object) -> None:
+    with pytest.raises(ConfigError, match=r'degraded = '):
+        load_rig(None, {'degraded': word})

@@ -18,7 +18,7 @@ _BREAK = 0.5
 
 def changed_parameters(parameters: Mapping[str, Any]) -> dict[str, Any]:
     """Parameters that differ from their defaults, and those that this version does not know."""
-    return {k: v for k, v in parameters.items() if k not in BY_NAME or BY_NAME[k].default != v}
+    return {k: v for k, v in parameters.items() if k not in BY_NAME or BY_NAME[k].default != BY_NAME[k].meant(v)}
 
 
 def lacks(recording: Recording, topics: Mapping[str, int]) -> list[str]:

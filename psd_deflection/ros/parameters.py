@@ -61,6 +61,14 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     return descriptor
 
 
+def _without_synonyms(changed: list[RosParameter]) -> list[RosParameter]:
+    out = []
+    for parameter in changed:
+        meant = BY_NAME[parameter.name].meant(parameter.value) if parameter.name in BY_NAME else parameter.value
+        out.append(parameter if meant is parameter.value else RosParameter(parameter.name, value=meant))
+    return out
+
+
 class LiveParameters:
     """Carries out changes of the parameters that may change while the node runs; refuses the others."""
 
@@ -68,6 +76,8 @@ class LiveParameters:
         self._node = node
         self._showing = False
         self.session: Session | None = None
+        # Before rclpy refuses the type of a synonym: `ros2 param set … degraded off` sends false.
+        node.add_pre_set_parameters_callback(_without_synonyms)
         node.add_on_set_parameters_callback(self._change)
 
     def show(self, rig: Rig) -> None:

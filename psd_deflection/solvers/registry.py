@@ -88,8 +88,8 @@ def check_arrangement(rig: Rig) -> None:
             f'solver = {config.solver!r} has the PSDs at the {at}; {", ".join(others)} of solvers have not: '
             f'set solvers: [{config.solver}]'
         )
-    if at == 'base' and config.degraded != 'off':
-        raise ConfigError(f'degraded = {config.degraded!r}: one PSD at the base gives no pose; set degraded: off')
+    if at == 'base' and config.degraded != 'none':
+        raise ConfigError(f'degraded = {config.degraded!r}: one PSD at the base gives no pose; set degraded: none')
     for i, psd in enumerate(rig.psds, start=1):
         if at == 'tip' and psd.height < -0.5 * rig.link.length:
             raise ConfigError(

@@ -14,6 +14,8 @@ from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import SampleBlock
 from test.recordings.making import HELLO, T0, block, write_bag
 
+CLEAN = Path(__file__).resolve().parents[2] / 'bags' / 'clean'
+
 
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
@@ -89,3 +91,9 @@ def test_an_unreadable_recording_is_status_4_and_one_line(tmp_path: Path, capsys
     said = capsys.readouterr().err
     assert said.count('\n') == 1
     assert 'no such recording' in said
+
+
+def test_an_older_word_for_a_default_is_no_change(capsys: pytest.CaptureFixture[str]) -> None:
+    assert open_recording(CLEAN).parameters['degraded'] == 'off'
+    assert main(['info', str(CLEAN)]) == 0
+    assert 'degraded' not in capsys.readouterr().out

@@ -244,7 +244,8 @@ def test_a_disk_that_hangs_holds_up_its_own_requests_alone(
 
 
 def test_parameters_have_units_and_ranges_and_are_refused_by_name(start: Callable[..., Any], peer: Any) -> None:
-    start()
+    # YAML takes the word for a boolean.
+    start('--ros-args', '-p', 'degraded:=off')
     poses = peer.collect(PoseStamped, '/link_tip/deflection')
     peer.until(lambda: len(poses) > 0, 'estimates')
     request = DescribeParameters.Request(names=['link.length', 'block_size', 'sum_min', 'psd_1.center'])
@@ -266,7 +267,12 @@ def test_parameters_have_units_and_ranges_and_are_refused_by_name(start: Callabl
     assert not put('sum_min', -1.0).successful
     assert not put('link.length', 2.0).successful
     # The same words as for a file, with what must fit together as well; then nothing has changed.
-    assert "degraded = 'sideways': must be one of off, hold, zero" in put('degraded', 'sideways').reason
+    for word in (False, 'off', 'none'):
+        assert put('degraded', 'hold').successful
+        assert put('degraded', word).successful, word
+        request = GetParameters.Request(names=['degraded'])
+        assert peer.call(GetParameters, '/estimator/get_parameters', request).values[0].string_value == 'none'
+    assert "degraded = 'sideways': must be one of none, hold, zero" in put('degraded', 'sideways').reason
     assert 'psd_1.zero = [9.0, 0.0] m: must be at least -0.5 and at most 0.5' in put('psd_1.zero', [9.0, 0.0]).reason
     assert 'sum_min = 9.0 V: must be less than sum_max = 7.5 V' in put('sum_min', 9.0).reason
     # A level above what the lasers give: they count as lost, and the estimates stop.

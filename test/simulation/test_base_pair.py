@@ -51,7 +51,7 @@ def test_it_is_simulated_recorded_replayed_and_solved(
 
 CONTRADICTIONS = [
     ({'solvers': ['base_pair', 'exact']}, r'exact of solvers.*set solvers: \[base_pair\]'),
-    ({'degraded': 'hold'}, 'set degraded: off'),
+    ({'degraded': 'hold'}, 'set degraded: none'),
     ({'solver': 'exact', 'solvers': ['exact']}, 'psd_1.height = -0.585 m.*need solver: base_pair'),
 ]
 
