@@ -92,6 +92,18 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f'; did you mean {near[0]}?' if near else ''
 
 
+class Warned(str):
+    """A line about what somebody should look at. A line of neither kind is information."""
+
+    __slots__ = ()
+
+
+class Failed(str):
+    """A line about what does not work."""
+
+    __slots__ = ()
+
+
 def printable(text: str, longest: int) -> str:
     """``text`` in one line of printable characters; what is beyond ``longest`` characters is cut, with an ellipsis.
 

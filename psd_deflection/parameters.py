@@ -42,8 +42,9 @@ _KINDS: Mapping[object, Kind] = {float: 'double', int: 'integer', bool: 'bool', 
 class Parameter:
     """One parameter. ``minimum`` and ``maximum`` apply to each element of an array.
 
-    ``above``: an exclusive lower bound. ``synonyms``: other words, each with the one of ``choices`` that it means. ``live``: the parameter may be changed while the node runs. ``before``: the
-    value for recordings that were made before this parameter existed and do not name it; None: the default.
+    ``above``: an exclusive lower bound. ``synonyms``: other words, each with the one of ``choices`` that it means.
+    ``live``: the parameter may be changed while the node runs. ``before``: the value for recordings that were made
+    before this parameter existed and do not name it; None: the default.
     """
 
     name: str

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 from psd_deflection.cli._program import program
+from psd_deflection.errors import Failed, Warned
 from psd_deflection.runner.session import Session
 
 REFRESH_S = 0.25
@@ -44,8 +45,9 @@ class Display:
 
     def say(self, text: str) -> None:
         """Print a message on its own line, above the live one."""
+        sign = '[ERROR] ' if isinstance(text, Failed) else '[WARN] ' if isinstance(text, Warned) else ''
         with self._lock:
-            self._put(text + '\n', shown=False)
+            self._put(f'{sign}{text}\n', shown=False)
 
     def update(self, session: Session) -> None:
         """Show the state, if an update is due."""

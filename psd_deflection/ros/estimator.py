@@ -29,7 +29,7 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters import DEFLECTION, DIAGNOSTICS, INPUTS, TOPIC_TYPES, solver_topic, to_messages
-from psd_deflection.errors import ConfigError, PsdDeflectionError
+from psd_deflection.errors import ConfigError, Failed, PsdDeflectionError, Warned
 from psd_deflection.monitor.start import start_monitor
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
@@ -154,7 +154,7 @@ class EstimatorNode:
                     return await await_or_execute(carry_out, request, response)
                 except Exception as error:
                     reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-                    self._say(f'{name}: refused: {reason}')
+                    self._say(Warned(f'{name}: refused: {reason}'))
                     return response
 
             return answer
@@ -181,12 +181,12 @@ class EstimatorNode:
     def _tell_error(self, text: str) -> None:
         # At the start it is raised, and the caller reports it.
         if not self._starting:
-            self._say(text)
+            self._say(Failed(text))
 
     def start(self) -> None:
         """Configure and activate, if ``autostart`` is set. Raises the error of a failed transition."""
         if self.node.get_parameter('use_sim_time').value:
-            self._say('use_sim_time is true: what is measured is stamped by the system clock all the same')
+            self._say(Warned('use_sim_time is true: what is measured is stamped by the system clock all the same'))
         if not self.rig.acquisition.autostart:
             self._say(f'waiting to be configured: ros2 lifecycle set {self.node.get_fully_qualified_name()} configure')
             return
@@ -302,7 +302,9 @@ class EstimatorNode:
         (topic,) = self._wire.names((DEFLECTION,))
         alone = self.node.count_publishers(topic) <= 1
         if self._alone and not alone:
-            self._say(f'another node publishes on {topic} too: start one of them in a namespace (-r __ns:=/NAME)')
+            self._say(
+                Warned(f'another node publishes on {topic} too: start one of them in a namespace (-r __ns:=/NAME)')
+            )
         self._alone = alone
 
     def _report(self) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from rcl_interfaces.msg import Log
+from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -17,6 +18,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters import DIAGNOSTICS, INPUTS, TEMPERATURE, TOPIC_TYPES, from_fields, to_messages
 from psd_deflection import __version__
+from psd_deflection.errors import Failed, Warned
 from psd_deflection.recordings import cdr
 from psd_deflection.records import ENVIRONMENT, ParameterChange, RigState, TemperatureReading
 from psd_deflection.ros.names import delivery
@@ -107,15 +109,27 @@ class RigPublisher:
             self._wire.put(message.topic, message.type, cdr.encode(message.type, message.fields), time.time_ns())
 
 
+def severity(text: str) -> LoggingSeverity:
+    """Severity of a line that a session says."""
+    if isinstance(text, Failed):
+        return LoggingSeverity.ERROR
+    return LoggingSeverity.WARN if isinstance(text, Warned) else LoggingSeverity.INFO
+
+
 def say_on_rosout(node: Node, say: Callable[[str], None]) -> Callable[[str], None]:
     """Call ``say`` and also write the line to ``/rosout``: the terminal's lines do not go through the ROS log."""
     as_every_node = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     publisher = node.create_publisher(Log, '/rosout', as_every_node)
-    name = node.get_logger().name
+    logger = node.get_logger()
+    name = logger.name
 
     def both(text: str) -> None:
+        level = severity(text)
+        # What --log-level leaves out.
+        if not logger.is_enabled_for(level):
+            return
         say(text)
-        line = Log(level=Log.INFO, name=name, msg=text)
+        line = Log(level=int(level), name=name, msg=text)
         line.stamp.sec, line.stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
         # An abandoned thread may log a line after the node is gone.
         with contextlib.suppress(RuntimeError):

@@ -21,7 +21,7 @@ import numpy as np
 from psd_deflection.config import Rig
 from psd_deflection.devices.registry import make_source
 from psd_deflection.devices.source import Clock, Event, Sample, Source, SourceEndedError
-from psd_deflection.errors import DeviceError
+from psd_deflection.errors import DeviceError, Failed, Warned
 from psd_deflection.protocol.frames import BadFrame, BadReason, HelloFrame, PongFrame, SampleFrame, StatusFrame
 from psd_deflection.protocol.sequence import SequenceExtender, Step
 from psd_deflection.records import FLAG_DEVICE_DROPPED, RESTART, IntArray, ParameterChange, RawChunk
@@ -188,7 +188,7 @@ class Acquisition:
                 self.source.give_up()
                 self._thread.join(READ_TIMEOUT_S)
             else:
-                self._say(f'{self._name}: the source hangs; it is not waited for')
+                self._say(Warned(f'{self._name}: the source hangs; it is not waited for'))
                 self.queue.put(Ended())
                 return
         self.source.close()
@@ -288,7 +288,7 @@ class Acquisition:
             most = max(new, key=lambda reason: new[reason], default='')
             why = f'{new[most]} bad frames: {most}' if most and new[most] else 'is the baud rate right?'
             what = f'bytes but no sample ({why})'
-        self._repeats.tell('silent', f'{self._name}: {what} for {SILENCE_S:g} s; still listening', now / 1e9)
+        self._repeats.tell('silent', Warned(f'{self._name}: {what} for {SILENCE_S:g} s; still listening'), now / 1e9)
         # It may have been stopped, by itself or by another program.
         self.source.wake()
 
@@ -302,7 +302,7 @@ class Acquisition:
         self._connected = False
         self._was_away = True
         self._refusal = ''
-        self._repeats.tell('away', f'{error}; waiting for it to come back', time.monotonic(), NEWS)
+        self._repeats.tell('away', Failed(f'{error}; waiting for it to come back'), time.monotonic(), NEWS)
 
     def _reopen(self) -> None:
         try:
@@ -318,7 +318,7 @@ class Acquisition:
             # Report once why the device is refused; a port that is still missing is not worth a line.
             if 'no such port' not in refusal and refusal != self._refusal:
                 self._refusal = refusal
-                self._repeats.tell('refused', f'{refusal}; still trying', time.monotonic(), NEWS)
+                self._repeats.tell('refused', Warned(f'{refusal}; still trying'), time.monotonic(), NEWS)
             return
         self._connected = True
         self._name = self.source.name
@@ -406,7 +406,7 @@ class Acquisition:
             self.counters.count_lost(missing, cause)
         elif step is Step.RESTART:
             self._restarted(number)
-            self._repeats.tell('restart', f'{self._name}: the device started anew', now / 1e9, NEWS)
+            self._repeats.tell('restart', Warned(f'{self._name}: the device started anew'), now / 1e9, NEWS)
         return True
 
     def _restarted(self, number: int | None) -> None:
@@ -435,7 +435,7 @@ class Acquisition:
             except AnotherDeviceError:
                 raise
             except DeviceError as error:
-                self._repeats.tell('hello', f'{error}; kept to the first HELLO', now / 1e9)
+                self._repeats.tell('hello', Warned(f'{error}; kept to the first HELLO'), now / 1e9)
 
     def _hand_over(self, now: int) -> None:
         gathered = self._gathered

@@ -102,6 +102,7 @@ class HealthReporter:
             ('refused on coming back', str(wire.refused_reopenings)),
             ('blocks waiting', str(s.acquisition.queue.qsize())),
         ]
+        values.append(('simulated', 'yes' if s.simulated else 'no'))
         values += s.acquisition.source.describe().items()
         if wire.temperature is not None:
             values.append(('device temperature (degC)', f'{wire.temperature:.2f}'))

@@ -16,6 +16,7 @@ from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
+from psd_deflection.errors import Warned
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import Record
 from psd_deflection.runner.acquisition import Arrival, Item, Restarted
@@ -75,7 +76,7 @@ class Spokesman:
             line += f' ({self._blocks} {noun} affected since the last line)'
         self._last_line = now
         self._blocks = self._changes = 0
-        self._say(line)
+        self._say(Warned(line) if cause else line)
 
 
 class Processing:

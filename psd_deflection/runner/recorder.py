@@ -23,7 +23,7 @@ from concurrent.futures import Future
 from pathlib import Path
 
 from psd_deflection.config import AcquisitionConfig, Rig
-from psd_deflection.errors import RecordingError
+from psd_deflection.errors import Failed, RecordingError, Warned
 from psd_deflection.recordings.bag_writer import BagWriter
 from psd_deflection.records import ParameterChange
 
@@ -203,8 +203,10 @@ class Recorder:
             thread.join(max(until - time.monotonic(), 0.0))
             if thread.is_alive():
                 self._say(
-                    f'{take.folder}: the disk is slow; it is not waited for. '
-                    f'If the end is missing, `psd-deflection recover {take.folder}` makes it whole'
+                    Warned(
+                        f'{take.folder}: the disk is slow; it is not waited for. '
+                        f'If the end is missing, `psd-deflection recover {take.folder}` makes it whole'
+                    )
                 )
         return None if ended.done() and ended.exception() is not None else folder
 
@@ -248,7 +250,7 @@ class Recorder:
             take.closed.set_result(bag.folder)
             return
         self.failure = why
-        self._say(f'recording stopped: {why}')
+        self._say(Failed(f'recording stopped: {why}'))
         take.closed.set_exception(RecordingError(f'recording stopped: {why}'))
 
     def _open(self, rig: Rig, hello: Mapping[str, object] | None) -> BagWriter:
@@ -344,7 +346,7 @@ class Recorder:
             if deleted is None:
                 raise _FullError(f'{missing} and there is no older file of this recording to delete')
             self.files_deleted += 1
-            self._say(f'{deleted}: deleted, {missing} (disk_full is delete_oldest)')
+            self._say(Warned(f'{deleted}: deleted, {missing} (disk_full is delete_oldest)'))
 
 
 def _look_for(bag: BagWriter) -> None:

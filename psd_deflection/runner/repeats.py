@@ -51,7 +51,7 @@ class Repeats:
         if now_s < known.next_s:
             return
         more = f' (and {known.since - 1} more like it)' if known.since > 1 else ''
-        self._say(known.line + more)
+        self._say(type(known.line)(known.line + more))
         known.since = 0
         known.told += 1
         known.next_s = now_s + known.wait_s

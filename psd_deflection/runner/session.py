@@ -14,7 +14,7 @@ from pathlib import Path
 
 from msg_adapters import TOPIC_TYPES
 from psd_deflection.config import ZEROS, Rig, left_as_in_the_thesis, replace_values
-from psd_deflection.errors import printable
+from psd_deflection.errors import Failed, Warned, printable
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings import cdr
 from psd_deflection.records import ParameterChange
@@ -78,7 +78,12 @@ class Session:
             self._simulated = SimulatedRigProcess(rig)
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)
-            say(f'no port given: started the simulated rig on {self._simulated.port} (parameter port names a real one)')
+            say(
+                Warned(
+                    f'no port given: started the simulated rig on {self._simulated.port} '
+                    '(parameter port names a real one)'
+                )
+            )
         same = left_as_in_the_thesis(rig.values)
         if same:
             say(f'as in the thesis rig, unless you measured the same: {"; ".join(same)}')
@@ -109,7 +114,7 @@ class Session:
             raise
 
     def _tell(self, text: str) -> None:
-        text = printable(text, LONGEST_LINE)
+        text = type(text)(printable(text, LONGEST_LINE))
         for listener in tuple(self.listeners):
             listener(text)
 
@@ -156,7 +161,9 @@ class Session:
             if wait((asked,), OPEN_S).done:
                 asked.result()
             else:
-                self._tell('the disk does not answer; the recording begins when it does, samples flow meanwhile')
+                self._tell(
+                    Warned('the disk does not answer; the recording begins when it does, samples flow meanwhile')
+                )
                 asked.add_done_callback(self._tell_refused)
         self.acquisition.start()
 
@@ -184,7 +191,7 @@ class Session:
         error = done.exception()
         if error is not None:
             self.recorder.failure = str(error)
-            self._tell(f'not recorded: {error}')
+            self._tell(Failed(f'not recorded: {error}'))
 
     def temperature(self, celsius: float) -> None:
         """Set the ambient temperature for the corrections that need it, from the next block on.
@@ -253,10 +260,10 @@ class Session:
         self.acquisition.stop()
         self.processing.join(JOIN_S)
         if self.processing.alive:
-            self._tell('a subscriber holds up the last blocks; they are not waited for')
+            self._tell(Warned('a subscriber holds up the last blocks; they are not waited for'))
         folder = self.recorder.close()
         if self._store is not None and not self._store.join(KEEP_S):
-            self._tell(f'{self._store.path}: the disk is slow; the zero may not be kept')
+            self._tell(Warned(f'{self._store.path}: the disk is slow; the zero may not be kept'))
         if self._simulated is not None:
             self._simulated.close()
         return folder

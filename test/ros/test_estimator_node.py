@@ -308,6 +308,11 @@ def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start:
     # What the terminal shows is on /rosout as well.
     said = 'publishing on ROS domain'
     peer.until(lambda: any(m.name == 'left.estimator' and m.msg.startswith(said) for m in log), 'its log')
+    levels = {m.msg.partition(' ')[0]: m.level for m in log}
+    # 20 is information, 30 a warning: simulated data must not pass for measured.
+    assert (levels['publishing'], levels['no'], levels['use_sim_time']) == (20, 30, 30)
+    assert 'no port given' in daemon.until(r'\[WARN\] (no port.*)')[1]
+    assert ('simulated', 'yes') in {(v.key, v.value) for s in health[-1].status for v in s.values}
     # Whose estimates would be mixed with somebody else's hears of it.
     peer.node.create_publisher(PoseStamped, '/left/link_tip/deflection', 10)
     daemon.until('another node publishes on /left/link_tip/deflection too')

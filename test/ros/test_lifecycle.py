@@ -16,10 +16,14 @@ from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from geometry_msgs.msg import PoseStamped, WrenchStamped  # noqa: E402
 from lifecycle_msgs.msg import State, Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
-from rcl_interfaces.msg import Parameter as ParameterMessage  # noqa: E402
-from rcl_interfaces.msg import ParameterValue  # noqa: E402
+from rcl_interfaces.msg import (  # noqa: E402
+    Log,
+    ParameterValue,
+)
+from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
@@ -105,10 +109,12 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
 
 
 def test_a_device_that_is_not_there_leaves_the_node_unconfigured(start: Callable[..., Any], peer: Any) -> None:
-    daemon = start('--port', '/dev/nothing_here', '--ros-args', '-p', 'autostart:=false')
-    daemon.until('waiting to be configured')
+    daemon = start('--port', '/dev/nothing_here', '--ros-args', '-p', 'autostart:=false', '--log-level', 'warn')
+    log = peer.collect(Log, '/rosout', QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
     assert not change(peer, Transition.TRANSITION_CONFIGURE)
-    daemon.until('no such port')
+    daemon.until(r'\[ERROR\] .*no such port')
+    peer.until(lambda: any('no such port' in m.msg and m.level == 40 for m in log), 'the error on /rosout')
+    assert not any('waiting to be configured' in line for line in daemon.lines)
     assert state(peer) == State.PRIMARY_STATE_UNCONFIGURED
     daemon.send(signal.SIGTERM)
     assert daemon.wait() == 0, daemon.lines
