@@ -20,7 +20,7 @@ from rcl_interfaces.msg import (  # noqa: E402
     Log,
     ParameterValue,
 )
-from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import Parameter as ParameterMessage  # noqa: E402
 from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
