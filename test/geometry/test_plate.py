@@ -116,4 +116,4 @@ def test_the_geometry_is_that_of_the_rig_file() -> None:
     assert geometry.heights.tolist() == [0.02, -0.01]
     assert geometry.centers.tolist() == [[0.0, 0.07], [-0.09, 0.01]]
     assert geometry.zeros.tolist() == [[1e-3, 2e-3], [0.0, 0.0]]
-    assert (geometry.length, geometry.slope_ratio) == (0.4, 1.4)
+    assert (geometry.link_length, geometry.slope_ratio) == (0.4, 1.4)
