@@ -235,6 +235,17 @@ def test_noise_is_told_and_motion_is_not_taken_for_it() -> None:
     assert findings_of(load_rig(), swinging)[0].findings == ()
 
 
+@pytest.mark.parametrize(('times', 'least', 'most'), [(3.0, 0, 3), (7.0, 42, 50)])
+def test_noise_is_told_from_five_times_the_rig_files_on(times: float, least: int, most: int) -> None:
+    rng = np.random.default_rng(3)
+    told = 0
+    for _ in range(50):
+        counts = moving(1)
+        counts[:, 0] = np.rint(rng.normal(0.0, times * 2e-3 / STEP, SIZE)).astype(np.int16)
+        told += bool(findings_of(load_rig(), counts)[0].findings)
+    assert least <= told <= most
+
+
 def test_noise_is_held_against_the_readings_own() -> None:
     counts = moving(1)
     counts[:, 3] += np.rint(np.random.default_rng(2).normal(0, 0.05 / STEP, SIZE)).astype(np.int16)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from psd_deflection.config import load_rig
 from psd_deflection.geometry import Geometry
 from psd_deflection.geometry.plate import (
     crossing,
@@ -107,3 +108,12 @@ def test_the_tie_is_the_cantilevers() -> None:
     assert tied == pytest.approx(tie_matrix(1.5, 0.585) @ pose, rel=1e-15)
     # Golden case G5: phi 0.33055 deg, omega 0.017629 deg.
     assert np.degrees(tied[3:]) == pytest.approx([0.3305525741, 0.01762947062], rel=1e-9)
+
+
+def test_the_geometry_is_that_of_the_rig_file() -> None:
+    values = {'psd_1.height': 0.02, 'psd_2.height': -0.01, 'psd_1.zero': [1e-3, 2e-3], 'link.length': 0.4}
+    geometry = Geometry.from_rig(load_rig(overrides={**values, 'link.slope_ratio': 1.4, 'psd_2.center': [-0.09, 0.01]}))
+    assert geometry.heights.tolist() == [0.02, -0.01]
+    assert geometry.centers.tolist() == [[0.0, 0.07], [-0.09, 0.01]]
+    assert geometry.zeros.tolist() == [[1e-3, 2e-3], [0.0, 0.0]]
+    assert (geometry.link_length, geometry.slope_ratio) == (0.4, 1.4)

@@ -198,6 +198,14 @@ def test_a_dot_that_was_not_seen_is_not_published(status: BlockStatus) -> None:
     assert [m.topic for m in to_messages(spots(1, status))] == (list(SPOTS) if seen else [])
 
 
+def test_each_dot_is_published_in_its_own_frame_and_axes() -> None:
+    seen = [(m.topic, m.fields['header']['frame_id'], m.fields['point']) for m in to_messages(spots(3))]
+    assert seen == [
+        ('/psd_1/spot', 'psd_1', {'x': 1e-3, 'y': -2e-3, 'z': 0.0}),
+        ('/psd_2/spot', 'psd_2', {'x': 1e-4 * 3, 'y': 0.0, 'z': 0.0}),
+    ]
+
+
 def test_only_the_primary_estimate_is_the_deflection() -> None:
     assert [m.topic for m in to_messages(estimate(1, 'wls', primary=False))] == ['/link_tip/wls/deflection']
     primary = to_messages(estimate(1))
