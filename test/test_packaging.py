@@ -21,7 +21,7 @@ BESIDE_THE_PACKAGE = {'bench', 'blind', 'data', 'docs'}
 TESTED_ELSEWHERE = {'correction', 'errors', 'files', 'parameters', 'records'}
 """Rooms without a test file of their own: declarations; and the correction, of which the effects' tests are."""
 
-EXECUTABLES = ('estimator', 'replay', 'simulate', 'discover', 'check')
+EXECUTABLES = ('estimator', 'replay', 'simulate', 'discover', 'check', 'effects')
 
 
 def installed_files() -> dict[str, Path]:

@@ -109,7 +109,7 @@ NEVER_HERE = ('a machine to administer', 'ros2')
 """Needs that NEED_TOOLS=1 (any other missing program is a failure) does not ask for."""
 
 QUICK = re.compile(
-    r'^psd-deflection (info|replay|convert|plot|budget|design|params|completion|compare-methods)\b'
+    r'^psd-deflection (info|replay|convert|plot|budget|design|params|effects|completion|compare-methods)\b'
     r'|^psd-deflection simulate .*--(out|help)\b'
 )
 LIVE = re.compile(

@@ -12,6 +12,7 @@ records and yaml the input chooses among what a grammar allows, so that it gets 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import random
 import struct
@@ -19,7 +20,7 @@ import sys
 import tempfile
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import zstandard
@@ -28,20 +29,26 @@ ROOT = Path(__file__).resolve().parents[2]
 LIMITS = ['-timeout=60', '-rss_limit_mb=256', '-max_len=65536']
 
 HANG_S = 1.0
-"""More than this on one input is a hang, in seconds of the processor: libFuzzer's clock runs on while
-others have the machine, and stays for what never comes back at all."""
+"""More than this in one reading of an input is a hang, in seconds of the processor: libFuzzer's clock runs on while
+others have the machine, and stays for what never comes back at all. Coverage makes a reading three times as long."""
 
 Target = Callable[[bytes], list[str]]
 """Reads an input, and returns what the package refuses of it; whatever else it raises is a defect."""
 
 
-def judged(target: Target, content: bytes) -> list[str]:
-    """``target(content)``. AssertionError if that takes longer than ``HANG_S``, or a refusal is not one line."""
+@contextlib.contextmanager
+def timed() -> Iterator[None]:
+    """AssertionError if what is inside takes longer than ``HANG_S``."""
     began = time.process_time()
-    refused = target(content)
+    yield
     took = time.process_time() - began
     if took > HANG_S:
         raise AssertionError(f'{took:.1f} s for one input')
+
+
+def judged(target: Target, content: bytes) -> list[str]:
+    """``target(content)``. AssertionError if a refusal is not one line."""
+    refused = target(content)
     for text in refused:
         if '\n' in text:
             raise AssertionError(f'more than one line: {text!r}')
@@ -60,6 +67,7 @@ def frames_target() -> tuple[Target, list[bytes]]:
         encode,
     )
 
+    @timed()
     def target(stream: bytes) -> list[str]:
         stream = stream[:4096]
         whole = FrameDecoder().feed(b'\x00' + stream)
@@ -93,7 +101,8 @@ def _file_target(suffix: str, *steps: Callable[[Path], object]) -> Target:
         refused = []
         for step in steps:
             try:
-                step(path)
+                with timed():
+                    step(path)
             except PsdDeflectionError as error:
                 refused.append(str(error))
         path.with_name(path.name + '.cut').unlink(missing_ok=True)
@@ -220,6 +229,7 @@ def hello_target() -> tuple[Target, list[bytes]]:
         'volts_per_count': rig.converter.volts_per_count,
     }
 
+    @timed()
     def target(content: bytes) -> list[str]:
         choices = Choices(content)
         gate = HelloGate(rig)
@@ -331,6 +341,7 @@ def yaml_target() -> tuple[Target, list[bytes]]:
 
     folder = Path(tempfile.mkdtemp(dir='/dev/shm' if Path('/dev/shm').is_dir() else None))
 
+    @timed()
     def target(content: bytes) -> list[str]:
         text = said(Choices(content), 0, [])
         refused = []

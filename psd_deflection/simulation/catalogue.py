@@ -155,6 +155,11 @@ def make_active(name: str, values: Mapping[str, object], source: str) -> ActiveE
                 f'{source}: {p.name} = {raw!r}{unit}: must be at least {p.minimum:g} and at most {p.maximum:g}'
             )
         out[p.name] = value
+    sizes = [p.name for p in effect.parameters if p.kind == 'amplitude']
+    if not any(name in values for name in sizes):
+        raise ConfigError(
+            f'{source}: {name} is off without {" or ".join(sizes)}: psd-deflection effects {name} explains them'
+        )
     return ActiveEffect(effect, out)
 
 

@@ -181,8 +181,10 @@ def test_a_hang_and_a_refusal_of_two_lines_are_found(monkeypatch: pytest.MonkeyP
     with pytest.raises(AssertionError, match='more than one line'):
         judged(lambda content: ['refused\nat length'], b'')
     monkeypatch.setattr(fuzz, 'HANG_S', -1.0)
-    with pytest.raises(AssertionError, match='for one input'):
-        judged(lambda content: [], b'')
+    for name in ('frames', 'hello', 'csv', 'yaml'):
+        target, seeds = TARGETS[name]()
+        with pytest.raises(AssertionError, match='for one input'):
+            judged(target, seeds[0])
 
 
 def test_damaged_frames_are_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -121,3 +121,10 @@ def test_an_impossible_room_is_refused(
 def test_a_room_too_small_for_two_is_refused() -> None:
     with pytest.raises(ConfigError, match='no room'):
         placement.best_pair(Room(0.1, box=(0.2, 0.2, 0.3, 0.3)))
+
+
+def test_candidates_fill_the_box_and_its_corners() -> None:
+    room = Room(1.0, box=(0.1, -0.3, 0.2, 0.4))
+    found = {tuple(p) for p in room.candidates(3).round(12).tolist()}
+    # No point of the rim is in this box: they are those of the grid.
+    assert found == {(x, y) for x in (0.1, 0.15, 0.2) for y in (-0.3, 0.05, 0.4)}
