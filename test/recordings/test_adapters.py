@@ -21,6 +21,7 @@ from msg_adapters import (
     TOPIC_TYPES,
     from_fields,
     point_cloud2,
+    pose_stamped,
     pose_with_covariance_stamped,
     solver_topic,
     string,
@@ -96,6 +97,10 @@ def test_definitions_are_the_standard_ones(name: str) -> None:
     assert typed.hash_rihs01(name) == STORE.hash_rihs01(name) == MESSAGE_TYPES[name].type_hash
     for part, fields in typed.fielddefs.items():
         assert fields == STORE.fielddefs[part]
+    # Each part once, and the message itself at the head alone.
+    headings = [line for line in MESSAGE_TYPES[name].definition.splitlines() if line.startswith('MSG: ')]
+    assert len(set(headings)) == len(headings)
+    assert f'MSG: {name.replace("/msg/", "/")}' not in headings
 
 
 @given(times, numbers, numbers, numbers)
@@ -179,6 +184,18 @@ def test_a_block_with_a_long_pause_takes_two_messages() -> None:
     np.testing.assert_array_equal(t + points['dt'].astype(np.int64), t_ns[12:])
 
 
+@pytest.mark.parametrize(('span', 'pieces'), [(2**32 - 1, 1), (2**32, 2)])
+def test_a_block_is_cut_only_if_its_times_do_not_fit(span: int, pieces: int) -> None:
+    whole = block(0)
+    t_ns = whole.t_ns.copy()
+    t_ns[-1] = t_ns[0] + span
+    messages = to_messages(SampleBlock(0, whole.seq, t_ns, whole.volts, whole.flags))
+    assert len(messages) == pieces
+    seen = [point_cloud2.to_points(m.fields) for m in messages]
+    times = np.concatenate([t + points['dt'].astype(np.int64) for t, points in seen])
+    np.testing.assert_array_equal(times, t_ns)
+
+
 def test_points_that_contradict_themselves_are_refused() -> None:
     (m,) = to_messages(block(0))
     for change, message in (
@@ -219,6 +236,49 @@ def test_the_covariance_stands_at_x_y_and_yaw() -> None:
     k = np.array(fields['pose']['covariance']).reshape(6, 6)
     np.testing.assert_array_equal(k[np.ix_([0, 1, 5], [0, 1, 5])].ravel(), e.covariance)
     np.testing.assert_array_equal(np.diag(k)[2:5], [1e6, 1e6, 1e6])
+
+
+def test_no_covariance_stands_anywhere_else() -> None:
+    k = np.array(pose_with_covariance_stamped.from_estimate(estimate(3))['pose']['covariance']).reshape(6, 6)
+    k[np.ix_([0, 1, 5], [0, 1, 5])] = 0.0
+    assert k.tolist() == np.diag([0.0, 0.0, 1e6, 1e6, 1e6, 0.0]).tolist()
+
+
+def test_a_pose_lies_in_the_plane_with_all_its_angles() -> None:
+    e = estimate(3)
+    for fields in (to_messages(e)[0].fields['pose'], pose_with_covariance_stamped.from_estimate(e)['pose']['pose']):
+        assert fields['position'] == {'x': e.dx, 'y': e.dy, 'z': 0.0}
+        assert angles(fields['orientation']) == pytest.approx((e.theta, e.phi, e.omega), abs=1e-15)
+    (reference,) = to_messages(ReferencePose(T0, 1e-3, -2e-3, 0.01))
+    assert reference.fields['pose']['position'] == {'x': 1e-3, 'y': -2e-3, 'z': 0.0}
+    # What did not measure tilts says none.
+    assert angles(reference.fields['pose']['orientation']) == pytest.approx((0.01, 0.0, 0.0), abs=1e-15)
+
+
+def test_a_load_is_a_force_in_the_plane_and_a_torque_about_z() -> None:
+    for record in (TipLoad(T0, 1.0, 2.0, 3.0), AppliedLoad(T0, 1.0, 2.0, 3.0)):
+        (m,) = to_messages(record)
+        assert m.fields['header']['frame_id'] == 'link_tip_rest'
+        assert m.fields['wrench'] == {
+            'force': {'x': 1.0, 'y': 2.0, 'z': 0.0},
+            'torque': {'x': 0.0, 'y': 0.0, 'z': 3.0},
+        }
+
+
+def test_numbers_of_many_messages_are_poses_and_covariances() -> None:
+    """As a reader takes them: the float64 of each message in order."""
+    rows, wanted = [], []
+    for e in (estimate(2), estimate(5)):
+        fields = pose_with_covariance_stamped.from_estimate(e)['pose']
+        rows.append([*fields['pose']['position'].values(), *fields['pose']['orientation'].values()])
+        rows[-1] += fields['covariance']
+        wanted.append(e)
+    numbers = np.array(rows)
+    poses, tilts = pose_stamped.to_poses(numbers)
+    np.testing.assert_allclose(poses, [(e.dx, e.dy, e.theta) for e in wanted], atol=1e-15)
+    np.testing.assert_allclose(tilts, [(e.phi, e.omega) for e in wanted], atol=1e-15)
+    covariances = pose_with_covariance_stamped.to_covariances(numbers)
+    assert covariances.reshape(2, 9).tolist() == [list(e.covariance) for e in wanted]
 
 
 def test_diagnostics_keep_levels_and_values() -> None:
