@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 NODE_NAME = 'estimator'
 
 SPIN_S = 0.1
+ANSWER_S = 0.3
 """Longest time until a signal takes effect, s."""
 
 
@@ -374,6 +375,11 @@ def run(
                         watchdog.alive()
                     if while_running is not None and session is not None:
                         while_running(session)
+                if estimator.finished:
+                    # DDS does not say when the answer to the transition has left. If the service goes first, it is lost.
+                    until = time.monotonic() + ANSWER_S
+                    while not signals.stop and (left := until - time.monotonic()) > 0.0:
+                        executor.spin_once(timeout_sec=left)
             except StopRequestedError:
                 pass
             finally:
