@@ -376,7 +376,7 @@ def run(
                     if while_running is not None and session is not None:
                         while_running(session)
                 if estimator.finished:
-                    # DDS does not say when the answer to the transition has left. If the service goes first, it is lost.
+                    # DDS does not say when the answer has left. If the service goes first, it is lost.
                     until = time.monotonic() + ANSWER_S
                     while not signals.stop and (left := until - time.monotonic()) > 0.0:
                         executor.spin_once(timeout_sec=left)
