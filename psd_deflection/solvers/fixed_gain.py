@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from psd_deflection.geometry.linear import gain_matrix
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
@@ -43,3 +45,7 @@ class FixedGain(Solver):
         status = SolverStatus.OK if theta - theta == 0.0 else SolverStatus.NOT_CONVERGED
         covariance = (vxx, vxy, vxt, vxy, vyy, vyt, vxt, vyt, vtt)
         return Solution(dx, dy, theta, 0.0, 0.0, covariance, residual, status, 0)
+
+    def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
+        """The gain itself. See :class:`Solver`."""
+        return np.array([c[1:4] for c in self._columns]).T

@@ -139,16 +139,23 @@ class Solver(abc.ABC):
 def flat_gain(
     centers: tuple[float, ...], dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution
 ) -> FloatArray:
-    """:meth:`Solver.gain` of weighted least squares on a flat plate: P A^T V^-1, P the solution's own covariance.
+    """:meth:`Solver.gain` of weighted least squares on a flat plate. ``centers``: (x1, y1, x2, y2, ...), m."""
+    points = tuple(center + dot for center, dot in zip(centers, dots, strict=True))
+    return weighted_gain(points, solution.theta, variances, solution)
 
-    ``centers``: (x1, y1, x2, y2, ...), m. The readings of a dot at q = c + m go with the pose as
-    -R(-theta) and (q_y, -q_x).
+
+def weighted_gain(
+    points: tuple[float, ...], theta: float, variances: tuple[float, ...], solution: Solution
+) -> FloatArray:
+    """P A^T V^-1, P the solution's own covariance: the gain of least squares with the weights 1/``variances``.
+
+    ``points``: q = (x1, y1, ...), m. The readings of a dot at q go with the pose as -R(-theta) and (q_y, -q_x).
     """
-    c, s = cos(solution.theta), sin(solution.theta)
+    c, s = cos(theta), sin(theta)
     xx, xy, xt, _, yy, yt, _, _, tt = solution.covariance
     rows: tuple[list[float], list[float], list[float]] = ([], [], [])
-    for i in range(0, len(dots), 2):
-        qx, qy = centers[i] + dots[i], centers[i + 1] + dots[i + 1]
+    for i in range(0, len(points), 2):
+        qx, qy = points[i], points[i + 1]
         for ax, ay, at, v in ((-c, -s, qy, variances[i]), (s, -c, -qx, variances[i + 1])):
             rows[0].append((xx * ax + xy * ay + xt * at) / v)
             rows[1].append((xy * ax + yy * ay + yt * at) / v)

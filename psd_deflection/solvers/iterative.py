@@ -20,6 +20,7 @@ from typing import ClassVar
 import numpy as np
 
 from psd_deflection.geometry.layout import Geometry, check_twist
+from psd_deflection.records import FloatArray
 from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
 from psd_deflection.solvers.plane import Covariance, turn_covariance
 
@@ -90,6 +91,25 @@ class IterativeSolver(Solver):
             residual.append(qy - my + s * lx - c * ly)
         covariance = self._covariance(c, s, mx, my, variances)
         return Solution(dx, dy, theta, 0.0, 0.0, covariance, tuple(residual), status, trials)
+
+    def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
+        """In closed form: the disagreement stays 0 if a dot moves. See :class:`Solver`."""
+        count = self._count
+        c, s = cos(solution.theta), sin(solution.theta)
+        plate = [(r[0] + dots[2 * i], r[1] + dots[2 * i + 1], r[2], r[3]) for i, r in enumerate(self._rows)]
+        mx = sum(p[0] for p in plate) / count
+        my = sum(p[1] for p in plate) / count
+        # The beams are about their mean, so the dots' mean counts for nothing.
+        agreement = sum(c * (qx * lx + qy * ly) + s * (qx * ly - qy * lx) for qx, qy, lx, ly in plate)
+        gx, gy = s * mx + c * my, s * my - c * mx
+        rows: tuple[list[float], list[float], list[float]] = ([], [], [])
+        for _, _, lx, ly in plate:
+            for ax, ay, turn in ((-c, -s, c * ly - s * lx), (s, -c, -c * lx - s * ly)):
+                theta = turn / agreement
+                rows[0].append(ax / count + gx * theta)
+                rows[1].append(ay / count + gy * theta)
+                rows[2].append(theta)
+        return np.array(rows)
 
     def _covariance(self, c: float, s: float, mx: float, my: float, variances: tuple[float, ...]) -> Covariance:
         """G V G^T in plate axes, turned to the base's; (mx, my) is the centroid of the plate points."""

@@ -20,8 +20,9 @@ from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.geometry.linear import design_matrix
+from psd_deflection.records import FloatArray
 from psd_deflection.solvers.fixed_gain import FixedGain
-from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.solvers.interface import Solution, Solver, SolverStatus, weighted_gain
 
 THESIS_ROW_SCALING = (0.03, 0.5, 10.0, 0.1)
 """Po of x1, y1, x2, y2 for the thesis's loads on the sidebar (section 5.5, Figs 5.12-5.20)."""
@@ -54,6 +55,7 @@ class WlsSolver(Solver):
         check_twist(geometry)
         beams, zeros = np.asarray(geometry.beams).tolist(), np.asarray(geometry.zeros).tolist()
         self._rows = tuple((lx, ly, x0, y0) for (lx, ly), (x0, y0) in zip(beams, zeros, strict=True))
+        self._places = tuple(np.asarray(geometry.beams, dtype=np.float64).ravel().tolist())
         self._fixed = fixed_weights(geometry, weights, row_scaling)
 
     @classmethod
@@ -114,6 +116,12 @@ class WlsSolver(Solver):
             SolverStatus.OK if theta - theta == 0.0 else SolverStatus.NOT_CONVERGED,
             0,
         )
+
+    def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
+        """In closed form: that of the beams' places without twist. See :class:`Solver`."""
+        if self._fixed is not None:
+            return self._fixed.gain(dots, variances, solution)
+        return weighted_gain(self._places, 0.0, variances, solution)
 
 
 def fixed_weights(geometry: Geometry, weights: Weights, row_scaling: tuple[float, ...]) -> FixedGain | None:
