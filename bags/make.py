@@ -70,7 +70,7 @@ def record(rig: Rig, name: str, lose: frozenset[int], dark: Dark) -> None:
         )
         for step in (pipeline.process(chunk), pipeline.flush()):
             for item in step:
-                bag.write(item)
+                bag.put(item)
     poses = np.concatenate(feed.poses)[: SECONDS * 1000]
     rows = poses.reshape(-1, rig.estimator.block_size, 3).mean(axis=1)
     with (HERE / f'{name}_truth.csv').open('w', encoding='ascii') as stream:
