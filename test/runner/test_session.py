@@ -128,6 +128,7 @@ def test_a_noted_load_is_recorded_and_holds_for_the_next_recording(
     running.heard('load noted: Fx 0 N, Fy -10 N, Tz 0.5 N·m')
     before = session.acquisition.now_ns()
     folder = session.record(True).result(WAIT_S)
+    assert folder is not None
     more = session.note_load(1.0, -10.0, 0.0, add=True)
     device.send_frames(*(sample(seq) for seq in range(200, 300)))
     assert session.record(False).result(WAIT_S) == folder

@@ -3,15 +3,23 @@
 
 export function clock(seconds, digits = 0) {
   // Times of a CSV may count from its own zero.
-  if (seconds < 1e9) return `${seconds.toFixed(digits || (Math.round(seconds) === seconds ? 0 : 2))} s`;
-  const text = new Date(seconds * 1000).toLocaleTimeString([], { hour12: false });
-  return digits ? text + (seconds % 1).toFixed(digits).slice(1) : text;
+  if (seconds < 1e9) return `${seconds.toFixed(digits)} s`;
+  const ticks = Math.round(seconds * 10 ** digits);
+  const text = new Date(Math.floor(ticks / 10 ** digits) * 1000).toLocaleTimeString([], { hour12: false });
+  return digits ? `${text}.${String(ticks % 10 ** digits).padStart(digits, '0')}` : text;
+}
+
+// As many digits as tell neighbouring labels apart.
+function times(u, ticks) {
+  const step = ticks.length > 1 ? ticks[1] - ticks[0] : 1;
+  const digits = Math.min(6, Math.max(0, -Math.floor(Math.log10(step) + 1e-6)));
+  return ticks.map((t) => whole(u, t, digits));
 }
 
 // A label that the edge would cut is left out.
-function whole(u, t) {
+function whole(u, t, digits) {
   const room = u.bbox.width / (window.devicePixelRatio || 1) - u.valToPos(t, 'x');
-  return room < 20 ? '' : clock(t);
+  return room < 20 + 4 * digits ? '' : clock(t, digits);
 }
 
 export function number(value, digits = 5) {
@@ -41,7 +49,7 @@ export function options(color, element, series, extra) {
     series: [{}, ...series],
     ...extra,
     axes: [
-      { ...axis, size: 26, space: 90, values: (u, ticks) => ticks.map((t) => whole(u, t)), ...(extra.x || {}) },
+      { ...axis, size: 26, space: 90, values: times, ...(extra.x || {}) },
       { ...axis, size: 62, space: 28, values: (u, ticks) => ticks.map((v) => number(v)), ...(extra.y || {}) },
     ],
   };
@@ -111,6 +119,7 @@ export function eventMarks(color, state) {
     g.clip();
     g.strokeStyle = g.fillStyle = color('--quiet');
     g.lineWidth = ratio;
+    g.textAlign = 'left';
     g.setLineDash([5 * ratio, 4 * ratio]);
     g.font = `${10 * ratio}px system-ui, sans-serif`;
     for (const [t, kind, ...load] of state.marks) {
@@ -134,7 +143,8 @@ export function eventMarks(color, state) {
 
 const MOST_REFERENCES = 400;
 
-// Small rings where an independent measurement was; `columns`: of t and of each value, with its colour.
+// Small rings where an independent measurement was; `columns`: of t, and of each value its colour,
+// the values and the series that it belongs to.
 export function referenceMarks(color, columns) {
   return (u) => {
     const [ts, ...values] = columns();
@@ -147,7 +157,8 @@ export function referenceMarks(color, columns) {
     g.rect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height);
     g.clip();
     g.lineWidth = 1.2 * ratio;
-    for (const [name, column] of values) {
+    for (const [name, column, series] of values) {
+      if (!u.series[series].show) continue;
       g.strokeStyle = color(name);
       for (let i = 0; i < ts.length; i += step) {
         if (column[i] === null) continue;
@@ -188,9 +199,8 @@ export function modeMarks(color, modes, highest) {
 // The captions' keys: each shows its value under the cursor, and switches its curve on and off. A key names
 // its plot and its series (data-plot, data-series); `hidden` remembers what is off when plots are built anew.
 export class Legend {
-  constructor(plotOf, digits = 6) {
+  constructor(plotOf) {
     this.plotOf = plotOf;
-    this.digits = digits;
     this.hidden = new Set();
     this.keys = [...document.querySelectorAll('button.key')];
     this.times = [...document.querySelectorAll('output.at')];
@@ -217,14 +227,14 @@ export class Legend {
     }
   }
 
-  follow(name) {
+  follow(name, digits = 6) {
     return (u) => {
       const i = u.cursor.idx;
       const there = i !== null && i !== undefined && u.cursor.left >= 0;
       for (const key of this.keys) {
         if (key.dataset.plot !== name) continue;
         const value = there ? u.data[Number(key.dataset.series)][i] : null;
-        write(key.querySelector('output'), value === null || value === undefined ? '' : number(value, this.digits));
+        write(key.querySelector('output'), value === null || value === undefined ? '' : number(value, digits));
       }
       for (const at of this.times) {
         if (at.dataset.plot === name) write(at, there ? (at.dataset.unit ? `${number(u.data[0][i], 4)} ${at.dataset.unit}` : clock(u.data[0][i], 3)) : '');

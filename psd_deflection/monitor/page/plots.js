@@ -31,7 +31,7 @@ export class Plots {
     const time = { time: false, range: () => [this.state.from, this.state.to] };
     const seen = (name, draw) => ({ draw, setCursor: [legend.follow(name)], setSelect: [dragged(this.zoom)] });
     const marked = [lossMarks(color, this.state), eventMarks(color, this.state)];
-    const of = (...columns) => referenceMarks(color, () => [this.state.references[0], ...columns.map(([name, i]) => [name, this.state.references[i]])]);
+    const of = (...columns) => referenceMarks(color, () => [this.state.references[0], ...columns.map(([name, i, series]) => [name, this.state.references[i], series])]);
     const [f0, bins] = hello.frequency;
     this.frequencies = Array.from({ length: bins }, (_, i) => f0 * (i + 1));
     const spectral = (range) => {
@@ -44,13 +44,13 @@ export class Plots {
         bands: [{ series: [3, 2], fill: fade('--dx') }, { series: [6, 5], fill: fade('--dy') }],
         scales: { x: time, y: { range: calm(1) } },
         cursor: cursor(this.zoom, 'traces'),
-        hooks: seen('shift', [...marked, of(['--dx', 1], ['--dy', 2])]),
+        hooks: seen('shift', [...marked, of(['--dx', 1, 1], ['--dy', 2, 4])]),
       }), this.empty(7), elements.shift),
       theta: new uPlot(options(color, elements.theta, [line(color('--theta')), edge, edge], {
         bands: [{ series: [3, 2], fill: fade('--theta') }],
         scales: { x: time, y: { range: calm(0.5) } },
         cursor: cursor(this.zoom, 'traces'),
-        hooks: seen('theta', [...marked, of(['--theta', 3])]),
+        hooks: seen('theta', [...marked, of(['--theta', 3, 1])]),
       }), this.empty(4), elements.theta),
       sums: new uPlot(options(color, elements.sums, [line(color('--dx')), line(color('--dy'))], {
         scales: { x: time, y: { range: () => [0, 1.5 * hello.sum_nominal] } },
@@ -60,7 +60,7 @@ export class Plots {
       spectrum: new uPlot(options(color, elements.spectrum, ['--x1', '--y1', '--x2', '--y2'].map((n) => line(color(n), 1)), {
         scales: { x: { time: false, distr: 3, range: () => this.band ?? [f0, f0 * bins] }, y: { distr: 3 } },
         cursor: cursor(spectral),
-        hooks: { drawAxes: [modeMarks(color, hello.modes, this.frequencies.at(-1))], setCursor: [legend.follow('spectrum')], setSelect: [dragged(spectral)] },
+        hooks: { drawAxes: [modeMarks(color, hello.modes, this.frequencies.at(-1))], setCursor: [legend.follow('spectrum', 3)], setSelect: [dragged(spectral)] },
         x: { splits: decades, values: (u, ticks) => ticks.map((v) => number(v)) },
         y: { splits: decades, values: (u, ticks) => ticks.map(power) },
       }), [this.frequencies, ...[1, 2, 3, 4].map(() => this.frequencies.map(() => null))], elements.spectrum),
