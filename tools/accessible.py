@@ -27,7 +27,9 @@ VIEWS = (('light', 1440, 900, False), ('dark', 1440, 900, False), ('light', 390,
 RUN = """
 const done = arguments[arguments.length - 1];
 axe.run(document, {resultTypes: ['violations']}).then(
-  (found) => done(found.violations.map((v) => [v.id, v.help, v.nodes.map((n) => [n.target.join(' '), n.failureSummary])])),
+  (found) => done(found.violations.map(
+    (v) => [v.id, v.help, v.nodes.map((n) => [n.target.join(' '), n.failureSummary])],
+  )),
   (error) => done([['axe', String(error), []]]),
 );
 """

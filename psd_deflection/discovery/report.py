@@ -49,7 +49,7 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 def _wide(content: str, words: str) -> str:
     """What may be wider than a phone: it is moved by itself, also with the keyboard."""
-    return f'<div class="wide" role="region" tabindex="0" aria-label="{html.escape(words)}">{content}</div>'
+    return f'<div class="wide" role="group" tabindex="0" aria-label="{html.escape(words)}">{content}</div>'
 
 
 def _image(figure: Figure, words: str) -> str:
@@ -232,9 +232,8 @@ def report_html(discovery: Discovery) -> str:
     body.append(_table(('effect', 'gain', 'parameters', 'p'), rows))
     trace = '; '.join(discovery.search.trace) or 'nothing passed the screen'
     body.append(f'<h2>Provenance</h2><p class=quiet>Steps: {html.escape(trace)}.</p>')
-    body.append(
-        f'<pre role="region" tabindex="0" aria-label="provenance">{html.escape(json.dumps(_plain(provenance(discovery)), indent=1))}</pre>'
-    )
+    source = html.escape(json.dumps(_plain(provenance(discovery)), indent=1))
+    body.append(f'<pre role="group" tabindex="0" aria-label="provenance">{source}</pre>')
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1"><title>psd-deflection discover</title>'
