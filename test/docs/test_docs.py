@@ -243,7 +243,7 @@ def test_every_command_and_parameter_is_on_its_page(hooks: Any) -> None:
     assert '<!--' not in page
     for name in COMMANDS:
         assert f'usage: psd-deflection {name}' in page
-    assert '| `monitor_control` | `False` |' in page
+    assert '| `monitor_control` | `local` |' in page
 
 
 def test_what_docstrings_say_for_sphinx_is_not_shown(hooks: Any) -> None:
