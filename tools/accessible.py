@@ -87,6 +87,9 @@ def main() -> int:
         driver = open_browser(Path(profile))
         try:
             for view in views(driver):
+                driver.get(f'http://127.0.0.1:{server.server_port}/{pages[0]}')
+                # The site keeps the colours that it was seen in first.
+                driver.execute_script('localStorage.clear()')
                 for page in pages:
                     driver.get(f'http://127.0.0.1:{server.server_port}/{page}')
                     WebDriverWait(driver, WAIT_S).until(

@@ -195,3 +195,18 @@ def on_page_content(html: str, **kwargs: Any) -> str:
     """mkdocs calls it for each page: convert Sphinx roles in docstrings, which mkdocs does not render."""
     html = re.sub(r':(?:class|meth|func|mod|data|attr):(?=<code>)', '', html)
     return re.sub(r'<code>~[\w.]*\.(\w+)</code>', r'<code>\1</code>', html)
+
+
+def on_post_page(output: str, **kwargs: Any) -> str:
+    """mkdocs calls it for each finished page: name what the theme leaves without a name, for screen readers."""
+
+    def named(nav: re.Match[str]) -> str:
+        title = re.search(rf'<label class="md-nav__title" for="{nav[1]}">(.*?)</label>', output, re.S)
+        return nav[0] if title is None else f'aria-label="{" ".join(re.sub("<[^>]+>", "", title[1]).split())}"'
+
+    html = re.sub(r'aria-labelledby="(__nav_[\d_]+)_label"', named, output)
+    html = html.replace(
+        'data-md-component="search" role="dialog">', 'data-md-component="search" role="dialog" aria-label="Search">'
+    )
+    # A block of code may be wider than the page: it is moved with the keyboard.
+    return re.sub(r'(<pre[^>]*>(?:<span></span>)?<code)>', r'\1 tabindex="0">', html)

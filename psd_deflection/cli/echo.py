@@ -6,7 +6,7 @@ plus-minus sign are standard deviations.
 
   psd-deflection echo
   psd-deflection echo --count 1
-  psd-deflection echo --json > poses.jsonl
+  psd-deflection echo --json --count 100
 
 With ROS: ros2 topic echo /link_tip/deflection
 """
