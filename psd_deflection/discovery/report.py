@@ -178,7 +178,7 @@ def _effect_section(effect: NamedEffect) -> str:
         others = [
             (n, f'{loss:.1f}', f'{bic:.1f}', told[n in effect.equivalent]) for n, loss, bic in effect.alternatives
         ]
-        out.append(_table(('in its place', 'chi-square lost', 'BIC worse by', ''), others))
+        out.append(_table(('in its place', 'chi-square lost', 'BIC worse by', 'verdict'), others))
     if effect.suggestion is not None:
         out.append(f'<p>To decide: {html.escape(effect.suggestion.text)}.</p>')
     return ''.join(out)
