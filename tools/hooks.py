@@ -209,4 +209,9 @@ def on_post_page(output: str, **kwargs: Any) -> str:
         'data-md-component="search" role="dialog">', 'data-md-component="search" role="dialog" aria-label="Search">'
     )
     # A block of code may be wider than the page: it is moved with the keyboard.
-    return re.sub(r'(<pre[^>]*>(?:<span></span>)?<code)>', r'\1 tabindex="0">', html)
+    return re.sub(r'(<pre[^>]*>(?:<span></span>)?<code)(?=[ >])', r'\1 tabindex="0"', html)
+
+
+def on_post_template(output: str, template_name: str, **kwargs: Any) -> str:
+    """mkdocs calls it for each page that has no Markdown, such as 404.html."""
+    return on_post_page(output) if template_name.endswith('.html') else output
