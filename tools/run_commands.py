@@ -44,6 +44,7 @@ CI_RUNS = (
     (r'^make test$', '.ci/run', 'make test '),
     (r'^make (lint|types|contracts|unit)$', 'Makefile', 'test: lint types contracts unit'),
     (r'^make docs$', '.ci/run', 'make docs '),
+    (r'^make axe$', '.ci/run', 'make axe '),
     (r'^make colcon$', '.ci/run', 'make colcon '),
     (r'^colcon build$', 'Makefile', 'bin/colcon --log-base log build '),
     (
