@@ -205,11 +205,8 @@ def on_post_page(output: str, **kwargs: Any) -> str:
         return nav[0] if title is None else f'aria-label="{" ".join(re.sub("<[^>]+>", "", title[1]).split())}"'
 
     html = re.sub(r'aria-labelledby="(__nav_[\d_]+)_label"', named, output)
-    html = html.replace(
-        'data-md-component="search" role="dialog">', 'data-md-component="search" role="dialog" aria-label="Search">'
-    )
-    # A block of code may be wider than the page: it is moved with the keyboard.
-    return re.sub(r'(<pre[^>]*>(?:<span></span>)?<code)(?=[ >])', r'\1 tabindex="0"', html)
+    search = 'data-md-component="search" role="dialog"'
+    return html.replace(f'{search}>', f'{search} aria-label="Search">')
 
 
 def on_post_template(output: str, template_name: str, **kwargs: Any) -> str:
