@@ -353,7 +353,16 @@ class MonitorConfig:
     port: int = parameter(
         8790, '', 'port it is served on; 0 takes any free one', name='monitor_port', minimum=0, maximum=65535
     )
-    control: bool = parameter(False, '', 'let the page take the zero and record', name='monitor_control')
+    control: str = parameter(
+        'local',
+        '',
+        'who may zero, record and note loads from the page: users of this machine if nobody else can reach it (local), '
+        'also the network, with a token (on), nobody (off)',
+        choices=('local', 'on', 'off'),
+        # YAML reads on and off as booleans.
+        synonyms=((True, 'on'), (False, 'off')),
+        name='monitor_control',
+    )
 
 
 LINK = Section(LinkConfig, 'link.')

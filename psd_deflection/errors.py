@@ -20,8 +20,9 @@ EXIT_STATUSES: Mapping[int, str] = {
     4: 'a recording or an output that cannot be read or written',
     5: 'the device: missing, in use, silent, or of another protocol',
     6: 'the geometry of the rig cannot be solved',
+    7: 'a running daemon: none answers, or it refuses',
     71: 'the machine: too little memory, or no further thread',
-    INTERRUPTED: 'Ctrl-C before it was done (estimator and monitor then end with 0)',
+    INTERRUPTED: 'Ctrl-C before it was done (what runs until Ctrl-C ends with 0)',
 }
 """What each exit status of ``psd-deflection`` means; its help and the documentation are made from this table."""
 
@@ -75,6 +76,15 @@ class SolverError(PsdDeflectionError):
     """
 
     exit_status = 6
+
+
+class DaemonError(PsdDeflectionError):
+    """No running daemon answers, or it refuses what it was asked for.
+
+    Example: ``http://127.0.0.1:8790/: no daemon answers``.
+    """
+
+    exit_status = 7
 
 
 class MachineError(PsdDeflectionError):

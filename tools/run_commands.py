@@ -44,6 +44,7 @@ CI_RUNS = (
     (r'^make test$', '.ci/run', 'make test '),
     (r'^make (lint|types|contracts|unit)$', 'Makefile', 'test: lint types contracts unit'),
     (r'^make docs$', '.ci/run', 'make docs '),
+    (r'^make axe$', '.ci/run', 'make axe '),
     (r'^make colcon$', '.ci/run', 'make colcon '),
     (r'^colcon build$', 'Makefile', 'bin/colcon --log-base log build '),
     (
@@ -115,6 +116,8 @@ QUICK = re.compile(
 LIVE = re.compile(
     r'^psd-deflection (estimator|monitor)\b|--serve\b|^make run\b|^ros2 (run|launch) psd_deflection estimator\b'
 )
+ASKS = re.compile(r'^psd-deflection (echo|zero|record|load)\b')
+"""Commands that speak to a running daemon."""
 
 
 class Command(NamedTuple):
@@ -246,6 +249,9 @@ class Reader:
             self._press(line)
         elif LIVE.search(line):
             self._live(line)
+        elif ASKS.search(line):
+            self._serve()
+            self._to_the_end(line)
         elif line.startswith('make '):
             target = line.split()[1]
             self._to_the_end(f'{line} {SHORTEST.get(target, "")}', VERDICTS.get(target, ''))
@@ -294,10 +300,14 @@ class Reader:
         if record and 'replay it:' not in program.text:
             raise RuntimeError(f'no recording was made\n{program.text[-2000:]}')
 
-    def _press(self, line: str) -> None:
+    def _serve(self) -> None:
+        """Start a daemon with a page, unless one runs."""
         if not self._background:
-            self._background.append(self._start('psd-deflection monitor --control'))
+            self._background.append(self._start('psd-deflection monitor'))
             self._background[-1].until(r'θ +[-+]\d')
+
+    def _press(self, line: str) -> None:
+        self._serve()
         url = self._background[-1].until(r'monitor: (http://[^\s#]+)/')[1]
         line = line.replace('http://127.0.0.1:8790', url)
         done = subprocess.run(

@@ -57,7 +57,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seconds', type=float, default=40.0, help='before the first picture')
     seconds = parser.parse_args().seconds
-    program = Program([*PSD_DEFLECTION, 'monitor', '--http-port', '0', '--control'])
+    program = Program([*PSD_DEFLECTION, 'monitor', '--http-port', '0'])
     try:
         url = program.until(r'monitor: (http\S+)')[1]
         for i, shot in enumerate((*SHOTS, PHONE)):

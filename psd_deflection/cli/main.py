@@ -36,6 +36,10 @@ from psd_deflection.errors import (
 COMMANDS: dict[str, str] = {
     'estimator': 'acquire, estimate, publish on ROS 2 and record (the daemon)',
     'monitor': 'serve a web page that shows the rig live, or plays a recording',
+    'echo': 'print what a running daemon measures, without ROS',
+    'zero': 'make a running daemon take the zero, without ROS',
+    'record': 'start or stop a recording of a running daemon, without ROS',
+    'load': 'note a known load that acts on the tip from now on, for the recording',
     'replay': 'compute the estimates of a recording again, as the daemon did',
     'simulate': 'simulate the rig: write a recording, or act as a device on a pseudo-terminal',
     'discover': 'find the physical effect that the simulation of a recording lacks',

@@ -2,11 +2,12 @@
 
 Without REC it acquires, without ROS, from --port or from a simulated rig of its own. With REC (a bag
 folder, an .mcap or a .csv) it plays that recording. Only this machine can open the page, unless
---address is given. The buttons (zero, record) need --control; if other machines can reach the page,
-they also need the token in the printed address. Ctrl-C ends it.
+--address is given. Its buttons (zero, record, load) work for users of this machine. If the network can
+reach the page, they are off; with --control they work for those who have the printed address with its
+token. Ctrl-C ends it.
 
   psd-deflection monitor                                 the simulated rig
-  psd-deflection monitor --port /dev/ttyACM0 --control   a device, with buttons
+  psd-deflection monitor --port /dev/ttyACM0             a device
   psd-deflection monitor recordings/psd_20260101_120000 --speed 2 --loop
 
 The node serves the same page: estimator --monitor, or the parameter monitor:=true.
@@ -23,7 +24,7 @@ from collections.abc import Iterator
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import given_as_option, given_parameters, namespace_option, parameter_option, refuse
 from psd_deflection.cli._report import warn
-from psd_deflection.config import read_parameter_file, replace_values, rig_from_values
+from psd_deflection.config import MONITOR, read_parameter_file, replace_values, rig_from_values
 from psd_deflection.errors import UsageError
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.monitor.shown import ShownRecording
@@ -43,8 +44,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     page = parser.add_argument_group('the page')
     parameter_option(page, '--http-port', 'monitor_port')
     parameter_option(page, '--address', 'monitor_address')
-    page.add_argument(
-        '--control', dest='monitor_control', action='store_true', help='enable the buttons for zero and record'
+    control = page.add_mutually_exclusive_group()
+    control.add_argument(
+        '--control',
+        dest='monitor_control',
+        action='store_const',
+        const='on',
+        help='let the buttons work although the network can reach the page, with the printed token',
+    )
+    control.add_argument(
+        '--no-control', dest='monitor_control', action='store_const', const='off', help='switch the buttons off'
     )
     live = parser.add_argument_group('the rig (without REC)')
     parameter_option(live, '--port', 'port')
@@ -92,6 +101,9 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     from psd_deflection.monitor.server import MonitorServer
 
     opened, rig = open_for_replay(args.recording, args.params_file, args.namespace)
+    if args.params_file is None:
+        # Where the page was served when it was recorded says nothing of today.
+        rig = replace_values(rig, {p.name: p.default for p in MONITOR.parameters.values()})
     rig = replace_values(rig, overrides, 'command line')
     for warning in nominal_rig(opened, args.params_file):
         warn(warning)
@@ -113,7 +125,22 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
         if server is not None:
             server.tell(text)
 
-    shown = ShownRecording(str(args.recording), open_steps, feed, say, speed=args.speed, loop=args.loop)
+    def find_span() -> tuple[int, int]:
+        first = last = None
+        for block in opened.blocks():
+            first, last = first or block, block
+        return (int(first.t_ns[0]), int(last.t_ns[-1])) if first is not None and last is not None else (0, 0)
+
+    shown = ShownRecording(
+        str(args.recording),
+        open_steps,
+        feed,
+        say,
+        speed=args.speed,
+        loop=args.loop,
+        inputs=[*opened.loads(), *opened.references()],
+        find_span=find_span,
+    )
     server = MonitorServer(shown, feed, rig.monitor, display.say)
     server.start()
     try:

@@ -1,42 +1,57 @@
 """Draw a recording: deflection and twist with their uncertainty, dots, sums, spectrum and losses.
 
-The estimates are computed as by `replay`, with the recorded parameters or those of --params-file.
-The ending of --out sets the format: .png, .svg, .pdf or .html (one self-contained page).
+The estimates are computed as by `replay`, with the recorded parameters or those of --params-file. Known
+loads, references and zeros of the recording are drawn too. The ending of --out sets the format: .png,
+.svg, .pdf, or .html: one self-contained page with values under the cursor and zoom.
 
   psd-deflection plot bags/lost_samples
+  psd-deflection plot bags/clean --from 1.5 --to 3
   psd-deflection plot run.csv --params-file my_rig.yaml --out run.html
 """
 
 from __future__ import annotations
 
 import argparse
-import html
-import io
+import math
 import os
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from psd_deflection import __version__
-from psd_deflection.cli._options import PICTURES, namespace_option, need_folder, picture_name
+from psd_deflection.cli._options import PICTURES, namespace_option, need_folder, number, picture_name
+from psd_deflection.cli._plot_page import plot_page
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, save, save_figure, show, warn
 from psd_deflection.config import Rig
-from psd_deflection.errors import RecordingError, printable
+from psd_deflection.errors import RecordingError, UsageError, printable
+from psd_deflection.monitor.feed import is_zero
 from psd_deflection.monitor.spectrum import Spectrum
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay_engine import nominal_rig, open_for_replay, replayed
-from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, Record, SampleBlock, SpotMeans
+from psd_deflection.records import (
+    AppliedLoad,
+    BlockStatus,
+    DeflectionEstimate,
+    FloatArray,
+    Record,
+    ReferencePose,
+    SampleBlock,
+    SpotMeans,
+)
 
 SPECTRUM_OF_S = 600.0
 """The spectrum is of the last ten minutes: it does not get better after that, only slower."""
 
+MAX_SECONDS = 1e8
+
 LONGEST_NAME = 200
 """Characters of a recording's name in the figure."""
+
+MOST_REFERENCES = 500
 
 COLORS = {'dx': '#0b6bcb', 'dy': '#c2570c', 'theta': '#0f7b4f', 'lost': '#c62828', 'quiet': '#5a6875'}
 
@@ -51,8 +66,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='OUT',
         help='.png, .svg, .pdf or .html (default: REC.png in this folder)',
     )
+    for option, name, words in (('--from', 'first_s', 'from'), ('--to', 'last_s', 'up to')):
+        parser.add_argument(
+            option,
+            dest=name,
+            type=number(option, 0.0, MAX_SECONDS),
+            metavar='S',
+            help=f'draw {words} this time, in s from the first block',
+        )
     namespace_option(parser)
     parser.add_argument('--json', action='store_true', help='print the summary as JSON, in SI units')
+
+
+class Inputs(NamedTuple):
+    """What came into the recording from outside: known loads, references, and when the zero was taken, ns."""
+
+    loads: list[AppliedLoad]
+    references: list[ReferencePose]
+    zeros: list[int]
 
 
 @dataclass
@@ -60,18 +91,30 @@ class Drawn:
     """What is drawn, a row a block: s, m, m, rad, V; NaN where a block has no estimate.
 
     ``numbers``: of the first and the last sample. ``first``, ``last``: the blocks at the ends, which a
-    start or a stop amid a block leaves unfinished.
+    start or a stop amid a block leaves unfinished. ``window``: what is drawn of the recording, s from its
+    first block, which was at ``start_ns``. ``zeros``: when a zero was taken, ns.
     """
 
     recording: Recording
+    window: tuple[float, float] = (-math.inf, math.inf)
+    start_ns: int | None = None
     numbers: tuple[int, int] | None = None
     first: SampleBlock | None = None
     last: SampleBlock | None = None
+    _inside: bool = True
     spots: list[SpotMeans] = field(default_factory=list)
     estimates: dict[int, DeflectionEstimate] = field(default_factory=dict)
+    zeros: list[int] = field(default_factory=list)
 
-    def add(self, record: Record) -> None:
-        """Take what is drawn of a record."""
+    def add(self, record: Record) -> bool:
+        """Take what is drawn of a record; return whether it is within the window."""
+        if isinstance(record, SpotMeans | DeflectionEstimate):
+            self.start_ns = record.t_ns if self.start_ns is None else self.start_ns
+            self._inside = self.window[0] <= (record.t_ns - self.start_ns) / 1e9 <= self.window[1]
+        if is_zero(record):
+            self.zeros.append(record.t_ns)
+        if not self._inside:
+            return False
         if isinstance(record, SpotMeans):
             self.spots.append(record)
         elif isinstance(record, DeflectionEstimate) and record.primary:
@@ -81,10 +124,26 @@ class Drawn:
             self.numbers = (first if self.numbers is None else self.numbers[0], last)
             self.first = self.first or record
             self.last = record
+        return True
+
+    @property
+    def ended(self) -> bool:
+        """Whether the window lies before the record that was added last."""
+        return bool(self.spots) and not self._inside
+
+    def inputs(self) -> Inputs:
+        """Loads, references and zeros within the window; first the load that is held when it begins."""
+        first = self.spots[0].t_ns
+        last = self.spots[-1].t_ns
+        loads = sorted((r for r in self.recording.loads() if r.t_ns <= last), key=lambda r: r.t_ns)
+        before = [load._replace(t_ns=first) for load in loads if load.t_ns <= first][-1:]
+        references = [r for r in self.recording.references() if first <= r.t_ns <= last]
+        zeros = [z for z in self.zeros if first <= z <= last]
+        return Inputs([*before, *(r for r in loads if r.t_ns > first)], references, zeros)
 
     def table(self) -> dict[str, FloatArray]:
         """Arrays (n,): t from the first block, pose, standard deviations, dots, sums, samples lost, 1 if unfinished."""
-        start = self.spots[0].t_ns
+        start = self.start_ns if self.start_ns is not None else self.spots[0].t_ns
         nothing = (np.nan,) * 6
         rows: list[tuple[float, ...]] = []
         index = self.spots[0].index - 1
@@ -131,24 +190,32 @@ def run(args: argparse.Namespace) -> int:
     )
     out = Path(args.out) if args.out is not None else default_out(args.recording)
     need_folder(out)
+    window = (-math.inf if args.first_s is None else args.first_s, math.inf if args.last_s is None else args.last_s)
+    if window[0] >= window[1]:
+        raise UsageError(f'--from {window[0]:g} --to {window[1]:g}: must rise')
     recording, rig = open_for_replay(args.recording, args.params_file, args.namespace)
     for warning in nominal_rig(recording, args.params_file):
         warn(warning)
-    drawn, spectrum = Drawn(recording), Spectrum(rig, SPECTRUM_OF_S)
+    drawn, spectrum = Drawn(recording, window), Spectrum(rig, SPECTRUM_OF_S)
     for records in replayed(recording, Pipeline(rig), progress_of(recording.blocks(), quiet=args.json)):
         for record in records:
-            drawn.add(record)
-            if isinstance(record, SampleBlock):
+            if drawn.add(record) and isinstance(record, SampleBlock):
                 spectrum.add(record)
+        if drawn.ended:
+            break
     if not drawn.spots:
-        raise RecordingError(f'{args.recording}: has no samples to draw')
+        part = '' if window == (-math.inf, math.inf) else ' between --from and --to'
+        raise RecordingError(f'{args.recording}: has no samples to draw{part}')
     summary = summarise(drawn, rig)
     with told('drawing', quiet=args.json):
-        figure = draw_recording(drawn, spectrum, rig, name)
         if out.suffix.lower() == '.html':
-            write_html(figure, out, title, summary)
+            density = spectrum.density()
+            shape = None if density is None else (spectrum.frequencies, density)
+            start_ns = drawn.start_ns or 0
+            page = plot_page(title, drawn.table(), shape, *drawn.inputs(), start_ns, rig, summary)
+            save(page.encode(), out)
         else:
-            save_figure(figure, out, dpi=150)
+            save_figure(draw_recording(drawn, spectrum, rig, name), out, dpi=150)
     if args.json:
         print_json({**plot_json(drawn, rig), 'out': str(out)})
         return 0
@@ -170,7 +237,7 @@ def plot_json(drawn: Drawn, rig: Rig) -> dict[str, Any]:
     table = drawn.table()
     causes = Counter(s.status.name.lower() for s in drawn.spots if s.reason)
     out: dict[str, Any] = {
-        'duration_s': float(table['t'][-1]) + rig.estimator.block_size / rig.converter.sample_rate_hz,
+        'duration_s': float(table['t'][-1] - table['t'][0]) + rig.estimator.block_size / rig.converter.sample_rate_hz,
         'samples': sum(s.present for s in drawn.spots),
         'lost': drawn.gone(),
         'blocks': len(drawn.spots),
@@ -215,16 +282,17 @@ def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    table = drawn.table()
+    table, inputs = drawn.table(), drawn.inputs()
     t = table['t']
     # Paths of an hour's blocks are pictures, not paths, else an .svg of them chokes its reader.
     raster = len(t) > 20_000
     with mpl.rc_context({'font.size': 9, 'axes.grid': True, 'grid.alpha': 0.3, 'axes.axisbelow': True}):
         figure = Figure(figsize=(13, 8), layout='constrained')
         figure.suptitle(f'{name} · {len(drawn.estimates)} estimates, {drawn.gone()} samples lost')
-        grid = figure.add_gridspec(4, 4, height_ratios=(3, 3, 3, 1.6))
+        heights = (3, 3, 3, 1.6, *([1.6] if inputs.loads else []))
+        grid = figure.add_gridspec(len(heights), 4, height_ratios=heights)
         left = [figure.add_subplot(grid[0, :2])]
-        left += [figure.add_subplot(grid[i, :2], sharex=left[0]) for i in (1, 2, 3)]
+        left += [figure.add_subplot(grid[i, :2], sharex=left[0]) for i in range(1, len(heights))]
         for axes, (key, label, scale, unit) in zip(left, _POSE, strict=False):
             value, sd = table[key] * scale, table[f'sd_{key}'] * scale
             axes.fill_between(
@@ -235,17 +303,20 @@ def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any
             axes.set_ylabel(f'{label} ({unit})')
             axes.set_title(f'{label}{typical}', loc='left', fontsize=9)
             _mark_losses(axes, table)
+            _mark_inputs(axes, inputs, key, scale, drawn.start_ns or 0)
         if left[0].get_legend_handles_labels()[0]:
             left[0].legend(loc='upper right', fontsize=8)
         for key, color in (('sum1', COLORS['dx']), ('sum2', COLORS['dy'])):
             left[3].plot(t, table[key], color=color, linewidth=0.9, label=key, rasterized=raster)
         left[3].axhline(rig.estimator.sum_min, color=COLORS['quiet'], linestyle=':', linewidth=1)
         left[3].set(
-            xlabel='t (s)',
             ylabel='sum (V)',
             ylim=(0.0, 1.2 * max(rig.amplifier.sum_nominal, np.nanmax(table['sum1']), np.nanmax(table['sum2']))),
         )
         left[3].legend(loc='center right', fontsize=8, ncols=2)
+        if inputs.loads:
+            _loads(left[4], inputs.loads, drawn.start_ns or 0, float(t[-1]))
+        left[-1].set_xlabel('t (s)')
         for number in (1, 2):
             _detector(figure.add_subplot(grid[:2, 1 + number]), table, rig, number, raster)
         _spectrum(figure.add_subplot(grid[2:, 2:]), spectrum, rig)
@@ -271,6 +342,41 @@ def _mark_losses(axes: Any, table: dict[str, FloatArray]) -> None:
         axes.plot(
             t[lost], np.ones(int(lost.sum())), '|', color=COLORS['lost'], ms=9, transform=where, label='lost samples'
         )
+
+
+def _mark_inputs(axes: Any, inputs: Inputs, name: str, scale: float, start_ns: int) -> None:
+    """Rings where a reference was, a dashed line where the zero was taken or the load changed."""
+    if inputs.references:
+        at = [(r.t_ns - start_ns) / 1e9 for r in inputs.references]
+        values = [getattr(r, name) * scale for r in inputs.references]
+        every = max(1, len(at) // MOST_REFERENCES)
+        axes.plot(
+            at[::every], values[::every], 'o', ms=3, mfc='none', color=COLORS['quiet'], alpha=0.8, label='reference'
+        )
+    for i, zero in enumerate(inputs.zeros):
+        axes.axvline((zero - start_ns) / 1e9, color=COLORS['lost'], ls='--', lw=1, label='' if i else 'zero taken')
+    for load in inputs.loads[1:]:
+        axes.axvline((load.t_ns - start_ns) / 1e9, color=COLORS['quiet'], ls='--', lw=0.6)
+
+
+def _loads(axes: Any, loads: list[AppliedLoad], start_ns: int, end: float) -> None:
+    """The known load: forces on the left, the torque on the right."""
+    at = [*((r.t_ns - start_ns) / 1e9 for r in loads), end]
+    twin = axes.twinx()
+    lines = []
+    for name, unit, color, where in (
+        ('fx', 'N', COLORS['dx'], axes),
+        ('fy', 'N', COLORS['dy'], axes),
+        ('tz', 'N m', COLORS['theta'], twin),
+    ):
+        values = [getattr(r, name) for r in (*loads, loads[-1])]
+        lines += where.step(
+            at, values, where='post', color=color, lw=0.9, ls='--' if where is twin else '-', label=f'{name} ({unit})'
+        )
+    axes.set_ylabel('load (N)')
+    twin.set_ylabel('(N m)')
+    twin.grid(visible=False)
+    axes.legend(handles=lines, loc='upper right', fontsize=8, ncols=3)
 
 
 def _detector(axes: Any, table: dict[str, FloatArray], rig: Rig, number: int, raster: bool) -> None:
@@ -309,26 +415,3 @@ def _spectrum(axes: Any, spectrum: Spectrum, rig: Rig) -> None:
         axes.axvline(hertz, color=COLORS['quiet'], linestyle=':', linewidth=1)
         axes.text(hertz, 0.02, f' {label}', rotation=90, transform=axes.get_xaxis_transform(), fontsize=8, va='bottom')
     axes.legend(loc='upper right', fontsize=8, ncols=2)
-
-
-PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title><style>
-body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 1200px; margin: 2rem auto; padding: 0 1rem; color: #17212b; }}
-svg {{ width: 100%; height: auto; }}
-td, th {{ text-align: left; padding: .1rem 1.5rem .1rem 0; }} th {{ font-weight: 600; }}
-</style></head><body><h1>{title}</h1><table>{rows}</table>{picture}
-<p>psd_deflection {version}; <code>psd-deflection plot {title}</code></p></body></html>
-"""
-
-
-def write_html(figure: Any, path: Path, title: str, summary: list[tuple[str, str]]) -> None:
-    """One page with the figure in it. Raises RecordingError where it cannot be written."""
-    stream = io.StringIO()
-    figure.savefig(stream, format='svg', metadata={'Date': None})
-    picture = stream.getvalue()
-    rows = ''.join(f'<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>' for k, v in summary)
-    page = PAGE.format(
-        title=html.escape(title), rows=rows, picture=picture[picture.index('<svg') :], version=__version__
-    )
-    save(page.encode(), path)

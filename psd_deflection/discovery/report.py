@@ -24,13 +24,19 @@ BEFORE, AFTER, HELD, FLOOR = '#c44e52', '#4c72b0', '#55a868', '#8c8c8c'
 DOTS = ('x1', 'y1', 'x2', 'y2')
 
 STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:#222}
-h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2.2rem;border-bottom:1px solid #ddd}
-.verdict{font-size:1.25rem;padding:1rem 1.2rem;border-left:6px solid #4c72b0;background:#f3f6fa}
+:root{color-scheme:light dark;--bg:#fff;--text:#222;--quiet:#5d5d5d;--line:#ddd;--card:#f3f6fa}
+@media(prefers-color-scheme:dark){:root{--bg:#12171c;--text:#e4e8ec;--quiet:#a3adb8;--line:#39434d;--card:#1c242c}}
+body{font:16px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:var(--text);
+background:var(--bg);overflow-wrap:anywhere}
+h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2.2rem;border-bottom:1px solid var(--line)}
+.verdict{font-size:1.25rem;padding:1rem 1.2rem;border-left:6px solid #4c72b0;background:var(--card)}
 table{border-collapse:collapse;width:100%;font-size:.9rem}
-th,td{text-align:left;padding:.3rem .6rem;border-bottom:1px solid #e5e5e5;font-variant-numeric:tabular-nums}
-img{max-width:100%}.quiet{color:#666;font-size:.85rem}
-pre{background:#f6f6f6;padding:.8rem;overflow:auto;font-size:.8rem}
+th,td{text-align:left;padding:.3rem .6rem;border-bottom:1px solid var(--line);
+font-variant-numeric:tabular-nums;overflow-wrap:normal}
+.wide{overflow-x:auto}.wide:focus-visible,pre:focus-visible{outline:2px solid #4c72b0}
+img{max-width:100%;background:#fff}.quiet{color:var(--quiet);font-size:.85rem}
+pre{background:var(--card);padding:.8rem;overflow:auto;font-size:.8rem}
+@media(max-width:46rem){img{max-width:none;width:46rem}body{margin-top:1rem}}
 """
 
 
@@ -38,7 +44,12 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """A table; every cell is escaped."""
     lines = [''.join(f'<td>{html.escape(str(cell))}</td>' for cell in row) for row in rows]
     head = ''.join(f'<th>{html.escape(h)}</th>' for h in header)
-    return f'<table><tr>{head}</tr>' + ''.join(f'<tr>{line}</tr>' for line in lines) + '</table>'
+    return _wide(f'<table><tr>{head}</tr>' + ''.join(f'<tr>{line}</tr>' for line in lines) + '</table>', 'table')
+
+
+def _wide(content: str, words: str) -> str:
+    """What may be wider than a phone: it is moved by itself, also with the keyboard."""
+    return f'<div class="wide" role="group" tabindex="0" aria-label="{html.escape(words)}">{content}</div>'
 
 
 def _image(figure: Figure, words: str) -> str:
@@ -46,7 +57,7 @@ def _image(figure: Figure, words: str) -> str:
     FigureCanvasAgg(figure)
     figure.savefig(buffer, format='png', dpi=110)
     code = base64.b64encode(buffer.getvalue()).decode()
-    return f'<img alt="{html.escape(words)}" src="data:image/png;base64,{code}">'
+    return _wide(f'<img alt="{html.escape(words)}" src="data:image/png;base64,{code}">', f'picture: {words}')
 
 
 def _residual_figure(discovery: Discovery) -> Figure:
@@ -167,7 +178,7 @@ def _effect_section(effect: NamedEffect) -> str:
         others = [
             (n, f'{loss:.1f}', f'{bic:.1f}', told[n in effect.equivalent]) for n, loss, bic in effect.alternatives
         ]
-        out.append(_table(('in its place', 'chi-square lost', 'BIC worse by', ''), others))
+        out.append(_table(('in its place', 'chi-square lost', 'BIC worse by', 'verdict'), others))
     if effect.suggestion is not None:
         out.append(f'<p>To decide: {html.escape(effect.suggestion.text)}.</p>')
     return ''.join(out)
@@ -221,10 +232,12 @@ def report_html(discovery: Discovery) -> str:
     body.append(_table(('effect', 'gain', 'parameters', 'p'), rows))
     trace = '; '.join(discovery.search.trace) or 'nothing passed the screen'
     body.append(f'<h2>Provenance</h2><p class=quiet>Steps: {html.escape(trace)}.</p>')
-    body.append(f'<pre>{html.escape(json.dumps(_plain(provenance(discovery)), indent=1))}</pre>')
+    source = html.escape(json.dumps(_plain(provenance(discovery)), indent=1))
+    body.append(f'<pre role="group" tabindex="0" aria-label="provenance">{source}</pre>')
     return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>psd-deflection discover</title>'
-        f'<style>{STYLE}</style></head><body>{"".join(body)}</body></html>'
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1"><title>psd-deflection discover</title>'
+        f'<style>{STYLE}</style></head><body><main>{"".join(body)}</main></body></html>'
     )
 
 

@@ -7,9 +7,18 @@ from __future__ import annotations
 
 import math
 import queue
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
-from psd_deflection.records import DeflectionEstimate, Record, SampleBlock, SpotMeans
+from psd_deflection.config import ZEROS
+from psd_deflection.records import (
+    AppliedLoad,
+    DeflectionEstimate,
+    ParameterChange,
+    Record,
+    ReferencePose,
+    SampleBlock,
+    SpotMeans,
+)
 
 QUEUE_ITEMS = 2000
 """Ten seconds at 100 blocks/s and two items per block."""
@@ -44,14 +53,20 @@ class BlockResult(NamedTuple):
     estimate: DeflectionEstimate | None
 
 
+Item = BlockResult | SampleBlock | AppliedLoad | ReferencePose | ParameterChange
+
+
 class Feed:
-    """A sink of records; :meth:`take` is for one other thread. ``dropped``: items that did not fit."""
+    """A sink of records; :meth:`take` is for one other thread. ``dropped``: items that did not fit.
+
+    Loads and references may come from any thread, the other records from one.
+    """
 
     def __init__(self, limit: int = QUEUE_ITEMS) -> None:
         self.dropped = 0
         self._limit = limit
         self._estimate: DeflectionEstimate | None = None
-        self._queue: queue.SimpleQueue[BlockResult | SampleBlock] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
 
     def put(self, record: Record) -> None:
         """Take one record; kinds that the page does not show are ignored."""
@@ -61,7 +76,7 @@ class Feed:
         elif isinstance(record, SpotMeans):
             best, self._estimate = self._estimate, None
             self._offer(BlockResult(record, best if best is not None and best.block == record.index else None))
-        elif isinstance(record, SampleBlock):
+        elif isinstance(record, SampleBlock | AppliedLoad | ReferencePose) or is_zero(record):
             self._offer(record)
 
     @property
@@ -69,15 +84,37 @@ class Feed:
         """Number of items that wait in the queue."""
         return self._queue.qsize()
 
-    def take(self) -> list[BlockResult | SampleBlock]:
+    def take(self) -> list[Item]:
         """The items since the last call, in order; does not wait."""
         return [self._queue.get_nowait() for _ in range(self._queue.qsize())]
 
-    def _offer(self, item: BlockResult | SampleBlock) -> None:
+    def _offer(self, item: Item) -> None:
         if self._queue.qsize() >= self._limit:
             self.dropped += 1
         else:
             self._queue.put(item)
+
+
+def is_zero(record: Record) -> TypeGuard[ParameterChange]:
+    """Whether a record says that the unloaded dots changed."""
+    return isinstance(record, ParameterChange) and any(name in ZEROS for name, _ in record.values)
+
+
+def mark_json(record: AppliedLoad | ParameterChange) -> str:
+    """A load as ``[t, "load", fx, fy, tz]``, a zero as ``[t, "zero"]``: s, N, N, N m."""
+    if isinstance(record, AppliedLoad):
+        return f'[{_seconds(record.t_ns)},"load",{record.fx:.7g},{record.fy:.7g},{record.tz:.7g}]'
+    return f'[{_seconds(record.t_ns)},"zero"]'
+
+
+def reference_json(record: ReferencePose) -> str:
+    """``[t, dx, dy, theta]``: s, m, m, rad."""
+    return f'[{_seconds(record.t_ns)},{record.dx:.7g},{record.dy:.7g},{record.theta:.7g}]'
+
+
+def _seconds(t_ns: int) -> str:
+    # A double holds a time since the epoch only to the microsecond.
+    return f'{t_ns // 1_000_000_000}.{t_ns % 1_000_000_000 // 1000:06d}'
 
 
 def row_json(result: BlockResult) -> str:
@@ -88,8 +125,7 @@ def row_json(result: BlockResult) -> str:
         values += [*estimate.pose, *(math.sqrt(max(v, 0.0)) for v in estimate.variances)]
     numbers = [f'{v:.7g}' if math.isfinite(v) else 'null' for v in values]
     numbers += ['null'] * (12 - len(numbers))
-    # A double holds a time since the epoch only to the microsecond.
-    seconds = f'{spots.t_ns // 1_000_000_000}.{spots.t_ns % 1_000_000_000 // 1000:06d}'
+    seconds = _seconds(spots.t_ns)
     chi_square = estimate.chi_square if estimate is not None else math.nan
     last = f'{chi_square:.4g}' if math.isfinite(chi_square) else 'null'
     return f'[{seconds},{spots.index},{",".join(numbers)},{spots.present},{spots.lost},{int(spots.status)},{last}]'

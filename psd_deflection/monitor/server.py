@@ -13,6 +13,7 @@ import contextlib
 import errno
 import json
 import logging
+import math
 import os
 import secrets
 import socket
@@ -30,10 +31,11 @@ from psd_deflection import __version__
 from psd_deflection.config import MonitorConfig
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor import access
-from psd_deflection.monitor.feed import COLUMNS, BlockResult, Feed, row_json
+from psd_deflection.monitor.feed import COLUMNS, BlockResult, Feed, mark_json, reference_json, row_json
+from psd_deflection.monitor.served import Served, announce, withdraw
 from psd_deflection.monitor.shown import RefusedError, Shown
 from psd_deflection.monitor.spectrum import Spectrum, density_json
-from psd_deflection.records import BlockStatus, DiagnosticReport
+from psd_deflection.records import BlockStatus, DiagnosticReport, ReferencePose, SampleBlock
 
 PAGE = Path(__file__).parent / 'page'
 TOKEN_VARIABLE = 'PSD_DEFLECTION_MONITOR_TOKEN'
@@ -44,6 +46,13 @@ SPECTRUM_EVERY_S = 0.5
 HEALTH_S = 0.9
 HISTORY_S = 60.0
 MESSAGES = 50
+MARKS = 200
+"""Loads and zeros that are kept."""
+
+MAX_SEEK_S = 1e8
+MAX_FORCE = 1e6
+"""Largest load that is taken down, N and N m: a slip of the hand is refused."""
+
 BROWSERS = 16
 CONNECTIONS = 100
 """Maximum plain HTTP connections, in addition to websockets; a browser opens at most six."""
@@ -83,6 +92,13 @@ class MonitorServer:
         rate = shown.rig.converter.sample_rate_hz / shown.rig.estimator.block_size
         self._rows: deque[str] = deque(maxlen=max(100, round(HISTORY_S * rate)))
         self._row_count = 0
+        # References may come faster than blocks: one for each block is shown.
+        self._references: deque[str] = deque(maxlen=self._rows.maxlen)
+        self._reference_count = 0
+        self._reference_ns: int | None = None
+        self._block_ns = 1e9 / rate
+        self._marks: deque[str] = deque(maxlen=MARKS)
+        self._mark_count = 0
         self._messages: deque[tuple[int, float, str]] = deque(maxlen=MESSAGES)
         self._message_count = 0
         self._health: tuple[int, str] = (0, 'null')
@@ -96,18 +112,23 @@ class MonitorServer:
         self._ended: asyncio.Event | None = None
         self._started: Future[str] = Future()
         self._thread = threading.Thread(target=self._run, name='monitor', daemon=True)
-        if config.control and not access.is_loopback(config.address):
+        alone = access.is_loopback(config.address)
+        self._control = config.control == 'on' or (config.control == 'local' and alone)
+        self._announced: Path | None = None
+        if self._control and not alone:
             self.token = os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(16)
 
     def start(self) -> str:
         """Start the thread; return the page's address. Raises ConfigError if it cannot be served."""
         self._thread.start()
         self.url = self._started.result(START_S)
+        self._announced = announce(Served(self.url, self.token, str(self._shown.describe()['name']), os.getpid()))
         self._say(f'monitor: {self.url}' + (f'#token={self.token}' if self.token else ''))
         return self.url
 
     def close(self) -> None:
         """Close the connections to the browsers and end the thread; a second call does nothing."""
+        withdraw(self._announced)
         if self._loop is not None and self._ended is not None and self._thread.is_alive():
             with contextlib.suppress(RuntimeError):
                 self._loop.call_soon_threadsafe(self._ended.set)
@@ -135,6 +156,8 @@ class MonitorServer:
         application.router.add_get('/ws', self._websocket)
         application.router.add_post('/api/zero', self._zero)
         application.router.add_post('/api/record', self._record)
+        application.router.add_post('/api/load', self._load)
+        application.router.add_post('/api/play', self._play)
         application.router.add_static('/page', PAGE)
         application.on_response_prepare.append(_add_headers)
         runner = web.AppRunner(
@@ -193,8 +216,14 @@ class MonitorServer:
                     self._rows.append(row_json(item))
                     self._row_count += 1
                     new = True
-                else:
+                elif isinstance(item, SampleBlock):
                     self._spectrum.add(item)
+                elif isinstance(item, ReferencePose):
+                    new = self._take_reference(item) or new
+                else:
+                    self._marks.append(mark_json(item))
+                    self._mark_count += 1
+                    new = True
             now = time.monotonic()
             if self._browsers and now >= due:
                 due = now + SPECTRUM_EVERY_S
@@ -203,6 +232,15 @@ class MonitorServer:
             if new:
                 self._wake()
             await asyncio.sleep(PUMP_S)
+
+    def _take_reference(self, reference: ReferencePose) -> bool:
+        last = self._reference_ns
+        if last is not None and 0 <= reference.t_ns - last < self._block_ns:
+            return False
+        self._reference_ns = reference.t_ns
+        self._references.append(reference_json(reference))
+        self._reference_count += 1
+        return True
 
     async def _once_a_second(self) -> None:
         while True:
@@ -280,7 +318,8 @@ class MonitorServer:
         event = asyncio.Event()
         self._browsers[browser] = event
         self._looked_through.add(request.protocol)
-        sender = asyncio.create_task(self._send(browser, event))
+        history = request.query.get('history') != '0'
+        sender = asyncio.create_task(self._send(browser, event, history))
         try:
             self._take_health()
             async for message in browser:
@@ -294,15 +333,21 @@ class MonitorServer:
                 await sender
         return browser
 
-    async def _send(self, browser: web.WebSocketResponse, event: asyncio.Event) -> None:
+    async def _send(self, browser: web.WebSocketResponse, event: asyncio.Event, history: bool) -> None:
+        rows = self._row_count - (len(self._rows) if history else 0)
+        marks = references = messages = health = density = 0
         await browser.send_str(json.dumps({'hello': self._hello()}))
-        rows = self._row_count - len(self._rows)
-        messages = health = density = 0
         while True:
             parts = []
             if (new := min(self._row_count - rows, len(self._rows))) > 0:
                 rows = self._row_count
                 parts.append('"rows":[' + ','.join([self._rows[i] for i in range(-new, 0)]) + ']')
+            if (new := min(self._mark_count - marks, len(self._marks))) > 0:
+                marks = self._mark_count
+                parts.append('"marks":[' + ','.join([self._marks[i] for i in range(-new, 0)]) + ']')
+            if (new := min(self._reference_count - references, len(self._references))) > 0:
+                references = self._reference_count
+                parts.append('"references":[' + ','.join([self._references[i] for i in range(-new, 0)]) + ']')
             if self._message_count > messages:
                 told = [m for m in tuple(self._messages) if m[0] > messages]
                 messages = self._message_count
@@ -338,22 +383,63 @@ class MonitorServer:
             'frequency': [frequencies[0], len(frequencies)],
             'spectrum_s': self._spectrum.seconds,
             'solver': rig.estimator.solver,
-            'control': self._config.control,
+            'control': self._control,
+            'why_no_control': '' if self._control else self._why_no_control(),
             'needs_token': bool(self.token),
             **self._shown.describe(),
         }
 
+    def _why_no_control(self) -> str:
+        if self._config.control == 'off':
+            return 'the buttons are switched off (parameter monitor_control)'
+        return (
+            'the buttons are off because the network can reach this page; the parameter monitor_control:=on, or '
+            '`psd-deflection monitor --control`, allows them to whoever has the token'
+        )
+
     async def _zero(self, request: web.Request) -> web.StreamResponse:
-        return await self._act(request, 'zero', lambda wanted: asyncio.to_thread(self._shown.zero))
+        def zero(body: dict[str, Any]) -> Awaitable[str]:
+            _need(not body, '{}')
+            return asyncio.to_thread(self._shown.zero)
+
+        return await self._act(request, 'zero', zero)
 
     async def _record(self, request: web.Request) -> web.StreamResponse:
-        return await self._act(request, 'record', self._shown.record)
+        def record(body: dict[str, Any]) -> Awaitable[str]:
+            # Nothing is recorded unless it was asked for in so many words.
+            wanted = body.get('record')
+            _need(isinstance(wanted, bool), '{"record": true} or {"record": false}')
+            return self._shown.record(bool(wanted))
+
+        return await self._act(request, 'record', record)
+
+    async def _load(self, request: web.Request) -> web.StreamResponse:
+        def load(body: dict[str, Any]) -> Awaitable[str]:
+            values: list[Any] = [body.get(name) for name in ('fx', 'fy', 'tz')]
+            add = body.get('add', False)
+            good = all(map(_is_number, values)) and all(abs(v) <= MAX_FORCE for v in values) and isinstance(add, bool)
+            _need(good, f'{{"fx": N, "fy": N, "tz": N m, "add": false}}, each of at most {MAX_FORCE:g}')
+            fx, fy, tz = map(float, values)
+            return asyncio.to_thread(self._shown.load, fx, fy, tz, add)
+
+        return await self._act(request, 'load', load)
+
+    async def _play(self, request: web.Request) -> web.StreamResponse:
+        def play(body: dict[str, Any]) -> Awaitable[str]:
+            paused, seek = body.get('paused'), body.get('seek')
+            good = (paused is None or isinstance(paused, bool)) and (seek is None or _is_number(seek))
+            good = good and (seek is None or 0.0 <= seek <= MAX_SEEK_S) and (paused, seek) != (None, None)
+            _need(good, '{"paused": true} or {"seek": SECONDS}')
+            return asyncio.to_thread(self._shown.play, paused, seek)
+
+        return await self._act(request, '', play)
 
     async def _act(
-        self, request: web.Request, name: str, action: Callable[[bool], Awaitable[str]]
+        self, request: web.Request, name: str, action: Callable[[dict[str, Any]], Awaitable[str]]
     ) -> web.StreamResponse:
-        if not self._config.control:
-            return _answer(403, 'refused: the buttons are off; the parameter monitor_control allows them')
+        """Carry out ``action`` with the body of ``request``, if it is allowed; ``name`` is said, unless it is ''."""
+        if not self._control:
+            return _answer(403, f'refused: {self._why_no_control()}')
         if self.token and not access.is_token(request.headers.get(TOKEN_HEADER), self.token):
             return _answer(401, 'refused: the token is missing or wrong; the address printed at the start has it')
         # A type that a form of another site cannot send.
@@ -363,20 +449,35 @@ class MonitorServer:
             body = json.loads(await request.read() or b'{}')
         except (ValueError, RecursionError):
             return _answer(400, 'refused: not JSON')
-        # Nothing is recorded unless it was asked for in so many words.
-        unsaid = True if name == 'zero' else None
-        wanted = body.get('record', unsaid) if isinstance(body, dict) else None
-        if not isinstance(wanted, bool):
-            return _answer(400, 'refused: expected {"record": true} or {"record": false}')
         try:
-            text = await action(wanted)
+            _need(isinstance(body, dict), 'a JSON object')
+            text = await action(body)
+        except _BadBodyError as error:
+            return _answer(400, f'refused: expected {error}')
         except RefusedError as error:
             return _answer(409, str(error))
-        # What came of it is told by the run itself.
-        self._say(f'monitor: {name} was asked for by {request.remote}')
+        if name:
+            # What came of it is told by the run itself.
+            self._say(f'monitor: {name} was asked for by {request.remote}')
         if self._browsers:
             self._take_health()
         return _answer(200, text)
+
+
+class _BadBodyError(Exception):
+    """The body of a request is not what it should be; the message says what that is."""
+
+
+def _need(good: bool, expected: str) -> None:
+    if not good:
+        raise _BadBodyError(expected)
+
+
+def _is_number(value: object) -> bool:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    # An integer may be too large for a float.
+    return abs(value) < math.inf
 
 
 def _answer(status: int, text: str) -> web.Response:

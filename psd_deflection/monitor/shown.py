@@ -3,25 +3,41 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from typing import Any, Protocol
 
 from psd_deflection.config import Rig
 from psd_deflection.errors import PsdDeflectionError
-from psd_deflection.monitor.feed import Feed
+from psd_deflection.monitor.feed import QUEUE_ITEMS, Feed
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.records import RESTART, DiagnosticEntry, DiagnosticReport, ParameterChange, Record, SpotMeans
+from psd_deflection.records import (
+    RESTART,
+    AppliedLoad,
+    DiagnosticEntry,
+    DiagnosticReport,
+    ParameterChange,
+    Record,
+    ReferencePose,
+    SpotMeans,
+)
 from psd_deflection.runner.diagnostics import ERROR, OK, WARN, HealthReporter
-from psd_deflection.runner.session import Session, why_no_zero, zero_text
+from psd_deflection.runner.session import Session, load_text, why_no_zero, zero_text
 
 LONGEST_WAIT_S = 2.0
 """Longest wait for a pause in a recording, s."""
 
 REQUEST_TIMEOUT_S = 1.0
+
+BEFORE_GOAL_NS = 60_000_000_000
+"""What lies this long before the time that is sought is shown: the traces are not empty there."""
+
+FULL_S = 0.01
+"""Pause while the page's queue is half full."""
 
 
 class RefusedError(Exception):
@@ -47,6 +63,12 @@ class Shown(Protocol):
     async def record(self, wanted: bool) -> str:
         """Start or stop a recording; return the result as a line once the disk has answered. Raises RefusedError."""
 
+    def load(self, fx: float, fy: float, tz: float, add: bool) -> str:
+        """Note a known load (N, N, N m), beside the held one if ``add``; return it as a line. Raises RefusedError."""
+
+    def play(self, paused: bool | None, seek_s: float | None) -> str:
+        """Pause or resume, go to a time from the start; None leaves it. Raises RefusedError."""
+
 
 class ShownSession:
     """A running session."""
@@ -61,12 +83,13 @@ class ShownSession:
         return self._session.rig
 
     def describe(self) -> dict[str, Any]:
-        """Port, and whether it is recorded."""
-        folder = self._session.recorder.folder
+        """Port, whether it is recorded, and the load that is held."""
+        folder, load = self._session.recorder.folder, self._session.load
         return {
             'kind': 'simulated' if self._session.simulated else 'live',
             'name': self._session.rig.acquisition.port,
             'recording': str(folder) if folder is not None else None,
+            'load': [load.fx, load.fy, load.tz] if load is not None else None,
         }
 
     def health(self, t_ns: int) -> DiagnosticReport:
@@ -95,12 +118,21 @@ class ShownSession:
             return 'no recording was made'
         return f'recording to {folder}' if wanted else f'recording ended: {folder}'
 
+    def load(self, fx: float, fy: float, tz: float, add: bool) -> str:
+        """Take down a load that acts from now on."""
+        return load_text(self._session.note_load(fx, fy, tz, add=add))
+
+    def play(self, paused: bool | None, seek_s: float | None) -> str:
+        """Refuse: what is measured cannot be paused."""
+        raise RefusedError('only a recording can be paused')
+
 
 class ShownRecording:
     """A recording, played once or repeatedly; a separate thread feeds ``feed``.
 
     ``open_steps``: returns a new pipeline and the records of each of its steps. ``speed``: factor of the
-    recorded speed.
+    recorded speed. ``inputs``: its loads and references. ``find_span``: finds the times of its first and last
+    block, ns, which may take a while; it runs in a thread of its own.
     """
 
     def __init__(
@@ -112,6 +144,8 @@ class ShownRecording:
         *,
         speed: float = 1.0,
         loop: bool = False,
+        inputs: Iterable[AppliedLoad | ReferencePose] = (),
+        find_span: Callable[[], tuple[int, int]] | None = None,
     ) -> None:
         self.failed: BaseException | None = None
         self._name = name
@@ -120,12 +154,21 @@ class ShownRecording:
         self._say = say
         self._speed = speed
         self._loop = loop
+        self._inputs = sorted(inputs, key=lambda r: r.t_ns)
+        self._find_span = find_span
+        self._span: tuple[int, int] | None = None
         self._pipeline, self._steps = open_steps()
-        self._requests: queue.SimpleQueue[Future[str]] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[tuple[Future[str], Callable[[], str]]] = queue.SimpleQueue()
         self._stop = threading.Event()
         self._woken = threading.Event()
         self._ended = False
+        self._paused = False
+        self._goal: int | None = None
+        self._again = False
         self._lost = 0
+        self._next_input = 0
+        self._load: AppliedLoad | None = None
+        self._start_ns: int | None = None
         self._last: SpotMeans | None = None
         self._seen = (0, 0, 0)
         self._thread = threading.Thread(target=self._run, name='replay', daemon=True)
@@ -138,6 +181,8 @@ class ShownRecording:
     def start(self) -> None:
         """Start playing."""
         self._thread.start()
+        if self._find_span is not None:
+            threading.Thread(target=self._look_for_span, args=(self._find_span,), name='span', daemon=True).start()
 
     def close(self) -> None:
         """Stop playing."""
@@ -152,8 +197,17 @@ class ShownRecording:
         return self._ended
 
     def describe(self) -> dict[str, Any]:
-        """The recording's name."""
-        return {'kind': 'replay', 'name': self._name, 'recording': None}
+        """The recording's name, which part of it is played, and the load that is held there."""
+        load = self._load
+        return {
+            'kind': 'replay',
+            'name': self._name,
+            'recording': None,
+            'load': [load.fx, load.fy, load.tz] if load is not None else None,
+            'paused': self._paused,
+            'seeking': self._goal is not None,
+            'span': [t / 1e9 for t in self._span] if self._span is not None else None,
+        }
 
     def health(self, t_ns: int) -> DiagnosticReport:
         """Counts of the part played so far, and why blocks have no estimate."""
@@ -168,6 +222,8 @@ class ShownRecording:
         level, message = OK, f'playing {pace}'
         if self._ended:
             message = 'end of the recording'
+        elif self._paused:
+            message = 'paused'
         elif new_lost:
             level, message = WARN, f'{new_lost} samples lost'
         entries = [
@@ -201,38 +257,88 @@ class ShownRecording:
         """Take the zero between two blocks; it holds for the rest of the playback."""
         if self._ended or self._thread.ident is None:
             raise RefusedError('not zeroed: the recording has ended')
-        asked: Future[str] = Future()
-        self._requests.put(asked)
-        self._woken.set()
-        try:
-            return asked.result(REQUEST_TIMEOUT_S)
-        except TimeoutError:
-            if asked.cancel():
-                raise RefusedError('not zeroed: no data flows') from None
-            # It was begun at this very moment: its answer is the true one.
-            return asked.result(REQUEST_TIMEOUT_S)
+        return self._between_blocks(self._take_zero, 'not zeroed: no data flows')
 
     async def record(self, wanted: bool) -> str:
         """Refuse: a recording is not recorded again."""
         raise RefusedError('a recording is not recorded again; the command replay writes its answers')
 
+    def load(self, fx: float, fy: float, tz: float, add: bool) -> str:
+        """Refuse: what is recorded is not changed."""
+        raise RefusedError('a recording is played: its loads are those that were recorded')
+
+    def play(self, paused: bool | None, seek_s: float | None) -> str:
+        """Pause or resume, go to a time from the first block. What lies between is computed as fast as possible."""
+
+        def change() -> str:
+            if paused is not None:
+                self._paused = paused
+            if seek_s is not None and self._start_ns is not None:
+                self._goal = self._start_ns + round(seek_s * 1e9)
+                self._again = self._last is None or self._last.t_ns >= self._goal
+            elif self._ended and paused is False:
+                # Played to its end: from the start again.
+                self._goal, self._again = self._start_ns, True
+            return 'paused' if self._paused else 'playing'
+
+        return self._between_blocks(change, 'not done: the recording cannot be read fast enough')
+
+    def _between_blocks(self, action: Callable[[], str], too_late: str) -> str:
+        asked: Future[str] = Future()
+        self._requests.put((asked, action))
+        self._woken.set()
+        try:
+            return asked.result(REQUEST_TIMEOUT_S)
+        except TimeoutError:
+            if asked.cancel():
+                raise RefusedError(too_late) from None
+            # It was begun at this very moment: its answer is the true one.
+            return asked.result(REQUEST_TIMEOUT_S)
+
+    def _take_zero(self) -> str:
+        change = self._pipeline.zero()
+        if change is None:
+            raise RefusedError(f'not zeroed: {why_no_zero(self._pipeline)}')
+        self._feed.put(change)
+        text = zero_text(self._pipeline.rig)
+        self._say(text)
+        return text
+
+    def _look_for_span(self, find: Callable[[], tuple[int, int]]) -> None:
+        # A recording that cannot be read is reported by the thread that plays it.
+        with contextlib.suppress(PsdDeflectionError):
+            self._span = find()
+
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
                 self._lap()
-                if not self._loop:
+                if not self._again:
+                    # Sought beyond the end.
+                    self._goal = None
+                if not self._again and not self._loop:
+                    self._wait_at_the_end()
+                if self._stop.is_set():
                     break
                 self._pipeline, self._steps = self._open()
-                self._lost = 0
-            self._ended = True
-            if not self._stop.is_set():
-                self._say(f'{self._name}: end of the recording')
+                self._again = self._ended = False
+                self._lost = self._next_input = 0
+                self._load = None
         except BaseException as error:
             self.failed = error
             self._ended = True
             if not isinstance(error, PsdDeflectionError):
                 raise
             self._say(str(error))
+
+    def _wait_at_the_end(self) -> None:
+        self._ended = True
+        if not self._stop.is_set():
+            self._say(f'{self._name}: end of the recording')
+        while not self._stop.is_set() and not self._again:
+            self._woken.wait()
+            self._woken.clear()
+            self._carry_out()
 
     def _lap(self) -> None:
         due = time.monotonic()
@@ -246,6 +352,9 @@ class ShownRecording:
                     if isinstance(before_after, tuple):
                         self._lost -= int(before_after[1] - before_after[0]) - 1
                 if isinstance(record, SpotMeans):
+                    if self._start_ns is None:
+                        self._start_ns = record.t_ns
+                    self._give_inputs(record.t_ns)
                     if last_t_ns is not None:
                         due += min((record.t_ns - last_t_ns) / 1e9 / self._speed, LONGEST_WAIT_S)
                         gone = record.index - last_block - 1
@@ -253,22 +362,48 @@ class ShownRecording:
                     last_t_ns, last_block = record.t_ns, record.index
                     self._lost += record.lost
                     self._last = record
-                self._feed.put(record)
+                if last_t_ns is None or self._goal is None or last_t_ns > self._goal - BEFORE_GOAL_NS:
+                    self._feed.put(record)
             self._carry_out()
-            while not self._stop.is_set() and self._woken.wait(max(due - time.monotonic(), 0.0)):
+            if self._goal is not None and last_t_ns is not None:
+                if last_t_ns < self._goal:
+                    # No faster than the page takes it.
+                    while self._feed.waiting > QUEUE_ITEMS // 2 and not self._stop.wait(FULL_S):
+                        pass
+                    due = time.monotonic()
+                else:
+                    self._goal, due = None, time.monotonic()
+            while not self._stop.is_set() and not self._again and self._waits(due):
                 self._woken.clear()
                 self._carry_out()
-            if self._stop.is_set():
+                if self._paused:
+                    due = time.monotonic()
+            if self._stop.is_set() or self._again:
                 return
+
+    def _waits(self, due: float) -> bool:
+        """Wait until ``due``, or longer if paused; whether a request ended the wait, or it is paused."""
+        if self._goal is not None:
+            return False
+        if self._paused:
+            self._woken.wait()
+            return True
+        return self._woken.wait(max(due - time.monotonic(), 0.0))
+
+    def _give_inputs(self, t_ns: int) -> None:
+        while self._next_input < len(self._inputs) and self._inputs[self._next_input].t_ns <= t_ns:
+            record = self._inputs[self._next_input]
+            self._next_input += 1
+            if isinstance(record, AppliedLoad):
+                self._load = record
+            self._feed.put(record)
 
     def _carry_out(self) -> None:
         while not self._requests.empty():
-            asked = self._requests.get()
+            asked, action = self._requests.get()
             if not asked.set_running_or_notify_cancel():
                 continue
-            if self._pipeline.zero() is None:
-                asked.set_exception(RefusedError(f'not zeroed: {why_no_zero(self._pipeline)}'))
-            else:
-                text = zero_text(self._pipeline.rig)
-                self._say(text)
-                asked.set_result(text)
+            try:
+                asked.set_result(action())
+            except RefusedError as error:
+                asked.set_exception(error)

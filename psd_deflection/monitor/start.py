@@ -40,5 +40,6 @@ def start_monitor(session: Session, say: Callable[[str], None]) -> MonitorServer
     server.start()
     # After publishing and recording.
     session.processing.sinks.append(feed)
+    session.input_sinks.append(feed)
     session.listeners.append(server.tell)
     return server

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -16,7 +15,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from msg_adapters import DIAGNOSTICS, INPUTS, TEMPERATURE, TOPIC_TYPES, from_fields, to_messages
+from msg_adapters import DIAGNOSTICS, INPUTS, TOPIC_TYPES, to_messages
 from psd_deflection import __version__
 from psd_deflection.errors import Failed, Warned
 from psd_deflection.recordings import cdr
@@ -162,14 +161,11 @@ class InputRecorder:
         if len(message) > MAX_INPUT_BYTES:
             self.refused += 1
         elif self.session is not None:
-            self.session.recorder.put(topic, TOPIC_TYPES[topic], bytes(message), self.session.acquisition.now_ns())
-            if topic == TEMPERATURE and self.session.pipeline.needs_temperature:
-                self._correct_for(message, self.session)
-
-    def _correct_for(self, message: bytes, session: Session) -> None:
-        try:
-            reading = from_fields(TEMPERATURE, cdr.decode(TOPIC_TYPES[TEMPERATURE], bytes(message)))
-            if isinstance(reading, TemperatureReading) and math.isfinite(reading.celsius):
-                session.temperature(reading.celsius)
-        except (ValueError, TimeoutError):
-            self.refused += 1
+            record = self.session.take_input(topic, bytes(message))
+            try:
+                if record is None:
+                    self.refused += 1
+                elif isinstance(record, TemperatureReading):
+                    self.session.temperature(record.celsius)
+            except TimeoutError:
+                self.refused += 1

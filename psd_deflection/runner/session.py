@@ -7,20 +7,21 @@ closes. Only the threads ``recorder`` and ``zero`` wait for the disk. ``zero`` s
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, wait
 from pathlib import Path
 
-from msg_adapters import TOPIC_TYPES
+from msg_adapters import LOAD, TOPIC_TYPES, from_fields, to_messages
 from psd_deflection.config import ZEROS, Rig, left_as_in_the_thesis, replace_values
 from psd_deflection.errors import Failed, Warned, printable
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings import cdr
-from psd_deflection.records import ParameterChange
+from psd_deflection.records import AppliedLoad, ParameterChange, Record
 from psd_deflection.runner.acquisition import Acquisition
 from psd_deflection.runner.fanout import Fanout
-from psd_deflection.runner.processing import Processing
+from psd_deflection.runner.processing import Processing, RecordSink
 from psd_deflection.runner.realtime import lock_memory
 from psd_deflection.runner.recorder import Recorder
 from psd_deflection.runner.simulated_rig import SimulatedRigProcess, simulates
@@ -52,6 +53,11 @@ def zero_text(rig: Rig) -> str:
     return f'unloaded dots (mm): psd_1 ({x1 * 1e3:z.4f}, {y1 * 1e3:z.4f}), psd_2 ({x2 * 1e3:z.4f}, {y2 * 1e3:z.4f})'
 
 
+def load_text(load: AppliedLoad) -> str:
+    """A known load, as one line of text."""
+    return f'load noted: Fx {load.fx:.6g} N, Fy {load.fy:.6g} N, Tz {load.tz:.6g} N·m'
+
+
 def why_no_zero(pipeline: Pipeline) -> str:
     """Why :meth:`Pipeline.zero` took no zero, as text."""
     last = pipeline.last_spots
@@ -60,7 +66,8 @@ def why_no_zero(pipeline: Pipeline) -> str:
 
 class Session:
     """Opens the device on construction. ``say`` and every function in ``listeners`` get one line for each
-    change of state, from any thread.
+    change of state, from any thread. ``input_sinks`` get known loads, references and temperatures as they come.
+    ``load``: the known load that is held now, or None.
 
     Raises DeviceError, ConfigError, SolverError or RecordingError if the run cannot start.
     """
@@ -69,6 +76,8 @@ class Session:
         self._simulated: SimulatedRigProcess | None = None
         self._closed = False
         self.listeners: list[Callable[[str], None]] = [say]
+        self.input_sinks: list[RecordSink] = []
+        self.load: AppliedLoad | None = None
         say = self._tell
         check_live(rig.estimator.solver)
         check_arrangement(rig)
@@ -175,8 +184,13 @@ class Session:
         TimeoutError if no data flows.
         """
 
+        asked_ns = self.acquisition.now_ns()
+
         def tell(done: Future[Path | None]) -> None:
             if done.exception() is None and (folder := done.result()) is not None:
+                if wanted and (load := self.load) is not None:
+                    # It holds already when the recording begins.
+                    self._put_load(load._replace(t_ns=max(load.t_ns, asked_ns)))
                 self._tell(f'recording to {folder}' if wanted else f'recording ended: {folder}')
 
         if wanted:
@@ -192,6 +206,42 @@ class Session:
         if error is not None:
             self.recorder.failure = str(error)
             self._tell(Failed(f'not recorded: {error}'))
+
+    def take_input(self, topic: str, message: bytes) -> Record | None:
+        """Record an encoded message of a known load, a reference or a temperature, and show it.
+
+        Returns its record, or None if the message cannot be decoded or holds a number that is not finite.
+        """
+        self.recorder.put(topic, TOPIC_TYPES[topic], message, self.acquisition.now_ns())
+        try:
+            record = from_fields(topic, cdr.decode(TOPIC_TYPES[topic], message))
+        except ValueError:
+            return None
+        if not all(map(math.isfinite, record)):
+            return None
+        if record.t_ns == 0:
+            record = record._replace(t_ns=self.acquisition.now_ns())
+        if isinstance(record, AppliedLoad):
+            self.load = record
+        for sink in self.input_sinks:
+            sink.put(record)
+        return record
+
+    def note_load(self, fx: float, fy: float, tz: float, *, add: bool = False) -> AppliedLoad:
+        """Take down that this load (N, N, N m) acts at the tip from now on, as if it had come on ``/link_tip/load``.
+
+        ``add``: it acts beside the one that is held.
+        """
+        if add and (held := self.load) is not None:
+            fx, fy, tz = held.fx + fx, held.fy + fy, held.tz + tz
+        load = AppliedLoad(self.acquisition.now_ns(), fx, fy, tz)
+        self._put_load(load)
+        self._tell(load_text(load))
+        return load
+
+    def _put_load(self, load: AppliedLoad) -> None:
+        (message,) = to_messages(load)
+        self.take_input(LOAD, cdr.encode(message.type, message.fields))
 
     def temperature(self, celsius: float) -> None:
         """Set the ambient temperature for the corrections that need it, from the next block on.

@@ -14,7 +14,19 @@ from psd_deflection.errors import EXIT_STATUSES
 
 ROOT = Path(__file__).parent.parent.parent
 OURS = 'psd-deflection '
-ENDLESS = ('check', 'estimator', 'monitor', 'discover', 'devices', 'simulate --serve', 'compare-methods --out')
+ENDLESS = (
+    'check',
+    'echo',
+    'zero',
+    'record',
+    'load',
+    'estimator',
+    'monitor',
+    'discover',
+    'devices',
+    'simulate --serve',
+    'compare-methods --out',
+)
 """Examples that go on until Ctrl-C, take long, or want a device: only their options are parsed."""
 
 

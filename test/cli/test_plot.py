@@ -1,16 +1,23 @@
 from __future__ import annotations
 
+import base64
 import itertools
 import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.cli.plot import default_out
+from psd_deflection.cli.plot import Drawn, default_out, draw_recording
+from psd_deflection.monitor.spectrum import Spectrum
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.replay_engine import replayed, rig_at_start
+from psd_deflection.records import FloatArray, ParameterChange
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
 
@@ -27,22 +34,105 @@ def test_a_recording_is_drawn(tmp_path: Path, ending: str, magic: bytes, capsys:
     assert 'too few samples' in printed
 
 
+def content_of(page: Path) -> dict[str, Any]:
+    """The data in an interactive page."""
+    found = re.search(r'<script type="application/json" id="recording">(.*?)</script>', page.read_text(), re.S)
+    assert found is not None
+    content: dict[str, Any] = json.loads(found[1])
+    return content
+
+
+def column(text: str, kind: str = '<f4') -> FloatArray:
+    return np.frombuffer(base64.b64decode(text), kind).astype(np.float64)
+
+
 def test_the_page_is_whole(tmp_path: Path) -> None:
     out = tmp_path / 'page.html'
     assert main(['plot', str(BAGS / 'laser_off'), '--out', str(out)]) == 0
     page = out.read_text()
-    assert page.count('<svg') == 1
-    assert not re.search(r'(src|href)="(?!#)', re.sub(r'xlink:href="#', 'xlink:href="#', page))
+    assert not re.search(r'(src|href)="(?!#)|\bimport\b[^(;]*from|@import|url\(', page)
     assert 'laser lost' in page
     assert '52 blocks' in page
+    # As many plots as have data, each with its keys.
+    assert re.findall(r'<div id="plot_(\w+)">', page) == ['shift', 'theta', 'sums', 'spectrum']
+    recorded = open_recording(BAGS / 'laser_off').estimates()['/link_tip/deflection']
+    columns = content_of(out)['columns']
+    dx, t = column(columns['dx']), column(columns['t'], '<f8')
+    assert (len(dx), np.isnan(dx).sum()) == (200, 52)
+    assert dx[~np.isnan(dx)] == pytest.approx(recorded.pose[:, 0], rel=1e-6)
+    assert t[~np.isnan(dx)] == pytest.approx((recorded.t_ns - recorded.t_ns[0]) / 1e9, abs=1e-9)
+
+
+def test_a_name_that_is_markup_is_text(tmp_path: Path) -> None:
+    recording = tmp_path / '<b>&"x".csv'
+    assert main(['convert', str(BAGS / 'clean'), '--out', str(tmp_path / 'run.csv')]) == 0
+    (tmp_path / 'run.csv').rename(recording)
+    out = tmp_path / 'page.html'
+    assert main(['plot', str(recording), '--out', str(out)]) == 0
+    assert '<b>' not in out.read_text()
+    assert '&lt;b&gt;&amp;&quot;x&quot;.csv</title>' in out.read_text()
+
+
+@pytest.fixture(scope='module')
+def loaded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seconds at rest, then two load cases of a second, with the true pose beside."""
+    out = tmp_path_factory.mktemp('loaded') / 'run'
+    loads = 'steps:0,0,0;0,0,0;0,-10,-5.85;10,0,0:1'
+    assert main(['simulate', '--out', str(out), '--loads', loads, '--reference']) == 0
+    return out
+
+
+def test_loads_and_references_are_drawn(loaded: Path, tmp_path: Path) -> None:
+    out = tmp_path / 'page.html'
+    assert main(['plot', str(loaded), '--out', str(out)]) == 0
+    content = content_of(out)
+    assert [[round(t, 2), *mark] for t, *mark in content['marks']] == [
+        [0.0, 'load', 0.0, 0.0, 0.0],
+        [1.99, 'load', 0.0, -10.0, -5.85],
+        [2.99, 'load', 10.0, 0.0, 0.0],
+    ]
+    # The last one holds until the end.
+    assert column(content['loads']['fy']).tolist() == [0.0, -10.0, 0.0, 0.0]
+    assert column(content['loads']['t'], '<f8')[-1] == pytest.approx(3.98, abs=0.01)
+    references = column(content['references']['dy'])
+    assert len(references) > 100
+    assert references == pytest.approx(column(content['columns']['dy'])[: len(references)], abs=1e-4)
+    assert 'id="plot_load"' in out.read_text()
+
+
+def test_a_window_is_drawn(loaded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / 'window.html'
+    arguments = ['plot', str(loaded), '--from', '2.5', '--to', '3.5']
+    assert main([*arguments, '--out', str(out), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found['blocks'], found['samples'], found['duration_s']) == (51, 1020, pytest.approx(1.02, abs=1e-6))
+    content = content_of(out)
+    t = column(content['columns']['t'], '<f8')
+    # Times count from the start of the recording, not from that of the window.
+    assert (t[0], t[-1]) == (pytest.approx(2.5, abs=1e-6), pytest.approx(3.5, abs=1e-6))
+    # The load that holds when the window begins is known there.
+    assert [[round(m[0], 2), *m[2:]] for m in content['marks']] == [[2.5, 0.0, -10.0, -5.85], [2.99, 10.0, 0.0, 0.0]]
+    assert main([*arguments, '--out', str(tmp_path / 'window.png')]) == 0
+
+
+def test_a_zero_that_was_taken_is_marked() -> None:
+    drawn = Drawn(open_recording(BAGS / 'clean'))
+    recording = drawn.recording
+    recording.changes = [
+        ParameterChange(0, 100, (('psd_1.zero', (1e-4, 0.0)),)),
+        ParameterChange(0, 150, (('sum_min', 2.0),)),
+    ]
+    middle = next(b for b in recording.blocks() if b.index == 100)
+    recording.changes[0] = recording.changes[0]._replace(t_ns=int(middle.t_ns[0]))
+    for records in replayed(recording, Pipeline(rig_at_start(recording))):
+        for record in records:
+            drawn.add(record)
+    assert drawn.inputs().zeros == [int(middle.t_ns[0])]
+    figure = draw_recording(drawn, Spectrum(rig_at_start(recording), 1.0), rig_at_start(recording), 'clean')
+    assert 'zero taken' in figure.axes[0].get_legend_handles_labels()[1]
 
 
 def test_losses_and_missing_estimates_are_marked() -> None:
-    from psd_deflection.cli.plot import Drawn
-    from psd_deflection.pipeline import Pipeline
-    from psd_deflection.recordings.readers import open_recording
-    from psd_deflection.recordings.replay_engine import replayed, rig_at_start
-
     recording = open_recording(BAGS / 'lost_samples')
     drawn = Drawn(recording)
     for records in replayed(recording, Pipeline(rig_at_start(recording)), recording.blocks()):
@@ -63,10 +153,7 @@ def test_losses_and_missing_estimates_are_marked() -> None:
 def test_blocks_cut_by_start_and_stop_have_lost_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from matplotlib.figure import Figure
 
-    from psd_deflection.cli.plot import Drawn, _mark_losses
-    from psd_deflection.pipeline import Pipeline
-    from psd_deflection.recordings.readers import open_recording
-    from psd_deflection.recordings.replay_engine import replayed, rig_at_start
+    from psd_deflection.cli.plot import _mark_losses
     from psd_deflection.records import SampleBlock
 
     recording = open_recording(BAGS / 'clean')
@@ -137,6 +224,9 @@ def test_the_picture_is_named_like_the_recording(
     ('arguments', 'status', 'told'),
     [
         (['no_such'], 4, 'no such recording'),
+        ([str(BAGS / 'clean'), '--from', '2', '--to', '1'], 2, '--from 2 --to 1: must rise'),
+        ([str(BAGS / 'clean'), '--from', '-1'], 2, '--from -1: must be a number'),
+        ([str(BAGS / 'clean'), '--from', '9'], 4, 'has no samples to draw between --from and --to'),
         ([str(BAGS / 'clean'), '--out', 'x.bmp'], 2, 'the name must end in'),
         ([str(BAGS / 'clean'), '--out', '/no/such/folder/x.html'], 4, 'cannot be written'),
         ([str(BAGS / 'clean'), '--out', '/no/such/folder/x.png'], 4, 'cannot be written'),

@@ -243,7 +243,7 @@ def test_every_command_and_parameter_is_on_its_page(hooks: Any) -> None:
     assert '<!--' not in page
     for name in COMMANDS:
         assert f'usage: psd-deflection {name}' in page
-    assert '| `monitor_control` | `False` |' in page
+    assert '| `monitor_control` | `local` |' in page
 
 
 def test_what_docstrings_say_for_sphinx_is_not_shown(hooks: Any) -> None:
@@ -281,8 +281,8 @@ def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[s
     # What is left is numbers and words: a new kind of value is to be put here or among the paths. Options that may be
     # repeated have an action of their own, and none is a path.
     assert {str(values[name]) for name in set(values) - as_path} == {
-        '/NAME', 'ADDRESS', 'M', 'N', 'NAME', 'PPM', 'SEED', 'SOURCE',
-        'T0[,T1...]', 'X', "('FX', 'FY', 'TZ')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
+        '/NAME', 'ADDRESS', 'M', 'N', 'NAME', 'PPM', 'S', 'SEED', 'SOURCE',
+        'T0[,T1...]', 'TZ', 'URL', 'X', "('FX', 'FY', 'TZ')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
     }  # fmt: skip
 
 

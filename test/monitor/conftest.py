@@ -1,10 +1,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
 from .serving import Serving
+
+
+@pytest.fixture(autouse=True)
+def own_state(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the pages of this test are announced: not among those of the user who runs it."""
+    folder = tmp_path_factory.mktemp('state')
+    monkeypatch.setenv('XDG_STATE_HOME', str(folder))
+    return folder / 'psd_deflection'
 
 
 @pytest.fixture

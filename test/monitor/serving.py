@@ -29,6 +29,8 @@ class StillShown:
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
         self.zeros = 0
+        self.loads: list[tuple[float, float, float, bool]] = []
+        self.played: list[tuple[bool | None, float | None]] = []
         self.recordings: list[str | None] = []
         self.refusal = ''
         self.reports = 0
@@ -55,6 +57,16 @@ class StillShown:
             raise RefusedError(self.refusal)
         self.recordings.append('recordings/test' if wanted else None)
         return 'recording' if wanted else 'recording ended'
+
+    def load(self, fx: float, fy: float, tz: float, add: bool) -> str:
+        if self.refusal:
+            raise RefusedError(self.refusal)
+        self.loads.append((fx, fy, tz, add))
+        return 'load noted'
+
+    def play(self, paused: bool | None, seek_s: float | None) -> str:
+        self.played.append((paused, seek_s))
+        return 'playing'
 
 
 def spots_of(index: int, *, status: BlockStatus = BlockStatus.OK, lost: int = 0) -> SpotMeans:

@@ -15,13 +15,15 @@ import pytest
 
 pytest.importorskip('selenium', reason='the browser tests need selenium: pip install .[test]')
 
+from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
+from psd_deflection.records import AppliedLoad, ParameterChange, ReferencePose
 from tools.program import PSD_DEFLECTION, ROOT, Program
 
 from .browsing import Page
-from .serving import Serving
+from .serving import BLOCK_NS, START_NS, Serving
 
 pytestmark = pytest.mark.browser
 
@@ -117,7 +119,7 @@ def test_the_daemon_on_the_simulated_rig_shows_moving_dots_and_traces(
 ) -> None:
     if how == 'node' and importlib.util.find_spec('rclpy') is None:
         pytest.skip('the node needs rclpy: pip install .[ros]')
-    arguments = ['--params-file', parameter_file(tmp_path, monitor=True, monitor_port=0)]
+    arguments = ['--params-file', parameter_file(tmp_path, monitor=True, monitor_port=0, monitor_control='off')]
     # As `make run` starts it, but for the port, which others may have.
     program = start('estimator', *arguments, *([] if how == 'node' else ['--no-ros']))
     page.open(address_of(program))
@@ -133,7 +135,10 @@ def test_the_daemon_on_the_simulated_rig_shows_moving_dots_and_traces(
     page.until('document.querySelectorAll("#tiles dd").length > 5')
     page.until('[...document.querySelectorAll("#entries b")].some((b) => b.textContent.startsWith("clock"))')
     # Not allowed: neither by the page nor past it.
-    assert page.js('document.getElementById("zero").disabled && document.getElementById("record").disabled')
+    for button in ('zero', 'record', 'load'):
+        page.until(f'document.getElementById("{button}").getAttribute("aria-disabled") === "true"')
+        page.driver.find_element(By.ID, button).click()
+        page.until('document.getElementById("notice").textContent.includes("buttons are switched off")')
     answer = page.later(
         'fetch("/api/zero", {method: "POST", headers: {"Content-Type": "application/json"}, body: "{}"})'
         '.then((r) => r.json().then((j) => [r.status, j.message]))'
@@ -143,13 +148,13 @@ def test_the_daemon_on_the_simulated_rig_shows_moving_dots_and_traces(
     assert page.complaints() == [] or all('403' in c for c in page.complaints())
 
 
-def test_zero_and_record_work_where_they_are_allowed(page: Page, start: Start, tmp_path: Path) -> None:
+def test_zero_and_record_work_on_this_machine(page: Page, start: Start, tmp_path: Path) -> None:
     # Taken as unloaded: dots 0.5 mm off those that the device has at rest. Its loads act along Y.
     port = start('simulate', '--serve').until('port: (.+)')[1]
     zeros = {'psd_1.zero': [5e-4, 0.0], 'psd_2.zero': [5e-4, 0.0]}
     # Neither takes over nor leaves behind a zero that a user of this machine has taken.
     rig = parameter_file(tmp_path, keep_zero=False, **zeros)
-    program = start('monitor', '--port', port, '--params-file', rig, '--http-port', '0', '--control')
+    program = start('monitor', '--port', port, '--params-file', rig, '--http-port', '0')
     page.open(address_of(program))
     page.live()
     dx = 'Number(document.getElementById("dx").textContent.replace("\\u2212", "-"))'
@@ -196,7 +201,7 @@ def test_the_token_of_the_printed_address_opens_the_buttons(page: Page, serve: C
     address = f'http://127.0.0.1:{serving.port}/'
     serving.give(0, 10)
     page.open(f'{address}#token=wrong')
-    page.until('document.getElementById("zero").disabled === false')
+    page.until('document.getElementById("zero").getAttribute("aria-disabled") === "false"')
     page.driver.find_element(By.ID, 'zero').click()
     page.until('document.getElementById("notice").textContent.includes("token is missing or wrong")')
     assert serving.shown.zeros == 0
@@ -246,7 +251,9 @@ def test_the_page_reconnects_to_a_restarted_daemon(page: Page, start: Start) -> 
     instance = page.js('document.body.dataset.instance')
     assert first.end() == 0
     page.until('document.body.dataset.state === "offline"')
-    page.until('document.getElementById("zero").disabled')
+    page.until('document.getElementById("zero").getAttribute("aria-disabled") === "true"')
+    page.driver.find_element(By.ID, 'zero').click()
+    page.until('document.getElementById("notice").textContent === "there is no connection to the daemon"')
     before = page.rows()
     address_of(start('monitor', str(BAGS / 'clean'), '--loop', '--http-port', port))
     page.live()
@@ -292,6 +299,126 @@ def test_no_element_is_cut_off_or_overlaps(page: Page, serve: Callable[..., Serv
         assert header < 100
     finally:
         page.driver.execute_cdp_cmd('Emulation.clearDeviceMetricsOverride', {})
+
+
+def test_a_load_is_noted_from_the_page(page: Page, start: Start) -> None:
+    page.open(address_of(start('monitor', '--http-port', '0')))
+    page.live()
+
+    def note(button: str, **values: str) -> None:
+        page.driver.find_element(By.ID, 'load').click()
+        page.until('document.getElementById("weigh").open')
+        for name, value in values.items():
+            field = page.driver.find_element(By.ID, name)
+            field.clear()
+            field.send_keys(value)
+        page.driver.find_element(By.CSS_SELECTOR, f'#weigh button[value={button}]').click()
+
+    note('set', fx='0', fy='-10', tz='0.5')
+    page.until('document.getElementById("notice").textContent === "load noted: Fx 0 N, Fy -10 N, Tz 0.5 N\u00b7m"')
+    page.until('document.getElementById("tiles").textContent.includes("known load\u221210 N in Y, 0.5 N\u00b7m")')
+    note('add', fx='0', fy='-10', tz='0')
+    page.until('document.getElementById("notice").textContent === "load noted: Fx 0 N, Fy -20 N, Tz 0.5 N\u00b7m"')
+    page.driver.find_element(By.ID, 'load').click()
+    page.until('document.getElementById("held").textContent === "\u221220 N in Y, 0.5 N\u00b7m"')
+    page.driver.find_element(By.ID, 'weigh_cancel').click()
+    page.until('!document.getElementById("weigh").open')
+    assert page.complaints() == []
+
+
+INK = """((plot) => {
+  const canvas = document.querySelector(plot + ' canvas');
+  const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+  let n = 0;
+  for (let i = 3; i < data.length; i += 4) n += data[i] > 200;
+  return n;
+})"""
+"""Pixels of a plot that are drawn on."""
+
+
+def test_traces_show_values_zoom_and_can_be_switched_off(page: Page, serve: Callable[..., Serving]) -> None:
+    serving = serve()
+    serving.give(0, 500)
+    page.open(serving.url)
+    page.until(f'document.body.dataset.rows >= 500 && {COLORED} > 200')
+    plot = page.driver.find_element(By.CSS_SELECTOR, '#plot_shift .u-over')
+    wide = plot.size['width']
+    key = 'document.querySelector(\'[data-plot="{}"][data-series="{}"] output\').textContent'
+    shown = key.format('shift', 1)
+    assert page.js(shown) == ''
+    ActionChains(page.driver).move_to_element_with_offset(plot, -wide // 4, 0).perform()
+    page.until(f'{shown} !== ""')
+    # The cursor is on all traces at once; the value is that of the row below it, an amplitude of 1 mm.
+    assert abs(float(page.js(shown).replace('\u2212', '-'))) <= 1000.0
+    assert page.js(key.format('theta', 1)) != ''
+    assert page.js(key.format('sums', 2)) == '5'
+    assert page.js('document.querySelector(\'output.at[data-plot="shift"]\').textContent').count(':') == 2
+    # A stretch that is dragged over fills the plot, and the traces stand still.
+    before = page.js(f'{INK}("#plot_shift")')
+    ActionChains(page.driver).click_and_hold().move_by_offset(wide // 8, 0).release().perform()
+    page.until('document.getElementById("hold").getAttribute("aria-pressed") === "true"')
+    page.until(f'{INK}("#plot_shift") !== {before}')
+    serving.give(500, 10)
+    page.until('document.body.dataset.rows >= 510')
+    ActionChains(page.driver).double_click(plot).perform()
+    page.until('document.getElementById("hold").getAttribute("aria-pressed") === "false"')
+    dy = page.driver.find_element(By.CSS_SELECTOR, '[data-plot="shift"][data-series="4"]')
+    dy.click()
+    page.until(f'{COLORED} === 0', 'no trace of dY')
+    assert dy.get_attribute('aria-pressed') == 'false'
+    # It stays off when the plots are drawn in other colours.
+    scheme = {'features': [{'name': 'prefers-color-scheme', 'value': 'dark'}]}
+    page.driver.execute_cdp_cmd('Emulation.setEmulatedMedia', scheme)
+    try:
+        page.until('getComputedStyle(document.body).backgroundColor === "rgb(14, 20, 26)"')
+        page.until(f'{INK}("#plot_theta") > 1000')
+        assert page.js(COLORED) == 0
+    finally:
+        page.driver.execute_cdp_cmd('Emulation.setEmulatedMedia', {'features': []})
+    dy.click()
+    page.until(f'{COLORED} > 200', 'a trace of dY')
+    # The test reads the canvas, which the page does not.
+    assert [c for c in page.complaints() if 'willReadFrequently' not in c] == []
+
+
+def test_loads_zeros_and_references_are_drawn(page: Page, serve: Callable[..., Serving]) -> None:
+    drawn = []
+    for marked in (False, True):
+        serving = serve()
+        if marked:
+            serving.feed.put(AppliedLoad(START_NS + 100 * BLOCK_NS, 0.0, -10.0, 0.0))
+            serving.feed.put(ParameterChange(START_NS + 200 * BLOCK_NS, 200, (('psd_1.zero', (0.0, 0.0)),)))
+            for k in range(0, 500, 20):
+                serving.feed.put(ReferencePose(START_NS + k * BLOCK_NS, 0.5e-3, -0.5e-3, 0.005))
+        serving.give(0, 500)
+        page.open(serving.url)
+        page.until(f'document.body.dataset.rows >= 500 && {COLORED} > 200')
+        shown = 'document.querySelector(".references").hidden'
+        page.until(f'{shown} === {str(not marked).lower()}')
+        drawn.append([page.js(f'{INK}("{plot}")') for plot in ('#plot_shift', '#plot_theta')])
+    # Two dashed lines with words, and rings.
+    assert all(after > before + 100 for before, after in zip(*drawn, strict=True))
+
+
+def test_a_recording_is_paused_and_sought(page: Page, start: Start) -> None:
+    page.open(address_of(start('monitor', str(BAGS / 'clean'), '--http-port', '0', '--speed', '0.05')))
+    page.until('!document.getElementById("seek").disabled')
+    page.driver.find_element(By.ID, 'pause').click()
+    page.until('document.getElementById("state").textContent === "paused"')
+    assert page.js('document.getElementById("pause").textContent') == 'Play'
+    before = page.rows()
+    page.js('(() => { const s = document.getElementById("seek"); s.value = 3; s.onchange(); })()')
+    page.until('document.getElementById("position").textContent.startsWith("3.0 of 4.0 s")')
+    assert page.rows() > before + 50
+    # Backwards too: the traces start again.
+    page.js('(() => { const s = document.getElementById("seek"); s.value = 1; s.onchange(); })()')
+    page.until('document.getElementById("position").textContent.startsWith("1.0 of 4.0 s")')
+    for button in ('record', 'load'):
+        page.driver.find_element(By.ID, button).click()
+        page.until('document.getElementById("notice").textContent.startsWith("a recording is played; it")')
+    page.driver.find_element(By.ID, 'pause').click()
+    page.until('document.getElementById("state").textContent === "playing"')
+    assert page.complaints() == []
 
 
 def test_an_hour_leaves_the_heap_as_it_was(page: Page, serve: Callable[..., Serving]) -> None:

@@ -16,10 +16,10 @@ from psd_deflection.errors import ConfigError
 from psd_deflection.monitor import server
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.monitor.server import BROWSERS, CONNECTIONS, MonitorServer
-from psd_deflection.records import BlockStatus
+from psd_deflection.records import AppliedLoad, BlockStatus, ParameterChange, ReferencePose
 from test.heard import WAIT_S
 
-from .serving import Serving, StillShown
+from .serving import BLOCK_NS, START_NS, Serving, StillShown
 
 Serve = Callable[..., Serving]
 
@@ -77,7 +77,8 @@ def test_a_browser_gets_the_last_minute_then_new_rows(serve: Serve) -> None:
     hello = messages[0]['hello']
     assert hello['columns'][:2] == ['t', 'block']
     assert hello['active_areas'] == [[0.01, 0.01], [0.01, 0.01]]
-    assert hello['control'] is False
+    assert hello['control'] is True
+    assert hello['why_no_control'] == ''
     assert hello['spectrum_s'] == 4.0
     rows = rows_in(messages)
     assert [r[1] for r in rows] == list(range(8))
@@ -120,18 +121,37 @@ def test_the_page_is_whole_and_loads_nothing_from_elsewhere(serve: Serve) -> Non
         assert ask(serving.url + name, 'GET')[0] in (403, 404)
 
 
-def test_the_buttons_are_off_unless_allowed(serve: Serve) -> None:
-    serving = serve()
-    for path in ('api/zero', 'api/record'):
-        status, text, _ = ask(serving.url + path)
+@pytest.mark.parametrize(
+    ('overrides', 'reason'),
+    [
+        ({'monitor_address': '0.0.0.0'}, 'because the network can reach this page'),
+        ({'monitor_control': False}, 'switched off'),
+        ({'monitor_control': 'off', 'monitor_address': '0.0.0.0'}, 'switched off'),
+    ],
+)
+def test_the_buttons_are_off_on_the_network_and_if_they_are_switched_off(
+    serve: Serve, overrides: dict[str, object], reason: str
+) -> None:
+    serving = serve(**overrides)
+    url = f'http://127.0.0.1:{serving.port}/'
+    for path in ('api/zero', 'api/record', 'api/load', 'api/play'):
+        status, text, _ = ask(url + path)
         assert status == 403
         assert 'monitor_control' in text
+        assert reason in text
     assert serving.shown.zeros == 0
     assert not serving.shown.recordings
+    assert not serving.shown.loads
+    hello = listen(url, lambda m: 'hello' in m)[0]['hello']
+    assert hello['control'] is False
+    assert reason in hello['why_no_control']
+    # A token would be for nothing.
+    assert hello['needs_token'] is False
+    assert 'token' not in serving.said[0]
 
 
-def test_allowed_buttons_work_and_report_the_result(serve: Serve) -> None:
-    serving = serve(monitor_control=True)
+def test_on_this_machine_the_buttons_work_and_report_the_result(serve: Serve) -> None:
+    serving = serve()
     assert ask(serving.url + 'api/zero')[:2] == (200, '{"ok": true, "message": "unloaded dots taken"}')
     assert serving.shown.zeros == 1
     assert ask(serving.url + 'api/record', body={'record': True})[0] == 200
@@ -168,10 +188,85 @@ def test_requests_from_another_site_are_refused(
     serve: Serve, headers: dict[str, str], body: object, status: int
 ) -> None:
     serving = serve(monitor_control=True)
-    for path in ('api/zero', 'api/record'):
+    for path in ('api/zero', 'api/record', 'api/load', 'api/play'):
         assert ask(serving.url + path, body=body, headers=headers)[0] == status
     assert serving.shown.zeros == 0
     assert not serving.shown.recordings
+    assert not serving.shown.loads
+
+
+def test_a_load_is_noted(serve: Serve) -> None:
+    serving = serve()
+    assert ask(serving.url + 'api/load', body={'fx': 0, 'fy': -10.5, 'tz': 0.25})[0] == 200
+    assert ask(serving.url + 'api/load', body={'fx': 1, 'fy': 0, 'tz': 0, 'add': True})[0] == 200
+    assert serving.shown.loads == [(0.0, -10.5, 0.25, False), (1.0, 0.0, 0.0, True)]
+    assert ask(serving.url + 'api/play', body={'paused': True, 'seek': 2.5})[0] == 200
+    assert serving.shown.played == [(True, 2.5)]
+    # Who paused it is of no interest later.
+    assert [line for line in serving.said if 'asked for' in line] == ['monitor: load was asked for by 127.0.0.1'] * 2
+
+
+@pytest.mark.parametrize(
+    ('path', 'body'),
+    [
+        ('load', {}),
+        ('load', {'fx': 1, 'fy': 2}),
+        ('load', {'fx': 1, 'fy': 2, 'tz': True}),
+        ('load', {'fx': 1, 'fy': 2, 'tz': '3'}),
+        ('load', {'fx': 1, 'fy': 2, 'tz': 1e7}),
+        ('load', {'fx': 1, 'fy': 2, 'tz': 3, 'add': 1}),
+        ('load', '{"fx": NaN, "fy": 0, "tz": 0}'),
+        ('load', '{"fx": -Infinity, "fy": 0, "tz": 0}'),
+        ('load', f'{{"fx": 1{"0" * 400}, "fy": 0, "tz": 0}}'),
+        ('play', {'seek': -1.0}),
+        ('play', '{"seek": NaN}'),
+        ('play', {'paused': 'yes'}),
+        ('play', {}),
+        ('record', {}),
+        ('zero', {'record': True}),
+    ],
+)
+def test_a_body_of_another_kind_is_refused(serve: Serve, path: str, body: object) -> None:
+    serving = serve()
+    status, text, _ = ask(f'{serving.url}api/{path}', body=body, headers={'Content-Type': 'application/json'})
+    assert (status, json.loads(text)['message'].startswith('refused: expected')) == (400, True)
+    assert (serving.shown.loads, serving.shown.played, serving.shown.zeros) == ([], [], 0)
+
+
+def test_loads_zeros_and_references_are_shown(serve: Serve) -> None:
+    serving = serve()
+    serving.feed.put(AppliedLoad(START_NS, 0.0, -10.0, 0.5))
+    serving.feed.put(ParameterChange(START_NS + BLOCK_NS, 1, (('psd_1.zero', (0.0, 0.0)), ('psd_2.zero', (0.0, 0.0)))))
+    serving.feed.put(ParameterChange(START_NS + BLOCK_NS, 1, (('sum_min', 2.0),)))
+    # A tracker may be faster than the blocks: one of it for each block is enough.
+    for k in range(40):
+        serving.feed.put(ReferencePose(START_NS + k * BLOCK_NS // 10, 1e-3, -2e-3, 0.01 * k))
+    serving.give(0, 1)
+    messages = listen(serving.url, lambda m: 'rows' in m)
+    t = START_NS / 1e9
+    marks = [mark for m in messages for mark in m.get('marks', ())]
+    assert marks == [[t, 'load', 0, -10, 0.5], [pytest.approx(t + 0.02, abs=1e-6), 'zero']]
+    references = [r for m in messages for r in m.get('references', ())]
+    assert references == [
+        [pytest.approx(t + 0.02 * k, abs=1e-6), 0.001, -0.002, pytest.approx(0.1 * k)] for k in range(4)
+    ]
+
+
+def test_a_client_that_wants_no_history_gets_new_rows_alone(serve: Serve) -> None:
+    serving = serve()
+    serving.give(0, 5)
+    listen(serving.url, lambda m: 'rows' in m)
+
+    async def go() -> list[Any]:
+        async with aiohttp.ClientSession() as session, session.ws_connect(f'{serving.url}ws?history=0') as socket:
+            await socket.receive()
+            serving.give(5, 1)
+            while 'rows' not in (message := json.loads((await socket.receive()).data)):
+                pass
+            return list(message['rows'])
+
+    rows = asyncio.run(asyncio.wait_for(go(), WAIT_S))
+    assert [row[1] for row in rows] == [5]
 
 
 @pytest.mark.parametrize('headers', [{'Origin': 'http://evil.example'}, {'Host': 'evil.example'}])

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -13,7 +13,7 @@ from psd_deflection.monitor.shown import RefusedError, ShownRecording
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.replay_engine import replayed, rig_at_start
-from psd_deflection.records import BlockStatus, Record, SpotMeans
+from psd_deflection.records import AppliedLoad, BlockStatus, ParameterChange, Record, ReferencePose, SpotMeans
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
 
@@ -30,7 +30,9 @@ def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event, sp
         said.append(text)
         ended.set()
 
-    return ShownRecording(name, open_steps, feed, say, speed=speed)
+    first = next(iter(open_recording(BAGS / name).blocks()))
+    inputs = [AppliedLoad(int(first.t_ns[0]) + k * 10**9, 0.0, -k, 0.0) for k in (3, 1, 0, 2)]
+    return ShownRecording(name, open_steps, feed, say, speed=speed, inputs=inputs)
 
 
 def test_a_recording_is_shown_as_it_is_with_its_losses() -> None:
@@ -76,6 +78,61 @@ def test_a_zero_does_not_wait_for_the_next_block_of_a_slow_recording() -> None:
     source.close()
     assert told.startswith('unloaded dots (mm): psd_1 (')
     assert said == [told]
+
+
+class Played(Feed):
+    """Tells the times of the blocks that were played, and waits for one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.times: list[int] = []
+        self.others: list[Record] = []
+        self._new = threading.Condition()
+
+    def put(self, record: Record) -> None:
+        super().put(record)
+        self.take()
+        with self._new:
+            if isinstance(record, SpotMeans):
+                self.times.append(record.t_ns)
+            elif isinstance(record, AppliedLoad | ReferencePose | ParameterChange):
+                self.others.append(record)
+            self._new.notify_all()
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        with self._new:
+            assert self._new.wait_for(condition, 60.0)
+
+
+def test_a_recording_can_be_paused_and_sought() -> None:
+    feed, ended = Played(), threading.Event()
+    # A block every two seconds: what comes sooner was sought.
+    source = source_of('clean', feed, [], ended, speed=1e-3)
+    source.start()
+    feed.until(lambda: len(feed.times) >= 1)
+    assert source.play(True, None) == 'paused'
+    start = feed.times[0]
+    times = open_recording(BAGS / 'clean').estimates()['/link_tip/deflection'].t_ns
+    for seconds in (3.0, 1.0, 2.0):
+        before = len(feed.times)
+        assert source.play(None, seconds) == 'paused'
+        goal = int(times[times >= start + seconds * 1e9][0])
+        feed.until(lambda before=before, goal=goal: goal in feed.times[before:])  # type: ignore[misc]
+        # Played up to there, and no further.
+        assert feed.times[-1] == goal
+    described = source.describe()
+    assert (described['paused'], described['load']) == (True, [0.0, -2.0, 0.0])
+    # Beyond the end it ends; from there it starts again.
+    source.play(False, 9.0)
+    assert ended.wait(60.0)
+    assert feed.times[-1] >= times[-1]
+    before = len(feed.times)
+    assert source.play(False, None) == 'playing'
+    feed.until(lambda: len(feed.times) > before)
+    assert feed.times[before] == start
+    source.close()
+    with pytest.raises(RefusedError, match='those that were recorded'):
+        source.load(0.0, 0.0, 0.0, False)
 
 
 @pytest.mark.parametrize(

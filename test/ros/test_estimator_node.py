@@ -324,6 +324,20 @@ def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start:
     headers = {'Content-Type': 'application/json'}
     with urllib.request.urlopen(urllib.request.Request(url + 'api/zero', b'{}', headers), timeout=60.0) as answer:
         assert json.load(answer)['ok']
+    # A load of another node is known to the page; what is noted there acts beside it.
+    weights = peer.node.create_publisher(WrenchStamped, '/left/link_tip/load', 10)
+    peer.until(lambda: weights.get_subscription_count() > 0, 'the subscription to loads')
+    hung = WrenchStamped()
+    hung.wrench.force.y = -10.0
+    weights.publish(hung)
+
+    def noted(fy: float) -> str:
+        body = json.dumps({'fx': 0, 'fy': fy, 'tz': 0, 'add': True}).encode()
+        with urllib.request.urlopen(urllib.request.Request(url + 'api/load', body, headers), timeout=60.0) as answer:
+            return str(json.load(answer)['message'])
+
+    peer.until(lambda: 'Fy -10 N' in noted(0.0), 'the load')
+    assert 'Fy -15 N' in noted(-5.0)
     request = GetParameters.Request(names=['psd_1.zero'])
 
     def shown() -> list[float]:

@@ -5,11 +5,16 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
+from msg_adapters import REFERENCE, to_messages
 from psd_deflection.config import load_rig
 from psd_deflection.protocol.frames import SampleFrame
+from psd_deflection.recordings import cdr
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.records import AppliedLoad, Record, ReferencePose
 from psd_deflection.runner import processing
 from psd_deflection.runner import session as module
 from psd_deflection.runner.diagnostics import STALE, HealthReporter
@@ -23,9 +28,11 @@ Sample = Callable[..., SampleFrame]
 class Running:
     """A session on ``device``, past its first estimates."""
 
-    def __init__(self, device: ScriptedDevice, sample: Sample) -> None:
+    def __init__(self, device: ScriptedDevice, sample: Sample, folder: Path) -> None:
         self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
-        rig = load_rig(overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False})
+        rig = load_rig(
+            overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False, 'bag_dir': str(folder)}
+        )
         self.session = Session(rig, self.said.put)
         estimates = Estimates(5)
         self.session.processing.sinks.append(estimates)
@@ -39,11 +46,13 @@ class Running:
 
 
 @pytest.fixture
-def running(device: ScriptedDevice, sample: Sample, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
+def running(
+    device: ScriptedDevice, sample: Sample, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Iterator[Running]:
     # However busy the machine is: only what a test does makes a device silent or a request late.
     monkeypatch.setattr(module, 'SILENT_S', 1e3)
     monkeypatch.setattr(processing, 'REQUEST_TIMEOUT_S', WAIT_S)
-    one = Running(device, sample)
+    one = Running(device, sample, tmp_path / 'recordings')
     yield one
     one.session.close()
 
@@ -98,3 +107,53 @@ def test_the_start_says_what_another_rig_has_as_in_the_thesis(device: ScriptedDe
     (line,) = [text for text in said if 'as in the thesis rig' in text]
     assert 'dynamics.bending_frequency = 14.0 Hz' in line
     assert 'torsion_frequency' not in line
+
+
+class Seen:
+    """A sink that keeps what it gets."""
+
+    def __init__(self) -> None:
+        self.records: list[Record] = []
+
+    def put(self, record: Record) -> None:
+        self.records.append(record)
+
+
+def test_a_noted_load_is_recorded_and_holds_for_the_next_recording(
+    running: Running, device: ScriptedDevice, sample: Sample
+) -> None:
+    session, seen = running.session, Seen()
+    session.input_sinks.append(seen)
+    first = session.note_load(0.0, -10.0, 0.5)
+    running.heard('load noted: Fx 0 N, Fy -10 N, Tz 0.5 N·m')
+    before = session.acquisition.now_ns()
+    folder = session.record(True).result(WAIT_S)
+    assert folder is not None
+    more = session.note_load(1.0, -10.0, 0.0, add=True)
+    device.send_frames(*(sample(seq) for seq in range(200, 300)))
+    assert session.record(False).result(WAIT_S) == folder
+    loads = open_recording(folder).loads()
+    # What hung there when the recording began is in it, before its first sample.
+    assert [load[1:] for load in loads] == [(0.0, -10.0, 0.5), (1.0, -20.0, 0.5)]
+    assert first.t_ns < before <= loads[0].t_ns <= loads[1].t_ns
+    assert loads[1] == more == session.load
+    assert [r for r in seen.records if isinstance(r, AppliedLoad)] == [first, *loads]
+
+
+def test_an_input_that_is_no_number_is_recorded_and_not_shown(running: Running) -> None:
+    seen = Seen()
+    running.session.input_sinks.append(seen)
+
+    def give(pose: ReferencePose) -> Record | None:
+        (message,) = to_messages(pose)
+        return running.session.take_input(REFERENCE, cdr.encode(message.type, message.fields))
+
+    good = ReferencePose(1_700_000_000_000_000_000, 1e-3, -2e-3, 0.0)
+    assert give(good) == good
+    assert give(good._replace(dx=float('nan'))) is None
+    assert running.session.take_input(REFERENCE, b'too short') is None
+    # A publisher that sends no stamp means now.
+    now = give(good._replace(t_ns=0))
+    assert isinstance(now, ReferencePose)
+    assert now.t_ns > good.t_ns
+    assert seen.records == [good, now]

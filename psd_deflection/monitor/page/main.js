@@ -1,6 +1,7 @@
 // Connects, keeps the last minute, draws. Nothing here grows with time: the rows are a ring, the
 // messages a list of fifty, and whatever is drawn is drawn into what is there.
 
+import { clock, loadText } from '/page/charts.js';
 import { Detector, signed } from '/page/detector.js';
 import { Plots } from '/page/plots.js';
 import { Rows } from '/page/rows.js';
@@ -12,6 +13,7 @@ const SILENT_MS = 4000;
 const RETRY_MS = [300, 600, 1200, 2500];
 const MESSAGES = 50;
 const GAP_BLOCKS = 3.5;
+const MARKS = 200;
 
 const $ = (id) => document.getElementById(id);
 const body = document.body;
@@ -26,6 +28,7 @@ const SCALES = { dx: MICRO, dy: MICRO, theta: MDEG };
 
 let hello = null;
 let rows = null;
+let references = null;
 let plots = null;
 let detectors = [];
 let health = null;
@@ -69,6 +72,8 @@ function connect() {
 function take(message) {
   if (message.hello) greet(message.hello);
   if (message.rows) message.rows.forEach(takeRow);
+  if (message.marks) message.marks.forEach(takeMark);
+  if (message.references) message.references.forEach(takeReference);
   if (message.messages) message.messages.forEach(([t, text]) => tell(t, text));
   if (message.health) showHealth(message.health);
   if ('spectrum' in message) {
@@ -86,18 +91,46 @@ function greet(found) {
   hello.at = Object.fromEntries(found.columns.map((name, i) => [name, i]));
   if (other) {
     rows = new Rows(KEEP, found.rows);
+    references = new Rows(['t', 'dx', 'dy', 'theta'], found.rows);
     detectors = [1, 2].map((n) => new Detector($(`detector_${n}`), n, found.active_areas[n - 1], color));
     if (plots) {
       plots.hello = found;
+      plots.references = references;
       plots.build();
-    } else plots = new Plots(found, color);
+    } else plots = new Plots(found, color, references, hold);
   }
-  rows.clear();
+  startOver();
   $('spectrum_s').textContent = String(Number(found.spectrum_s.toPrecision(2)));
   if (anew) notice('connected to a daemon that was started anew');
   body.dataset.instance = found.instance;
   $('messages').replaceChildren();
   buttons();
+}
+
+function startOver() {
+  rows.clear();
+  references.clear();
+  plots.state.marks = [];
+  showReferences();
+}
+
+function takeMark(mark) {
+  const { marks } = plots.state;
+  marks.push(mark);
+  if (marks.length > MARKS) marks.shift();
+  fresh = true;
+}
+
+function takeReference([t, dx, dy, theta]) {
+  const last = references.last('t');
+  if (last !== null && t <= last) references.clear();
+  references.push([t, dx * MICRO, dy * MICRO, theta * MDEG]);
+  showReferences();
+  fresh = true;
+}
+
+function showReferences() {
+  for (const key of document.querySelectorAll('.references')) key.hidden = references.empty;
 }
 
 // Breaks the traces where blocks are gone altogether, and is marked as lost.
@@ -108,7 +141,7 @@ function takeRow(values) {
   const at = hello.at;
   const t = values[at.t];
   const last = rows.last('t');
-  if (last !== null && t <= last) rows.clear();
+  if (last !== null && t <= last) startOver();
   else if (last !== null && t - last > GAP_BLOCKS * hello.block_s) {
     blank[0] = last + hello.block_s;
     rows.push(blank);
@@ -158,10 +191,17 @@ function frame(now) {
   }
 }
 
+function hold(wanted) {
+  $('hold').setAttribute('aria-pressed', String(wanted));
+  $('hold').textContent = wanted ? 'Held' : 'Hold';
+  if (!wanted) fresh = true;
+}
+
 const held = () => $('hold').getAttribute('aria-pressed') === 'true';
 
 function numbers() {
   body.dataset.rows = String(received);
+  showPosition();
   if (rows.empty || held()) return;
   for (const name of ['dx', 'dy', 'theta']) {
     const value = rows.last(name);
@@ -181,7 +221,9 @@ function showState() {
     // A connection that says nothing is none, whatever the browser thinks of it.
     [state, text] = ['offline', 'connection lost, trying again'];
     socket.close();
-  } else if (received === 0) [state, text] = ['connecting', 'waiting for samples'];
+  } else if (health && health.seeking) [state, text] = ['live', 'seeking'];
+  else if (health && health.paused) [state, text] = ['live', 'paused'];
+  else if (received === 0) [state, text] = ['connecting', 'waiting for samples'];
   else if (now - lastRowAt > Math.max(STALE_MS, 3000 * hello.block_s)) [state, text] = hello.kind === 'replay' ? ['ended', 'end of recording'] : ['stale', 'no samples'];
   else {
     const status = rows.last('status');
@@ -217,6 +259,7 @@ function showHealth(found) {
   hello.sum_min = found.sum_min;
   const values = new Map(found.entries.filter((e) => e.name !== 'recording').flatMap((e) => e.values));
   const tiles = TILES.filter(([, key]) => values.has(key)).map(([label, key]) => [label, values.get(key), LOSSES.has(key) && values.get(key) !== '0']);
+  if (found.load) tiles.push(['known load', loadText(...found.load), false]);
   tiles.push(['not shown (page too slow)', String(found.dropped), found.dropped > 0]);
   list($('tiles'), tiles);
   const there = new Set();
@@ -263,15 +306,65 @@ function tell(t, text) {
 
 // From the hand.
 
+// Why a button does nothing now; '' if it works.
+function refused(id) {
+  if (!hello || body.dataset.state === 'offline') return 'there is no connection to the daemon';
+  if (!hello.control) return hello.why_no_control;
+  if (hello.kind === 'replay' && id === 'record') return 'a recording is played; it is not recorded again';
+  if (hello.kind === 'replay' && id === 'load') return 'a recording is played; its loads are those that were recorded';
+  return '';
+}
+
+const TITLES = new Map(['load', 'zero', 'record'].map((id) => [id, $(id).title]));
+
 function buttons() {
   const recording = Boolean(health && health.recording);
-  for (const id of ['zero', 'record']) {
-    $(id).disabled = !hello.control || body.dataset.state === 'offline' || (id === 'record' && hello.kind === 'replay');
-    if (!hello.control) $(id).title = 'off; monitor_control:=true (or --control) allows it';
+  // Not `disabled`: a button that cannot be reached cannot say why.
+  for (const [id, title] of TITLES) {
+    const why = refused(id);
+    $(id).setAttribute('aria-disabled', String(why !== ''));
+    $(id).title = why || title;
   }
   $('record').setAttribute('aria-pressed', String(recording));
   $('record').textContent = recording ? '● Recording' : 'Record';
   if (recording) $('record').title = health.recording;
+  $('held').textContent = health && health.load ? loadText(...health.load) : 'nothing';
+  showPlayer();
+}
+
+function press(id, action) {
+  $(id).onclick = () => {
+    const why = refused(id);
+    if (why) notice(why, true);
+    else action();
+  };
+}
+
+// A recording that is played.
+
+let seeking = false;
+
+function showPlayer() {
+  $('player').hidden = hello.kind !== 'replay';
+  if (hello.kind !== 'replay') return;
+  const stopped = (health && health.paused) || body.dataset.state === 'ended';
+  const words = stopped ? 'Play' : 'Pause';
+  if ($('pause').textContent !== words) $('pause').textContent = words;
+  const span = health && health.span;
+  $('seek').disabled = !span;
+  if (span) $('seek').max = String(span[1] - span[0]);
+  showPosition();
+}
+
+function showPosition() {
+  const span = health && health.span;
+  if (!hello || hello.kind !== 'replay' || !span || rows.empty) return;
+  if (!seeking) $('seek').value = String(rows.last('t') - span[0]);
+  const text = `${Number($('seek').value).toFixed(1)} of ${(span[1] - span[0]).toFixed(1)} s`;
+  if ($('position').textContent !== text) {
+    $('position').textContent = text;
+    $('seek').setAttribute('aria-valuetext', `${text}, ${clock(span[0] + Number($('seek').value), 1)}`);
+  }
 }
 
 function notice(text, bad = false) {
@@ -282,7 +375,7 @@ function notice(text, bad = false) {
   notice.timer = setTimeout(() => { $('notice').hidden = true; }, 8000);
 }
 
-async function act(path, content) {
+async function act(path, content, quiet = false) {
   if (hello.needs_token && !token && !(token = await askToken())) return;
   try {
     const answer = await fetch(path, {
@@ -295,7 +388,7 @@ async function act(path, content) {
       token = '';
       sessionStorage.removeItem('token');
     }
-    notice(result.message, !result.ok);
+    if (!quiet || !result.ok) notice(result.message, !result.ok);
   } catch {
     notice('no answer: the connection is lost', true);
   }
@@ -315,18 +408,43 @@ function askToken() {
   });
 }
 
-$('zero').onclick = () => act('/api/zero', {});
-$('record').onclick = () => act('/api/record', { record: !(health && health.recording) });
+press('zero', () => act('/api/zero', {}));
+press('record', () => act('/api/record', { record: !(health && health.recording) }));
+press('load', () => {
+  $('weigh').returnValue = '';
+  $('weigh').showModal();
+});
+$('weigh').onclose = () => {
+  const how = $('weigh').returnValue;
+  if (!how) return;
+  const [fx, fy, tz] = ['fx', 'fy', 'tz'].map((id) => $(id).valueAsNumber);
+  act('/api/load', { fx, fy, tz, add: how === 'add' });
+};
+$('weigh_cancel').onclick = () => $('weigh').close('');
 $('cancel').onclick = () => $('ask').close('');
-$('span').onchange = () => { fresh = true; };
-$('hold').onclick = () => {
-  $('hold').setAttribute('aria-pressed', String(!held()));
-  $('hold').textContent = held() ? 'Held' : 'Hold';
-  fresh = true;
+$('span').onchange = () => hold(false);
+$('hold').onclick = () => hold(!held());
+$('pause').onclick = () => {
+  const why = refused('zero');
+  if (why) notice(why, true);
+  else act('/api/play', { paused: !(health.paused || body.dataset.state === 'ended') }, true);
+};
+$('seek').oninput = () => {
+  seeking = true;
+  showPosition();
+};
+$('seek').onchange = async () => {
+  const why = refused('zero');
+  if (why) notice(why, true);
+  else await act('/api/play', { seek: Number($('seek').value) }, true);
+  seeking = false;
 };
 matchMedia('(prefers-color-scheme: dark)').onchange = () => {
-  if (plots) plots.build();
-  fresh = newDensity = true;
+  if (plots) {
+    plots.build();
+    if (!rows.empty) plots.traces(rows, Number($('span').value));
+  }
+  newDensity = true;
 };
 
 connect();

@@ -1,0 +1,29 @@
+"""The option ``--url`` of the commands that speak to a running daemon, and their requests."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+
+from psd_deflection.cli._report import show
+from psd_deflection.monitor.start import need_server
+
+
+def url_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--url``."""
+    parser.add_argument(
+        '--url',
+        metavar='URL',
+        help="address of the daemon's page, as it was printed (default: the one that you run on this machine, "
+        'else http://127.0.0.1:8790/)',
+    )
+
+
+def request(args: argparse.Namespace, path: str, body: Mapping[str, object]) -> int:
+    """Ask the daemon of ``args`` for something, and print its answer. Raises DaemonError."""
+    need_server()
+    # Imported here: only these commands and the page need aiohttp.
+    from psd_deflection.monitor.client import ask, find_daemon
+
+    show(ask(find_daemon(args.url), path, body))
+    return 0

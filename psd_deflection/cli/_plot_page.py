@@ -1,0 +1,142 @@
+"""The page of a recording: one file with its data, drawn by the scripts of the live page."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+import psd_deflection.monitor
+from psd_deflection import __version__
+from psd_deflection.config import Rig
+from psd_deflection.records import AppliedLoad, FloatArray, ReferencePose
+
+PAGE = Path(psd_deflection.monitor.__file__).parent / 'page'
+
+KEYS = {
+    'shift': (('ΔX', 'dx', 1, True), ('ΔY', 'dy', 4, True)),
+    'theta': (('θ', 'theta', 1, True),),
+    'load': (('Fx', 'dx', 1, False), ('Fy', 'dy', 2, False), ('Tz', 'theta', 3, False)),
+    'sums': (('sum 1', 'dx', 1, False), ('sum 2', 'dy', 2, False)),
+    'spectrum': (('x1', 'x1', 1, False), ('y1', 'y1', 2, False), ('x2', 'x2', 3, False), ('y2', 'y2', 4, False)),
+}
+"""Of each plot: words, colour, series and whether it has a band."""
+
+CAPTIONS = {
+    'shift': 'µm, band ±2 sd',
+    'theta': 'mdeg, band ±2 sd',
+    'load': 'known load, N and N·m',
+    'sums': 'V',
+    'spectrum': 'µm/√Hz over Hz',
+}
+
+
+def plot_page(
+    title: str,
+    table: Mapping[str, FloatArray],
+    spectrum: tuple[FloatArray, FloatArray] | None,
+    loads: Sequence[AppliedLoad],
+    references: Sequence[ReferencePose],
+    zeros: Sequence[int],
+    start_ns: int,
+    rig: Rig,
+    summary: Sequence[tuple[str, str]],
+) -> str:
+    """The page as text.
+
+    ``table``: as ``Drawn.table`` makes it. ``spectrum``: frequencies (k,) Hz and densities (4, k) m/sqrt(Hz).
+    ``zeros``: when the zero was taken, ns. Times are shown from ``start_ns`` on.
+    """
+    end = float(table['t'][-1])
+    seconds = [(load.t_ns - start_ns) / 1e9 for load in loads]
+    marks: list[tuple[float, list[object]]] = [
+        (s, ['load', load.fx, load.fy, load.tz]) for s, load in zip(seconds, loads, strict=True)
+    ]
+    marks += [((z - start_ns) / 1e9, ['zero']) for z in zeros]
+    held: dict[str, str] = {}
+    if loads:
+        held['t'] = _packed([*seconds, max(end, seconds[-1])], np.float64)
+        for i, name in enumerate(('fx', 'fy', 'tz'), start=1):
+            held[name] = _packed([load[i] for load in (*loads, loads[-1])])
+    content = {
+        'columns': {n: _packed(v, np.float64 if n == 't' else np.float32) for n, v in table.items()},
+        'marks': [[t, *words] for t, words in sorted(marks, key=lambda mark: mark[0])],
+        'loads': held,
+        'references': {
+            't': _packed([(r.t_ns - start_ns) / 1e9 for r in references], np.float64),
+            **{n: _packed([r[i] for r in references]) for i, n in enumerate(('dx', 'dy', 'theta'), start=1)},
+        },
+        'spectrum': None
+        if spectrum is None
+        else {'f': _packed(spectrum[0]), 'density': [_packed(row) for row in spectrum[1]]},
+        'modes': [['bending', rig.dynamics.bending_frequency], ['torsion', rig.dynamics.torsion_frequency]],
+        'active_areas': [psd.active_area for psd in rig.psds],
+        'sum_nominal': rig.amplifier.sum_nominal,
+    }
+    shown = [name for name in KEYS if (name != 'load' or loads) and (name != 'spectrum' or spectrum is not None)]
+    rows = ''.join(f'<tr><th scope="row">{html.escape(k)}</th><td>{html.escape(v)}</td></tr>' for k, v in summary)
+    detectors = ''.join(
+        f'<figure class="detector"><figcaption>PSD {n}</figcaption>'
+        f'<canvas role="img" aria-label="dots on the active area of PSD {n}"></canvas></figure>'
+        for n in (1, 2)
+    )
+    name = html.escape(title)
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f'<title>{name}</title><style>{_text("vendor/uPlot.min.css")}{_text("style.css")}{_text("recording.css")}</style></head><body>'
+        f'<header><div class="title"><h1>{name}</h1> <span id="range" class="quiet"></span></div><div class="tools">'
+        '<span class="quiet">drag over a trace to look closer</span>'
+        '<button id="whole" type="button" aria-disabled="true">All of it</button></div></header>'
+        f'<main class="drawn"><section class="traces" aria-label="traces">{"".join(map(_figure, shown))}</section>'
+        f'<section class="side" aria-label="summary"><div class="detectors">{detectors}</div>'
+        f'<div class="card"><h2>Summary</h2><table>{rows}</table><p class="quiet">psd_deflection {__version__}; '
+        f'<code>psd-deflection plot {name}</code></p></div></section></main>'
+        f'<noscript>This page draws with JavaScript.</noscript>'
+        f'<script type="application/json" id="recording">{_safe(json.dumps(content))}</script>'
+        f'<script>{_text("vendor/uPlot.iife.min.js")}</script>'
+        f'<script type="module">{_joined("charts.js", "recording.js")}</script></body></html>\n'
+    )
+
+
+def _figure(name: str) -> str:
+    keys = ' '.join(
+        f'<button type="button" class="key c-{color}" data-plot="{name}" data-series="{series}"'
+        f'{" data-band" if band else ""} aria-pressed="true">{words} <output></output></button>'
+        for words, color, series, band in KEYS[name]
+    )
+    more = '<span class="quiet references" hidden>○ reference</span>' if name in ('shift', 'theta') else ''
+    lost = '<span class="key c-bad">lost samples</span>' if name == 'theta' else ''
+    unit = ' data-unit="Hz"' if name == 'spectrum' else ''
+    size = {'shift': ' tall', 'sums': ' short', 'load': ' short'}.get(name, '')
+    return (
+        f'<figure class="plot{size}"><figcaption>{keys} <span class="quiet">{CAPTIONS[name]}</span> {more}{lost}'
+        f'<output class="at quiet right" data-plot="{name}"{unit}></output></figcaption>'
+        f'<div id="plot_{name}"></div></figure>'
+    )
+
+
+def _packed(values: npt.ArrayLike, kind: type[np.floating[Any]] = np.float32) -> str:
+    """Little-endian floats in base64: an hour is 13 MB, where its digits would be 25 MB."""
+    return base64.b64encode(np.asarray(values, np.dtype(kind).newbyteorder('<')).tobytes()).decode()
+
+
+def _text(name: str) -> str:
+    return (PAGE / name).read_text(encoding='utf-8')
+
+
+def _joined(*names: str) -> str:
+    """Modules as one: what they export to each other is in one file."""
+    return '\n'.join(re.sub(r'^import .*\n|^export (?=const|function|class)', '', _text(n), flags=re.M) for n in names)
+
+
+def _safe(text: str) -> str:
+    """JSON that ends no script element."""
+    return text.replace('<', '\\u003c')

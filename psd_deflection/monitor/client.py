@@ -1,0 +1,117 @@
+"""Speaks to a running daemon over its page: requests, and what it measures. For commands without ROS."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+from collections.abc import AsyncGenerator, Mapping
+from typing import Any, NamedTuple
+from urllib.parse import parse_qs, urlsplit
+
+import aiohttp
+
+from psd_deflection.errors import DaemonError, UsageError
+from psd_deflection.monitor.served import served_pages
+from psd_deflection.monitor.server import TOKEN_HEADER, TOKEN_VARIABLE
+
+DEFAULT_URL = 'http://127.0.0.1:8790/'
+ANSWER_S = 10.0
+"""Time limit for an answer, s; the daemon waits for its disk before it answers a recording."""
+
+HEARD_S = 15.0
+"""A daemon that says nothing for this long is gone, s; it reports its health once a second."""
+
+MAX_MESSAGE = 64 * 1024 * 1024
+
+
+class Daemon(NamedTuple):
+    """Where a daemon's page is, and its token or ''."""
+
+    url: str
+    token: str
+
+
+def find_daemon(url: str | None) -> Daemon:
+    """The daemon at ``url`` (a printed address, with or without its token), else the one of this user.
+
+    Raises DaemonError if several are running, UsageError if ``url`` is no address.
+    """
+    pages = served_pages()
+    if url is not None:
+        try:
+            parts = urlsplit(url if '//' in url else f'http://{url}')
+            given = parts.scheme in ('http', 'https') and parts.hostname is not None
+            # Out of range, it raises.
+            given = given and parts.port != 0
+        except ValueError:
+            given = False
+        if not given:
+            raise UsageError(f'--url {url}: is no address such as {DEFAULT_URL}')
+        base = f'{parts.scheme}://{parts.netloc}/'
+        token = parse_qs(parts.fragment).get('token', [''])[0] or next((p.token for p in pages if p.url == base), '')
+        return Daemon(base, token or os.environ.get(TOKEN_VARIABLE, ''))
+    if len(pages) > 1:
+        listed = ', '.join(f'{p.url} ({p.name})' for p in pages)
+        raise DaemonError(f'several daemons are running: {listed}; choose one with --url')
+    if pages:
+        return Daemon(pages[0].url, pages[0].token)
+    # One of another user, such as a service.
+    return Daemon(DEFAULT_URL, os.environ.get(TOKEN_VARIABLE, ''))
+
+
+def ask(daemon: Daemon, path: str, body: Mapping[str, object]) -> str:
+    """Send a request such as ``api/zero``; return the answer's message. Raises DaemonError."""
+    return asyncio.run(_ask(daemon, path, body))
+
+
+async def _ask(daemon: Daemon, path: str, body: Mapping[str, object]) -> str:
+    headers = {TOKEN_HEADER: daemon.token} if daemon.token else {}
+    limit = aiohttp.ClientTimeout(total=ANSWER_S)
+    try:
+        async with (
+            aiohttp.ClientSession(timeout=limit) as session,
+            session.post(daemon.url + path, json=body, headers=headers, allow_redirects=False) as answer,
+        ):
+            status, text = answer.status, (await answer.content.read(10_000)).decode(errors='replace')
+    except (aiohttp.ClientError, OSError, TimeoutError, ValueError) as error:
+        raise _unreachable(daemon, error) from None
+    message: Any = None
+    with contextlib.suppress(ValueError, RecursionError, TypeError, KeyError):
+        message = json.loads(text)['message']
+    if not isinstance(message, str):
+        raise DaemonError(f'{daemon.url}: {text[:200]!r} is no answer of a daemon (HTTP status {status})')
+    if status != 200:
+        hint = '; give --url with that token' if status == 401 else ''
+        raise DaemonError(f'{daemon.url}: {message}{hint}')
+    return message
+
+
+async def messages(daemon: Daemon) -> AsyncGenerator[dict[str, Any], None]:
+    """What the page is told: ``hello`` first, then new rows as they come. Raises DaemonError, also at the end."""
+    limit = aiohttp.ClientTimeout(total=None, sock_connect=ANSWER_S)
+    try:
+        async with (
+            aiohttp.ClientSession(timeout=limit) as session,
+            session.ws_connect(f'{daemon.url}ws?history=0', max_msg_size=MAX_MESSAGE) as socket,
+        ):
+            while True:
+                message = await socket.receive(HEARD_S)
+                if message.type is not aiohttp.WSMsgType.TEXT:
+                    why = f': {message.extra}' if message.extra else ''
+                    raise DaemonError(f'{daemon.url}: the daemon closed the connection{why}')
+                content = json.loads(message.data)
+                if not isinstance(content, dict):
+                    raise DaemonError(f'{daemon.url}: no page of this program is there')
+                yield content
+    except (aiohttp.ClientError, OSError, TimeoutError, ValueError, RecursionError) as error:
+        raise _unreachable(daemon, error) from None
+
+
+def _unreachable(daemon: Daemon, error: Exception) -> DaemonError:
+    why = error.strerror if isinstance(error, OSError) and error.strerror else str(error) or 'no answer in time'
+    return DaemonError(
+        f'{daemon.url}: no daemon answers ({why}); start one with `psd-deflection monitor` or '
+        '`psd-deflection estimator --monitor`, or give the address that it printed as --url'
+    )

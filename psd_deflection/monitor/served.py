@@ -1,0 +1,70 @@
+"""The pages that this user's daemons serve now, so that commands find them without an address.
+
+Each page has a small file below ``$XDG_STATE_HOME/psd_deflection`` while it is served. Only the user can
+read it: it holds the token, if there is one. A file that a killed daemon left behind is removed by the
+next look.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+from psd_deflection.runner.zero_store import state_folder
+
+MAX_BYTES = 10_000
+
+
+class Served(NamedTuple):
+    """A served page: its address without the token, the token or '', what it shows, its process."""
+
+    url: str
+    token: str
+    name: str
+    pid: int
+
+
+def announce(page: Served) -> Path | None:
+    """Write the file of ``page``; None if it cannot be written: then commands need ``--url``."""
+    path = state_folder() / f'page_{page.pid}_{page.url.rstrip("/").rpartition(":")[2]}.json'
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Left by a process that had the same number.
+        path.unlink(missing_ok=True)
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), 'w') as stream:
+            json.dump(page._asdict(), stream)
+    except (OSError, RuntimeError):
+        # RuntimeError: a user without a home folder.
+        return None
+    return path
+
+
+def withdraw(path: Path | None) -> None:
+    """Remove the file of :func:`announce`."""
+    if path is not None:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+
+
+def served_pages() -> list[Served]:
+    """The pages of the processes that run."""
+    with contextlib.suppress(OSError, RuntimeError):
+        return [page for path in sorted(state_folder().glob('page_*.json')) if (page := _read(path)) is not None]
+    return []
+
+
+def _read(path: Path) -> Served | None:
+    try:
+        with path.open('rb') as stream:
+            kept = json.loads(stream.read(MAX_BYTES))
+        page = Served(str(kept['url']), str(kept['token']), str(kept['name']), int(kept['pid']))
+        os.kill(page.pid, 0)
+    except ProcessLookupError:
+        withdraw(path)
+        return None
+    except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError):
+        return None
+    return page

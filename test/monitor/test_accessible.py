@@ -1,0 +1,112 @@
+"""No page of ours has a violation that axe-core finds: colours, names, labels, landmarks, order of headings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip('selenium', reason='the browser tests need selenium: pip install .[test]')
+
+from psd_deflection.cli.main import main
+from psd_deflection.records import AppliedLoad, BlockStatus
+from tools.accessible import views, violations
+
+from .browsing import Page
+from .serving import BLOCK_NS, START_NS, Serving
+
+pytestmark = pytest.mark.browser
+
+BAGS = Path(__file__).parent.parent.parent / 'bags'
+
+
+@pytest.fixture(scope='module')
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    one = Page(tmp_path_factory.mktemp('profile'))
+    yield one
+    one.close()
+
+
+def audit(page: Page, ready: str) -> None:
+    found = []
+    for view in views(page.driver):
+        page.driver.refresh()
+        page.until(ready)
+        found += [f'{view}: {line}' for line in violations(page.driver)]
+    assert found == []
+
+
+@pytest.fixture
+def shown(serve: Callable[..., Serving]) -> Serving:
+    serving = serve(monitor_control='off')
+    serving.shown.recordings.append('recordings/test')
+    serving.feed.put(AppliedLoad(START_NS + 10 * BLOCK_NS, 0.0, -10.0, 0.0))
+    serving.give(0, 100)
+    serving.give(100, 5, lost=3)
+    for number in range(50):
+        serving.server.tell(f'message {number}')
+    return serving
+
+
+def test_axe_finds_what_is_wrong(page: Page, tmp_path: Path) -> None:
+    bad = tmp_path / 'bad.html'
+    bad.write_text('<!doctype html><html><title>x</title><body><input><p style="color:#aaa">pale</p></body></html>')
+    page.open(bad.as_uri())
+    found = ' '.join(violations(page.driver))
+    for rule in ('color-contrast', 'html-has-lang', 'label', 'landmark-one-main'):
+        assert f'{rule} (' in found
+
+
+def test_the_live_page(page: Page, shown: Serving) -> None:
+    page.open(shown.url)
+    audit(page, 'document.body.dataset.rows >= 105 && document.querySelectorAll("#entries details").length > 0')
+
+
+def test_the_live_page_with_all_that_opens(page: Page, shown: Serving) -> None:
+    shown.give(105, 1, status=BlockStatus.LASER_LOST)
+    page.open(shown.url)
+    for what in ('weigh', 'ask'):
+        page.until('document.querySelectorAll("#entries details").length > 0')
+        page.js('[...document.querySelectorAll("details")].forEach((d) => { d.open = true; })')
+        page.js('document.getElementById("hold").click()')
+        page.js('document.querySelector("[data-series=\'4\']").click()')
+        page.js(f'document.getElementById("{what}").showModal()')
+        assert violations(page.driver) == []
+        page.driver.refresh()
+
+
+def test_a_recording_that_is_played(page: Page, serve: Callable[..., Serving]) -> None:
+    serving = serve()
+    replay = {'kind': 'replay', 'name': 'bags/test', 'recording': None, 'paused': True, 'span': [1.7e9, 1.7e9 + 10]}
+    serving.shown.describe = lambda: replay  # type: ignore[method-assign]
+    serving.give(0, 100)
+    page.open(serving.url)
+    audit(page, 'document.getElementById("state").textContent === "paused"')
+
+
+def test_the_page_of_a_recording(page: Page, tmp_path: Path) -> None:
+    out = tmp_path / 'recording.html'
+    assert main(['plot', str(BAGS / 'laser_off'), '--out', str(out)]) == 0
+    page.open(out.as_uri())
+    audit(page, 'document.querySelectorAll(".uplot").length === 4')
+    assert page.complaints() == []
+
+
+def test_the_report_of_discover(page: Page, tmp_path: Path) -> None:
+    recording, out = tmp_path / 'run.csv', tmp_path / 'found'
+    hidden = ['--effect', 'sensor_rotation,psd=1,angle=0.01']
+    loads = ['--loads', 'steps:0,0,0;0,-10,-5.85;10,0,0:0.6']
+    assert main(['simulate', '--out', str(recording), *loads, *hidden]) == 0
+    assert main(['discover', str(recording), '--params-file', 'config/thesis_rig.yaml', '--out', str(out)]) == 0
+    page.open((out / 'report.html').as_uri())
+    audit(page, 'document.querySelectorAll("img").length >= 4')
+    page.driver.execute_cdp_cmd(
+        'Emulation.setDeviceMetricsOverride', {'width': 390, 'height': 844, 'deviceScaleFactor': 1, 'mobile': True}
+    )
+    try:
+        # Readable on a phone: as wide as it, and no wider.
+        assert page.js('window.innerWidth') == 390
+        assert page.js('document.documentElement.scrollWidth') <= 390
+    finally:
+        page.driver.execute_cdp_cmd('Emulation.clearDeviceMetricsOverride', {})

@@ -1,0 +1,110 @@
+"""Audits pages with axe-core in headless Chromium: ``make axe`` for the documentation site, the tests for the rest.
+
+axe-core (Deque) comes with the package axe-core-python. A page is audited in light and in dark colours, and as
+wide as a phone. Only the rules that axe calls violations count; what it cannot decide is for a person's eyes.
+"""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import importlib.util
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from selenium.webdriver.support.ui import WebDriverWait
+
+from tools.browser import open_browser
+from tools.program import WAIT_S
+
+VIEWS = (('light', 1440, 900, False), ('dark', 1440, 900, False), ('light', 390, 844, True), ('dark', 390, 844, True))
+"""Colour scheme, width, height, whether it is a phone."""
+
+RUN = """
+const done = arguments[arguments.length - 1];
+axe.run(document, {resultTypes: ['violations']}).then(
+  (found) => done(found.violations.map(
+    (v) => [v.id, v.help, v.nodes.map((n) => [n.target.join(' '), n.failureSummary])],
+  )),
+  (error) => done([['axe', String(error), []]]),
+);
+"""
+
+
+@functools.cache
+def axe_source() -> str:
+    """The text of axe.min.js. SystemExit, with the fix, if it is not installed."""
+    spec = importlib.util.find_spec('axe_core_python')
+    if spec is None or not spec.submodule_search_locations:
+        raise SystemExit('axe-core is needed: pip install axe-core-python')
+    return (Path(next(iter(spec.submodule_search_locations))) / 'axe.min.js').read_text(encoding='utf-8')
+
+
+def violations(driver: Any) -> list[str]:
+    """What axe has against the page that ``driver`` shows: rule, and the elements concerned."""
+    driver.set_script_timeout(WAIT_S)
+    driver.execute_script(axe_source())
+    found = driver.execute_async_script(RUN)
+    return [f'{rule} ({text}): {where}: {" ".join(why.split())}' for rule, text, nodes in found for where, why in nodes]
+
+
+def views(driver: Any) -> Iterator[str]:
+    """Show the page in each of ``VIEWS``; yields its name. Afterwards the window is as it was."""
+    try:
+        for scheme, width, height, mobile in VIEWS:
+            driver.execute_cdp_cmd(
+                'Emulation.setDeviceMetricsOverride',
+                {'width': width, 'height': height, 'deviceScaleFactor': 1, 'mobile': mobile},
+            )
+            driver.execute_cdp_cmd(
+                'Emulation.setEmulatedMedia', {'features': [{'name': 'prefers-color-scheme', 'value': scheme}]}
+            )
+            yield f'{scheme}, {width} px'
+    finally:
+        driver.execute_cdp_cmd('Emulation.clearDeviceMetricsOverride', {})
+        driver.execute_cdp_cmd('Emulation.setEmulatedMedia', {'features': []})
+
+
+def main() -> int:
+    """Audit every page of the site in the folder that is given; the exit status is 1 if one has a violation."""
+    site = Path(sys.argv[1])
+    pages = sorted(str(p.relative_to(site)) for p in site.rglob('*.html'))
+    if not pages:
+        raise SystemExit(f'{site}: no pages are there')
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            """Say nothing."""
+
+    server = http.server.ThreadingHTTPServer(('127.0.0.1', 0), functools.partial(Quiet, directory=str(site)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    failures = 0
+    with tempfile.TemporaryDirectory() as profile:
+        driver = open_browser(Path(profile))
+        try:
+            for view in views(driver):
+                driver.get(f'http://127.0.0.1:{server.server_port}/{pages[0]}')
+                # The site keeps the colours that it was seen in first.
+                driver.execute_script('localStorage.clear()')
+                for page in pages:
+                    driver.get(f'http://127.0.0.1:{server.server_port}/{page}')
+                    WebDriverWait(driver, WAIT_S).until(
+                        lambda d: d.execute_script('return document.readyState') == 'complete'
+                    )
+                    for line in violations(driver):
+                        failures += 1
+                        print(f'{page} ({view}): {line}', flush=True)
+        finally:
+            driver.quit()
+            server.shutdown()
+            server.server_close()
+    print(f'{len(pages)} pages, {len(VIEWS)} views each: {failures} violations')
+    return 1 if failures else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
