@@ -145,3 +145,33 @@ def test_while_warming_up_a_clock_that_runs_away_is_followed() -> None:
         error = int(clock.to_host_ns(np.array([1000 * k], np.int64))[0]) - true
     # The least delay of nine seconds ago alone would be stale by 750 us.
     assert abs(error - 300_000) < 250_000
+
+
+def test_the_last_five_minutes_count_and_no_more() -> None:
+    """A clock that is right for ten minutes and then 50 ppm off, on a line without jitter."""
+    clock = ClockMap()
+    turn = 600 * 10
+    for k in range(turn + 320 * 10):
+        late = 0 if k < turn else round((k - turn) * 100 * MS * 50e-6)
+        clock.observe(100_000 * k, 100 * MS * k + 200_000 + late)
+        clock.to_host_ns(np.array([100_000 * k], np.int64))
+        if k == turn:
+            assert clock.state().points == 300
+            assert clock.state().skew_ppm == pytest.approx(0.0, abs=1e-3)
+    assert clock.state().points == 300
+    assert clock.state().skew_ppm == pytest.approx(50.0, abs=1e-3)
+
+
+def test_a_map_that_is_off_draws_near_within_seconds_and_evenly() -> None:
+    """From the eleventh second on by a fifth of what is missing a second: blocks stay even within 4 us."""
+    clock = ClockMap()
+    stamps = []
+    for k in range(60 * 50):
+        # From second 30 on a shorter line: 0.8 ms less.
+        host = 20 * MS * k + (1_000_000 if k < 30 * 50 else 200_000)
+        clock.observe(20_000 * k, host)
+        stamps.append(int(clock.to_host_ns(np.array([20_000 * k], np.int64))[0]))
+    uneven = np.abs(np.diff(stamps) - 20 * MS)
+    assert uneven[: 30 * 50].max() <= 1
+    assert uneven.max() < 4_100
+    assert uneven.max() > 100

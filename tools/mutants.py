@@ -41,31 +41,49 @@ class Room(NamedTuple):
     leave: tuple[str, ...] = ()
 
 
-_WHOLE = ('test/test_golden.py', 'test/test_pipeline.py')
+_PIPELINE = 'test/test_pipeline.py -k not(drift)'
+_GOLDEN = 'test/test_golden.py'
 
 ROOMS: Mapping[str, Room] = {
-    'solvers': Room(('psd_deflection/solvers',), ('test/solvers', *_WHOLE)),
-    'geometry': Room(('psd_deflection/geometry',), ('test/geometry', 'test/solvers/test_properties.py', 'test/budget')),
-    'averaging': Room(('psd_deflection/averaging.py',), ('test/test_averaging.py', *_WHOLE)),
+    'solvers': Room(
+        ('psd_deflection/solvers',),
+        (
+            *(
+                f'test/solvers/test_{n}.py'
+                for n in (
+                    'golden',
+                    'properties',
+                    'interface',
+                    'degenerate',
+                    'registry',
+                    'gauss_newton',
+                    'one_psd',
+                )
+            ),
+            _GOLDEN,
+        ),
+    ),
+    'geometry': Room(('psd_deflection/geometry',), ('test/geometry',)),
+    'averaging': Room(('psd_deflection/averaging.py',), ('test/test_averaging.py', _GOLDEN)),
     'timing': Room(('psd_deflection/timing.py',), ('test/test_timing.py', 'test/runner/test_clock_watch.py')),
     'pipeline': Room(
         ('psd_deflection/pipeline.py', 'psd_deflection/correction.py'),
-        ('test/test_pipeline.py', 'test/test_golden.py', 'test/uncertainty', 'test/simulation/test_effects.py'),
+        (_PIPELINE, _GOLDEN, 'test/uncertainty/test_pipeline_state.py'),
     ),
-    'calibration': Room(('psd_deflection/calibration',), ('test/calibration', *_WHOLE)),
-    'uncertainty': Room(('psd_deflection/uncertainty',), ('test/uncertainty', 'test/blind/test_coverage.py')),
+    'calibration': Room(('psd_deflection/calibration',), ('test/calibration', _GOLDEN)),
+    'uncertainty': Room(('psd_deflection/uncertainty',), ('test/uncertainty',)),
     'adapters': Room(('msg_adapters',), ('test/recordings/test_adapters.py', 'test/recordings/test_contract.py')),
     'protocol': Room(
         ('psd_deflection/protocol',),
-        (
-            'test/protocol',
-            'test/runner/test_hello.py',
-            *(f'test/devices/test_{n}.py' for n in ('dataq', 'text_lines', 'thorlabs')),
-        ),
+        ('test/protocol', *(f'test/devices/test_{n}.py' for n in ('dataq', 'text_lines', 'thorlabs'))),
     ),
     'effects': Room(
         ('psd_deflection/simulation/effects',),
-        ('test/simulation/test_effect_formulas.py', 'test/simulation/test_effects.py'),
+        (
+            'test/simulation/test_catalogue.py',
+            'test/simulation/test_effect_formulas.py',
+            'test/simulation/test_effects.py -k correction_gives_back or sequential or pieces',
+        ),
     ),
     'discovery': Room(
         ('psd_deflection/discovery',),

@@ -1,7 +1,8 @@
 """Run pytest in one child after another of a process that has imported all libraries already.
 
-Arguments: the tests, a file or folder each. Each line of the input is a number of seconds. Each line of the
-output is 1 if all tests passed in that time, 0 if not. The program is imported again by every child.
+Arguments: the tests, a file or folder each, perhaps with "-k WORDS". Each line of the input is a number of
+seconds; each line of the output is 1 if all tests passed in that time, 0 if not. Every child imports the
+program again.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def passed(tests: Sequence[str], seconds: float) -> bool:
 def warm_up(tests: Sequence[str]) -> None:
     """Import what the tests import, and forget what is of this checkout: a child reads it anew."""
     with Path(os.devnull).open('w') as nowhere, contextlib.redirect_stdout(nowhere):
-        pytest.main([*OPTIONS, '--collect-only', *tests])
+        pytest.main([*OPTIONS, '--collect-only', *(t.split(' ')[0] for t in tests)])
     for name in list(sys.modules):
         if name.split('.')[0] in OURS:
             del sys.modules[name]
@@ -62,7 +63,7 @@ def main() -> None:
     for line in sys.stdin:
         end = time.monotonic() + float(line)
         # One after the other: what the first notices need not wait for the imports of the rest.
-        good = all(passed([t], end - time.monotonic()) for t in tests)
+        good = all(passed(t.split(' ', 2), end - time.monotonic()) for t in tests)
         print(int(good), flush=True)
 
 
