@@ -52,6 +52,7 @@ ROOMS: Mapping[str, Room] = {
                 f'test/solvers/test_{n}.py'
                 for n in (
                     'golden',
+                    'truth',
                     'properties',
                     'interface',
                     'degenerate',
@@ -134,9 +135,8 @@ def copy_of_checkout(folder: Path) -> Path:
     return folder
 
 
-def mutants_of(file: str) -> Iterator[Mutant]:
+def mutants_of(file: str, text: str) -> Iterator[Mutant]:
     """All of a file."""
-    text = (ROOT / file).read_text()
     lines, tree = text.splitlines(), get_ast(text)
     for name in OPERATORS:
         operator = get_operator('core/' + name)()
@@ -147,11 +147,11 @@ def mutants_of(file: str) -> Iterator[Mutant]:
                 yield Mutant(file, line, name, occurrence)
 
 
-def drawn(room: Room, count: int, seed: int) -> list[Mutant]:
-    """``count`` mutants, at most one a line."""
-    places = [p for c in room.code for p in ([ROOT / c] if c.endswith('.py') else (ROOT / c).rglob('*.py'))]
-    files = {str(p.relative_to(ROOT)) for p in places} - {*room.leave}
-    every = sorted(m for f in files for m in mutants_of(f))
+def drawn(folder: Path, room: Room, count: int, seed: int) -> list[Mutant]:
+    """``count`` mutants of the copy in ``folder``, at most one a line."""
+    places = [p for c in room.code for p in ([folder / c] if c.endswith('.py') else (folder / c).rglob('*.py'))]
+    files = {str(p.relative_to(folder)) for p in places} - {*room.leave}
+    every = sorted(m for f in files for m in mutants_of(f, (folder / f).read_text()))
     random.Random(seed).shuffle(every)
     lines: dict[tuple[str, int], Mutant] = {}
     for m in every:
@@ -191,7 +191,7 @@ def tried(name: str, python: str, count: int, seed: int) -> Iterator[tuple[str, 
                 raise RuntimeError(f'{name}: the tests fail without a mutant: run pytest {" ".join(room.tests)}')
             # A mutant that never ends is noticed, and need not cost ten minutes.
             longest = 30.0 + 3.0 * (time.monotonic() - begun)
-            for mutant in drawn(room, count, seed):
+            for mutant in drawn(folder, room, count, seed):
                 file = folder / mutant.file
                 text = file.read_text()
                 file.write_text(mutant.code(text))
