@@ -82,6 +82,7 @@ def test_a_clock_that_jumps_is_laid_anew_and_counted(device_us: int, host_ms: in
     observe_usb(clock, 20, 0.0, 4)
     assert clock.observe(device_us, host_ms * MS)
     assert clock.resets == 1
+    assert clock.state().residual_ns == 0.0
     assert clock.to_host_ns(np.array([device_us], np.int64))[0] == host_ms * MS
 
 

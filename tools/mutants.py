@@ -11,6 +11,7 @@ notice, each with the reason, and they do not count.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import os
 import random
 import shutil
@@ -29,6 +30,8 @@ from cosmic_ray.plugins import get_operator
 
 ROOT = Path(__file__).parent.parent
 EQUIVALENT = Path(__file__).with_name('mutants_equivalent.txt')
+NOTICED = ROOT / 'build' / 'mutants' / 'noticed.txt'
+"""Digests of broken files that a test has noticed: only what was not is tried again. Delete it to begin anew."""
 
 
 class Room(NamedTuple):
@@ -183,6 +186,7 @@ def warm(python: str, folder: Path, tests: Sequence[str]) -> Iterator[Callable[[
 def tried(name: str, python: str, count: int, seed: int) -> Iterator[tuple[str, bool]]:
     """The mutants of one room in words, and whether a test noticed. Raises RuntimeError if the tests fail without."""
     room = ROOMS[name]
+    noticed = frozenset(NOTICED.read_text().split()) if NOTICED.exists() else frozenset()
     with tempfile.TemporaryDirectory() as scratch:
         folder = copy_of_checkout(Path(scratch))
         with warm(python, folder, room.tests) as passed:
@@ -194,10 +198,17 @@ def tried(name: str, python: str, count: int, seed: int) -> Iterator[tuple[str, 
             for mutant in drawn(folder, room, count, seed):
                 file = folder / mutant.file
                 text = file.read_text()
-                file.write_text(mutant.code(text))
-                good = passed(longest)
-                file.write_text(text)
-                yield f'{mutant.words(text)}  (line {mutant.line})', not good
+                code = mutant.code(text)
+                key = hashlib.sha256(f'{mutant.file}\n{code}'.encode()).hexdigest()
+                seen = key in noticed
+                if not seen:
+                    file.write_text(code)
+                    seen = not passed(longest)
+                    file.write_text(text)
+                    if seen:
+                        with NOTICED.open('a') as stream:
+                            stream.write(key + '\n')
+                yield f'{mutant.words(text)}  (line {mutant.line})', seen
 
 
 def equivalent() -> dict[str, str]:
