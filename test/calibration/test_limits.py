@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -96,7 +97,7 @@ def judge_frozen(frozen: tuple[int, int]) -> Verdict:
 @pytest.mark.parametrize('axis', range(4))
 def test_a_dot_is_outside_beyond_half_the_active_area(axis: int) -> None:
     half = 4e-3 if axis % 2 else 3e-3
-    areas = {'psd_1.active_area': [6e-3, 8e-3], 'psd_2.active_area': [6e-3, 8e-3]}
+    areas: dict[str, Any] = {'psd_1.active_area': [6e-3, 8e-3], 'psd_2.active_area': [6e-3, 8e-3]}
     for sign in (1.0, -1.0):
         for off, status in ((1e-6, BlockStatus.OUTSIDE_ACTIVE_AREA), (-1e-6, BlockStatus.OK)):
             dots = list(DOTS)

@@ -13,9 +13,7 @@ TABLE = Path(__file__).parents[1] / 'data' / 'effects.txt'
 
 
 def lines_of(effect: Effect) -> list[str]:
-    out = [
-        f'{effect.name}: {effect.stage}, at {effect.point}' + (', shows only at some sizes' if effect.finite else '')
-    ]
+    out = [f'{effect.name}: {effect.stage} {effect.order}, at {effect.point}' + ', finite' * effect.finite]
     for p in effect.parameters:
         low, high = (f'{v:.6g}' for v in (p.minimum, p.maximum))
         words = [

@@ -19,7 +19,7 @@ from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.simulation import loads
 from psd_deflection.simulation.catalogue import catalogue
 from psd_deflection.simulation.chunk import Chunk
-from psd_deflection.simulation.declaration import ActiveEffect, Effect
+from psd_deflection.simulation.declaration import ActiveEffect, Effect, Traced
 from psd_deflection.simulation.physics import Physics
 from psd_deflection.simulation.simulator import ForwardModel
 
@@ -133,3 +133,39 @@ def test_a_signal_without_its_noise_shows_the_mean_over_it(name: str, size: dict
     # Forty-one nodes stand for the noise where the steps are sharp.
     allowed = 0.08 * 0.05 if 0.0 < sigma < 0.006 else 2e-5
     assert np.abs(chunk.volts - want).max() < allowed
+
+
+def traced(name: str, values: dict[str, float], poses: FloatArray, seconds: float) -> FloatArray:
+    """The poses before a link effect, block after block."""
+    effect, physics = catalogue()[name], Physics.of(load_rig())
+    assert effect.trace_back is not None
+    whole = {**effect.off_values(physics, next(effect.variants())), **values}
+    remembered: list[float] = []
+    out = []
+    for pose in poses.tolist():
+        block = Traced(pose, [0.0, 0.0, 0.0], seconds, physics)
+        effect.trace_back(block, whole, remembered)
+        out.append(block.pose)
+    return np.array(out)
+
+
+def test_creep_is_taken_off_a_step_and_off_its_end() -> None:
+    """A step to q grows by amplitude (1 - exp(-t/tau)) q; what grew stays when it ends, and dies away."""
+    amplitude, tau, period = 0.2, 0.5, 0.02
+    t = np.arange(1, 101) * period
+    grown = 1.0 - np.exp(-t / tau)
+    after = np.where(t > 1.0, 1.0 - np.exp(-(t - 1.0) / tau), 0.0)
+    static = np.where(t > 1.0 + 1e-9, 0.0, 1.0)[:, None] * np.array([1e-3, -2e-3, 0.01])
+    crept = static + amplitude * (grown - after)[:, None] * np.array([1e-3, -2e-3, 0.01])
+    got = traced('creep', {'amplitude': amplitude, 'time_constant': tau}, crept, period)
+    np.testing.assert_allclose(got, static, atol=1e-12)
+
+
+def test_a_turned_force_is_turned_back() -> None:
+    effect, physics = catalogue()['load_direction'], Physics.of(load_rig())
+    assert effect.trace_back is not None
+    # By 30 degrees about Z the load (2, 0) acts as (sqrt 3, 1), and (0, 2) as (-1, sqrt 3).
+    for given, acts in (((2.0, 0.0), (3.0**0.5, 1.0)), ((0.0, 2.0), (-1.0, 3.0**0.5))):
+        block = Traced([0.0] * 3, [*acts, 7.0], 0.02, physics)
+        effect.trace_back(block, {'angle': np.pi / 6.0}, [])
+        assert block.loads == pytest.approx([*given, 7.0])

@@ -115,7 +115,7 @@ def dots_of(pose: FloatArray) -> FloatArray:
     dx, dy, theta = pose
     c, s = math.cos(theta), math.sin(theta)
     u, v = CENTERS[:, 0] - dx, CENTERS[:, 1] - dy
-    return np.column_stack((c * u + s * v, c * v - s * u)).ravel() - CENTERS.ravel()
+    return np.asarray(np.column_stack((c * u + s * v, c * v - s * u)) - CENTERS).ravel()
 
 
 def seen(change: Any, blocks: int = 60, size: float = 1.0) -> str:
