@@ -319,6 +319,54 @@ def test_an_alternative_is_equivalent_up_to_a_stated_loss(loss: float, names: tu
     assert bic == pytest.approx(loss + 3.0 * (len(names) - 1))
 
 
+@pytest.mark.parametrize(
+    ('gain', 'of_other', 'refitted'),
+    [
+        # Half of what the named effect explains; from 100 on all but 60 of it; from 150 on six tenths.
+        (80.0, 40.5, True),
+        (80.0, 39.5, False),
+        (120.0, 60.5, True),
+        (120.0, 59.5, False),
+        (200.0, 120.5, True),
+        (200.0, 119.5, False),
+    ],
+)
+def test_an_alternative_is_tried_if_it_explains_enough_of_the_same(
+    gain: float, of_other: float, refitted: bool
+) -> None:
+    shown = pictures(A, B)
+    a = shown[A] / np.linalg.norm(shown[A])
+    across = shown[B] - a * np.sum(a * shown[B])
+    share = of_other / gain
+    shown[B] = np.linalg.norm(shown[A]) * (
+        math.sqrt(share) * a + math.sqrt(1.0 - share) * across / np.linalg.norm(across)
+    )
+    plant = Plant(shown, without_noise((shown[A], gain)))
+    found = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'b')]
+    search = Search(plant, lambda workspace: Screen(workspace, found))
+    null, fit = refit(plant, ()), refit(plant, [active('a', x=0.0)])
+    others = search.alternatives(null, fit, 0, null.chi2 - fit.chi2)
+    assert [f.effects[-1].effect.name for f in others] == (['b'] if refitted else [])
+
+
+def test_a_search_adds_what_passes_and_nothing_else() -> None:
+    """Two of three effects act; from the residual of the first the second is found, and no third."""
+    shown = pictures(A, B, ('c', 'x'))
+    plant = Plant(shown, without_noise((shown[A], 4000.0), (shown[B], 500.0)) + noise())
+    found = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'b', 'c')]
+    said: list[str] = []
+    result = Search(plant, lambda workspace: Screen(workspace, found), said.append).run()
+    assert sorted(a.effect.name for a in result.fit.effects) == ['a', 'b']
+    assert said[:2] == ['adding a', 'adding b']
+    lost = {a.effect.name: g for a, g in zip(result.fit.effects, result.delta_chi2, strict=True)}
+    # Noise adds some tens: 2 sqrt(gain).
+    assert lost['a'] == pytest.approx(4000.0, abs=4 * 2 * math.sqrt(4000.0))
+    assert lost['b'] == pytest.approx(500.0, abs=4 * 2 * math.sqrt(500.0))
+    assert [s.candidate.effect.name for s in result.first_scores[:2]] == ['a', 'b']
+    quiet = Search(Plant(shown, noise()), lambda workspace: Screen(workspace, found)).run()
+    assert quiet.fit.effects == ()
+
+
 # Load cases that a fit has not seen.
 
 
@@ -529,9 +577,10 @@ def test_effects_weaker_than_the_unknown_remainder_are_taken_out(monkeypatch: py
     shown = pictures(A, B)
     search = search_of(Plant(shown, without_noise((shown[A], 5000.0), (shown[B], 150.0)) + noise()))
     effects = [active('a', x=0.0), active('b', x=0.0)]
-    for excess, kept in ((140.0, ['a', 'b']), (300.0, ['a'])):
+    # An excess that chance explains is no unknown remainder.
+    for p, excess, kept in ((0.0, 140.0, ['a', 'b']), (0.0, 300.0, ['a']), (0.1, 300.0, ['a', 'b'])):
         result = result_of(search, effects)
-        left = nowhere(p=0.0, excess=excess)
+        left = nowhere(p=p, excess=excess)
         monkeypatch.setattr('psd_deflection.discovery.discover.localise', lambda *_, found=left: found)
         fit, heldout, _ = _credible(search, result, result.fit, [HeldOut(1.0, 1.0)] * 2, 0.0, np.random.default_rng(0))
         assert [a.effect.name for a in fit.effects] == kept
