@@ -63,7 +63,9 @@ ROOMS: Mapping[str, Room] = {
     'calibration': Room(('psd_deflection/calibration',), ('test/calibration', _GOLDEN)),
     'uncertainty': Room(
         ('psd_deflection/uncertainty',),
-        tuple(f'test/uncertainty/test_{n}.py' for n in ('formulas', 'consistency', 'block_fit', 'noise')),
+        tuple(
+            f'test/uncertainty/test_{n}.py' for n in ('formulas', 'consistency', 'block_fit', 'noise', 'pipeline_state')
+        ),
     ),
     'adapters': Room(('msg_adapters',), ('test/recordings/test_adapters.py', 'test/recordings/test_contract.py')),
     'protocol': Room(
