@@ -8,7 +8,7 @@
 # make fuzz     coverage-guided fuzzing of all that reads strangers' bytes, FUZZ_SECONDS=600 each; 10^7 damaged frames; 10^6 HELLOs
 # make soak     SOAK_MINUTES=30 in real time, then SOAK_HOURS=24 of simulated time (a quarter of an hour on an idle core)
 # make firmware build the example firmware, run it in qemu, join it to the daemon (installs what it needs with apt-get)
-# make mutants  break the numerics line by line and see whether the tests notice (two hours; MUTANTS="--rooms solvers" for one room)
+# make mutants  break the numerics line by line and see whether the tests notice (an hour; MUTANTS="--rooms solvers" for one room)
 # make golden   make the recordings in bags/ anew
 # make colcon   build with colcon in a virtual environment of its own and look at what it installed
 # make docs     the documentation as a web site, in build/site

@@ -272,3 +272,34 @@ def test_a_drift_in_the_rig_file_is_corrected_and_replayed_to_the_bit(
     assert main(['replay', str(bag), '--params-file', str(nominal), '--out', str(again)]) == 0
     blind = open_recording(again).estimates()['/link_tip/deflection'].pose
     assert abs(blind[-100:].mean(axis=0) - blind[:100].mean(axis=0)).max() > 3e-6
+
+
+def exact_chunk(dots: npt.NDArray[np.float64], first: int = 0) -> RawChunk:
+    """Volts of these dots (n, 4), m, at 0.5 mm a volt, without noise."""
+    n = len(dots)
+    volts = np.full((n, 6), 5.0)
+    volts[:, [0, 1, 3, 4]] = dots / 5e-4
+    seq = np.arange(first, first + n)
+    return RawChunk(seq, seq * 1_000_000, volts.astype(np.float32), np.zeros(n, np.uint8))
+
+
+def test_a_zero_is_the_mean_of_the_last_half_second(rig: Rig) -> None:
+    """25 blocks of 20 ms: of dots that creep by a micrometre a block, those of blocks 5 to 29."""
+    dots = np.outer(np.repeat(np.arange(30.0), 20) * 1e-6, [1.0, 2.0, -1.0, 3.0])
+    pipeline = Pipeline(rig)
+    run(pipeline.process, exact_chunk(dots))
+    change = pipeline.zero()
+    assert change is not None
+    values = dict(change.values)
+    assert values['psd_1.zero'] == pytest.approx((17e-6, 34e-6), rel=1e-5)
+    assert values['psd_2.zero'] == pytest.approx((-17e-6, 51e-6), rel=1e-5)
+
+
+def test_what_the_readings_contradict_is_half_a_length_over_the_root_of_two(rig: Rig) -> None:
+    """A dot that is off along the base line by e leaves e/2 in each dot, so e/(2 sqrt 2) rms of four readings."""
+    along = np.array([0.1, 0.07]) / np.hypot(0.1, 0.07)
+    dots = np.tile(np.concatenate((20e-6 * along, [0.0, 0.0])), (20, 1))
+    (best,) = (
+        r for r in run(Pipeline(rig).process, exact_chunk(dots)) if isinstance(r, DeflectionEstimate) and r.primary
+    )
+    assert best.residual_rms == pytest.approx(20e-6 / 8.0**0.5, rel=1e-3)

@@ -82,6 +82,7 @@ def test_a_clock_that_jumps_is_laid_anew_and_counted(device_us: int, host_ms: in
     observe_usb(clock, 20, 0.0, 4)
     assert clock.observe(device_us, host_ms * MS)
     assert clock.resets == 1
+    assert clock.state().residual_ns == 0.0
     assert clock.to_host_ns(np.array([device_us], np.int64))[0] == host_ms * MS
 
 
@@ -99,16 +100,21 @@ def test_the_lower_line_touches_from_below() -> None:
     assert all(y >= slope * x + intercept - 1e-9 for x, y in points)
 
 
-def test_a_start_that_came_late_is_no_jump_of_the_clock() -> None:
+@pytest.mark.parametrize('up_us', [0, 3_600_000_000])
+def test_a_start_that_came_late_is_no_jump_of_the_clock(up_us: int) -> None:
     clock = ClockMap()
     # The host was busy: the first sample is seen 80 ms late, the next ones in time.
-    clock.observe(0, 80 * MS)
-    assert not clock.observe(20_000, 20 * MS + 500_000, passed_us=20_000.0)
+    clock.observe(up_us, 80 * MS)
+    assert not clock.observe(up_us + 20_000, 20 * MS + 500_000, passed_us=20_000.0)
     assert clock.resets == 0
-    assert abs(int(clock.to_host_ns(np.array([20_000], np.int64))[0]) - 20 * MS) < 1 * MS
+    assert abs(int(clock.to_host_ns(np.array([up_us + 20_000], np.int64))[0]) - 20 * MS) < 1 * MS
     # By the same arrival, but a clock that does not agree with the numbers, it did jump.
-    assert clock.observe(200_000, 41 * MS, passed_us=20_000.0)
+    assert clock.observe(up_us + 200_000, 41 * MS, passed_us=20_000.0)
     assert clock.resets == 1
+    # Who knows that it cannot be followed says so, and it counts.
+    clock.lay_anew(up_us, 50 * MS)
+    assert clock.resets == 2
+    assert clock.host_ns(up_us) == 50 * MS
 
 
 def test_pings_at_random_phase_take_off_what_beats() -> None:
@@ -145,3 +151,56 @@ def test_while_warming_up_a_clock_that_runs_away_is_followed() -> None:
         error = int(clock.to_host_ns(np.array([1000 * k], np.int64))[0]) - true
     # The least delay of nine seconds ago alone would be stale by 750 us.
     assert abs(error - 300_000) < 250_000
+
+
+def test_the_last_five_minutes_count_and_no_more() -> None:
+    """A clock that is right for ten minutes and then 50 ppm off, on a line without jitter."""
+    clock = ClockMap()
+    turn = 600 * 10
+    for k in range(turn + 320 * 10):
+        late = 0 if k < turn else round((k - turn) * 100 * MS * 50e-6)
+        clock.observe(100_000 * k, 100 * MS * k + 200_000 + late)
+        clock.to_host_ns(np.array([100_000 * k], np.int64))
+        if k == turn:
+            assert clock.state().points == 300
+            assert clock.state().skew_ppm == pytest.approx(0.0, abs=1e-3)
+    assert clock.state().points == 300
+    assert clock.state().skew_ppm == pytest.approx(50.0, abs=1e-3)
+
+
+def test_a_map_that_is_off_draws_near_within_seconds_and_evenly() -> None:
+    """From the eleventh second on by a fifth of what is missing a second: blocks stay even within 4 us."""
+    clock = ClockMap()
+    stamps = []
+    for k in range(60 * 50):
+        # From second 30 on a shorter line: 0.8 ms less.
+        host = 20 * MS * k + (1_000_000 if k < 30 * 50 else 200_000)
+        clock.observe(20_000 * k, host)
+        stamps.append(int(clock.to_host_ns(np.array([20_000 * k], np.int64))[0]))
+    uneven = np.abs(np.diff(stamps) - 20 * MS)
+    assert uneven[: 30 * 50].max() <= 1
+    assert uneven.max() < 4_100
+    assert uneven.max() > 100
+
+
+@pytest.mark.parametrize('ahead', [0, 3_600_000 * MS])
+@pytest.mark.parametrize(('ppm', 'seconds'), [(600.0, 5), (-600.0, 5), (2000.0, 3), (150.0, 10), (-30.0, 10)])
+def test_a_clock_is_fitted_early_as_soon_as_it_has_run_off_by_two_milliseconds(
+    ppm: float, seconds: int, ahead: int
+) -> None:
+    """600 ppm take 4 s from the first of five minima to the last; fewer than three show no rate. Ten always do."""
+    clock = ClockMap()
+    for k in range(12 * 100):
+        clock.observe(10_000 * k, ahead + round(10 * MS * k * (1.0 + ppm * 1e-6)) + 200_000)
+        fitted = k >= seconds * 100
+        assert clock.state().skew_ppm == pytest.approx(ppm if fitted else 0.0, abs=0.01), k
+
+
+def test_the_map_draws_near_within_a_second_at_first() -> None:
+    clock = ClockMap()
+    clock.observe(0, 500_000)
+    for k in range(1, 100):
+        clock.observe(10_000 * k, 10 * MS * k + 200_000)
+        clock.to_host_ns(np.array([10_000 * k], np.int64))
+    # 300 us too late at first, 1 s later not: but for what the clock may have drifted meanwhile.
+    assert clock.host_ns(990_000) - 990 * MS == pytest.approx(200_000, abs=20_000)

@@ -2,8 +2,8 @@
 
 cosmic-ray makes the mutants: a sign, a number, a comparison, a truth value. Of each room so many are
 drawn with a fixed seed, each is put into a copy of this checkout, and the tests of the room run until
-one fails. What no test notices is listed with its difference; tools/mutants_equivalent.txt has those
-that nobody could notice, each with the reason, and they do not count.
+one fails. What no test notices is listed; tools/mutants_equivalent.txt has those that nobody could
+notice, each with the reason, and they do not count.
 
   python -m tools.mutants --count 32 --rooms solvers geometry
 """
@@ -11,58 +11,84 @@ that nobody could notice, each with the reason, and they do not count.
 from __future__ import annotations
 
 import argparse
-import functools
-import json
+import hashlib
 import os
 import random
 import shutil
-import sqlite3
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.plugins import get_operator
+
 ROOT = Path(__file__).parent.parent
 EQUIVALENT = Path(__file__).with_name('mutants_equivalent.txt')
+NOTICED = ROOT / 'build' / 'mutants' / 'noticed.txt'
+"""Digests of broken files that a test has noticed: only what was not is tried again. Delete it to begin anew."""
 
 
 class Room(NamedTuple):
-    """``code``: files and folders that are broken. ``tests``: what should notice, the quickest first."""
+    """``code``: files and folders that are broken. ``tests``: what should notice, the quickest first.
+    ``leave``: files that only draw or word what others computed.
+    """
 
     code: tuple[str, ...]
     tests: tuple[str, ...]
+    leave: tuple[str, ...] = ()
 
 
-_WHOLE = ('test/test_golden.py', 'test/test_pipeline.py')
+_PIPELINE = 'test/test_pipeline.py -k not(drift or rms_errors)'
+_GOLDEN = 'test/test_golden.py'
+_SOLVERS = ('truth', 'golden', 'interface', 'properties', 'degenerate', 'registry', 'gauss_newton', 'one_psd')
 
 ROOMS: Mapping[str, Room] = {
-    'solvers': Room(('psd_deflection/solvers',), ('test/solvers', *_WHOLE)),
-    'geometry': Room(('psd_deflection/geometry',), ('test/geometry', 'test/solvers', 'test/budget')),
-    'averaging': Room(('psd_deflection/averaging.py',), ('test/test_averaging.py', *_WHOLE)),
+    'solvers': Room(
+        ('psd_deflection/solvers',),
+        (*(f'test/solvers/test_{n}.py' for n in _SOLVERS), _GOLDEN),
+    ),
+    'geometry': Room(('psd_deflection/geometry',), ('test/geometry',)),
+    'averaging': Room(('psd_deflection/averaging.py',), ('test/test_averaging.py', _GOLDEN)),
     'timing': Room(('psd_deflection/timing.py',), ('test/test_timing.py', 'test/runner/test_clock_watch.py')),
     'pipeline': Room(
         ('psd_deflection/pipeline.py', 'psd_deflection/correction.py'),
-        ('test/test_pipeline.py', 'test/test_golden.py', 'test/uncertainty', 'test/simulation/test_effects.py'),
+        (_PIPELINE, _GOLDEN),
     ),
-    'calibration': Room(('psd_deflection/calibration',), ('test/calibration', *_WHOLE)),
-    'uncertainty': Room(('psd_deflection/uncertainty',), ('test/uncertainty', 'test/blind/test_coverage.py')),
+    'calibration': Room(('psd_deflection/calibration',), ('test/calibration', _GOLDEN)),
+    'uncertainty': Room(
+        ('psd_deflection/uncertainty',),
+        tuple(
+            f'test/uncertainty/test_{n}.py' for n in ('formulas', 'consistency', 'block_fit', 'noise', 'pipeline_state')
+        ),
+    ),
     'adapters': Room(('msg_adapters',), ('test/recordings/test_adapters.py', 'test/recordings/test_contract.py')),
     'protocol': Room(
         ('psd_deflection/protocol',),
-        (
-            'test/protocol',
-            'test/runner/test_hello.py',
-            *(f'test/devices/test_{n}.py' for n in ('dataq', 'text_lines', 'thorlabs')),
-        ),
+        ('test/protocol', *(f'test/devices/test_{n}.py' for n in ('dataq', 'text_lines', 'thorlabs'))),
     ),
     'effects': Room(
         ('psd_deflection/simulation/effects',),
-        ('test/simulation/test_effect_formulas.py', 'test/simulation/test_effects.py'),
+        (
+            'test/simulation/test_catalogue.py',
+            'test/simulation/test_effect_formulas.py',
+            'test/simulation/test_effects.py -k back or play or pieces or (wrench and (creep or friction or load))',
+        ),
     ),
-    'discovery': Room(('psd_deflection/discovery',), ('test/discovery', 'test/blind/test_blind.py')),
+    'discovery': Room(
+        ('psd_deflection/discovery',),
+        (
+            'test/discovery/test_rules.py',
+            # Its pieces: a whole discovery takes seconds.
+            'test/discovery/test_discover.py -k known or stripped or refined or coarse or imagined or floor',
+        ),
+        leave=('psd_deflection/discovery/report.py',),
+    ),
 }
 
 OPERATORS = (
@@ -80,30 +106,22 @@ OPERATORS = (
 
 
 class Mutant(NamedTuple):
-    """One that was tried. ``noticed``: a test failed, or took too long. ``diff``: as of ``diff -u``."""
+    """One change of one line, ``line`` from 1; ``occurrence``: of those that ``operator`` finds in ``file``."""
 
-    room: str
     file: str
     line: int
-    noticed: bool
-    diff: str
+    operator: str
+    occurrence: int
 
-    def changed(self) -> tuple[str, str]:
-        """The line as it is and as it was made, without indentation."""
-        lines = [d[1:].strip() for d in self.diff.splitlines() if d[:1] in '+-' and d[:3] not in ('+++', '---')]
-        return (lines[0], lines[-1]) if lines else ('', '')
+    def code(self, text: str) -> str:
+        """The file with the change."""
+        return str(mutate_code(text, get_operator('core/' + self.operator)(), self.occurrence))
 
-    def words(self) -> str:
-        """The line as it is and as it was made, for the list."""
-        was, made = self.changed()
+    def words(self, text: str) -> str:
+        """The first changed line as it is and as it was made, for the list."""
+        lines = zip(text.splitlines(), self.code(text).splitlines(), strict=True)
+        was, made = next((a.strip(), b.strip()) for a, b in lines if a != b)
         return f'{self.file}: {was} -> {made}'
-
-
-def cosmic_ray(*arguments: str, folder: Path) -> str:
-    """What cosmic-ray printed. Raises CalledProcessError."""
-    environment = {**os.environ, 'PYTHONPATH': '.', 'PYTHONDONTWRITEBYTECODE': '1'}
-    command = [sys.executable, '-m', 'cosmic_ray.cli', *arguments]
-    return subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True, text=True).stdout
 
 
 def copy_of_checkout(folder: Path) -> Path:
@@ -115,60 +133,83 @@ def copy_of_checkout(folder: Path) -> Path:
     return folder
 
 
-def draw(session: Path, count: int, seed: int) -> None:
-    """Leave ``count`` of a session's mutants, at most one a line, of :data:`OPERATORS`."""
-    with sqlite3.connect(session) as base:
-        rows = base.execute(
-            'SELECT job_id, module_path, start_pos_row, operator_name, occurrence FROM mutation_specs'
-        ).fetchall()
-        good = sorted((r for r in rows if r[3].removeprefix('core/') in OPERATORS), key=lambda r: r[1:])
-        chance = random.Random(seed)
-        chance.shuffle(good)
-        lines: dict[tuple[str, int], str] = {}
-        for job, module, line, _, _ in good:
-            lines.setdefault((module, line), job)
-        kept = list(lines.values())[:count]
-        marks = ','.join('?' * len(kept))
-        for table in ('mutation_specs', 'work_items'):
-            base.execute(f'DELETE FROM {table} WHERE job_id NOT IN ({marks})', kept)
+def mutants_of(file: str, text: str) -> Iterator[Mutant]:
+    """All of a file."""
+    lines, tree = text.splitlines(), get_ast(text)
+    for name in OPERATORS:
+        operator = get_operator('core/' + name)()
+        places = [start for node in ast_nodes(tree) for start, _ in operator.mutation_positions(node)]
+        for occurrence, (line, _) in enumerate(places):
+            # That a record is frozen or has slots is no number.
+            if not lines[line - 1].lstrip().startswith('@'):
+                yield Mutant(file, line, name, occurrence)
 
 
-def tried(name: str, python: str, count: int, seed: int) -> list[Mutant]:
-    """The mutants of one room. Raises RuntimeError if its tests fail without any."""
+def drawn(folder: Path, room: Room, count: int, seed: int) -> list[Mutant]:
+    """``count`` mutants of the copy in ``folder``, at most one a line."""
+    places = [p for c in room.code for p in ([folder / c] if c.endswith('.py') else (folder / c).rglob('*.py'))]
+    files = {str(p.relative_to(folder)) for p in places} - {*room.leave}
+    every = sorted(m for f in files for m in mutants_of(f, (folder / f).read_text()))
+    random.Random(seed).shuffle(every)
+    lines: dict[tuple[str, int], Mutant] = {}
+    for m in every:
+        lines.setdefault((m.file, m.line), m)
+    return list(lines.values())[:count]
+
+
+@contextmanager
+def warm(python: str, folder: Path, tests: Sequence[str]) -> Iterator[Callable[[float, str], bool]]:
+    """Says whether ``tests`` pass, in a copy of the checkout, in so many seconds; a module's own come first."""
+    environment = {**os.environ, 'PYTHONPATH': str(folder), 'PYTHONDONTWRITEBYTECODE': '1'}
+    command = [python, str(ROOT / 'tools' / 'warm_pytest.py'), *tests]
+    with subprocess.Popen(command, cwd=folder, env=environment, stdin=-1, stdout=-1, text=True) as process:
+
+        def passed(seconds: float, module: str) -> bool:
+            if process.stdin is None or process.stdout is None:
+                raise RuntimeError('the process that runs the tests has no pipes')
+            process.stdin.write(f'{seconds} {module}\n')
+            process.stdin.flush()
+            answer = process.stdout.readline()
+            if not answer:
+                raise RuntimeError('the process that runs the tests ended')
+            return answer == '1\n'
+
+        yield passed
+        process.terminate()
+
+
+def tried(name: str, python: str, count: int, seed: int) -> Iterator[tuple[str, bool]]:
+    """The mutants of one room in words, and whether a test noticed. Raises RuntimeError if the tests fail without."""
     room = ROOMS[name]
+    noticed = frozenset(NOTICED.read_text().split()) if NOTICED.exists() else frozenset()
     with tempfile.TemporaryDirectory() as scratch:
         folder = copy_of_checkout(Path(scratch))
-        # In the order given: what notices most, and soonest, first.
-        tests = ' '.join(room.tests)
-        options = '-x -q -p no:cacheprovider -p no:randomly -m "not browser"'
-        paths = ', '.join(json.dumps(c) for c in room.code)
-        (folder / 'mutants.toml').write_text(
-            f'[cosmic-ray]\nmodule-path = [{paths}]\ntimeout = 300.0\nexcluded-modules = []\n'
-            f'test-command = {json.dumps(f"{python} -m pytest {options} {tests}")}\n'
-            '[cosmic-ray.distributor]\nname = "local"\n'
-        )
-        cosmic_ray('init', 'mutants.toml', 'mutants.sqlite', folder=folder)
-        draw(folder / 'mutants.sqlite', count, seed)
-        try:
-            cosmic_ray('baseline', 'mutants.toml', folder=folder)
-        except subprocess.CalledProcessError as exc:
-            raise RuntimeError(f'{name}: the tests fail without a mutant:\n{exc.stdout}{exc.stderr}') from None
-        cosmic_ray('exec', 'mutants.toml', 'mutants.sqlite', folder=folder)
-        out = []
-        for line in cosmic_ray('dump', 'mutants.sqlite', folder=folder).splitlines():
-            item, result = json.loads(line)
-            (spec,) = item['mutations']
-            noticed = result['test_outcome'] != 'survived'
-            place = int(spec['start_pos'][0])
-            out.append(Mutant(name, str(spec['module_path']), place, noticed, result['diff'] or ''))
-        return out
+        with warm(python, folder, room.tests) as passed:
+            begun = time.monotonic()
+            if not passed(600.0, name):
+                raise RuntimeError(f'{name}: the tests fail without a mutant: run pytest {" ".join(room.tests)}')
+            # A mutant that never ends is noticed, and need not cost ten minutes.
+            longest = 30.0 + 3.0 * (time.monotonic() - begun)
+            for mutant in drawn(folder, room, count, seed):
+                file = folder / mutant.file
+                text = file.read_text()
+                code = mutant.code(text)
+                key = hashlib.sha256(f'{mutant.file}\n{code}'.encode()).hexdigest()
+                seen = key in noticed
+                if not seen:
+                    file.write_text(code)
+                    seen = not passed(longest, file.stem)
+                    file.write_text(text)
+                    if seen:
+                        with NOTICED.open('a') as stream:
+                            stream.write(key + '\n')
+                yield f'{mutant.words(text)}  (line {mutant.line})', seen
 
 
 def equivalent() -> dict[str, str]:
     """Mutants that nobody could notice (:meth:`Mutant.words`), and why. Raises ValueError if a reason is missing."""
     out: dict[str, str] = {}
-    text = EQUIVALENT.read_text() if EQUIVALENT.exists() else ''
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(EQUIVALENT.read_text().splitlines(), 1):
         if line and not line.startswith('#'):
             what, _, why = line.partition('  # ')
             if not why:
@@ -184,24 +225,26 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--count', type=int, default=32, help='mutants of each room (default 32)')
     parser.add_argument('--seed', type=int, default=1, help='another seed draws others (default 1)')
     parser.add_argument('--python', default=sys.executable, help='the Python that runs the tests (default this one)')
-    parser.add_argument('--jobs', type=int, default=2, help='rooms at once (default 2)')
     arguments = parser.parse_args(argv)
     known = equivalent()
-    one = functools.partial(tried, python=arguments.python, count=arguments.count, seed=arguments.seed)
     good = True
     print('| room | mutants | equivalent | noticed | of those that count |\n|---|---|---|---|---|', flush=True)
-    unnoticed: list[Mutant] = []
-    with ThreadPoolExecutor(arguments.jobs) as pool:
-        for name, mutants in zip(arguments.rooms, pool.map(one, arguments.rooms), strict=True):
-            left = [m for m in mutants if not m.noticed and m.words() not in known]
-            noticed = sum(m.noticed for m in mutants)
-            share = noticed / max(noticed + len(left), 1)
-            good &= share >= 0.95
-            same = len(mutants) - noticed - len(left)
-            print(f'| {name} | {len(mutants)} | {same} | {noticed} | {share:.0%} |', flush=True)
-            unnoticed += left
-    for m in unnoticed:
-        print(f'\nnot noticed: {m.words()}  (line {m.line})')
+    unnoticed: list[str] = []
+    for name in arguments.rooms:
+        same, noticed, left = 0, 0, 0
+        for words, seen in tried(name, arguments.python, arguments.count, arguments.seed):
+            print(f'{"noticed" if seen else "NOT noticed"}: {words}', file=sys.stderr, flush=True)
+            noticed += seen
+            if not seen and words.rpartition('  (')[0] in known:
+                same += 1
+            elif not seen:
+                left += 1
+                unnoticed.append(words)
+        share = noticed / max(noticed + left, 1)
+        good &= share >= 0.95
+        print(f'| {name} | {same + noticed + left} | {same} | {noticed} | {share:.0%} |', flush=True)
+    for words in unnoticed:
+        print(f'\nnot noticed: {words}')
     return 0 if good else 1
 
 

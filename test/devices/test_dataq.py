@@ -110,6 +110,34 @@ def test_a_rate_that_the_model_cannot_do_has_no_setting() -> None:
     assert plan_rate(1e6, MODELS['2108'], False) is None
 
 
+def test_the_models_are_those_of_the_data_sheets() -> None:
+    """Analog inputs, a counter, a decimating filter; the highest rate is 60 MHz over the least srate."""
+    assert {name: (m.analog, m.counter, m.decimates, 60e6 / m.srate_min) for name, m in MODELS.items()} == {
+        '1100': (4, False, False, 40_000.0),
+        '1110': (8, True, False, 160_000.0),
+        '1120': (4, True, False, 160_000.0),
+        '2108': (8, True, True, 160_000.0),
+        '4108': (8, True, True, 160_000.0),
+    }
+
+
+@pytest.mark.parametrize(
+    ('model', 'hz', 'possible'),
+    [
+        ('2108', 160_000.0, True),
+        ('2108', 161_000.0, False),
+        ('1110', 60e6 / 65_535, True),
+        ('1110', 60e6 / 65_537, False),
+        ('2108', 60e6 / 65_537, True),
+        ('2108', 60e6 / (65_535 * 512), True),
+        ('2108', 60e6 / (65_535 * 512.01), False),
+    ],
+)
+def test_srate_and_dec_have_the_limits_of_the_protocol(model: str, hz: float, possible: bool) -> None:
+    """srate of 16 bits, dec to 512."""
+    assert (plan_rate(hz, MODELS[model], False) is not None) == possible
+
+
 @pytest.mark.parametrize('per_channel', [False, True])
 def test_it_reads_the_rig_at_the_rate_of_the_rig(
     wired: Any, run: Any, unloaded: Any, volts: Any, per_channel: bool

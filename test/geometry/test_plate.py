@@ -117,3 +117,13 @@ def test_the_geometry_is_that_of_the_rig_file() -> None:
     assert geometry.centers.tolist() == [[0.0, 0.07], [-0.09, 0.01]]
     assert geometry.zeros.tolist() == [[1e-3, 2e-3], [0.0, 0.0]]
     assert (geometry.link_length, geometry.slope_ratio) == (0.4, 1.4)
+
+
+def test_places_are_lifted_whatever_the_shape() -> None:
+    one = lifted(np.array([1.0, 2.0]), 3.0)
+    assert one.tolist() == [1.0, 2.0, 3.0]
+    across = np.arange(24.0).reshape(4, 3, 2)
+    many = lifted(across, np.array([7.0, 8.0, 9.0]))
+    assert many.shape == (4, 3, 3)
+    assert many[2, 1].tolist() == [*across[2, 1], 8.0]
+    assert lifted(across[0, 0], np.array([1.0, 2.0])).tolist() == [[0.0, 1.0, 1.0], [0.0, 1.0, 2.0]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -326,6 +327,14 @@ def test_an_independent_decoder_reads_the_rig() -> None:
     text = STORE.deserialize_cdr(raw, m.type).data
     assert json.loads(text)['zero'] == {'psd_1': [0.1, 0.2], 'psd_2': [0.0, 0.0]}
     assert string.to_rig(cdr.decode(m.type, raw)) == state
+
+
+def test_a_rig_of_read_only_maps_is_written_and_one_of_anything_else_is_not() -> None:
+    frozen = MappingProxyType({'psd_1.zero': [0.1, 0.2], 'nested': MappingProxyType({'a': 1})})
+    (m,) = to_messages(RigState(5, 7, frozen, None, {}, '1'))
+    assert json.loads(m.fields['data'])['parameters'] == {'psd_1.zero': [0.1, 0.2], 'nested': {'a': 1}}
+    with pytest.raises(TypeError, match='has no JSON'):
+        to_messages(RigState(5, 7, {'bad': {1, 2}}, None, {}, '1'))
 
 
 @pytest.mark.parametrize('text', ['', '[]', '{"version": 1}', '[' * 100_000, 'x' * (string.MAX_CHARACTERS + 1)])

@@ -18,7 +18,8 @@ from psd_deflection.config import load_rig
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.simulation import loads
 from psd_deflection.simulation.catalogue import catalogue
-from psd_deflection.simulation.declaration import ActiveEffect, Effect
+from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import ActiveEffect, Effect, Traced
 from psd_deflection.simulation.physics import Physics
 from psd_deflection.simulation.simulator import ForwardModel
 
@@ -100,3 +101,71 @@ def test_it_does_what_the_second_formula_says(active: ActiveEffect, length: floa
     assert size.max() > 1e-4, 'the second formula has no such effect'
     allowed = LARGEST_MISS.get(active.effect.name, 1e-4)
     assert np.abs(got - want).max() <= allowed * size.max()
+
+
+@pytest.mark.parametrize(
+    ('name', 'size', 'sigma'),
+    [
+        ('amplifier_saturation', {'limit': 0.3}, 0.0),
+        ('amplifier_saturation', {'limit': 0.3}, 0.1),
+        ('amplifier_saturation', {'limit': 0.3}, 1.5),
+        # With little noise a step of the converter is all but sharp; with much it is all but gone.
+        ('quantisation', {'step': 0.05}, 0.0),
+        ('quantisation', {'step': 0.05}, 0.005),
+        ('quantisation', {'step': 0.05}, 0.007),
+        ('quantisation', {'step': 0.05}, 0.02),
+    ],
+)
+def test_a_signal_without_its_noise_shows_the_mean_over_it(name: str, size: dict[str, float], sigma: float) -> None:
+    volts = np.linspace(-0.46, 0.47, 41)
+    physics = Physics.of(load_rig())
+    chunk = Chunk(np.zeros(41), np.zeros(41), np.zeros((3, 41)), physics, volts=np.tile(volts, (6, 1)))
+    chunk.noise[:] = sigma
+    effect = catalogue()[name]
+    assert effect.apply is not None
+    effect.apply(chunk, {**effect.off_values(physics, next(effect.variants())), **size}, {})
+    # The mean by adding up: 20001 values of the noise with their weights.
+    deviate = np.linspace(-8.0, 8.0, 20_001)
+    weight = np.exp(-0.5 * deviate**2)
+    noisy = volts[:, None] + sigma * deviate
+    each = np.clip(noisy, -0.3, 0.3) if 'limit' in size else np.rint(noisy / 0.05) * 0.05
+    want = (each * weight).sum(axis=1) / weight.sum()
+    # Forty-one nodes stand for the noise where the steps are sharp.
+    allowed = 0.08 * 0.05 if 0.0 < sigma < 0.006 else 2e-5
+    assert np.abs(chunk.volts - want).max() < allowed
+
+
+def traced(name: str, values: dict[str, float], poses: FloatArray, seconds: float) -> FloatArray:
+    """The poses before a link effect, block after block."""
+    effect, physics = catalogue()[name], Physics.of(load_rig())
+    assert effect.trace_back is not None
+    whole = {**effect.off_values(physics, next(effect.variants())), **values}
+    remembered: list[float] = []
+    out = []
+    for pose in poses.tolist():
+        block = Traced(pose, [0.0, 0.0, 0.0], seconds, physics)
+        effect.trace_back(block, whole, remembered)
+        out.append(block.pose)
+    return np.array(out)
+
+
+def test_creep_is_taken_off_a_step_and_off_its_end() -> None:
+    """A step to q grows by amplitude (1 - exp(-t/tau)) q; what grew stays when it ends, and dies away."""
+    amplitude, tau, period = 0.2, 0.5, 0.02
+    t = np.arange(1, 101) * period
+    grown = 1.0 - np.exp(-t / tau)
+    after = np.where(t > 1.0, 1.0 - np.exp(-(t - 1.0) / tau), 0.0)
+    static = np.where(t > 1.0 + 1e-9, 0.0, 1.0)[:, None] * np.array([1e-3, -2e-3, 0.01])
+    crept = static + amplitude * (grown - after)[:, None] * np.array([1e-3, -2e-3, 0.01])
+    got = traced('creep', {'amplitude': amplitude, 'time_constant': tau}, crept, period)
+    np.testing.assert_allclose(got, static, atol=1e-12)
+
+
+def test_a_turned_force_is_turned_back() -> None:
+    effect, physics = catalogue()['load_direction'], Physics.of(load_rig())
+    assert effect.trace_back is not None
+    # By 30 degrees about Z the load (2, 0) acts as (sqrt 3, 1), and (0, 2) as (-1, sqrt 3).
+    for given, acts in (((2.0, 0.0), (3.0**0.5, 1.0)), ((0.0, 2.0), (-1.0, 3.0**0.5))):
+        block = Traced([0.0] * 3, [*acts, 7.0], 0.02, physics)
+        effect.trace_back(block, {'angle': np.pi / 6.0}, [])
+        assert block.loads == pytest.approx([*given, 7.0])

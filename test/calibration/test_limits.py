@@ -1,0 +1,188 @@
+"""Where a block stops being good: each limit from both sides, in numbers worked out by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psd_deflection.calibration.health import OpticsHealth, Verdict
+from psd_deflection.config import load_rig
+from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, SampleBlock
+
+STEP = 10.0 / 32768
+GOOD = (0.5, -0.5, 5.0, 0.25, -0.25, 5.0)
+DOTS = (2.5e-4, -2.5e-4, 1.25e-4, -1.25e-4)
+
+
+def judge(
+    volts: tuple[float, ...] = GOOD,
+    dots: tuple[float, ...] = DOTS,
+    *,
+    present: int = 20,
+    flag: int = 0,
+    frozen: tuple[int, int] = (0, 0),
+    one: tuple[float, ...] | None = None,
+    **overrides: object,
+) -> Verdict:
+    """``one``: volts of a single sample of the block."""
+    rig = load_rig(overrides={**overrides})
+    rows = np.tile(np.array(volts, np.float32), (present, 1))
+    if one is not None:
+        rows[present // 2] = one
+    flags = np.zeros(present, np.uint8)
+    flags[3] = flag
+    seq = np.arange(present)
+    block = SampleBlock(0, seq, seq * 1_000_000, rows, flags)
+    return OpticsHealth(rig).judge(block, rows, dots, rows[:, 2::3].astype(np.float64), frozen)
+
+
+def changed(i: int, value: float) -> tuple[float, ...]:
+    return (*GOOD[:i], value, *GOOD[i + 1 :])
+
+
+def test_a_good_block_is_good() -> None:
+    assert judge() == Verdict(BlockStatus.OK, '', 0)
+
+
+@pytest.mark.parametrize(('psd', 'channel'), [(1, 2), (2, 5)])
+def test_a_laser_is_lost_below_the_least_sum_even_in_one_sample(psd: int, channel: int) -> None:
+    least = load_rig().estimator.sum_min
+    lost = judge(one=changed(channel, least - 0.001))
+    assert (lost.status, lost.faulty, lost.faults) == (BlockStatus.LASER_LOST, psd, frozenset({psd}))
+    assert lost.reason == f'laser {psd} lost: sum {least - 0.001:.3f} V, below {least:g} V'
+    assert judge(one=changed(channel, least + 0.001)).status is BlockStatus.OK
+    # Half of it if two lasers share the detectors.
+    assert judge(one=changed(channel, 0.5 * least + 0.001), splitter=True).status is BlockStatus.OK
+    assert judge(one=changed(channel, 0.5 * least - 0.001), splitter=True).faulty == psd
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+@pytest.mark.parametrize('channel', range(6))
+def test_a_channel_is_saturated_from_the_converters_last_step_on(channel: int, sign: float) -> None:
+    if channel in (2, 5) and sign < 0.0:
+        return
+    name = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')[channel]
+    full = judge(one=changed(channel, sign * 32767 * STEP))
+    assert (full.status, full.faulty) == (BlockStatus.SATURATED, 1 + channel // 3)
+    assert full.reason == f'{name} saturated: 10.000 V'
+    assert judge(one=changed(channel, sign * 32765 * STEP)).status is BlockStatus.OK
+
+
+def test_the_devices_flag_blames_no_detector_unless_a_cause_is_seen() -> None:
+    told = judge(flag=FLAG_OVER_RANGE)
+    assert (told.status, told.faulty) == (BlockStatus.SATURATED, 0)
+    assert judge(changed(2, 0.0), flag=FLAG_OVER_RANGE).status is BlockStatus.LASER_LOST
+
+
+@pytest.mark.parametrize(('blocks', 'status'), [(4, BlockStatus.OK), (5, BlockStatus.FROZEN)])
+def test_a_detector_is_frozen_after_five_blocks_if_that_is_to_be_refused(blocks: int, status: BlockStatus) -> None:
+    for psd, frozen in ((1, (blocks, 0)), (2, (0, blocks))):
+        got = judge_frozen(frozen)
+        assert got.status is status
+        assert got.faulty == (psd if status is BlockStatus.FROZEN else 0)
+        assert judge(frozen=frozen).status is BlockStatus.OK
+
+
+def judge_frozen(frozen: tuple[int, int]) -> Verdict:
+    rig = load_rig()
+    rig = dataclasses.replace(rig, estimator=dataclasses.replace(rig.estimator, frozen='refuse'))
+    rows = np.tile(np.array(GOOD, np.float32), (20, 1))
+    block = SampleBlock(0, np.arange(20), np.arange(20) * 1_000_000, rows, np.zeros(20, np.uint8))
+    return OpticsHealth(rig).judge(block, rows, DOTS, rows[:, 2::3].astype(np.float64), frozen)
+
+
+@pytest.mark.parametrize('axis', range(4))
+def test_a_dot_is_outside_beyond_half_the_active_area(axis: int) -> None:
+    half = 4e-3 if axis % 2 else 3e-3
+    areas: dict[str, Any] = {'psd_1.active_area': [6e-3, 8e-3], 'psd_2.active_area': [6e-3, 8e-3]}
+    for sign in (1.0, -1.0):
+        for off, status in ((1e-6, BlockStatus.OUTSIDE_ACTIVE_AREA), (-1e-6, BlockStatus.OK)):
+            dots = list(DOTS)
+            dots[axis] = sign * (half + off)
+            got = judge(dots=tuple(dots), **areas)
+            assert got.status is status
+            assert got.faulty == (1 + axis // 2 if off > 0 else 0)
+
+
+def test_too_few_samples_leave_no_detector_to_go_on_with() -> None:
+    assert judge(present=10).status is BlockStatus.OK
+    few = judge(present=9)
+    assert (few.status, few.faulty) == (BlockStatus.TOO_FEW_SAMPLES, 0)
+    assert few.reason == '9 of 20 samples, at least 10 are needed'
+    # A lost laser says more; but the other detector has too few samples too.
+    dark = judge(changed(2, 0.0), present=9)
+    assert (dark.status, dark.faulty, dark.faults) == (BlockStatus.LASER_LOST, 0, frozenset({1}))
+
+
+def test_the_worst_cause_is_told_first_and_two_faults_leave_nothing() -> None:
+    far = (1.0, 0.0, 1.25e-4, -1.25e-4)
+    both = judge(changed(5, 0.0), far)
+    assert (both.status, both.faulty, both.faults) == (BlockStatus.LASER_LOST, 0, frozenset({1, 2}))
+    assert both.reason.startswith('laser 2')
+    # Of one detector the cause, not what it causes.
+    assert judge(changed(2, 0.0), far).reason.startswith('laser 1')
+    assert judge(changed(3, 10.0), (*DOTS[:2], 1.0, 0.0)).status is BlockStatus.SATURATED
+
+
+@pytest.mark.parametrize(('share', 'told'), [(0.34, False), (0.36, True), (0.64, True), (0.66, False)])
+def test_half_the_light_on_both_is_one_laser_of_two(share: float, told: bool) -> None:
+    nominal = load_rig().amplifier.sum_nominal
+    volts = (*GOOD[:2], share * nominal, *GOOD[3:5], share * nominal)
+    got = judge(volts, splitter=True)
+    assert got.half_light == told
+    assert any('half the light' in f for f in got.findings) == told
+    assert not judge((*volts[:5], nominal), splitter=True).half_light
+    assert not judge(volts).half_light
+
+
+def test_other_light_and_a_clipped_spot_are_told_of_the_detector() -> None:
+    most = load_rig().estimator.sum_max
+    for psd, channel in ((1, 2), (2, 5)):
+        assert judge(one=changed(channel, most + 0.01)).findings == (
+            f'psd_{psd} sees other light: sum {most + 0.01:.3f} V, above {most:g} V',
+        )
+        assert judge(one=changed(channel, most - 0.01)).findings == ()
+    area, radius = load_rig().psds[0].active_area, load_rig().psds[0].spot_radius
+    for axis in range(4):
+        edge = area[axis % 2] / 2.0 - radius
+        for off, told in ((1e-6, True), (-1e-6, False)):
+            dots = (*DOTS[:axis], -edge - off, *DOTS[axis + 1 :])
+            said = (f'psd_{1 + axis // 2}: the spot is clipped at the edge',) if told else ()
+            assert judge(dots=dots).findings == said
+
+
+def test_other_light_moves_a_dot_toward_its_own_centre_wherever_that_is() -> None:
+    """1 V too much of 6.5 V: the dot may be off by a share of it, evenly up to half the larger side."""
+    rig = load_rig(overrides={'sum_max': 6.0, 'psd_2.active_area': [6e-3, 8e-3]})
+    health = OpticsHealth(rig)
+    nominal = rig.amplifier.sum_nominal
+    assert health.background_variance(np.full((20, 2), 5.9)) == (0.0, 0.0)
+    first, second = health.background_variance(np.column_stack((np.full(20, 5.0), np.full(20, 6.5))))
+    assert first == 0.0
+    rng = np.random.default_rng(0)
+    off = (6.5 - nominal) / 6.5 * rng.uniform(-4e-3, 4e-3, 400_000)
+    assert second == pytest.approx(float(np.var(off)), rel=0.01)
+
+
+@pytest.mark.parametrize('order', [0, 1, 2])
+def test_noise_is_told_whatever_the_link_does_slowly(order: int) -> None:
+    """White noise of ten times the rig file's on a polynomial is told; of four times it is not."""
+    rig = load_rig()
+    t = np.linspace(-1.0, 1.0, 20)
+    told = {4.0: 0, 10.0: 0}
+    rng = np.random.default_rng(2)
+    for times in told:
+        for _ in range(200):
+            volts = np.tile(np.array(GOOD, np.float32), (20, 1))
+            volts[:, 4] += (3.0 * t**order + times * 2e-3 * rng.standard_normal(20)).astype(np.float32)
+            found = OpticsHealth(rig).late_findings(volts, Verdict(BlockStatus.OK, '', 0), (0, 0))
+            assert len(found) <= 1
+            assert all(f.startswith('psd_2 is noisy') for f in found)
+            told[times] += len(found)
+    assert told[4.0] < 30
+    assert told[10.0] > 190
+    blamed = OpticsHealth(rig).late_findings(volts, Verdict(BlockStatus.OK, '', 0, faults=frozenset({2})), (0, 0))
+    assert blamed == ()

@@ -1,0 +1,776 @@
+"""The rules and the statistics of discover, against least squares of numpy on a plant that is linear.
+
+The plant shows the sum of its effects, each a fixed picture times its size, in noise of known level.
+So each answer is that of a textbook: least squares, its covariance, its loss of chi-square.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from scipy.stats import chi2 as chi2_law
+
+from psd_deflection.config import load_rig
+from psd_deflection.discovery import experiment
+from psd_deflection.discovery.coincidence import coincidences
+from psd_deflection.discovery.discover import _accept, _credible, _named, _tied, _unknown
+from psd_deflection.discovery.fit import Fit, refit
+from psd_deflection.discovery.localise import Dependence, Localisation, _energies, _layouts, dependences, localise
+from psd_deflection.discovery.noise import NoiseModel, _ar_density, _block_autocovariance, _level
+from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.screen import Screen
+from psd_deflection.discovery.search import Search, SearchResult
+from psd_deflection.discovery.signatures import Candidate
+from psd_deflection.discovery.validate import HeldOut, heldout_gain, heldout_gap, heldout_residual
+from psd_deflection.discovery.workspace import Workspace, fine_means
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation import loads
+from psd_deflection.simulation.catalogue import make_active
+from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter
+from psd_deflection.simulation.physics import Physics
+from psd_deflection.simulation.simulator import ForwardModel
+
+RIG = load_rig()
+SIGMA = 1e-3
+FINE, CASES = 400, 8
+N = 6 * FINE
+
+Pictures = Mapping[tuple[str, str], FloatArray]
+
+
+def effect(name: str, *parameters: str, least: float = -1.0, most: float = 1.0) -> Effect:
+    return Effect(
+        name=name,
+        stage='electronics',
+        summary='',
+        equation='',
+        source='',
+        needs='',
+        parameters=tuple(EffectParameter(p, 'V', least, most, 1e-3, '') for p in parameters),
+        point='output',
+        apply=lambda chunk, values, state: None,
+    )
+
+
+def active(name: str, least: float = -1.0, most: float = 1.0, **values: float) -> ActiveEffect:
+    return ActiveEffect(effect(name, *values, least=least, most=most), values)
+
+
+class Plant(Workspace):
+    """``measured`` (6, FINE) V: sizes times ``pictures``, and noise of ``SIGMA``; eight load cases of equal length."""
+
+    def __init__(self, pictures: Pictures, measured: FloatArray) -> None:
+        size = 4
+        nothing = np.zeros((FINE * size, 6))
+        self.pictures = pictures
+        self.observations = (Observation('plant', RIG, nothing, nothing[:, :3]),)
+        self.physics = Physics.of(RIG)
+        self.simulations = 0
+        self.base = ()
+        self.fine = [size]
+        self.measured = [measured]
+        self.valid = [np.ones(FINE, dtype=bool)]
+        self.case = [np.arange(FINE) * CASES // FINE]
+        level = np.full(6, SIGMA)
+        self.noise = [NoiseModel(2 * level, np.zeros((6, 2)), level, level / math.sqrt(5.0), 1.0, (False,) * 6)]
+        self.data = self.whiten(self.measured)
+
+    def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
+        self.simulations += 1
+        total = np.zeros((6, FINE))
+        for a in effects:
+            for name, value in a.values.items():
+                total += value * self.pictures[a.effect.name, name]
+        return [total]
+
+    def estimate_noise(self, effects: Sequence[ActiveEffect]) -> None:
+        pass
+
+
+def pictures(*names: tuple[str, str], seed: int = 1) -> dict[tuple[str, str], FloatArray]:
+    rng = np.random.default_rng(seed)
+    return {n: rng.standard_normal((6, FINE)) for n in names}
+
+
+def noise(seed: int = 2) -> FloatArray:
+    return SIGMA * np.random.default_rng(seed).standard_normal((6, FINE))
+
+
+def columns(shown: Pictures, *names: tuple[str, str]) -> FloatArray:
+    """(D, p): whitened pictures, one a column."""
+    return np.stack([shown[n].ravel() / SIGMA for n in names], axis=1)
+
+
+def without_noise(*at: tuple[FloatArray, float]) -> FloatArray:
+    """Each picture at the size that explains this much chi-square, and nothing else."""
+    return cast(FloatArray, sum(p * SIGMA * math.sqrt(gain) / np.linalg.norm(p) for p, gain in at))
+
+
+def search_of(plant: Plant, library: int = 1, penalty: float = 3.0) -> Search:
+    screen = SimpleNamespace(candidates=[None] * library)
+    search = Search(plant, lambda _: cast(Screen, screen))
+    search.penalty = penalty
+    return search
+
+
+def result_of(search: Search, effects: Sequence[ActiveEffect], others: Sequence[Sequence[Fit]] = ()) -> SearchResult:
+    null, fit = refit(search.workspace, ()), refit(search.workspace, effects)
+    p, bic, gains = search._weigh(null, fit)
+    return SearchResult(null, fit, p, bic, gains, [], [list(o) for o in others])
+
+
+# Fits.
+
+A, B = ('a', 'x'), ('b', 'x')
+
+
+def test_a_refit_is_least_squares_with_its_covariance() -> None:
+    shown = pictures(A, ('a', 'y'), B)
+    shown['b', 'x'] += shown['a', 'x']
+    truth = 2e-3 * shown['a', 'x'] - 5e-3 * shown['a', 'y'] + 1e-3 * shown['b', 'x']
+    plant = Plant(shown, truth + noise())
+    fit = refit(plant, [active('a', x=0.0, y=0.0), active('b', x=0.0)])
+    matrix, data = columns(shown, A, ('a', 'y'), B), plant.measured[0].ravel() / SIGMA
+    want, (rss,), _, _ = np.linalg.lstsq(matrix, data, rcond=None)
+    got = [fit.effects[0].values['x'], fit.effects[0].values['y'], fit.effects[1].values['x']]
+    np.testing.assert_allclose(got, want, atol=1e-9)
+    assert fit.chi2 == pytest.approx(rss, rel=1e-9)
+    assert fit.residual == pytest.approx(data - matrix @ want, abs=1e-5)
+    np.testing.assert_allclose(fit.jacobian, matrix, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(fit.covariance(), np.linalg.inv(matrix.T @ matrix), rtol=1e-6)
+    assert fit.free == ((0, 'x'), (0, 'y'), (1, 'x'))
+    assert [fit.columns_of(i) for i in (0, 1)] == [[0, 1], [2]]
+    assert (fit.parameters, fit.at_bound) == (3, ())
+    # The start, one pass of three differences, a step; then one more, which gains nothing.
+    assert plant.simulations <= 12
+
+
+def test_a_refit_stops_at_a_bound_and_the_rest_adapts() -> None:
+    shown = pictures(A, B)
+    shown['b', 'x'] += shown['a', 'x']
+    plant = Plant(shown, 5e-3 * shown['a', 'x'] + 1e-3 * shown['b', 'x'] + noise())
+    for most, least, end in ((2e-3, -1.0, 2e-3), (1.0, 7e-3, 7e-3)):
+        fit = refit(
+            plant, [active('a', least, most, x=0.5 * (max(least, -0.01) + min(most, 0.01))), active('b', x=0.0)]
+        )
+        assert fit.at_bound == ((0, 'x'),)
+        assert fit.effects[0].values['x'] == end
+        left = (plant.measured[0] - end * shown['a', 'x']).ravel()
+        want = left @ shown['b', 'x'].ravel() / np.sum(shown['b', 'x'] ** 2)
+        assert fit.effects[1].values['x'] == pytest.approx(want, abs=1e-8)
+    # A bound that the start lies beyond is where it begins.
+    assert refit(plant, [active('a', -1.0, 2e-3, x=0.9)], iterations=0).effects[0].values['x'] == 2e-3
+
+
+def test_the_sd_of_a_named_effect_is_that_of_least_squares() -> None:
+    shown = pictures(A, B)
+    shown['b', 'x'] += 0.5 * shown['a', 'x']
+    search = search_of(Plant(shown, 3e-3 * shown['a', 'x'] - 2e-3 * shown['b', 'x'] + noise()))
+    result = result_of(search, [active('a', x=0.0), active('b', x=0.0)], [[], []])
+    matrix = columns(shown, A, B)
+    want = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)))
+    named = _named(search, result, result.fit, [HeldOut(9.0, 1.0)] * 2)
+    assert [n.sd['x'] for n in named] == pytest.approx(want.tolist(), rel=1e-6)
+    assert [n.active.effect.name for n in named] == ['a', 'b']
+
+
+def test_what_an_effect_weighs_is_the_chi_square_that_is_lost_without_it() -> None:
+    shown = pictures(A, ('b', 'x'), ('b', 'y'))
+    shown['b', 'x'] += 0.5 * shown['a', 'x']
+    plant = Plant(shown, 1e-4 * shown['a', 'x'] - 2e-4 * shown['b', 'x'] + noise())
+    search = search_of(plant, library=50, penalty=4.0)
+    result = result_of(search, [active('a', x=0.0), active('b', x=0.0, y=0.0)])
+    data = plant.measured[0].ravel() / SIGMA
+
+    def rss(*names: tuple[str, str]) -> float:
+        return float(np.linalg.lstsq(columns(shown, *names), data, rcond=None)[1][0])
+
+    whole = rss(A, B, ('b', 'y'))
+    lost = [rss(B, ('b', 'y')) - whole, rss(A) - whole]
+    assert result.delta_chi2 == pytest.approx(lost, rel=1e-5)
+    assert result.delta_bic == pytest.approx([lost[0] - 4.0, lost[1] - 8.0], rel=1e-5)
+    # Sidak: the chance that the best of 50 does as well.
+    want = [1.0 - (1.0 - chi2_law.sf(g, k)) ** 50 for g, k in zip(lost, (1, 2), strict=True)]
+    assert result.p == pytest.approx(want, rel=1e-3)
+
+
+# The rules by which an effect is named.
+
+
+@pytest.mark.parametrize(
+    ('gain', 'penalty', 'library', 'named'),
+    [
+        # BIC better by more than 10.
+        (13.1, 3.0, 1, True),
+        (12.9, 3.0, 1, False),
+        (14.9, 5.0, 1, False),
+        # p of the whole library at most 0.01: chi-square of 19.5 has p 1e-5, and there are 1000.
+        (19.7, 3.0, 1000, True),
+        (19.3, 3.0, 1000, False),
+    ],
+)
+def test_an_effect_is_named_from_stated_limits_on(gain: float, penalty: float, library: int, named: bool) -> None:
+    shown = pictures(A)
+    search = search_of(Plant(shown, without_noise((shown[A], gain))), library, penalty)
+    result = result_of(search, [active('a', x=0.0)])
+    assert result.delta_chi2 == pytest.approx([gain], rel=1e-6)
+    heldout, fit = _accept(search, result, np.random.default_rng(0))
+    assert [a.effect.name for a in fit.effects] == (['a'] if named else [])
+    assert len(heldout) == len(result.p) == len(result.delta_bic) == len(result.delta_chi2) == named
+    assert bool(search.trace) == (not named)
+
+
+@pytest.mark.parametrize(('cases', 'named'), [(range(8), True), ((0, 4), False)])
+def test_what_does_not_hold_on_unseen_load_cases_is_not_named(cases: Sequence[int], named: bool) -> None:
+    """Its picture should show in every load case. If it shows in two of one fold, the others speak against it."""
+    shown = pictures(A)
+    inside = np.isin(np.arange(FINE) * CASES // FINE, list(cases))
+    share = np.sum(shown[A][:, inside] ** 2) / np.sum(shown[A] ** 2)
+    search = search_of(Plant(shown, without_noise((shown[A], 60.0)) * inside / share))
+    result = result_of(search, [active('a', x=0.0)])
+    assert result.delta_chi2 == pytest.approx([60.0], rel=1e-3)
+    _, fit = _accept(search, result, np.random.default_rng(0))
+    assert bool(fit.effects) == named
+
+
+def test_an_effect_whose_amplitudes_are_all_at_a_bound_is_not_named() -> None:
+    shown = pictures(('a', 'x'), ('a', 'y'))
+    truth = 5e-3 * shown['a', 'x'] + 1e-3 * shown['a', 'y']
+    search = search_of(Plant(shown, truth + noise()))
+    for most, named in ((8e-3, True), (3e-3, True), (5e-4, False)):
+        start = active('a', -1.0, most, x=0.0, y=0.0)
+        _, fit = _accept(search, result_of(search, [start]), np.random.default_rng(0))
+        assert bool(fit.effects) == named
+
+
+def test_the_weakest_effect_goes_first_and_the_other_is_weighed_again() -> None:
+    shown = pictures(A, B)
+    # Two pictures nearly the same: with the other present, each seems to explain nothing.
+    shown['b', 'x'] = shown['a', 'x'] + 0.1 * shown['b', 'x']
+    search = search_of(Plant(shown, without_noise((shown[A], 300.0)) + noise()))
+    result = result_of(search, [active('b', x=0.0), active('a', x=0.0)])
+    assert max(result.delta_bic) < 10.0
+    heldout, fit = _accept(search, result, np.random.default_rng(0))
+    weakest = int(
+        np.argmin([result_of(search, [active('a', x=0.0)]).fit.chi2, result_of(search, [active('b', x=0.0)]).fit.chi2])
+    )
+    assert [a.effect.name for a in fit.effects] == ['ab'[weakest]]
+    assert len(heldout) == 1
+
+
+@pytest.mark.parametrize(('gain', 'stays'), [(13.5, True), (12.5, False)])
+def test_a_step_of_the_search_passes_from_the_same_limit_on(gain: float, stays: bool) -> None:
+    shown = pictures(A)
+    search = search_of(Plant(shown, without_noise((shown[A], gain))))
+    null, fit = refit(search.workspace, ()), refit(search.workspace, [active('a', x=0.0)])
+    assert search._passes(null, fit, null) == stays
+
+
+@pytest.mark.parametrize(('share', 'stays'), [(0.0022, True), (0.0018, False)])
+def test_what_explains_less_than_two_thousandths_of_the_whole_may_be_the_simulations_error(
+    share: float, stays: bool
+) -> None:
+    shown = pictures(A, B)
+    shown[B] -= shown[A] * np.sum(shown[A] * shown[B]) / np.sum(shown[A] ** 2)
+    whole = 1e5
+    search = search_of(Plant(shown, without_noise((shown[A], whole * (1.0 - share)), (shown[B], whole * share))))
+    null, one = refit(search.workspace, ()), refit(search.workspace, [active('a', x=0.0)])
+    both = refit(search.workspace, [active('a', x=0.0), active('b', x=0.0)])
+    assert search._passes(one, both, null) == stays
+
+
+@pytest.mark.parametrize(
+    ('loss', 'names', 'equal'),
+    [
+        # Sizes of one more parameter must be as close in BIC too: 6, with a penalty of 3 for each.
+        (21.5, ('x',), True),
+        (21.7, ('x',), False),
+        (2.9, ('x', 'y'), True),
+        (3.1, ('x', 'y'), False),
+    ],
+)
+def test_an_alternative_is_equivalent_up_to_a_stated_loss(loss: float, names: tuple[str, ...], equal: bool) -> None:
+    shown = pictures(A)
+    search = search_of(Plant(shown, without_noise((shown[A], 500.0))))
+    fit = refit(search.workspace, [active('a', x=0.0)])
+    other = dataclasses.replace(
+        fit,
+        effects=(active('b', **dict.fromkeys(names, 0.0)),),
+        chi2=fit.chi2 + loss,
+        free=tuple((0, n) for n in names),
+        jacobian=np.zeros((N, len(names))),
+    )
+    result = result_of(search, [active('a', x=0.0)], [[other]])
+    result = dataclasses.replace(result, fit=fit)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr('psd_deflection.discovery.discover.suggest', lambda *_: experiment.Suggestion('try this', 1.0))
+        (named,) = _named(search, result, fit, [HeldOut(9.0, 1.0)])
+    assert named.equivalent == (('b',) if equal else ())
+    assert (named.suggestion is not None) == equal
+    ((name, lost, bic),) = named.alternatives
+    assert name == 'b'
+    assert lost == pytest.approx(loss)
+    assert bic == pytest.approx(loss + 3.0 * (len(names) - 1))
+
+
+@pytest.mark.parametrize(
+    ('gain', 'of_other', 'refitted'),
+    [
+        # Half of what the named effect explains; from 100 on all but 60 of it; from 150 on six tenths.
+        (80.0, 40.5, True),
+        (80.0, 39.5, False),
+        (120.0, 60.5, True),
+        (120.0, 59.5, False),
+        (200.0, 120.5, True),
+        (200.0, 119.5, False),
+    ],
+)
+def test_an_alternative_is_tried_if_it_explains_enough_of_the_same(
+    gain: float, of_other: float, refitted: bool
+) -> None:
+    shown = pictures(A, B)
+    a = shown[A] / np.linalg.norm(shown[A])
+    across = shown[B] - a * np.sum(a * shown[B])
+    share = of_other / gain
+    shown[B] = np.linalg.norm(shown[A]) * (
+        math.sqrt(share) * a + math.sqrt(1.0 - share) * across / np.linalg.norm(across)
+    )
+    plant = Plant(shown, without_noise((shown[A], gain)))
+    found = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'b')]
+    search = Search(plant, lambda workspace: Screen(workspace, found))
+    null, fit = refit(plant, ()), refit(plant, [active('a', x=0.0)])
+    others = search.alternatives(null, fit, 0, null.chi2 - fit.chi2)
+    assert [f.effects[-1].effect.name for f in others] == (['b'] if refitted else [])
+
+
+def test_a_search_adds_what_passes_and_nothing_else() -> None:
+    """Two of three effects act; from the residual of the first the second is found, and no third."""
+    shown = pictures(A, B, ('c', 'x'))
+    plant = Plant(shown, without_noise((shown[A], 4000.0), (shown[B], 500.0)) + noise())
+    found = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'b', 'c')]
+    said: list[str] = []
+    result = Search(plant, lambda workspace: Screen(workspace, found), said.append).run()
+    assert sorted(a.effect.name for a in result.fit.effects) == ['a', 'b']
+    assert said[:2] == ['adding a', 'adding b']
+    lost = {a.effect.name: g for a, g in zip(result.fit.effects, result.delta_chi2, strict=True)}
+    # Noise adds some tens: 2 sqrt(gain).
+    assert lost['a'] == pytest.approx(4000.0, abs=4 * 2 * math.sqrt(4000.0))
+    assert lost['b'] == pytest.approx(500.0, abs=4 * 2 * math.sqrt(500.0))
+    assert [s.candidate.effect.name for s in result.first_scores[:2]] == ['a', 'b']
+    quiet = Search(Plant(shown, noise()), lambda workspace: Screen(workspace, found)).run()
+    assert quiet.fit.effects == ()
+
+
+# Load cases that a fit has not seen.
+
+
+def test_an_unseen_residual_is_that_of_a_fit_without_its_load_cases() -> None:
+    shown = pictures(A, B)
+    plant = Plant(shown, 1e-4 * shown[A] - 1e-4 * shown[B] + noise())
+    fit = refit(plant, [active('a', x=0.0), active('b', x=0.0)])
+    matrix, data = columns(shown, A, B), plant.measured[0].ravel() / SIGMA
+    # Cases 0 and 4, 1 and 5, ... are one fold.
+    fold = np.tile(plant.case[0] % 4, 6)
+    want = np.empty(N)
+    for k in range(4):
+        rest = np.linalg.lstsq(matrix[fold != k], data[fold != k], rcond=None)[0]
+        want[fold == k] = data[fold == k] - matrix[fold == k] @ rest
+    got = heldout_residual(plant, fit)
+    assert np.abs(got - want).max() < 1e-4 * np.abs(want - fit.residual).max() + 1e-6
+    null = refit(plant, ())
+    np.testing.assert_array_equal(heldout_residual(plant, null), null.residual)
+    gain = heldout_gain(plant, null, fit, np.random.default_rng(0))
+    assert gain.gain == pytest.approx(0.5 * float(data @ data - want @ want), rel=1e-3)
+    # The gap: rms over the four dots of means over 20 samples (5 fine blocks), in metres.
+    volts = SIGMA * want.reshape(6, FINE)[[0, 1, 3, 4]].reshape(4, -1, 5).mean(axis=2)
+    dots = volts * RIG.sensitivities.reshape(4, 1)
+    assert heldout_gap(plant, fit) == pytest.approx(float(np.sqrt(np.mean(dots**2))), rel=1e-4)
+    assert heldout_gap(plant, null) == plant.gap(null.difference)
+
+
+def test_the_error_of_an_unseen_gain_is_the_smaller_of_two() -> None:
+    """sqrt(2 gain), of the likelihood ratio; or the scatter of half seconds drawn again."""
+    shown = pictures(A)
+    plant = Plant(shown, without_noise((shown[A], 400.0)))
+    # Every half second (125 fine blocks) gains the same: the scatter of 4 pieces is that of their sizes alone.
+    null, fit = refit(plant, ()), refit(plant, [active('a', x=0.0)])
+    gain = heldout_gain(plant, null, fit, np.random.default_rng(0))
+    data = (null.residual**2 - heldout_residual(plant, fit) ** 2).reshape(6, FINE).sum(axis=0) / 2.0
+    piece = np.array([data[a : a + 125].sum() for a in range(0, FINE, 125)])
+    bootstrap = math.sqrt(len(piece)) * float(np.std(piece))
+    assert gain.gain == pytest.approx(piece.sum())
+    assert gain.error == pytest.approx(min(bootstrap, math.sqrt(2.0 * gain.gain)), rel=0.15)
+    far = np.zeros((6, FINE))
+    far[:, 0] = 1.0
+    plant = Plant({A: far}, without_noise((far, 400.0)))
+    null, fit = refit(plant, ()), refit(plant, [active('a', x=0.0)])
+    fit = dataclasses.replace(fit, jacobian=np.zeros_like(fit.jacobian))
+    gain = heldout_gain(plant, null, fit, np.random.default_rng(0))
+    assert gain.error == pytest.approx(math.sqrt(2.0 * 200.0), rel=1e-3)
+    assert gain.holds
+    assert not HeldOut(2.0, 1.0).holds
+    assert HeldOut(2.1, 1.0).holds
+
+
+# The screen.
+
+
+def candidate(name: str, *parameters: str, least: float = -1.0) -> Candidate:
+    e = effect(name, *parameters, least=least)
+    off = dict.fromkeys(parameters, 0.0)
+    return Candidate(e, off, parameters, off)
+
+
+def test_a_score_is_the_chi_square_that_a_candidate_would_gain() -> None:
+    shown = pictures(A, ('b', 'x'), ('b', 'y'), ('c', 'x'), ('d', 'x'))
+    shown['d', 'x'] = 1e-6 * SIGMA * shown['d', 'x']
+    plant = Plant(shown, 2e-4 * shown[A] - 1e-4 * shown['b', 'y'] - 1e-4 * shown['c', 'x'] + noise())
+    found = [
+        (candidate('a', 'x'), [[shown[A]]]),
+        (candidate('b', 'x', 'y'), [[shown['b', 'x']], [shown['b', 'y']]]),
+        (candidate('c', 'x', least=0.0), [[shown['c', 'x']]]),
+        (candidate('d', 'x'), [[shown['d', 'x']]]),
+    ]
+    screen = Screen(plant, found)
+    # d changes the readings by less than a thousandth of sigma in all.
+    assert [c.effect.name for c in screen.candidates] == ['a', 'b', 'c']
+    data = plant.measured[0].ravel() / SIGMA
+
+    def rss(*names: tuple[str, str]) -> float:
+        return float(np.linalg.lstsq(columns(shown, *names), data, rcond=None)[1][0]) if names else float(data @ data)
+
+    for known in ((), (('c', 'x'),)):
+        scores = {s.candidate.effect.name: s for s in screen.score(data, columns(shown, *known) if known else None)}
+        residual = data
+        if known:
+            matrix = columns(shown, *known)
+            residual = data - matrix @ np.linalg.lstsq(matrix, data, rcond=None)[0]
+            scores = {s.candidate.effect.name: s for s in screen.score(residual, matrix)}
+        for name, own in (('a', [A]), ('b', [('b', 'x'), ('b', 'y')])):
+            gain = rss(*known) - rss(*known, *own)
+            assert scores[name].gain == pytest.approx(gain, rel=1e-3)
+            assert scores[name].dof == len(own)
+            assert scores[name].p == pytest.approx(1.0 - (1.0 - chi2_law.sf(gain, len(own))) ** 3, rel=1e-2)
+    # The size of c is negative, which its bounds do not allow.
+    assert {s.candidate.effect.name: s.gain for s in screen.score(data)}['c'] == 0.0
+    order = [s.gain for s in screen.score(data)]
+    assert order == sorted(order, reverse=True)
+    assert screen.score(data)[0].coefficients == pytest.approx([2e-4], rel=0.1)
+
+
+def test_a_pair_is_scored_jointly() -> None:
+    """Two pictures that are nearly opposite: alone neither explains much, together all."""
+    shown = pictures(A, B, ('c', 'x'), ('c', 'y'))
+    shown[B] = -shown[A] + 0.05 * shown[B]
+    plant = Plant(shown, 2e-3 * (shown[A] + shown[B]) + noise())
+    found = [
+        (candidate('c', 'x', 'y'), [[shown['c', 'x']], [shown['c', 'y']]]),
+        (candidate('a', 'x'), [[shown[A]]]),
+        (candidate('b', 'x', least=0.0), [[shown[B]]]),
+    ]
+    screen = Screen(plant, found)
+    data = plant.measured[0].ravel() / SIGMA
+    (first, second, gain), *rest = screen.pairs(data, 3.0, 3)
+    assert [first.candidate.effect.name, second.candidate.effect.name] in (['a', 'b'], ['b', 'a'])
+    c, (rss,), _, _ = np.linalg.lstsq(columns(shown, A, B), data, rcond=None)
+    assert gain == pytest.approx(float(data @ data) - rss, rel=1e-2)
+    both = {s.candidate.effect.name: float(s.coefficients[0]) for s in (first, second)}
+    assert [both['a'], both['b']] == pytest.approx(c.tolist(), rel=1e-2)
+    assert {s.candidate.effect.name: len(s.coefficients) for s in rest[0][:2]}['c'] == 2
+    # The opposite sign of b is not allowed, whoever stands first.
+    for order in (found, found[::-1]):
+        names = [
+            {a.candidate.effect.name, b.candidate.effect.name} for a, b, _ in Screen(plant, order).pairs(-data, 3.0, 3)
+        ]
+        assert {'a', 'b'} not in names
+
+
+def test_sizes_come_from_coefficients_of_pictures() -> None:
+    kinds = (
+        EffectParameter('x', 'V', -1.0, 1.0, 0.1, '', nominal=0.2),
+        EffectParameter('place', 'm', -1.0, 1.0, 0.5, '', kind='coupled'),
+        EffectParameter('angle', 'rad', -4.0, 4.0, 1.0, '', kind='phase', partner='x'),
+    )
+    e = dataclasses.replace(effect('a', 'x'), parameters=kinds[:2])
+    off = {'x': 0.2, 'place': 0.0}
+    values = Candidate(e, off, ('x', 'place'), off).from_coefficients(np.array([2.0, 0.5])).values
+    # 0.2 + 2 probes of 0.1; a place is in proportion to the amplitude: 0.5/2 of 0.5 m.
+    assert values == pytest.approx({'x': 0.4, 'place': 0.125})
+    assert Candidate(e, off, ('x', 'place'), off).from_coefficients(np.array([20.0, 0.0])).values['x'] == 1.0
+    e = dataclasses.replace(effect('a', 'x'), parameters=(dataclasses.replace(kinds[0], nominal=0.0), kinds[2]))
+    off = {'x': 0.0, 'angle': 0.0}
+    values = Candidate(e, off, ('x', 'angle'), off).from_coefficients(np.array([3.0, 4.0])).values
+    assert values == pytest.approx({'x': 0.5, 'angle': math.atan2(4.0, 3.0)})
+
+
+# Sizes that are tied.
+
+
+@pytest.mark.parametrize(('ratio', 'tied'), [(1.0, True), (1.02, True), (1.1, False), (2.0, False), (-1.0, True)])
+def test_two_sizes_are_tied_if_their_ratio_is_one_within_the_fit(ratio: float, tied: bool) -> None:
+    shown = pictures(A, B)
+    shown[B] -= shown[A] * np.sum(shown[A] * shown[B]) / np.sum(shown[A] ** 2)
+    sd = 0.01
+    size = 50 * SIGMA / np.linalg.norm(shown[A]) / (sd / 0.02)
+    plant = Plant(shown, size * shown[A] + ratio * size * shown[B])
+    fit = refit(plant, [active('a', x=0.0), active('b', x=0.0)])
+    got = coincidences(fit, plant.physics)
+    assert bool(got) == tied
+    if tied:
+        k = fit.covariance()
+        a, b = (e.values['x'] for e in fit.effects)
+        # The spread of ln(a/b), with a floor of 0.3 %; against a flat law over two decades.
+        spread = math.sqrt(k[0, 0] / a**2 + k[1, 1] / b**2 - 2.0 * k[0, 1] / (a * b) + 0.003**2)
+        density = math.exp(-0.5 * (math.log(abs(a / b)) / spread) ** 2) / (spread * math.sqrt(2.0 * math.pi))
+        assert got[0].odds == pytest.approx(density * 2.0 * math.log(10.0), rel=1e-6)
+        assert (got[0].first, got[0].second, got[0].unit) == ((0, 'x'), (1, 'x'), 'V')
+
+
+# Where, and what it depends on.
+
+
+def nowhere(**changes: Any) -> Localisation:
+    return dataclasses.replace(Localisation((), (), 0.0, 1.0, np.zeros((1, 6, 6)), ()), **changes)
+
+
+@pytest.mark.parametrize(
+    ('p', 'excess', 'explained', 'unknown'),
+    [
+        (0.9e-4, 61.0, 0.0, True),
+        (1.1e-4, 61.0, 0.0, False),
+        (0.9e-4, 59.0, 0.0, False),
+        # More than 2 % of what is explained.
+        (0.9e-4, 210.0, 1e4, True),
+        (0.9e-4, 190.0, 1e4, False),
+    ],
+)
+def test_a_remainder_is_unknown_from_stated_limits_on(p: float, excess: float, explained: float, unknown: bool) -> None:
+    got = _unknown(nowhere(p=p, excess=excess), explained)
+    assert bool(got) == unknown
+    if unknown:
+        assert got[0].explains == pytest.approx(excess / (excess + explained))
+        assert got[0].remains
+
+
+def test_an_unknown_is_described_by_what_it_follows() -> None:
+    def words(*d: tuple[str, float]) -> str:
+        depends = tuple(Dependence('x2', name, gain, 1e-6) for name, gain in d)
+        (u,) = _unknown(nowhere(p=0.0, excess=100.0, dependences=depends), 0.0)
+        assert u.depends_on == tuple(name for name, _ in d)
+        return u.signature
+
+    assert words(('dot_y^2', 50.0), ('dot_y', 20.0)) == 'on x2; follows dot_y^2, dot_y; mostly even'
+    assert words(('dot_y', 50.0), ('|dot_y|', 20.0)) == 'on x2; follows dot_y, |dot_y|; mostly odd'
+    assert words(('dot_y', 50.0), ('constant', 40.0)) == 'on x2; follows dot_y, constant; odd and even parts'
+    assert 'hysteretic' in words(('history of load_fy', 50.0))
+    faint = nowhere(p=0.0, excess=100.0, dependences=(Dependence('x2', 'dot_x', 20.0, 2e-3),))
+    assert _unknown(faint, 0.0)[0].signature == 'on no single channel'
+
+
+def test_effects_weaker_than_the_unknown_remainder_are_taken_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = pictures(A, B)
+    search = search_of(Plant(shown, without_noise((shown[A], 5000.0), (shown[B], 150.0)) + noise()))
+    effects = [active('a', x=0.0), active('b', x=0.0)]
+    # An excess that chance explains is no unknown remainder.
+    for p, excess, kept in ((0.0, 140.0, ['a', 'b']), (0.0, 300.0, ['a']), (0.1, 300.0, ['a', 'b'])):
+        result = result_of(search, effects)
+        left = nowhere(p=p, excess=excess)
+        monkeypatch.setattr('psd_deflection.discovery.discover.localise', lambda *_, found=left: found)
+        fit, heldout, _ = _credible(search, result, result.fit, [HeldOut(1.0, 1.0)] * 2, 0.0, np.random.default_rng(0))
+        assert [a.effect.name for a in fit.effects] == kept
+        assert len(heldout) == len(kept) == len(result.delta_chi2)
+
+
+def test_tied_effects_are_told_with_what_they_explain() -> None:
+    shown = pictures(A, B)
+    size = 200 * SIGMA / np.linalg.norm(shown[A])
+    search = search_of(Plant(shown, size * (shown[A] + shown[B])))
+    result = result_of(search, [active('a', x=0.0), active('b', x=0.0)])
+    (u,) = _tied(coincidences(result.fit, search.workspace.physics), result.fit, result, nowhere())
+    assert not u.remains
+    assert u.explains == pytest.approx(min(sum(result.delta_chi2) / (result.null.chi2 - result.fit.chi2), 1.0))
+    assert 'a and b agree in size' in u.signature
+    assert _tied([], result.fit, result, nowhere()) == ()
+
+
+def test_energy_by_band_is_that_of_the_samples() -> None:
+    """Parseval: the bands of a load case hold the energy of its samples, and of noise as much as they have parts."""
+    plant = Plant({}, noise())
+    layouts = _layouts(plant)
+    assert [(x.start, x.stop) for x in layouts] == [(50 * i, 50 * i + 50) for i in range(8)]
+    parts = [noise(5) / SIGMA]
+    z, excess = _energies(parts, layouts)
+    for i, layout in enumerate(layouts):
+        energy = np.sum(parts[0][:, layout.start : layout.stop] ** 2, axis=1)
+        # 50 values are 50 degrees of freedom, 26 frequencies.
+        assert excess[i].sum(axis=1) == pytest.approx(energy - 50.0, abs=1e-9)
+    seen = z[z > -9.0]
+    assert abs(seen.mean()) < 0.2
+    assert seen.std() == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_tone_is_found_where_it_is() -> None:
+    t = np.arange(50) * 0.004
+    residual = noise(6) / SIGMA
+    residual[3, 150:200] += 2.5 * np.sin(2 * np.pi * 20.0 * t)
+    plant = Plant({}, noise())
+    found = localise(plant, residual.ravel(), None, np.random.default_rng(1))
+    first = found.cells[0]
+    assert (first.channel, first.band) == ('x2', (17.0, 25.0))
+    assert first.when == pytest.approx((0.6, 0.8))
+    assert first.p < 1e-3
+    # Energy of the tone: 50 samples of 2.5^2/2.
+    assert first.energy == pytest.approx(50 * 2.5**2 / 2, rel=0.35)
+    assert found.excess == pytest.approx(first.energy, rel=0.3)
+    assert found.spans[3] == pytest.approx((0, 0.6, 0.8))
+    assert found.map[3, 3, 3] == found.map.max()
+    assert found.p < 1e-3
+    quiet = localise(plant, (noise(7) / SIGMA).ravel(), None, np.random.default_rng(1))
+    assert quiet.p > 0.01
+    assert quiet.excess == 0.0
+    # Single wild values count as six sigma at most.
+    wild = noise(7) / SIGMA
+    wild[0, 10] = 60.0
+    assert localise(plant, wild.ravel(), None, np.random.default_rng(1)).p > 1e-4
+
+
+def test_a_dependence_is_the_chi_square_that_a_regressor_explains() -> None:
+    history = loads.steps([(0, 0, 0), (5, -20, -9), (-10, 10, 12)], 0.6).loads
+    volts = ForwardModel(RIG, []).expect(history, None).volts.T + noise(8)[0, 0]
+    rng = np.random.default_rng(4)
+    seen = Observation('seen', RIG, volts + 2e-3 * rng.standard_normal(volts.shape), history)
+    workspace = Workspace([seen])
+    residual = rng.standard_normal(len(workspace.data))
+    chunk = ForwardModel(RIG, []).run(history, None)
+    size = workspace.fine[0]
+    dot = fine_means(chunk.dots, size)
+    load = fine_means(chunk.loads, size)
+    part = workspace.split(residual)
+    gains = {(d.channel, d.regressor): d.gain for d in dependences(workspace, residual, None)}
+    cases = [
+        (0, 'x1', 'dot_x^2', dot[0] ** 2),
+        (1, 'y1', 'dot_y', dot[1]),
+        (2, 'sum1', '|dot_y|', np.abs(dot[1])),
+        (3, 'x2', 'dot_x dot_y', dot[2] * dot[3]),
+        (4, 'y2', 'dot_y r^2', dot[3] * (dot[2] ** 2 + dot[3] ** 2)),
+        (4, 'y2', 'load_fy^2', load[1] ** 2),
+        (5, 'sum2', 'rate of dot_x', np.gradient(dot[2])),
+    ]
+    for c, channel, name, regressor in cases:
+        e = part[0][c]
+        assert gains[channel, name] == pytest.approx((e @ regressor) ** 2 / (regressor @ regressor), rel=1e-6)
+    # What a known column explains is taken off both.
+    known = rng.standard_normal((len(residual), 1))
+    known[: 2 * dot.shape[1], 0] += np.tile(1e4 * dot[0] ** 2, 2)
+    e = residual - known[:, 0] * (known[:, 0] @ residual) / (known[:, 0] @ known[:, 0])
+    row = np.zeros((6, dot.shape[1]))
+    row[0] = dot[0] ** 2
+    own = row.ravel()
+    own = own - known[:, 0] * (known[:, 0] @ own) / (known[:, 0] @ known[:, 0])
+    gains = {(d.channel, d.regressor): d.gain for d in dependences(workspace, residual, known)}
+    assert gains['x1', 'dot_x^2'] == pytest.approx((e @ own) ** 2 / (own @ own), rel=1e-6)
+    best = max(dependences(workspace, residual, None), key=lambda d: d.gain)
+    count = len(gains)
+    assert best.p == pytest.approx(1.0 - (1.0 - chi2_law.sf(best.gain, 1)) ** count, rel=0.05)
+
+
+# Noise.
+
+
+def test_a_level_is_the_mean_power_and_ignores_lines() -> None:
+    power = np.random.default_rng(0).exponential(3.0, 200_000)
+    assert _level(power) == pytest.approx(3.0, rel=0.01)
+    power[::50] *= 1e6
+    assert _level(power) == pytest.approx(3.0, rel=0.08)
+
+
+def test_the_spectrum_of_a_memory_is_that_of_its_impulse_response() -> None:
+    phi = np.array([0.6, -0.2])
+    response = np.zeros(512)
+    response[0] = 1.0
+    for i in range(1, 512):
+        response[i] = phi[0] * response[i - 1] + (phi[1] * response[i - 2] if i > 1 else 0.0)
+    want = np.abs(np.fft.rfft(response)) ** 2
+    got = _ar_density(phi, np.arange(257) / 512.0)
+    assert got == pytest.approx(want, rel=1e-9)
+
+
+def test_a_block_mean_has_the_covariance_of_its_samples() -> None:
+    acov = 0.9 ** np.arange(40) * np.cos(0.3 * np.arange(40))
+    size, lags = 5, 3
+    whole = acov[np.abs(np.subtract.outer(np.arange(size * lags), np.arange(size * lags)))]
+    mean = np.kron(np.eye(lags), np.full((1, size), 1.0 / size))
+    np.testing.assert_allclose(_block_autocovariance(acov, size, lags), (mean @ whole @ mean.T)[0], rtol=1e-12)
+
+
+# Workspace.
+
+
+def test_counts_gaps_and_floor_of_a_workspace() -> None:
+    volts = 2e-3 * np.random.default_rng(0).standard_normal((2000, 6))
+    volts[[3, 99, 1001]] = np.nan
+    workspace = Workspace([Observation('seen', RIG, volts, np.zeros((2000, 3)))])
+    assert workspace.fine == [4]
+    assert workspace.size == 6 * 497
+    assert workspace.effective_size() == pytest.approx(6 * 497 * 4 / 20)
+    rows = volts[:, [0, 1, 3, 4]] * RIG.sensitivities.reshape(4)
+    blocks = rows.reshape(100, 20, 4).mean(axis=1)
+    each = workspace.gap_per_channel(workspace.measured)
+    assert each == pytest.approx(np.sqrt(np.nanmean(blocks**2, axis=0)), rel=1e-9)
+    assert workspace.gap(workspace.measured) == pytest.approx(float(np.sqrt(np.nanmean(blocks**2))), rel=1e-9)
+    sigma = workspace.noise[0].block_sigma[[0, 1, 3, 4]] * RIG.sensitivities.reshape(4)
+    assert workspace.floor() == pytest.approx(float(np.sqrt(np.mean(sigma**2))), rel=1e-9)
+
+
+# The experiment that decides.
+
+
+def test_an_experiment_separates_by_what_no_size_of_the_other_explains(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The least chi-square between two effects over the other's size, old and new data together; by a scan."""
+    history = loads.steps([(0, 0, 0), (0, -50, -10)], 0.4)
+    given = make_active('bending_stiffness', {'scale': -0.02, 'moves_frequency': 0}, 'test')
+    other = make_active('clamp_bending_compliance', {'compliance': 1e-7}, 'test')
+    volts = ForwardModel(RIG, [given]).expect(history.loads, None).volts.T
+    volts = volts + 2e-3 * np.random.default_rng(0).standard_normal(volts.shape)
+    workspace = Workspace([Observation('seen', RIG, volts, history.loads)])
+    named, rival = refit(workspace, [given]), refit(workspace, [other])
+    new = loads.steps([(0, 0, 0), (30, 0, 0)], 0.4)
+    offered = experiment.Proposal('pull', new, None, {'link.length': 0.4})
+    idle = experiment.Proposal('wait', loads.constant((0.0, 0.0, 0.0), 0.4), None, {})
+    monkeypatch.setattr(experiment, 'proposals', lambda _: [idle, offered])
+    found = experiment.suggest(workspace, named, [rival])
+    assert found is not None
+    assert found.words == 'pull'
+    short = load_rig(overrides={'link.length': 0.4})
+    sigma = workspace.noise[0].innovation[:, None]
+
+    def there(a: ActiveEffect) -> FloatArray:
+        return fine_means(ForwardModel(short, [a]).expect(new.loads, None).volts, 4) / sigma
+
+    (name,) = [n for _, n in rival.free]
+    size = rival.effects[0].values[name]
+
+    def apart(change: float) -> float:
+        moved = ActiveEffect(rival.effects[0].effect, {**rival.effects[0].values, name: size + change})
+        old = change**2 * float(np.sum(rival.jacobian**2))
+        return float(np.sum((there(named.effects[0]) - there(moved)) ** 2)) + old
+
+    reach = 0.5 * abs(size)
+    trials = np.linspace(-reach, reach, 5)
+    # A parabola, to first order.
+    curve = np.polynomial.Polynomial.fit(trials, [apart(float(c)) for c in trials], 2)
+    low = float(curve(curve.deriv().roots()[0].real))
+    assert found.separation == pytest.approx(low, rel=0.05)
+    assert experiment.suggest(workspace, named, []) is None
+
+
+@pytest.mark.parametrize(('separation', 'enough'), [(21.7, True), (21.5, False)])
+def test_a_suggestion_says_whether_it_is_enough(separation: float, enough: bool) -> None:
+    text = experiment.Suggestion('do it', separation).text
+    assert text.startswith('do it: in simulation' if enough else 'none of the experiments')

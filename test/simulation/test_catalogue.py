@@ -1,0 +1,38 @@
+"""The catalogue as rig files rely on it: names, order, bounds, defaults, choices; and where a search looks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from psd_deflection.config import load_rig
+from psd_deflection.simulation.catalogue import catalogue, sort_effects
+from psd_deflection.simulation.declaration import ActiveEffect, Effect
+from psd_deflection.simulation.physics import Physics
+
+TABLE = Path(__file__).parents[1] / 'data' / 'effects.txt'
+
+
+def lines_of(effect: Effect) -> list[str]:
+    out = [f'{effect.name}: {effect.stage} {effect.order}, at {effect.point}' + ', finite' * effect.finite]
+    for p in effect.parameters:
+        low, high = (f'{v:.6g}' for v in (p.minimum, p.maximum))
+        words = [
+            f'{p.kind}, {low} to {high} {p.unit}'.rstrip(),
+            f'default {p.of_rig or f"{p.nominal:g}"}',
+            f'probe {p.scale:g}',
+        ]
+        words += ['required'] * p.required + ['each'] * p.each + [f'power {p.power}'] * bool(p.power)
+        words += [f'choices {" ".join(map(str, p.choices))}'] * bool(p.choices)
+        words += [f'tried {" ".join(f"{v:g}" for v in p.grid)}'] * bool(p.grid)
+        words += [f'with {p.partner}'] * bool(p.partner)
+        words += [f'from {" ".join(p.proposed_by(c) for c in effect.variants())}'] * bool(p.propose)
+        out.append(f'  {p.name}: ' + ', '.join(words))
+    return out
+
+
+def test_the_catalogue_is_the_one_that_rig_files_know() -> None:
+    """In the order in which effects act; an effect of yours takes its place by the number."""
+    physics = Physics.of(load_rig())
+    every = [ActiveEffect(e, e.off_values(physics, next(e.variants()))) for e in catalogue().values()]
+    got = [line for a in sort_effects(every) for line in lines_of(a.effect)]
+    assert '\n'.join(got) + '\n' == TABLE.read_text()

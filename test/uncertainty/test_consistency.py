@@ -1,0 +1,163 @@
+"""The reading too many, against generalised least squares with dense matrices of numpy."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psd_deflection.records import FloatArray
+from psd_deflection.uncertainty.consistency import Consistency, Suspect, widened
+
+CENTERS = np.array([[0.0, 0.070], [-0.100, 0.0]])
+COVARIANCE = np.diag([4e-12, 1e-12, 9e-12, 2e-12]) + 0.5e-12
+REST = tuple((CENTERS[0] - CENTERS[1]).tolist())
+# d(x1, y1, x2, y2)/d(dX, dY, theta) at rest: -1, and the place turned by a right angle.
+DESIGN = np.array([[-1.0, 0.0, 0.070], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.100]])
+
+
+def left_over(readings: FloatArray, covariance: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+    """Residual of least squares with this covariance, its chi-square, and the gain."""
+    weight = np.linalg.inv(covariance)
+    gain = np.linalg.inv(DESIGN.T @ weight @ DESIGN) @ DESIGN.T @ weight
+    residual = readings - DESIGN @ gain @ readings
+    return residual, float(residual @ weight @ residual), gain
+
+
+def check(readings: FloatArray, of: Consistency | None = None, **options: Any) -> Any:
+    residual, _, _ = left_over(readings, np.eye(4))
+    return (of or Consistency()).check(REST, tuple(residual.tolist()), COVARIANCE, **options)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_chi_square_is_that_of_least_squares_with_the_whole_covariance(seed: int) -> None:
+    """Whatever the weights were with which the pose was found."""
+    readings = np.random.default_rng(seed).normal(size=4) * 5e-6
+    _, chi_square, _ = left_over(readings, COVARIANCE)
+    got = check(readings)
+    assert got.chi_square == pytest.approx(chi_square, rel=1e-9)
+    # Of each reading the error that alone explains all: with it taken off nothing is left.
+    for i, error in enumerate(got.errors):
+        true = readings.copy()
+        true[i] -= error
+        assert left_over(true, COVARIANCE)[1] == pytest.approx(0.0, abs=1e-9)
+
+
+def scaled_to(chi_square: float) -> FloatArray:
+    readings = np.array([1e-5, 0.0, 0.0, 0.0])
+    return readings * math.sqrt(chi_square / left_over(readings, COVARIANCE)[1])
+
+
+@pytest.mark.parametrize(
+    ('chi_square', 'contradict', 'widens', 'limit'),
+    [
+        (19.9, False, True, 20.0),
+        (20.1, True, True, 20.0),
+        # Chance exceeds 6.635 once in a hundred.
+        (6.7, False, True, 20.0),
+        (6.5, False, False, 20.0),
+        (319.0, False, True, 320.0),
+        (321.0, True, True, 320.0),
+        (107.0, False, True, 320.0),
+        (105.0, False, False, 320.0),
+    ],
+)
+def test_limits(chi_square: float, contradict: bool, widens: bool, limit: float) -> None:
+    got = check(scaled_to(chi_square), limit=limit)
+    assert got.chi_square == pytest.approx(chi_square)
+    assert got.contradict == contradict
+    # Half as much again as the error of one alone.
+    assert np.abs(got.possible) == pytest.approx(1.5 * np.abs(got.errors) if widens else np.zeros(4))
+
+
+def test_a_contradiction_is_held_and_forgotten_by_a_fiftieth_a_block() -> None:
+    of = Consistency()
+    first = check(scaled_to(60.0), of)
+    assert first.contradict
+    blocks = 0
+    while (got := check(np.zeros(4), of)).contradict:
+        blocks += 1
+        assert got.chi_square == pytest.approx(0.0, abs=1e-9)
+        assert np.abs(got.possible) == pytest.approx(np.abs(first.possible) * 0.98 ** (blocks / 2.0))
+    # 60 falls to 20.
+    assert blocks == math.floor(math.log(3.0) / -math.log(0.98))
+    assert of.held == 0.0
+    assert got.possible == (0.0, 0.0, 0.0, 0.0)
+
+
+def test_what_has_next_to_no_part_in_the_base_line_is_not_accused() -> None:
+    """Along a base line in x a wrong y changes its length to second order only."""
+    for y, seen in ((0.0, False), (0.0028 * 2**0.5 * 1.05, True), (0.0028 * 2**0.5 * 0.95, False)):
+        got = Consistency().check((0.14, y), (1e-5, 0.0, -1e-5, 0.0), COVARIANCE)
+        assert [e != 0.0 for e in got.errors] == [True, seen, True, seen]
+    nothing = Consistency().check((0.0, 0.0), (1e-5,) * 4, COVARIANCE)
+    assert nothing == (0.0, False, (0.0,) * 4, (0.0,) * 4)
+    assert Consistency().check(REST, (1e-5, 0.0, 0.0, 0.0), np.zeros((4, 4))).chi_square == 0.0
+
+
+def test_a_covariance_is_widened_by_what_each_error_alone_would_cause() -> None:
+    _, _, gain = left_over(np.zeros(4), COVARIANCE)
+    errors = (1e-5, -2e-5, 0.0, 3e-5)
+    own = gain @ COVARIANCE @ gain.T
+    want = own + sum(np.outer(gain[:, i] * e, gain[:, i] * e) for i, e in enumerate(errors))
+    np.testing.assert_allclose(widened(own, gain, errors), want, rtol=1e-12, atol=1e-24)
+
+
+# The reading that is wrong.
+
+NOISE = 1e-6
+
+
+def dots_of(pose: FloatArray) -> FloatArray:
+    """Of a flat plate, m = R(-theta)(l - d) - c."""
+    dx, dy, theta = pose
+    c, s = math.cos(theta), math.sin(theta)
+    u, v = CENTERS[:, 0] - dx, CENTERS[:, 1] - dy
+    return np.asarray(np.column_stack((c * u + s * v, c * v - s * u)) - CENTERS).ravel()
+
+
+def seen(change: Any, blocks: int = 60, size: float = 1.0) -> str:
+    """What is said after ``blocks`` poses of some millimetres of which ``change`` alters the readings."""
+    rng = np.random.default_rng(5)
+    suspect, consistency = Suspect(CENTERS, CENTERS), Consistency()
+    for _ in range(blocks):
+        readings = change(dots_of(rng.normal(size=3) * (2e-3, 2e-3, 0.02) * size) + rng.normal(size=4) * NOISE)
+        apart = (CENTERS + readings.reshape(2, 2))[0] - (CENTERS + readings.reshape(2, 2))[1]
+        # r by its definition: how much longer the line between the dots is than that between the beams.
+        r = (math.hypot(*apart) - math.hypot(*REST)) / 2**0.5
+        a = np.array([*apart, *-apart]) / math.hypot(*apart) / 2**0.5
+        checked = consistency.check(tuple(apart.tolist()), tuple((a * r).tolist()), NOISE**2 * np.eye(4))
+        suspect.add(tuple(readings.tolist()), checked.errors)
+    return suspect.most_likely(NOISE)
+
+
+def with_(i: int, law: Any) -> Any:
+    def change(readings: FloatArray) -> FloatArray:
+        out = readings.copy()
+        out[i] = law(out[i])
+        return out
+
+    return change
+
+
+@pytest.mark.parametrize('name', ['x1', 'y1', 'x2', 'y2'])
+def test_a_reading_that_stands_still_or_is_inverted_is_named(name: str) -> None:
+    i = ('x1', 'y1', 'x2', 'y2').index(name)
+    assert seen(with_(i, lambda _: 3e-4)) == f'{name} does not move with the others'
+    assert seen(with_(i, lambda v: -v), size=0.2) == f'{name} has the wrong sign'
+    # Too little to tell: few blocks, small motion.
+    assert seen(with_(i, lambda _: 3e-4), blocks=9) == ''
+    assert seen(with_(i, lambda _: 3e-4), size=0.02) == ''
+    # Neither law: half as large.
+    assert seen(with_(i, lambda v: 0.5 * v)) == ''
+
+
+@pytest.mark.parametrize(('psd', 'order'), [(1, [1, 0, 2, 3]), (2, [0, 1, 3, 2])])
+def test_exchanged_axes_are_named(psd: int, order: list[int]) -> None:
+    assert seen(lambda r: r[order]) == f'the axes of psd_{psd} are exchanged'
+
+
+def test_sound_readings_are_not_accused() -> None:
+    assert seen(lambda r: r) == ''

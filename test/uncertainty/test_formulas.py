@@ -1,0 +1,196 @@
+"""The parts of the noise estimate and of the fit, each against the definition written with dense matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.uncertainty import noise
+from psd_deflection.uncertainty.block_fit import BlockFit, basis
+from psd_deflection.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise
+
+PLACES = np.array([[0.0, 0.070], [-0.100, 0.0]])
+SIZE = 20
+SIGMA = 1e-6
+ALL = np.arange(SIZE)
+
+
+def white(times: float) -> FloatArray:
+    gamma = np.zeros((4, 4, SIZE))
+    gamma[range(4), range(4), 0] = times * SIGMA**2
+    return gamma
+
+
+@pytest.mark.parametrize('size', [1, 2, 20])
+def test_the_variance_of_a_mean_is_that_of_the_toeplitz_matrix(size: int) -> None:
+    lags = np.random.default_rng(0).normal(size=size)
+    whole = lags[np.abs(np.subtract.outer(np.arange(size), np.arange(size)))]
+    assert lags @ noise._mean_weights(size) == pytest.approx(whole.mean(), rel=1e-12)
+
+
+def test_an_autocovariance_is_the_mean_product_of_what_is_left_of_a_line() -> None:
+    n = SEGMENT_BLOCKS * SIZE
+    rng = np.random.default_rng(1)
+    e = rng.normal(size=(n + 1, 3))
+    series = e[1:] + 0.5 * e[:-1] + np.outer(np.arange(n), [1e-2, -2e-2, 0.0]) + [5.0, 0.0, -3.0]
+    series[:, 1] += 0.3 * series[:, 0]
+    left = series - np.column_stack([np.polyval(np.polyfit(np.arange(n), s, 1), np.arange(n)) for s in series.T])
+    got = noise._autocovariance(np.arange(n), series, n, SIZE)
+    for lag in (0, 1, 7, 19):
+        want = left[: n - lag].T @ left[lag:] / (n - lag)
+        np.testing.assert_allclose(got[:2, :2, lag], want[:2, :2], atol=2e-3 * want[1, 1] if lag == 0 else 1e-9)
+        assert got[2, 2, lag] == pytest.approx(want[2, 2], rel=2e-3, abs=1e-9)
+    # The last has no covariance with the others.
+    assert not got[2, :2].any()
+    assert not got[:2, 2].any()
+
+
+def test_an_autocovariance_leaves_gaps_out() -> None:
+    n = SEGMENT_BLOCKS * SIZE
+    rng = np.random.default_rng(2)
+    keep = np.sort(rng.choice(n, 7 * n // 10, replace=False))
+    e = rng.normal(size=(n + 1, 1))
+    series = np.tile(e[1:] + 0.5 * e[:-1], (1, 2))[keep]
+    got = noise._autocovariance(keep, series, n, SIZE)
+    line = np.polyval(np.polyfit(keep, series[:, 0], 1), keep)
+    here = np.full(n, np.nan)
+    here[keep] = series[:, 0] - line
+    for lag in (1, 2, 13):
+        assert got[0, 0, lag] == pytest.approx(np.nanmean(here[: n - lag] * here[lag:]), abs=1e-9)
+
+
+def test_roughness_is_the_median_over_blocks_of_what_a_polynomial_leaves() -> None:
+    rng = np.random.default_rng(3)
+    n = SEGMENT_BLOCKS * SIZE
+    places = np.delete(np.arange(n), [3, 4, 111, *range(200, 214)])
+    series = rng.normal(size=(len(places), 2)) + np.column_stack((places**2 * 1e-3, np.zeros(len(places))))
+    q = basis(SIZE)
+    each = []
+    for block in range(SEGMENT_BLOCKS):
+        at = places // SIZE == block
+        # Six samples of a block that lost fourteen say too little: five orders leave one.
+        if at.sum() < q.shape[1] + 2:
+            continue
+        used = q[places[at] % SIZE]
+        left = series[at] - used @ np.linalg.lstsq(used, series[at], rcond=None)[0]
+        each.append((left**2).sum(axis=0) / (at.sum() - q.shape[1]))
+    assert len(each) == SEGMENT_BLOCKS - 1
+    np.testing.assert_allclose(noise._roughness(places, series, q), np.median(each, axis=0), rtol=1e-6)
+
+
+@pytest.mark.parametrize('sigma', [0.0, 0.2, 0.35])
+def test_what_noise_does_not_dither_stays_as_an_error_of_rounding(sigma: float) -> None:
+    """Mean square over all places of the mean of the rounded reading less the place, added up by hand."""
+    step = 3.0
+    place = (np.arange(2000) + 0.5) / 2000.0
+    deviate = np.linspace(-7.0, 7.0, 4001)
+    weight = np.exp(-0.5 * deviate**2) / np.exp(-0.5 * deviate**2).sum()
+    mean = np.rint(place[:, None] + sigma * deviate) @ weight
+    want = step**2 * float(np.mean((mean - place) ** 2))
+    assert noise._undithered((sigma * step) ** 2, step) == pytest.approx(want, rel=5e-3)
+    assert noise._undithered(1.0, 0.0) == 0.0
+
+
+def stream() -> StreamNoise:
+    out = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0)
+    out._judge(white(1.0), white(1.0)[0, 0], np.full(8, SIGMA**2))
+    out._seen = 5
+    out.gamma = out._in_use()
+    return out
+
+
+def level(of: StreamNoise) -> float:
+    return float(of._in_use()[0, 0, 0]) / SIGMA**2
+
+
+def judge(of: StreamNoise, times: float, rough: float | None = None) -> None:
+    """A segment at rest with so much variance; ``rough``: of the combinations that move, if it is not that."""
+    roughness = np.full(8, times * SIGMA**2)
+    roughness[:3] *= 1.0 if rough is None else rough
+    of._judge(white(times), white(times)[0, 0], roughness)
+
+
+def test_a_segment_joins_the_mean_of_the_last_twenty() -> None:
+    of = stream()
+    judge(of, 1.5)
+    assert level(of) == pytest.approx(1.25)
+    for _ in range(40):
+        judge(of, 1.25)
+    judge(of, 1.45)
+    assert level(of) == pytest.approx(1.25 + 0.2 / 20.0, abs=2e-4)
+
+
+@pytest.mark.parametrize(('times', 'after'), [(1.9, 1.45), (2.1, 1.0), (0.45, 0.725), (0.35, 0.35)])
+def test_noise_that_doubles_waits_and_noise_that_falls_below_two_fifths_is_believed(times: float, after: float) -> None:
+    of = stream()
+    judge(of, times)
+    assert level(of) == pytest.approx(after)
+
+
+def test_the_third_louder_segment_in_a_row_is_believed() -> None:
+    of = stream()
+    for k in range(3):
+        assert level(of) == pytest.approx(1.0)
+        judge(of, 9.0)
+        assert level(of) == pytest.approx(9.0 if k == 2 else 1.0)
+    # In a row: one as before in between begins the count again; so does one in motion.
+    of = stream()
+    for times, rough in ((9.0, None), (9.0, None), (1.0, None), (9.0, None), (9.0, 0.1), (9.0, None), (9.0, None)):
+        judge(of, times, rough)
+    assert level(of) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(('rough', 'rest'), [(0.26, True), (0.24, False)])
+def test_motion_is_four_times_more_than_roughness_explains(rough: float, rest: bool) -> None:
+    of = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0)
+    judge(of, 1.0, rough)
+    assert of.at_rest == rest
+
+
+def test_half_a_segment_says_something_less_does_not() -> None:
+    rng = np.random.default_rng(4)
+    for blocks, seen in ((25, 1), (24, 0)):
+        of = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0)
+        for b in range(SEGMENT_BLOCKS - blocks, SEGMENT_BLOCKS):
+            of.add(b, ALL, SIGMA * rng.normal(size=(SIZE, 4)))
+        assert of._seen == seen
+
+
+@pytest.mark.parametrize('slots', [ALL, np.delete(ALL, [3, 11, 12])], ids=['all', 'gaps'])
+def test_in_motion_a_block_is_the_least_squares_polynomial_at_its_middle(slots: IntArray) -> None:
+    """So much motion that nothing is known of the coefficients: weights by dense least squares of order 4."""
+    gamma = white(1.0)
+    fit = BlockFit(SIZE, PLACES, PLACES, True)
+    fit.set_noise(gamma)
+    rng = np.random.default_rng(5)
+    u = (ALL - 9.5) / 9.5
+    for _ in range(200):
+        shape = np.polynomial.polynomial.polyvander(u, 4) @ rng.normal(size=(5, 4))
+        fit.fit(ALL, 1e-4 * shape + SIGMA * rng.normal(size=(SIZE, 4)))
+    dots = (1e-4 * shape + SIGMA * rng.normal(size=(SIZE, 4)))[slots]
+    got = fit.fit(slots, dots)
+    powers = np.polynomial.polynomial.polyvander(u[slots], 4)
+    w = np.linalg.pinv(powers)[0]
+    # The base line between the dots does not move, whatever the link does: there the mean may be better.
+    moving = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0]])
+    # To second order in the motion: the length of the base line is taken exactly.
+    np.testing.assert_allclose(moving @ got.dots, moving @ (w @ dots), atol=2e-8)
+    want = SIGMA**2 * float(w @ w)
+    np.testing.assert_allclose((moving @ got.covariance @ moving.T).diagonal(), 2.0 * want, rtol=5e-3)
+
+
+@pytest.mark.parametrize('slots', [ALL, np.delete(ALL, [3, 11, 12])], ids=['all', 'gaps'])
+def test_the_mean_has_the_variance_of_the_samples_that_are_present(slots: IntArray) -> None:
+    lags = 0.7**ALL * SIGMA**2
+    gamma = np.zeros((4, 4, SIZE))
+    gamma[range(4), range(4)] = lags
+    gamma[0, 1] = gamma[1, 0] = 0.3 * lags
+    fit = BlockFit(SIZE, PLACES, PLACES, False)
+    fit.set_noise(gamma)
+    dots = SIGMA * np.random.default_rng(6).normal(size=(SIZE, 4))[slots]
+    got = fit.fit(slots, dots)
+    np.testing.assert_allclose(got.dots, dots.mean(axis=0), rtol=0.0, atol=1e-11)
+    mean = lags[np.abs(np.subtract.outer(slots, slots))].mean()
+    np.testing.assert_allclose(got.covariance.diagonal(), mean, rtol=1e-5)
+    assert got.covariance[0, 1] == pytest.approx(0.3 * mean, rel=1e-4)
