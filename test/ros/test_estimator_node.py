@@ -158,7 +158,7 @@ def test_zero_and_record(start: Callable[..., Any], peer: Any, tmp_path: Path, s
     ended = peer.call(SetBool, '/estimator/record', SetBool.Request(data=False))
     assert ended.success
     assert ended.message == f'recording ended: {folder}'
-    assert peer.call(SetBool, '/estimator/record', SetBool.Request(data=False)).message == 'no recording was made'
+    assert peer.call(SetBool, '/estimator/record', SetBool.Request(data=False)).message == 'no recording runs'
     assert [line for line in daemon.lines if 'recording' in line] == [begun.message, ended.message]
     # An independent reader finds in the bag what was received.
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -227,7 +227,7 @@ def test_a_disk_that_hangs_holds_up_its_own_requests_alone(
     assert peer.call(Trigger, '/estimator/zero', Trigger.Request()).success
     peer.until_of_now(poses, 'estimates')
     assert not any(future.done() for future in begun)
-    assert peer.call(SetBool, '/estimator/record', SetBool.Request(data=False)).message == 'no recording was made'
+    assert peer.call(SetBool, '/estimator/record', SetBool.Request(data=False)).message == 'no recording runs'
     peer.until(lambda: all(future.done() for future in begun), 'the answers of the starts')
     for future in begun:
         assert not future.result().success
