@@ -140,7 +140,7 @@ class EstimatorNode:
         if shown.publish_volts:
             session.processing.sinks.append(VoltsPublisher(self._wire, shown.frame_prefix))
         if shown.publish_tf and not installed():
-            self._say('no frames on /tf: tf2_msgs is not installed (publish_tf)')
+            self._say('tf2_msgs is not installed: no frames on /tf (publish_tf)')
         elif shown.publish_tf:
             self._transforms = TransformPublisher(self.node, session.rig)
             session.processing.sinks.append(self._transforms)

@@ -182,6 +182,8 @@ class LiveParameters:
                 raise ConfigError(f'{name}: is set by the node')
             if name in _AT_START:
                 raise ConfigError(f'{name}: is {_AT_START[name]}')
+        if not new:
+            return
         if self.session is None:
             rig = replace_values(self.rig, new, SOURCE)
             _check_solvers(rig)
@@ -194,9 +196,5 @@ class LiveParameters:
             raise ConfigError(
                 f'{", ".join(fixed)}: is {_READ}; first ros2 lifecycle set {node} deactivate, then cleanup'
             )
-        live = {
-            n: tuple(v) if isinstance(v, list) else v for n, v in values.items() if n in BY_NAME and BY_NAME[n].live
-        }
-        if live:
-            # All of them or none, between two blocks.
-            self.session.change(live)
+        # All of them or none, between two blocks.
+        self.session.change({n: tuple(v) if isinstance(v, list) else v for n, v in new.items()})
