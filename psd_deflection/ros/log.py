@@ -64,15 +64,16 @@ class NodeLog:
         level = severity(text)
         if not self._logger.is_enabled_for(level):
             return
-        self._say(text)
         line = Log(level=int(level), name=self._logger.name, msg=text)
         line.stamp.sec, line.stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
-        # An abandoned thread may log a line after the node is gone.
-        with contextlib.suppress(RuntimeError):
-            self._publisher.publish(line)
+        # The terminal comes last: who reads a line there finds it in the file.
         if self._thread is not None and self._lines.qsize() < MOST_LINES:
             seconds = f'{line.stamp.sec}.{line.stamp.nanosec:09d}'
             self._lines.put(f'[{level.name}] [{seconds}] [{self._logger.name}]: {text}\n')
+        # An abandoned thread may log a line after the node is gone.
+        with contextlib.suppress(RuntimeError):
+            self._publisher.publish(line)
+        self._say(text)
 
     def close(self) -> None:
         """Write the last lines."""
@@ -82,6 +83,6 @@ class NodeLog:
 
     def _write(self, file: Path) -> None:
         # The daemon measures on without a log.
-        with contextlib.suppress(OSError), file.open('a', encoding='utf-8', buffering=1) as stream:
+        with contextlib.suppress(OSError), file.open('a', 1, 'utf-8', 'backslashreplace') as stream:
             while (line := self._lines.get()) is not None:
                 stream.write(line)
