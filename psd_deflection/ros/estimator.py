@@ -235,6 +235,8 @@ class EstimatorNode:
             self._rig_told.tell()
         if self._markers is not None:
             self._markers.session = self.session
+        if self.node.get_namespace() != '/' and not self._live.rig.monitor.frame_prefix:
+            self._say('frames have no prefix: where several rigs run, give each its own (frame_prefix)')
         domain = os.environ.get('ROS_DOMAIN_ID') or '0'
         node = self.node.get_fully_qualified_name()
         topics = ', '.join(self._wire.names((DEFLECTION, '/link_tip/wrench', '/psd/samples', DIAGNOSTICS)))

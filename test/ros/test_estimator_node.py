@@ -399,6 +399,7 @@ def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start:
     assert {s.hardware_id for s in health[-1].status} == {'SIM-0001'}
     assert abs(stamp(health[-1]) - stamp(poses[-1])) < 60 * 10**9
     # What the terminal shows is on /rosout as well.
+    daemon.until('frames have no prefix')
     said = 'publishing on ROS domain'
     peer.until(lambda: any(m.name == 'left.estimator' and m.msg.startswith(said) for m in log), 'its log')
     levels = {m.msg.partition(' ')[0]: m.level for m in log}
