@@ -74,7 +74,6 @@ FROM_PYPI = {
     'cobs': 'python-cobs-pip',
     # It brings the others.
     **dict.fromkeys(('mcap', 'mcap_ros2', 'zstandard', 'lz4'), 'mcap-ros2-support'),
-    'rosbags': 'python3-rosbags-pip',
 }
 """Imported name to the key by which rosdep knows it. The key of any other is ``python3-NAME``."""
 
@@ -84,6 +83,7 @@ UNNAMED = {
     'rerun': 'an extra',
     'shtab': 'completion in the shell, which says that it is missing; not in rosdep',
     'cyclonedds': 'another DDS as judge; not in rosdep',
+    'rosbags': 'another reader as judge; from PyPI, so not forced on whoever builds the workspace',
     'selenium': 'the page in a browser; not tested in a build of ROS',
     **dict.fromkeys(('psd_deflection', 'msg_adapters', 'test', 'tools', 'bench', 'blind'), 'ours'),
 }
