@@ -104,8 +104,9 @@ class PsdConfig:
         ('x', 'y'),
         '',
         'which channels of the device are its x and its y, with their signs: [-y, x] '
-        "(write 'y' in quotes: ROS takes a bare y for true)",
+        "(write +y, or 'y' in quotes: ROS takes a bare y for true)",
         choices=AXES,
+        synonyms=(('+x', 'x'), ('+y', 'y')),
     )
 
 

@@ -22,6 +22,7 @@ from rclpy.parameter import Parameter as RosParameter
 from psd_deflection.config import (
     BY_NAME,
     PARAMETERS,
+    PSDS,
     QOS_OVERRIDES_PREFIX,
     ROS_OWN,
     SIMULATED,
@@ -37,6 +38,7 @@ from psd_deflection.runner.session import Session
 from psd_deflection.solvers.registry import SOLVERS, check_live, solver_class
 
 SOURCE = 'ROS parameters'
+_AXES = [section.parameters['axes'] for section in PSDS]
 
 _READ = 'read when the node is configured'
 _AT_START = {'autostart': 'read at the start of the process'}
@@ -56,7 +58,8 @@ def rig_of_node(node: Node) -> Rig:
     """
     given = {name: _plain(parameter) for name, parameter in node.get_parameters_by_prefix('').items()}
     rig = rig_from_values(given, SOURCE)
-    values = {p.name: (rig.values[p.name], _descriptor(p)) for p in PARAMETERS}
+    shown = _ros_values(rig)
+    values = {p.name: (shown[p.name], _descriptor(p)) for p in PARAMETERS}
     for name, (value, descriptor) in {**values, SIMULATED: (False, _SIMULATED)}.items():
         # rclpy tells of overrides that nobody declares (a mistyped name) only by declaring them, and then without
         # descriptor and with the type as it was typed.
@@ -64,6 +67,14 @@ def rig_of_node(node: Node) -> Rig:
             node.undeclare_parameter(name)
         node.declare_parameter(name, value, descriptor, ignore_override=True)
     return rig
+
+
+def _ros_values(rig: Rig) -> dict[str, Any]:
+    """The values by name. Signs are written out, because rcl does not read the bare y that `ros2 param dump` writes."""
+    signed = {
+        p.name: [a if a.startswith('-') else f'+{a}' for a in psd.axes] for p, psd in zip(_AXES, rig.psds, strict=True)
+    }
+    return {**rig.values, **signed}
 
 
 def _plain(parameter: RosParameter) -> Any:
@@ -141,7 +152,7 @@ class LiveParameters:
         simulated = session is not None and session.simulated
         changed = [
             RosParameter(name, value=value)
-            for name, value in {**self.rig.values, SIMULATED: simulated}.items()
+            for name, value in {**_ros_values(self.rig), SIMULATED: simulated}.items()
             if _plain(self._node.get_parameter(name)) != value
         ]
         self._showing = True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import array
 import itertools
 import json
 import math
@@ -18,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
@@ -34,7 +36,7 @@ from geometry_msgs.msg import (  # noqa: E402
 )
 from rcl_interfaces.msg import Log  # noqa: E402
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters  # noqa: E402
-from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
@@ -338,6 +340,29 @@ def test_each_parameter_says_what_it_takes(start: Callable[..., Any], peer: Any)
     assert 'appendix_d' not in constraints['solver']
     assert 'dataq' in constraints['source']
     assert constraints['autostart'] == 'read at the start of the process'
+
+
+def test_a_dump_of_the_parameters_starts_the_node_again(start: Callable[..., Any], peer: Any, tmp_path: Path) -> None:
+    first = start('--ros-args', '-p', 'sum_min:=2.4', '-p', "psd_1.axes:=[-y, 'x']")
+    first.until('publishing on ROS domain')
+    names = [p.name for p in PARAMETERS] + ['simulated', 'use_sim_time']
+    request = GetParameters.Request(names=names)
+    values = peer.call(GetParameters, '/estimator/get_parameters', request).values
+    held = {name: parameter_value_to_python(value) for name, value in zip(names, values, strict=True)}
+    held = {name: list(value) if isinstance(value, array.array) else value for name, value in held.items()}
+    assert held['psd_1.axes'] == ['-y', '+x']
+    assert held['psd_2.axes'] == ['+x', '+y']
+    first.send(signal.SIGINT)
+    assert first.wait() == 0, first.lines
+    # As ros2 param dump writes it, which leaves a y without quotes.
+    dump = tmp_path / 'dump.yaml'
+    dump.write_text(yaml.dump({'/estimator': {'ros__parameters': held}}))
+    again = start('--ros-args', '--params-file', str(dump))
+    again.until('publishing on ROS domain')
+    values = peer.call(GetParameters, '/estimator/get_parameters', request).values
+    assert [parameter_value_to_python(value) for value in values] == [
+        parameter_value_to_python(Parameter('', value=held[name]).get_parameter_value()) for name in names
+    ]
 
 
 def test_the_log_file_of_the_process_has_the_lines(start: Callable[..., Any], tmp_path: Path) -> None:
