@@ -1,6 +1,11 @@
 """The estimator: ``ros2 launch psd_deflection estimator.launch.py port:=/dev/ttyACM0 record:=true``.
 
-Parameters that are not given here come from ``params_file``.
+Parameters that are not given here come from ``params_file``. Two rigs on one graph::
+
+    ros2 launch psd_deflection estimator.launch.py namespace:=left frame_prefix:=left_ port:=/dev/psd_left
+    ros2 launch psd_deflection estimator.launch.py namespace:=right frame_prefix:=right_ port:=/dev/psd_right
+
+``autostart:=false`` leaves the transitions to you or to a lifecycle manager.
 """
 
 from launch import LaunchContext, LaunchDescription
@@ -10,13 +15,20 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-ARGUMENTS: dict[str, tuple[type, str]] = {
+PARAMETERS: dict[str, tuple[type, str]] = {
     'port': (str, 'serial port; without one, here or in params_file: the simulated rig'),
+    'source': (str, 'what the device speaks (psd-deflection devices --help)'),
+    'solver': (str, 'solver whose answer is /link_tip/deflection (ros2 param describe NODE solver)'),
+    'autostart': (bool, 'configure and activate at start; false: wait for lifecycle transitions'),
     'record': (bool, 'record from the start'),
     'bag_dir': (str, 'where recordings go'),
     'monitor': (bool, 'serve the live page'),
     'markers': (bool, 'publish markers for RViz'),
+    'publish_tf': (bool, 'publish the frames on /tf and /tf_static'),
+    'publish_volts': (bool, 'publish raw samples as plain numbers, for plots'),
+    'frame_prefix': (str, 'put before the name of every frame'),
 }
+"""Parameters of the node that may be given as arguments, with their types."""
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -28,9 +40,19 @@ def generate_launch_description() -> LaunchDescription:
                 default_value=[FindPackageShare('psd_deflection'), '/config/thesis_rig.yaml'],
                 description='ROS 2 parameter file with the rig',
             ),
+            DeclareLaunchArgument('namespace', default_value='', description='namespace of the node and its topics'),
+            DeclareLaunchArgument(
+                'log_level',
+                default_value='info',
+                description='least severity that is logged: debug, info, warn, error, fatal',
+            ),
             *(
-                DeclareLaunchArgument(name, default_value='', description=f'{what} (empty: as params_file says)')
-                for name, (_, what) in ARGUMENTS.items()
+                DeclareLaunchArgument(
+                    name,
+                    default_value='',
+                    description=f'{what} (empty: as params_file says)',
+                )
+                for name, (_, what) in PARAMETERS.items()
             ),
             OpaqueFunction(function=estimator),
         ]
@@ -41,7 +63,7 @@ def estimator(context: LaunchContext) -> list[Node]:
     """The node, with the arguments that were given."""
     given = {
         name: ParameterValue(LaunchConfiguration(name), value_type=kind)
-        for name, (kind, _) in ARGUMENTS.items()
+        for name, (kind, _) in PARAMETERS.items()
         if LaunchConfiguration(name).perform(context)
     }
     return [
@@ -49,9 +71,15 @@ def estimator(context: LaunchContext) -> list[Node]:
             package='psd_deflection',
             executable='estimator',
             name='estimator',
+            namespace=LaunchConfiguration('namespace'),
             output='screen',
             # Not under `parameters`: launch_ros passes over a file that is not there with a warning.
-            ros_arguments=['--params-file', LaunchConfiguration('params_file')],
+            ros_arguments=[
+                '--params-file',
+                LaunchConfiguration('params_file'),
+                '--log-level',
+                LaunchConfiguration('log_level'),
+            ],
             parameters=[given] if given else [],
         )
     ]

@@ -116,15 +116,30 @@ def solver_topic(solver: str) -> str:
     return f'/link_tip/{solver}/deflection'
 
 
-def to_messages(record: Record) -> tuple[Message, ...]:
-    """Every message that a record is published and recorded as; an empty tuple if there is none."""
-    return tuple(messages(record))
+def to_messages(record: Record, frame_prefix: str = '') -> tuple[Message, ...]:
+    """Every message that a record is published and recorded as; an empty tuple if there is none.
+
+    ``frame_prefix``: put before the name of the messages' frame.
+    """
+    return tuple(messages(record, frame_prefix))
 
 
-def messages(record: Record) -> Iterator[Message]:
+def messages(record: Record, frame_prefix: str = '') -> Iterator[Message]:
     """:func:`to_messages` as a generator: the first message does not wait for the others."""
+    named = None
+    for message in _messages(record):
+        # Topics may share their fields.
+        if frame_prefix and message.fields is not named:
+            named = message.fields
+            header = named.get('header', {})
+            if header.get('frame_id'):
+                header['frame_id'] = frame_prefix + header['frame_id']
+        yield message
+
+
+def _messages(record: Record) -> Iterator[Message]:
     if not isinstance(record, DeflectionEstimate):
-        yield from _messages(record)
+        yield from _of_topics(record)
         return
     t_ns = record.t_ns
     fields = pose_stamped.from_estimate(record)
@@ -137,7 +152,7 @@ def messages(record: Record) -> Iterator[Message]:
         yield Message(DEFLECTION_WITH_COVARIANCE, pose_with_covariance_stamped.MESSAGE.name, t_ns, with_covariance)
 
 
-def _messages(record: Record) -> tuple[Message, ...]:
+def _of_topics(record: Record) -> tuple[Message, ...]:
     if isinstance(record, SampleBlock):
         return tuple(
             Message(SAMPLES, point_cloud2.MESSAGE.name, int(part.t_ns[0]), point_cloud2.from_block(part))

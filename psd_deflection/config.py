@@ -31,6 +31,9 @@ MAX_KEYS = 10_000
 
 EFFECTS_PREFIX = 'effects.'
 """Keys below it describe simulated effects; ``psd_deflection.simulation`` checks them."""
+FRAME_PREFIX = 'frame_prefix'
+SIMULATED = 'simulated'
+"""Set by the node: whether its samples are those of the simulated rig. A file of ``ros2 param dump`` has it too."""
 ROS_OWN = ('use_sim_time', 'start_type_description_service')
 QOS_OVERRIDES_PREFIX = 'qos_overrides.'
 LEAST_BITS, MOST_BITS = 8, 24
@@ -101,8 +104,9 @@ class PsdConfig:
         ('x', 'y'),
         '',
         'which channels of the device are its x and its y, with their signs: [-y, x] '
-        "(write 'y' in quotes: ROS takes a bare y for true)",
+        "(write +y, or 'y' in quotes: ROS takes a bare y for true)",
         choices=AXES,
+        synonyms=(('+x', 'x'), ('+y', 'y')),
     )
 
 
@@ -340,8 +344,17 @@ class AcquisitionConfig:
 
 @dataclass(frozen=True, slots=True)
 class MonitorConfig:
-    """What the user sees: markers in RViz and the live page."""
+    """What viewers get: frames, transforms, numbers to plot, markers in RViz and the live page."""
 
+    frame_prefix: str = parameter(
+        '', '', 'put before the name of every frame, in messages, recordings and transforms: left_ gives left_link_tip'
+    )
+    publish_tf: bool = parameter(
+        True, '', 'publish the frames on /tf and /tf_static (needs tf2_msgs, which comes with a ROS installation)'
+    )
+    publish_volts: bool = parameter(
+        False, '', 'publish each raw sample as plain numbers too, for plots (/psd_1/volts, /psd_2/volts)'
+    )
     markers: bool = parameter(False, '', 'publish link, plate, beams and dots for RViz (/link_tip/markers)')
     markers_magnify: float = parameter(
         10.0, '', 'factor by which the markers exaggerate displacements', above=0.0, maximum=1e4
@@ -459,9 +472,9 @@ class Rig:
 def rig_from_values(values: Mapping[str, object], source: str = 'parameters') -> Rig:
     """Make a :class:`Rig` from flat values; missing values take their defaults.
 
-    Parameters that every ROS node has are ignored, because ``ros2 param dump`` writes them too. Raises ConfigError
-    for an unknown key (with the nearest known one), a wrong type, a value out of bounds, or values that contradict
-    each other.
+    Parameters of the node that are not of the rig are ignored, because ``ros2 param dump`` writes them too. Raises
+    ConfigError for an unknown key (with the nearest known one), a wrong type, a value out of bounds, or values that
+    contradict each other.
     """
     return _rig({p.name: p.default for p in PARAMETERS}, {}, values, source)
 
@@ -490,7 +503,7 @@ def _rig(values: Mapping[str, Value], effects: Mapping[str, Any], changes: Mappi
             effects[key.removeprefix(EFFECTS_PREFIX)] = value
         elif key in BY_NAME:
             v[key] = check_value(BY_NAME[key], value, source)
-        elif key not in ROS_OWN and not key.startswith(QOS_OVERRIDES_PREFIX):
+        elif key not in (*ROS_OWN, SIMULATED) and not key.startswith(QOS_OVERRIDES_PREFIX):
             raise ConfigError(
                 f'{source}: {key} = {shown(value)}: no parameter of that name{did_you_mean(key, BY_NAME)}'
             )

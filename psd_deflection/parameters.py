@@ -223,7 +223,7 @@ def _numbers(parameter: Parameter, value: object) -> list[float]:
 
 def _strings(parameter: Parameter, value: object) -> list[str]:
     items = _items(parameter, value)
-    names = [item for item in items if isinstance(item, str)]
+    names = [item for item in map(parameter.meant, items) if isinstance(item, str)]
     if not names or len(names) != len(items):
         raise _RefusedError('must be a list of names')
     if parameter.choices is not None and not set(names) <= set(parameter.choices):

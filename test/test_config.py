@@ -59,6 +59,7 @@ def test_a_bad_value_is_refused_by_name(key: str, value: object, said: str) -> N
 def test_a_dump_of_a_node_is_a_parameter_file() -> None:
     of_every_node = {
         'use_sim_time': False,
+        'simulated': True,
         'start_type_description_service': True,
         'qos_overrides./diagnostics.publisher.depth': 10,
     }

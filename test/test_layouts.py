@@ -91,7 +91,7 @@ def test_the_sros2_policy() -> None:
     assert sorted(enclaves) == ['/psd/estimator', '/psd/operator', '/psd/viewer']
     of_every_node = {'/rosout', '/parameter_events'}
     topics = {t.text for t in root.iter('topic')} - of_every_node - {'*', '/link_tip/*'}
-    assert topics <= set(TOPIC_TYPES)
+    assert topics <= {*TOPIC_TYPES, names.TF, names.TF_STATIC}
     assert topics >= set(INPUTS)
     served = {name.replace('~', '/estimator') for name in names.SERVICES}
     requested = {

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.metadata
+import re
 import subprocess
 import sys
 import sysconfig
@@ -66,6 +68,54 @@ def test_the_version_is_the_same_everywhere() -> None:
     root = xml.etree.ElementTree.parse(ROOT / 'package.xml').getroot()
     assert root.findtext('version') == __version__
     assert f'## {__version__}' in (ROOT / 'CHANGELOG.md').read_text()
+
+
+FROM_PYPI = {
+    'cobs': 'python-cobs-pip',
+    # It brings the others.
+    **dict.fromkeys(('mcap', 'mcap_ros2', 'zstandard', 'lz4'), 'mcap-ros2-support'),
+}
+"""Imported name to the key by which rosdep knows it. The key of any other is ``python3-NAME``."""
+
+ROS_PACKAGES = {'rclpy', 'rcl_interfaces', 'launch', 'launch_ros'}
+
+UNNAMED = {
+    'rerun': 'an extra',
+    'shtab': 'completion in the shell, which says that it is missing; not in rosdep',
+    'cyclonedds': 'another DDS as judge; not in rosdep',
+    'rosbags': 'another reader as judge; from PyPI, so not forced on whoever builds the workspace',
+    'selenium': 'the page in a browser; not tested in a build of ROS',
+    **dict.fromkeys(('psd_deflection', 'msg_adapters', 'test', 'tools', 'bench', 'blind'), 'ours'),
+}
+"""What the sources import and package.xml does not name."""
+
+
+def imported(*folders: str) -> set[str]:
+    """Keys in package.xml of all that the sources below ``folders`` import. Messages the node loads by their names."""
+    names: set[str] = set()
+    for path in (p for folder in folders for p in (ROOT / folder).rglob('*.py')):
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.partition('.')[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names.add(node.module.partition('.')[0])
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and 'test' not in folders:
+                found = re.fullmatch(r'(\w+)(?:/msg/\w+|\.msg)', node.value)
+                names |= {found[1]} if found else set()
+    names -= {*sys.stdlib_module_names, *UNNAMED}
+    ros = {n for n in names if n in ROS_PACKAGES or n.endswith(('_msgs', '_srvs'))}
+    return ros | {FROM_PYPI.get(n, f'python3-{n}') for n in names - ros}
+
+
+def test_package_xml_names_what_the_sources_import() -> None:
+    root = xml.etree.ElementTree.parse(ROOT / 'package.xml').getroot()
+    runs, tests = ({e.text for e in root.iter(f'{kind}_depend')} for kind in ('exec', 'test'))
+    # ros2launch is the command that reads launch/.
+    assert runs == imported('psd_deflection', 'msg_adapters', 'launch') | {'ros2launch'}
+    # Plug-ins of pytest are named in its options only.
+    assert tests == (imported('test') - runs) | {'python3-pytest-timeout', 'python3-pytest-xdist'}
+    assert {e.get('type') for e in root.iter('url')} == {'website', 'repository', 'bugtracker'}
+    assert all(e.get('email') for e in root.iter('maintainer'))
 
 
 def rooms(package: Path) -> set[str]:

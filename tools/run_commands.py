@@ -114,7 +114,8 @@ QUICK = re.compile(
     r'|^psd-deflection simulate .*--(out|help)\b'
 )
 LIVE = re.compile(
-    r'^psd-deflection (estimator|monitor)\b|--serve\b|^make run\b|^ros2 (run|launch) psd_deflection estimator\b'
+    r'^psd-deflection (estimator|monitor)\b|--serve\b|^make run\b'
+    r'|^ros2 (run|launch) psd_deflection estimator\b(?!.*--show-args)'
 )
 ASKS = re.compile(r'^psd-deflection (echo|zero|record|load)\b')
 """Commands that speak to a running daemon."""

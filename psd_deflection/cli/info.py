@@ -54,7 +54,8 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     if found['namespace']:
         out.append(row('namespace', found['namespace']))
     if found['version']:
-        out.append(row('recorded by', f'psd_deflection {found["version"]}'))
+        by = f', node {found["node"]}' if found['node'] else ''
+        out.append(row('recorded by', f'psd_deflection {found["version"]}{by}'))
     if found['device_hello'] is not None:
         hello = {k: ' '.join(map(str, v)) if isinstance(v, list) else v for k, v in found['device_hello'].items()}
         out.append(row('device', ', '.join(f'{k} {v}' for k, v in hello.items())))

@@ -115,7 +115,7 @@ class ShownSession:
         except (TimeoutError, PsdDeflectionError) as error:
             raise RefusedError(str(error)) from None
         if folder is None:
-            return 'no recording was made'
+            return 'no recording runs'
         return f'recording to {folder}' if wanted else f'recording ended: {folder}'
 
     def load(self, fx: float, fy: float, tz: float, add: bool) -> str:

@@ -37,7 +37,7 @@ from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
 from psd_deflection.protocol.sequence import WRAP
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.allowance import Warnings
-from psd_deflection.recordings.bag_writer import META_CHANGE, META_HELLO, META_PARAMETERS, META_SOFTWARE
+from psd_deflection.recordings.bag_writer import META_CHANGE, META_HELLO, META_NODE, META_PARAMETERS, META_SOFTWARE
 from psd_deflection.recordings.clouds import CloudDecoder, Samples, joined_points
 from psd_deflection.recordings.mcap_reader import McapReader, RawMessage
 from psd_deflection.recordings.recording import EstimateSeries, Recording, from_json
@@ -82,7 +82,8 @@ class BagRecording(Recording):
             metadata.update(source.metadata)
         self.parameters = from_json(metadata.get(META_PARAMETERS, {}))
         self.hello = from_json(metadata[META_HELLO]) if META_HELLO in metadata else None
-        self.version = metadata.get(META_SOFTWARE, {}).get('version', '')
+        software = metadata.get(META_SOFTWARE, {})
+        self.version, self.node = software.get('version', ''), software.get(META_NODE, '')
         self.changes = self._changes_in(metadata)
         if META_PARAMETERS not in metadata:
             self._take_rig_of_messages()

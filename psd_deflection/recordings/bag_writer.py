@@ -23,6 +23,7 @@ from mcap.writer import CompressionType, Writer
 
 from msg_adapters import LATCHED, MESSAGE_TYPES, to_messages
 from psd_deflection import __version__
+from psd_deflection.config import FRAME_PREFIX
 from psd_deflection.errors import RecordingError, creating
 from psd_deflection.files import HeldFolder
 from psd_deflection.recordings import cdr
@@ -43,10 +44,11 @@ CHUNK_NS = 500_000_000
 """Largest log time that a chunk spans: together with the queues, a crash costs less than a second."""
 
 META_SOFTWARE = 'psd_deflection'
+META_NODE = 'node'
 META_PARAMETERS = 'psd_deflection.parameters'
 META_HELLO = 'psd_deflection.device_hello'
 META_CHANGE = 'psd_deflection.change.'
-"""Names of the MCAP metadata records; every value in the last three is JSON."""
+"""Names of the MCAP metadata records, and of a value in the first; every value in the last three is JSON."""
 
 
 _CHUNK_INDICES = '_Writer__chunk_indices'
@@ -99,6 +101,9 @@ class _IndexSpool:
 class _RecordSink(abc.ABC):
     """A sink of records that ``with`` closes."""
 
+    def __init__(self, rig_values: Mapping[str, object]) -> None:
+        self._frame_prefix = str(rig_values.get(FRAME_PREFIX, ''))
+
     @abc.abstractmethod
     def close(self) -> None: ...
 
@@ -113,7 +118,7 @@ class _RecordSink(abc.ABC):
         if isinstance(record, ParameterChange):
             self._change(record)
             return
-        for message in to_messages(record):
+        for message in to_messages(record, self._frame_prefix):
             self.write_encoded(message.topic, message.type, cdr.encode(message.type, message.fields), message.t_ns)
 
     def __enter__(self) -> Self:
@@ -130,7 +135,7 @@ class McapFile(_RecordSink):
     created, or the disk refuses to write. After such an error the file is closed and holds all
     complete chunks. While it is being written the file is locked (``flock``), so that no program repairs it.
     ``durable``: each chunk is written to the disk, not only to the operating system, before the next begins.
-    ``folder``: where the file is made, if its caller holds that folder.
+    ``folder``: where the file is made, if its caller holds that folder. ``node``: full name of the recorded ROS node.
     """
 
     def __init__(
@@ -141,7 +146,9 @@ class McapFile(_RecordSink):
         device_hello: Mapping[str, object] | None = None,
         durable: bool = False,
         folder: HeldFolder | None = None,
+        node: str = '',
     ) -> None:
+        super().__init__(rig_values)
         self.path = path
         self._durable = durable
         self.topics: dict[str, TopicCount] = {}
@@ -169,7 +176,7 @@ class McapFile(_RecordSink):
         with self._guard():
             self._spool = vars(self._writer)[_CHUNK_INDICES] = spool
             self._writer.start(profile='ros2', library=f'psd_deflection {__version__}')
-            self._writer.add_metadata(META_SOFTWARE, {'version': __version__})
+            self._writer.add_metadata(META_SOFTWARE, {'version': __version__, **({META_NODE: node} if node else {})})
             self._writer.add_metadata(META_PARAMETERS, parameters)
             if hello is not None:
                 self._writer.add_metadata(META_HELLO, hello)
@@ -309,7 +316,7 @@ class McapFile(_RecordSink):
 class BagWriter(_RecordSink):
     """A rosbag2 bag being written: ``NAME/NAME_0.mcap`` and so on, ``NAME/metadata.yaml`` at the end.
 
-    ``rig_values``: the flat parameter set, effects included.
+    ``rig_values``: the flat parameter set, effects included. ``node``: full name of the recorded ROS node.
     ``max_bytes``, ``max_s``: a file of this size, or with this span of log time, is closed and the
     next one begun (0: never); each file can be read alone. Raises RecordingError if the folder
     exists already or cannot be created; the calls raise it as in :class:`McapFile`.
@@ -324,13 +331,15 @@ class BagWriter(_RecordSink):
         max_bytes: int = 0,
         max_s: float = 0.0,
         durable: bool = False,
+        node: str = '',
     ) -> None:
+        super().__init__(rig_values)
         self.folder = Path(folder)
         with creating(self.folder):
             self.folder.mkdir(parents=True)
             self._held = HeldFolder(self.folder, follow=False)
         self._name = self.folder.resolve().name
-        self._rig_values, self._hello = rig_values, device_hello
+        self._rig_values, self._hello, self._node = rig_values, device_hello, node
         self._max_bytes, self._max_ns, self._durable = max_bytes, round(max_s * 1e9), durable
         self._number = 0
         self._ended: list[tuple[FileCount, list[TopicCount]]] = []
@@ -358,6 +367,7 @@ class BagWriter(_RecordSink):
             device_hello=self._hello,
             durable=self._durable,
             folder=self._held,
+            node=self._node,
         )
         self._number += 1
         return file

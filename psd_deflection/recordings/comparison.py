@@ -13,6 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from msg_adapters import DIAGNOSTICS, INPUTS, RIG, SAMPLES, pose_stamped, to_messages
+from psd_deflection.config import FRAME_PREFIX
 from psd_deflection.errors import RecordingError
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.recording import Recording
@@ -45,6 +46,7 @@ class Comparison:
         self._gapless = recording.version != '' and not recording.rig_from_messages
         self._between: dict[str, int] = {}
         self._recording = recording
+        self._frame_prefix = str(recording.parameters.get(FRAME_PREFIX, ''))
         self._complete = True
         self._recorded: dict[str, deque[tuple[int, bytes]]] = {t: deque() for t in topics}
         self._replayed: dict[str, deque[tuple[int, bytes]]] = {t: deque() for t in topics}
@@ -72,7 +74,7 @@ class Comparison:
         for record in records:
             if isinstance(record, ParameterChange):
                 continue
-            for topic, type_name, t_ns, fields in to_messages(record):
+            for topic, type_name, t_ns, fields in to_messages(record, self._frame_prefix):
                 if topic in self._replayed:
                     self._replayed[topic].append((t_ns, cdr.encode(type_name, fields)))
                 elif topic not in _NOT_ESTIMATED:

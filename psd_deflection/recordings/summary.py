@@ -66,6 +66,7 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
         'bytes': sum(f.stat().st_size for f in files),
         'namespace': recording.namespace,
         'version': recording.version,
+        'node': recording.node,
         'device_hello': recording.hello,
         'start_ns': first[1],
         'duration_s': (last[1] - first[1]) * 1e-9,

@@ -28,19 +28,21 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-from msg_adapters import DEFLECTION, DIAGNOSTICS, INPUTS, TOPIC_TYPES, solver_topic, to_messages
+from msg_adapters import DEFLECTION, DIAGNOSTICS, to_messages
+from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, Failed, PsdDeflectionError, Warned
 from psd_deflection.monitor.start import start_monitor
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
+from psd_deflection.ros.log import NodeLog
 from psd_deflection.ros.names import RECORD, ZERO
-from psd_deflection.ros.parameters import LiveParameters, rig_of_node
-from psd_deflection.ros.wires import InputRecorder, PublisherWire, RigPublisher, say_on_rosout
+from psd_deflection.ros.parameters import LiveParameters
+from psd_deflection.ros.transforms import TransformPublisher, installed
+from psd_deflection.ros.wires import InputRecorder, PublisherWire, RigPublisher, VoltsPublisher, topics_of
 from psd_deflection.runner.diagnostics import STALE, HealthReporter
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import Session, why_no_zero, zero_text
 from psd_deflection.runner.signals import Signals, StopRequestedError
-from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 
 if TYPE_CHECKING:
     from psd_deflection.monitor.server import MonitorServer
@@ -82,7 +84,7 @@ class _ManagedNode(LifecycleNode):  # type: ignore[misc]
 class EstimatorNode:
     """The node and, while it is configured, its session. Raises ConfigError if the parameters are refused."""
 
-    def __init__(self, overrides: Mapping[str, object], say: Callable[[str], None] | None, signals: Signals) -> None:
+    def __init__(self, overrides: Mapping[str, object], say: Callable[[str], None], signals: Signals) -> None:
         self.session: Session | None = None
         self.error: Exception | None = None
         self.finished = False
@@ -92,6 +94,8 @@ class EstimatorNode:
         self._health: HealthReporter | None = None
         self._monitor: MonitorServer | None = None
         self._rig_told: RigPublisher | None = None
+        self._markers: RigMarkers | None = None
+        self._transforms: TransformPublisher | None = None
         try:
             self.node = _ManagedNode(
                 NODE_NAME,
@@ -110,37 +114,41 @@ class EstimatorNode:
             raise ConfigError('ROS: ' + ' '.join(str(error).split())) from None
         self.node.owner = self
         try:
-            self._say = say_on_rosout(self.node, say) if say is not None else self.node.get_logger().info
-            self.rig = rig_of_node(self.node)
+            self._log = NodeLog(self.node, say)
+            self._say = self._log
             self._live = LiveParameters(self.node)
             self.node.create_service(Trigger, ZERO, self._zero)
             # In a separate group: while one request waits for the disk, the node serves everything else.
             self.node.create_service(SetBool, RECORD, self._record, callback_group=ReentrantCallbackGroup())
             self._survive_requests()
-            self._wire, self._inputs = self._wires()
+            self._wire, self._inputs = self._wires(self._live.rig)
             # A steady clock: health is published even if a simulated clock stops or the system clock is set.
             self.node.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
-            self._markers = self._make_markers()
         except BaseException:
             self.node.destroy_node()
             raise
 
-    def _wires(self) -> tuple[PublisherWire, InputRecorder]:
-        outputs = {topic: kind for topic, kind in TOPIC_TYPES.items() if topic not in INPUTS}
-        solvers = (*self.rig.estimator.solvers, ONE_PSD)
-        outputs.update({solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in solvers})
+    def _wires(self, rig: Rig) -> tuple[PublisherWire, InputRecorder]:
         try:
-            return PublisherWire(self.node, outputs), InputRecorder(self.node)
+            return PublisherWire(self.node, topics_of(rig)), InputRecorder(self.node)
         except (InvalidQosOverridesError, ValueError, RuntimeError) as error:
             raise ConfigError(f'ROS parameters: qos_overrides: {error}') from None
 
-    def _make_markers(self) -> RigMarkers | None:
-        if not self.rig.monitor.markers:
-            return None
-        # Imported here: only the markers need visualization_msgs.
-        from psd_deflection.ros.markers import RigMarkers
+    def _make_views(self, session: Session) -> None:
+        """What the parameters ask for beside the messages of the records."""
+        shown = session.rig.monitor
+        if shown.publish_volts:
+            session.processing.sinks.append(VoltsPublisher(self._wire, shown.frame_prefix))
+        if shown.publish_tf and not installed():
+            self._say('tf2_msgs is not installed: no frames on /tf (publish_tf)')
+        elif shown.publish_tf:
+            self._transforms = TransformPublisher(self.node, session.rig)
+            session.processing.sinks.append(self._transforms)
+        if shown.markers:
+            # Imported here: only the markers need visualization_msgs.
+            from psd_deflection.ros.markers import RigMarkers
 
-        return RigMarkers(self.node, self.rig)
+            self._markers = RigMarkers(self.node, session.rig)
 
     def _survive_requests(self) -> None:
         """Answer a failed request and log the error, instead of ending the node.
@@ -188,7 +196,7 @@ class EstimatorNode:
         """Configure and activate, if ``autostart`` is set. Raises the error of a failed transition."""
         if self.node.get_parameter('use_sim_time').value:
             self._say(Warned('use_sim_time is true: what is measured is stamped by the system clock all the same'))
-        if not self.rig.acquisition.autostart:
+        if not self._live.rig.acquisition.autostart:
             self._say(f'waiting to be configured: ros2 lifecycle set {self.node.get_fully_qualified_name()} configure')
             return
         self._starting = True
@@ -199,15 +207,18 @@ class EstimatorNode:
 
     def configure(self) -> None:
         """Open the port and let samples flow; nothing is published yet."""
-        session = self._signals.interruptible(lambda: Session(self.rig, self._say))
+        node, rig, unzeroed = self.node.get_fully_qualified_name(), self._live.rig, self._live.unzeroed
+        self._wire.offer(topics_of(rig))
+        session = self._signals.interruptible(lambda: Session(rig, self._say, node, unzeroed))
         self.session = session
         try:
             self._live.session = session
-            self._live.show(session.rig)
+            self._live.show()
             self._health = HealthReporter(session)
             session.fanout.wires.insert(0, self._wire)
             self._rig_told = RigPublisher(self._wire, session)
             session.fanout.change_wires.append(self._rig_told)
+            self._make_views(session)
             self._inputs.session = session
             session.start()
             self._monitor = start_monitor(session, self._say)
@@ -218,10 +229,14 @@ class EstimatorNode:
     def activate(self) -> None:
         """Publish."""
         self._wire.active = True
+        if self._transforms is not None:
+            self._transforms.active = True
         if self._rig_told is not None:
             self._rig_told.tell()
         if self._markers is not None:
             self._markers.session = self.session
+        if self.node.get_namespace() != '/' and not self._live.rig.monitor.frame_prefix:
+            self._say('frames have no prefix: where several rigs run, give each its own (frame_prefix)')
         domain = os.environ.get('ROS_DOMAIN_ID') or '0'
         node = self.node.get_fully_qualified_name()
         topics = ', '.join(self._wire.names((DEFLECTION, '/link_tip/wrench', '/psd/samples', DIAGNOSTICS)))
@@ -233,8 +248,10 @@ class EstimatorNode:
         self._say('not publishing; reading and recording go on')
 
     def release(self) -> None:
-        """End the session, and log it."""
+        """End the session, and log it. The parameters keep what changed while it ran."""
+        self._live.show()
         self.cleanup()
+        self._live.show()
         self._say('not configured: the port is free')
 
     def finish(self) -> None:
@@ -256,9 +273,15 @@ class EstimatorNode:
         session, self.session = self.session, None
         if session is not None:
             session.close()
+        for view in (self._markers, self._transforms):
+            if view is not None:
+                view.close()
+        self._markers = self._transforms = None
 
     def _silence(self) -> None:
         self._wire.active = False
+        if self._transforms is not None:
+            self._transforms.active = False
         if self._markers is not None:
             self._markers.session = None
 
@@ -275,9 +298,8 @@ class EstimatorNode:
         if change is None:
             response.message = f'not zeroed: {why_no_zero(self.session.pipeline)}'
             return response
-        rig = self.session.rig
-        self._live.show(rig)
-        response.success, response.message = True, zero_text(rig)
+        self._live.show()
+        response.success, response.message = True, zero_text(self.session.rig)
         return response
 
     async def _record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
@@ -296,7 +318,7 @@ class EstimatorNode:
             return response
         response.success = True
         verb = 'recording to' if request.data else 'recording ended:'
-        response.message = f'{verb} {folder}' if folder is not None else 'no recording was made'
+        response.message = f'{verb} {folder}' if folder is not None else 'no recording runs'
         return response
 
     def _look_for_others(self) -> None:
@@ -312,7 +334,7 @@ class EstimatorNode:
         self._look_for_others()
         if self.session is not None and self._health is not None:
             # The page may have taken a zero as well.
-            self._live.show(self.session.rig)
+            self._live.show()
             if self._rig_told is not None:
                 self._rig_told.tell(again=False)
             # In the time of the samples, so that a recording has one time even if the system clock is set.
@@ -324,23 +346,22 @@ class EstimatorNode:
         self._wire.put(message.topic, message.type, cdr.encode(message.type, message.fields), now)
 
     def _named(self, report: DiagnosticReport) -> DiagnosticReport:
-        """``report`` with this node's name if that is not the usual one, to distinguish two rigs."""
+        """``report`` with this node's name, as diagnostic_updater names its own, to distinguish two rigs."""
         node = self.node.get_fully_qualified_name().removeprefix('/')
-        if node == NODE_NAME:
-            return report
         entries = (e._replace(name=e.name.replace('psd_deflection', node, 1)) for e in report.entries)
         return report._replace(entries=tuple(entries))
 
     def close(self) -> None:
         """End the session, then the node."""
         self.cleanup()
+        self._log.close()
         self.node.destroy_node()
 
 
 def run(
     ros_args: Sequence[str],
     overrides: Mapping[str, object],
-    say: Callable[[str], None] | None = None,
+    say: Callable[[str], None],
     while_running: Callable[[Session], None] | None = None,
 ) -> int:
     """Run the node until SIGINT or SIGTERM, however often they come.

@@ -1,4 +1,4 @@
-"""Markers for RViz: link, plate, detectors, beams and dots, and the transforms if tf2 is installed.
+"""Markers for RViz: link, plate, detectors, beams and dots.
 
 They are published if the parameter ``markers`` is on. Static parts (beams, lasers, link at rest) are
 latched, so that an RViz started later shows them. Moving parts are removed if there is no estimate, and
@@ -8,14 +8,12 @@ metre, so displacements are drawn ``markers_magnify`` times as large; the transf
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import time
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Point, Quaternion, TransformStamped
+from geometry_msgs.msg import Point, Quaternion
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from visualization_msgs.msg import Marker, MarkerArray
@@ -24,7 +22,7 @@ from msg_adapters.orientation import quaternion
 from psd_deflection.config import Rig
 from psd_deflection.geometry.scene import Vector, bend, tip_boxes
 from psd_deflection.records import DeflectionEstimate, SpotMeans
-from psd_deflection.ros.names import BASE, MARKERS, MARKERS_AT_REST, REST, TIP
+from psd_deflection.ros.names import BASE, MARKERS, MARKERS_AT_REST
 from psd_deflection.ros.wires import qos, relative
 from psd_deflection.runner.session import Session
 
@@ -43,7 +41,6 @@ def _marker(
     number: int, name: str, kind: int, color: Sequence[float], scale: Vector, at: Vector = (0.0, 0.0, 0.0)
 ) -> Any:
     marker = Marker(ns=name, id=number, type=kind, action=Marker.ADD)
-    marker.header.frame_id = BASE
     marker.pose.position = Point(x=at[0], y=at[1], z=at[2])
     marker.scale.x, marker.scale.y, marker.scale.z = scale
     marker.color.r, marker.color.g, marker.color.b, marker.color.a = color
@@ -68,7 +65,7 @@ def at_rest(rig: Rig) -> Any:
         beam = _marker(i, 'beam', Marker.LINE_LIST, (*_LASER[:3], 0.7), (0.0015, 0.0, 0.0))
         beam.points = [Point(x=x, y=y, z=0.0), Point(x=x, y=y, z=length + psd.height)]
         out.append(beam)
-    return MarkerArray(markers=out)
+    return _of_rig(rig, out)
 
 
 def moving(rig: Rig, estimate: DeflectionEstimate | None, spots: SpotMeans, magnify: float) -> Any:
@@ -107,17 +104,13 @@ def moving(rig: Rig, estimate: DeflectionEstimate | None, spots: SpotMeans, magn
         marker.lifetime.sec, marker.lifetime.nanosec = seconds, nanoseconds
         if estimate is None:
             marker.action = Marker.DELETE
-    return MarkerArray(markers=out)
+    return _of_rig(rig, out)
 
 
-def transform(parent: str, child: str, t_ns: int, at: Vector, rotation: dict[str, float]) -> Any:
-    """One TransformStamped."""
-    out = TransformStamped(child_frame_id=child)
-    out.header.frame_id = parent
-    out.header.stamp.sec, out.header.stamp.nanosec = divmod(t_ns, 1_000_000_000)
-    out.transform.translation.x, out.transform.translation.y, out.transform.translation.z = at
-    out.transform.rotation = Quaternion(**rotation)
-    return out
+def _of_rig(rig: Rig, markers: list[Any]) -> Any:
+    for marker in markers:
+        marker.header.frame_id = rig.monitor.frame_prefix + BASE
+    return MarkerArray(markers=markers)
 
 
 class RigMarkers:
@@ -128,26 +121,14 @@ class RigMarkers:
 
     def __init__(self, node: Node, rig: Rig) -> None:
         self.session: Session | None = None
+        self._node = node
         self._magnify = rig.monitor.markers_magnify
         self._seen = 0
         self._at_rest = node.create_publisher(MarkerArray, relative(MARKERS_AT_REST), qos(MARKERS_AT_REST))
         self._moving = node.create_publisher(MarkerArray, relative(MARKERS), qos(MARKERS))
         self._at_rest.publish(at_rest(rig))
         self._rest_of = rig
-        self._tf: Any = None
-        # tf2_msgs comes with a ROS installation, not with the wheels.
-        if importlib.util.find_spec('tf2_msgs') is not None:
-            from tf2_msgs.msg import TFMessage
-
-            self._tf_message = TFMessage
-            self._tf = node.create_publisher(TFMessage, '/tf', 10)
-            self._tf_static = node.create_publisher(TFMessage, '/tf_static', qos(MARKERS_AT_REST))
-            now = time.time_ns()
-            upright = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
-            self._tf_static.publish(
-                TFMessage(transforms=[transform(BASE, REST, now, (0.0, 0.0, rig.link.length), upright)])
-            )
-        node.create_timer(PERIOD_S, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._timer = node.create_timer(PERIOD_S, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _publish(self) -> None:
         session = self.session
@@ -161,7 +142,9 @@ class RigMarkers:
             self._rest_of = session.rig
             self._at_rest.publish(at_rest(session.rig))
         self._moving.publish(moving(session.rig, estimate, spots, self._magnify))
-        if self._tf is not None and estimate is not None:
-            rotation = quaternion(estimate.theta, estimate.phi, estimate.omega)
-            at = (estimate.dx, estimate.dy, 0.0)
-            self._tf.publish(self._tf_message(transforms=[transform(REST, TIP, estimate.t_ns, at, rotation)]))
+
+    def close(self) -> None:
+        """Take the publishers off the graph."""
+        self._node.destroy_timer(self._timer)
+        for publisher in (self._at_rest, self._moving):
+            self._node.destroy_publisher(publisher)

@@ -16,6 +16,8 @@ class Delivery(NamedTuple):
     latched: bool = False
 
 
+TF, TF_STATIC = '/tf', '/tf_static'
+VOLTS = ('/psd_1/volts', '/psd_2/volts')
 MARKERS = '/link_tip/markers'
 MARKERS_AT_REST = '/link_tip/markers_at_rest'
 _LATCHED = Delivery(depth=1, latched=True)
@@ -25,6 +27,10 @@ _SAMPLES_DEPTH = 50
 
 _DELIVERY: Mapping[str, Delivery] = {
     SAMPLES: Delivery(_SAMPLES_DEPTH),
+    # A block's samples come at once.
+    **dict.fromkeys(VOLTS, Delivery(20 * _SAMPLES_DEPTH)),
+    TF: Delivery(100),
+    TF_STATIC: _LATCHED,
     MARKERS_AT_REST: _LATCHED,
     **dict.fromkeys(LATCHED, _LATCHED),
     **{topic: Delivery(_SAMPLES_DEPTH, reliable=False) for topic in INPUTS},
@@ -41,4 +47,5 @@ SERVICES = (ZERO, RECORD)
 """Services of the node; ``~`` stands for the node's name."""
 
 BASE, REST, TIP = 'link_base', 'link_tip_rest', 'link_tip'
-"""Frames: the clamp, the unloaded tip, the tip."""
+PSDS = ('psd_1', 'psd_2')
+"""Frames: the clamp, the unloaded tip, the tip, the PSDs."""

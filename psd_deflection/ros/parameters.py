@@ -2,9 +2,12 @@
 
 Values from the command line, a launch file or a parameter file reach the node as overrides.
 :func:`rig_from_values` validates them as everywhere else: ``0`` for a length is refused by name, and a
-whole number is accepted for a ``double``. The pipeline validates a change while the node runs, because it
-knows which values depend on each other. The descriptors come from the declarations; with them rclpy
-refuses read-only parameters, wrong types and values out of range.
+whole number is accepted for a ``double``. The descriptors come from the declarations; with them rclpy
+refuses wrong types and values out of range.
+
+While the node is unconfigured every parameter may be set; configuring reads them. While it is configured only the
+live ones may; the pipeline validates these, because it knows which values depend on each other. What was set
+stays when the node is cleaned up.
 """
 
 from __future__ import annotations
@@ -12,15 +15,39 @@ from __future__ import annotations
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from psd_deflection.config import BY_NAME, PARAMETERS, Rig, rig_from_values
-from psd_deflection.errors import ConfigError
+from psd_deflection.config import (
+    BY_NAME,
+    PARAMETERS,
+    PSDS,
+    QOS_OVERRIDES_PREFIX,
+    ROS_OWN,
+    SIMULATED,
+    ZEROS,
+    Rig,
+    replace_values,
+    rig_from_values,
+)
+from psd_deflection.devices.registry import source_names
+from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.parameters import Parameter
 from psd_deflection.runner.session import Session
+from psd_deflection.solvers.registry import SOLVERS, check_live, solver_class
 
 SOURCE = 'ROS parameters'
+_AXES = [section.parameters['axes'] for section in PSDS]
+
+_READ = 'read when the node is configured'
+_AT_START = {'autostart': 'read at the start of the process'}
+
+_SIMULATED = ParameterDescriptor(
+    name=SIMULATED,
+    description='whether the samples are those of the simulated rig that the node started, because no port is given',
+    additional_constraints='set by the node',
+)
 
 
 def rig_of_node(node: Node) -> Rig:
@@ -31,13 +58,23 @@ def rig_of_node(node: Node) -> Rig:
     """
     given = {name: _plain(parameter) for name, parameter in node.get_parameters_by_prefix('').items()}
     rig = rig_from_values(given, SOURCE)
-    for parameter in PARAMETERS:
+    shown = _ros_values(rig)
+    values = {p.name: (shown[p.name], _descriptor(p)) for p in PARAMETERS}
+    for name, (value, descriptor) in {**values, SIMULATED: (False, _SIMULATED)}.items():
         # rclpy tells of overrides that nobody declares (a mistyped name) only by declaring them, and then without
         # descriptor and with the type as it was typed.
-        if parameter.name in given:
-            node.undeclare_parameter(parameter.name)
-        node.declare_parameter(parameter.name, rig.values[parameter.name], _descriptor(parameter), ignore_override=True)
+        if name in given:
+            node.undeclare_parameter(name)
+        node.declare_parameter(name, value, descriptor, ignore_override=True)
     return rig
+
+
+def _ros_values(rig: Rig) -> dict[str, Any]:
+    """The values by name. Signs are written out, because rcl does not read the bare y that `ros2 param dump` writes."""
+    signed = {
+        p.name: [a if a.startswith('-') else f'+{a}' for a in psd.axes] for p, psd in zip(_AXES, rig.psds, strict=True)
+    }
+    return {**rig.values, **signed}
 
 
 def _plain(parameter: RosParameter) -> Any:
@@ -49,8 +86,9 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
         name=parameter.name,
         description=parameter.description + (f' [{parameter.unit}]' if parameter.unit else ''),
-        additional_constraints=parameter.bound_text(),
-        read_only=not parameter.live,
+        additional_constraints='; '.join(
+            filter(None, (_bound_text(parameter), '' if parameter.live else _AT_START.get(parameter.name, _READ)))
+        ),
     )
     low = parameter.minimum if parameter.minimum is not None else parameter.above
     if low is not None and parameter.maximum is not None:
@@ -61,31 +99,61 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     return descriptor
 
 
-def _without_synonyms(changed: list[RosParameter]) -> list[RosParameter]:
-    out = []
-    for parameter in changed:
-        meant = BY_NAME[parameter.name].meant(parameter.value) if parameter.name in BY_NAME else parameter.value
-        out.append(parameter if meant is parameter.value else RosParameter(parameter.name, value=meant))
-    return out
+def _bound_text(parameter: Parameter) -> str:
+    """Bounds or choices in words; also those that other rooms' registries add to the declaration."""
+    if parameter.name == 'source':
+        return f'one of {", ".join(source_names())}'
+    if parameter.name == 'solver':
+        return f'one of {", ".join(name for name, entry in SOLVERS.items() if not entry.instead)}'
+    if parameter.name == 'solvers':
+        return f'each one of {", ".join(SOLVERS)}'
+    return parameter.bound_text()
+
+
+def _check_solvers(rig: Rig) -> None:
+    check_live(rig.estimator.solver)
+    for name in rig.estimator.solvers:
+        solver_class(name)
+
+
+class _UnknownParameterError(ParameterNotDeclaredException):  # type: ignore[misc]
+    """Its text is the answer of the service. rclpy's own lists no names, and it takes an empty name for a known one."""
+
+    def __init__(self, name: str) -> None:
+        Exception.__init__(self, f'{name!r}: no parameter of that name{did_you_mean(name, BY_NAME)}')
 
 
 class LiveParameters:
-    """Carries out changes of the parameters that may change while the node runs; refuses the others."""
+    """Carries out changes of the node's parameters, or refuses them.
+
+    ``rig``: as the parameters describe it. ``session``: the one that runs while the node is configured, or None.
+    """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._showing = False
+        self.rig = rig_of_node(node)
+        self._zeros = {name: self.rig.values[name] for name in ZEROS}
         self.session: Session | None = None
-        # Before rclpy refuses the type of a synonym: `ros2 param set … degraded off` sends false.
-        node.add_pre_set_parameters_callback(_without_synonyms)
+        node.add_pre_set_parameters_callback(self._known)
         node.add_on_set_parameters_callback(self._change)
 
-    def show(self, rig: Rig) -> None:
+    @property
+    def unzeroed(self) -> Rig:
+        """``rig`` with the zero that it was given, without one that was taken while the node ran."""
+        return replace_values(self.rig, self._zeros, SOURCE)
+
+    def show(self) -> None:
         """Set the node's parameters to the present values of the rig, so that a new zero can be read there."""
+        session = self.session
+        if session is not None:
+            live = {p.name: session.rig.values[p.name] for p in PARAMETERS if p.live}
+            self.rig = replace_values(self.rig, live, SOURCE)
+        simulated = session is not None and session.simulated
         changed = [
-            RosParameter(p.name, value=rig.values[p.name])
-            for p in PARAMETERS
-            if p.live and _plain(self._node.get_parameter(p.name)) != rig.values[p.name]
+            RosParameter(name, value=value)
+            for name, value in {**_ros_values(self.rig), SIMULATED: simulated}.items()
+            if _plain(self._node.get_parameter(name)) != value
         ]
         self._showing = True
         try:
@@ -93,23 +161,51 @@ class LiveParameters:
         finally:
             self._showing = False
 
+    def _known(self, changed: list[RosParameter]) -> list[RosParameter]:
+        """``changed`` without synonyms, whose type rclpy would refuse: `ros2 param set … degraded off` sends false."""
+        out = []
+        for parameter in changed:
+            if not parameter.name or not self._node.has_parameter(parameter.name):
+                raise _UnknownParameterError(parameter.name)
+            meant = BY_NAME[parameter.name].meant(parameter.value) if parameter.name in BY_NAME else parameter.value
+            out.append(parameter if meant is parameter.value else RosParameter(parameter.name, value=meant))
+        return out
+
     def _change(self, changed: list[RosParameter]) -> SetParametersResult:
         if self._showing:
             return SetParametersResult(successful=True)
-        values: dict[str, Any] = {}
-        for parameter in changed:
-            if parameter.name in BY_NAME:
-                value = _plain(parameter)
-                values[parameter.name] = tuple(value) if isinstance(value, list) else value
-        if not values:
-            return SetParametersResult(successful=True)
-        if self.session is None:
-            return SetParametersResult(successful=False, reason='not changed: the node is not configured')
+        values = {p.name: _plain(p) for p in changed if p.name not in ROS_OWN}
+        values = {n: v for n, v in values.items() if not n.startswith(QOS_OVERRIDES_PREFIX)}
         try:
-            # All of them or none, between two blocks.
-            self.session.change(values)
+            self._take(values)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         except TimeoutError as error:
             return SetParametersResult(successful=False, reason=f'not changed: {error}')
         return SetParametersResult(successful=True)
+
+    def _take(self, values: dict[str, Any]) -> None:
+        """Set all of ``values`` or none. Raises ConfigError or, if no data flows, TimeoutError."""
+        # A file that `ros2 param dump` wrote names every parameter; only those that differ are changes.
+        new = {n: v for n, v in values.items() if v != _plain(self._node.get_parameter(n))}
+        for name in new:
+            if name == SIMULATED:
+                raise ConfigError(f'{name}: is set by the node')
+            if name in _AT_START:
+                raise ConfigError(f'{name}: is {_AT_START[name]}')
+        if not new:
+            return
+        if self.session is None:
+            rig = replace_values(self.rig, new, SOURCE)
+            _check_solvers(rig)
+            self.rig = rig
+            self._zeros |= {name: rig.values[name] for name in ZEROS if name in new}
+            return
+        fixed = [name for name in new if name not in BY_NAME or not BY_NAME[name].live]
+        if fixed:
+            node = self._node.get_fully_qualified_name()
+            raise ConfigError(
+                f'{", ".join(fixed)}: is {_READ}; first ros2 lifecycle set {node} deactivate, then cleanup'
+            )
+        # All of them or none, between two blocks.
+        self.session.change({n: tuple(v) if isinstance(v, list) else v for n, v in new.items()})

@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-from rcl_interfaces.msg import Log
-from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from msg_adapters import DIAGNOSTICS, INPUTS, TOPIC_TYPES, to_messages
+from msg_adapters import (
+    DEFLECTION,
+    DIAGNOSTICS,
+    INPUTS,
+    TOPIC_TYPES,
+    solver_topic,
+    to_messages,
+    vector3_stamped,
+)
 from psd_deflection import __version__
-from psd_deflection.errors import Failed, Warned
+from psd_deflection.config import Rig
 from psd_deflection.recordings import cdr
-from psd_deflection.records import ENVIRONMENT, ParameterChange, RigState, TemperatureReading
-from psd_deflection.ros.names import delivery
+from psd_deflection.records import ENVIRONMENT, ParameterChange, Record, RigState, SampleBlock, TemperatureReading
+from psd_deflection.ros.names import VOLTS, delivery
 from psd_deflection.runner.session import Session
+from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 
 MAX_INPUT_BYTES = 4096
 """Maximum size of a message of another node that we record, bytes; valid ones have some hundred bytes."""
@@ -51,16 +57,30 @@ def qos(topic: str) -> QoSProfile:
     )
 
 
+def topics_of(rig: Rig) -> dict[str, str]:
+    """The topics that a node of ``rig`` publishes encoded messages on, with their types."""
+    outputs = {topic: kind for topic, kind in TOPIC_TYPES.items() if topic not in INPUTS}
+    outputs |= {solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in (*rig.estimator.solvers, ONE_PSD)}
+    return outputs | (dict.fromkeys(VOLTS, vector3_stamped.MESSAGE.name) if rig.monitor.publish_volts else {})
+
+
 class PublisherWire:
     """Publishes encoded messages: a wire of the fan-out. While it is not ``active``, diagnostics alone."""
 
     def __init__(self, node: Node, topics: Mapping[str, str]) -> None:
         self.active = False
-        options = QoSOverridingOptions.with_default_policies()
+        self._node = node
         self._publishers: dict[str, Publisher] = {}
-        for topic, type_name in topics.items():
-            self._publishers[topic] = node.create_publisher(
-                message_class(type_name), relative(topic), qos(topic), qos_overriding_options=options
+        self.offer(topics)
+
+    def offer(self, topics: Mapping[str, str]) -> None:
+        """Publish exactly these topics (name to type) from now on. Only while no session runs."""
+        for topic in [t for t in self._publishers if t not in topics]:
+            self._node.destroy_publisher(self._publishers.pop(topic))
+        options = QoSOverridingOptions.with_default_policies()
+        for topic in [t for t in topics if t not in self._publishers]:
+            self._publishers[topic] = self._node.create_publisher(
+                message_class(topics[topic]), relative(topic), qos(topic), qos_overriding_options=options
             )
 
     def names(self, topics: Iterable[str]) -> list[str]:
@@ -71,6 +91,22 @@ class PublisherWire:
         """Publish; the stamp is in the message."""
         if self.active or topic == DIAGNOSTICS:
             self._publishers[topic].publish(cdr)
+
+
+class VoltsPublisher:
+    """A sink of records: each raw sample as plain numbers, which plots draw; the bag has them as ``/psd/samples``."""
+
+    def __init__(self, wire: PublisherWire, frame_prefix: str) -> None:
+        self._wire = wire
+        self._frame_prefix = frame_prefix
+        self._encode = cdr.encoder_of(vector3_stamped.MESSAGE)
+
+    def put(self, record: Record) -> None:
+        """Publish the samples of a block."""
+        if isinstance(record, SampleBlock) and self._wire.active:
+            for psd, topic in enumerate(VOLTS, 1):
+                for t_ns, fields in vector3_stamped.from_block(record, psd, self._frame_prefix):
+                    self._wire.put(topic, vector3_stamped.MESSAGE.name, self._encode(fields), t_ns)
 
 
 class RigPublisher:
@@ -106,35 +142,6 @@ class RigPublisher:
         state = RigState(self._last.t_ns, self._last.block, self._session.rig.flat(), self._told, changed, __version__)
         for message in to_messages(state):
             self._wire.put(message.topic, message.type, cdr.encode(message.type, message.fields), time.time_ns())
-
-
-def severity(text: str) -> LoggingSeverity:
-    """Severity of a line that a session says."""
-    if isinstance(text, Failed):
-        return LoggingSeverity.ERROR
-    return LoggingSeverity.WARN if isinstance(text, Warned) else LoggingSeverity.INFO
-
-
-def say_on_rosout(node: Node, say: Callable[[str], None]) -> Callable[[str], None]:
-    """Call ``say`` and also write the line to ``/rosout``: the terminal's lines do not go through the ROS log."""
-    as_every_node = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    publisher = node.create_publisher(Log, '/rosout', as_every_node)
-    logger = node.get_logger()
-    name = logger.name
-
-    def both(text: str) -> None:
-        level = severity(text)
-        # What --log-level leaves out.
-        if not logger.is_enabled_for(level):
-            return
-        say(text)
-        line = Log(level=int(level), name=name, msg=text)
-        line.stamp.sec, line.stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
-        # An abandoned thread may log a line after the node is gone.
-        with contextlib.suppress(RuntimeError):
-            publisher.publish(line)
-
-    return both
 
 
 class InputRecorder:

@@ -366,8 +366,10 @@ class Acquisition:
                     self.counters.clock_jumps += 1
                     self._repeats.tell(
                         'lag',
-                        f"{self._name}: the device's clock stands still, or falls behind its sample numbers; "
-                        'the time map starts again',
+                        Warned(
+                            f"{self._name}: the device's clock stands still, or falls behind its sample numbers; "
+                            'the time map starts again'
+                        ),
                         now / 1e9,
                         NEWS,
                     )
@@ -388,7 +390,7 @@ class Acquisition:
     def _jumped(self, now: int) -> None:
         self.counters.clock_jumps += 1
         self._repeats.tell(
-            'jump', f"{self._name}: the device's clock jumped; the time map starts again", now / 1e9, NEWS
+            'jump', Warned(f"{self._name}: the device's clock jumped; the time map starts again"), now / 1e9, NEWS
         )
 
     def _unusual(self, number: int, step: Step, missing: int, flags: int, now: int) -> bool:

@@ -81,6 +81,8 @@ class HealthReporter:
         s = self._session
         wire = s.acquisition.counters
         level, message = OK, 'samples flow'
+        if s.simulated:
+            level, message = WARN, 'samples of the simulated rig flow: no port is given'
         if new.samples == 0:
             level, message = ERROR, 'no samples'
         elif new.lost or new.bad or new.dropped:

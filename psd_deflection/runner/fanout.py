@@ -24,9 +24,10 @@ class ChangeWire(Protocol):
 
 
 class Fanout:
-    """A sink of records. ``wires`` in the order in which they are served."""
+    """A sink of records. ``wires`` in the order in which they are served. ``frame_prefix``: before names of frames."""
 
-    def __init__(self) -> None:
+    def __init__(self, frame_prefix: str = '') -> None:
+        self._frame_prefix = frame_prefix
         self.wires: list[Wire] = []
         self.change_wires: list[ChangeWire] = []
 
@@ -38,7 +39,7 @@ class Fanout:
             return
         last: object = None
         encoded = b''
-        for topic, type_name, t_ns, fields in messages(record):
+        for topic, type_name, t_ns, fields in messages(record, self._frame_prefix):
             # The same message on two topics is encoded once.
             if fields is not last:
                 last, encoded = fields, cdr.encode(type_name, fields)

@@ -84,7 +84,8 @@ class Recorder:
     """Makes one recording at a time; a wire like any other. ``say`` gets a line if a recording ends by itself.
 
     ``between_blocks`` runs an action in the thread that calls the wires (``Processing.request``).
-    ``failure``: why the last recording ended by itself, empty while all is well; for diagnostics.
+    ``node``: full name of the recorded ROS node. ``failure``: why the last recording
+    ended by itself, empty while all is well; for diagnostics.
     """
 
     def __init__(
@@ -92,7 +93,9 @@ class Recorder:
         queue_blocks: int,
         say: Callable[[str], None],
         between_blocks: Callable[[Callable[[], None]], None],
+        node: str = '',
     ) -> None:
+        self._node = node
         self.dropped = 0
         self.written = 0
         self.files_deleted = 0
@@ -268,6 +271,7 @@ class Recorder:
                     max_bytes=config.bag_max_bytes,
                     max_s=config.bag_max_duration,
                     durable=True,
+                    node=self._node,
                 )
             except RecordingError as error:
                 raise RecordingError(f'{error}; {ELSEWHERE}') from None

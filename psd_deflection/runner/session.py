@@ -67,12 +67,13 @@ def why_no_zero(pipeline: Pipeline) -> str:
 class Session:
     """Opens the device on construction. ``say`` and every function in ``listeners`` get one line for each
     change of state, from any thread. ``input_sinks`` get known loads, references and temperatures as they come.
-    ``load``: the known load that is held now, or None.
+    ``load``: the known load that is held now, or None. ``node``: full name of the ROS node, for recordings.
+    ``unzeroed``: ``rig`` with the zero that it was given, if it has one that was taken in an earlier session.
 
     Raises DeviceError, ConfigError, SolverError or RecordingError if the run cannot start.
     """
 
-    def __init__(self, rig: Rig, say: Callable[[str], None]) -> None:
+    def __init__(self, rig: Rig, say: Callable[[str], None], node: str = '', unzeroed: Rig | None = None) -> None:
         self._simulated: SimulatedRigProcess | None = None
         self._closed = False
         self.listeners: list[Callable[[str], None]] = [say]
@@ -103,7 +104,7 @@ class Session:
             self._store: ZeroStore | None = None
             # Our own simulated rig starts unloaded, so no kept zero applies.
             if rig.acquisition.keep_zero and not self.simulated:
-                self._store = ZeroStore(rig, hello.info.get('serial') if hello is not None else None)
+                self._store = ZeroStore(unzeroed or rig, hello.info.get('serial') if hello is not None else None)
                 rig, about = self._store.load(rig)
                 if about:
                     say(about)
@@ -111,8 +112,8 @@ class Session:
                     pipeline.tip_loads.zeroed = self._store.loaded
             say('; '.join(f'{name}: {what}' for name, what in self.acquisition.source.describe().items()))
             self.processing = Processing(self.acquisition.queue, pipeline, say)
-            self.recorder = Recorder(rig.acquisition.queue_blocks, say, self.processing.request)
-            self.fanout = Fanout()
+            self.recorder = Recorder(rig.acquisition.queue_blocks, say, self.processing.request, node)
+            self.fanout = Fanout(rig.monitor.frame_prefix)
             self.fanout.change_wires.append(self.recorder)
             self.processing.sinks.append(self.fanout)
         except BaseException:

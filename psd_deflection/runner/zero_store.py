@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from psd_deflection.config import BY_NAME, ZEROS, Rig, replace_values
-from psd_deflection.errors import ConfigError
+from psd_deflection.errors import ConfigError, Failed, Warned
 from psd_deflection.files import replace_file
 from psd_deflection.parameters import check_value
 
@@ -66,11 +66,13 @@ class ZeroStore:
         except FileNotFoundError:
             return rig, ''
         except (OSError, ValueError, RecursionError, ConfigError) as error:
-            return rig, f'{self.path}: the kept zero cannot be used ({error}); the rig file holds'
+            return rig, Warned(f'{self.path}: the kept zero cannot be used ({error}); the rig file holds')
         if kept.get('serial') != self._serial:
-            return rig, f'{self.path}: the kept zero is that of another device; the rig file holds'
+            return rig, Warned(f'{self.path}: the kept zero is that of another device; the rig file holds')
         if kept['configured'] != self._configured:
-            return rig, f'{self.path}: the rig file has another zero than when this one was kept; the rig file holds'
+            return rig, Warned(
+                f'{self.path}: the rig file has another zero than when this one was kept; the rig file holds'
+            )
         self.loaded = True
         return replace_values(rig, zeros, str(self.path)), f'zero of the last run, from {self.path}'
 
@@ -102,4 +104,4 @@ class ZeroStore:
             rig, self._wanted = self._wanted, None
             trouble = self.save(rig) if rig is not None else ''
         if trouble:
-            say(trouble)
+            say(Failed(trouble))

@@ -44,6 +44,18 @@ def test_info_says_what_another_rig_has_as_in_the_thesis(tmp_path: Path, capsys:
     assert 'as in the thesis rig' not in capsys.readouterr().out
 
 
+def test_info_names_the_recorded_node(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with BagWriter(tmp_path / 'run', rig_values={'block_size': 20}, node='/arm/tip') as bag:
+        bag.put(block(0))
+        bag.rotate()
+        bag.put(block(1))
+    for part in (tmp_path / 'run', tmp_path / 'run' / 'run_1.mcap'):
+        assert main(['info', str(part)]) == 0
+        assert ', node /arm/tip' in capsys.readouterr().out
+    assert main(['info', str(tmp_path / 'run'), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['node'] == '/arm/tip'
+
+
 def test_info_reads_a_cut_file_and_says_so(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = bag / 'run_0.mcap'
     path.write_bytes(path.read_bytes()[:-3000])

@@ -27,6 +27,7 @@ from msg_adapters import (
     solver_topic,
     string,
     to_messages,
+    vector3_stamped,
 )
 from msg_adapters.header import header, stamp_ns
 from msg_adapters.orientation import angles, quaternion
@@ -102,6 +103,32 @@ def test_definitions_are_the_standard_ones(name: str) -> None:
     headings = [line for line in MESSAGE_TYPES[name].definition.splitlines() if line.startswith('MSG: ')]
     assert len(set(headings)) == len(headings)
     assert f'MSG: {name.replace("/msg/", "/")}' not in headings
+
+
+def test_each_raw_sample_as_plain_numbers() -> None:
+    given_block = block(3)
+    assert vector3_stamped.MESSAGE.type_hash == STORE.hash_rihs01(vector3_stamped.MESSAGE.name)
+    encode = cdr.encoder_of(vector3_stamped.MESSAGE)
+    for psd in (1, 2):
+        told = list(vector3_stamped.from_block(given_block, psd, 'left_'))
+        assert [t_ns for t_ns, _ in told] == given_block.t_ns.tolist()
+        for (t_ns, fields), volts in zip(told, given_block.volts, strict=True):
+            m = STORE.deserialize_cdr(encode(fields), vector3_stamped.MESSAGE.name)
+            assert m.header.stamp.sec * 10**9 + m.header.stamp.nanosec == t_ns
+            assert m.header.frame_id == f'left_psd_{psd}'
+            assert [m.vector.x, m.vector.y, m.vector.z] == volts[3 * psd - 3 : 3 * psd].tolist()
+
+
+def test_a_prefix_is_before_every_frame_once() -> None:
+    records = (block(0), spots(1), estimate(1), TipLoad(T0, 1.0, 2.0, 3.0), DiagnosticReport(T0, (), ''))
+    for record in records:
+        plain, prefixed = (to_messages(record, prefix) for prefix in ('', 'left_'))
+        assert len(plain) == len(prefixed) > 0
+        for one, other in zip(plain, prefixed, strict=True):
+            frame = one.fields['header']['frame_id']
+            # Diagnostics have none.
+            assert other.fields['header']['frame_id'] == (f'left_{frame}' if frame else '')
+            assert other.fields | {'header': None} == one.fields | {'header': None}
 
 
 @given(times, numbers, numbers, numbers)

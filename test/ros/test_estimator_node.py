@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import array
+import itertools
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,23 +19,34 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 pytestmark = pytest.mark.ros
 pytest.importorskip('rclpy')
 
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped, WrenchStamped  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
+from geometry_msgs.msg import (  # noqa: E402
+    PointStamped,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Vector3Stamped,
+    WrenchStamped,
+)
 from rcl_interfaces.msg import Log  # noqa: E402
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters  # noqa: E402
-from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
+from msg_adapters import point_cloud2  # noqa: E402
+from psd_deflection.cli.main import main  # noqa: E402
+from psd_deflection.config import PARAMETERS  # noqa: E402
+from psd_deflection.recordings.readers import open_recording  # noqa: E402
 from test.ros.conftest import BLOCK_NS, HANGING_DISK, stamp  # noqa: E402
 
 MS = 1_000_000
@@ -53,6 +67,10 @@ TOPICS = {
     '/reference/deflection': 'geometry_msgs/msg/PoseStamped',
     '/environment/temperature': 'sensor_msgs/msg/Temperature',
 }
+
+
+def points_of(cloud: Any) -> Any:
+    return np.frombuffer(bytes(cloud.data), point_cloud2.PLAIN if cloud.point_step == 32 else point_cloud2.FLAGGED)
 
 
 def test_what_is_published_and_how_often(start: Callable[..., Any], peer: Any) -> None:
@@ -91,7 +109,7 @@ def test_what_is_published_and_how_often(start: Callable[..., Any], peer: Any) -
     assert covariance[5, 5] > 0
     assert abs(spots[0].point.x) < 5e-3
     names = {s.name for s in health[-1].status}
-    assert 'psd_deflection: acquisition' in names
+    assert 'estimator: acquisition' in names
     values = {v.key: v.value for s in health[-1].status for v in s.values}
     # On a busy machine the simulated device drops samples, and says so; there is no other cause here.
     causes = {key: int(value) for key, value in values.items() if key.startswith('lost: ')}
@@ -161,7 +179,7 @@ def test_zero_and_record(start: Callable[..., Any], peer: Any, tmp_path: Path, s
     ended = peer.call(SetBool, '/estimator/record', SetBool.Request(data=False))
     assert ended.success
     assert ended.message == f'recording ended: {folder}'
-    assert peer.call(SetBool, '/estimator/record', SetBool.Request(data=False)).message == 'no recording was made'
+    assert peer.call(SetBool, '/estimator/record', SetBool.Request(data=False)).message == 'no recording runs'
     assert [line for line in daemon.lines if 'recording' in line] == [begun.message, ended.message]
     # An independent reader finds in the bag what was received.
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -221,7 +239,7 @@ def test_a_disk_that_hangs_holds_up_its_own_requests_alone(
     peer.until(client.service_is_ready, 'the service')
 
     def told_of_recording() -> list[str]:
-        return [s.message for array in health for s in array.status if s.name == 'psd_deflection: recording']
+        return [s.message for array in health for s in array.status if s.name == 'estimator: recording']
 
     # A start that is ended while it hangs, and one that is waited for.
     begun = [client.call_async(SetBool.Request(data=True)) for _ in range(2)]
@@ -230,7 +248,7 @@ def test_a_disk_that_hangs_holds_up_its_own_requests_alone(
     assert peer.call(Trigger, '/estimator/zero', Trigger.Request()).success
     peer.until_of_now(poses, 'estimates')
     assert not any(future.done() for future in begun)
-    assert peer.call(SetBool, '/estimator/record', SetBool.Request(data=False)).message == 'no recording was made'
+    assert peer.call(SetBool, '/estimator/record', SetBool.Request(data=False)).message == 'no recording runs'
     peer.until(lambda: all(future.done() for future in begun), 'the answers of the starts')
     for future in begun:
         assert not future.result().success
@@ -257,9 +275,9 @@ def test_parameters_have_units_and_ranges_and_are_refused_by_name(start: Callabl
     ).descriptors
     assert '[m]' in length.description
     assert length.floating_point_range[0].to_value == 1000.0
-    assert length.read_only
+    assert 'read when the node is configured' in length.additional_constraints
     assert block.integer_range[0].from_value == 1
-    assert not sum_min.read_only
+    assert 'read when' not in sum_min.additional_constraints
     assert center.type == Parameter.Type.DOUBLE_ARRAY.value
 
     def put(name: str, value: object) -> Any:
@@ -268,7 +286,16 @@ def test_parameters_have_units_and_ranges_and_are_refused_by_name(start: Callabl
         return answer.results[0]
 
     assert not put('sum_min', -1.0).successful
-    assert not put('link.length', 2.0).successful
+    # What cannot be taken while samples flow says what to do; a value that is there already is no change.
+    assert put('link.length', 2.0).reason == (
+        'link.length: is read when the node is configured; first ros2 lifecycle set /estimator deactivate, then cleanup'
+    )
+    assert put('link.length', 0.585).successful
+    assert put('simulated', False).reason == 'simulated: is set by the node'
+    for unknown, advice in (('block_sice', '; did you mean block_size?'), ('', '')):
+        answer = put(unknown, 3)
+        assert not answer.successful
+        assert answer.reason == f'{unknown!r}: no parameter of that name{advice}'
     # The same words as for a file, with what must fit together as well; then nothing has changed.
     for word in (False, 'off', 'none'):
         assert put('degraded', 'hold').successful
@@ -290,6 +317,93 @@ def test_parameters_have_units_and_ranges_and_are_refused_by_name(start: Callabl
     peer.until_of_now(poses, 'estimates again')
 
 
+def test_each_parameter_says_what_it_takes(start: Callable[..., Any], peer: Any) -> None:
+    start('--ros-args', '-p', 'autostart:=false')
+    names = [p.name for p in PARAMETERS]
+    request = DescribeParameters.Request(names=names)
+    told = peer.call(DescribeParameters, '/estimator/describe_parameters', request).descriptors
+    assert [d.name for d in told] == names
+    for declared, d in zip(PARAMETERS, told, strict=True):
+        assert not d.read_only, d.name
+        assert d.description, d.name
+        ranged = d.floating_point_range or d.integer_range
+        assert bool(ranged) == (declared.kind in ('double', 'integer')), d.name
+        if declared.choices is not None:
+            assert ', '.join(declared.choices) in d.additional_constraints, d.name
+        if declared.kind == 'double_array':
+            assert 'at most' in d.additional_constraints, d.name
+    constraints = {d.name: d.additional_constraints for d in told}
+    for word, name in itertools.product(('exact', 'wls', 'base_pair'), ('solver', 'solvers')):
+        assert word in constraints[name]
+    # A live run does not take the methods as printed as its answer.
+    assert 'appendix_d' in constraints['solvers']
+    assert 'appendix_d' not in constraints['solver']
+    assert 'dataq' in constraints['source']
+    assert constraints['autostart'] == 'read at the start of the process'
+
+
+def test_a_dump_of_the_parameters_starts_the_node_again(start: Callable[..., Any], peer: Any, tmp_path: Path) -> None:
+    first = start('--ros-args', '-p', 'sum_min:=2.4', '-p', "psd_1.axes:=[-y, 'x']")
+    first.until('publishing on ROS domain')
+    names = [p.name for p in PARAMETERS] + ['simulated', 'use_sim_time']
+    request = GetParameters.Request(names=names)
+    values = peer.call(GetParameters, '/estimator/get_parameters', request).values
+    held = {name: parameter_value_to_python(value) for name, value in zip(names, values, strict=True)}
+    held = {name: list(value) if isinstance(value, array.array) else value for name, value in held.items()}
+    assert held['psd_1.axes'] == ['-y', '+x']
+    assert held['psd_2.axes'] == ['+x', '+y']
+    first.send(signal.SIGINT)
+    assert first.wait() == 0, first.lines
+    # As ros2 param dump writes it, which leaves a y without quotes.
+    dump = tmp_path / 'dump.yaml'
+    dump.write_text(yaml.dump({'/estimator': {'ros__parameters': held}}))
+    again = start('--ros-args', '--params-file', str(dump))
+    again.until('publishing on ROS domain')
+    values = peer.call(GetParameters, '/estimator/get_parameters', request).values
+    assert [parameter_value_to_python(value) for value in values] == [
+        parameter_value_to_python(Parameter('', value=held[name]).get_parameter_value()) for name in names
+    ]
+
+
+def test_the_log_file_of_the_process_has_the_lines(start: Callable[..., Any], tmp_path: Path) -> None:
+    daemon = start('--ros-args', '-p', f'zero_file:={tmp_path}', '--log-level', 'warn', '--log-file-name', 'tip')
+    daemon.until('no port given')
+    daemon.send(signal.SIGINT)
+    assert daemon.wait() == 0, daemon.lines
+    (file,) = Path(os.environ['ROS_LOG_DIR']).glob(f'tip_{daemon.process.pid}_*.log')
+    (line,) = file.read_text().splitlines()
+    assert re.fullmatch(r'\[WARN\] \[\d+\.\d{9}\] \[estimator\]: no port given: started the simulated rig .*', line)
+
+
+def test_raw_samples_as_plain_numbers_in_prefixed_frames(start: Callable[..., Any], peer: Any, tmp_path: Path) -> None:
+    words = ('publish_volts:=true', 'frame_prefix:=left_', 'markers:=true')
+    daemon = start('--record', str(tmp_path), '--ros-args', *(w for word in words for w in ('-p', word)))
+    volts = [peer.collect(Vector3Stamped, f'/psd_{n}/volts', 1000) for n in (1, 2)]
+    clouds = peer.collect(PointCloud2, '/psd/samples')
+    poses = peer.collect(PoseStamped, '/link_tip/deflection')
+    markers = peer.collect(MarkerArray, '/link_tip/markers')
+    peer.until(lambda: len(poses) >= 25 and min(map(len, volts)) >= 500 and len(markers) > 0, 'all of them')
+    frames = {m.header.frame_id for m in (*poses, *clouds, *volts[0], *volts[1], *markers[-1].markers)}
+    assert frames == {'left_link_tip_rest', 'left_link_tip', 'left_psd_1', 'left_psd_2', 'left_link_base'}
+    rows = {stamp(c) + int(p['dt']): p for c in clouds for p in points_of(c)}
+    for number, heard in enumerate(volts, 1):
+        found = [(m.vector, rows[stamp(m)]) for m in heard if stamp(m) in rows]
+        assert len(found) >= 200
+        for vector, row in found:
+            assert (vector.x, vector.y, vector.z) == tuple(row[f'{c}{number}'] for c in ('x', 'y', 'sum'))
+    daemon.send(signal.SIGINT)
+    assert daemon.wait() == 0, daemon.lines
+    # The recording has the same frames, the samples once, and the node's name.
+    (folder,) = tmp_path.glob('psd_*')
+    with Reader(folder) as bag:
+        kept = {c.topic for c in bag.connections}
+        assert not kept & {'/psd_1/volts', '/psd_2/volts'}
+        assert '/psd/samples' in kept
+    recording = open_recording(folder)
+    assert recording.node == '/estimator'
+    assert main(['replay', str(folder), '--compare', '--strict']) == 0
+
+
 def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start: Callable[..., Any], peer: Any) -> None:
     pytest.importorskip('aiohttp')
     options = {'use_sim_time': True, 'markers': True, 'monitor': True, 'monitor_port': 0, 'monitor_control': True}
@@ -306,9 +420,14 @@ def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start:
     peer.until(lambda: len(health) >= 2, 'its health')
     assert not [topic for topic, _ in peer.node.get_topic_names_and_types() if topic.startswith(('/link_tip', '/psd'))]
     assert {s.name for s in health[-1].status} >= {'left/estimator: acquisition', 'left/estimator: clock'}
+    (acquired,) = [s for s in health[-1].status if s.name == 'left/estimator: acquisition']
+    assert acquired.level == DiagnosticStatus.WARN
+    request = GetParameters.Request(names=['simulated'])
+    assert peer.call(GetParameters, '/left/estimator/get_parameters', request).values[0].bool_value
     assert {s.hardware_id for s in health[-1].status} == {'SIM-0001'}
     assert abs(stamp(health[-1]) - stamp(poses[-1])) < 60 * 10**9
     # What the terminal shows is on /rosout as well.
+    daemon.until('frames have no prefix')
     said = 'publishing on ROS domain'
     peer.until(lambda: any(m.name == 'left.estimator' and m.msg.startswith(said) for m in log), 'its log')
     levels = {m.msg.partition(' ')[0]: m.level for m in log}

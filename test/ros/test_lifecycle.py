@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import json
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -21,9 +23,10 @@ from rcl_interfaces.msg import (  # noqa: E402
     ParameterValue,
 )
 from rcl_interfaces.msg import Parameter as ParameterMessage  # noqa: E402
-from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
-from rclpy.parameter import Parameter  # noqa: E402
+from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically  # noqa: E402
+from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
@@ -32,7 +35,7 @@ from psd_deflection.errors import ConfigError, DeviceError  # noqa: E402
 from psd_deflection.recordings.readers import open_recording  # noqa: E402
 from psd_deflection.ros import estimator  # noqa: E402
 from test.heard import WAIT_S  # noqa: E402
-from test.ros.conftest import PATIENT  # noqa: E402
+from test.ros.conftest import PATIENT, stamp  # noqa: E402
 
 
 def change(peer: Any, transition: int) -> bool:
@@ -108,6 +111,84 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
     assert daemon.wait() == 0, daemon.lines
 
 
+def put(peer: Any, **values: object) -> str:
+    """Why the values are refused, '' if they are taken; ``__`` in a name stands for a dot."""
+    changes = [Parameter(n.replace('__', '.'), value=v).to_parameter_msg() for n, v in values.items()]
+    request = SetParametersAtomically.Request(parameters=changes)
+    answer = peer.call(SetParametersAtomically, '/estimator/set_parameters_atomically', request).result
+    assert answer.successful == (answer.reason == '')
+    return str(answer.reason)
+
+
+def cycle(peer: Any, *transitions: str) -> None:
+    for name in transitions:
+        assert change(peer, getattr(Transition, f'TRANSITION_{name.upper()}')), name
+
+
+def value_of(peer: Any, name: str) -> Any:
+    (value,) = peer.call(GetParameters, '/estimator/get_parameters', GetParameters.Request(names=[name])).values
+    return parameter_value_to_python(value)
+
+
+def test_parameters_that_are_set_while_unconfigured_are_read_and_kept(
+    start: Callable[..., Any], peer: Any, simulated_port: str, tmp_path: Path
+) -> None:
+    daemon = start(
+        '--port',
+        '/dev/nothing_here',
+        '--ros-args',
+        *('-p', 'autostart:=false', '-p', f'zero_file:={tmp_path / "zero.json"}'),
+        *('-p', 'effects.axis_crosstalk.psd:=1', '-p', 'effects.axis_crosstalk.xy:=0.01'),
+    )
+    daemon.until('waiting to be configured')
+    assert not change(peer, Transition.TRANSITION_CONFIGURE)
+    daemon.until('no such port')
+    # Refused at once, all of them, by the words that refuse a file.
+    assert 'must be less than sum_max' in put(peer, sum_min=9.0, solver='ols')
+    assert "solver = 'magic': must be one of" in put(peer, solver='magic')
+    assert 'comparison only' in put(peer, solver='appendix_d')
+    assert put(peer, autostart=True) == 'autostart: is read at the start of the process'
+    assert value_of(peer, 'solver') == 'exact'
+    assert put(peer, port=simulated_port, solver='ols', block_size=10, sum_min=2.4, markers=True) == ''
+    assert put(peer, effects__axis_crosstalk__xy=0.02) == ''
+    rigs = peer.collect(String, '/link_tip/rig', QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    poses = peer.collect(PoseStamped, '/link_tip/deflection')
+    own = peer.collect(PoseStamped, '/link_tip/ols/deflection')
+    markers = peer.collect(MarkerArray, '/link_tip/markers')
+    cycle(peer, 'configure', 'activate')
+    peer.until(lambda: len(poses) >= 30 and len(own) >= 30 and len(markers) > 0 and rigs != [], 'estimates of ols')
+    told = json.loads(rigs[-1].data)['parameters']
+    assert [told[n] for n in ('block_size', 'sum_min', 'effects.axis_crosstalk.xy')] == [10, 2.4, 0.02]
+    assert value_of(peer, 'solvers')[0] == 'ols'
+    # Half a block: the stamps are closer.
+    assert min(stamp(b) - stamp(a) for a, b in itertools.pairwise(poses)) < 15_000_000
+    for fixed in ({'port': '/dev/other'}, {'effects__axis_crosstalk__xy': 0.03}):
+        assert 'is read when the node is configured' in put(peer, **fixed)
+    assert put(peer, sum_min=2.3) == ''
+    assert peer.call(Trigger, '/estimator/zero', Trigger.Request()).success
+    taken = parameters(peer, 'psd_1.zero', 'psd_2.zero')
+    cycle(peer, 'deactivate', 'cleanup')
+    assert value_of(peer, 'sum_min') == 2.3
+    assert put(peer, solver='wls', markers=False) == ''
+    cycle(peer, 'configure', 'activate')
+    daemon.until('zero of the last run')
+    now = len(poses)
+    peer.until(lambda: len(poses) >= now + 30 and len(rigs) >= 2, 'estimates of wls')
+    told = json.loads(rigs[-1].data)['parameters']
+    assert [told[n] for n in ('solver', 'block_size', 'sum_min')] == ['wls', 10, 2.3]
+    assert parameters(peer, 'psd_1.zero', 'psd_2.zero') == taken == [told['psd_1.zero'], told['psd_2.zero']]
+    topics = dict(peer.node.get_topic_names_and_types())
+    peer.until(lambda: peer.node.count_publishers('/link_tip/markers') == 0, 'the markers to be gone')
+    assert '/link_tip/wls/deflection' in topics
+    # A zero that was set by hand meanwhile holds, as a rig file that was edited does.
+    cycle(peer, 'deactivate', 'cleanup')
+    assert put(peer, psd_1__zero=[0.0004, 0.0]) == ''
+    cycle(peer, 'configure')
+    assert parameters(peer, 'psd_1.zero') == [[0.0004, 0.0]]
+    daemon.send(signal.SIGINT)
+    assert daemon.wait() == 0, daemon.lines
+
+
 def test_a_device_that_is_not_there_leaves_the_node_unconfigured(start: Callable[..., Any], peer: Any) -> None:
     daemon = start('--port', '/dev/nothing_here', '--ros-args', '-p', 'autostart:=false', '--log-level', 'warn')
     log = peer.collect(Log, '/rosout', QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
@@ -172,7 +253,7 @@ def test_a_shutdown_ends_the_daemon(start: Callable[..., Any], peer: Any, simula
 
 
 def test_an_unforeseen_error_at_the_start_is_not_swallowed(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(rig: Any, tell: Any) -> Any:
+    def broken(*arguments: Any) -> Any:
         raise ZeroDivisionError('of our own making')
 
     monkeypatch.setattr(estimator, 'Session', broken)

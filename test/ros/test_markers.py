@@ -101,3 +101,9 @@ def test_a_late_rviz_sees_both(start: Callable[..., Any], peer: Any) -> None:
     peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[put]))
     x = RIG.psds[0].center[0] + 0.001
     peer.until(lambda: by_name(rest[-1])['beam', 1].points[0].x == pytest.approx(x), 'the beam at the new zero')
+
+
+def test_markers_are_in_prefixed_frames() -> None:
+    rig = load_rig(overrides={'frame_prefix': 'left_'})
+    drawn = (*at_rest(rig).markers, *moving(rig, estimate(), spots((0.0, 0.0, 0.0, 0.0)), 10.0).markers)
+    assert {m.header.frame_id for m in drawn} == {'left_link_base'}

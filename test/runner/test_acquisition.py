@@ -19,7 +19,7 @@ from psd_deflection.config import Rig, load_rig
 from psd_deflection.devices import contract_frames
 from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import Clock, Event, Received, Sample, Source, SourceEndedError
-from psd_deflection.errors import DeviceError
+from psd_deflection.errors import DeviceError, Warned
 from psd_deflection.protocol.frames import FrameDecoder, HelloFrame, PongFrame, encode
 from psd_deflection.records import RESTART
 from psd_deflection.runner import acquisition as module
@@ -323,7 +323,7 @@ def test_a_device_clock_jump_is_reported_and_stamps_increase(
     device.send_frames(*[sample(s, t_us=clock[s]) for s in range(40)])
     before = take(run.acquisition, 40)
     device.send_frames(*[sample(s, t_us=clock[s]) for s in range(40, 80)])
-    run.heard("the device's clock jumped")
+    assert isinstance(run.heard("the device's clock jumped"), Warned)
     items = before + take(run.acquisition, 40)
     t = [int(t) for i in items if isinstance(i, Arrival) for t in i.raw.t_ns]
     assert all(b > a for a, b in itertools.pairwise(t))

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.config import Rig, load_rig, replace_values
+from psd_deflection.errors import Warned
 from psd_deflection.runner.zero_store import ZeroStore
 
 ZERO = {'psd_1.zero': [1e-4, -2e-4], 'psd_2.zero': [3e-5, 0.0]}
@@ -43,6 +44,7 @@ def test_a_zero_file_of_another_device_is_passed_over(tmp_path: Path) -> None:
     back, said = ZeroStore(named, 'B').load(named)
     assert back is named
     assert 'that of another device' in said
+    assert isinstance(said, Warned)
 
 
 def test_a_rig_file_that_says_otherwise_now_holds(rig: Rig) -> None:
@@ -51,6 +53,7 @@ def test_a_rig_file_that_says_otherwise_now_holds(rig: Rig) -> None:
     back, said = ZeroStore(edited, 'A').load(edited)
     assert back is edited
     assert 'the rig file holds' in said
+    assert isinstance(said, Warned)
 
 
 @pytest.mark.parametrize('serial', ['../../evil', '/etc/passwd', '..', '', None, 'a' * 500, 'x\x00y', 7])

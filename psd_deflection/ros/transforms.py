@@ -1,0 +1,80 @@
+"""The frames of the messages as a tree for tf2: ``link_base``, ``link_tip_rest``, ``link_tip``, ``psd_1``, ``psd_2``.
+
+What the rig file fixes is static and latched. The tip moves with each estimate of the primary solver; it is sent
+by the pipeline thread, with the estimate's own stamp.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import time
+from typing import Any
+
+from geometry_msgs.msg import Quaternion, TransformStamped
+from rclpy.node import Node
+
+from msg_adapters.orientation import quaternion
+from psd_deflection.config import Rig
+from psd_deflection.geometry.scene import Vector
+from psd_deflection.records import DeflectionEstimate, Record
+from psd_deflection.ros.names import BASE, PSDS, REST, TF, TF_STATIC, TIP
+from psd_deflection.ros.wires import qos
+from psd_deflection.solvers.registry import psds_at_base
+
+_UPRIGHT = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
+
+
+def installed() -> bool:
+    """Whether tf2_msgs is there: it comes with a ROS installation, not with rclpy's wheels."""
+    return importlib.util.find_spec('tf2_msgs') is not None
+
+
+def _transform(prefix: str, parent: str, child: str, t_ns: int, at: Vector, rotation: dict[str, float]) -> Any:
+    out = TransformStamped(child_frame_id=prefix + child)
+    out.header.frame_id = prefix + parent
+    out.header.stamp.sec, out.header.stamp.nanosec = divmod(t_ns, 1_000_000_000)
+    out.transform.translation.x, out.transform.translation.y, out.transform.translation.z = at
+    out.transform.rotation = Quaternion(**rotation)
+    return out
+
+
+def static_transforms(rig: Rig, t_ns: int) -> list[Any]:
+    """The TransformStamped of the unloaded tip and of both PSDs, which are on the plate or, ``base_pair``, fixed."""
+    prefix = rig.monitor.frame_prefix
+    holder = REST if psds_at_base(rig) else TIP
+    return [
+        _transform(prefix, BASE, REST, t_ns, (0.0, 0.0, rig.link.length), _UPRIGHT),
+        *(
+            _transform(prefix, holder, name, t_ns, (*psd.center, psd.height), _UPRIGHT)
+            for name, psd in zip(PSDS, rig.psds, strict=True)
+        ),
+    ]
+
+
+def tip_transform(rig: Rig, e: DeflectionEstimate) -> Any:
+    """The TransformStamped of the tip, true to scale."""
+    rotation = quaternion(e.theta, e.phi, e.omega)
+    return _transform(rig.monitor.frame_prefix, REST, TIP, e.t_ns, (e.dx, e.dy, 0.0), rotation)
+
+
+class TransformPublisher:
+    """A sink of records: ``/tf`` for each primary estimate while it is ``active``. Needs tf2_msgs."""
+
+    def __init__(self, node: Node, rig: Rig) -> None:
+        self.active = False
+        self._node, self._rig = node, rig
+        self._message = importlib.import_module('tf2_msgs.msg').TFMessage
+        self._moving = node.create_publisher(self._message, TF, qos(TF))
+        self._static = node.create_publisher(self._message, TF_STATIC, qos(TF_STATIC))
+        self._static.publish(self._message(transforms=static_transforms(rig, time.time_ns())))
+
+    def put(self, record: Record) -> None:
+        """Publish where the tip is."""
+        if self.active and isinstance(record, DeflectionEstimate) and record.primary:
+            self._moving.publish(self._message(transforms=[tip_transform(self._rig, record)]))
+
+    def close(self) -> None:
+        """Take the publishers off the graph."""
+        for publisher in (self._moving, self._static):
+            self._node.destroy_publisher(publisher)

@@ -1,0 +1,84 @@
+"""The launch file: its arguments are parameters, and each reaches the node."""
+
+from __future__ import annotations
+
+import runpy
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+
+from psd_deflection.config import BY_NAME
+
+FILE = Path(__file__).parent.parent.parent / 'launch' / 'estimator.launch.py'
+KINDS = {'string': str, 'bool': bool, 'double': float, 'integer': int}
+
+
+class Configuration:
+    """Stands for a LaunchConfiguration. (launch comes with a ROS installation, not with the wheels.)"""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def perform(self, context: dict[str, str]) -> str:
+        return context[self.name]
+
+
+@pytest.fixture
+def launch_file(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The names of the launch file, run with stand-ins that keep their arguments."""
+
+    def keep(*words: object, **named: object) -> SimpleNamespace:
+        return SimpleNamespace(words=words, **named)
+
+    modules: dict[str, dict[str, Any]] = {
+        'launch': {'LaunchContext': object, 'LaunchDescription': list},
+        'launch.actions': {'DeclareLaunchArgument': keep, 'OpaqueFunction': keep},
+        'launch.substitutions': {'LaunchConfiguration': Configuration},
+        'launch_ros': {},
+        'launch_ros.actions': {'Node': keep},
+        'launch_ros.parameter_descriptions': {'ParameterValue': lambda value, value_type: (value.name, value_type)},
+        'launch_ros.substitutions': {'FindPackageShare': keep},
+    }
+    for module, names in modules.items():
+        made = ModuleType(module)
+        vars(made).update(names)
+        monkeypatch.setitem(sys.modules, module, made)
+    return runpy.run_path(str(FILE))
+
+
+def test_every_argument_is_a_parameter_of_its_type(launch_file: dict[str, Any]) -> None:
+    arguments = launch_file['PARAMETERS']
+    assert {'port', 'solver', 'autostart', 'record', 'frame_prefix', 'publish_tf'} <= arguments.keys()
+    for name, (kind, text) in arguments.items():
+        assert KINDS[BY_NAME[name].kind] is kind, name
+        assert text, name
+
+
+def test_what_is_given_reaches_the_node_and_nothing_else_does(launch_file: dict[str, Any]) -> None:
+    declared = {a.words[0]: a for a in launch_file['generate_launch_description']() if hasattr(a, 'description')}
+    assert {'params_file', 'namespace', 'log_level', *launch_file['PARAMETERS']} == declared.keys()
+    assert all(a.description for a in declared.values())
+    context = dict.fromkeys(declared, '')
+    (plain,) = launch_file['estimator'](context)
+    assert plain.parameters == []
+    given = {'solver': 'wls', 'autostart': 'false'}
+    (node,) = launch_file['estimator']({**context, **given})
+    assert node.parameters == [{'solver': ('solver', str), 'autostart': ('autostart', bool)}]
+    assert node.namespace.name == 'namespace'
+    assert [w if isinstance(w, str) else w.name for w in node.ros_arguments] == [
+        *('--params-file', 'params_file'),
+        *('--log-level', 'log_level'),
+    ]
+
+
+@pytest.mark.skipif(shutil.which('ros2') is None, reason='ros2 launch comes with a ROS installation')
+def test_ros2_launch_shows_the_arguments() -> None:
+    command = ['ros2', 'launch', str(FILE), '--show-args']
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    for name in ('namespace', 'autostart', 'solver', 'log_level', 'port'):
+        assert f"'{name}':" in shown
