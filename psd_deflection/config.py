@@ -25,6 +25,7 @@ from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
 from psd_deflection.parameters import Parameter, Section, Value, check_value, parameter, shown
 from psd_deflection.records import FloatArray
+from psd_deflection.tables import html_table
 
 MAX_FILE_BYTES = 1_000_000
 MAX_KEYS = 10_000
@@ -399,7 +400,7 @@ _ORDERED = (
 _COMPARE = {'less than': operator.lt, 'at most': operator.le}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Rig:
     """The whole parameter set. ``values``: the flat values that it was made of, including defaults.
 
@@ -416,6 +417,22 @@ class Rig:
     monitor: MonitorConfig
     values: Mapping[str, Value] = field(repr=False)
     effects: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        changed = [p.with_value(self.values[p.name]) for p in PARAMETERS if self.values[p.name] != p.default]
+        own = sorted({key.partition('.')[0] for key in self.effects})
+        words = ', '.join([*changed, *(f'{EFFECTS_PREFIX}{name}' for name in own)])
+        return f'<Rig {words}>' if words else '<Rig of the thesis>'
+
+    def _repr_html_(self) -> str:
+        flat = self.flat()
+        return html_table(
+            'Rig',
+            (
+                (name, BY_NAME[name].with_value(value).partition(' = ')[2] if name in BY_NAME else value)
+                for name, value in flat.items()
+            ),
+        )
 
     def flat(self) -> dict[str, object]:
         """All values under their flat names, including simulated effects; :func:`rig_from_values` reads them."""
@@ -536,7 +553,7 @@ def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[
         if not isinstance(body, dict) or not isinstance(body.get('ros__parameters'), dict):
             raise ConfigError(f'{path}: {name}: not a ROS 2 parameter file: "ros__parameters:" is missing below it')
         if name in wanted:
-            _flatten(body['ros__parameters'], '', flat, path, 0)
+            flat.update(flattened(body['ros__parameters'], str(path)))
     if not any(name in wanted for name in tree):
         raise ConfigError(f'{path}: has no parameters for /** or {node_name} (found: {", ".join(map(str, tree))})')
     return flat
@@ -557,17 +574,24 @@ def _read_yaml(path: Path) -> object:
         raise ConfigError(f'{path}{error.where}: {error}') from None
 
 
-def _flatten(tree: Mapping[Any, Any], prefix: str, out: dict[str, object], path: Path, depth: int) -> None:
+def flattened(tree: Mapping[Any, Any], source: str) -> dict[str, object]:
+    """``tree`` with maps as dotted keys; lists stay lists. Raises ConfigError naming ``source``."""
+    out: dict[str, object] = {}
+    _flatten(tree, '', out, source, 0)
+    return out
+
+
+def _flatten(tree: Mapping[Any, Any], prefix: str, out: dict[str, object], source: str, depth: int) -> None:
     if depth > 8:
-        raise ConfigError(f'{path}: {prefix} is nested too deep')
+        raise ConfigError(f'{source}: {prefix} is nested too deep')
     for key, value in tree.items():
         name = f'{prefix}{key}'
-        if isinstance(value, dict):
-            _flatten(value, name + '.', out, path, depth + 1)
+        if isinstance(value, Mapping):
+            _flatten(value, name + '.', out, source, depth + 1)
         else:
             out[name] = value
         if len(out) > MAX_KEYS:
-            raise ConfigError(f'{path}: more than {MAX_KEYS} parameters')
+            raise ConfigError(f'{source}: more than {MAX_KEYS} parameters')
 
 
 def left_as_in_the_thesis(values: Mapping[str, object]) -> tuple[str, ...]:

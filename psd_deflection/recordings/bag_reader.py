@@ -39,8 +39,9 @@ from psd_deflection.recordings import cdr
 from psd_deflection.recordings.allowance import Warnings
 from psd_deflection.recordings.bag_writer import META_CHANGE, META_HELLO, META_PARAMETERS, META_SOFTWARE
 from psd_deflection.recordings.clouds import CloudDecoder, Samples, joined_points
+from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.mcap_reader import McapReader, RawMessage
-from psd_deflection.recordings.recording import EstimateSeries, Recording, from_json
+from psd_deflection.recordings.recording import Recording, from_json
 from psd_deflection.records import (
     RESTART,
     AppliedLoad,

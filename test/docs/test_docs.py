@@ -6,6 +6,7 @@ What ends in a moment is run here; ``make doc-commands`` runs the rest (tools/ru
 from __future__ import annotations
 
 import argparse
+import doctest
 import importlib.util
 import json
 import re
@@ -142,6 +143,34 @@ def test_python_blocks_run(
     script = tmp_path / f'block_{number}.py'
     script.write_text(text)
     runpy.run_path(str(script))
+
+
+SESSIONS = [
+    (page, fences)
+    for page in PAGES
+    if (fences := [block for block in FENCE.finditer(page.read_text()) if block['kind'] == 'pycon'])
+]
+
+
+@pytest.mark.parametrize(('page', 'fences'), SESSIONS, ids=lambda v: getattr(v, 'name', ''))
+def test_python_sessions_answer_as_printed(
+    page: Path, fences: list[re.Match[str]], checkout: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(checkout)
+    pytest.importorskip('xarray')
+    text = page.read_text()
+    # All of a page in one namespace, as a reader types them; by the page's own lines.
+    examples = [
+        doctest.Example(e.source, e.want, e.exc_msg, e.lineno + text.count('\n', 0, fence.start('text')), e.indent)
+        for fence in fences
+        for e in doctest.DocTestParser().get_examples(fence['text'])
+    ]
+    said: list[str] = []
+    flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    session = doctest.DocTest(examples, {}, page.name, str(page), 0, text)
+    failed, tried = doctest.DocTestRunner(optionflags=flags).run(session, out=said.append)
+    assert failed == 0, ''.join(said)
+    assert tried > 5
 
 
 def test_the_notebook_runs(checkout: Path, tmp_path: Path) -> None:
