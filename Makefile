@@ -12,6 +12,7 @@
 # make golden   make the recordings in bags/ anew
 # make colcon   build with colcon in a virtual environment of its own and look at what it installed
 # make docs     the documentation as a web site, in build/site
+# make notebooks  execute the notebooks of the documentation and keep what they answer
 # make wheel    sdist and wheel in dist/, tried in an environment of its own
 # make doc-commands  every command of README and docs that the tests do not run, run
 # make rerun    recordings converted for the Rerun viewer (170 MB, in an environment of its own) and looked at in it
@@ -31,7 +32,7 @@ PYTEST ?=
 WORKERS ?= 2
 BIN := $(VENV)/bin
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs shots blind demo-discover colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks shots blind demo-discover colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -119,6 +120,9 @@ docs: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[docs]'
 	$(BIN)/python -m mkdocs build --strict --quiet --site-dir build/site
 	@echo 'open build/site/index.html (its search needs a server: python -m http.server --directory build/site)'
+
+notebooks: $(VENV)/.installed
+	$(BIN)/python -m pytest --nbmake --overwrite docs/*.ipynb
 
 SHOT_SECONDS ?= 40
 shots: $(VENV)/.installed
