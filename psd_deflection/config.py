@@ -51,7 +51,7 @@ class LinkConfig:
     slope_ratio: float = parameter(
         1.5,
         '',
-        'k of the tip slope, phi = -k dY/L: 3/2 for a tip force, 2 for a tip moment',
+        'k of the tip slope, φ = -k ΔY/L: 3/2 for a tip force, 2 for a tip moment',
         minimum=0.0,
         maximum=10.0,
     )

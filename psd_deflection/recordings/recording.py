@@ -157,6 +157,11 @@ class Recording(abc.ABC):
             return 0.0
         return (last[0] - first[0]) * 1e9 / (last[1] - first[1])
 
+    def lasts(self, first_ns: int, last_ns: int) -> float:
+        """Seconds from the sample at ``first_ns`` to the end of the one at ``last_ns``, by their stamps."""
+        rate = self.sample_rate_hz
+        return (last_ns - first_ns) * 1e-9 + (1.0 / rate if rate > 0.0 else 0.0)
+
     @functools.cached_property
     def samples(self) -> npt.NDArray[np.void]:
         """Every sample as a structured array (n,) of ``SAMPLE_DTYPE``, read at first use."""
