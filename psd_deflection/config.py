@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from psd_deflection.errors import ConfigError, did_you_mean
-from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
+from psd_deflection.foreign_yaml import YamlError, edited, parse_yaml, read_text
 from psd_deflection.parameters import Parameter, Section, Value, check_value, parameter, shown
 from psd_deflection.records import FloatArray
 from psd_deflection.tables import html_table
@@ -389,6 +389,15 @@ _DESCRIBED = tuple(
     # A default of 0 says that there is nothing; any other one is a measure of the thesis rig.
     if p.kind.startswith('double') and np.any(p.default)
 )
+DESCRIPTION = (
+    *(
+        p.name
+        for section in (LINK, *PSDS, AMPLIFIER, CONVERTER, DYNAMICS, ESTIMATOR)
+        for p in section.parameters.values()
+    ),
+    *(ACQUISITION.parameters[name].name for name in ('psds_exchanged', 'latency_offset', 'thorlabs_x_sign')),
+)
+"""Parameters that describe the rig and how it is evaluated; the others say how the node runs on one machine."""
 ZEROS = tuple(section.parameters['zero'].name for section in PSDS)
 """The parameters that ``~/zero`` sets, one for each detector."""
 
@@ -544,11 +553,31 @@ def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[
     missing, too large, not YAML, or not a parameter file.
     """
     path = Path(path)
-    tree = _read_yaml(path)
+    return flat_parameters(parameter_text(path), path, node_name)
+
+
+def parameter_text(path: Path) -> str:
+    """The text of a parameter file. Raises ConfigError naming the file when it is missing or too large."""
+    try:
+        return read_text(path, MAX_FILE_BYTES)
+    except FileNotFoundError:
+        raise ConfigError(f'{path}: no such parameter file') from None
+    except OSError as error:
+        raise ConfigError(f'{path}: cannot be read as a parameter file ({error.strerror or error})') from None
+    except YamlError as error:
+        raise ConfigError(f'{path}: cannot be read as a parameter file ({error})') from None
+
+
+def flat_parameters(text: str, path: Path, node_name: str = 'estimator') -> dict[str, object]:
+    """Flat values of the text of a parameter file, as of :func:`read_parameter_file`. Raises ConfigError."""
+    try:
+        tree = parse_yaml(text)
+    except YamlError as error:
+        raise ConfigError(f'{path}{error.where}: {error}') from None
     if not isinstance(tree, dict):
         raise ConfigError(f'{path}: not a ROS 2 parameter file: expected "/**:" then "ros__parameters:"')
     flat: dict[str, object] = {}
-    wanted = ('/**', node_name, '/' + node_name, '/**/' + node_name)
+    wanted = _sections_of(node_name)
     for name, body in tree.items():
         if not isinstance(body, dict) or not isinstance(body.get('ros__parameters'), dict):
             raise ConfigError(f'{path}: {name}: not a ROS 2 parameter file: "ros__parameters:" is missing below it')
@@ -559,19 +588,36 @@ def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[
     return flat
 
 
-def _read_yaml(path: Path) -> object:
+def _sections_of(node_name: str) -> tuple[str, ...]:
+    """Names of the sections of a parameter file that a node reads."""
+    return '/**', node_name, '/' + node_name, '/**/' + node_name
+
+
+def with_effects_section(text: str, effects: Mapping[str, Mapping[str, object]], path: Path) -> str:
+    """The text of a parameter file with ``effects`` instead of its own; all else is as it was, comments too.
+
+    ``path``: for a message. Raises ConfigError if the file cannot be edited so that it says the same otherwise.
+    """
+    sections = _sections_of('estimator')
+
+    def edit(tree: Any) -> None:
+        found = [body['ros__parameters'] for name, body in tree.items() if name in sections]
+        for body in found:
+            for key in [k for k in body if k == EFFECTS_PREFIX.rstrip('.') or str(k).startswith(EFFECTS_PREFIX)]:
+                del body[key]
+        if effects:
+            found[-1][EFFECTS_PREFIX.rstrip('.')] = effects
+
+    wanted = {k: v for k, v in flat_parameters(text, path).items() if not k.startswith(EFFECTS_PREFIX)}
+    wanted.update(flattened({EFFECTS_PREFIX.rstrip('.'): effects}, str(path)))
     try:
-        text = read_text(path, MAX_FILE_BYTES)
-    except FileNotFoundError:
-        raise ConfigError(f'{path}: no such parameter file') from None
-    except OSError as error:
-        raise ConfigError(f'{path}: cannot be read as a parameter file ({error.strerror or error})') from None
+        out = edited(text, edit)
     except YamlError as error:
-        raise ConfigError(f'{path}: cannot be read as a parameter file ({error})') from None
-    try:
-        return parse_yaml(text)
-    except YamlError as error:
-        raise ConfigError(f'{path}{error.where}: {error}') from None
+        raise ConfigError(f'{path}: {error}') from None
+    # The editor reads YAML 1.2, ROS and our reader YAML 1.1.
+    if flat_parameters(out, path) != wanted:
+        raise ConfigError(f'{path}: cannot be written again with the same values')
+    return out
 
 
 def flattened(tree: Mapping[Any, Any], source: str) -> dict[str, object]:
