@@ -40,7 +40,7 @@ __all__ = ['discover', 'load_rig', 'open', 'replay', 'simulate', 'solve']
 # Every function imports what it needs when it is called, to keep `import psd_deflection` fast.
 
 
-def load_rig(path: str | Path | None = None, **overrides: object) -> Rig:
+def load_rig(path: str | Path | None = None, /, **overrides: object) -> Rig:
     """The rig of a ROS 2 parameter file; the thesis rig if ``path`` is None.
 
     ``overrides``: parameters that differ, with dots or as maps: ``load_rig(block_size=10, link={'length': 0.4})``,

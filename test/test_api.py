@@ -166,7 +166,7 @@ def test_discover_takes_what_simulate_gives() -> None:
         (ConfigError, 'dots: has the shape (2,): must be (4,) or (n, 4): x1, y1, x2, y2 in m',
          lambda: psd_deflection.solve([1, 2])),
         (ConfigError, 'dots[1, 3] = nan m: must be finite',
-         lambda: psd_deflection.solve([[0, 0, 0, 0], [0, 0, 0, float('nan')]])),
+         lambda: psd_deflection.solve([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, float('nan')]])),
         (ConfigError, 'dots: must be numbers, (4,) or (n, 4)', lambda: psd_deflection.solve(['a', 'b', 'c', 'd'])),
         (ConfigError, 'did you mean exact?', lambda: psd_deflection.solve([0] * 4, solver='exakt')),
         (SolverError, 'coincide', lambda: psd_deflection.solve(
@@ -240,7 +240,8 @@ def test_estimates_as_tables_with_units() -> None:
     frame, data = estimates.to_pandas(), estimates.to_xarray()
     assert frame.attrs['units']['sd_theta'] == data['sd_theta'].attrs['units'] == 'rad'
     assert np.array_equal(frame['dy'], estimates.dy)
-    assert np.array_equal(data['fy'], estimates.wrench[:, 1] if estimates.wrench is not None else None)
+    assert estimates.wrench is not None
+    assert np.array_equal(data['fy'], estimates.wrench[:, 1])
     # What was recorded as plain poses has no covariance, and no such columns.
     recorded = psd_deflection.open(CLEAN).estimates()['/link_tip/deflection']
     assert recorded.sd is None

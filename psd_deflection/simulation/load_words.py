@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from numbers import Real
 
 import numpy as np
 import numpy.typing as npt
@@ -102,7 +101,11 @@ def load_table(
     repeats = 1
     if seconds is not None:
         most = MAX_SECONDS / len(rows)
-        if isinstance(seconds, bool) or not isinstance(seconds, Real) or not 0.0 < seconds <= most:
+        try:
+            fits = 0.0 < seconds <= most
+        except TypeError:
+            fits = False
+        if not fits:
             raise ConfigError(f'seconds = {shown(seconds)} s: must be above 0 and at most {most:g}')
         repeats = round(seconds * rate)
     return LoadHistory(np.repeat(rows, repeats, axis=0), rate)
