@@ -132,7 +132,7 @@ def message_tables() -> str:
     for names, heading in [*(((n,), h) for n, h in headings.items()), (WITHOUT_STATUS, 'While it goes on')]:
         rows = sorted({(text, module) for kind, text, module in found if kind in names})
         if rows:
-            out.append(f'### {heading}\n\n| message | from |\n|---|---|')
+            out.append(f'## {heading}\n\n| message | from |\n|---|---|')
             out += [f'| {cell(text)} | `{module}` |' for text, module in rows]
             out.append('')
     return '\n'.join(out)

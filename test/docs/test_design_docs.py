@@ -1,4 +1,4 @@
-"""What docs/mechanics.md and docs/budget.md quote is what the commands print."""
+"""What docs/mechanics.md, docs/budget.md and docs/audit.md quote is what the commands print."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RIG = str(ROOT / 'config' / 'thesis_rig.yaml')
 @pytest.mark.parametrize(
     ('page', 'arguments'),
     [
-        ('mechanics.md', ['design']),
+        ('audit.md', ['design']),
         ('mechanics.md', ['design', '--params-file', RIG, '--sigma', '2e-6']),
         ('budget.md', ['budget', '--params-file', RIG, '--monte-carlo', '20000']),
     ],

@@ -123,6 +123,14 @@ def test_the_tests_that_follow_the_steps_are_there() -> None:
     assert [name for name in named if not (ROOT / name).is_file()] == []
 
 
+def test_errata_of_the_thesis_are_on_one_page() -> None:
+    audit = {page.name: page.read_text() for page in PAGES}.pop('audit.md')
+    assert len(re.findall(r'^## ', audit, re.M)) > 6
+    elsewhere = re.compile(r'^#+ .*(errat|discrepanc)|errors of the source', re.M | re.I)
+    for page in PAGES:
+        assert page.name == 'audit.md' or not elsewhere.search(page.read_text()), page
+
+
 def test_no_page_loads_anything_from_elsewhere() -> None:
     for page in PAGES:
         assert not re.search(r'!\[[^\]]*\]\(https?:', page.read_text()), page
@@ -237,10 +245,10 @@ def pattern(row: str) -> re.Pattern[str]:
     ],
     ids=lambda v: ' '.join(v) if isinstance(v, list) else str(v),
 )
-def test_every_user_message_is_on_the_troubleshooting_page(
+def test_every_user_message_is_on_the_page_of_messages(
     status: int, argv: list[str], hooks: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
-    page = hooks.on_page_markdown((ROOT / 'docs' / 'troubleshooting.md').read_text())
+    page = hooks.on_page_markdown((ROOT / 'docs' / 'messages.md').read_text())
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
     for name, line in {
         'unknown': 'link: {lenght: 1.0}',
@@ -258,7 +266,7 @@ def test_every_user_message_is_on_the_troubleshooting_page(
         ended = stop.code if isinstance(stop.code, int) else 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert ended == status, said
-    table = page.partition(f'### Exit status {status}: ')[2].partition('\n### ')[0]
+    table = page.partition(f'## Exit status {status}: ')[2].partition('\n## ')[0]
     rows = re.findall(r'^\| `(.+)` \| `', table, re.M)
     assert len(rows) > 5
     # A row of few words would fit whatever is said.
