@@ -1,4 +1,7 @@
-"""discover on open data of another machine, a two-link flexible arm, through the adapter. ``python -m blind.arm``.
+"""discover on open data of another machine, a two-link flexible arm, through the adapter.
+
+``python -m blind.arm [FOLDER]``; the folder holds ``excerpt.csv``, by default ``../shared/data/two_link_arm`` beside
+this checkout. The data are nine steps measured by others (repository basta/quanser-2-dof-serial-flexible-link, MIT).
 
 Stage 1 of the arm: a geared motor turns a hub, and a flexible link carries the rest. The equations
 of motion are (hub angle h, tip angle against the hub d, motor current u)::
@@ -13,6 +16,7 @@ model applied to the recorded states. A closed loop would hide many of the model
 
 from __future__ import annotations
 
+import argparse
 import csv
 import sys
 from collections.abc import Sequence
@@ -24,7 +28,7 @@ from blind.adapter import Model, PlantDiscovery, PlantEffect, discover_in
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.declaration import EffectParameter
 
-DATA = Path(__file__).parent.parent / 'test' / 'data' / 'two_link_arm' / 'excerpt.csv'
+DATA = Path(__file__).resolve().parent.parent.parent / 'shared' / 'data' / 'two_link_arm'
 RATE = 100.0
 SUBSTEPS = 8
 CREEP_RATE = 0.02
@@ -65,9 +69,10 @@ class Arm:
     channels = ('theta_hub', 'theta_tip')
     library = LIBRARY
 
-    def __init__(self, path: Path = DATA) -> None:
+    def __init__(self, folder: Path = DATA) -> None:
+        """``folder`` holds ``excerpt.csv``. Raises OSError if it does not."""
         rows: dict[str, list[list[float]]] = {}
-        with path.open(newline='') as stream:
+        with (folder / 'excerpt.csv').open(newline='') as stream:
             for row in csv.DictReader(stream):
                 names = ('t', 'current', 'theta_hub', 'theta_tip', 'rate_hub', 'rate_tip')
                 rows.setdefault(row['segment'], []).append([float(row[n] or 'nan') for n in names])
@@ -162,7 +167,15 @@ def report(found: PlantDiscovery) -> str:
 
 def main() -> int:
     """Run the five steps and print them."""
-    print(report(discover_in(Arm())))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument('folder', nargs='?', type=Path, default=DATA, help='with excerpt.csv (default: %(default)s)')
+    folder = parser.parse_args().folder
+    try:
+        arm = Arm(folder)
+    except OSError as error:
+        print(f'{error.filename}: {error.strerror}', file=sys.stderr)
+        return 3
+    print(report(discover_in(arm)))
     return 0
 
 

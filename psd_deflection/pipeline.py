@@ -266,7 +266,7 @@ class Pipeline:
         if status is BlockStatus.OK:
             if self.stamped.active:
                 fitted = self.stamped.fit(slots, samples)
-                x1, y1, x2, y2 = fitted.dots.tolist()
+                x1, y1, x2, y2 = fitted.dots
                 dots = (x1, y1, x2, y2)
                 spread = self._spread_of(verdict, sums, fitted.covariance)
             best, checked, failure = self._primary(t_ns, block.index, dots, variances, spread)
@@ -374,9 +374,10 @@ class Pipeline:
         # A printed threshold method has no covariance, and no slope either.
         if (spread is not None or widen) and covariance[0] == covariance[0]:
             gain = solver.gain(dots, variances, s)
-            own = np.array(covariance).reshape(3, 3)
             if spread is not None:
-                own = np.einsum('ik,jk->ij', np.einsum('ic,ck->ik', gain, spread), gain)
+                own = np.einsum('ic,ck,jk->ij', gain, spread, gain)
+            else:
+                own = np.array(covariance).reshape(3, 3)
             if widen and checked is not None:
                 own = widened(own, gain, checked.possible)
             covariance = tuple(own.ravel().tolist())

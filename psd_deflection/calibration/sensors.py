@@ -60,6 +60,10 @@ class Sensor(abc.ABC):
         """The inverse of :meth:`from_ratios`."""
         return np.asarray(place / self.half)
 
+    def to_linear(self, ratios: FloatArray) -> FloatArray:
+        """Ratios (n, 2) as an amplifier gives them, times its sensitivity at the centre, m."""
+        return self.from_ratios(ratios)
+
     def from_linear(self, place: FloatArray) -> FloatArray:
         """Places (n, 2), m, of ``place``: volts times the sensitivity at the centre, m.
 
@@ -179,6 +183,10 @@ class Quadrant(Sensor):
     def to_ratios(self, place: FloatArray) -> FloatArray:
         """erf(sqrt(2) x/w), (n, 2)."""
         return np.asarray(self._erf(sqrt(2.0) / self.spot_radius * np.asarray(place)))
+
+    def to_linear(self, ratios: FloatArray) -> FloatArray:
+        """The inverse of the line at the centre in :meth:`from_linear`."""
+        return np.asarray(ratios * (self.spot_radius / sqrt(8.0 / pi)))
 
     def from_linear(self, place: FloatArray) -> FloatArray:
         """At the centre dX/dx = sqrt(8/pi)/w: a ratio is ``place`` times that."""

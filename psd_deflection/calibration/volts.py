@@ -59,16 +59,25 @@ class Calibration:
                 dots[:, 2 * i : 2 * i + 2] = sensor.from_linear(dots[:, 2 * i : 2 * i + 2])
         return dots
 
-    def dots_of_currents(self, currents: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Places (n, 4) m and photocurrents (n, 2) A of electrode currents (n, 8) A.
+    def volts_of_electrodes(self, electrodes: FloatArray) -> FloatArray:
+        """Volts (n, 6) on the device's channels, as an amplifier that divides would give them.
 
-        For converters behind transimpedance amplifiers without a divider: four currents of PSD 1 in
-        the order of its ``electrodes``, then those of PSD 2. NaN without light.
+        ``electrodes`` (n, 8): of PSD 1 in the order of its ``electrodes``, then of PSD 2, each a current or what a
+        transimpedance amplifier makes of it, V. The sums are in their unit. A PSD without light reads 0, its sum too.
         """
-        halves = (currents[:, :4], currents[:, 4:])
-        places = [sensor.place(half) for sensor, half in zip(self.sensors, halves, strict=True)]
-        sums = [sensor.sum_signal(half) for sensor, half in zip(self.sensors, halves, strict=True)]
-        return np.hstack(places), np.column_stack(sums)
+        own = np.empty((len(electrodes), 6))
+        for psd, sensor in enumerate(self.sensors, start=1):
+            first = self.wiring.input_of(psd) - 1
+            four = electrodes[:, 4 * first : 4 * first + 4]
+            own[:, 3 * first : 3 * first + 2] = sensor.ratios(four)
+            own[:, 3 * first + 2] = sensor.sum_signal(four)
+        volts = self.wiring.to_psds(own)
+        for psd, sensor in enumerate(self.sensors):
+            both = volts[:, 3 * psd : 3 * psd + 2]
+            both[:] = sensor.to_linear(both) / self.sensitivities[2 * psd : 2 * psd + 2]
+            # No place may be made up where the currents of one axis are missing.
+            volts[~np.isfinite(both).all(axis=1), 3 * psd : 3 * psd + 3] = 0.0
+        return self.wiring.to_device(volts)
 
 
 def dot_noise_variances(rig: Rig) -> FloatArray:

@@ -12,7 +12,10 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from psd_deflection import __version__
+from psd_deflection.calibration import Calibration
 from psd_deflection.config import Rig
 from psd_deflection.devices.device import (
     OUTPUT_LIMIT,
@@ -29,7 +32,9 @@ from psd_deflection.devices.source import Event, Received, Sample
 from psd_deflection.errors import DeviceError
 from psd_deflection.protocol.frames import PROTOCOL_VERSION, BadFrame, HelloFrame
 from psd_deflection.protocol.text_lines import (
+    ELECTRODES,
     MAX_VOLTS,
+    READINGS,
     Description,
     Line,
     LineDecoder,
@@ -51,7 +56,10 @@ class TextLines(PortSource):
 
     def __init__(self, rig: Rig) -> None:
         super().__init__(rig.acquisition.port)
+        self._rig = rig
         self._baud = rig.acquisition.baud
+        self._electrodes: Calibration | None = None
+        self._scale: float | None = None
         self._decoder = LineDecoder()
         self._time = TimeExtender()
         self.volts = True
@@ -72,8 +80,8 @@ class TextLines(PortSource):
                 for item in decoder.feed(piece):
                     lines += isinstance(item, Line)
                     if isinstance(item, Description) and 'sample_rate_hz' in item.info:
-                        self.volts = positive(item.info.get('volts_per_count')) is None
-                        return _hello(item.info)
+                        self._describe(item.info)
+                        return self._hello(item.info)
         except BaseException:
             self.close()
             raise
@@ -103,20 +111,57 @@ class TextLines(PortSource):
             elif isinstance(item, BadFrame):
                 events.append(item)
             elif 'sample_rate_hz' in item.info:
-                events.append(_hello(item.info))
+                events.append(self._hello(item.info))
         return Received(events, now, len(received))
 
+    def _hello(self, info: Mapping[str, object]) -> HelloFrame:
+        """What the line that describes the device says."""
+        own: dict[str, object] = {
+            'serial': str(info.get('serial', ''))[:64],
+            'firmware': 'text lines',
+            'channels': list(CHANNELS),
+            'volts_per_count': None,
+        }
+        # Only what is known is kept: the line is a stranger's and goes into recordings.
+        known = ['firmware', 'sample_rate_hz', 'channels', 'bits']
+        if self._electrodes is None:
+            # Otherwise what we hand on is volts.
+            known.append('volts_per_count')
+        return HelloFrame(PROTOCOL_VERSION, own | {k: v for k, v in info.items() if k in known})
+
+    def _describe(self, info: Mapping[str, object]) -> None:
+        """What the first description says of the readings; it holds as long as the port is open."""
+        self._scale = positive(info.get('volts_per_count'))
+        electrodes = info.get('electrodes') is True
+        self.volts = self._scale is None or electrodes
+        self._electrodes = Calibration.from_rig(self._rig) if electrodes else None
+
     def _sample(self, line: Line) -> Event:
+        readings = line.readings
+        wanted = READINGS if self._electrodes is None else ELECTRODES
+        if len(readings) != wanted:
+            return BadFrame(f'{len(readings)} readings where the description says {wanted}', 0)
+        if self._electrodes is not None:
+            return self._of_electrodes(line, self._electrodes)
         if self.volts:
-            if max(map(abs, line.readings)) > MAX_VOLTS:
+            if max(map(abs, readings)) > MAX_VOLTS:
                 return BadFrame('a reading is out of all bounds', 0)
-            return Sample(0, line.seq, self._time.extend(line), line.readings)
+            return Sample(0, line.seq, self._time.extend(line), readings)
         top = self._top
-        if not all(r.is_integer() and -top - 1 <= r <= top for r in line.readings):
+        if not all(r.is_integer() and -top - 1 <= r <= top for r in readings):
             return BadFrame(f'counts are whole numbers of {self._bits} bits', 0)
-        counts = tuple(int(r) for r in line.readings)
-        over = max(counts) == top or min(counts) == -top - 1
-        return Sample(FLAG_OVER_RANGE if over else 0, line.seq, self._time.extend(line), counts)
+        counts = tuple(int(r) for r in readings)
+        return Sample(self._flags(readings), line.seq, self._time.extend(line), counts)
+
+    def _of_electrodes(self, line: Line, calibration: Calibration) -> Event:
+        electrodes = np.array([line.readings]) * (self._scale or 1.0)
+        if np.abs(electrodes).max() > MAX_VOLTS:
+            return BadFrame('a reading is out of all bounds', 0)
+        volts = tuple(calibration.volts_of_electrodes(electrodes)[0].tolist())
+        return Sample(self._flags(line.readings) if self._scale else 0, line.seq, self._time.extend(line), volts)
+
+    def _flags(self, counts: tuple[float, ...]) -> int:
+        return FLAG_OVER_RANGE if max(counts) >= self._top or min(counts) <= -self._top - 1 else 0
 
     def describe(self) -> Mapping[str, str]:
         """Port and line speed."""
@@ -125,19 +170,6 @@ class TextLines(PortSource):
             'sample numbers': 'of the device',
             'sample times': 'of the device',
         }
-
-
-def _hello(info: Mapping[str, object]) -> HelloFrame:
-    """What the line that describes the device says."""
-    own: dict[str, object] = {
-        'serial': str(info.get('serial', ''))[:64],
-        'firmware': 'text lines',
-        'channels': list(CHANNELS),
-        'volts_per_count': None,
-    }
-    # Only what is known is kept: the line is a stranger's and goes into recordings.
-    known = ('firmware', 'sample_rate_hz', 'channels', 'volts_per_count', 'bits')
-    return HelloFrame(PROTOCOL_VERSION, own | {k: v for k, v in info.items() if k in known})
 
 
 class SimulatedLines:

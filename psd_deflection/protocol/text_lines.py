@@ -1,7 +1,8 @@
 """One sample per line of text, simple to send from an Arduino and readable; no I/O.
 
 Theory of operation. A line is ``seq,t_us,x1,y1,sum1,x2,y2,sum2`` and a newline (a carriage return
-before it is ignored): ``seq`` and ``t_us`` whole numbers modulo 2^32, the six readings decimal. A
+before it is ignored): ``seq`` and ``t_us`` whole numbers modulo 2^32, the six readings decimal. Where
+the electrodes themselves are converted, eight readings take their place: four of PSD 1, four of PSD 2. A
 line that begins with ``#`` describes the device: a JSON object with ``sample_rate_hz`` and, if the
 readings are converter counts, ``volts_per_count``. Without ``volts_per_count`` the readings are
 volts. The device sends this line at power-up and once a second.
@@ -25,7 +26,8 @@ from psd_deflection.protocol.words import device_words, finite
 MAX_LINE = 400
 """Bytes. Longer lines are malformed."""
 
-FIELDS = 8
+READINGS = 6
+ELECTRODES = 8
 _WHOLE = re.compile(rb'\d{1,10}')
 _DECIMAL = re.compile(rb'[+-]?(\d{1,9}(\.\d{0,9})?|\.\d{1,9})')
 MAX_VOLTS = 1e3
@@ -72,8 +74,8 @@ def parse(line: bytes) -> Item | None:
     if line.startswith(b'#'):
         return _description(line[1:], size)
     fields = [f.strip() for f in line.split(b',')]
-    if len(fields) != FIELDS:
-        return BadFrame('not eight fields', size)
+    if len(fields) - 2 not in (READINGS, ELECTRODES):
+        return BadFrame('not eight fields, nor ten', size)
     if not (_WHOLE.fullmatch(fields[0]) and _WHOLE.fullmatch(fields[1])):
         return BadFrame('seq or t_us is no whole number', size)
     seq, t_us = int(fields[0]), int(fields[1])

@@ -50,8 +50,10 @@ NEWS = 3
 RECORDED_RESTARTS = 10_000
 """Restarts of one run that are recorded: a device that does nothing else must not fill the disk."""
 
-GATHER_S = 0.004
-"""Longest time that the reader lets samples gather: waking up costs more than reading a sample."""
+GATHER_S = 0.018
+GATHER_SAMPLES = 36
+"""Longest time that the reader lets samples gather, and most samples: waking up costs more than reading a sample.
+The kernel holds 4096 bytes for us."""
 
 Say = Callable[[str], None]
 
@@ -268,14 +270,15 @@ class Acquisition:
     def _gather(self) -> None:
         """Let samples gather before the next read; the last ones of a block are waited for one by one.
 
-        The clock map needs samples that are read as they arrive, and the estimate needs the last one.
+        The clock map needs samples and answers to pings that are read as they arrive, and the estimate needs the last
+        sample.
         """
-        if not self._clock.regressed:
-            # The time of the read is the time of the sample.
+        # Without the map, the time of the read is the time of the sample.
+        if not self._clock.regressed or self._pinger.awaits(time.monotonic_ns()):
             return
         to_come = -(self._last_number + 1) % self._block_size or self._block_size
         period_s = self._period_us / 1e6
-        rest = min(GATHER_S, (to_come - 2) * period_s)
+        rest = min(GATHER_S, min(to_come - 2, GATHER_SAMPLES) * period_s)
         if rest >= 2 * period_s:
             time.sleep(rest)
 

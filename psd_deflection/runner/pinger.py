@@ -15,6 +15,9 @@ PING_S = (0.1, 0.4)
 UNANSWERED = 20
 """After this many unanswered pings in a row the device does not support them, and gets no more."""
 
+ANSWER_NS = 20_000_000
+"""An answer comes within this time, or later than is of use."""
+
 
 class Pinger:
     """Keeps at most one ping under way; a new ping replaces the one before."""
@@ -29,6 +32,10 @@ class Pinger:
     def is_due(self, now_s: float) -> bool:
         """Whether the next ping is due."""
         return self._unanswered < UNANSWERED and now_s >= self._next_s
+
+    def awaits(self, now_ns: int) -> bool:
+        """Whether an answer may come at any moment. ``now_ns``: CLOCK_MONOTONIC."""
+        return self._cookie is not None and now_ns - self._sent_ns < ANSWER_NS
 
     def ask(self, source: Source, now_s: float, sent_ns: int) -> bool:
         """Ping ``source``; False if it cannot be asked. ``sent_ns``: CLOCK_MONOTONIC.

@@ -43,13 +43,10 @@ _SUDDEN = 12.0
 _MISFIT = 5.0
 """Standard deviations of the sum of squares that is left, above which the polynomial does not fit."""
 
-_ANY = 1e30
-"""m^2: nothing is known of order 0 beforehand."""
-
 LARGEST = 64
 """Samples a block up to which the colour of the noise makes the weights; of larger ones it makes the variance alone."""
 
-_ORDERS = np.arange(ORDER + 1)
+_DIAGONAL = np.arange(4)
 
 _WIDEN = 1.0
 """Times what is left of the samples: the standard deviation of a misfit's error in the middle."""
@@ -58,7 +55,7 @@ _WIDEN = 1.0
 class Fitted(NamedTuple):
     """``dots`` (4,) m at the stamp, their ``covariance`` (4, 4) m^2, ``misfit``: the polynomial does not fit."""
 
-    dots: FloatArray
+    dots: tuple[float, ...]
     covariance: FloatArray
     misfit: bool
 
@@ -88,22 +85,28 @@ def combinations(beams: FloatArray) -> FloatArray:
 
 
 class _Terms(NamedTuple):
-    """What the samples that are present say of the coefficients, for K orders of which ``len(v[0])`` can be told.
+    """What the samples that are present say of the coefficients, for K orders of which ``told`` can be told.
 
-    ``q`` (n, K). ``precision`` (4, n, n). ``u`` (4, n, K): precision times q. ``information`` (4, K, K): of the
-    coefficients; ``inverse`` (4, k, k) and ``v`` (4, k): covariance and variances of the first k.
-    ``all`` (4, n, K + k + n): u, u times inverse, precision.
+    ``q`` (n, K). ``u`` (4, n, K): precision times q. ``information`` (4, K, K): of the coefficients. ``v`` (4, told):
+    variances of the first ones. ``all`` (4, n, K + told + n): u, u times the covariance of the first ones, precision.
+    ``used``: orders above 0 that the middle needs. Once order 0, of which nothing is known beforehand, is taken out:
+    ``rest`` (4, k, k) and ``right`` (4, k) are the equations of those; ``first`` (4,) and ``share`` (4, k) give its
+    weight from theirs.
     """
 
     q: FloatArray
     u: FloatArray
     information: FloatArray
-    inverse: FloatArray
     v: FloatArray
     all: FloatArray
+    used: slice
+    rest: list[list[list[float]]]
+    right: list[list[float]]
+    first: list[float]
+    share: list[list[float]]
 
 
-def _terms(q: FloatArray, precision: FloatArray) -> _Terms:
+def _terms(q: FloatArray, precision: FloatArray, middle: FloatArray, whole: bool) -> _Terms:
     samples, orders = q.shape
     told = min(orders, max(samples // 2, 1))
     u = np.einsum('ast,tk->ask', precision, q)
@@ -111,7 +114,14 @@ def _terms(q: FloatArray, precision: FloatArray) -> _Terms:
     inverted = inverse(information[:, :told, :told])
     v = np.einsum('akk->ak', inverted).copy()
     estimate = np.einsum('ask,akj->asj', u[:, :, :told], inverted)
-    return _Terms(q, u, information, inverted, v, np.concatenate((u, estimate, precision), axis=2))
+    # In a whole block odd orders are 0 in the middle and uncorrelated with even ones.
+    used = slice(2, told, 2) if whole else slice(1, told)
+    own, mixed = information[:, 0, 0], information[:, 0, used]
+    share = mixed / own[:, None]
+    rest = (information[:, used, used] - share[:, :, None] * mixed[:, None, :]).tolist()
+    right = (middle[used] - share * middle[0]).tolist()
+    every = np.concatenate((u, estimate, precision), axis=2)
+    return _Terms(q, u, information, v, every, used, rest, right, (middle[0] / own).tolist(), share.tolist())
 
 
 class BlockFit:
@@ -135,6 +145,7 @@ class BlockFit:
     def set_geometry(self, centers: FloatArray, beams: FloatArray) -> None:
         """Use these places (2, 2), m, from now on; :meth:`set_noise` must follow."""
         self._turn = combinations(beams)
+        self._columns = [tuple(column) for column in self._turn.T.tolist()]
         apart = centers[0] - centers[1]
         self._across, self._along = (
             float(np.einsum('i,i->', row[:2], apart)) for row in (self._turn[2], self._turn[3])
@@ -151,7 +162,8 @@ class BlockFit:
         self._spectrum = np.fft.fft(whole)[:, :, : self._fft // 2 + 1] * self._folds
         own = turned[range(4), range(4)]
         self._precision = _precision(own, white=not self._poly or self._size > LARGEST)
-        self._whole = _terms(self._q, self._precision)
+        self._whole = _terms(self._q, self._precision, self._middle, whole=True)
+        self._bias, self._least = _BIAS * self._whole.v, 1e-9 * self._whole.v
         f = np.fft.rfft(self._whole.u, self._fft, axis=1)
         self._of_whole = np.einsum('afk,abf,bfj->akbj', f, self._spectrum, np.conj(f)).real
 
@@ -164,54 +176,48 @@ class BlockFit:
         offset = z.sum(axis=1) / len(slots)
         z -= offset[:, None]
         whole = len(slots) == self._size
-        terms = self._whole if whole else _terms(self._q[slots], self._without(slots))
+        terms = self._whole if whole else _terms(self._q[slots], self._without(slots), self._middle, whole=False)
         orders, told = self._orders, terms.v.shape[1]
         seen = np.einsum('asj,as->aj', terms.all, z)
-        h, c, weighted = seen[:, :orders], seen[:, orders : orders + told], seen[:, orders + told :]
-        x = np.zeros((4, orders))
-        motion = None
+        more = None
         if orders > 1:
+            c = seen[:, orders : orders + told]
             motion = self._motion(c, terms.v)
-            # In a whole block odd orders are 0 in the middle and uncorrelated with even ones.
-            step = 2 if whole else 1
-            known = terms.information[:, :told:step, :told:step].copy()
-            np.einsum('akk->ak', known)[:] += 1.0 / motion[:, :told:step]
-            x[:, :told:step] = _solved(known, self._middle[:told:step])
+            x, more = _weights(terms, motion, self._middle)
+            left = len(slots) - told
+            # In units of the noise: a chi-square of n - K degrees of freedom.
+            squares = (z * seen[:, orders + told :]).sum(axis=1) - (seen[:, :told] * c).sum(axis=1)
         else:
-            x[:, 0] = terms.inverse[:, 0, 0] * self._middle[0]
-        value = (x * h).sum(axis=1) + offset
+            x = np.array(terms.first)[:, None]
+        value = (x * seen[:, :orders]).sum(axis=1) + offset
         if whole:
-            covariance = np.einsum('ak,akb->ab', x, np.einsum('akbj,bj->akb', self._of_whole, x))
+            covariance = np.einsum('ak,akbj,bj->ab', x, self._of_whole, x)
         else:
             weights = np.zeros((4, self._size))
             weights[:, slots] = np.einsum('ask,ak->as', terms.u, x)
             covariance = self._spread(weights)
         misfit = False
-        left = len(slots) - told
-        if motion is not None and left > 0:
-            missed = self._middle - np.einsum('akj,aj->ak', terms.information, x)
-            missed[:, 0] = 0.0
-            more = (missed * missed * motion).sum(axis=1)
-            # In units of the noise: a chi-square of n - K degrees of freedom.
-            squares = (z * weighted).sum(axis=1) - (h[:, :told] * c).sum(axis=1)
-            outside = squares > left + _MISFIT * (2.0 * left) ** 0.5
-            misfit = bool(outside.any())
+        if more is not None:
+            limit = left + _MISFIT * (2.0 * left) ** 0.5
+            misfit = left > 0 and max(squares.tolist()) > limit
             if misfit:
                 rest = z - np.einsum('sk,ak->as', terms.q[:, :told], c)
-                more += np.where(outside, _WIDEN**2 * (rest * rest).sum(axis=1) / left, 0.0)
-            np.einsum('aa->a', covariance)[:] += more
-        # Back from the length to the part along the base line at rest.
-        length, across = float(value[3]) + self._base_line, float(value[2]) + self._across
+                more += np.where(squares > limit, _WIDEN**2 * (rest * rest).sum(axis=1) / left, 0.0)
+            covariance[_DIAGONAL, _DIAGONAL] += more
+        return Fitted(*self._back(value.tolist(), covariance), misfit)
+
+    def _back(self, value: list[float], covariance: FloatArray) -> tuple[tuple[float, ...], FloatArray]:
+        """Dots (4,) m and their covariance (4, 4) m^2 from those of the combinations."""
+        # From the length to the part along the base line at rest.
+        x, y, twist, length = value[0], value[1], value[2], value[3] + self._base_line
+        across = twist + self._across
         along = max(length * length - across * across, 1e-4 * length * length) ** 0.5
-        value[3] = along - self._along
         back = self._turn.copy()
         back[2] -= (across / along) * back[3]
         back[3] *= length / along
-        return Fitted(
-            np.einsum('ac,a->c', self._turn, value),
-            np.einsum('ac,ad->cd', back, np.einsum('ab,bd->ad', covariance, back)),
-            misfit,
-        )
+        longer = along - self._along
+        dots = tuple([x * p + y * q + twist * r + longer * s for p, q, r, s in self._columns])
+        return dots, np.einsum('ac,ab,bd->cd', back, covariance, back)
 
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""
@@ -238,23 +244,27 @@ class BlockFit:
         )
 
     def _motion(self, c: FloatArray, v: FloatArray) -> FloatArray:
-        """tau^2 (4, K) after this block; infinite for order 0, of which nothing is known beforehand.
+        """tau^2 (4, K) after this block; order 0, of which nothing is known beforehand, is not meant.
 
-        ``c``, ``v`` (4, k): coefficients and their variances of the orders that this block tells of.
+        ``c``, ``v`` (4, told): coefficients and their variances of the orders that this block tells of.
         """
-        own = self._whole.v
         told = v.shape[1]
+        square = c * c
+        excess = square - v
         squares, weight = self._squares[:, :told], self._weight[:, :told]
-        excess = c * c - v
-        # A block with gaps says less the more noise its coefficients have.
-        sure = np.minimum(own[:, :told] / v, 1.0) ** 2
-        squares += _FORGET * (sure * excess - squares)
-        weight += _FORGET * (sure - weight)
-        tau = np.maximum(self._squares / np.maximum(self._weight, 1e-3) - _BIAS * own, own * 1e-9)
-        tau[:, :told] = np.where(
-            c * c > _SUDDEN * (v + tau[:, :told]), np.maximum(excess, tau[:, :told]), tau[:, :told]
-        )
-        tau[:, 0] = _ANY
+        if v is self._whole.v:
+            squares += _FORGET * (excess - squares)
+            weight += _FORGET * (1.0 - weight)
+        else:
+            # A block with gaps says less the more noise its coefficients have.
+            sure = np.minimum(self._whole.v[:, :told] / v, 1.0) ** 2
+            squares += _FORGET * (sure * excess - squares)
+            weight += _FORGET * (sure - weight)
+        tau: FloatArray = np.maximum(self._squares / np.maximum(self._weight, 1e-3) - self._bias, self._least)
+        usual = tau[:, :told]
+        sudden = square > _SUDDEN * (v + usual)
+        if sudden.any():
+            np.maximum(excess, usual, out=usual, where=sudden)
         return tau
 
     def _spread(self, weights: FloatArray) -> FloatArray:
@@ -281,20 +291,54 @@ def inverse(matrices: FloatArray) -> FloatArray:
     return out
 
 
-def _solved(matrices: FloatArray, right: FloatArray) -> FloatArray:
-    """x (n, k) of ``matrices`` (n, k, k), positive definite, times x = ``right`` (k,); ``matrices`` are used up."""
-    count, size, _ = matrices.shape
-    x = np.empty((count, size))
-    x[:] = right
-    for i in range(size - 1):
-        factor = matrices[:, i + 1 :, i] / matrices[:, i, i, None]
-        matrices[:, i + 1 :, i + 1 :] -= factor[:, :, None] * matrices[:, i, None, i + 1 :]
-        x[:, i + 1 :] -= factor * x[:, i, None]
+def _weights(terms: _Terms, motion: FloatArray, middle: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Weights (4, K) of the sums h in the middle, and the variance (4,), m^2, of the motion that they leave out.
+
+    A few numbers: floats, of which numpy's calls would cost a multiple.
+    """
+    used = terms.used
+    priors = (1.0 / motion[:, used]).tolist()
+    rows = []
+    more = []
+    for rest, right, first, share, prior in zip(terms.rest, terms.right, terms.first, terms.share, priors, strict=True):
+        known = [row.copy() for row in rest]
+        for k, p in enumerate(prior):
+            known[k][k] += p
+        found = _solved(known, right.copy())
+        # What the weights miss of an order is its weight times its prior's precision.
+        missed = 0.0
+        for w, p, s in zip(found, prior, share, strict=True):
+            missed += w * w * p
+            first -= s * w
+        row = [0.0] * motion.shape[1]
+        row[used] = found
+        row[0] = first
+        rows.append(row)
+        more.append(missed)
+    x, left_out = np.array(rows), np.array(more)
+    told = terms.v.shape[1]
+    if told < motion.shape[1]:
+        # So few samples cannot tell of these.
+        untold = middle[told:] - np.einsum('akj,aj->ak', terms.information[:, told:], x)
+        left_out += (untold * untold * motion[:, told:]).sum(axis=1)
+    return x, left_out
+
+
+def _solved(matrix: list[list[float]], right: list[float]) -> list[float]:
+    """x (k,) of ``matrix`` (k, k), positive definite, times x = ``right`` (k,); both are used up."""
+    size = len(right)
+    for i, pivot in enumerate(matrix):
+        for j in range(i + 1, size):
+            row = matrix[j]
+            factor = row[i] / pivot[i]
+            for m in range(i + 1, size):
+                row[m] -= factor * pivot[m]
+            right[j] -= factor * right[i]
     for i in range(size - 1, -1, -1):
-        if i < size - 1:
-            x[:, i] -= (matrices[:, i, i + 1 :] * x[:, i + 1 :]).sum(axis=1)
-        x[:, i] /= matrices[:, i, i]
-    return x
+        for m in range(i + 1, size):
+            right[i] -= matrix[i][m] * right[m]
+        right[i] /= matrix[i][i]
+    return right
 
 
 def _precision(gamma: FloatArray, white: bool) -> FloatArray:

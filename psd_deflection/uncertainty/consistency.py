@@ -87,20 +87,21 @@ class Consistency:
         if size == 0.0:
             return Checked(0.0, False, _NONE, _NONE)
         ax, ay = x / size, y / size
-        a = (ax, ay, -ax, -ay)
-        r = sum(p * e for p, e in zip(a, residual, strict=True))
-        variance = sum(
-            p * sum(q * c for q, c in zip(a, row, strict=True)) for p, row in zip(a, covariance.tolist(), strict=True)
-        )
+        x1, y1, x2, y2 = residual
+        r = ax * (x1 - x2) + ay * (y1 - y2)
+        u1, v1, u2, v2 = [ax * (c[0] - c[2]) + ay * (c[1] - c[3]) for c in covariance.tolist()]
+        variance = ax * (u1 - u2) + ay * (v1 - v2)
         chi_square = r * r / variance if variance > 0.0 else 0.0
         contradict = chi_square > limit
         held = max(_FADE * self.held, r * r if contradict else 0.0)
         self.held = held if held > limit * variance else 0.0
-        one = tuple(1.0 / p if abs(p) > _UNSEEN else 0.0 for p in a)
+        one_x, one_y = [1.0 / p if abs(p) > _UNSEEN else 0.0 for p in (ax, ay)]
         # The limit's share: below it an error is not sure enough to be held, and may still be many standard deviations.
         doubtful = chi_square * LIMIT > WIDEN * limit
         root = _MORE * max(self.held, r * r if doubtful else 0.0) ** 0.5
-        return Checked(chi_square, self.held > 0.0, tuple(r * p for p in one), tuple(root * p for p in one))
+        errors = (r * one_x, r * one_y, -r * one_x, -r * one_y)
+        possible = (root * one_x, root * one_y, -root * one_x, -root * one_y)
+        return Checked(chi_square, self.held > 0.0, errors, possible)
 
 
 def widened(covariance: FloatArray, gain: FloatArray, errors: tuple[float, ...]) -> FloatArray:

@@ -309,17 +309,17 @@ def _covariance(each: FloatArray, sure: FloatArray) -> FloatArray:
 
 
 def _positive(gamma: FloatArray) -> bool:
-    """Whether no weighted sum of N samples of each reading has a variance of 0 or below, by elimination."""
+    """Whether no weighted sum of N samples of each reading has a variance of 0 or below."""
     count, _, size = gamma.shape
     both = np.concatenate((gamma.transpose(1, 0, 2)[:, :, :0:-1], gamma), axis=2)
     lags = np.arange(size) - np.arange(size)[:, None] + size - 1
-    left = both[:, :, lags].transpose(0, 2, 1, 3).reshape(count * size, count * size)
-    for _ in range(count * size):
-        pivot = float(left[0, 0])
-        if not pivot > 0.0:
-            return False
-        left = left[1:, 1:] - left[1:, :1] * (left[:1, 1:] / pivot)
-    return True
+    whole = both[:, :, lags].transpose(0, 2, 1, 3).reshape(count * size, count * size)
+    try:
+        # Its last digits depend on the machine. The answer would only if a variance were 0 to 15 digits.
+        np.linalg.cholesky(whole)
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.isfinite(whole).all())
 
 
 def _undithered(variance: float, step: float) -> float:

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from blind import generator, run, score
 from blind.adapter import Model, PlantEffect, discover_in
-from blind.arm import Arm
+from blind.arm import DATA, Arm
 from blind.cases import Case, all_cases, designs, gap_of, scaled, short_cases
 from psd_deflection.config import load_rig
 from psd_deflection.records import FloatArray
@@ -132,6 +132,7 @@ def test_the_adapter_adds_nothing_to_a_plant_that_lacks_nothing() -> None:
     assert discover_in(Spring(0.0)).steps == ()
 
 
+@pytest.mark.skipif(not DATA.is_dir(), reason='the data that others measured are not here')
 def test_what_was_found_missing_closes_the_gap_on_measured_data() -> None:
     # The search itself takes minutes (python -m blind.arm); what it ended with is in docs/discover.md.
     arm = Arm()

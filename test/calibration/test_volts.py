@@ -125,9 +125,33 @@ def test_a_quadrants_volts_are_unbent_and_agree_with_a_lateral_one_at_the_centre
     np.testing.assert_allclose(beyond[0, 0], 1.5 * w, rtol=1e-9)
 
 
-def test_currents_of_both_psds() -> None:
+def test_electrodes_of_both_psds_come_out_as_places_and_light() -> None:
     calibration = Calibration.from_rig(rig_from_values({'psd_2.type': 'pincushion'}))
-    currents = np.array([[3.0, 1.0, 2.0, 2.0, 0.0, 1.0, 1.0, 0.0]])
-    dots, sums = calibration.dots_of_currents(currents)
-    np.testing.assert_allclose(dots, [[2.5e-3, 0.0, 5e-3, 0.0]], atol=1e-15)
-    np.testing.assert_allclose(sums, [[4.0, 2.0]])
+    electrodes = np.array([[3.0, 1.0, 2.0, 2.0, 0.0, 1.0, 1.0, 0.0]])
+    volts = calibration.volts_of_electrodes(electrodes)
+    # 5 mm at the edge: (3 - 1)/(3 + 1) and ((X2 + Y1) - (X1 + Y2))/sum of it; a duolateral counts the light twice.
+    np.testing.assert_allclose(calibration.dots(volts.astype(np.float32)), [[2.5e-3, 0.0, 5e-3, 0.0]], atol=1e-9)
+    np.testing.assert_allclose(volts[:, 2::3], [[4.0, 2.0]])
+
+
+def test_electrodes_go_through_the_wiring_once() -> None:
+    wired = {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x'], 'psd_1.sensitivity': [1e-3, 2e-3]}
+    calibration = Calibration.from_rig(rig_from_values(wired))
+    # The second input is that of PSD 1: its own x is 1/2 of the way and its own y 1/4 back.
+    electrodes = np.array([[1.0, 1.0, 1.0, 1.0, 3.0, 1.0, 3.0, 5.0]])
+    dots = calibration.dots(calibration.seen(calibration.volts_of_electrodes(electrodes).astype(np.float32)))
+    np.testing.assert_allclose(dots, [[1.25e-3, 2.5e-3, 0.0, 0.0]], atol=1e-9)
+
+
+def test_an_axis_without_current_makes_no_place() -> None:
+    calibration = Calibration.from_rig(rig_from_values({}))
+    volts = calibration.volts_of_electrodes(np.array([[0.0, 0.0, 3.0, 1.0, 1.0, 1.0, 1.0, 1.0]]))
+    np.testing.assert_array_equal(volts, [[0.0, 0.0, 0.0, 0.0, 0.0, 2.0]])
+
+
+def test_a_quadrants_electrodes_are_unbent_once() -> None:
+    rig = rig_from_values({'psd_1.type': 'quadrant', 'psd_1.spot_radius': 0.5e-3})
+    calibration = Calibration.from_rig(rig)
+    four = calibration.sensors[0].currents(np.array([[0.3e-3, -0.1e-3]]), 4.0)
+    volts = calibration.volts_of_electrodes(np.hstack((four, np.ones((1, 4)))))
+    np.testing.assert_allclose(calibration.dots(volts.astype(np.float32))[0, :2], [0.3e-3, -0.1e-3], rtol=1e-5)

@@ -35,7 +35,7 @@ LINE = Line(7, 7000, VALUES)
         (b'# {"sample_rate_hz": 200}', Description({'sample_rate_hz': 200})),
         (b'# a remark', BadFrame('comment without a description', 10)),
         (b'#[1]', BadFrame('comment without a description', 4)),
-        (b'7,7000,0.1,-0.2,5,0,1.5', BadFrame('not eight fields', 23)),
+        (b'7,7000,0.1,-0.2,5,0,1.5', BadFrame('not eight fields, nor ten', 23)),
         (b'7,7000,0.1,-0.2,5,0,1.5,x', BadFrame('a reading is no number', 25)),
         (b'7,7000,0.1,-0.2,5,0,1.5,nan', BadFrame('a reading is no number', 27)),
         (b'7,7000,0.1,-0.2,5,0,1.5,1e9', BadFrame('a reading is no number', 27)),
@@ -62,7 +62,7 @@ STREAM = b'tail\n7,7000,0.1,-0.2,5,0,1.5,4.75\r\n\n#{"a":1}\nrubbish\n' + b'x' *
 ITEMS = [
     LINE,
     Description({'a': 1}),
-    BadFrame('not eight fields', 7),
+    BadFrame('not eight fields, nor ten', 7),
     BadFrame('longer than a line', 1000),
     Line(1, 2, (0, 0, 5, 0, 0, 5)),
 ]
@@ -200,3 +200,41 @@ def test_readings_out_of_bounds_are_no_samples(wired: Any, info: bytes, line: by
     source.close()
     assert events
     assert all(isinstance(event, BadFrame) and event.reason == reason for event in events)
+
+
+def sent(wired: Any, info: bytes, line: bytes, **more: Any) -> Any:
+    """What the source makes of a line."""
+    device = Says(b'\n#{"sample_rate_hz": 1000, %s}\n' % info)
+    device.take = lambda since_power_up_ns, room=4096: line + b'\n'  # type: ignore[method-assign]
+    source = make_source(load_rig(overrides={'source': 'lines', 'port': str(wired(device).link), **more}))
+    hello = source.open(2.0)
+    source.start()
+    events = [event for _ in range(10) for event in source.read(1.0).events]
+    source.close()
+    return hello, events[0]
+
+
+ELECTRODES = b'1,1000,3,1,2,2,1,3,1,1'
+
+
+def test_electrodes_become_the_readings_of_a_divider(wired: Any) -> None:
+    hello, event = sent(wired, b'"electrodes": true', ELECTRODES)
+    # Half of 5 mm at 0.5 mm/V.
+    assert event == Sample(0, 1, 1000, (5.0, 0.0, 4.0, -5.0, 0.0, 3.0))
+    assert hello.info['volts_per_count'] is None
+
+
+def test_electrodes_in_counts_are_scaled_and_their_end_is_told(wired: Any) -> None:
+    scale = 10.0 / 2**15
+    info = b'"electrodes": true, "volts_per_count": %r' % scale
+    _, event = sent(wired, info, b'1,1000,32767,0,100,100,100,300,200,200')
+    assert event.flags == FLAG_OVER_RANGE
+    np.testing.assert_allclose(event[3], [10.0, 0.0, 32967 / 2 * scale, -5.0, 0.0, 400 * scale])
+
+
+@pytest.mark.parametrize(
+    ('info', 'line'), [(b'"serial": "a"', ELECTRODES), (b'"electrodes": true', b'1,1000,0,0,5,0,0,5')]
+)
+def test_a_line_must_have_as_many_readings_as_the_description_says(wired: Any, info: bytes, line: bytes) -> None:
+    _, event = sent(wired, info, line)
+    assert 'readings where the description says' in event.reason

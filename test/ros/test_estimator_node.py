@@ -64,6 +64,9 @@ def test_what_is_published_and_how_often(start: Callable[..., Any], peer: Any) -
     clouds = peer.collect(PointCloud2, '/psd/samples')
     health = peer.collect(DiagnosticArray, '/diagnostics')
     peer.until(lambda: len(poses) >= 251 and len(wrenches) >= 251 and len(health) >= 3, 'five seconds of estimates')
+    last = max(stamp(poses[250]), stamp(wrenches[250]))
+    # What was lost up to then is told later.
+    peer.until(lambda: stamp(health[-1]) > last, 'the diagnostics after them')
     graph = dict(peer.node.get_topic_names_and_types())
     for topic, kind in TOPICS.items():
         assert graph.get(topic) == [kind], topic
