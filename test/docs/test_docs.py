@@ -23,6 +23,7 @@ import pytest
 
 from psd_deflection import errors
 from psd_deflection.cli.main import COMMANDS, main, make_parser
+from psd_deflection.simulation.catalogue import catalogue
 from tools import run_commands
 from tools.program import ROOT
 from tools.run_commands import FENCE, PAGES, Command
@@ -290,6 +291,16 @@ def test_every_command_and_parameter_is_on_its_page(hooks: Any) -> None:
     for name in COMMANDS:
         assert f'usage: psd-deflection {name}' in page
     assert '| `monitor_control` | `False` |' in page
+
+
+def test_every_effect_is_on_its_page(hooks: Any) -> None:
+    page = hooks.on_page_markdown((ROOT / 'docs' / 'effects.md').read_text())
+    assert '<!--' not in page
+    assert re.findall(r'^## (\w+)$', page, re.M) == [
+        e.name for e in sorted(catalogue().values(), key=lambda e: e.rank) if e.name in hooks.OWN_EFFECTS
+    ]
+    assert len(hooks.OWN_EFFECTS) >= 27
+    assert 'angle: ' in page.partition('## sensor_rotation')[2].partition('\n## ')[0]
 
 
 def test_what_docstrings_say_for_sphinx_is_not_shown(hooks: Any) -> None:
