@@ -19,6 +19,7 @@ from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.mcap_reader import RawMessage
 from psd_deflection.records import (
     CHANNELS,
+    RESTART,
     AppliedLoad,
     FloatArray,
     IntArray,
@@ -84,9 +85,18 @@ class Recording(abc.ABC):
 
     def with_block_size(self, block_size: int) -> Self:
         """The same recording, cut into blocks of another number of samples."""
+        if block_size == self.block_size:
+            return self
         other = copy.copy(self)
         other.requested_block_size = block_size
+        # After a restart numbers go on with the next block, so they depend on its size.
+        other.__dict__.pop('samples', None)
+        other.restarts = self._noted_restarts()
         return other
+
+    def _noted_restarts(self) -> set[tuple[int, int]]:
+        """The restarts that the recorder noted, before any pass over the recording."""
+        return {r for change in self.changes if (r := _restart_in(change)) is not None}
 
     @property
     @abc.abstractmethod
@@ -261,6 +271,14 @@ def _once(found: Sequence[ReferencePose], t_ns: IntArray) -> FloatArray:
     inside = index < len(t_ns)
     out[index[inside]] = np.array([f[1:] for f in found], dtype=np.float64)[inside]
     return out
+
+
+def _restart_in(change: ParameterChange) -> tuple[int, int] | None:
+    value = dict(change.values).get(RESTART)
+    if not isinstance(value, tuple) or len(value) != 2 or not all(isinstance(n, int) for n in value):
+        return None
+    before, after = int(value[0]), int(value[1])
+    return (before, after) if 0 <= before < after < 2**62 else None
 
 
 def from_json(values: Mapping[str, str]) -> dict[str, Any]:
