@@ -5,7 +5,7 @@
 # make bench    what it costs, as ratios to peers measured in the same run (a few minutes)
 # make faults   a campaign of faults against the real node, each FAULT_TIMES=20 times (about 20 minutes)
 # make crash    kill -9 at 200 random instants while recording (about 8 minutes)
-# make fuzz     coverage-guided fuzzing of all that reads strangers' bytes, FUZZ_SECONDS=600 each; 10^7 damaged frames
+# make fuzz     coverage-guided fuzzing of all that reads strangers' bytes, FUZZ_SECONDS=600 each; 10^7 damaged frames; 10^6 HELLOs
 # make soak     SOAK_MINUTES=30 in real time, then SOAK_HOURS=24 of simulated time (a quarter of an hour on an idle core)
 # make firmware build the example firmware, run it in qemu, join it to the daemon (installs what it needs with apt-get)
 # make mutants  break the numerics line by line and see whether the tests notice (two hours; MUTANTS="--rooms solvers" for one room)
@@ -91,9 +91,11 @@ crash: $(VENV)/.installed
 
 FUZZ_SECONDS ?= 600
 FUZZ_FRAMES ?= 10000000
+FUZZ_HELLOS ?= 1000000
 fuzz: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check atheris
 	$(BIN)/python -m bench.campaign.fuzz corrupted $(FUZZ_FRAMES)
+	$(BIN)/python -m bench.campaign.hellos $(FUZZ_HELLOS)
 	for target in frames hello bag records csv parameters yaml; do $(BIN)/python -m bench.campaign.fuzz $$target -max_total_time=$(FUZZ_SECONDS) || exit 1; done
 
 SOAK_MINUTES ?= 30

@@ -72,7 +72,7 @@ SHORTEST = {
     'BENCH_ACCURACY="--blocks 100"',
     'faults': 'FAULT_TIMES=1 FAULTS="--only zero"',
     'crash': 'CRASH_TIMES=1',
-    'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=1000',
+    'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=1000 FUZZ_HELLOS=1000',
     'soak': 'SOAK_MINUTES=0.05 SOAK_HOURS=0.05',
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
     'shots': 'SHOT_SECONDS=2',

@@ -20,7 +20,7 @@ import sys
 import tempfile
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import zstandard
@@ -212,6 +212,15 @@ class Choices:
         return {self.text(): self.value(depth + 1) for _ in range(self.below(6))}
 
 
+def hello_words(choices: Choices, good: Mapping[str, object]) -> dict[str, object]:
+    """``good`` with up to two entries of any name and value."""
+    info = dict(good)
+    for _ in range(choices.below(3)):
+        key = [*good, choices.text()][choices.below(len(good) + 1)]
+        info[key] = choices.value()
+    return info
+
+
 def hello_target() -> tuple[Target, list[bytes]]:
     """A HELLO of any words, as a frame, through the gate: what is taken is printable, bounded, and can be recorded."""
     from psd_deflection.config import load_rig
@@ -235,12 +244,8 @@ def hello_target() -> tuple[Target, list[bytes]]:
         gate = HelloGate(rig)
         refused = []
         while choices:
-            info = dict(good)
-            for _ in range(choices.below(3)):
-                key = [*good, choices.text()][choices.below(len(good) + 1)]
-                info[key] = choices.value()
             try:
-                frames = FrameDecoder().feed(b'\0' + encode(HelloFrame(1, info)))
+                frames = FrameDecoder().feed(b'\0' + encode(HelloFrame(1, hello_words(choices, good))))
             except (ValueError, OverflowError):
                 # It does not fit into a frame.
                 continue

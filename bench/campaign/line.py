@@ -171,6 +171,11 @@ class Line:
         with self.lock:
             self._pending += garbage
 
+    def backlog(self) -> int:
+        """Bytes that have not left the device yet."""
+        with self.lock:
+            return len(self._pending)
+
     def next_identity(self) -> int:
         """Of the next sample to be taken."""
         with self.lock:

@@ -23,7 +23,7 @@ from psd_deflection.commissioning.wirings import (
     parameters,
 )
 from psd_deflection.config import Rig
-from psd_deflection.records import FloatArray
+from psd_deflection.records import CHANNELS, FloatArray
 
 RIGHT, WRONG, CANNOT_TELL = 'right', 'wrong', 'cannot_tell'
 
@@ -88,7 +88,7 @@ def check(rig: Rig, pushes: Sequence[Response], measured: Levels, drift: FloatAr
     if not dead and found:
         findings += _wiring_findings(file, seen, found, best, lines)
         findings += _load_findings(seen, best)
-    findings += _level_findings(rig, measured, lines)
+    findings += _level_findings(rig, measured, best.wiring, lines)
     told = not dead and len(found) == 1
     if not told and not dead:
         findings += _coverage(pushes, seen, found)
@@ -170,13 +170,32 @@ def _load_findings(seen: Sequence[Response], found: Candidate) -> list[Finding]:
     return out
 
 
-def _level_findings(rig: Rig, measured: Levels, lines: dict[str, object]) -> list[Finding]:
+def _level_findings(rig: Rig, measured: Levels, wiring: Wiring, lines: dict[str, object]) -> list[Finding]:
+    if any(any(psd.noise) for psd in rig.psds):
+        return [f for psd in (1, 2) for f in _channel_findings(rig, measured, wiring, psd, lines)]
     factor = measured.noise_factor
     if not factor or 1.0 / NOISE_FACTOR <= factor <= NOISE_FACTOR:
         return []
     level = float(f'{factor * rig.amplifier.noise:.2g}')
     lines['amplifier.noise'] = level
     return [Finding('noise_level', 'x1 y1 x2 y2', round(factor, 3), line('amplifier.noise', level))]
+
+
+def _channel_findings(rig: Rig, measured: Levels, wiring: Wiring, psd: int, lines: dict[str, object]) -> list[Finding]:
+    """The noise of one PSD's x and y against a rig file that says it for each."""
+    step = rig.converter.volts_per_count
+    stated = np.hypot(rig.noises[psd - 1, :2], step / np.sqrt(12.0))
+    columns = list(wiring.columns[3 * psd - 3 : 3 * psd - 1])
+    if any(CHANNELS[c] in measured.stuck for c in columns):
+        return []
+    factors = measured.noise[columns] / stated
+    far = np.maximum(factors, 1.0 / factors)
+    if (far <= NOISE_FACTOR).all():
+        return []
+    worst = int(np.argmax(far))
+    name, level = f'psd_{psd}.noise', [float(f'{v:.2g}') for v in measured.noise[columns].tolist()]
+    lines[name] = level
+    return [Finding('noise_level', f'{"xy"[worst]}{psd}', round(float(factors[worst]), 3), line(name, level))]
 
 
 def _coverage(pushes: Sequence[Response], seen: Sequence[Response], found: Sequence[Candidate]) -> list[Finding]:

@@ -73,7 +73,8 @@ def crossing(
     return qx, qy, row_x, row_y
 
 
-def _turns(theta: FloatArray, phi: FloatArray, omega: FloatArray) -> Turns[FloatArray]:
+def turns_of(theta: FloatArray, phi: FloatArray, omega: FloatArray) -> Turns[FloatArray]:
+    """Cosine and sine of each angle."""
     return np.cos(theta), np.sin(theta), np.cos(phi), np.sin(phi), np.cos(omega), np.sin(omega)
 
 
@@ -83,7 +84,7 @@ def crossings(poses: FloatArray, beams: FloatArray, heights: FloatArray) -> tupl
     ``poses`` (..., 5): dX, dY m, theta, phi, omega rad; ``beams`` (P, 2) or (..., P, 2) m; ``heights`` (P,) m.
     """
     dx, dy, theta, phi, omega = (poses[..., i, None] for i in range(5))
-    turns = _turns(theta, phi, omega)
+    turns = turns_of(theta, phi, omega)
     x, y, qx, qy = _point(beams[..., 0], beams[..., 1], heights, dx, dy, turns)
     points = np.stack((qx, qy), axis=-1)
     jacobian = np.empty((*points.shape, 5))
@@ -113,7 +114,7 @@ def points_under(
     """q_x and q_y, m, one array for each coordinate, of any shapes that broadcast; for long runs of
     samples.
     """
-    return _point(lx, ly, height, dx, dy, _turns(theta, phi, omega))[2:]
+    return _point(lx, ly, height, dx, dy, turns_of(theta, phi, omega))[2:]
 
 
 def flat_points(poses: FloatArray, beams: FloatArray) -> FloatArray:

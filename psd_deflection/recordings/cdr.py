@@ -1,9 +1,10 @@
-"""Converts message field dicts to CDR bytes and back; no other module knows the encoding.
+"""Converts message field dicts to CDR bytes and back.
 
 The node publishes and the recorder writes the same bytes (XCDR1, little-endian, header
 ``00 01 00 00``), so a message is encoded once. The encoders are made from the message definitions.
 Seven of a block's eight messages consist of a header and numbers: they are packed in one step, and
-:func:`numbers` reads them in one step. ``mcap_ros2`` decodes all others.
+:func:`numbers` reads them in one step. ``mcap_ros2`` decodes all others, and
+``clouds`` the samples.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ Encoder = Callable[[Mapping[str, Any]], bytes]
 _Writer = Callable[[bytearray, Any], None]
 
 _ENCAPSULATION = b'\x00\x01\x00\x00'
-_LITTLE = b'\x00\x01'
-_STAMP = struct.Struct('<iI')
-_U32 = struct.Struct('<I')
+LITTLE = b'\x00\x01'
+STAMP = struct.Struct('<iI')
+U32 = struct.Struct('<I')
 _FLOAT64 = re.compile(r'float64(?:\[(\d+)\])?')
 _ARRAY = re.compile(r'(.+)\[(\d*)\]')
 _FORMATS = {
@@ -86,7 +87,7 @@ def _writer(message: MessageType, kind: str) -> _Writer:
 
 
 def _write_size(out: bytearray, size: int) -> None:
-    out += bytes(-len(out) % 4) + _U32.pack(size)
+    out += bytes(-len(out) % 4) + U32.pack(size)
 
 
 def _write_text(out: bytearray, value: str) -> None:
@@ -222,11 +223,11 @@ def numbers(type_name: str, cdr: bytes) -> tuple[int, tuple[float, ...]]:
 
     Takes a tenth of the time of :func:`decode`. Raises ValueError if the message is too short or big-endian.
     """
-    if cdr[:2] != _LITTLE:
+    if cdr[:2] != LITTLE:
         raise ValueError('is not little-endian CDR')
     try:
-        sec, nanosec = _STAMP.unpack_from(cdr, 4)
-        (length,) = _U32.unpack_from(cdr, 12)
+        sec, nanosec = STAMP.unpack_from(cdr, 4)
+        (length,) = U32.unpack_from(cdr, 12)
         # Alignment counts from behind the encapsulation.
         at = 4 + (12 + length + 7) // 8 * 8
         return sec * 1_000_000_000 + nanosec, _doubles(type_name).unpack_from(cdr, at)

@@ -16,11 +16,8 @@ import numpy.typing as npt
 from msg_adapters import point_cloud2
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.allowance import MAX_FIELDS
+from psd_deflection.recordings.cdr import LITTLE, STAMP, U32
 from psd_deflection.records import CHANNELS, IntArray
-
-_LITTLE = b'\x00\x01'
-_STAMP = struct.Struct('<iI')
-_U32 = struct.Struct('<I')
 
 
 class _Layout(NamedTuple):
@@ -47,9 +44,9 @@ class CloudDecoder:
         for width_at, row_step_at, before_width, after_width, dtype in self._layouts:
             if message[12:width_at] == before_width and message[width_at + 4 : row_step_at] == after_width:
                 try:
-                    sec, nanosec = _STAMP.unpack_from(message, 4)
-                    (width,) = _U32.unpack_from(message, width_at)
-                    (size,) = _U32.unpack_from(message, row_step_at + 4)
+                    sec, nanosec = STAMP.unpack_from(message, 4)
+                    (width,) = U32.unpack_from(message, width_at)
+                    (size,) = U32.unpack_from(message, row_step_at + 4)
                     if width * dtype.itemsize != size:
                         break
                     return sec * 1_000_000_000 + nanosec, np.frombuffer(message, dtype, width, row_step_at + 8)
@@ -58,14 +55,14 @@ class CloudDecoder:
         if _declared_fields(message) > MAX_FIELDS:
             raise ValueError(f'it declares more than {MAX_FIELDS} fields')
         stamp, points = point_cloud2.to_points(cdr.decode(point_cloud2.MESSAGE.name, message))
-        if message[:2] == _LITTLE and len(self._layouts) < self._MOST:
+        if message[:2] == LITTLE and len(self._layouts) < self._MOST:
             self._layouts.append(_learn(message, points.dtype))
         return stamp, points
 
 
 def _declared_fields(message: bytes) -> int:
     """How many fields a PointCloud2 declares, before any is decoded; 0 if the message ends before that."""
-    order = '<I' if message[:2] == _LITTLE else '>I'
+    order = '<I' if message[:2] == LITTLE else '>I'
     try:
         (length,) = struct.unpack_from(order, message, 12)
         (count,) = struct.unpack_from(order, message, 16 + (length + 3) // 4 * 4 + 8)
@@ -78,11 +75,11 @@ def _learn(message: bytes, dtype: np.dtype[np.void]) -> _Layout:
     """Offsets of the parts that change from one message to the next; ``message`` must be valid."""
 
     def after_text(at: int) -> int:
-        (length,) = _U32.unpack_from(message, at)
+        (length,) = U32.unpack_from(message, at)
         return at + 4 + (int(length) + 3) // 4 * 4
 
     width_at = after_text(12) + 4
-    (count,) = _U32.unpack_from(message, width_at + 4)
+    (count,) = U32.unpack_from(message, width_at + 4)
     at = width_at + 8
     for _ in range(count):
         at = after_text(at) + 12

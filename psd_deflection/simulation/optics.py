@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from psd_deflection.geometry.landing import landings
 from psd_deflection.geometry.plate import points_under
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.physics import Physics
@@ -16,28 +17,9 @@ def dots_on_plate(pose: FloatArray, beams: FloatArray, physics: Physics) -> Floa
     """
     k = physics.slope_ratio / physics.length
     phi, omega = (-k * pose[1], k * pose[0]) if k != 0.0 else (np.zeros(1), np.zeros(1))
-    fall = _landings if physics.psds_at_base else points_under
+    fall = landings if physics.psds_at_base else points_under
     qx, qy = fall(beams[0::2], beams[1::2], physics.heights[:, None], pose[0], pose[1], pose[2], phi, omega)
     dots = np.empty_like(beams)
     np.subtract(qx, physics.centers[:, :1], out=dots[0::2])
     np.subtract(qy, physics.centers[:, 1:], out=dots[1::2])
     return dots
-
-
-def _landings(
-    lx: FloatArray,
-    ly: FloatArray,
-    height: FloatArray,
-    dx: FloatArray,
-    dy: FloatArray,
-    theta: FloatArray,
-    phi: FloatArray,
-    omega: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Where lasers at (lx, ly) on the plate, along its normal, fall in the planes at ``height``: x and y, m.
-
-    The plate is turned by R = Ry(omega) Rx(phi) Rz(theta) (thesis 5.3, exact). Arrays of any shapes that broadcast.
-    """
-    ax, ay = np.cos(theta) * lx - np.sin(theta) * ly, np.sin(theta) * lx + np.cos(theta) * ly
-    tilt, lean, co = np.tan(phi), np.tan(omega), np.cos(omega)
-    return dx + ax / co + height * lean, dy + ay / np.cos(phi) - ax * lean * tilt - height * tilt / co

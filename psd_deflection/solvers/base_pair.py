@@ -18,18 +18,18 @@ assumption: ``no_twist`` (5.3's own assumption: dX, dY, phi, omega), or ``beam``
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, sin, tan
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, SolverError
+from psd_deflection.geometry.landing import landing
 from psd_deflection.geometry.layout import SMALLEST_BASE_LINE, Geometry, check_twist
-from psd_deflection.geometry.plate import Row, tie_matrix
+from psd_deflection.geometry.plate import tie_matrix
 from psd_deflection.solvers.beam import slope_per_metre
-from psd_deflection.solvers.gauss_newton import fit
-from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.solvers.gauss_newton import answer, fit
+from psd_deflection.solvers.interface import Solution, Solver
 
 Assume = Literal['beam', 'no_twist', 'nothing']
 
@@ -121,21 +121,8 @@ class BasePairSolver(Solver):
         """One block, pure floats. See :class:`Solver`."""
         measured = [c + m for c, m in zip(self._centers, dots, strict=True)]
         found = fit(self._model, (0.0,) * self._matrix.shape[1], measured, variances)
-        (vxx, vxy, vxt), (_, vyy, vyt), (_, _, vtt) = (
-            self._matrix[:3] @ found.covariance @ self._matrix[:3].T
-        ).tolist()
-        dx, dy, theta, phi, omega = (self._matrix @ found.parameters).tolist()
-        return Solution(
-            dx,
-            dy,
-            theta,
-            phi,
-            omega,
-            (vxx, vxy, vxt, vxy, vyy, vyt, vxt, vyt, vtt),
-            tuple(found.residual),
-            SolverStatus.OK if found.converged else SolverStatus.NOT_CONVERGED,
-            found.steps,
-        )
+        covariance = (self._matrix[:3] @ found.covariance @ self._matrix[:3].T).tolist()
+        return answer(found, (self._matrix @ found.parameters).tolist(), covariance)
 
     def _model(self, x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
         dx, dy, theta, phi, omega = [sum([a * b for a, b in zip(row, x, strict=True)]) for row in self._spread]
@@ -148,29 +135,3 @@ class BasePairSolver(Solver):
             for j in (jx, jy):
                 rows.append([sum([a * b for a, b in zip(j, column, strict=True)]) for column in self._columns])
         return predicted, rows
-
-
-def landing(
-    lx: float, ly: float, height: float, dx: float, dy: float, theta: float, phi: float, omega: float
-) -> tuple[float, float, Row, Row]:
-    """Where the laser at (lx, ly) on the plate falls in the plane at ``height``, and the derivatives of that place."""
-    ct = cos(theta)
-    st = sin(theta)
-    ax = ct * lx - st * ly
-    ay = st * lx + ct * ly
-    co = cos(omega)
-    cp = cos(phi)
-    to = tan(omega)
-    tp = tan(phi)
-    return (
-        dx + ax / co + height * to,
-        dy + ay / cp - ax * to * tp - height * tp / co,
-        (1.0, 0.0, -ay / co, 0.0, (ax * sin(omega) + height) / (co * co)),
-        (
-            0.0,
-            1.0,
-            ax / cp + ay * to * tp,
-            (ay * sin(phi) - ax * to - height / co) / (cp * cp),
-            -tp * (ax + height * sin(omega)) / (co * co),
-        ),
-    )

@@ -18,8 +18,8 @@ from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.geometry.plate import crossing, flat_pose
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.gauss_newton import fit
-from psd_deflection.solvers.interface import Solution, Solver, SolverStatus, flat_gain
+from psd_deflection.solvers.gauss_newton import answer, fit
+from psd_deflection.solvers.interface import Solution, Solver, flat_gain
 
 
 class BeamSolver(Solver):
@@ -52,18 +52,7 @@ class BeamSolver(Solver):
         q = [c + m for c, m in zip(self._centers, dots, strict=True)]
         found = fit(self._model, flat_pose(q, self._beams), q, variances)
         dx, dy, theta = found.parameters
-        (vxx, vxy, vxt), (_, vyy, vyt), (_, _, vtt) = found.covariance
-        return Solution(
-            dx,
-            dy,
-            theta,
-            -self._tie * dy,
-            self._tie * dx,
-            (vxx, vxy, vxt, vxy, vyy, vyt, vxt, vyt, vtt),
-            tuple(found.residual),
-            SolverStatus.OK if found.converged else SolverStatus.NOT_CONVERGED,
-            found.steps,
-        )
+        return answer(found, (dx, dy, theta, -self._tie * dy, self._tie * dx), found.covariance)
 
     def _model(self, x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
         dx, dy, theta = x

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from psd_deflection.errors import SolverError
+from psd_deflection.solvers.interface import Solution, SolverStatus
 
 Model = Callable[[Sequence[float]], tuple[list[float], list[Sequence[float]]]]
 """Parameters (p) to predicted readings (m) and rows of derivatives (m of p)."""
@@ -29,6 +30,23 @@ class Minimum(NamedTuple):
     residual: list[float]
     converged: bool
     steps: int
+
+
+def answer(found: Minimum, pose: Sequence[float], covariance: Sequence[Sequence[float]]) -> Solution:
+    """``found`` as a solver answers: ``pose`` (dX, dY, theta, phi, omega), ``covariance`` of the first three."""
+    dx, dy, theta, phi, omega = pose
+    (vxx, vxy, vxt), (_, vyy, vyt), (_, _, vtt) = (row[:3] for row in covariance[:3])
+    return Solution(
+        dx,
+        dy,
+        theta,
+        phi,
+        omega,
+        (vxx, vxy, vxt, vxy, vyy, vyt, vxt, vyt, vtt),
+        tuple(found.residual),
+        SolverStatus.OK if found.converged else SolverStatus.NOT_CONVERGED,
+        found.steps,
+    )
 
 
 def fit(model: Model, start: Sequence[float], measured: Sequence[float], variances: Sequence[float]) -> Minimum:

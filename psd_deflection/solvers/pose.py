@@ -17,8 +17,8 @@ import numpy as np
 from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import SMALLEST_BASE_LINE, Geometry, check_twist
 from psd_deflection.geometry.plate import crossing, flat_poses
-from psd_deflection.solvers.gauss_newton import fit
-from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.solvers.gauss_newton import answer, fit
+from psd_deflection.solvers.interface import Solution, Solver
 
 
 class PoseSolver(Solver):
@@ -60,19 +60,7 @@ class PoseSolver(Solver):
         points = np.asarray(dots).reshape(-1, 2) + self._centers
         start = flat_poses(points, self._beams).tolist()
         found = fit(self._model, [*start, 0.0, 0.0], points.ravel().tolist(), variances)
-        dx, dy, theta, phi, omega = found.parameters
-        v = found.covariance
-        return Solution(
-            dx,
-            dy,
-            theta,
-            phi,
-            omega,
-            (v[0][0], v[0][1], v[0][2], v[1][0], v[1][1], v[1][2], v[2][0], v[2][1], v[2][2]),
-            tuple(found.residual),
-            SolverStatus.OK if found.converged else SolverStatus.NOT_CONVERGED,
-            found.steps,
-        )
+        return answer(found, found.parameters, found.covariance)
 
     def _model(self, x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
         dx, dy, theta, phi, omega = x

@@ -16,10 +16,10 @@ from matplotlib.patches import Ellipse
 
 from psd_deflection.calibration.sensors import Duolateral, Quadrant
 from psd_deflection.geometry import Geometry
+from psd_deflection.geometry.landing import landing
 from psd_deflection.geometry.linear import design_matrix, gain_matrix
 from psd_deflection.geometry.placement import pose_spread
 from psd_deflection.geometry.plate import tied_pose
-from psd_deflection.solvers.base_pair import landing
 from psd_deflection.solvers.registry import make_solver
 from psd_deflection.thesis.comparison import (
     CONDITIONS,

@@ -264,6 +264,38 @@ def test_noise_hum_and_light_are_held_against_the_rig_file() -> None:
     assert not quiet.notes
 
 
+def test_noise_that_the_rig_file_says_for_each_channel_is_held_against_each() -> None:
+    loads = pushes(50.0)
+    volts = recorded(loads, 5, sigmas=(1e-3, 2e-3, 2e-3, 8e-3, 2e-3, 2e-3))
+    rig = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [4e-3, 2e-3]})
+    found = checked(volts, loads, rig)
+    (noisy,) = found.findings
+    assert (noisy.name, noisy.where) == ('noise_level', 'x2')
+    assert noisy.value == pytest.approx(2.0, rel=0.05)
+    assert found.lines == {'psd_2.noise': pytest.approx([8e-3, 2e-3], rel=0.05)}
+    right = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [8e-3, 2e-3]})
+    assert not checked(volts, loads, right).findings
+
+
+@pytest.mark.parametrize('name', ['psd_1', 'psd_2'])
+def test_a_wrong_wiring_is_named_whatever_the_sensitivities_are(name: str) -> None:
+    loads = pushes(50.0)
+    rig = load_rig(overrides={'psd_1.sensitivity': [0.4e-3, 0.6e-3], 'psd_2.sensitivity': [0.5e-3, 0.8e-3]})
+    turn = next(
+        t for t in every_turn() if list(lines_of(t)) == [f'{name}.axes'] and lines_of(t)[f'{name}.axes'] == ['-y', 'x']
+    )
+    volts = recorded(loads, 3)
+    gains = (0.5e-3 / rig.sensitivities).tolist()
+    for (x, y), first in zip(gains, (0, 3), strict=True):
+        volts[:, first] *= x
+        volts[:, first + 1] *= y
+    names = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
+    turned = np.column_stack([sign * volts[:, names.index(of)] for of, sign in (turn[n] for n in names)])
+    found = checked(turned, loads, rig)
+    assert found.verdict == WRONG
+    assert dict(found.lines) == lines_of(turn)
+
+
 def test_drift_is_told_with_its_sign() -> None:
     loads = pushes(50.0)
     drifting = {'name': 'laser_pointing_drift', 'psd': 2, 'rate_x': 1e-6, 'rate_y': 0.0}

@@ -120,7 +120,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 def test_the_tests_that_follow_the_steps_are_there() -> None:
     named = re.findall(r'`(test/[a-z_/]+\.py)`', (ROOT / 'docs' / 'extending.md').read_text())
-    assert len(named) == 7
+    assert len(named) >= 7
     assert [name for name in named if not (ROOT / name).is_file()] == []
 
 

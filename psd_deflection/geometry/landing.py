@@ -1,0 +1,63 @@
+"""PSDs at the base under lasers on the plate: pose -> dots, with derivatives.
+
+Laser i sits at (l_x, l_y) on the plate and shines along the plate's normal; PSD i has its surface at height h_i over
+the reference section. The plate is turned by R = Ry(omega) Rx(phi) Rz(theta) (thesis 5.3, exact), so with
+(a_x, a_y) = Rz(theta)(l_x, l_y) the dot is at
+
+    x = dX + a_x/cos(omega) + h tan(omega),
+    y = dY + a_y/cos(phi) - a_x tan(omega) tan(phi) - h tan(phi)/cos(omega).
+
+``landing`` takes floats: a solver calls it once a block. ``landings`` is the same formula for arrays.
+"""
+
+from __future__ import annotations
+
+from math import cos, sin
+
+from psd_deflection.geometry.plate import Number, Row, Turns, turns_of
+from psd_deflection.records import FloatArray
+
+
+def _place(
+    lx: Number, ly: Number, height: Number, dx: Number, dy: Number, turns: Turns[Number]
+) -> tuple[Number, Number, Number, Number]:
+    """a_x, a_y, x, y as in the module's text."""
+    ct, st, cp, sp, co, so = turns
+    ax, ay = ct * lx - st * ly, st * lx + ct * ly
+    across = ax * so + height
+    return ax, ay, dx + (ax + height * so) / co, dy + ay / cp - across * sp / (cp * co)
+
+
+def landing(
+    lx: float, ly: float, height: float, dx: float, dy: float, theta: float, phi: float, omega: float
+) -> tuple[float, float, Row, Row]:
+    """(x, y, dx, dy) of one laser's dot: m; m/m for dX, dY and m/rad for the angles."""
+    turns = cos(theta), sin(theta), cos(phi), sin(phi), cos(omega), sin(omega)
+    _, _, cp, sp, co, so = turns
+    ax, ay, x, y = _place(lx, ly, height, dx, dy, turns)
+    return (
+        x,
+        y,
+        (1.0, 0.0, -ay / co, 0.0, (ax * so + height) / (co * co)),
+        (
+            0.0,
+            1.0,
+            ax / cp + ay * so * sp / (co * cp),
+            (ay * sp - (ax * so + height) / co) / (cp * cp),
+            -sp * (ax + height * so) / (cp * co * co),
+        ),
+    )
+
+
+def landings(
+    lx: FloatArray,
+    ly: FloatArray,
+    height: FloatArray,
+    dx: FloatArray,
+    dy: FloatArray,
+    theta: FloatArray,
+    phi: FloatArray,
+    omega: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """x and y, m, one array for each, of any shapes that broadcast; for long runs of samples."""
+    return _place(lx, ly, height, dx, dy, turns_of(theta, phi, omega))[2:]
