@@ -248,14 +248,6 @@ def test_estimates_as_tables_with_units() -> None:
     assert 'sd_dx' not in recorded.to_pandas()
 
 
-@pytest.mark.parametrize('name', ['pandas', 'xarray'])
-def test_a_missing_library_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, name, None)
-    recording = psd_deflection.open(CLEAN)
-    with pytest.raises(ConfigError, match=rf"to_{name} needs {name}: `pip install 'psd_deflection\[pandas\]'`"):
-        getattr(recording, f'to_{name}')()
-
-
 def test_recordings_say_what_they_are() -> None:
     recording = psd_deflection.open(CLEAN)
     assert repr(recording) == f'<BagRecording {CLEAN}: device GOLDEN, parameters {len(recording.parameters)}>'
