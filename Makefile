@@ -13,6 +13,7 @@
 # make colcon   build with colcon in a virtual environment of its own and look at what it installed
 # make docs     the documentation as a web site, in build/site
 # make axe      audit the web site with axe-core (needs Chromium)
+# make notebooks  execute the notebooks of the documentation and keep what they answer
 # make wheel    sdist and wheel in dist/, tried in an environment of its own
 # make doc-commands  every command of README and docs that the tests do not run, run
 # make rerun    recordings converted for the Rerun viewer (170 MB, in an environment of its own) and looked at in it
@@ -32,7 +33,7 @@ PYTEST ?=
 WORKERS ?= 2
 BIN := $(VENV)/bin
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs axe shots blind demo-discover colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks axe shots blind demo-discover colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -126,6 +127,9 @@ docs: $(VENV)/.installed
 axe: docs
 	$(BIN)/python -m tools.accessible build/site
 
+notebooks: $(VENV)/.installed
+	$(BIN)/python -m pytest --nbmake --overwrite docs/*.ipynb
+
 SHOT_SECONDS ?= 40
 shots: $(VENV)/.installed
 	$(BIN)/python -m tools.shots --seconds $(SHOT_SECONDS)
@@ -141,7 +145,7 @@ wheel: $(VENV)/.installed
 	$(BIN)/python -m build --outdir dist . > build/wheel/log
 	$(PYTHON) -m venv build/wheel/use && build/wheel/use/bin/pip install --quiet --disable-pip-version-check dist/*.whl
 	cd build/wheel && use/bin/psd-deflection --help && use/bin/psd-deflection info ../../bags/clean
-	build/wheel/use/bin/pip install --quiet --disable-pip-version-check 'psd_deflection[monitor]' 'psd_deflection[ros]'
+	build/wheel/use/bin/pip install --quiet --disable-pip-version-check 'psd_deflection[monitor]' 'psd_deflection[ros]' 'psd_deflection[pandas]'
 	build/wheel/use/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/*.tar.gz
 	cd build/wheel && use/bin/psd-deflection --version && use/lib/psd_deflection/replay --help > log
 

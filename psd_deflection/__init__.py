@@ -1,6 +1,19 @@
 """Tip deflection and twist of a flexible link from two position sensing detectors.
 
-``docs/architecture.md`` lists the subpackages and the direction of the imports between them.
+    import psd_deflection as pd
+
+    rig = pd.load_rig('my_rig.yaml')                     # what is known of the rig; no file: the thesis rig
+    recording = pd.open('recordings/run')                # a bag folder, an .mcap or a .csv
+    recording.samples                                    # numpy, one row a sample, V
+    recording.to_pandas()                                # the same as a DataFrame; .to_xarray() as a Dataset
+    estimates = pd.replay(recording)                     # the deflections, as the daemon computes them
+    estimates.t, estimates.dx, estimates.dy              # s, m, m; .theta rad; .sd; .wrench N, N, N m
+    pd.solve([0.0, -1e-3, 0.0, -2e-3], rig).pose         # dots in m (x1, y1, x2, y2) to dX m, dY m, theta rad
+    pd.simulate(rig, (0, -10, -5.85), seconds=2)         # a recording of this rig under a load, N, N, N m
+    pd.discover([recording], rig)                        # the effects that the simulation lacks
+
+SI units everywhere. What is refused raises a subclass of ``psd_deflection.errors.PsdDeflectionError``: one line with
+the file or argument, the value and its bound. The command ``psd-deflection`` does the same from a shell, and more.
 """
 
 from __future__ import annotations
@@ -8,14 +21,36 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
+
+    import numpy.typing as npt
 
     from psd_deflection.config import Rig
     from psd_deflection.discovery.discover import Discovery
+    from psd_deflection.recordings.estimates import EstimateSeries
     from psd_deflection.recordings.recording import Recording
+    from psd_deflection.recordings.simulated_recording import SimulatedRecording
+    from psd_deflection.solvers.interface import Solutions
 
 __version__ = '0.1.0'
+
+__all__ = ['discover', 'load_rig', 'open', 'replay', 'simulate', 'solve']
+
+# Every function imports what it needs when it is called, to keep `import psd_deflection` fast.
+
+
+def load_rig(path: str | Path | None = None, /, **overrides: object) -> Rig:
+    """The rig of a ROS 2 parameter file; the thesis rig if ``path`` is None.
+
+    ``overrides``: parameters that differ, with dots or as maps: ``load_rig(block_size=10, link={'length': 0.4})``,
+    ``load_rig('my_rig.yaml', **{'psd_1.center': [0.0, 0.08]})``. ``psd-deflection params`` lists them.
+    Raises :class:`psd_deflection.errors.ConfigError`, which names file, parameter, value and bound.
+    """
+    from psd_deflection.config import flattened
+    from psd_deflection.config import load_rig as of_file
+
+    return of_file(path, flattened(overrides, 'load_rig'))
 
 
 def open(path: str | Path) -> Recording:
@@ -23,27 +58,141 @@ def open(path: str | Path) -> Recording:
 
     Raises :class:`psd_deflection.errors.RecordingError` if it cannot be read.
     """
-    # Imported here to keep `import psd_deflection` fast.
     from psd_deflection.recordings.readers import open_recording
 
     return open_recording(path)
 
 
-def discover(recordings: Sequence[str | Path], rig: Rig | str | Path | None = None, *, seed: int = 0) -> Discovery:
+def solve(dots: npt.ArrayLike, rig: Rig | str | Path | None = None, solver: str | None = None) -> Solutions:
+    """The pose of the tip from the dots, without any correction of effects.
+
+    ``dots``: (4,) or (n, 4): x1, y1, x2, y2 from each PSD's centre, m. ``rig``: the rig or its parameter file; by
+    default the thesis rig. ``solver``: by default that of the rig; :mod:`psd_deflection.solvers` has their names.
+
+    The result has ``pose`` (dX m, dY m, theta rad), ``tilt`` (phi, omega, rad), ``covariance`` of the pose (for means
+    of one block, with the rig's noise), ``residual`` (m) and ``status`` (0: solved), each for one block or for n.
+    Raises :class:`psd_deflection.errors.ConfigError` for a bad argument, and
+    :class:`~psd_deflection.errors.SolverError` if the method cannot solve the rig.
+    """
+    import dataclasses
+
+    import numpy as np
+
+    from psd_deflection.calibration import dot_noise_variances
+    from psd_deflection.errors import ConfigError
+    from psd_deflection.solvers import solver_from_rig
+
+    known = _rig(rig)
+    try:
+        rows = np.asarray(dots, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigError('dots: must be numbers, (4,) or (n, 4)') from None
+    if rows.ndim not in (1, 2) or rows.shape[-1] != 4:
+        raise ConfigError(f'dots: has the shape {rows.shape}: must be (4,) or (n, 4): x1, y1, x2, y2 in m')
+    bad = np.argwhere(~np.isfinite(rows))
+    if len(bad):
+        raise ConfigError(f'dots{bad[0].tolist()} = {rows[tuple(bad[0])]} m: must be finite')
+    method = solver_from_rig(known.estimator.solver if solver is None else solver, known)
+    found = method.solve_many(np.atleast_2d(rows), dot_noise_variances(known) / known.estimator.block_size)
+    if rows.ndim == 2:
+        return found
+    return dataclasses.replace(found, **{f.name: getattr(found, f.name)[0] for f in dataclasses.fields(found)})
+
+
+def simulate(
+    rig: Rig | str | Path | None = None,
+    loads: str | npt.ArrayLike = 'thesis',
+    effects: str | Sequence[str] | Mapping[str, object] = (),
+    *,
+    seconds: float | None = None,
+    temperature: npt.ArrayLike | None = None,
+    seed: int = 0,
+) -> SimulatedRecording:
+    """A recording of the simulated rig, in memory, with the true pose (``.pose``) and the loads.
+
+    ``rig``: the rig or its parameter file; by default the thesis rig. Its own effects are simulated and known.
+    ``loads``: (3,) or (n, 3), Fx N, Fy N, Tz N m at the tip; each row is held for ``seconds``, or for one sample. Or
+    words of ``psd-deflection simulate --loads``: ``'thesis'``, ``'identification'``, ``'ramp:0,0,0;0,-10,0:2'``.
+    ``effects``: hidden effects that the recording does not name: ``['creep,amplitude=0.03']``, or a map as below
+    ``effects:`` of a rig file, ``{'sensor_rotation': {'psd': 2, 'angle': 0.01}}``; ``psd-deflection effects`` lists
+    them. ``temperature``: degrees Celsius, straight lines through these, evenly over the recording. The same
+    ``seed`` gives the same noise.
+    Raises :class:`psd_deflection.errors.ConfigError` naming argument, value and bound.
+    """
+    from psd_deflection.errors import ConfigError
+    from psd_deflection.recordings.simulated_recording import SimulatedRecording
+    from psd_deflection.simulation.effect_words import with_effects_of
+    from psd_deflection.simulation.load_words import load_history, load_table, temperature_table
+
+    known = with_effects_of(_rig(rig), (), 'effects')
+    rate = known.converter.sample_rate_hz
+    if not isinstance(loads, str):
+        history = load_table(loads, rate, seconds)
+    elif seconds is None:
+        history = load_history(loads, rate)
+    else:
+        raise ConfigError(f'seconds = {seconds!r} s: loads = {loads!r} says how long they last; leave seconds out')
+    if len(history) < 2:
+        raise ConfigError(f'loads: {len(history)} samples at {rate:g} Hz: must be at least 2; give seconds')
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ConfigError(f'seed = {seed!r}: must be a whole number of at least 0')
+    warmth = None if temperature is None else temperature_table(temperature, len(history))
+    return SimulatedRecording(with_effects_of(known, effects, 'effects'), known, history.loads, warmth, seed)
+
+
+def replay(
+    recording: Recording | str | Path, rig: Rig | str | Path | None = None, *, solver: str | None = None
+) -> EstimateSeries:
+    """The estimates of a recording, computed as the live node computes them.
+
+    ``recording``: from :func:`open` or :func:`simulate`, or its path. ``rig``: the rig or its parameter file; by
+    default the parameters in the recording, which give the messages that were published, bit for bit.
+    ``solver``: by default that of the rig.
+
+    The result has numpy arrays (``t``, ``dx``, ``dy``, ``theta``, ``sd``, ``covariance``, ``wrench``), ``to_pandas()``
+    and ``to_xarray()``. Blocks without an estimate (a laser lost) have no row. Warns (``UserWarning``) if the
+    recording names no rig and none is given.
+    Raises :class:`psd_deflection.errors.RecordingError`, :class:`~psd_deflection.errors.ConfigError`,
+    :class:`~psd_deflection.errors.SolverError`.
+    """
+    import warnings
+
+    from psd_deflection.config import replace_values
+    from psd_deflection.recordings.recording import Recording
+    from psd_deflection.recordings.replay_engine import nominal_rig, replayed_estimates, rig_at_start
+
+    opened = recording if isinstance(recording, Recording) else open(recording)
+    known = rig_at_start(opened) if rig is None else _rig(rig)
+    if solver is not None:
+        known = replace_values(known, {'solver': solver, 'solvers': [solver]}, 'replay')
+    if rig is None:
+        for warning in nominal_rig(opened):
+            warnings.warn(warning, stacklevel=2)
+    return replayed_estimates(opened, known)
+
+
+def discover(
+    recordings: Sequence[Recording | str | Path], rig: Rig | str | Path | None = None, *, seed: int = 0
+) -> Discovery:
     """Name the effects that the simulation lacks to explain ``recordings``.
 
-    ``recordings``: files with loads, or ``.yaml`` lists of them.
+    ``recordings``: with loads; from :func:`open` or :func:`simulate`, or paths, or ``.yaml`` lists of them.
     ``rig``: the known rig, or its parameter file; by default the parameters in the recordings. The same
     ``seed`` gives the same answer. ``psd_deflection.discovery.result`` turns the answer into
     ``result.json`` and ``model.yaml``. Raises :class:`psd_deflection.errors.RecordingError` if a
     recording cannot be read or holds no loads, :class:`~psd_deflection.errors.ConfigError` for a bad
     parameter.
     """
-    from pathlib import Path
-
-    from psd_deflection.config import load_rig
     from psd_deflection.discovery.discover import discover as of_observations
     from psd_deflection.recordings.observations import read_observations
 
-    known = load_rig(rig) if isinstance(rig, str | Path) else rig
+    known = None if rig is None else _rig(rig)
     return of_observations(read_observations(recordings, known), known, seed=seed)
+
+
+def _rig(rig: Rig | str | Path | None) -> Rig:
+    """``rig``, or that of the parameter file, or the thesis rig."""
+    from psd_deflection.config import Rig
+    from psd_deflection.config import load_rig as of_file
+
+    return rig if isinstance(rig, Rig) else of_file(rig)

@@ -22,9 +22,10 @@ from typing import Any
 import numpy as np
 
 from psd_deflection.errors import ConfigError, did_you_mean
-from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
+from psd_deflection.foreign_yaml import YamlError, edited, parse_yaml, read_text
 from psd_deflection.parameters import Parameter, Section, Value, check_value, parameter, shown
 from psd_deflection.records import FloatArray
+from psd_deflection.tables import html_table
 
 MAX_FILE_BYTES = 1_000_000
 MAX_KEYS = 10_000
@@ -53,7 +54,7 @@ class LinkConfig:
     slope_ratio: float = parameter(
         1.5,
         '',
-        'k of the tip slope, phi = -k dY/L: 3/2 for a tip force, 2 for a tip moment',
+        'k of the tip slope, φ = -k ΔY/L: 3/2 for a tip force, 2 for a tip moment',
         minimum=0.0,
         maximum=10.0,
     )
@@ -410,6 +411,15 @@ _DESCRIBED = tuple(
     # A default of 0 says that there is nothing; any other one is a measure of the thesis rig.
     if p.kind.startswith('double') and np.any(p.default)
 )
+DESCRIPTION = (
+    *(
+        p.name
+        for section in (LINK, *PSDS, AMPLIFIER, CONVERTER, DYNAMICS, ESTIMATOR)
+        for p in section.parameters.values()
+    ),
+    *(ACQUISITION.parameters[name].name for name in ('psds_exchanged', 'latency_offset', 'thorlabs_x_sign')),
+)
+"""Parameters that describe the rig and how it is evaluated; the others say how the node runs on one machine."""
 ZEROS = tuple(section.parameters['zero'].name for section in PSDS)
 """The parameters that ``~/zero`` sets, one for each detector."""
 
@@ -421,7 +431,7 @@ _ORDERED = (
 _COMPARE = {'less than': operator.lt, 'at most': operator.le}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Rig:
     """The whole parameter set. ``values``: the flat values that it was made of, including defaults.
 
@@ -438,6 +448,22 @@ class Rig:
     monitor: MonitorConfig
     values: Mapping[str, Value] = field(repr=False)
     effects: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        changed = [p.with_value(self.values[p.name]) for p in PARAMETERS if self.values[p.name] != p.default]
+        own = sorted({key.partition('.')[0] for key in self.effects})
+        words = ', '.join([*changed, *(f'{EFFECTS_PREFIX}{name}' for name in own)])
+        return f'<Rig {words}>' if words else '<Rig of the thesis>'
+
+    def _repr_html_(self) -> str:
+        flat = self.flat()
+        return html_table(
+            'Rig',
+            (
+                (name, BY_NAME[name].with_value(value).partition(' = ')[2] if name in BY_NAME else value)
+                for name, value in flat.items()
+            ),
+        )
 
     def flat(self) -> dict[str, object]:
         """All values under their flat names, including simulated effects; :func:`rig_from_values` reads them."""
@@ -549,47 +575,91 @@ def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[
     missing, too large, not YAML, or not a parameter file.
     """
     path = Path(path)
-    tree = _read_yaml(path)
-    if not isinstance(tree, dict):
-        raise ConfigError(f'{path}: not a ROS 2 parameter file: expected "/**:" then "ros__parameters:"')
-    flat: dict[str, object] = {}
-    wanted = ('/**', node_name, '/' + node_name, '/**/' + node_name)
-    for name, body in tree.items():
-        if not isinstance(body, dict) or not isinstance(body.get('ros__parameters'), dict):
-            raise ConfigError(f'{path}: {name}: not a ROS 2 parameter file: "ros__parameters:" is missing below it')
-        if name in wanted:
-            _flatten(body['ros__parameters'], '', flat, path, 0)
-    if not any(name in wanted for name in tree):
-        raise ConfigError(f'{path}: has no parameters for /** or {node_name} (found: {", ".join(map(str, tree))})')
-    return flat
+    return flat_parameters(parameter_text(path), path, node_name)
 
 
-def _read_yaml(path: Path) -> object:
+def parameter_text(path: Path) -> str:
+    """The text of a parameter file. Raises ConfigError naming the file when it is missing or too large."""
     try:
-        text = read_text(path, MAX_FILE_BYTES)
+        return read_text(path, MAX_FILE_BYTES)
     except FileNotFoundError:
         raise ConfigError(f'{path}: no such parameter file') from None
     except OSError as error:
         raise ConfigError(f'{path}: cannot be read as a parameter file ({error.strerror or error})') from None
     except YamlError as error:
         raise ConfigError(f'{path}: cannot be read as a parameter file ({error})') from None
+
+
+def flat_parameters(text: str, path: Path, node_name: str = 'estimator') -> dict[str, object]:
+    """Flat values of the text of a parameter file, as of :func:`read_parameter_file`. Raises ConfigError."""
     try:
-        return parse_yaml(text)
+        tree = parse_yaml(text)
     except YamlError as error:
         raise ConfigError(f'{path}{error.where}: {error}') from None
+    if not isinstance(tree, dict):
+        raise ConfigError(f'{path}: not a ROS 2 parameter file: expected "/**:" then "ros__parameters:"')
+    flat: dict[str, object] = {}
+    wanted = _sections_of(node_name)
+    for name, body in tree.items():
+        if not isinstance(body, dict) or not isinstance(body.get('ros__parameters'), dict):
+            raise ConfigError(f'{path}: {name}: not a ROS 2 parameter file: "ros__parameters:" is missing below it')
+        if name in wanted:
+            flat.update(flattened(body['ros__parameters'], str(path)))
+    if not any(name in wanted for name in tree):
+        raise ConfigError(f'{path}: has no parameters for /** or {node_name} (found: {", ".join(map(str, tree))})')
+    return flat
 
 
-def _flatten(tree: Mapping[Any, Any], prefix: str, out: dict[str, object], path: Path, depth: int) -> None:
+def _sections_of(node_name: str) -> tuple[str, ...]:
+    """Names of the sections of a parameter file that a node reads."""
+    return '/**', node_name, '/' + node_name, '/**/' + node_name
+
+
+def with_effects_section(text: str, effects: Mapping[str, Mapping[str, object]], path: Path) -> str:
+    """The text of a parameter file with ``effects`` instead of its own; all else is as it was, comments too.
+
+    ``path``: for a message. Raises ConfigError if the file cannot be edited so that it says the same otherwise.
+    """
+    sections = _sections_of('estimator')
+
+    def edit(tree: Any) -> None:
+        found = [body['ros__parameters'] for name, body in tree.items() if name in sections]
+        for body in found:
+            for key in [k for k in body if k == EFFECTS_PREFIX.rstrip('.') or str(k).startswith(EFFECTS_PREFIX)]:
+                del body[key]
+        if effects:
+            found[-1][EFFECTS_PREFIX.rstrip('.')] = effects
+
+    wanted = {k: v for k, v in flat_parameters(text, path).items() if not k.startswith(EFFECTS_PREFIX)}
+    wanted.update(flattened({EFFECTS_PREFIX.rstrip('.'): effects}, str(path)))
+    try:
+        out = edited(text, edit)
+    except YamlError as error:
+        raise ConfigError(f'{path}: {error}') from None
+    # The editor reads YAML 1.2, ROS and our reader YAML 1.1.
+    if flat_parameters(out, path) != wanted:
+        raise ConfigError(f'{path}: cannot be written again with the same values')
+    return out
+
+
+def flattened(tree: Mapping[Any, Any], source: str) -> dict[str, object]:
+    """``tree`` with maps as dotted keys; lists stay lists. Raises ConfigError naming ``source``."""
+    out: dict[str, object] = {}
+    _flatten(tree, '', out, source, 0)
+    return out
+
+
+def _flatten(tree: Mapping[Any, Any], prefix: str, out: dict[str, object], source: str, depth: int) -> None:
     if depth > 8:
-        raise ConfigError(f'{path}: {prefix} is nested too deep')
+        raise ConfigError(f'{source}: {prefix} is nested too deep')
     for key, value in tree.items():
         name = f'{prefix}{key}'
-        if isinstance(value, dict):
-            _flatten(value, name + '.', out, path, depth + 1)
+        if isinstance(value, Mapping):
+            _flatten(value, name + '.', out, source, depth + 1)
         else:
             out[name] = value
         if len(out) > MAX_KEYS:
-            raise ConfigError(f'{path}: more than {MAX_KEYS} parameters')
+            raise ConfigError(f'{source}: more than {MAX_KEYS} parameters')
 
 
 def left_as_in_the_thesis(values: Mapping[str, object]) -> tuple[str, ...]:

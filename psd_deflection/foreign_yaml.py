@@ -6,6 +6,8 @@ of aliases or merge keys can stand for more than any memory holds, and some tags
 
 from __future__ import annotations
 
+import io
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +66,30 @@ def parse_yaml(text: str) -> object:
         raise YamlError(f'malformed YAML: {error.problem or "not YAML"}', error.problem_mark) from None
     except Exception:
         raise YamlError('malformed YAML: not YAML') from None
+
+
+def edited(text: str, edit: Callable[[Any], None]) -> str:
+    """``text`` after ``edit`` has changed its tree; comments, order and quotes of the rest are kept.
+
+    Raises YamlError if :func:`parse_yaml` refuses the text, or if it can be read but not written again.
+    """
+    parse_yaml(text)
+    # Imported here: it is slow, and only who writes a file of a user again needs it.
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    # Its round-trip loader makes no objects of tags, and does not write aliases out.
+    writer = YAML(typ='rt')
+    writer.preserve_quotes = True
+    writer.width = 10_000
+    out = io.StringIO()
+    try:
+        tree = writer.load(text)
+        edit(tree)
+        writer.dump(tree, out)
+    except (YAMLError, ValueError, TypeError, RecursionError) as error:
+        raise YamlError(f'cannot be written again ({type(error).__name__})') from None
+    return out.getvalue()
 
 
 def _count(text: str) -> None:

@@ -1,7 +1,8 @@
 """Inserts text from the program into the pages when the site is built, so that the two agree.
 
 ``<!-- messages -->``: every error message, by exit status. ``<!-- commands -->``: every command's
-help. ``<!-- parameters -->``: every parameter. ``<!-- exit statuses -->``: what each one means.
+help. ``<!-- parameters -->``: every parameter. ``<!-- effects -->``: every effect of the package.
+``<!-- exit statuses -->``: what each one means.
 """
 
 from __future__ import annotations
@@ -16,11 +17,15 @@ from pathlib import Path
 from typing import Any
 
 from psd_deflection import errors
+from psd_deflection.cli.effects import explained
 from psd_deflection.cli.main import COMMANDS, main, make_parser
 from psd_deflection.config import PARAMETERS
+from psd_deflection.simulation.catalogue import catalogue
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ('psd_deflection', 'msg_adapters')
+OWN_EFFECTS = {path.stem for path in (ROOT / 'psd_deflection' / 'simulation' / 'effects').glob('[a-z]*.py')}
+"""Not those of whoever builds the site."""
 
 STATUS = {
     name: kind.exit_status
@@ -132,7 +137,7 @@ def message_tables() -> str:
     for names, heading in [*(((n,), h) for n, h in headings.items()), (WITHOUT_STATUS, 'While it goes on')]:
         rows = sorted({(text, module) for kind, text, module in found if kind in names})
         if rows:
-            out.append(f'### {heading}\n\n| message | from |\n|---|---|')
+            out.append(f'## {heading}\n\n| message | from |\n|---|---|')
             out += [f'| {cell(text)} | `{module}` |' for text, module in rows]
             out.append('')
     return '\n'.join(out)
@@ -172,7 +177,14 @@ def exit_statuses() -> str:
     return '\n'.join(['| status | meaning |', '|---|---|', *rows])
 
 
+def effect_list() -> str:
+    """Every effect of the package, explained."""
+    shown = sorted((e for e in catalogue().values() if e.name in OWN_EFFECTS), key=lambda e: e.rank)
+    return '\n'.join(f'## {e.name}\n\n```text\n{chr(10).join(explained(e))}\n```\n' for e in shown)
+
+
 FILLED = {
+    'effects': effect_list,
     'exit statuses': exit_statuses,
     'messages': message_tables,
     'commands': command_help,

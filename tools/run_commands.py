@@ -48,7 +48,7 @@ CI_RUNS = (
     (r'^make colcon$', '.ci/run', 'make colcon '),
     (r'^colcon build$', 'Makefile', 'bin/colcon --log-base log build '),
     (
-        r"^pip install 'psd_deflection\[(ros|monitor)\]'$",
+        r"^pip install 'psd_deflection\[(ros|monitor|pandas)\]'$",
         'Makefile',
         "pip install --quiet --disable-pip-version-check 'psd_deflection[",
     ),

@@ -52,7 +52,7 @@ PLANE_TILT = Term(
     'plane_tilt',
     'E_Tilt',
     Kind.KNOWN,
-    'the tip tilts by phi = -k dY/L, omega = +k dX/L, the method takes k as 0 (beam: as it is)',
+    'the tip tilts by φ = -k ΔY/L, ω = +k ΔX/L, the method takes k as 0 (beam: as it is)',
     (),
     lambda at: np.ones(1),
     _tilt,

@@ -66,6 +66,7 @@ class OpticsHealth:
         self._sum_max = config.sum_max
         self.refuses_frozen = config.frozen == 'refuse'
         step = rig.converter.volts_per_count
+        self._full_scale = rig.converter.full_scale
         # The converter's last step on either side: the true value may lie beyond it.
         self._rail = np.float32((2 ** (rig.converter.bits - 1) - 1) * step)
         self._half = tuple(half / 2.0 for psd in rig.psds for half in psd.active_area)
@@ -107,7 +108,8 @@ class OpticsHealth:
         if float(extremes.max()) >= self._rail:
             for column, name in enumerate(_NAMES):
                 if extremes[column] >= self._rail:
-                    reason = f'{name} saturated: {float(extremes[column]):.3f} V'
+                    at = float(extremes[column])
+                    reason = f'{name} saturated: {at:.3f} V, converter.full_scale is {self._full_scale:g} V'
                     fault(1 + column // 3, BlockStatus.SATURATED, reason)
         elif bool((block.flags & FLAG_OVER_RANGE).any()) and not faults:
             return Verdict(BlockStatus.SATURATED, 'the device reports a channel over range', 0)

@@ -1,10 +1,10 @@
-"""Compute the error budget of a rig: how much each cause adds to the error of dX, dY and theta.
+"""Compute the error budget of a rig: how much each cause adds to the error of ΔX, ΔY and θ.
 
 The causes are those of the thesis's Table 3.1, with corrected equations, and those that it leaves
 out. Numbers are standard deviations, except for known biases: errors that follow from the pose
 because the method ignores something. Percentages are shares of the mean square of the total.
 
-  psd-deflection budget --params-file config/thesis_rig.yaml
+  psd-deflection budget --params-file config/thesis_rig.yaml --out budget.png
   psd-deflection budget --set rotation_tolerance=0.001 --method beam --json
   psd-deflection budget --explain
 
@@ -29,6 +29,7 @@ from psd_deflection.budget.environment import averaging_gain
 from psd_deflection.budget.estimate import METHODS, method_of
 from psd_deflection.budget.evaluate import CAUSES, Budget, evaluate, monte_carlo
 from psd_deflection.budget.inputs import INPUTS, read_inputs
+from psd_deflection.budget.load import default_load
 from psd_deflection.budget.term import Contribution, Kind, Situation
 from psd_deflection.cli._options import (
     PICTURES,
@@ -47,9 +48,6 @@ from psd_deflection.records import FloatArray
 
 MICRO_MILLIDEGREE = np.array([1e6, 1e6, math.degrees(1e3)])
 
-SIDEBAR_FORCE = 50.0
-"""N: the thesis's largest load, hung on a sidebar one link length out on +X."""
-
 MAX_DRAWS = 10_000_000
 
 KINDS = {Kind.PER_ESTIMATE: 'per estimate', Kind.SYSTEMATIC: 'systematic', Kind.KNOWN: 'known bias'}
@@ -66,7 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs=3,
         metavar=('FX', 'FY', 'TZ'),
-        help='tip load at which the errors are computed, N, N, N m (default: 50 N on the sidebar)',
+        help='tip load at which the errors are computed, N, N, N m (default: a weight on a sidebar as long as the '
+        'link: 50 N for the thesis rig, else one that uses half of the active area)',
     )
     parser.add_argument(
         '--method', choices=METHODS, help='method whose errors are computed (default: that of the rig file)'
@@ -84,16 +83,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--out',
         type=picture_name(*PICTURES),
         metavar='FILE.png|svg|pdf',
-        help='the chart (default: budget.png in this folder)',
+        help='draw the chart',
     )
-    parser.add_argument(
-        '--json', action='store_true', help='print JSON in SI units; the chart is drawn only with --out'
-    )
+    parser.add_argument('--json', action='store_true', help='print JSON in SI units')
     parser.add_argument('--explain', action='store_true', help='print formulas, inputs and their sources, and stop')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the table, draw the chart."""
+    """Print the table; draw the chart if a name is given."""
     if args.explain:
         refuse(args, {'json': False, 'out': None, 'monte_carlo': None, 'load': None}, 'does nothing beside --explain')
     rig = load_rig(args.params_file)
@@ -105,11 +102,10 @@ def run(args: argparse.Namespace) -> int:
         show_text(explain(rig, inputs))
         return 0
     method = args.method or method_of(rig)
-    load = tuple(args.load) if args.load else (0.0, -SIDEBAR_FORCE, -SIDEBAR_FORCE * rig.link.length)
+    load = tuple(args.load) if args.load else default_load(rig)
     need_finite('--load', load)
-    out = Path(args.out or 'budget.png')
-    if args.out is not None or not args.json:
-        need_folder(out)
+    if args.out is not None:
+        need_folder(Path(args.out))
     with given_as_option('load') if args.load or args.set else contextlib.nullcontext():
         budget = evaluate(Situation.at_load(rig, inputs, load, method))
     draws = args.monte_carlo
@@ -125,10 +121,10 @@ def run(args: argparse.Namespace) -> int:
         if sampled is not None:
             show('', f'Monte Carlo, {draws} draws of everything at once (seed {args.seed}):')
             show('total     ' + _figures_text(sampled))
-    if args.out is not None or not args.json:
-        draw_terms(budget, out)
+    if args.out is not None:
+        draw_terms(budget, Path(args.out))
         if not args.json:
-            show('', f'{out}')
+            show('', args.out)
     return 0
 
 
@@ -174,17 +170,17 @@ def _derived(rig: Rig, inputs: dict[str, float]) -> list[str]:
     return [
         f'  spot on the sensor (3.1): {spot * 1e3:.4f} mm',
         f'  index of air (3.3) at 50 % humidity: {index:.9f}, dn/dT {per_kelvin:.3e} 1/K',
-        f'  shift by a gradient across the beam: {per_gradient * 1e6:.3f} um per K/m',
-        f'  shift behind a boundary (3.4): {step * 1e6:.3f} um',
-        f'  noise of a dot: {_each(noise, 3)} um a sample, {_each(noise / math.sqrt(block), 3)} um a mean of {block}',
-        f'  step of the converter: {_each(rig.converter.volts_per_count * rig.sensitivities, 4)} um',
+        f'  shift by a gradient across the beam: {per_gradient * 1e6:.3f} µm per K/m',
+        f'  shift behind a boundary (3.4): {step * 1e6:.3f} µm',
+        f'  noise of a dot: {_each(noise, 3)} µm a sample, {_each(noise / math.sqrt(block), 3)} µm a mean of {block}',
+        f'  step of the converter: {_each(rig.converter.volts_per_count * rig.sensitivities, 4)} µm',
         f'  hum that a mean of {block} leaves at {inputs["interference_frequency"]:g} Hz: {hum:.3f}',
         f'  stop window of thesis_iteration: {math.degrees(window) * 1e3:.2f} mdeg',
     ]
 
 
 def _each(metres: FloatArray, digits: int) -> str:
-    """The values of x1, y1, x2, y2 in um; one if all are the same."""
+    """The values of x1, y1, x2, y2 in µm; one if all are the same."""
     words = [f'{value * 1e6:.{digits}f}' for value in metres.ravel()]
     return words[0] if len(set(words)) == 1 else ', '.join(words)
 
@@ -193,17 +189,17 @@ def table(budget: Budget, load: tuple[float, ...]) -> str:
     """The budget as text."""
     at = budget.at
     dx, dy, theta = at.pose.tolist()
-    rows = [['term', 'Table 3.1', 'kind', 'dX um', 'dY um', 'theta mdeg', 'dX %', 'dY %', 'theta %']]
+    rows = [['term', 'Table 3.1', 'kind', 'ΔX µm', 'ΔY µm', 'θ mdeg', 'ΔX %', 'ΔY %', 'θ %']]
     for cause, line in budget.lines:
         shares = [f'{100.0 * v:.1f}' for v in budget.shares(line).tolist()]
         rows.append([cause.name, cause.row or '-', KINDS[cause.kind], *_figures(line), *shares])
-    totals = [['', 'dX um', 'dY um', 'theta mdeg']]
+    totals = [['', 'ΔX µm', 'ΔY µm', 'θ mdeg']]
     totals += [[f'all {name} terms', *_figures(budget.total(kind))] for kind, name in KINDS.items()]
     totals.append(['total', *_figures(budget.total())])
     samples = at.rig.estimator.block_size
     return (
-        f'Load ({load[0]:g} N, {load[1]:g} N, {load[2]:g} N m): dX {dx * 1e3:.4f} mm, dY {dy * 1e3:.4f} mm, '
-        f'theta {math.degrees(theta):.4f} deg; method {at.method}; mean of {samples} samples\n\n'
+        f'Load ({load[0]:g} N, {load[1]:g} N, {load[2]:g} N m): ΔX {dx * 1e3:.4f} mm, ΔY {dy * 1e3:.4f} mm, '
+        f'θ {math.degrees(theta):.4f} deg; method {at.method}; mean of {samples} samples\n\n'
         + columns(rows, left=3)
         + '\n\n'
         + columns(totals)
@@ -216,11 +212,11 @@ def _figures(line: Contribution) -> list[str]:
 
 def _figures_text(line: Contribution) -> str:
     dx, dy, theta = _figures(line)
-    return f'dX {dx} um  dY {dy} um  theta {theta} mdeg'
+    return f'ΔX {dx} µm  ΔY {dy} µm  θ {theta} mdeg'
 
 
 def as_json(budget: Budget, load: tuple[float, ...], sampled: Contribution | None) -> dict[str, Any]:
-    """The budget for another program: SI, (dX, dY, theta) in this order."""
+    """The budget for another program: SI, (ΔX, ΔY, θ) in this order."""
 
     def figures(line: Contribution) -> dict[str, Any]:
         return {'rms': line.rms.tolist(), 'bias': line.bias.tolist(), 'covariance': line.covariance.tolist()}
@@ -263,7 +259,7 @@ def draw_terms(budget: Budget, path: Path) -> None:
     names = [f'{c.name} ({c.row})' if c.row else c.name for c, _ in lines]
     figure = Figure(figsize=(11.0, 0.28 * len(lines) + 1.8), layout='constrained')
     panels: Any = figure.subplots(1, 3, sharey=True)
-    titles = ('dX, um', 'dY, um', 'theta, mdeg')
+    titles = ('ΔX, µm', 'ΔY, µm', 'θ, mdeg')
     for panel, title, index in zip(panels, titles, range(3), strict=True):
         values = [v[index] for _, v in lines]
         panel.barh(names, values, color=[COLOURS[c.kind] for c, _ in lines])

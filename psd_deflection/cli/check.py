@@ -133,7 +133,7 @@ class Shown:
             return
         full = round(guide.progress * BAR)
         moved = '  '.join(f'{c} {v * 1e6:+8.1f}' for c, v in zip(DOTS, guide.moved.tolist(), strict=True))
-        print(f'\r\x1b[K  {moved} um  [{"#" * full}{"." * (BAR - full)}]', end='', file=self._stream, flush=True)
+        print(f'\r\x1b[K  {moved} µm  [{"#" * full}{"." * (BAR - full)}]', end='', file=self._stream, flush=True)
 
     def end(self) -> None:
         """Clear the live line."""
@@ -153,7 +153,7 @@ def report(rig: Rig, found: Checkup) -> list[str]:
 
 def _pushes(rig: Rig, found: Checkup) -> list[str]:
     """How each channel answered, beside what the rig file expects of it."""
-    rows = [['push', *(f'{c} um' for c in DOTS), '', *DOTS, 'size']]
+    rows = [['push', *(f'{c} µm' for c in DOTS), '', *DOTS, 'size']]
     for push, size in zip(found.pushes, found.sizes, strict=True):
         expected = on_channels(Wiring.from_rig(rig), push.expected)
         told_size = f'{abs(size):.2f}' if push.sized and math.isfinite(size) else ''
@@ -200,7 +200,7 @@ def _other(text: str) -> str:
     name, _, loads = text.partition(' of ')
     if name != 'load_sign':
         return text
-    ways = {'fx': '+X', 'fy': '+Y', 'tz': '+theta'}
+    ways = {'fx': '+X', 'fy': '+Y', 'tz': '+θ'}
     pushes = ', '.join(ways[load] for load in loads.split())
     return f'the rig file is right, and {pushes} went the other way (sign of the load); this would look the same'
 
@@ -212,7 +212,7 @@ def _levels(rig: Rig, found: Checkup) -> list[str]:
         f'{c} {v * 60e6:+.1f} +- {sd * 60e6:.1f}'
         for c, v, sd in zip(DOTS, found.drift.tolist(), found.drift_sd.tolist(), strict=True)
     )
-    drift += '  um a minute'
+    drift += '  µm a minute'
     if found.drift_sd.max() > TELLING_DRIFT:
         drift = 'too short a time to tell'
     hum = 'none at 50 or 60 Hz'

@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def errors_json() -> dict[str, dict[str, dict[str, object]]]:
-    """Method to condition to its errors, dX, dY in m and theta in rad; ``silent``: the share without an answer."""
+    """Method to condition to its errors, ΔX, ΔY in m and θ in rad; ``silent``: the share without an answer."""
     return {
         method.label: {
             condition: {'rms': list(e.rms), 'largest': list(e.largest), 'silent': e.silent}
@@ -96,7 +96,7 @@ def error_table() -> list[str]:
     width = max(len(m.label) for m in methods())
     cells = {m.label: [errors(m, c) for c in CONDITIONS] for m in methods()}
     lines = [
-        'Error on exact readings, dX um / dY um / theta mdeg. The rig of the thesis; dX, dY within 5 mm, theta within',
+        'Error on exact readings, ΔX µm / ΔY µm / θ mdeg. The rig of the thesis; ΔX, ΔY within 5 mm, θ within',
         '3 deg; tilts of -1, 0, 1 deg about each axis, or those of a cantilever, k = 1.5.',
     ]
     for title, largest in (('rms', False), ('largest', True)):
@@ -126,7 +126,7 @@ def _short(value: float) -> str:
 def linear_table() -> list[str]:
     """Lines about noise, condition and error bound."""
     geometry = thesis_geometry()
-    lines = ['Standard deviations for 2 um a reading: dX um / dY um / theta mdeg']
+    lines = ['Standard deviations for 2 µm a reading: ΔX µm / ΔY µm / θ mdeg']
     half = float(np.hypot(*np.ptp(geometry.centers, axis=0))) / 2.0
     opposite = Geometry(np.array([[half, 0.0], [-half, 0.0]]), np.zeros((2, 2)), np.zeros(2), 0.585)
     cases: list[tuple[str, str, Geometry, dict[str, Any]]] = [
@@ -148,7 +148,7 @@ def linear_table() -> list[str]:
             lines.append(f'{method.label:38} {found:.3f} mdeg')
     design = design_matrix(geometry.beams)
     lines += ['', 'Condition number of A (4.28), Frobenius (2-norm)']
-    for label, length in (('A in mm', 1e-3), ('A in m', 1.0), ('theta times 0.1 m', 0.1)):
+    for label, length in (('A in mm', 1e-3), ('A in m', 1.0), ('θ times 0.1 m', 0.1)):
         number = condition_number(design, length)
         lines.append(f'{label:38} {number.frobenius:.2f} ({number.two:.2f})')
     design_error = np.zeros((4, 3))
@@ -158,8 +158,8 @@ def linear_table() -> list[str]:
     printed = printed_bound(design, SIDEBAR_POSE, design_error, reading_error)
     lines += [
         '',
-        'Error bound at 50 N, R1 and R2 off by 1 mm, readings by 2 um',
-        f'{"for each component":38} {bound[0]:.1f} um, {bound[1]:.1f} um, {bound[2]:.2f} mrad',
+        'Error bound at 50 N, R1 and R2 off by 1 mm, readings by 2 µm',
+        f'{"for each component":38} {bound[0]:.1f} µm, {bound[1]:.1f} µm, {bound[2]:.2f} mrad',
         f'{"4.33, mm and rad in one norm":38} {printed:.3f}',
     ]
     return lines
@@ -170,8 +170,8 @@ def cause_table() -> list[str]:
     width = max(len(c.label) for c in CAUSES)
     reported = ' | '.join(_percent(row) for row in REPORTED)
     lines = [
-        'Table 5.1 (50 N on the sidebar), error in % of theta, dX, dY. Exact readings of dX = 0.12 mm (fitted: the',
-        'only free number), dY = -2.2272 mm, theta = -0.9407 deg (theory), then one cause at a time.',
+        'Table 5.1 (50 N on the sidebar), error in % of θ, ΔX, ΔY. Exact readings of ΔX = 0.12 mm (fitted: the',
+        'only free number), ΔY = -2.2272 mm, θ = -0.9407 deg (theory), then one cause at a time.',
         '',
         f'{"":{width}}  {"iterative (Appendix D)":23} | weighted least squares',
         f'{"reported":{width}}  {reported}',
@@ -182,9 +182,9 @@ def cause_table() -> list[str]:
         lines.append(f'{cause.label:{width}}  {cells}')
     lines += [
         '',
-        'The 84 % and 21 % of dX are the algorithms: the early stop times its lever of 70 mm, and the turn of d that',
-        'linearising leaves out (theta dY = 37 um, less theta^2/2 of 100 mm). Of dY, some 5.5 % common to both need',
-        'the rig: surfaces about 22 mm above the section, or a scale error. Least squares, +1.5 % of theta: open.',
+        'The 84 % and 21 % of ΔX are the algorithms: the early stop times its lever of 70 mm, and the turn of d that',
+        'linearising leaves out (θ ΔY = 37 µm, less θ^2/2 of 100 mm). Of ΔY, some 5.5 % common to both need',
+        'the rig: surfaces about 22 mm above the section, or a scale error. Least squares, +1.5 % of θ: open.',
     ]
     return lines
 

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from psd_deflection.budget.load import default_load
 from psd_deflection.cli._options import PICTURES, given_as_option, need_folder, picture_name, refuse
 from psd_deflection.cli._report import columns, print_json, save_figure, show, show_text
 from psd_deflection.config import Rig, load_rig
@@ -31,10 +32,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.thesis import scaling
 
 TILTED = np.array([0.0, 0.0, 0.0, math.radians(0.3), math.radians(0.1)])
-"""Where observability of tilt is stated: phi 0.3 deg, omega 0.1 deg. At rest coplanar sensors see none."""
-
-SIDEBAR_FORCE = 50.0
-"""N: the largest load of chapter 5, hung on a sidebar one link length long."""
+"""Where observability of tilt is stated: φ 0.3 deg, ω 0.1 deg. At rest coplanar sensors see none."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -187,7 +185,7 @@ def link_text(rig: Rig) -> str:
         f'Link: L {rig.link.length:g} m, I {section.second_moment:.4e} m^4, J {section.polar_moment:.4e} m^4, '
         f'area {section.area * 1e6:.1f} mm^2\n'
         f'EI {statics.bending_stiffness:.1f} N m^2, GJ {statics.torsional_stiffness:.1f} N m^2; '
-        f'tip {bend * 1e6:.2f} um/N, {math.degrees(twist) * 1e3:.2f} mdeg/(N m); torsion-to-bending ratio {ratio:.3f}'
+        f'tip {bend * 1e6:.2f} µm/N, {math.degrees(twist) * 1e3:.2f} mdeg/(N m); torsion-to-bending ratio {ratio:.3f}'
     )
 
 
@@ -225,7 +223,7 @@ def _spread(centers: FloatArray, sigma: float) -> placement.Spread:
 
 def placement_text(candidates: list[PlacementRow], sigma: float) -> str:
     """Spreads and condition numbers, and how much the best one gains."""
-    head = ['placement', 'c1 mm', 'c2 mm', 'dX um', 'dY um', 'theta mdeg', 'cond (0.1 m rad)', 'cond (m, rad)']
+    head = ['placement', 'c1 mm', 'c2 mm', 'ΔX µm', 'ΔY µm', 'θ mdeg', 'cond (0.1 m rad)', 'cond (m, rad)']
     rows = [head]
     spreads = []
     for name, centers in candidates:
@@ -242,10 +240,10 @@ def placement_text(candidates: list[PlacementRow], sigma: float) -> str:
     own, best = spreads[0], spreads[-1]
     gains = [a / b for a, b in zip(own, best, strict=True)]
     return (
-        f'Placement, one standard deviation for {sigma * 1e6:.3f} um on each reading, at rest:\n\n'
+        f'Placement, one standard deviation for {sigma * 1e6:.3f} µm on each reading, at rest:\n\n'
         + columns(rows)
-        + f'\n\n{candidates[-1].name} against this rig: deviation of dX {gains[0]:.2f}, dY {gains[1]:.2f}, '
-        f'theta {gains[2]:.2f} times smaller'
+        + f'\n\n{candidates[-1].name} against this rig: deviation of ΔX {gains[0]:.2f}, ΔY {gains[1]:.2f}, '
+        f'θ {gains[2]:.2f} times smaller'
     )
 
 
@@ -255,10 +253,10 @@ def _places(centers: FloatArray) -> list[str]:
 
 
 def tilt_text(rig: Rig, radius: float, sigma: float) -> str:
-    """What the sensors tell of the tilts, with all of dX, dY, theta, phi, omega free."""
+    """What the sensors tell of the tilts, with all of ΔX, ΔY, θ, φ, ω free."""
     three = placement.ring(3, radius)
     stagger = np.array([radius, -radius / 2.0, -radius / 2.0])
-    rows = [['tilts left free, at phi 0.3, omega 0.1 deg', 'dX um', 'dY um', 'theta mdeg', 'phi mdeg', 'omega mdeg']]
+    rows = [['tilts left free, at φ 0.3, ω 0.1 deg', 'ΔX µm', 'ΔY µm', 'θ mdeg', 'φ mdeg', 'ω mdeg']]
     for name, centers, heights in (
         ('this rig, two sensors', rig.centers, rig.heights),
         (f'three on a ring of {radius * 1e3:g} mm, one plane', three, np.zeros(3)),
@@ -275,11 +273,12 @@ def tilt_text(rig: Rig, radius: float, sigma: float) -> str:
 def tied_text(rig: Rig, best: FloatArray, sigma: float) -> str:
     """What two sensors tell of the slope ratio k once the tilts are tied to the deflection."""
     link = rig.link
-    pose = np.array(LinkStatics.from_rig(rig).deflection(0.0, -SIDEBAR_FORCE, -SIDEBAR_FORCE * link.length))
+    load = default_load(rig)
+    pose = np.array(LinkStatics.from_rig(rig).deflection(*load))
     stagger = np.array([0.05, -0.05])
     # Across the bending direction heights tell nothing of k: the best pair is turned into it.
     turned = placement.opposite(float(np.hypot(*(best[0] - best[1]))) / 2.0)
-    rows = [[f'tilts tied, k free, at {SIDEBAR_FORCE:g} N', 'dX um', 'dY um', 'theta mdeg', 'k']]
+    rows = [[f'tilts tied, k free, at {-load[1]:g} N', 'ΔX µm', 'ΔY µm', 'θ mdeg', 'k']]
     for name, centers, heights in (
         ('this rig', rig.centers, rig.heights),
         ('this rig, heights +50, -50 mm', rig.centers, rig.heights + stagger),

@@ -26,13 +26,13 @@ from tqdm import tqdm
 from psd_deflection.cli._options import namespace_option, seed
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import save, show, warn
-from psd_deflection.config import load_rig
-from psd_deflection.discovery.discover import discover
+from psd_deflection.config import Rig, load_rig, parameter_text, with_effects_section
+from psd_deflection.discovery.discover import Discovery, discover
 from psd_deflection.discovery.report import report_html
 from psd_deflection.discovery.result import model_yaml, result, sentence
-from psd_deflection.errors import RecordingError, UsageError
+from psd_deflection.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.recordings.observations import read_observations
-from psd_deflection.simulation.catalogue import effect_names
+from psd_deflection.simulation.catalogue import effect_names, effects_to_values
 
 STEPS = 8
 """Steps that the progress bar counts: described, signatures, adding, weighing, alternatives, where, report, done."""
@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
         bar.update(STEPS - bar.n)
     in_json = json.dumps(result(found), indent=1, allow_nan=False)
     files = {
-        'model.yaml': model_yaml(rig, found.active_effects),
+        'model.yaml': _model(args.params_file, rig, found),
         'result.json': in_json + '\n',
         'report.html': page,
     }
@@ -110,3 +110,14 @@ def run(args: argparse.Namespace) -> int:
         show(f'unknown: {unknown.signature}')
     show(f'{found.simulations} forward simulations; see {out / "report.html"}')
     return 0
+
+
+def _model(params_file: str | None, rig: Rig, found: Discovery) -> str:
+    """The user's parameter file with the effects, comments kept; without one what describes the rig."""
+    if params_file is not None:
+        path = Path(params_file)
+        try:
+            return with_effects_section(parameter_text(path), effects_to_values(found.active_effects), path)
+        except ConfigError as error:
+            warn(f'{error}: model.yaml has its values without its comments')
+    return model_yaml(rig, found.active_effects)

@@ -1,6 +1,7 @@
 """List every parameter with unit, bounds, default and what it is for.
 
-With --params-file the values of that file are shown and checked.
+With --params-file the values of that file are shown and checked, also against each other: unknown solvers and
+effects, and a geometry that cannot be solved, are refused.
 
   psd-deflection params
   psd-deflection params --params-file my_rig.yaml --json
@@ -12,6 +13,7 @@ import argparse
 
 from psd_deflection.cli._report import print_json, show
 from psd_deflection.config import PARAMETERS, load_rig
+from psd_deflection.pipeline import Pipeline
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,6 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the table."""
     rig = load_rig(args.params_file)
+    if args.params_file is not None:
+        # It makes the solvers and the effects, and refuses what cannot be evaluated.
+        Pipeline(rig)
     if args.json:
         print_json(dict(rig.values), indent=2)
         return 0

@@ -174,6 +174,12 @@ class Drawn:
                 lost = min(lost, int(block.seq[-1] - block.seq[0]) + 1 - len(block.seq))
         return lost
 
+    def seconds(self) -> float:
+        """How long the samples last, by their stamps."""
+        if self.first is None or self.last is None:
+            return 0.0
+        return self.recording.lasts(int(self.first.t_ns[0]), int(self.last.t_ns[-1]))
+
     def gone(self) -> int:
         """Samples that are missing between the first and the last one."""
         if self.numbers is None:
@@ -237,7 +243,7 @@ def plot_json(drawn: Drawn, rig: Rig) -> dict[str, Any]:
     table = drawn.table()
     causes = Counter(s.status.name.lower() for s in drawn.spots if s.reason)
     out: dict[str, Any] = {
-        'duration_s': float(table['t'][-1] - table['t'][0]) + rig.estimator.block_size / rig.converter.sample_rate_hz,
+        'duration_s': drawn.seconds(),
         'samples': sum(s.present for s in drawn.spots),
         'lost': drawn.gone(),
         'blocks': len(drawn.spots),

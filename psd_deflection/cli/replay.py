@@ -64,6 +64,8 @@ class Totals:
     samples: int = 0
     first_seq: int | None = None
     last_seq: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
     poses: list[tuple[float, float, float]] = field(default_factory=list)
 
     def add(self, record: Record) -> None:
@@ -72,10 +74,15 @@ class Totals:
             self.blocks += 1
             self.samples += len(record.seq)
             if self.first_seq is None:
-                self.first_seq = int(record.seq[0])
-            self.last_seq = int(record.seq[-1])
+                self.first_seq, self.first_ns = int(record.seq[0]), int(record.t_ns[0])
+            self.last_seq, self.last_ns = int(record.seq[-1]), int(record.t_ns[-1])
         elif isinstance(record, DeflectionEstimate) and record.primary:
             self.poses.append((record.dx, record.dy, record.theta))
+
+    @property
+    def seconds(self) -> float:
+        """How long the samples last, by their stamps."""
+        return self.recording.lasts(self.first_ns, self.last_ns) if self.blocks else 0.0
 
     @property
     def lost(self) -> int:
@@ -144,7 +151,6 @@ def _print_summary(
 ) -> None:
     counters = pipeline.counters
     poses = np.array(totals.poses).reshape(-1, 3)
-    recorded_seconds = totals.blocks * rig.estimator.block_size / rig.converter.sample_rate_hz
     if args.json:
         summary = {
             'recording': str(args.recording),
@@ -154,7 +160,7 @@ def _print_summary(
             'estimates': counters.estimates,
             'refused': counters.refused,
             'solver': rig.estimator.solver,
-            'seconds': recorded_seconds,
+            'seconds': totals.seconds,
             'replay_seconds': seconds,
             'out': args.out,
             'compared': None if comparison is None else comparison.counts(),
@@ -173,6 +179,6 @@ def _print_summary(
             f'  ΔX {low[0] * 1e6:+.2f} … {high[0] * 1e6:+.2f} µm, ΔY {low[1] * 1e6:+.2f} … {high[1] * 1e6:+.2f} µm, '
             f'θ {np.rad2deg(low[2]) * 1e3:+.2f} … {np.rad2deg(high[2]) * 1e3:+.2f} mdeg'
         )
-    show(f'  {recorded_seconds:.1f} s of data in {seconds:.2f} s')
+    show(f'  {totals.seconds:.1f} s of data in {seconds:.2f} s')
     if args.out is not None:
         show(f'  written to {Path(args.out)}')

@@ -202,7 +202,7 @@ def _coverage(pushes: Sequence[Response], seen: Sequence[Response], found: Seque
     missing = [load for load in ('fx', 'fy', 'tz') if (load,) not in {p.loads for p in seen}]
     weak = [p.name for p in pushes if not p.seen]
     if seen and not found:
-        text = 'no wiring explains these pushes: push one way at a time, along +X, along +Y, then turn about +theta'
+        text = 'no wiring explains these pushes: push one way at a time, along +X, along +Y, then turn about +θ'
     elif weak:
         text = f'pushes that do not stand out of the noise: {", ".join(weak)}; push harder'
     else:
@@ -248,7 +248,7 @@ def _notes(
     far = (per_minute > 5.0) & (np.abs(drift) > 5.0 * drift_sd)
     if far.any():
         worst = int(np.argmax(np.where(far, per_minute, 0.0)))
-        out.append(f'drift: {drift[worst] * 60e6:+.1f} um a minute on {DOTS[worst]}; let lasers and amplifier warm up')
+        out.append(f'drift: {drift[worst] * 60e6:+.1f} µm a minute on {DOTS[worst]}; let lasers and amplifier warm up')
     return out
 
 

@@ -49,7 +49,7 @@ class Step(Enum):
 
 
 def directions(rig: Rig) -> tuple[str, str, str]:
-    """What to do for +X, +Y and +theta, with a PSD as the landmark."""
+    """What to do for +X, +Y and +θ, with a PSD as the landmark."""
     return (
         f'Push the tip along +X ({_landmark(rig, 0)}) and hold it.',
         f'Push the tip along +Y ({_landmark(rig, 1)}) and hold it.',
@@ -144,7 +144,7 @@ class Guide:
         if filled < 1.0:
             return ''
         if wander > quiet and self._t < 3.0 * IMPATIENT_S:
-            return self._impatient(f'It still moves by {wander * 1e6:.1f} um rms: leave it alone.')
+            return self._impatient(f'It still moves by {wander * 1e6:.1f} µm rms: leave it alone.')
         self._rest_sd = np.maximum(here.std(axis=0), self._noise * np.sqrt(len(here) * self._period / REST_S))
         self._rests.append((self._t, here.mean(axis=0)))
         self._rest_volts = list(self._samples)
@@ -163,13 +163,13 @@ class Guide:
             return self._impatient('A dot is at the end of its PSD: push less.')
         if not held:
             if far <= needed:
-                return self._impatient(f'No push yet: the dots have moved by {far * 1e6:.1f} um.')
+                return self._impatient(f'No push yet: the dots have moved by {far * 1e6:.1f} µm.')
             return self._impatient('Hold it steadier.')
         if filled < 1.0:
             return ''
         self._held, self._held_sd = here.mean(axis=0), here.std(axis=0)
         self._next(Step.RELEASE)
-        return 'Got it: ' + ', '.join(f'{c} {v * 1e6:+.0f}' for c, v in zip(DOTS, moved, strict=True)) + ' um.'
+        return 'Got it: ' + ', '.join(f'{c} {v * 1e6:+.0f}' for c, v in zip(DOTS, moved, strict=True)) + ' µm.'
 
     def _released(self, here: FloatArray, filled: float) -> str:
         push = float(np.linalg.norm(self._held - self._rests[-1][1]))

@@ -1,6 +1,6 @@
 """Which of all wirings of a two-PSD rig explain how the dots answered to pushes.
 
-A push along +X moves both dots along -x, one along +Y both along -y, and a turn about +Z moves dot i by theta times
+A push along +X moves both dots along -x, one along +Y both along -y, and a turn about +Z moves dot i by θ times
 (l_iy, -l_ix): the columns of :func:`psd_deflection.geometry.linear.design_matrix`. The size is left open, because
 nobody knows the stiffness of a new rig: only direction and proportion count. Four signs, two orders of the axes of each
 PSD and the exchange of the PSDs are 128 wirings. Each is held against each push.
@@ -40,11 +40,11 @@ SEEN = 6.0
 """A movement below so many of its standard deviations says nothing."""
 
 DOTS = tuple(CHANNELS[i] for i in DOT_CHANNELS)
-_BY_PUSH = {'fx': '+X', 'fy': '+Y', 'tz': '+theta'}
+_BY_PUSH = {'fx': '+X', 'fy': '+Y', 'tz': '+θ'}
 
 
 def pattern(rig: Rig) -> FloatArray:
-    """Movement of x1 y1 x2 y2 (4, 3) per dX, dY (1) and theta (m/rad). Raises ConfigError for PSDs at the base."""
+    """Movement of x1 y1 x2 y2 (4, 3) per ΔX, ΔY (1) and θ (m/rad). Raises ConfigError for PSDs at the base."""
     if rig.estimator.solver == 'base_pair':
         raise ConfigError('solver = base_pair: check knows PSDs on the tip plate only, whose dots move otherwise')
     return design_matrix(rig.centers + rig.zeros)
@@ -76,7 +76,7 @@ class Response:
 
     @property
     def name(self) -> str:
-        """``+X``, or ``+Y with +theta``."""
+        """``+X``, or ``+Y with +θ``."""
         return ' with '.join(_BY_PUSH[load] for load in self.loads)
 
     @property

@@ -70,7 +70,7 @@ class Unknown:
     remains: bool = True
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Discovery:
     """The answer. Gaps in m (rms of block means over x1 y1 x2 y2)."""
 
@@ -96,6 +96,11 @@ class Discovery:
     def active_effects(self) -> list[ActiveEffect]:
         """The effects to add to the rig file."""
         return [*self.workspace.base, *(e.active for e in self.effects)]
+
+    def __repr__(self) -> str:
+        named = ', '.join(e.active.label for e in self.effects) or 'no effect'
+        before, after, floor = (f'{1e6 * v:.3f}' for v in (self.gap_before, self.gap_after, self.gap_floor))
+        return f'<Discovery {self.verdict}: {named}; gap {before} → {after} µm (noise alone: {floor} µm)>'
 
 
 def _proposals(workspace: Workspace) -> dict[str, list[float]]:

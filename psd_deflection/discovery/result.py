@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from psd_deflection import __version__
-from psd_deflection.config import Rig
+from psd_deflection.config import DESCRIPTION, Rig
 from psd_deflection.discovery.discover import Discovery, NamedEffect
 from psd_deflection.simulation.catalogue import effects_to_values
 from psd_deflection.simulation.declaration import ActiveEffect
@@ -119,8 +119,12 @@ def _nested(flat: Mapping[str, object]) -> dict[str, Any]:
 
 
 def model_yaml(rig: Rig, effects: Sequence[ActiveEffect]) -> str:
-    """The rig as a ROS 2 parameter file, with ``effects`` instead of its own."""
-    tree = _nested(rig.values)
+    """What describes the rig, as a ROS 2 parameter file with ``effects`` instead of its own.
+
+    For a rig without a file of its own; :func:`psd_deflection.config.with_effects_section` adds them to a file. Port,
+    folders and page are left out: they belong to a machine.
+    """
+    tree = _nested({name: rig.values[name] for name in DESCRIPTION})
     if effects:
         tree['effects'] = effects_to_values(effects)
     return yaml.safe_dump({'/**': {'ros__parameters': tree}}, sort_keys=False, allow_unicode=True)

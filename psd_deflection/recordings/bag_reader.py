@@ -39,10 +39,10 @@ from psd_deflection.recordings import cdr
 from psd_deflection.recordings.allowance import Warnings
 from psd_deflection.recordings.bag_writer import META_CHANGE, META_HELLO, META_NODE, META_PARAMETERS, META_SOFTWARE
 from psd_deflection.recordings.clouds import CloudDecoder, Samples, joined_points
+from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.mcap_reader import McapReader, RawMessage
-from psd_deflection.recordings.recording import EstimateSeries, Recording, from_json
+from psd_deflection.recordings.recording import Recording, from_json
 from psd_deflection.records import (
-    RESTART,
     AppliedLoad,
     IntArray,
     ParameterChange,
@@ -87,7 +87,7 @@ class BagRecording(Recording):
         self.changes = self._changes_in(metadata)
         if META_PARAMETERS not in metadata:
             self._take_rig_of_messages()
-        self.restarts.update(r for change in self.changes if (r := _restart_in(change)) is not None)
+        self.restarts = self._noted_restarts()
 
     def _files_of(self, folder: Path) -> list[Path]:
         """The bag's files in the order of ``metadata.yaml``, else of their numbers."""
@@ -403,14 +403,6 @@ class _SequenceCounter:
         self._moved += move
         if len(self._restarts) < MAX_RESTARTS:
             self._restarts.add((last, first + move))
-
-
-def _restart_in(change: ParameterChange) -> tuple[int, int] | None:
-    value = dict(change.values).get(RESTART)
-    if not isinstance(value, tuple) or len(value) != 2 or not all(isinstance(n, int) for n in value):
-        return None
-    before, after = int(value[0]), int(value[1])
-    return (before, after) if 0 <= before < after < 2**62 else None
 
 
 def _to_change(t_ns: int, block: int, tree: Mapping[str, object]) -> ParameterChange:

@@ -19,13 +19,11 @@ import numpy as np
 
 from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
 from psd_deflection.errors import RecordingError
+from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.mcap_reader import RawMessage
-from psd_deflection.recordings.recording import EstimateSeries, Recording
+from psd_deflection.recordings.recording import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN, Recording
 from psd_deflection.records import CHANNELS, AppliedLoad, RawChunk, ReferencePose, TemperatureReading
 
-LOAD_COLUMNS = ('load_fx', 'load_fy', 'load_tz')
-TEMPERATURE_COLUMN = 'temperature'
-REFERENCE_COLUMNS = ('ref_dx', 'ref_dy', 'ref_theta')
 REQUIRED = ('t', *CHANNELS)
 KNOWN = (*REQUIRED, *LOAD_COLUMNS, TEMPERATURE_COLUMN, *REFERENCE_COLUMNS)
 

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import TextIO
 
 from psd_deflection.errors import RecordingError, creating
-from psd_deflection.recordings.csv_reader import LOAD_COLUMNS, REFERENCE_COLUMNS, REQUIRED, TEMPERATURE_COLUMN
+from psd_deflection.recordings.csv_reader import REQUIRED
+from psd_deflection.recordings.recording import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN
 from psd_deflection.records import (
     AppliedLoad,
     DeflectionEstimate,

@@ -13,24 +13,28 @@ from psd_deflection.config import MAX_FILE_BYTES, Rig, replace_values
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.errors import ConfigError, RecordingError
 from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
+from psd_deflection.recordings.csv_reader import CsvRecording
 from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end
+from psd_deflection.recordings.simulated_recording import SimulatedRecording
 from psd_deflection.records import CHANNELS, FloatArray, IntArray
 
 MAX_SAMPLES = 20_000_000
 
 
 def read_observation(
-    path: str | Path,
+    source: Recording | str | Path,
     rig: Rig | None = None,
     overrides: Mapping[str, object] | None = None,
-    source: str = 'overrides',
+    where: str = 'overrides',
     *,
     namespace: str | None = None,
     warn: Callable[[str], None] | None = None,
 ) -> Observation:
     """One recording with its rig (by default from its own parameters), changed by ``overrides``.
 
+    ``source``: the recording or its path. ``where``: where the overrides are from, for a message.
     ``namespace``: as in :func:`open_recording`. ``warn``: told if the recording names no rig.
 
     Raises RecordingError if it has no loads or cannot be read, ConfigError for a bad override.
@@ -38,16 +42,16 @@ def read_observation(
     The sample at t sees the loads applied before t: a load counts from the first sample at or
     after its own time.
     """
-    path = Path(path)
+    recording = source if isinstance(source, Recording) else open_recording(source, namespace=namespace)
+    path = recording.path
     if rig is None:
-        found = open_recording(path, namespace=namespace)
-        rig = rig_at_end(found)
+        rig = rig_at_end(recording)
         if warn is not None:
-            for warning in nominal_rig(found):
+            for warning in nominal_rig(recording):
                 warn(warning)
     if overrides:
-        rig = replace_values(rig, overrides, source)
-    recording = open_recording(path, block_size=rig.estimator.block_size, namespace=namespace)
+        rig = replace_values(rig, overrides, where)
+    recording = recording.with_block_size(rig.estimator.block_size)
     samples = recording.samples
     rate = recording.sample_rate_hz
     if rate > 0.0 and abs(rate / rig.converter.sample_rate_hz - 1.0) > 0.01:
@@ -81,12 +85,13 @@ def read_observation(
     if temperatures:
         at = np.array([r.t_ns - start for r in temperatures], dtype=np.int64)
         celsius = np.array([r.celsius for r in temperatures])
-        if path.suffix.lower() == '.csv':
+        if isinstance(recording, CsvRecording | SimulatedRecording):
             # A row's value holds until the next differs; a thermometer's messages are points on a curve.
             warm = _held(at, celsius, t_ns, grace, celsius[0])
         else:
             warm = np.interp(t_ns, at.astype(np.float64), celsius)
-    return Observation(path.name, rig, Wiring.from_rig(rig).to_psds(volts), held, warm, digest=_digest(path))
+    digest = '' if isinstance(recording, SimulatedRecording) else _digest(path)
+    return Observation(path.name, rig, Wiring.from_rig(rig).to_psds(volts), held, warm, digest=digest)
 
 
 def _held(
@@ -113,13 +118,13 @@ def _digest(path: Path) -> str:
 
 
 def read_observations(
-    paths: Sequence[str | Path],
+    sources: Sequence[Recording | str | Path],
     rig: Rig | None = None,
     *,
     namespace: str | None = None,
     warn: Callable[[str], None] | None = None,
 ) -> list[Observation]:
-    """All of ``paths``: recordings, or ``.yaml`` lists of recordings with the parameters that differ in each::
+    """All of ``sources``: recordings (open or by path), or ``.yaml`` lists with the parameters that differ in each::
 
         - recording: short.csv
           overrides: {link.length: 0.4}
@@ -127,8 +132,11 @@ def read_observations(
     Raises ConfigError and RecordingError naming file and key.
     """
     out: list[Observation] = []
-    for text in paths:
-        path = Path(text)
+    for source in sources:
+        if isinstance(source, Recording):
+            out.append(read_observation(source, rig, namespace=namespace, warn=warn))
+            continue
+        path = Path(source)
         if path.suffix.lower() not in ('.yaml', '.yml') or path.name == 'metadata.yaml':
             out.append(read_observation(path, rig, namespace=namespace, warn=warn))
             continue

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
-from psd_deflection.errors import RecordingError
+from psd_deflection.errors import RecordingError, did_you_mean
 from psd_deflection.recordings.bag_reader import BagRecording
 from psd_deflection.recordings.csv_reader import CsvRecording
 from psd_deflection.recordings.mcap_reader import MAGIC
 from psd_deflection.recordings.recording import Recording
+
+MOST_NAMES = 1000
+"""Names of a folder that are looked at for one that was meant."""
 
 
 def open_recording(
@@ -31,7 +35,7 @@ def open_recording(
         if path.is_dir():
             return BagRecording(path, block_size, namespace)
         if not path.exists():
-            raise RecordingError(f'{path}: no such recording')
+            raise RecordingError(f'{path}: no such recording{_meant(path)}')
         if not path.is_file():
             # A pipe would wait for its writer, and it cannot be read twice.
             raise RecordingError(f'{path}: is no file; write it to one first')
@@ -46,3 +50,11 @@ def open_recording(
     if path.name == 'metadata.yaml':
         return BagRecording(path.parent, block_size, namespace)
     raise RecordingError(f'{path}: is no recording: a bag folder, an .mcap or a .csv is read')
+
+
+def _meant(path: Path) -> str:
+    """``; did you mean X?`` if the folder of ``path`` holds something of a similar name."""
+    try:
+        return did_you_mean(path.name, sorted(p.name for p in itertools.islice(path.parent.iterdir(), MOST_NAMES)))
+    except OSError:
+        return ''

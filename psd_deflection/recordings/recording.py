@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import abc
+import copy
 import functools
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.averaging import BlockCutter
+from psd_deflection.errors import RecordingError, printable
+from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.mcap_reader import RawMessage
 from psd_deflection.records import (
     CHANNELS,
+    RESTART,
     AppliedLoad,
     FloatArray,
     IntArray,
@@ -26,28 +29,23 @@ from psd_deflection.records import (
     SampleBlock,
     TemperatureReading,
 )
+from psd_deflection.tables import Column, Table, columns_of, html_table
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
 
 DEFAULT_BLOCK_SIZE = 20
+LONGEST_REPR = 2000
+
+LOAD_COLUMNS = ('load_fx', 'load_fy', 'load_tz')
+TEMPERATURE_COLUMN = 'temperature'
+REFERENCE_COLUMNS = ('ref_dx', 'ref_dy', 'ref_theta')
 
 SAMPLE_DTYPE = np.dtype(
     [('t', '<f8'), ('t_ns', '<i8'), ('seq', '<i8'), *((c, '<f4') for c in CHANNELS), ('flags', 'u1')]
 )
 """``t``: s from the first sample. ``t_ns``: ns since the epoch, or since the CSV's zero."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EstimateSeries:
-    """The deflections that were recorded on one topic, in the order of the recording.
-
-    ``t_ns`` int64 (n,). ``pose`` (n, 3): dX m, dY m, theta rad. ``tilt`` (n, 2): phi, omega, rad.
-    ``covariance`` (n, 3, 3) of the pose, or None if the topic has none.
-    """
-
-    topic: str
-    t_ns: IntArray
-    pose: FloatArray
-    tilt: FloatArray
-    covariance: FloatArray | None = None
 
 
 class Recording(abc.ABC):
@@ -59,7 +57,8 @@ class Recording(abc.ABC):
     ``rig_from_messages``: whether these come from messages, because the file lacks our metadata.
     ``changes``: of parameters during the run, in order. ``restarts``: of the device, each as the last sample
     number before and the first after; the numbers between belong to no sample. ``restarts`` and ``warnings``
-    (one line each) are complete after the first full pass over the recording.
+    (one line each) are complete after the first full pass over the recording. ``requested_block_size``: None takes
+    the recorded one.
     """
 
     def __init__(self, path: Path, block_size: int | None) -> None:
@@ -71,7 +70,7 @@ class Recording(abc.ABC):
         self.rig_from_messages = False
         self.changes: Sequence[ParameterChange] = ()
         self.restarts: set[tuple[int, int]] = set()
-        self._block_size = block_size
+        self.requested_block_size = block_size
 
     @property
     def namespace(self) -> str:
@@ -81,10 +80,25 @@ class Recording(abc.ABC):
     @property
     def block_size(self) -> int:
         """Samples per block: the requested number, else the recorded one, else 20."""
-        if self._block_size is not None:
-            return self._block_size
+        if self.requested_block_size is not None:
+            return self.requested_block_size
         recorded = self.parameters.get('block_size')
         return recorded if isinstance(recorded, int) and 1 <= recorded <= 1000 else DEFAULT_BLOCK_SIZE
+
+    def with_block_size(self, block_size: int) -> Self:
+        """The same recording, cut into blocks of another number of samples."""
+        if block_size == self.block_size:
+            return self
+        other = copy.copy(self)
+        other.requested_block_size = block_size
+        # After a restart numbers go on with the next block, so they depend on its size.
+        other.__dict__.pop('samples', None)
+        other.restarts = self._noted_restarts()
+        return other
+
+    def _noted_restarts(self) -> set[tuple[int, int]]:
+        """The restarts that the recorder noted, before any pass over the recording."""
+        return {r for change in self.changes if (r := _restart_in(change)) is not None}
 
     @property
     @abc.abstractmethod
@@ -155,6 +169,11 @@ class Recording(abc.ABC):
             return 0.0
         return (last[0] - first[0]) * 1e9 / (last[1] - first[1])
 
+    def lasts(self, first_ns: int, last_ns: int) -> float:
+        """Seconds from the sample at ``first_ns`` to the end of the one at ``last_ns``, by their stamps."""
+        rate = self.sample_rate_hz
+        return (last_ns - first_ns) * 1e-9 + (1.0 / rate if rate > 0.0 else 0.0)
+
     @functools.cached_property
     def samples(self) -> npt.NDArray[np.void]:
         """Every sample as a structured array (n,) of ``SAMPLE_DTYPE``, read at first use."""
@@ -168,6 +187,100 @@ class Recording(abc.ABC):
             out[channel] = volts[:, i]
         out['flags'] = np.concatenate([b.flags for b in blocks])
         return out
+
+    def _table(self) -> Table:
+        samples = self.samples
+        t_ns = samples['t_ns']
+        columns = [
+            Column('seq', samples['seq'], '', 'number of the sample'),
+            Column('t_ns', t_ns, 'ns', 'time, since the epoch if the recording has it'),
+            *(Column(name, samples[name], 'V', f'channel {name}') for name in CHANNELS),
+            Column('flags', samples['flags'], '', 'bit 0: over range, bit 1: samples were dropped before this one'),
+        ]
+        if loads := self.loads():
+            words = ['applied force along X', 'applied force along Y', 'applied torque about Z']
+            columns += columns_of(_held(loads, t_ns), LOAD_COLUMNS, ('N', 'N', 'N m'), words)
+        if temperatures := self.temperatures():
+            columns += columns_of(_held(temperatures, t_ns), (TEMPERATURE_COLUMN,), ('degC',), ['ambient temperature'])
+        if references := self.references():
+            words = ['reference displacement along X', 'reference displacement along Y', 'reference twist about Z']
+            columns += columns_of(_once(references, t_ns), REFERENCE_COLUMNS, ('m', 'm', 'rad'), words)
+        return Table(Column('t', samples['t'], 's', 'time from the first sample'), columns, {'path': str(self.path)})
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """One row a sample over ``t`` (s), in volts, with the columns of a CSV recording.
+
+        Loads and temperatures are held; they are NaN before the first, which is unknown. A reference is in the first
+        row at or after its time. ``.attrs['units']`` has the units.
+        Raises RecordingError if there are no samples, ConfigError if pandas is not installed.
+        """
+        return self._table().to_pandas()
+
+    def to_xarray(self) -> xarray.Dataset:
+        """The same as a dataset over ``t`` (s); every variable has ``units`` and ``long_name``.
+
+        Raises RecordingError if there are no samples, ConfigError if xarray is not installed.
+        """
+        return self._table().to_xarray()
+
+    def _summary(self) -> list[tuple[str, object]]:
+        """What is known without reading all of it."""
+        rows: list[tuple[str, object]] = []
+        if self.hello is not None:
+            rows.append(('device', self.hello.get('serial', 'without a serial number')))
+        if self.namespace:
+            rows.append(('namespace', self.namespace))
+        rows.append(('parameters', len(self.parameters) or 'none recorded'))
+        if 'samples' in self.__dict__:
+            samples = self.samples
+            rows += [('samples', len(samples)), ('duration', f'{samples["t"][-1]:.3f} s')]
+        if 'sample_rate_hz' in self.__dict__:
+            rows.append(('sample rate', f'{self.sample_rate_hz:g} Hz'))
+        return rows
+
+    def __repr__(self) -> str:
+        try:
+            words = f'{self.path}: ' + ', '.join(f'{name} {value}' for name, value in self._summary())
+        except RecordingError as error:
+            words = str(error)
+        return f'<{type(self).__name__} {printable(words, LONGEST_REPR)}>'
+
+    def _repr_html_(self) -> str:
+        rows: list[tuple[str, object]] = []
+        try:
+            rows += [('sample rate', f'{self.sample_rate_hz:g} Hz'), *self.topics().items()]
+            rows = [*(row for row in self._summary() if row[0] != 'sample rate'), *rows]
+        except RecordingError as error:
+            rows.append(('cannot be read', error))
+        return html_table(f'{type(self).__name__} {self.path}', rows)
+
+
+def _held(found: Sequence[AppliedLoad] | Sequence[TemperatureReading], t_ns: IntArray) -> FloatArray:
+    """The values of ``found`` (n, number of values) at ``t_ns``, each held from its time; NaN before the first."""
+    times = np.array([f.t_ns for f in found], dtype=np.int64)
+    order = np.argsort(times, kind='stable')
+    values = np.array([found[i][1:] for i in order], dtype=np.float64)
+    index = np.searchsorted(times[order], t_ns, side='right') - 1
+    out: FloatArray = values[np.maximum(index, 0)]
+    out[index < 0] = np.nan
+    return out
+
+
+def _once(found: Sequence[ReferencePose], t_ns: IntArray) -> FloatArray:
+    """The values of ``found`` (n, 3), each at the first of ``t_ns`` at or after its time; NaN in the others."""
+    out = np.full((len(t_ns), 3), np.nan)
+    index = np.searchsorted(t_ns, [f.t_ns for f in found], side='left')
+    inside = index < len(t_ns)
+    out[index[inside]] = np.array([f[1:] for f in found], dtype=np.float64)[inside]
+    return out
+
+
+def _restart_in(change: ParameterChange) -> tuple[int, int] | None:
+    value = dict(change.values).get(RESTART)
+    if not isinstance(value, tuple) or len(value) != 2 or not all(isinstance(n, int) for n in value):
+        return None
+    before, after = int(value[0]), int(value[1])
+    return (before, after) if 0 <= before < after < 2**62 else None
 
 
 def from_json(values: Mapping[str, str]) -> dict[str, Any]:

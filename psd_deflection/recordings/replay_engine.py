@@ -9,12 +9,23 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import numpy as np
+
+from msg_adapters import DEFLECTION
 from psd_deflection.config import BY_NAME, Rig, load_rig, replace_values, rig_as_recorded
 from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.summary import NO_PARAMETERS
-from psd_deflection.records import ENVIRONMENT, RawChunk, Record, SampleBlock
+from psd_deflection.records import (
+    ENVIRONMENT,
+    DeflectionEstimate,
+    RawChunk,
+    Record,
+    SampleBlock,
+    TipLoad,
+)
 
 
 def rig_at_start(recording: Recording) -> Rig:
@@ -54,7 +65,7 @@ def open_for_replay(
     recording = open_recording(path, namespace=namespace)
     rig = rig_at_start(recording) if params_file is None else load_rig(params_file)
     if recording.block_size != rig.estimator.block_size:
-        recording = open_recording(path, block_size=rig.estimator.block_size, namespace=namespace)
+        recording = recording.with_block_size(rig.estimator.block_size)
     return recording, rig
 
 
@@ -82,3 +93,34 @@ def replayed(
             yield [change]
         yield list(pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags)))
     yield list(pipeline.flush())
+
+
+def replayed_estimates(recording: Recording, rig: Rig) -> EstimateSeries:
+    """The estimates of the rig's solver, with the tip loads, from the samples of ``recording``.
+
+    Raises RecordingError, ConfigError and SolverError.
+    """
+    if recording.block_size != rig.estimator.block_size:
+        recording = recording.with_block_size(rig.estimator.block_size)
+    found: list[DeflectionEstimate] = []
+    wrenches: dict[int, TipLoad] = {}
+    start_ns: int | None = None
+    for records in replayed(recording, Pipeline(rig)):
+        for record in records:
+            if isinstance(record, DeflectionEstimate) and record.primary:
+                found.append(record)
+            elif isinstance(record, TipLoad):
+                wrenches[record.t_ns] = record
+            elif isinstance(record, SampleBlock) and start_ns is None:
+                start_ns = int(record.t_ns[0])
+    nothing = TipLoad(0, np.nan, np.nan, np.nan)
+    return EstimateSeries(
+        DEFLECTION,
+        np.array([e.t_ns for e in found], dtype=np.int64),
+        np.array([e.pose for e in found], dtype=np.float64).reshape(-1, 3),
+        np.array([(e.phi, e.omega) for e in found], dtype=np.float64).reshape(-1, 2),
+        np.array([e.covariance for e in found], dtype=np.float64).reshape(-1, 3, 3),
+        np.array([wrenches.get(e.t_ns, nothing)[1:] for e in found], dtype=np.float64).reshape(-1, 3),
+        np.array([e.chi_square for e in found], dtype=np.float64),
+        start_ns,
+    )

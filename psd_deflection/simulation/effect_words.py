@@ -1,11 +1,12 @@
-"""Effects in the notation of the command line: ``NAME,KEY=VALUE,...``."""
+"""Effects in the notation of the command line, ``NAME,KEY=VALUE,...``, and as a map like that of a rig file."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from psd_deflection.config import EFFECTS_PREFIX, Rig, replace_values
+from psd_deflection.config import EFFECTS_PREFIX, Rig, flattened, replace_values
 from psd_deflection.errors import ConfigError
+from psd_deflection.parameters import shown
 from psd_deflection.simulation.catalogue import effects_of_rig
 
 
@@ -23,3 +24,27 @@ def with_effects(rig: Rig, words: Sequence[str], source: str) -> Rig:
     changed = replace_values(rig, changes, source) if changes else rig
     effects_of_rig(changed)
     return changed
+
+
+def with_effects_of(rig: Rig, effects: str | Sequence[str] | Mapping[str, object], source: str) -> Rig:
+    """``rig`` with ``effects``: words of the command line, or a map like that below ``effects:`` of a rig file.
+
+    Raises ConfigError naming ``source``.
+    """
+    if isinstance(effects, str):
+        effects = [effects]
+    if isinstance(effects, Mapping):
+        taken = {key.partition('.')[0] for key in rig.effects}
+        tree = {
+            # An effect of the rig file stays beside a hidden one of its name.
+            f'hidden_{key}' if key in taken else key: {'name': key, **body} if isinstance(body, Mapping) else body
+            for key, body in effects.items()
+        }
+        changed = replace_values(rig, flattened({EFFECTS_PREFIX.rstrip('.'): tree}, source), source)
+        effects_of_rig(changed)
+        return changed
+    if not isinstance(effects, Sequence) or not all(isinstance(text, str) for text in effects):
+        raise ConfigError(
+            f"{source} = {shown(effects)}: must be ['NAME,KEY=VALUE,...'] or a map {{NAME: {{KEY: VALUE}}}}"
+        )
+    return with_effects(rig, effects, source)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from psd_deflection.errors import ConfigError
+from psd_deflection.parameters import shown
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation import loads
 from psd_deflection.simulation.loads import LoadHistory
@@ -80,12 +82,52 @@ def load_history(words: str, rate: float, parameter: str = 'loads') -> LoadHisto
     raise ConfigError(f'{source}: not a load history: thesis, identification, constant, steps, ramp, chirp or a .csv')
 
 
+def load_table(
+    loads: npt.ArrayLike, rate: float, seconds: float | None = None, parameter: str = 'loads'
+) -> LoadHistory:
+    """The history of ``loads``: (3,) or (n, 3), N, N, N m. Each row is held for ``seconds``; None: for one sample.
+
+    Raises ConfigError naming the ``parameter``, the value and what is wrong.
+    """
+    try:
+        rows = np.atleast_2d(np.asarray(loads, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise ConfigError(f'{parameter} = {shown(loads)}: must be numbers, (3,) or (n, 3)') from None
+    if rows.ndim != 2 or rows.shape[1] != 3:
+        raise ConfigError(f'{parameter}: has the shape {np.shape(loads)}: must be (3,) or (n, 3): N, N, N m')
+    bad = np.flatnonzero(~np.all(np.isfinite(rows), axis=1))
+    if len(bad):
+        raise ConfigError(f'{parameter}[{bad[0]}] = {rows[bad[0]].tolist()}: must be finite')
+    repeats = 1
+    if seconds is not None:
+        most = MAX_SECONDS / len(rows)
+        try:
+            fits = 0.0 < seconds <= most
+        except TypeError:
+            fits = False
+        if not fits:
+            raise ConfigError(f'seconds = {shown(seconds)} s: must be above 0 and at most {most:g}')
+        repeats = round(seconds * rate)
+    return LoadHistory(np.repeat(rows, repeats, axis=0), rate)
+
+
 def temperature_history(words: str, n: int, parameter: str = 'temperature') -> FloatArray:
     """``T0[,T1,...]`` in degrees Celsius: straight lines through these, evenly over n samples.
 
     Raises ConfigError naming the ``parameter``.
     """
-    knots = _numbers(words, None, f'{parameter} {words}')
-    if len(knots) == 1:
-        return np.full(n, knots[0])
-    return np.asarray(np.interp(np.linspace(0.0, 1.0, n), np.linspace(0.0, 1.0, len(knots)), knots))
+    return temperature_table(_numbers(words, None, f'{parameter} {words}'), n, parameter)
+
+
+def temperature_table(knots: npt.ArrayLike, n: int, parameter: str = 'temperature') -> FloatArray:
+    """Straight lines through ``knots`` (a number or (m,), degrees Celsius), evenly over n samples.
+
+    Raises ConfigError naming the ``parameter``.
+    """
+    try:
+        values = np.atleast_1d(np.asarray(knots, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise ConfigError(f'{parameter} = {shown(knots)}: must be numbers') from None
+    if values.ndim != 1 or not len(values) or not np.all(np.isfinite(values)):
+        raise ConfigError(f'{parameter} = {shown(knots)}: must be finite numbers, (m,)')
+    return np.asarray(np.interp(np.linspace(0.0, 1.0, n), np.linspace(0.0, 1.0, len(values)), values))

@@ -90,7 +90,7 @@ class BasePairSolver(Solver):
             per_degree = abs(null[1] / null[2]) * np.pi / 180.0
             raise SolverError(
                 'two PSDs at the base give 4 readings for 5 unknowns: with torsion, one degree of twist looks like '
-                f'{per_degree * 1e3:.3g} mm of dY; assume no_twist, or beam (tilts tied to the deflection), '
+                f'{per_degree * 1e3:.3g} mm of ΔY; assume no_twist, or beam (tilts tied to the deflection), '
                 'or put the PSDs at the tip'
             )
         if assume == 'no_twist' and np.ptp(heights) < SMALLEST_BASE_LINE:

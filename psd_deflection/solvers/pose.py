@@ -35,7 +35,7 @@ class PoseSolver(Solver):
         """
         if check_twist(geometry) == 2:
             raise SolverError(
-                'two PSDs give 4 readings for 5 unknowns (dX, dY, theta, phi, omega): a tilt about their base line '
+                'two PSDs give 4 readings for 5 unknowns (ΔX, ΔY, θ, φ, ω): a tilt about their base line '
                 'changes nothing; use a third PSD, or the beam solver, which ties the tilts to the deflection'
             )
         heights = np.asarray(geometry.heights, dtype=np.float64)

@@ -188,7 +188,7 @@ class Explanation:
 CAUSES: tuple[Explanation, ...] = (
     Explanation('the algorithms alone'),
     Explanation(
-        'twist, dY of Table B1 at 60 N, scaled',
+        'twist, ΔY of Table B1 at 60 N, scaled',
         pose=np.array([0.12e-3, -3.38e-3, -13.0 / 585.0]) * (1.0, 50.0 / 60.0, 50.0 / 60.0),
     ),
     Explanation('PSDs 22 mm above the section', height=0.022, pose=np.array([0.132e-3, -2.2272e-3, np.radians(-1.0)])),
@@ -197,7 +197,7 @@ CAUSES: tuple[Explanation, ...] = (
     Explanation('all gains +5 %', gain=1.05),
     Explanation('beam 1 inclined 1 deg in x', beam_1=(np.tan(np.radians(1.0)), 0.0)),
     Explanation('beam 1 inclined 1 deg in y', beam_1=(0.0, np.tan(np.radians(1.0)))),
-    Explanation('pre-load 70/-50 um left in', offset=(70e-6, -50e-6)),
+    Explanation('pre-load 70/-50 µm left in', offset=(70e-6, -50e-6)),
     Explanation('camera rolled +1 deg', camera_roll=np.radians(1.0)),
     Explanation('camera rolled -1 deg', camera_roll=np.radians(-1.0)),
     Explanation('plate centre off (2, 2) mm', center=(2e-3, 2e-3)),

@@ -66,13 +66,13 @@ def comparison() -> Figure:
         twist = [_MDEG * float(c.rms[2]) for c in cells]
         for ax, values in zip(axes, (translation, twist), strict=True):
             ax.plot(np.maximum(values, 1e-2), rows + 0.22 * (1 - k), 'o', color=color, ms=5, label=condition)
-    for ax, label in zip(axes, ('tip deflection, rms um', 'twist, rms mdeg'), strict=True):
+    for ax, label in zip(axes, ('tip deflection, rms µm', 'twist, rms mdeg'), strict=True):
         ax.set_xscale('log')
         ax.set(xlabel=label, xlim=(7e-3, 5e3), yticks=rows, yticklabels=[m.label for m in shown])
         ax.axvspan(7e-3, 1.4e-2, color=_GREY, alpha=0.15)
     axes[0].text(1.6e-2, 10.5, 'in the grey band: exact', color=_GREY, fontsize=8)
     axes[0].axvline(2.45, color='black', lw=0.8, ls=':')
-    axes[1].axvline(1.328, color='black', lw=0.8, ls=':', label='noise, for 2 um a reading')
+    axes[1].axvline(1.328, color='black', lw=0.8, ls=':', label='noise, for 2 µm a reading')
     handles, labels = axes[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc='outside lower center', ncols=4, fontsize=8)
     return figure
@@ -90,15 +90,15 @@ def iterative() -> Figure:
     gap_y = (geometry.beams[0, 1] - geometry.beams[1, 1]) - (s * (q[0, 0] - q[1, 0]) + c * (q[0, 1] - q[1, 1]))
     figure, ax = plt.subplots(figsize=(6.4, 3.4), layout='constrained')
     degrees = np.degrees(angles)
-    ax.plot(degrees, 1e3 * gap_x, color=_BLUE, label='dX of PSD 1 less PSD 2')
-    ax.plot(degrees, 1e3 * gap_y, color=_ORANGE, label='dY of PSD 1 less PSD 2')
+    ax.plot(degrees, 1e3 * gap_x, color=_BLUE, label='ΔX of PSD 1 less PSD 2')
+    ax.plot(degrees, 1e3 * gap_y, color=_ORANGE, label='ΔY of PSD 1 less PSD 2')
     ax.axhspan(-0.1, 0.1, color=_GREY, alpha=0.2, label='tolerance 0.1 mm')
     trial = tuple(dots.tolist()), tuple(VARIANCES.tolist())
     for criterion, name, color, height in (('absolute', 'first hit', _RED, -0.7), ('argmin', 'least', _GREEN, 0.62)):
         found = make_solver('iterative_printed', geometry, criterion=criterion).solve(*trial)
         at = np.degrees(found.theta)
         ax.axvline(at, color=color, lw=1.2)
-        label = f'{name}: {at:.2f} deg, dX off {1e6 * (found.dx - pose[0]):.0f} um'
+        label = f'{name}: {at:.2f} deg, ΔX off {1e6 * (found.dx - pose[0]):.0f} µm'
         ax.annotate(label, (at, height), (at - 0.02, height), ha='right', color=color, fontsize=8)
     ax.set(xlabel='trial angle, deg', ylabel='disagreement, mm', xlim=(0, 1))
     ax.legend(loc='upper right', fontsize=8)
@@ -120,7 +120,7 @@ def linear() -> Figure:
     ):
         found = make_solver(name, geometry, **options).solve_many(dots, VARIANCES).pose
         left.plot(np.degrees(theta), 1e6 * (found[:, 0] - 2e-3), color=color, ls=dash, label=label)
-    left.set(xlabel='twist, deg', ylabel='error of dX, um', title='tip at (2, -2) mm, no noise')
+    left.set(xlabel='twist, deg', ylabel='error of ΔX, µm', title='tip at (2, -2) mm, no noise')
     left.legend(fontsize=8)
     design = design_matrix(geometry.beams)
     for k, (label, scaling, color) in enumerate(
@@ -149,7 +149,7 @@ def exact() -> Figure:
     off = (found.pose - pose[0, :3]) * (1e6, 1e6, _MDEG)
     claimed = found.covariance[0] * np.outer((1e6, 1e6, _MDEG), (1e6, 1e6, _MDEG))
     figure, axes = plt.subplots(1, 2, figsize=(8.0, 3.6), layout='constrained')
-    labels = ('error of dX, um', 'error of dY, um', 'error of theta, mdeg')
+    labels = ('error of ΔX, µm', 'error of ΔY, µm', 'error of θ, mdeg')
     for ax, (i, j) in zip(axes, ((0, 2), (1, 2)), strict=True):
         ax.plot(off[:, i], off[:, j], '.', ms=1.5, color=_BLUE)
         values, vectors = np.linalg.eigh(claimed[np.ix_([i, j], [i, j])])
@@ -157,7 +157,7 @@ def exact() -> Figure:
         tilt = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
         ax.add_patch(Ellipse((0, 0), size[1], size[0], angle=tilt, fill=False, color=_RED, lw=1.5))
         ax.set(xlabel=labels[i], ylabel=labels[j])
-    axes[0].set_title('3000 draws of 2 um noise')
+    axes[0].set_title('3000 draws of 2 µm noise')
     axes[1].set_title('ellipse: 95 % by the covariance')
     return figure
 
@@ -190,9 +190,9 @@ def appendix_d() -> Figure:
     )
     bar = figure.colorbar(image, ticks=[0, 1, 2, 3, 4])
     bar.ax.set_yticklabels(['1', '10', '100', '1000', '10000'])
-    bar.set_label('error of theta, mdeg')
+    bar.set_label('error of θ, mdeg')
     ax.set(
-        xlabel='dY, mm',
+        xlabel='ΔY, mm',
         ylabel='twist, deg (counter-clockwise +)',
         title='grey: no trial passes, and (0, 0, 0) is returned',
     )
@@ -222,7 +222,7 @@ def minimum_tilt() -> Figure:
     ax.set(
         xlabel='tilt of the plate, deg',
         ylabel='least tilt that explains the dots, deg',
-        title='noise 2 um; the sign is never seen',
+        title='noise 2 µm; the sign is never seen',
     )
     ax.legend(fontsize=8, loc='center right')
     return figure
@@ -258,7 +258,7 @@ def beam() -> Figure:
             ylim=(1e-4, 300),
             title=f'surfaces {1e3 * height:g} mm above the section',
         )
-    axes[0].set_ylabel('error of (dX, dY), um')
+    axes[0].set_ylabel('error of (ΔX, ΔY), µm')
     axes[0].text(4, 1.5e-4, 'beam, true k = 1.5: exact', color=_BLUE, fontsize=8)
     axes[0].legend(fontsize=7, ncols=2, loc='upper center')
     return figure
@@ -280,7 +280,7 @@ def pose() -> Figure:
     ):
         ax.loglog(1e3 * steps, values, '.-', color=color, label=label)
     ax.set(xlabel='height of PSD 1, mm (the others half below)', ylabel='standard deviation, mdeg')
-    ax.set_title('three PSDs on a circle of 100 mm, noise 2 um')
+    ax.set_title('three PSDs on a circle of 100 mm, noise 2 µm')
     ax.legend(fontsize=8)
     return figure
 
@@ -300,7 +300,7 @@ def base_pair() -> Figure:
     for assume, color in (('no_twist', _RED), ('beam', _GREEN)):
         found = make_solver('base_pair', geometry, assume=assume).solve_many(dots, VARIANCES).pose
         left.plot(np.degrees(theta), 1e3 * (found[:, 1] + 2e-3), color=color, label=f'assume {assume}')
-    left.set(xlabel='true twist, deg', ylabel='error of dY, mm', title='tip at (1, -2) mm, exact readings')
+    left.set(xlabel='true twist, deg', ylabel='error of ΔY, mm', title='tip at (1, -2) mm, exact readings')
     left.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
     left.legend(fontsize=8)
     distance = np.linspace(0.0, 0.6, 61)

@@ -137,6 +137,13 @@ def test_both_lost_is_no_estimate_by_any_rule() -> None:
     assert sorted(found) == [0, 1, 4, 5]
 
 
+def test_what_is_saturated_is_said_with_the_parameter_of_the_range() -> None:
+    counts = moving(1)
+    counts[3, 2] = 32767
+    (spot, *_) = [r for r in records_of(Pipeline(load_rig()), counts) if isinstance(r, SpotMeans)]
+    assert spot.reason == 'sum1 saturated: 10.000 V, converter.full_scale is 10 V'
+
+
 def test_a_saturated_or_strayed_detector_leaves_the_other_too() -> None:
     rig = load_rig(overrides={'degraded': 'zero'})
     counts = moving(3)

@@ -31,7 +31,7 @@ def test_a_rigs_placement_is_compared(capsys: pytest.CaptureFixture[str]) -> Non
     rows = {line.split('  ')[0]: line.split() for line in reversed(out.splitlines())}
     assert rows['this rig'][-5:] == ['1.630', '1.828', '1.328', '2.451', '16.446']
     assert rows['best in the room'][-5:] == ['1.414', '1.414', '0.810', '1.000', '10.000']
-    assert 'dX 1.15, dY 1.29, theta 1.64 times smaller' in out
+    assert 'ΔX 1.15, ΔY 1.29, θ 1.64 times smaller' in out
     assert rows['this rig, two sensors'][-1] == 'unseen'
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -385,3 +386,64 @@ def test_another_error_of_ours_is_still_a_traceback(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr('psd_deflection.cli.info.open_recording', fail)
     with pytest.raises(RuntimeError, match='a defect'):
         main(['info', 'x.csv'])
+
+
+@pytest.mark.parametrize(
+    'words',
+    [
+        ['budget'], ['budget', '--explain'], ['design'], ['design', '--params-file', RIG], ['effects'],
+        ['effects', 'plane_tilt'], ['params'], ['compare-methods'], ['replay', CLEAN], ['info', CLEAN],
+    ],
+    ids=' '.join,
+)  # fmt: skip
+def test_quantities_are_written_alike_and_nothing_is_written_to_disk(
+    words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert not re.search(r'(?<![\w.])(um|dX|dY|theta|phi|omega)(?!\w)', out), out
+    assert list(folder.iterdir()) == []
+
+
+def rig_file(folder: Path, body: str) -> str:
+    path = folder / 'rig.yaml'
+    path.write_text(f'/**:\n  ros__parameters:\n    {body}\n')
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ('body', 'status', 'said'),
+    [
+        ('solver: exakt', 3, "solver = 'exakt': must be one of exact, wls,"),
+        ('psd_2: {center: [0.0, 0.070]}', 6, 'coincide'),
+        ('effects: {creap: {amplitude: 0.1}}', 3, 'did you mean creep?'),
+    ],
+)
+def test_params_refuses_a_rig_that_cannot_be_evaluated(
+    body: str, status: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(['params', '--params-file', rig_file(tmp_path, body)]) == status
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert said in err
+
+
+def test_a_recording_with_a_typing_error_is_found(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['info', str(ROOT / 'bags' / 'cleann')]) == 4
+    assert capsys.readouterr().err.endswith('cleann: no such recording; did you mean clean?\n')
+    assert main(['info', '/nowhere/at/all']) == 4
+    assert capsys.readouterr().err.endswith('/nowhere/at/all: no such recording\n')
+
+
+@pytest.mark.parametrize('command', ['replay', 'plot'])
+def test_how_long_a_recording_lasts_is_by_its_stamps(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At 200 Hz, with the rig file of 1000 Hz."""
+    path = tmp_path / 'run.csv'
+    rows = '\n'.join(f'{i / 200:.3f},0.0{i % 7},0.0{i % 5},5,0.0{i % 3},0.0{i % 4},5' for i in range(400))
+    path.write_text(f't,x1,y1,sum1,x2,y2,sum2\n{rows}\n')
+    out = ['--out', str(tmp_path / 'run.png')] if command == 'plot' else []
+    assert main([command, str(path), '--json', *out]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['seconds' if command == 'replay' else 'duration_s'] == pytest.approx(2.0)

@@ -233,7 +233,7 @@ def test_loads_that_leave_a_wire_untouched_cannot_tell_and_say_what_is_needed() 
     together = np.zeros((6000, 3))
     together[2000:4000] = (0.0, -10.0, -5.85)
     found = checked(recorded(together, 4), together)
-    assert [p.name for p in found.pushes] == ['+Y with +theta']
+    assert [p.name for p in found.pushes] == ['+Y with +θ']
     assert found.verdict == CANNOT_TELL
 
 
@@ -302,7 +302,7 @@ def test_drift_is_told_with_its_sign() -> None:
     found = checked(recorded(loads, 6, effects=[drifting]), loads)
     assert found.drift[2] == pytest.approx(1e-6, rel=0.1)
     (note,) = found.notes
-    assert re.match(r'drift: \+(59|6\d)\.\d um a minute on x2', note)
+    assert re.match(r'drift: \+(59|6\d)\.\d µm a minute on x2', note)
 
 
 def test_every_wiring_differs_from_each_file_in_what_its_parameters_say() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 import psd_deflection
 from psd_deflection.cli.main import main
-from psd_deflection.config import Rig, load_rig, replace_values
+from psd_deflection.config import DESCRIPTION, Rig, load_rig, read_parameter_file, replace_values
 from psd_deflection.discovery import proposals
 from psd_deflection.discovery.coincidence import coincidences
 from psd_deflection.discovery.discover import Discovery, discover
@@ -287,10 +287,14 @@ def test_from_simulate_to_model(tmp_path: Path, capsys: pytest.CaptureFixture[st
     page = (out / 'report.html').read_text()
     assert 'http' not in page.replace('http-equiv', '')
     assert page.count('data:image/png;base64,') == 4
-    assert (
-        main(['discover', str(recorded), '--params-file', str(out / 'model.yaml'), '--out', str(out), '--quiet']) == 0
-    )
+    model = out / 'model.yaml'
+    # Without a file of the user it describes the rig, and not the machine that recorded.
+    assert set(read_parameter_file(model)) == {*DESCRIPTION, *(k for k in load_rig(model).flat() if 'effects.' in k)}
+    model.write_text('# The rig as of Monday.\n' + model.read_text())
+    assert main(['discover', str(recorded), '--params-file', str(model), '--out', str(out), '--quiet']) == 0
     assert 'Nothing is missing' in capsys.readouterr().out
+    assert model.read_text().startswith('# The rig as of Monday.\n')
+    assert [a.effect.name for a in effects_of_rig(load_rig(model))] == ['sensor_gain']
 
 
 def test_a_bag_tells_its_own_rig_but_not_what_was_hidden(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

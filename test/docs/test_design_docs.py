@@ -1,4 +1,4 @@
-"""What docs/mechanics.md and docs/budget.md quote is what the commands print."""
+"""What docs/mechanics.md, docs/budget.md and docs/audit.md quote is what the commands print."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RIG = str(ROOT / 'config' / 'thesis_rig.yaml')
 @pytest.mark.parametrize(
     ('page', 'arguments'),
     [
-        ('mechanics.md', ['design']),
+        ('audit.md', ['design']),
         ('mechanics.md', ['design', '--params-file', RIG, '--sigma', '2e-6']),
         ('budget.md', ['budget', '--params-file', RIG, '--monte-carlo', '20000']),
     ],
@@ -25,7 +25,7 @@ def test_the_quoted_tables_are_the_printed_ones(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(arguments) == 0
-    printed = capsys.readouterr().out.removesuffix('\nbudget.png\n').rstrip()
+    printed = capsys.readouterr().out.rstrip()
     assert f'```\n{printed}\n```' in (ROOT / 'docs' / page).read_text(encoding='utf-8')
 
 
@@ -39,7 +39,7 @@ def test_the_quoted_tables_are_the_printed_ones(
                 *('--set', 'rotation_tolerance=1e-3', '--set', 'center_tolerance=1e-4'),
                 *('--set', 'height_tolerance=2e-4', '--set', 'pointing_drift=2e-6'),
             ],
-            '2.992 um, 5.048 um and 2.723 mdeg',
+            '2.992 µm, 5.048 µm and 2.723 mdeg',
         ),
     ],
 )
@@ -52,5 +52,5 @@ def test_the_quoted_figures_are_the_printed_ones(
     name = 'computation' if '--method' in arguments else 'total'
     line = next(line.split() for line in out.splitlines() if line.startswith(name))
     figures = line[4:7] if name == 'computation' else line[1:4]
-    # 'computation  E_C  known bias  dX dY theta ...'
+    # 'computation  E_C  known bias  ΔX ΔY θ ...'
     assert [w for w in quoted.replace('|', ' ').split() if w[0].isdigit()] == figures

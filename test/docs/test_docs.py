@@ -6,8 +6,10 @@ What ends in a moment is run here; ``make doc-commands`` runs the rest (tools/ru
 from __future__ import annotations
 
 import argparse
+import doctest
 import importlib.util
 import json
+import os
 import re
 import runpy
 import shlex
@@ -21,6 +23,7 @@ import pytest
 
 from psd_deflection import errors
 from psd_deflection.cli.main import COMMANDS, main, make_parser
+from psd_deflection.simulation.catalogue import catalogue
 from tools import run_commands
 from tools.program import ROOT
 from tools.run_commands import FENCE, PAGES, Command
@@ -121,6 +124,14 @@ def test_the_tests_that_follow_the_steps_are_there() -> None:
     assert [name for name in named if not (ROOT / name).is_file()] == []
 
 
+def test_errata_of_the_thesis_are_on_one_page() -> None:
+    audit = {page.name: page.read_text() for page in PAGES}.pop('audit.md')
+    assert len(re.findall(r'^## ', audit, re.M)) > 6
+    elsewhere = re.compile(r'^#+ .*(errat|discrepanc)|errors of the source', re.M | re.I)
+    for page in PAGES:
+        assert page.name == 'audit.md' or not elsewhere.search(page.read_text()), page
+
+
 def test_no_page_loads_anything_from_elsewhere() -> None:
     for page in PAGES:
         assert not re.search(r'!\[[^\]]*\]\(https?:', page.read_text()), page
@@ -144,27 +155,63 @@ def test_python_blocks_run(
     runpy.run_path(str(script))
 
 
-def test_the_notebook_runs(checkout: Path, tmp_path: Path) -> None:
-    if importlib.util.find_spec('pandas') is None:
-        pytest.skip('the notebook needs pandas: pip install .[test]')
-    cells = json.loads((ROOT / 'docs' / 'recording.ipynb').read_text())['cells']
-    sources = [''.join(cell['source']) for cell in cells if cell['cell_type'] == 'code']
-    assert len(sources) >= 4
-    script = tmp_path / 'notebook.py'
-    # As a notebook does: all in one namespace.
-    script.write_text(
-        "import matplotlib\nmatplotlib.use('Agg')\n" + '\n\n'.join(sources) + '\nassert len(samples) == 4000\n'
-    )
+SESSIONS = [
+    (page, fences)
+    for page in PAGES
+    if (fences := [block for block in FENCE.finditer(page.read_text()) if block['kind'] == 'pycon'])
+]
+
+
+@pytest.mark.parametrize(('page', 'fences'), SESSIONS, ids=lambda v: getattr(v, 'name', ''))
+def test_python_sessions_answer_as_printed(
+    page: Path, fences: list[re.Match[str]], checkout: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(checkout)
+    pytest.importorskip('xarray')
+    text = page.read_text()
+    # All of a page in one namespace, as a reader types them; by the page's own lines.
+    examples = [
+        doctest.Example(e.source, e.want, e.exc_msg, e.lineno + text.count('\n', 0, fence.start('text')), e.indent)
+        for fence in fences
+        for e in doctest.DocTestParser().get_examples(fence['text'])
+    ]
+    said: list[str] = []
+    flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    session = doctest.DocTest(examples, {}, page.name, str(page), 0, text)
+    failed, tried = doctest.DocTestRunner(optionflags=flags).run(session, out=said.append)
+    assert failed == 0, ''.join(said)
+    assert tried > 5
+
+
+NOTEBOOKS = sorted((ROOT / 'docs').glob('*.ipynb'))
+
+
+def outputs(notebook: Path) -> list[list[tuple[str, object]]]:
+    """Of each cell with code: the kinds of its outputs, and what it prints."""
+    cells = [c for c in json.loads(notebook.read_text())['cells'] if c['cell_type'] == 'code']
+    return [[(o['output_type'], o.get('text') or sorted(o.get('data', {}))) for o in c['outputs']] for c in cells]
+
+
+@pytest.mark.parametrize('notebook', NOTEBOOKS, ids=lambda p: p.name)
+def test_a_notebook_is_shipped_executed_and_runs_in_any_folder(notebook: Path, tmp_path: Path) -> None:
+    pytest.importorskip('nbmake')
+    copy = tmp_path / notebook.name
+    cells = json.loads(notebook.read_text())
+    for cell in cells['cells']:
+        if cell['cell_type'] == 'code':
+            cell.update(outputs=[], execution_count=None)
+    copy.write_text(json.dumps(cells))
     done = subprocess.run(
-        [sys.executable, str(script)],
-        cwd=checkout,
+        [sys.executable, '-m', 'pytest', '-q', '--nbmake', '--overwrite', '-p', 'no:cacheprovider', copy.name],
+        cwd=tmp_path,
         capture_output=True,
         text=True,
         check=False,
-        env={'PYTHONPATH': str(ROOT), 'PATH': '', 'MPLCONFIGDIR': str(tmp_path)},
+        env={**os.environ, 'PYTHONPATH': str(ROOT), 'HOME': str(tmp_path)},
     )
-    assert done.returncode == 0, done.stderr
-    assert 'sd at rest: 0.18 µm, 0.20 µm, 0.15 mdeg' in done.stdout
+    assert done.returncode == 0, done.stdout
+    assert outputs(copy) == outputs(notebook)
+    assert sum(('image/png' in str(kinds)) for cell in outputs(notebook) for kinds in cell) == 1
 
 
 @pytest.fixture(scope='module')
@@ -199,10 +246,10 @@ def pattern(row: str) -> re.Pattern[str]:
     ],
     ids=lambda v: ' '.join(v) if isinstance(v, list) else str(v),
 )
-def test_every_user_message_is_on_the_troubleshooting_page(
+def test_every_user_message_is_on_the_page_of_messages(
     status: int, argv: list[str], hooks: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
-    page = hooks.on_page_markdown((ROOT / 'docs' / 'troubleshooting.md').read_text())
+    page = hooks.on_page_markdown((ROOT / 'docs' / 'messages.md').read_text())
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
     for name, line in {
         'unknown': 'link: {lenght: 1.0}',
@@ -220,7 +267,7 @@ def test_every_user_message_is_on_the_troubleshooting_page(
         ended = stop.code if isinstance(stop.code, int) else 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert ended == status, said
-    table = page.partition(f'### Exit status {status}: ')[2].partition('\n### ')[0]
+    table = page.partition(f'## Exit status {status}: ')[2].partition('\n## ')[0]
     rows = re.findall(r'^\| `(.+)` \| `', table, re.M)
     assert len(rows) > 5
     # A row of few words would fit whatever is said.
@@ -244,6 +291,16 @@ def test_every_command_and_parameter_is_on_its_page(hooks: Any) -> None:
     for name in COMMANDS:
         assert f'usage: psd-deflection {name}' in page
     assert '| `monitor_control` | `local` |' in page
+
+
+def test_every_effect_is_on_its_page(hooks: Any) -> None:
+    page = hooks.on_page_markdown((ROOT / 'docs' / 'effects.md').read_text())
+    assert '<!--' not in page
+    assert re.findall(r'^## (\w+)$', page, re.M) == [
+        e.name for e in sorted(catalogue().values(), key=lambda e: e.rank) if e.name in hooks.OWN_EFFECTS
+    ]
+    assert len(hooks.OWN_EFFECTS) >= 27
+    assert 'angle: ' in page.partition('## sensor_rotation')[2].partition('\n## ')[0]
 
 
 def test_what_docstrings_say_for_sphinx_is_not_shown(hooks: Any) -> None:

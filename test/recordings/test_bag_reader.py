@@ -206,6 +206,20 @@ def test_a_restarted_device_does_not_mix_blocks(tmp_path: Path) -> None:
     assert any('start again after 99' in w for w in recording.warnings)
 
 
+def test_other_blocks_are_those_of_a_recording_opened_so(tmp_path: Path) -> None:
+    # After a restart numbers go on with the next block, so they depend on its size.
+    again = [block(i, lost=(0, 1, 2) if i == 1 else (), t0=T0 + 5 * 10**9) for i in (1, 2)]
+    path = write_mcap(tmp_path / 'a.mcap', [*(block(i) for i in range(5)), *again])
+    first = open_recording(path)
+    assert len(first.samples) == sum(len(b.seq) for b in first.blocks())
+    other, fresh = first.with_block_size(7), open_recording(path, block_size=7)
+    assert [(b.index, b.seq.tolist()) for b in other.blocks()] == [(b.index, b.seq.tolist()) for b in fresh.blocks()]
+    assert np.array_equal(other.samples, fresh.samples)
+    assert other.restarts == fresh.restarts != set()
+    assert not np.array_equal(other.samples['seq'], first.samples['seq'])
+    assert first.with_block_size(first.block_size) is first
+
+
 def test_numbers_left_out_at_a_restart_are_not_lost(tmp_path: Path) -> None:
     # The device was started at another number, of which the first in the recording is amid a block.
     again = [block(i, lost=(0, 1, 2) if i == 1 else (), t0=T0 + 5 * 10**9) for i in (1, 2)]

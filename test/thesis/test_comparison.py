@@ -65,14 +65,14 @@ def test_beam_is_exact_on_a_beam_and_the_flat_methods_on_a_flat_plate() -> None:
         assert errors(by_label[label], 'flat').largest.max() < 1e-13
 
 
-# Per cent of theta, dX, dY: Appendix D's iteration; weighted least squares.
+# Per cent of θ, ΔX, ΔY: Appendix D's iteration; weighted least squares.
 TABLE_5_1: dict[str, tuple[Cell, Cell]] = {
     'the algorithms alone': ((-8.6, 84.9, 0.0), (-0.4, 19.2, -0.5)),
-    'twist, dY of Table B1 at 60 N, scaled': ((-7.6, 86.0, 0.1), (-0.5, 29.2, -0.5)),
+    'twist, ΔY of Table B1 at 60 N, scaled': ((-7.6, 86.0, 0.1), (-0.5, 29.2, -0.5)),
     'PSDs 22 mm above the section': ((-8.0, 82.3, 5.7), (-0.5, 25.2, 5.1)),
     'both PSDs rotated 1 deg': ((-10.7, 73.2, 1.0), (0.6, 10.7, 0.5)),
     'all gains +5 %': ((-3.3, 85.3, 5.1), (4.5, 25.2, 4.5)),
-    'pre-load 70/-50 um left in': ((-8.6, 85.0, 0.0), (6.2, 60.2, 2.7)),
+    'pre-load 70/-50 µm left in': ((-8.6, 85.0, 0.0), (6.2, 60.2, 2.7)),
     'camera rolled +1 deg': ((-8.6, 173.5, 0.0), (-0.4, 76.4, -0.5)),
     'camera rolled -1 deg': ((-8.6, 39.7, 0.2), (-0.4, -9.9, -0.4)),
     'plate centre off (2, 2) mm': ((-8.6, 112.1, 1.5), (-0.4, 46.8, 1.0)),

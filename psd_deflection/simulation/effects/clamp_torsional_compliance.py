@@ -14,7 +14,7 @@ EFFECT = Effect(
     name='clamp_torsional_compliance',
     stage='link',
     summary='the clamp twists with the torque',
-    equation='theta += compliance Tz',
+    equation='θ += compliance Tz',
     source='thesis appendix B, experimental row',
     needs='known torques at two link lengths (at one length it is a change of GJ)',
     parameters=(EffectParameter('compliance', 'rad/(N m)', 0.0, 1e-1, 1e-6, 'twist of the clamp per torque'),),

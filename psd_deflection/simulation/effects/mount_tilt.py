@@ -15,7 +15,7 @@ EFFECT = Effect(
     name='mount_tilt',
     stage='link',
     summary='the base is tilted against the beams',
-    equation='dX += x L, dY += y L',
+    equation='ΔX += x L, ΔY += y L',
     source='geometry: a slope times the length',
     needs='recordings at two lengths, zeroed at one',
     parameters=(

@@ -14,7 +14,7 @@ EFFECT = Effect(
     name='plane_tilt',
     stage='optics',
     summary='the tip plate tilts with the bending slope',
-    equation='R = Ry(k dX/L) Rx(-k dY/L) Rz(theta)',
+    equation='R = Ry(k ΔX/L) Rx(-k ΔY/L) Rz(θ)',
     source='thesis section 2.3, corrected; beam theory',
     needs='large deflection; an even effect',
     parameters=(
@@ -24,7 +24,7 @@ EFFECT = Effect(
             0.0,
             20.0,
             1.5,
-            'k of phi = -k dY/L: 3/2 for a force, 2 for a moment',
+            'k of φ = -k ΔY/L: 3/2 for a force, 2 for a moment',
             grid=(1.5,),
             power=2,
         ),

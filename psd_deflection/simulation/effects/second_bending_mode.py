@@ -41,7 +41,7 @@ EFFECT = Effect(
     name='second_bending_mode',
     stage='link',
     summary='a second bending mode rings',
-    equation="q2'' + 2 zeta w q2' + w^2 q2 = w^2 gain q_static; dX, dY += q2",
+    equation="q2'' + 2 zeta w q2' + w^2 q2 = w^2 gain q_static; ΔX, ΔY += q2",
     source='Euler-Bernoulli cantilever: w2/w1 = 6.27',
     needs='steps',
     parameters=(

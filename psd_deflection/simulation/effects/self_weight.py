@@ -14,7 +14,7 @@ EFFECT = Effect(
     name='self_weight',
     stage='link',
     summary='the link bends under its own weight',
-    equation='dY -= w L^4/(8 EI)',
+    equation='ΔY -= w L^4/(8 EI)',
     source='beam theory',
     needs='recordings at two lengths, zeroed at one',
     parameters=(EffectParameter('weight_per_length', 'N/m', 0.0, 1e3, 1e-2, 'weight of the link per length'),),

@@ -1,0 +1,118 @@
+"""A series of deflections: those of one topic of a recording, or those that a replay gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.tables import Column, Table, columns_of, html_table
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class EstimateSeries:
+    """Deflections in order of time.
+
+    ``t_ns`` int64 (n,). ``pose`` (n, 3): dX m, dY m, theta rad. ``tilt`` (n, 2): phi, omega, rad. ``covariance``
+    (n, 3, 3) of the pose. ``wrench`` (n, 3): load at the tip that the link model needs, N, N, N m, NaN if there is
+    none. ``chi_square`` (n,): of the one redundant reading, NaN if it was not checked. ``covariance``, ``wrench`` and
+    ``chi_square`` are None if the source has none. ``start_ns``: where ``t`` is 0; the first estimate if None.
+    """
+
+    topic: str
+    t_ns: IntArray
+    pose: FloatArray
+    tilt: FloatArray
+    covariance: FloatArray | None = None
+    wrench: FloatArray | None = None
+    chi_square: FloatArray | None = None
+    start_ns: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @property
+    def t(self) -> FloatArray:
+        """Time of each estimate (the middle of its block), s from ``start_ns``."""
+        start = self.start_ns if self.start_ns is not None else (self.t_ns[0] if len(self.t_ns) else 0)
+        seconds: FloatArray = (self.t_ns - start) * 1e-9
+        return seconds
+
+    @property
+    def dx(self) -> FloatArray:
+        """Displacement along X, (n,), m."""
+        return self.pose[:, 0]
+
+    @property
+    def dy(self) -> FloatArray:
+        """Displacement along Y, (n,), m."""
+        return self.pose[:, 1]
+
+    @property
+    def theta(self) -> FloatArray:
+        """Twist about Z, (n,), rad."""
+        return self.pose[:, 2]
+
+    @property
+    def sd(self) -> FloatArray | None:
+        """Standard deviations of dX m, dY m, theta rad, (n, 3), NaN if unknown; None without a covariance."""
+        if self.covariance is None:
+            return None
+        variances = np.diagonal(self.covariance, axis1=1, axis2=2)
+        return np.sqrt(np.where(variances >= 0.0, variances, np.nan))
+
+    def _table(self) -> Table:
+        axes = ('displacement along X', 'displacement along Y', 'twist about Z')
+        columns = [
+            Column('t_ns', self.t_ns, 'ns', 'time, since the epoch if the recording has it'),
+            *columns_of(self.pose, ('dx', 'dy', 'theta'), ('m', 'm', 'rad'), axes),
+            *columns_of(self.tilt, ('phi', 'omega'), ('rad', 'rad'), ('tilt about X', 'tilt about Y')),
+        ]
+        sd = self.sd
+        if sd is not None:
+            words = [f'standard deviation of the {axis}' for axis in axes]
+            columns += columns_of(sd, ('sd_dx', 'sd_dy', 'sd_theta'), ('m', 'm', 'rad'), words)
+        if self.wrench is not None:
+            words = ['force along X at the tip', 'force along Y at the tip', 'torque about Z at the tip']
+            columns += columns_of(self.wrench, ('fx', 'fy', 'tz'), ('N', 'N', 'N m'), words)
+        if self.chi_square is not None:
+            columns.append(Column('chi_square', self.chi_square, '', 'of the one redundant reading'))
+        return Table(Column('t', self.t, 's', 'time'), columns, {'topic': self.topic})
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """One row an estimate over ``t`` (s); ``.attrs['units']`` has the units.
+
+        Raises ConfigError if pandas is not installed.
+        """
+        return self._table().to_pandas()
+
+    def to_xarray(self) -> xarray.Dataset:
+        """One variable a quantity over ``t`` (s), with ``units`` and ``long_name``.
+
+        Raises ConfigError if xarray is not installed.
+        """
+        return self._table().to_xarray()
+
+    def _summary(self) -> list[tuple[str, str]]:
+        rows = [('estimates', str(len(self)))]
+        if len(self):
+            rows.append(('duration', f'{(self.t_ns[-1] - self.t_ns[0]) * 1e-9:.2f} s'))
+            for name, values, unit in (
+                ('ΔX', self.dx * 1e6, 'µm'),
+                ('ΔY', self.dy * 1e6, 'µm'),
+                ('θ', np.rad2deg(self.theta) * 1e3, 'mdeg'),
+            ):
+                rows.append((name, f'{np.nanmin(values):+.2f} … {np.nanmax(values):+.2f} {unit}'))
+        return rows
+
+    def __repr__(self) -> str:
+        return f'<EstimateSeries {self.topic}: {", ".join(f"{name} {value}" for name, value in self._summary())}>'
+
+    def _repr_html_(self) -> str:
+        return html_table(f'EstimateSeries {self.topic}', self._summary())

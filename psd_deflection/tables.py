@@ -1,0 +1,95 @@
+"""Columns with units, as a pandas DataFrame, an xarray Dataset or the HTML that a notebook shows."""
+
+from __future__ import annotations
+
+import html
+import importlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from psd_deflection.errors import ConfigError, printable
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+LONGEST_CELL = 200
+"""Characters of one cell of :func:`html_table`, which may hold words of a file."""
+
+
+class Column(NamedTuple):
+    """``values`` (n,), its ``unit`` ('' if it has none) and what it is."""
+
+    name: str
+    values: npt.NDArray[Any]
+    unit: str
+    description: str
+
+
+def columns_of(
+    values: npt.NDArray[Any], names: Sequence[str], units: Sequence[str], descriptions: Sequence[str]
+) -> list[Column]:
+    """One column for each of the (n, m) ``values``."""
+    return [Column(n, values[:, i], u, d) for i, (n, u, d) in enumerate(zip(names, units, descriptions, strict=True))]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of one length over ``index``. ``attributes``: of the whole."""
+
+    index: Column
+    columns: Sequence[Column]
+    attributes: Mapping[str, object] = field(default_factory=dict)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """The columns over the index; ``.attrs['units']`` has the unit of each by name.
+
+        Raises ConfigError if pandas is not installed.
+        """
+        pd = _library('pandas')
+        frame = pd.DataFrame(
+            {c.name: np.ascontiguousarray(c.values) for c in self.columns},
+            index=pd.Index(self.index.values, name=self.index.name),
+        )
+        frame.attrs.update(self.attributes)
+        frame.attrs['units'] = {c.name: c.unit for c in (self.index, *self.columns)}
+        return frame
+
+    def to_xarray(self) -> xarray.Dataset:
+        """One variable a column; each has ``units`` and ``long_name`` in its attributes.
+
+        Raises ConfigError if xarray is not installed.
+        """
+        xr = _library('xarray')
+        variables = {c.name: self._variable(c) for c in self.columns}
+        return xr.Dataset(variables, {self.index.name: self._variable(self.index)}, dict(self.attributes))
+
+    def _variable(self, column: Column) -> tuple[str, npt.NDArray[Any], dict[str, str]]:
+        values = np.ascontiguousarray(column.values)
+        return self.index.name, values, {'units': column.unit or '1', 'long_name': column.description}
+
+
+def _library(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ConfigError(
+            f"to_{name} needs {name}: `pip install 'psd_deflection[pandas]'` or `pip install {name}`"
+        ) from None
+
+
+def html_table(caption: str, rows: Iterable[tuple[str, object]]) -> str:
+    """Two columns with ``caption`` above; every word is escaped."""
+    cells = ''.join(
+        f'<tr><th style="text-align:left">{_cell(name)}</th><td style="text-align:left">{_cell(value)}</td></tr>'
+        for name, value in rows
+    )
+    return f'<table><caption style="text-align:left">{_cell(caption)}</caption>{cells}</table>'
+
+
+def _cell(value: object) -> str:
+    return html.escape(printable(str(value), LONGEST_CELL))
