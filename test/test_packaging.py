@@ -72,6 +72,7 @@ def test_the_version_is_the_same_everywhere() -> None:
 
 FROM_PYPI = {
     'cobs': 'python-cobs-pip',
+    'ruamel': 'python3-ruamel.yaml',
     # It brings the others.
     **dict.fromkeys(('mcap', 'mcap_ros2', 'zstandard', 'lz4'), 'mcap-ros2-support'),
 }
@@ -80,7 +81,7 @@ FROM_PYPI = {
 ROS_PACKAGES = {'rclpy', 'rcl_interfaces', 'launch', 'launch_ros'}
 
 UNNAMED = {
-    'rerun': 'an extra',
+    **dict.fromkeys(('rerun', 'pandas', 'xarray'), 'an extra'),
     'shtab': 'completion in the shell, which says that it is missing; not in rosdep',
     'cyclonedds': 'another DDS as judge; not in rosdep',
     'rosbags': 'another reader as judge; from PyPI, so not forced on whoever builds the workspace',

@@ -67,7 +67,7 @@ def test_a_channel_is_saturated_from_the_converters_last_step_on(channel: int, s
     name = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')[channel]
     full = judge(one=changed(channel, sign * 32767 * STEP))
     assert (full.status, full.faulty) == (BlockStatus.SATURATED, 1 + channel // 3)
-    assert full.reason == f'{name} saturated: 10.000 V'
+    assert full.reason == f'{name} saturated: 10.000 V, converter.full_scale is 10 V'
     assert judge(one=changed(channel, sign * 32765 * STEP)).status is BlockStatus.OK
 
 
