@@ -149,6 +149,7 @@ def test_a_spread_is_numpy_s() -> None:
     assert spread.mean == pytest.approx(float(np.mean(values)))
 
 
+@pytest.mark.statistics
 def test_simulated_minutes_lose_nothing_and_keep_time(capsys: pytest.CaptureFixture[str]) -> None:
     assert soak.simulated_time(200 / 3600)
     assert 'wrapped past 2^32' in capsys.readouterr().out

@@ -57,6 +57,7 @@ def test_cases_are_many_and_each_its_own() -> None:
     assert len({c.wanted[0][0] for c in cases if c.kind == 'single'}) >= 25
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('key', ['single-sensor_rotation-3-s', 'single-plane_tilt-3-s', 'single-quantisation-3-s'])
 def test_a_hidden_effect_is_named(key: str) -> None:
     case = next(c for c in short_cases() if c.key == key)

@@ -21,6 +21,7 @@ def test_the_truth_is_inside(label: str) -> None:
     assert s.alarms == 0.0
 
 
+@pytest.mark.statistics
 def test_weights_from_the_stated_noise_reach_the_bound() -> None:
     ratios = over_the_bound(UNEQUAL, ('wls', 'exact', 'ols'), rest_s=240)
     assert (ratios['wls'] < 1.02).all()

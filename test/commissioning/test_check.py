@@ -108,6 +108,7 @@ def lines_of(turn: Turn) -> dict[str, object]:
     return out
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('size', [10.0, 10.0 * BLOCK], ids=['of a sample', 'of a block'])
 def test_each_of_the_127_wrong_wirings_is_named_from_three_pushes_at_ten_times_the_noise(size: float) -> None:
     turns = every_turn()

@@ -106,6 +106,7 @@ def test_the_same_seed_gives_the_same_answer(rotated: Discovery) -> None:
     assert result(again)['where'] == result(rotated)['where']
 
 
+@pytest.mark.statistics
 def test_what_one_length_cannot_tell_two_can() -> None:
     one = discover([observe(with_effect('clamp_bending_compliance', compliance=2e-7))], RIG, bank=BANK)
     (effect,) = one.effects
@@ -124,6 +125,7 @@ def test_what_one_length_cannot_tell_two_can() -> None:
     assert effect.equivalent == ()
 
 
+@pytest.mark.statistics
 def test_what_is_not_in_the_library_is_unknown_and_not_merged() -> None:
     seen = observe(RIG, seed=3)
     volts = seen.volts.copy()
@@ -140,6 +142,7 @@ def two_effects(first: dict[str, object], second: dict[str, object]) -> Rig:
     return replace_values(RIG, {f'effects.{k}.{n}': v for k, e in both.items() for n, v in e.items()})
 
 
+@pytest.mark.statistics
 def test_sizes_that_agree_beyond_chance_are_put_down_to_one_cause() -> None:
     lag = observe(with_effect('amplifier_lag', time_constant=3e-5))
     found = discover([lag], RIG, without=['amplifier_lag'])
@@ -153,6 +156,7 @@ def test_sizes_that_agree_beyond_chance_are_put_down_to_one_cause() -> None:
     assert [e.active.effect.name for e in discover([lag], RIG, bank=BANK).effects] == ['amplifier_lag']
 
 
+@pytest.mark.statistics
 def test_independent_sizes_are_left_alone() -> None:
     skews = [{'name': 'channel_skew', 'psd': psd, 'delay': delay} for psd, delay in ((1, 2e-5), (2, 3.1e-5))]
     found = discover([observe(two_effects(*skews))], RIG, bank=BANK)
@@ -318,6 +322,7 @@ def test_a_zero_taken_while_it_ran_is_part_of_the_rig(tmp_path: Path, monkeypatc
     assert rig_at_end(recording).zeros.tolist() == [[0.0, 0.0], [1e-4, -2e-4]]
 
 
+@pytest.mark.statistics
 def test_a_bag_and_a_csv_of_one_run_give_one_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ['--loads', 'thesis:1', '--effect', 'creep,amplitude=0.02,time_constant=1', '--temperature', '20,22']
     answers = []
