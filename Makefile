@@ -124,8 +124,10 @@ docs: $(VENV)/.installed
 	$(BIN)/python -m mkdocs build --strict --quiet --site-dir build/site
 	@echo 'open build/site/index.html (its search needs a server: python -m http.server --directory build/site)'
 
+# AXE=--in-turn: each page in one of the four views only.
+AXE ?=
 axe: docs
-	$(BIN)/python -m tools.accessible build/site
+	$(BIN)/python -m tools.accessible build/site $(AXE)
 
 notebooks: $(VENV)/.installed
 	$(BIN)/python -m pytest --nbmake --overwrite docs/*.ipynb

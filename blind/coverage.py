@@ -286,7 +286,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Print the table of docs/accuracy.md."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--jobs', type=int, default=2, help='processes at once')
-    parser.add_argument('--rows', type=int, default=len(ROWS), help='only the first kinds of noise')
+    parser.add_argument('--rows', type=int, default=len(ROWS), help='only the first kinds of noise, and only the table')
+    parser.add_argument('--losses', type=int, default=len(LOSSES), help='only the first kinds of loss')
     parser.add_argument('--faults', action='store_true', help='instead: each reading wrong in turn')
     args = parser.parse_args(argv)
     if args.faults:
@@ -295,17 +296,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     print('|---' * (HEAD.count('|') - 1) + '|')
     cost: Array | None = None
     motion(100, 16)
+    pairs = [(row, loss) for row in ROWS[: args.rows] for loss in list(LOSSES)[: args.losses]]
+    whole = args.rows >= len(ROWS)
     with ProcessPoolExecutor(args.jobs) as pool:
-        rough = pool.submit(coarse)
-        for row, loss, s in pool.map(_job, [(row, loss) for row in ROWS[: args.rows] for loss in LOSSES]):
+        rough = pool.submit(coarse) if whole else None
+        for row, loss, s in pool.map(_job, pairs):
             name = row.label if loss == 'none' else ''
             tail = f'{s.ringing.three:.4f} | {s.alarms:.5f}'
             print(f'| {name} | {loss} | {_cells(s.rest)} | {_cells(s.ringing)} | {tail} |', flush=True)
             if cost is None:
                 cost = np.array(s.rest.rms) / bound(row)
-        r = rough.result()
-    print(f'| 10 bit, no dither | none | {_cells(r)} | | | | | {r.three:.4f} | |')
-    if cost is not None:
+        r = None if rough is None else rough.result()
+    if r is not None:
+        print(f'| 10 bit, no dither | none | {_cells(r)} | | | | | {r.three:.4f} | |')
+    if cost is not None and whole:
         print('\nrms error at rest over the Cramér–Rao bound, dX, dY, theta:')
         print(f'- white, no loss: {_three(cost)}')
         for fit in ('mean', 'poly'):

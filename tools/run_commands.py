@@ -82,7 +82,7 @@ SHORTEST = {
 
 SHORTER = {
     r'^python -m blind\.run\b': '--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation',
-    r'^python -m blind\.coverage$': '--rows 1',
+    r'^python -m blind\.coverage$': '--rows 1 --losses 1',
     r'^ros2 topic echo\b': '--once',
 }
 """Additional arguments with which a command takes only seconds."""
