@@ -77,12 +77,14 @@ SHORTEST = {
     'soak': 'SOAK_MINUTES=0.05 SOAK_HOURS=0.05',
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
     'shots': 'SHOT_SECONDS=2',
+    'mutants': 'MUTANTS="--rooms averaging --count 1"',
 }
 """Variables with which a ``make`` target takes only seconds."""
 
 SHORTER = {
     r'^python -m blind\.run\b': '--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation',
     r'^python -m blind\.coverage$': '--rows 1 --losses 1',
+    r'^python -m bench\.campaign\.hellos$': '1000',
     r'^ros2 topic echo\b': '--once',
 }
 """Additional arguments with which a command takes only seconds."""
@@ -349,6 +351,9 @@ def copy_checkout(target: Path) -> None:
         if name and (ROOT / name).is_file():
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, target / name)
+    # `make mutants` asks git for the files.
+    for words in (('init', '-q'), ('add', '-A')):
+        subprocess.run(['git', *words], cwd=target, check=True)
     whole = (ROOT / 'bags/clean/clean_0.mcap').read_bytes()
     (target / CUT).mkdir(parents=True)
     (target / CUT / 'cut_0.mcap').write_bytes(whole[: len(whole) * 6 // 10])
