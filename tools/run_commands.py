@@ -77,7 +77,6 @@ SHORTEST = {
     'soak': 'SOAK_MINUTES=0.05 SOAK_HOURS=0.05',
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
     'shots': 'SHOT_SECONDS=2',
-    'mutants': 'MUTANTS="--rooms averaging --count 1"',
 }
 """Variables with which a ``make`` target takes only seconds."""
 
@@ -108,7 +107,10 @@ TOOLS = {
 ADMINISTRATION = re.compile(r'/opt/psd_deflection|^(apt|install|journalctl|ssh|sudo|systemctl|udevadm|useradd) ')
 """Lines for root or for another machine: never typed here. test/docs/test_deploy.py checks the files they install."""
 
-NEVER_HERE = ('a machine to administer', 'ros2')
+HOURS = re.compile(r'^make mutants\b')
+"""Campaigns whose shortest form says nothing: never run here."""
+
+NEVER_HERE = ('a machine to administer', 'ros2', 'two hours')
 """Needs that NEED_TOOLS=1 (any other missing program is a failure) does not ask for."""
 
 QUICK = re.compile(
@@ -206,6 +208,8 @@ def what_is_missing(line: str) -> str:
     """Why ``line`` cannot be run here (a missing program, or a command for root); '' if it can."""
     if ADMINISTRATION.search(line):
         return NEVER_HERE[0]
+    if HOURS.search(line):
+        return NEVER_HERE[2]
     return ', '.join(t for p, tools in TOOLS.items() if re.search(p, line) for t in tools if not shutil.which(t))
 
 
@@ -213,7 +217,7 @@ def stale() -> list[str]:
     """Entries of the tables that no command of the documents needs any more."""
     lines = [c.line for c in commands()]
     patterns = [p for p, *_ in CI_RUNS] + [f'^make {name}\\b' for name in SHORTEST]
-    patterns += [*TOOLS, *SHORTER, ADMINISTRATION.pattern]
+    patterns += [*TOOLS, *SHORTER, ADMINISTRATION.pattern, HOURS.pattern]
     return [p for p in patterns if not any(re.search(p, line) for line in lines)]
 
 
@@ -351,9 +355,6 @@ def copy_checkout(target: Path) -> None:
         if name and (ROOT / name).is_file():
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, target / name)
-    # `make mutants` asks git for the files.
-    for words in (('init', '-q'), ('add', '-A')):
-        subprocess.run(['git', *words], cwd=target, check=True)
     whole = (ROOT / 'bags/clean/clean_0.mcap').read_bytes()
     (target / CUT).mkdir(parents=True)
     (target / CUT / 'cut_0.mcap').write_bytes(whole[: len(whole) * 6 // 10])
