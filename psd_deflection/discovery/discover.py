@@ -21,10 +21,11 @@ from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.localise import Localisation, localise
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.screen import Screen
-from psd_deflection.discovery.search import BIC_ACCEPT, BUDGET, P_ACCEPT, Search, SearchResult
+from psd_deflection.discovery.search import BIC_ACCEPT, BUDGET, P_ACCEPT, Search, SearchResult, unphysical
 from psd_deflection.discovery.signatures import SignatureBank, candidates
 from psd_deflection.discovery.validate import HeldOut, heldout_gain, heldout_gap
 from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.records import FloatArray
 from psd_deflection.simulation.catalogue import catalogue, effects_of_rig
 from psd_deflection.simulation.declaration import ActiveEffect, Effect
 from psd_deflection.simulation.physics import Physics
@@ -37,15 +38,27 @@ EQUIVALENT_BIC = 6.0
 fits as well.
 """
 UNKNOWN_P = 1e-4
-UNKNOWN_SHARE = 0.02
-"""Fraction of the explained part; a smaller remainder is attributed to the simulation's own error."""
 UNKNOWN_EXCESS = 60.0
+UNSAID = 1.5
+"""A gap of more floors than this never remains without being reported as unknown."""
+RIVAL_BIC = 10.0
+"""An effect in place of the named one counts as its rival up to this loss in BIC."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rival:
+    """An effect in place of a named one, with its fitted values; ``delta_bic``: how much worse, below 0 better."""
+
+    active: ActiveEffect
+    sd: Mapping[str, float]
+    delta_bic: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NamedEffect:
     """One effect of the answer. ``sd``: per fitted parameter. ``alternatives``: (name, loss in
-    chi-square, difference of BIC), the closest first; ``equivalent``: those that this data cannot exclude.
+    chi-square, difference of BIC), the closest first; ``equivalent``: those that this data cannot exclude;
+    ``rivals``: those and what else comes close in BIC.
     """
 
     active: ActiveEffect
@@ -54,6 +67,7 @@ class NamedEffect:
     delta_bic: float
     heldout: HeldOut
     equivalent: tuple[str, ...]
+    rivals: tuple[Rival, ...]
     alternatives: tuple[tuple[str, float, float], ...]
     suggestion: Suggestion | None
 
@@ -62,12 +76,14 @@ class NamedEffect:
 class Unknown:
     """A discrepancy that no effect explains, or only several tied effects: ``signature`` in words,
     ``explains``: its fraction of the gap's energy. ``remains``: whether it is still present with all effects added.
+    ``rms``: its size, m, as the gap counts it, without noise.
     """
 
     signature: str
     depends_on: tuple[str, ...]
     explains: float
     remains: bool = True
+    rms: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -91,6 +107,11 @@ class Discovery:
     fit: Fit
     workspace: Workspace
     seed: int
+
+    @property
+    def floors(self) -> float:
+        """The gap that remains, in units of the gap that noise alone leaves."""
+        return self.gap_after / self.gap_floor if self.gap_floor > 0.0 else 0.0
 
     @property
     def active_effects(self) -> list[ActiveEffect]:
@@ -169,7 +190,8 @@ def _credible(
     """Remove effects that explain less than the unknown remainder: they probably stand in for it."""
     ws = search.workspace
     while True:
-        left = localise(ws, fit.residual, fit.jacobian if fit.free else None, rng)
+        explained = result.null.residual - fit.residual if fit.free else None
+        left = localise(ws, fit.residual, fit.jacobian if fit.free else None, rng, explained=explained)
         if not fit.effects or not _unknown(left, max(result.null.chi2 - fit.chi2, 0.0) + seen):
             break
         weakest = int(np.argmin(result.delta_chi2))
@@ -205,15 +227,14 @@ def _accept(search: Search, result: SearchResult, rng: np.random.Generator) -> t
             gain = heldout_gain(ws, without, fit, rng)
             heldout.append(gain)
             columns = fit.columns_of(i)
-            amplitudes = [
-                fit.free[j] in fit.at_bound
-                for j in columns
-                if fit.effects[i].effect.parameter(fit.free[j][1]).kind == 'amplitude'
-            ]
-            unphysical = bool(amplitudes) and all(amplitudes)
             chi2 = without.chi2 - fit.chi2
             bic = chi2 - search.penalty * len(columns)
-            if not gain.holds or unphysical or search.library_p(chi2, len(columns)) > P_ACCEPT or bic <= BIC_ACCEPT:
+            if (
+                not gain.holds
+                or unphysical(ws, fit, i)
+                or search.library_p(chi2, len(columns)) > P_ACCEPT
+                or bic <= BIC_ACCEPT
+            ):
                 fails.append((bic, i))
         if not fails:
             break
@@ -256,10 +277,14 @@ def _answer(
     floor = ws.floor()
     # Coarse steps cause noise that varies with the signal; compare what they explain with it.
     explained = max(null.chi2 - fit.chi2, 0.0) + (0.0 if lattice is None else 2.0 * _lattice_gain(ws, lattice))
-    unknown = _unknown(left, explained) or _tied(coincidences(fit, ws.physics), fit, result, before)
+    gap_before, gap_after = ws.gap(null.difference), ws.gap(fit.difference)
+    unknown = (
+        _unknown(left, explained, gap_after, floor)
+        or _unsaid(gap_before, gap_after, floor)
+        or _tied(coincidences(fit, ws.physics), fit, result, before)
+    )
     verdict = 'unknown_effect' if unknown else 'effects_found' if named else 'nothing_missing'
     channels = ws.gap_per_channel(null.difference), ws.gap_per_channel(fit.difference)
-    gap_before, gap_after = ws.gap(null.difference), ws.gap(fit.difference)
     return Discovery(
         verdict,
         tuple(named),
@@ -289,28 +314,35 @@ def _named(search: Search, result: SearchResult, fit: Fit, heldout: Sequence[Hel
     named: list[NamedEffect] = []
     for i, active in enumerate(fit.effects):
         fits = result.alternatives[i] if as_found else search.alternatives(result.null, fit, i, result.delta_chi2[i])
-        rows, equal = [], []
+        rows, equal, rivals = [], [], []
         for f in fits:
             loss = f.chi2 - fit.chi2
             bic = loss + search.penalty * (f.parameters - fit.parameters)
             rows.append((f.effects[-1].effect.name, loss, bic))
             if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < EQUIVALENT_BIC):
                 equal.append(f)
+            if (bic < RIVAL_BIC or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
+                rivals.append(Rival(f.effects[-1], _sd(f, f.covariance(), len(f.effects) - 1), bic))
         names = tuple(dict.fromkeys(f.effects[-1].effect.name for f in equal))
-        sd = {fit.free[j][1]: float(np.sqrt(max(covariance[j, j], 0.0))) for j in fit.columns_of(i)}
         named.append(
             NamedEffect(
                 active,
-                sd,
+                _sd(fit, covariance, i),
                 result.p[i],
                 result.delta_bic[i],
                 heldout[i],
                 names,
+                tuple(sorted(rivals, key=lambda r: r.delta_bic)),
                 tuple(rows),
                 suggest(ws, fit, equal[: 3 if ws.simulations < BUDGET else 1]) if equal else None,
             )
         )
     return named
+
+
+def _sd(fit: Fit, covariance: FloatArray, index: int) -> dict[str, float]:
+    """Standard deviation of each fitted parameter of effect ``index``."""
+    return {fit.free[j][1]: float(np.sqrt(max(covariance[j, j], 0.0))) for j in fit.columns_of(index)}
 
 
 def _waterfall(ws: Workspace, fit: Fit, gap_before: float, gap_after: float) -> tuple[tuple[str, float], ...]:
@@ -335,11 +367,26 @@ def _named_lattice(workspace: Workspace, lattice: ActiveEffect) -> NamedEffect:
     gain = _lattice_gain(workspace, lattice)
     sd = min(s[1] for o in workspace.observations if (s := propose.coarse_step(o)) is not None)
     heldout = HeldOut(gain, float(np.sqrt(2.0 * gain)))
-    return NamedEffect(lattice, {lattice.effect.lattice: sd}, 0.0, 2.0 * gain, heldout, (), (), None)
+    return NamedEffect(lattice, {lattice.effect.lattice: sd}, 0.0, 2.0 * gain, heldout, (), (), (), None)
 
 
-def _unknown(left: Localisation, explained: float) -> tuple[Unknown, ...]:
-    if left.p > UNKNOWN_P or left.excess < max(UNKNOWN_EXCESS, UNKNOWN_SHARE * explained):
+def _beyond(gap: float, floor: float) -> float:
+    """The part of a gap, m, that noise does not explain."""
+    return float(np.sqrt(max(gap**2 - floor**2, 0.0)))
+
+
+def _unsaid(before: float, after: float, floor: float) -> tuple[Unknown, ...]:
+    """What remains although no place of it stands out: several small differences, or the simulation's own error."""
+    if after <= UNSAID * floor:
+        return ()
+    size = _beyond(after, floor)
+    words = f'{1e6 * size:.3g} µm remain, {after / floor:.1f} times the noise, in no single place or band'
+    return (Unknown(words, (), float(min((after / before) ** 2, 1.0)), rms=size),)
+
+
+def _unknown(left: Localisation, explained: float, gap: float = 0.0, floor: float = 0.0) -> tuple[Unknown, ...]:
+    """``gap``, ``floor``: what remains and what noise leaves, m."""
+    if left.p > UNKNOWN_P or left.excess < UNKNOWN_EXCESS:
         return ()
     strong = [d for d in left.dependences if d.p < 1e-3][:6]
     channels = list(dict.fromkeys([*(c.channel for c in left.cells if c.p < 0.01), *(d.channel for d in strong)]))
@@ -347,7 +394,10 @@ def _unknown(left: Localisation, explained: float) -> tuple[Unknown, ...]:
     even = sum(d.gain for d in strong if _even(d.regressor))
     odd = sum(d.gain for d in strong if not _even(d.regressor))
     lagging = any('history' in d.regressor for d in strong[:2])
+    size = _beyond(gap, floor)
     words = [f'on {", ".join(channels) or "no single channel"}']
+    if size > 0.0:
+        words.append(f'{1e6 * size:.3g} µm rms ({gap / floor:.1f} times the noise remain)')
     if strong:
         words.append(f'follows {", ".join(names[:3])}')
         words.append('mostly even' if even > 2.0 * odd else 'mostly odd' if odd > 2.0 * even else 'odd and even parts')
@@ -357,7 +407,7 @@ def _unknown(left: Localisation, explained: float) -> tuple[Unknown, ...]:
         c = left.cells[0]
         words.append(f'strongest at {c.when[0]:.1f} to {c.when[1]:.1f} s, {c.band[0]:g} to {c.band[1]:g} Hz')
     share = left.excess / max(left.excess + explained, 1e-300)
-    return (Unknown('; '.join(words), names, float(min(max(share, 0.0), 1.0))),)
+    return (Unknown('; '.join(words), names, float(min(max(share, 0.0), 1.0)), rms=size),)
 
 
 def _tied(ties: Sequence[Coincidence], fit: Fit, result: SearchResult, before: Localisation) -> tuple[Unknown, ...]:

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2 as chi2_law
 
+from psd_deflection.discovery.trust import BANDS, RELATIVE
 from psd_deflection.discovery.workspace import Workspace, fine_means
 from psd_deflection.records import CHANNELS, FloatArray, IntArray
 from psd_deflection.simulation.simulator import ForwardModel
 
-BANDS = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, 125.0)
 CLIP = 6.0
 """Whitened values are limited to this, so outliers of heavy-tailed noise do not count as structure."""
 DRAWS = 39
@@ -89,22 +89,34 @@ def _layouts(workspace: Workspace) -> list[_Layout]:
     return out
 
 
-def _energies(parts: list[FloatArray], layouts: list[_Layout]) -> tuple[FloatArray, FloatArray]:
-    """z and excess energy (layout, channel, band)."""
+def _power(x: FloatArray) -> FloatArray:
+    """Energy (k, frequencies) of rows (k, n), with the sum of their squares."""
+    n = x.shape[1]
+    power = np.abs(np.fft.rfft(x, axis=1)) ** 2 * (2.0 / n)
+    power[:, 0] *= 0.5
+    if n % 2 == 0:
+        power[:, -1] *= 0.5
+    return np.asarray(power)
+
+
+def _energies(
+    parts: list[FloatArray], layouts: list[_Layout], explained: list[FloatArray] | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """z and excess energy (layout, channel, band), beyond what the simulation of ``explained`` may be wrong by."""
     z = np.full((len(layouts), 6, len(BANDS) - 1), -9.0)
     excess = np.zeros_like(z)
     for i, layout in enumerate(layouts):
-        x = parts[layout.recording][:, layout.start : layout.stop]
-        n = x.shape[1]
-        power = np.abs(np.fft.rfft(x, axis=1)) ** 2 * (2.0 / n)
-        power[:, 0] *= 0.5
-        if n % 2 == 0:
-            power[:, -1] *= 0.5
+        span = slice(layout.start, layout.stop)
+        power = _power(parts[layout.recording][:, span])
+        wrong = None if explained is None else RELATIVE**2 * _power(explained[layout.recording][:, span])
+        n = layout.stop - layout.start
         for band, index in enumerate(layout.bins):
             if len(index) == 0:
                 continue
             dof = 2.0 * len(index) - float(0 in index) - float(n % 2 == 0 and n // 2 in index)
             energy = power[:, index].sum(axis=1)
+            if wrong is not None:
+                energy = energy / (1.0 + wrong[:, index].sum(axis=1) / dof)
             # Wilson-Hilferty: chi-square to a normal deviate, good into the tail.
             z[i, :, band] = (np.cbrt(energy / dof) - (1.0 - 2.0 / (9.0 * dof))) / np.sqrt(2.0 / (9.0 * dof))
             excess[i, :, band] = energy - dof
@@ -157,8 +169,13 @@ def regressors(workspace: Workspace) -> list[dict[str, list[FloatArray]]]:
     return out
 
 
-def dependences(workspace: Workspace, residual: FloatArray, known: FloatArray | None) -> list[Dependence]:
-    """Every channel against every regressor, after projecting out ``known`` (D, p)."""
+def dependences(
+    workspace: Workspace, residual: FloatArray, known: FloatArray | None, explained: FloatArray | None = None
+) -> list[Dependence]:
+    """Every channel against every regressor, after projecting out ``known`` (D, p).
+
+    What the simulation of ``explained`` (D,) may be wrong by does not count.
+    """
     table = regressors(workspace)
     q = None
     if known is not None and known.shape[1]:
@@ -182,12 +199,17 @@ def dependences(workspace: Workspace, residual: FloatArray, known: FloatArray | 
         e = np.concatenate([part[c] for part in workspace.split(residual)])
         lengths = np.einsum('ij,ij->j', matrix, matrix)
         g = matrix.T @ e
+        wrong = 0.0
+        if explained is not None:
+            own = np.concatenate([part[c] for part in workspace.split(explained)])
+            wrong = RELATIVE * np.sqrt(lengths) * np.linalg.norm(own)
         f = lengths.copy()
         if q is not None:
-            own = np.stack([np.concatenate([part[c] for part in workspace.split(col)]) for col in q.T])
-            across = matrix.T @ own.T
+            fitted = np.stack([np.concatenate([part[c] for part in workspace.split(col)]) for col in q.T])
+            across = matrix.T @ fitted.T
             f = f - np.einsum('ij,ij->i', across, across)
             g = g - across @ (q.T @ residual)
+        g = np.maximum(np.abs(g) - wrong, 0.0)
         for k, name in enumerate(names):
             if lengths[k] > 0.0 and f[k] > 1e-6 * lengths[k]:
                 found.append((channel, name, float(g[k] ** 2 / f[k])))
@@ -201,12 +223,21 @@ def dependences(workspace: Workspace, residual: FloatArray, known: FloatArray | 
 
 
 def localise(
-    workspace: Workspace, residual: FloatArray, known: FloatArray | None, rng: np.random.Generator, limit: int = 12
+    workspace: Workspace,
+    residual: FloatArray,
+    known: FloatArray | None,
+    rng: np.random.Generator,
+    limit: int = 12,
+    explained: FloatArray | None = None,
 ) -> Localisation:
-    """Where ``residual`` (D,), whitened, has structure; ``known`` (D, p): columns already fitted."""
+    """Where ``residual`` (D,), whitened, has structure; ``known`` (D, p): columns already fitted.
+
+    ``explained`` (D,): what the effects of the model explain; a small share of it may be the simulation's own error.
+    """
     layouts = _layouts(workspace)
-    z, _ = _energies(workspace.split(np.clip(residual, -CLIP, CLIP)), layouts)
-    raw_z, raw_excess = _energies(workspace.split(residual), layouts)
+    apart = None if explained is None else workspace.split(explained)
+    z, _ = _energies(workspace.split(np.clip(residual, -CLIP, CLIP)), layouts, apart)
+    raw_z, raw_excess = _energies(workspace.split(residual), layouts, apart)
     maxima = np.empty(DRAWS)
     q = None
     if known is not None and known.shape[1]:
@@ -224,7 +255,7 @@ def localise(
     def p_of(value: float) -> float:
         return float(-np.expm1(-np.exp(-max((value - mu) / beta, -5.0))))
 
-    depends = dependences(workspace, residual, known)
+    depends = dependences(workspace, residual, known, explained)
     main: dict[str, list[str]] = {}
     for d in depends:
         if d.p < 0.01 and len(main.setdefault(d.channel, [])) < 2:

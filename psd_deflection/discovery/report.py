@@ -15,9 +15,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from psd_deflection.discovery.discover import Discovery, NamedEffect
-from psd_deflection.discovery.localise import BANDS
 from psd_deflection.discovery.result import parameters_of, provenance, sentence
 from psd_deflection.discovery.screen import Score
+from psd_deflection.discovery.trust import BANDS
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 
 BEFORE, AFTER, HELD, FLOOR = '#c44e52', '#4c72b0', '#55a868', '#8c8c8c'

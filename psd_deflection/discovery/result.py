@@ -10,7 +10,7 @@ import yaml
 
 from psd_deflection import __version__
 from psd_deflection.config import DESCRIPTION, Rig
-from psd_deflection.discovery.discover import Discovery, NamedEffect
+from psd_deflection.discovery.discover import Discovery, NamedEffect, Rival
 from psd_deflection.simulation.catalogue import effects_to_values
 from psd_deflection.simulation.declaration import ActiveEffect
 
@@ -22,7 +22,7 @@ def _number(value: float) -> float:
     return float(min(max(value, -1e300), 1e300))
 
 
-def parameters_of(effect: NamedEffect) -> dict[str, Any]:
+def parameters_of(effect: NamedEffect | Rival) -> dict[str, Any]:
     """Choices as numbers, the rest with standard deviation and unit."""
     out: dict[str, Any] = {}
     for p in effect.active.effect.parameters:
@@ -63,17 +63,33 @@ def result(discovery: Discovery) -> dict[str, Any]:
                 'heldout_gain_error': _number(e.heldout.error),
             },
             'suggested_experiment': None if e.suggestion is None else e.suggestion.text,
+            'rivals': [
+                {
+                    'name': r.active.effect.name,
+                    'parameters': parameters_of(r),
+                    'delta_bic': _number(r.delta_bic),
+                }
+                for r in e.rivals
+            ],
         }
         for e in discovery.effects
     ]
     unknown = [
-        {'signature': u.signature, 'depends_on': list(u.depends_on), 'explains': u.explains} for u in discovery.unknown
+        {
+            'signature': u.signature,
+            'depends_on': list(u.depends_on),
+            'explains': u.explains,
+            'rms': u.rms,
+            'law': None,
+        }
+        for u in discovery.unknown
     ]
     return {
         'verdict': discovery.verdict,
         'where': where,
         'effects': effects,
         'unknown': unknown,
+        'remaining': {'rms': discovery.gap_after, 'floors': discovery.floors},
         'gap': {
             'unit': 'm',
             'before': discovery.gap_before,
@@ -130,30 +146,48 @@ def model_yaml(rig: Rig, effects: Sequence[ActiveEffect]) -> str:
     return yaml.safe_dump({'/**': {'ros__parameters': tree}}, sort_keys=False, allow_unicode=True)
 
 
+def size_of(effect: NamedEffect | Rival) -> str:
+    """The fitted amplitudes with their standard deviations, for a person: ``angle 0.00399 ± 2e-05 rad``."""
+    out = []
+    for p in effect.active.effect.parameters:
+        value, sd = effect.active.values[p.name], effect.sd.get(p.name, 0.0)
+        if p.kind == 'amplitude' and p.name in effect.sd and abs(value) > 2.0 * sd:
+            digits = 1 if sd <= 0.0 else max(1, 2 + math.floor(math.log10(max(abs(value) / sd, 1.0))))
+            out.append(f'{p.name} {value:.{min(digits, 6)}g} ± {sd:.1g} {p.unit}'.rstrip())
+    return ', '.join(out)
+
+
+def _left(discovery: Discovery) -> str:
+    """What remains, in micrometres and floors."""
+    after, floor = 1e6 * discovery.gap_after, 1e6 * discovery.gap_floor
+    return f'{after:.3f} µm, {discovery.floors:.2f} times what noise alone leaves ({floor:.3f} µm)'
+
+
 def sentence(discovery: Discovery) -> str:
     """The verdict in one sentence."""
-    floor, after, before = (1e6 * v for v in (discovery.gap_floor, discovery.gap_after, discovery.gap_before))
+    before, left = 1e6 * discovery.gap_before, _left(discovery)
     if discovery.verdict == 'nothing_missing':
-        return f'Nothing is missing: the gap of {before:.3f} µm is that of noise alone ({floor:.3f} µm).'
+        return f'Nothing is missing: the gap is {left}.'
     parts = []
     for e in discovery.effects:
         text = e.active.label
         if e.equivalent:
             text += f' (or {", ".join(e.equivalent)}: this data cannot tell)'
         parts.append(text)
+    sizes = '; '.join(f'{e.active.effect.name} {size}' for e in discovery.effects if (size := size_of(e)))
+    fitted = f' Fitted: {sizes}.' if sizes else ''
     named = ' and '.join(parts)
     if discovery.verdict == 'effects_found':
-        is_are = 'is' if len(parts) == 1 else 'are'
+        is_are, them = ('is', 'it') if len(parts) == 1 else ('are', 'them')
         return (
-            f'{named} {is_are} missing from the model; adding {"it" if len(parts) == 1 else "them"} '
-            f'closes the gap from {before:.3f} to {after:.3f} µm (noise alone: {floor:.3f} µm).'
+            f'{named} {is_are} missing from the model; adding {them} closes the gap from {before:.3f} to {left}.'
+            f'{fitted}'
         )
     if not any(u.remains for u in discovery.unknown):
         return (
-            f'{named} close the gap from {before:.3f} to {after:.3f} µm (noise alone: {floor:.3f} µm), but their sizes '
+            f'{named} close the gap from {before:.3f} to {left}, but their sizes '
             f'are tied: one effect that is not in the catalogue is likelier.'
         )
-    lead = (
-        f'{named} explains part, but an unknown effect remains' if named else 'An effect that is not in the catalogue'
-    )
-    return f'{lead}: the gap is {after:.3f} µm (noise alone: {floor:.3f} µm).'
+    if named:
+        return f'{named} explains part, but an unknown effect remains: the gap goes from {before:.3f} µm to {left}.'
+    return f'An effect that is not in the catalogue: the gap is {left}.'

@@ -16,17 +16,15 @@ from scipy.stats import chi2 as chi2_law
 
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.screen import Score, Screen
+from psd_deflection.discovery.trust import gain_beyond
 from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.records import FloatArray
 from psd_deflection.simulation.declaration import ActiveEffect, Effect
 
 P_ACCEPT = 0.01
 """Largest library-wide p of an accepted effect."""
 BIC_ACCEPT = 10.0
 """Smallest improvement of BIC by an accepted effect."""
-SHARE_ACCEPT = 0.002
-"""Smallest fraction of the whole model's gain that an accepted effect must explain. Smaller
-discrepancies may come from the simulation itself, for example from its discretisation.
-"""
 MAX_EFFECTS = 4
 TRIALS = 7
 BUDGET = 500
@@ -60,6 +58,30 @@ def key_of(active: ActiveEffect) -> tuple[object, ...]:
 def slot(effect: Effect, values: Mapping[str, float]) -> tuple[object, ...]:
     """Key of which a model has at most one: an effect, for each PSD."""
     return (effect.name, *(values[p.name] for p in effect.parameters if p.each))
+
+
+def unphysical(workspace: Workspace, fit: Fit, index: int) -> bool:
+    """Whether effect ``index`` of ``fit`` has run into a bound: it fits only as something that it is not.
+
+    An amplitude may end at the bound at which it is off, as long as another one is on.
+    """
+    effect = fit.effects[index].effect
+    on = False
+    for j in fit.columns_of(index):
+        p = effect.parameter(fit.free[j][1])
+        if fit.free[j] not in fit.at_bound:
+            on = on or p.kind == 'amplitude'
+        elif p.kind == 'shape' or (
+            p.kind == 'amplitude' and fit.effects[index].values[p.name] != p.off(workspace.physics)
+        ):
+            return True
+    return not on
+
+
+def unbound(fit: Fit) -> FloatArray:
+    """The Jacobian's columns (D, k) of the parameters that are free to move."""
+    keep = [j for j, name in enumerate(fit.free) if name not in fit.at_bound]
+    return fit.jacobian[:, keep]
 
 
 def promising(scores: Sequence[Score], penalty: float, share: float, limit: int) -> list[Score]:
@@ -121,9 +143,10 @@ class Search:
         return min(full, key=self._bic, default=None)
 
     def _passes(self, smaller: Fit, larger: Fit, null: Fit) -> bool:
-        gain = smaller.chi2 - larger.chi2
-        explained = max(null.chi2 - larger.chi2, 0.0)
-        return self._bic(smaller) - self._bic(larger) > BIC_ACCEPT and gain >= SHARE_ACCEPT * explained
+        explained = null.residual - smaller.residual
+        gain = gain_beyond(self.workspace, smaller.residual, larger.residual, explained)
+        more = self.penalty * (larger.parameters - smaller.parameters)
+        return min(gain, smaller.chi2 - larger.chi2) - more > BIC_ACCEPT
 
     def library_p(self, gain: float, dof: int) -> float:
         """p of a gain in chi-square, over the whole library (Sidak)."""
@@ -156,7 +179,7 @@ class Search:
         renoised = False
         while len(current.effects) < MAX_EFFECTS and ws.simulations < BUDGET:
             if current.effects:
-                scores = self.screen.score(current.residual, current.jacobian)
+                scores = self.screen.score(current.residual, unbound(current))
             taken = {slot(a.effect, a.values) for a in current.effects}
             scores = [s for s in scores if slot(s.candidate.effect, s.candidate.start) not in taken]
             if not scores or min(s.p for s in scores) > P_ACCEPT:
@@ -245,7 +268,7 @@ class Search:
         named = current.effects[index]
         rest = [a for j, a in enumerate(current.effects) if j != index]
         without = self.without_each(current, null)[index]
-        known = without.jacobian if rest else None
+        known = unbound(without) if rest else None
         scores = self.screen.score(without.residual, known)
         # Screening is linear: a candidate that falls short by little needs a full refit.
         bar = min(SWAP_REACH * gain, gain - 60.0) if gain > 100.0 else 0.5 * gain

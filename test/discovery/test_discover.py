@@ -73,6 +73,37 @@ def test_the_hidden_effect_is_named_with_its_size(rotated: Discovery) -> None:
     assert rotated.simulations < 2000
 
 
+@pytest.mark.parametrize(
+    ('large', 'small'),
+    [
+        # 2 µm on one channel behind 100 µm of hum; ten floors behind sixty micrometres of a softer link.
+        (
+            {
+                'name': 'mains_interference',
+                'frequency': 50.03,
+                **{f'amplitude_{c}': 0.2 for c in ('x1', 'y1', 'x2', 'y2')},
+            },
+            {'name': 'axis_crosstalk', 'psd': 2, 'xy': 0.004, 'yx': 0.0},
+        ),
+        (
+            {'name': 'bending_stiffness', 'scale': -0.06},
+            {'name': 'sensor_rotation', 'psd': 2, 'angle': 0.004},
+        ),
+    ],
+)
+def test_a_small_effect_behind_a_large_one_is_named_too(large: dict[str, object], small: dict[str, object]) -> None:
+    rig = replace_values(
+        RIG, {f'effects.{key}.{k}': v for key, e in (('a', large), ('b', small)) for k, v in e.items()}
+    )
+    found = discover([observe(rig, seed=4)], RIG, bank=BANK)
+    assert found.verdict == 'effects_found'
+    assert {e.active.effect.name for e in found.effects} == {large['name'], small['name']}
+    assert found.floors < 1.05
+    tree = result(found)
+    assert tree['remaining'] == {'rms': found.gap_after, 'floors': found.floors}
+    assert f'{found.floors:.2f} times what noise alone leaves' in sentence(found)
+
+
 def test_where_is_the_turned_sensor(rotated: Discovery) -> None:
     assert {c.channel for c in rotated.where.cells[:5]} <= {'x2', 'y2'}
     assert rotated.where.cells[0].p < 1e-6
