@@ -192,7 +192,7 @@ def dependences(
                 fine.append(rows)
             columns.append(
                 np.concatenate(
-                    [w.whiten(f, v)[c] for f, w, v in zip(fine, workspace.noise, workspace.valid, strict=True)]
+                    [w.whiten(f, v)[c] for f, w, v in zip(fine, workspace.noise, workspace.count, strict=True)]
                 )
             )
         matrix = np.stack(columns, axis=1)

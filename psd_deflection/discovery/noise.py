@@ -38,17 +38,20 @@ class NoiseModel:
     rest_seconds: float
     coloured: tuple[bool, ...]
 
-    def whiten(self, fine: FloatArray, valid: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> FloatArray:
-        """White, unit-variance innovations (6, nf) of fine-block rows (6, nf); 0 where unknown."""
+    def whiten(self, fine: FloatArray, count: FloatArray) -> FloatArray:
+        """White, unit-variance innovations (6, nf) of fine-block rows (6, nf); 0 where unknown.
+
+        ``count`` (6, nf): the share of each block's samples that is there. Fewer samples make a noisier mean.
+        """
         out = fine.copy()
-        good = valid.copy()
+        good = count > 0.0
         for j in range(1, self.ar.shape[1] + 1):
             column = self.ar[:, j - 1 : j]
             if np.any(column):
                 out[:, j:] -= column * fine[:, :-j]
-                good[j:] &= valid[:-j]
-        out /= self.innovation[:, None]
-        out[:, ~good] = 0.0
+                good[:, j:] &= (count[:, :-j] > 0.0) | (column == 0.0)
+        out *= np.sqrt(count) / self.innovation[:, None]
+        out[~good] = 0.0
         return out
 
 

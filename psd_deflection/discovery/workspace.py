@@ -25,10 +25,17 @@ MAX_FINE = 60_000
 """Approximate total number of fine blocks; long recordings get longer blocks, which limits memory."""
 
 
-def fine_means(rows: FloatArray, size: int) -> FloatArray:
-    """Means (k, n // size) over ``size`` samples of rows (k, n)."""
+def fine_means(rows: FloatArray, size: int, present: FloatArray | None = None) -> FloatArray:
+    """Means (k, n // size) over ``size`` samples of rows (k, n).
+
+    ``present`` (k, n): 1 for the samples that count, else 0; all of them by default. A mean of none is 0.
+    """
     n = rows.shape[1] // size
-    return np.asarray(rows[:, : n * size].reshape(rows.shape[0], n, size).mean(axis=2))
+    cut = rows[:, : n * size].reshape(rows.shape[0], n, size)
+    if present is None:
+        return np.asarray(cut.mean(axis=2))
+    weights = present[:, : n * size].reshape(cut.shape)
+    return np.asarray((cut * weights).sum(axis=2) / np.maximum(weights.sum(axis=2), 1.0))
 
 
 class Workspace:
@@ -41,7 +48,8 @@ class Workspace:
         self.base = tuple(base)
         self.fine: list[int] = []
         self.measured: list[FloatArray] = []
-        self.valid: list[np.ndarray[tuple[int], np.dtype[np.bool_]]] = []
+        self.count: list[FloatArray] = []
+        self._present: list[FloatArray | None] = []
         self.case: list[IntArray] = []
         self.noise: list[NoiseModel] = []
         next_case = 0
@@ -51,12 +59,13 @@ class Workspace:
             wanted = max(1, round(max(FINE_SECONDS, longest) / o.period))
             # An estimate block is a whole number of fine blocks.
             size = max(d for d in range(1, min(wanted, block) + 1) if block % d == 0)
-            means = fine_means(o.volts.T, size)
-            good = np.all(np.isfinite(means), axis=0)
-            means[:, ~good] = 0.0
+            there = np.isfinite(o.volts.T)
+            present = None if there.all() else there.astype(np.float64)
+            means = fine_means(np.where(there, o.volts.T, 0.0), size, present)
             self.fine.append(size)
             self.measured.append(means)
-            self.valid.append(good)
+            self._present.append(present)
+            self.count.append(np.ones_like(means) if present is None else fine_means(present, size))
             case = load_cases(o.loads, o.period)[: means.shape[1] * size : size] + next_case
             next_case = int(case.max()) + 1
             self.case.append(case)
@@ -86,14 +95,14 @@ class Workspace:
         """Fine-block means (6, nf) V of each recording, simulated without noise."""
         self.simulations += 1
         out = []
-        for o, size in zip(self.observations, self.fine, strict=True):
+        for o, size, present in zip(self.observations, self.fine, self._present, strict=True):
             chunk = ForwardModel(o.rig, sort_effects(effects)).expect(o.loads, o.temperature)
-            out.append(fine_means(chunk.volts, size))
+            out.append(fine_means(chunk.volts, size, present))
         return out
 
     def whiten(self, fine: Sequence[FloatArray]) -> FloatArray:
         """One vector of all recordings, white and of unit variance if the noise model holds."""
-        parts = [w.whiten(f, v).ravel() for f, w, v in zip(fine, self.noise, self.valid, strict=True)]
+        parts = [w.whiten(f, c).ravel() for f, w, c in zip(fine, self.noise, self.count, strict=True)]
         return np.concatenate(parts)
 
     def split(self, vector: FloatArray) -> list[FloatArray]:
@@ -111,41 +120,49 @@ class Workspace:
     @property
     def size(self) -> int:
         """Elements of a vector that carry data."""
-        return sum(6 * int(v.sum()) for v in self.valid)
+        return sum(int(np.count_nonzero(c)) for c in self.count)
 
     def effective_size(self) -> float:
         """Sample size for BIC: blocks of the estimate and channels (N over correlation time)."""
         return sum(
-            6.0 * float(v.sum()) * s / o.rig.estimator.block_size
-            for v, s, o in zip(self.valid, self.fine, self.observations, strict=True)
+            float(c.sum()) * s / o.rig.estimator.block_size
+            for c, s, o in zip(self.count, self.fine, self.observations, strict=True)
         )
 
     def block_dots(self, fine: Sequence[FloatArray]) -> list[FloatArray]:
-        """Block means of the dots (4, blocks), m, of fine-block volts; NaN if a sample is lost."""
+        """Block means of the dots (4, blocks), m, of fine-block volts; NaN if less than half of the block is there."""
         out = []
-        for f, v, s, o in zip(fine, self.valid, self.fine, self.observations, strict=True):
-            rows = np.where(v, f[list(DOT_CHANNELS)], np.nan)
-            out.append(fine_means(rows, o.rig.estimator.block_size // s) * o.rig.sensitivities.reshape(4, 1))
+        for f, c, s, o in zip(fine, self.count, self.fine, self.observations, strict=True):
+            per_block = o.rig.estimator.block_size // s
+            share = fine_means(c[DOT_CHANNELS], per_block)
+            total = fine_means(f[DOT_CHANNELS] * c[DOT_CHANNELS], per_block)
+            means = np.where(share >= 0.5, total / np.maximum(share, 0.5), np.nan)
+            out.append(means * o.rig.sensitivities.reshape(4, 1))
         return out
 
     def gap(self, residual: Sequence[FloatArray]) -> float:
         """rms of the block-mean residual over x1 y1 x2 y2, m; ``residual`` in fine-block volts."""
         blocks = np.concatenate([b.ravel() for b in self.block_dots(residual)])
-        return float(np.sqrt(np.nanmean(blocks**2)))
+        blocks = blocks[np.isfinite(blocks)]
+        return float(np.sqrt(np.mean(blocks**2))) if len(blocks) else 0.0
 
     def gap_per_channel(self, residual: Sequence[FloatArray]) -> FloatArray:
         """The same for each of x1 y1 x2 y2, (4,) m."""
         blocks = np.concatenate(self.block_dots(residual), axis=1)
-        return np.asarray(np.sqrt(np.nanmean(blocks**2, axis=1)))
+        there = np.isfinite(blocks)
+        return np.asarray(np.sqrt(np.where(there, blocks**2, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)))
 
     def floor(self) -> float:
         """The gap from noise alone, m."""
-        total, count = 0.0, 0.0
-        for w, o, v in zip(self.noise, self.observations, self.valid, strict=True):
-            n = float(v.sum())
-            total += n * float(np.mean((w.block_sigma[list(DOT_CHANNELS)] * o.rig.sensitivities.ravel()) ** 2))
-            count += n
-        return float(np.sqrt(total / max(count, 1.0)))
+        total, count = 0.0, 0
+        for w, o, c, s in zip(self.noise, self.observations, self.count, self.fine, strict=True):
+            share = fine_means(c[DOT_CHANNELS], o.rig.estimator.block_size // s)
+            variance = (w.block_sigma[DOT_CHANNELS] * o.rig.sensitivities.ravel())[:, None] ** 2
+            counted = share >= 0.5
+            # A block with some samples missing is noisier.
+            total += float((variance / np.maximum(share, 0.5))[counted].sum())
+            count += int(counted.sum())
+        return float(np.sqrt(total / max(count, 1)))
 
     def residual(self, effects: Sequence[ActiveEffect]) -> tuple[FloatArray, list[FloatArray]]:
         """Whitened residual vector and fine-block residual in V, measured minus simulated."""

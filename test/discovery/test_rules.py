@@ -75,7 +75,7 @@ class Plant(Workspace):
         self.base = ()
         self.fine = [size]
         self.measured = [measured]
-        self.valid = [np.ones(FINE, dtype=bool)]
+        self.count = [np.ones((6, FINE))]
         self.case = [np.arange(FINE) * CASES // FINE]
         level = np.full(6, SIGMA)
         self.noise = [NoiseModel(2 * level, np.zeros((6, 2)), level, level / math.sqrt(5.0), 1.0, (False,) * 6)]
