@@ -31,11 +31,11 @@ from psd_deflection.calibration import Wiring
 from psd_deflection.cli._options import given_parameters, in_the_world, parameter_option, refuse, world_option
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import LONGEST_LINE, columns, print_json, show
-from psd_deflection.commissioning.checkup import CANNOT_TELL, RIGHT, Checkup, check, line
+from psd_deflection.commissioning.checkup import CANNOT_TELL, RIGHT, Checkup, check
 from psd_deflection.commissioning.guide import Guide
 from psd_deflection.commissioning.levels import levels
 from psd_deflection.commissioning.responses import responses
-from psd_deflection.commissioning.wirings import DOTS, WIRINGS, on_channels
+from psd_deflection.commissioning.wirings import DOTS, WIRINGS, line, on_channels
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import printable
 from psd_deflection.recordings.observations import read_observation

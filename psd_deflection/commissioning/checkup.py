@@ -15,10 +15,11 @@ from psd_deflection.commissioning.wirings import (
     LIMIT,
     MARGIN,
     Candidate,
-    Difference,
     Response,
     candidates,
     differences,
+    fix_of,
+    line,
     misfit,
     parameters,
 )
@@ -134,7 +135,7 @@ def _wiring_findings(
             d.name,
             d.where,
             -1.0 if d.name == 'channel_sign' else None,
-            _fix(d, best.wiring, right),
+            fix_of(d, best.wiring, right),
             gained,
             also,
         )
@@ -148,17 +149,6 @@ def _same_to_first_order(file: Wiring, seen: Sequence[Response], best: Candidate
     total, worst = misfit(file, seen, turned)
     same = worst <= LIMIT and total <= best.misfit + MARGIN
     return (f'load_sign of {" ".join(turned)}',) if same else ()
-
-
-def _fix(difference: Difference, wiring: Wiring, right: Mapping[str, object]) -> str:
-    """The line of the rig file that puts one difference right."""
-    if difference.name == 'psd_swap':
-        return line('psds_exchanged', right['psds_exchanged'])
-    if difference.name == 'axis_swap':
-        name = f'{difference.where}.axes'
-    else:
-        name = next(f'psd_{psd}.axes' for psd in (1, 2) if wiring.input_of(psd) == int(difference.where[-1]))
-    return line(name, right[name] if name in right else list(wiring.axes[int(name[4]) - 1]))
 
 
 def _load_findings(seen: Sequence[Response], found: Candidate) -> list[Finding]:
@@ -250,11 +240,3 @@ def _notes(
         worst = int(np.argmax(np.where(far, per_minute, 0.0)))
         out.append(f'drift: {drift[worst] * 60e6:+.1f} µm a minute on {DOTS[worst]}; let lasers and amplifier warm up')
     return out
-
-
-def line(name: str, value: object) -> str:
-    """``name: value`` as YAML that ROS reads as well, which takes a bare ``y`` for true."""
-    if isinstance(value, list):
-        text = ', '.join(("'y'" if item == 'y' else str(item)) for item in value)
-        return f'{name}: [{text}]'
-    return f'{name}: {str(value).lower() if isinstance(value, bool) else value}'

@@ -12,7 +12,7 @@ size is fitted, 0 to 1. One wrong sign leaves half of a push or more. A push tha
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -201,3 +201,22 @@ def parameters(wiring: Wiring, file: Wiring) -> dict[str, object]:
         if axes != then:
             out[f'psd_{psd}.axes'] = list(axes)
     return out
+
+
+def fix_of(difference: Difference, wiring: Wiring, right: Mapping[str, object]) -> str:
+    """The line of the rig file that puts one difference right."""
+    if difference.name == 'psd_swap':
+        return line('psds_exchanged', right['psds_exchanged'])
+    if difference.name == 'axis_swap':
+        name = f'{difference.where}.axes'
+    else:
+        name = next(f'psd_{psd}.axes' for psd in (1, 2) if wiring.input_of(psd) == int(difference.where[-1]))
+    return line(name, right[name] if name in right else list(wiring.axes[int(name[4]) - 1]))
+
+
+def line(name: str, value: object) -> str:
+    """``name: value`` as YAML that ROS reads as well, which takes a bare ``y`` for true."""
+    if isinstance(value, list):
+        text = ', '.join(("'y'" if item == 'y' else str(item)) for item in value)
+        return f'{name}: [{text}]'
+    return f'{name}: {str(value).lower() if isinstance(value, bool) else value}'

@@ -13,16 +13,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.config import Rig
+from psd_deflection.commissioning.checkup import Finding
+from psd_deflection.config import Rig, replace_values
 from psd_deflection.discovery import proposals as propose
+from psd_deflection.discovery.cleaning import clean
 from psd_deflection.discovery.coincidence import Coincidence, coincidences
 from psd_deflection.discovery.experiment import Suggestion, suggest
 from psd_deflection.discovery.fit import Fit, refit
+from psd_deflection.discovery.hidden import SETUP, beginning, mistakes
 from psd_deflection.discovery.localise import Localisation, localise
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.screen import Screen
-from psd_deflection.discovery.search import BIC_ACCEPT, BUDGET, P_ACCEPT, Search, SearchResult, unphysical
-from psd_deflection.discovery.signatures import SignatureBank, candidates
+from psd_deflection.discovery.search import BIC_ACCEPT, BUDGET, P_ACCEPT, Search, SearchResult, far, unphysical
+from psd_deflection.discovery.setup import likely_delays, likely_jumps, noise_finding, said, wire
+from psd_deflection.discovery.signatures import SignatureBank, candidates, signature_columns
 from psd_deflection.discovery.validate import HeldOut, heldout_gain, heldout_gap
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import FloatArray
@@ -88,7 +92,11 @@ class Unknown:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Discovery:
-    """The answer. Gaps in m (rms of block means over x1 y1 x2 y2)."""
+    """The answer. Gaps in m (rms of block means over x1 y1 x2 y2).
+
+    ``setup``: mistakes of the set-up and the recording, with ``lines`` that put the rig file right; ``known``: the
+    effects that the rig file has already.
+    """
 
     verdict: str
     effects: tuple[NamedEffect, ...]
@@ -107,6 +115,9 @@ class Discovery:
     fit: Fit
     workspace: Workspace
     seed: int
+    setup: tuple[Finding, ...]
+    lines: Mapping[str, object]
+    known: tuple[ActiveEffect, ...]
 
     @property
     def floors(self) -> float:
@@ -116,7 +127,7 @@ class Discovery:
     @property
     def active_effects(self) -> list[ActiveEffect]:
         """The effects to add to the rig file."""
-        return [*self.workspace.base, *(e.active for e in self.effects)]
+        return [*self.known, *(e.active for e in self.effects)]
 
     def __repr__(self) -> str:
         named = ', '.join(e.active.label for e in self.effects) or 'no effect'
@@ -157,31 +168,69 @@ def discover(
     rig = recordings[0].rig if rig is None else rig
     rng = np.random.default_rng(seed)
     base = effects_of_rig(rig)
+    progress('checking the recording')
+    cleaned = [clean(o, base) for o in recordings]
+    observations, findings, lines = wire([o for o, _ in cleaned], base)
+    findings = [*(f for _, found in cleaned for f in found), *findings]
+    if lines:
+        rig = replace_values(rig, lines)
     progress('simulating the rig as it is described')
-    workspace = Workspace(recordings, base)
-    bank = SignatureBank() if bank is None else bank
-    bank.nominal(workspace)
+    workspace = Workspace(observations, base)
+    workspace.base = (*base, *_beginnings(workspace))
+    # Signatures that are kept are those of recordings as they were, from rest.
+    other = bool(findings) or len(workspace.base) > len(base)
+    kept = SignatureBank() if bank is None or other else bank
+    kept.nominal(workspace)
     found = _proposals(workspace)
     of_lattice = [e for e in catalogue().values() if e.lattice]
     lattice = _lattice(workspace, base, [e for e in of_lattice if e.name not in without])
     if lattice is not None:
         workspace.base = (*workspace.base, lattice)
     physics = Physics.of(rig)
+    delays = likely_delays(workspace)
 
-    def screen(ws: Workspace) -> Screen:
-        listed = candidates(physics, found, (*without, *(e.name for e in of_lattice)))
-        return Screen(ws, [(c, bank.get(c, ws)) for c in listed])
+    def screen(ws: Workspace, current: Fit | None) -> Screen:
+        residual = ws.residual(ws.base)[0] if current is None else current.residual
+        more = mistakes(len(observations), delays, likely_jumps(ws, residual))
+        listed = candidates(physics, found, (*without, *(e.name for e in of_lattice)), more)
+        if current is None or not far(current):
+            return Screen(ws, [(c, kept.get(c, ws)) for c in listed])
+        # A large effect changes the signatures of the others.
+        beside = [*ws.base, *current.effects]
+        now = ws.simulate(beside)
+        return Screen(ws, [(c, signature_columns(c, ws, now, beside)) for c in listed])
 
     progress('signatures of every effect')
     search = Search(workspace, screen, progress)
     result = search.run()
     progress('weighing')
-    kept, fit = _accept(search, result, rng)
+    heldout, fit = _accept(search, result, rng)
     seen = 0.0 if lattice is None else 2.0 * _lattice_gain(workspace, lattice)
-    fit, kept, left = _credible(search, result, fit, kept, seen, rng)
+    fit, heldout, left = _credible(search, result, fit, heldout, seen, rng)
     if lattice is not None:
-        workspace.base = tuple(base)
-    return _answer(search, result, fit, kept, left, lattice, rng, seed, progress)
+        workspace.base = tuple(a for a in workspace.base if a is not lattice)
+    checked = _Checked(findings, lines, tuple(base))
+    return _answer(search, result, fit, heldout, left, lattice, rng, seed, progress, checked)
+
+
+def _beginnings(workspace: Workspace) -> list[ActiveEffect]:
+    """How the link moved when the loads of a recording became known, if it was not unloaded and at rest."""
+    starts = [o.unknown_load[0] * o.period for o in workspace.observations]
+    effect = beginning(starts)
+    out = []
+    for o, choice in zip(workspace.observations, effect.variants(), strict=True):
+        if o.unknown_load[0] or np.any(o.loads[0] != 0.0):
+            out.append(ActiveEffect(effect, effect.off_values(workspace.physics, choice)))
+    return list(refit(workspace, out, iterations=3).effects) if out else []
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Checked:
+    """What the check of the recordings found, the lines for the rig file, and the effects that the rig file has."""
+
+    findings: Sequence[Finding]
+    lines: Mapping[str, object]
+    known: tuple[ActiveEffect, ...]
 
 
 def _credible(
@@ -262,6 +311,7 @@ def _answer(
     rng: np.random.Generator,
     seed: int,
     progress: Callable[[str], None],
+    checked: _Checked,
 ) -> Discovery:
     ws, null = search.workspace, result.null
     if lattice is not None:
@@ -269,6 +319,14 @@ def _answer(
         ws.base = (*ws.base, lattice)
     progress('alternatives')
     named = _named(search, result, fit, heldout)
+    setup, lines = list(checked.findings), dict(checked.lines)
+    for i, effect in enumerate(named):
+        if effect.active.effect.name in SETUP:
+            more, own = said(ws, fit, i, effect.delta_bic)
+            setup += more
+            lines.update(own)
+    named = [n for n in named if n.active.effect.name not in SETUP]
+    setup += noise_finding(ws)
     if lattice is not None:
         named.append(_named_lattice(ws, lattice))
         ws.base = ws.base[:-1]
@@ -303,6 +361,9 @@ def _answer(
         fit,
         ws,
         seed,
+        tuple(setup),
+        lines,
+        checked.known,
     )
 
 

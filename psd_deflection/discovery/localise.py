@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2 as chi2_law
 
+from psd_deflection.discovery.hidden import only_in
 from psd_deflection.discovery.trust import BANDS, RELATIVE
 from psd_deflection.discovery.workspace import Workspace, fine_means
 from psd_deflection.records import CHANNELS, FloatArray, IntArray
@@ -126,8 +127,8 @@ def _energies(
 def regressors(workspace: Workspace) -> list[dict[str, list[FloatArray]]]:
     """Per PSD (two), per name, per recording: regressors of a residual, on fine blocks (nf,)."""
     out: list[dict[str, list[FloatArray]]] = [{}, {}]
-    for o, size in zip(workspace.observations, workspace.fine, strict=True):
-        chunk = ForwardModel(o.rig, workspace.base).run(o.loads, o.temperature)
+    for i, (o, size) in enumerate(zip(workspace.observations, workspace.fine, strict=True)):
+        chunk = ForwardModel(o.rig, only_in(workspace.base, i)).run(o.loads, o.temperature)
         dots, loads = fine_means(chunk.dots, size) * 1e3, fine_means(chunk.loads, size)
         n = dots.shape[1]
         changes = np.sign(np.diff(chunk.loads, axis=1, prepend=chunk.loads[:, :1]))

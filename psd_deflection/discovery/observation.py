@@ -24,7 +24,8 @@ class Observation:
     """``volts`` (n, 6) V of the PSDs, x y sum of each, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held.
 
     ``temperature`` (n,) degrees Celsius or None. ``rig``: the rig with this recording's own
-    overrides. ``digest``: of its source.
+    overrides. ``digest``: of its source. ``unknown_load``: numbers of samples before the first known load and
+    after the last; what ``loads`` holds there is only a placeholder.
     """
 
     name: str
@@ -33,6 +34,7 @@ class Observation:
     loads: FloatArray
     temperature: FloatArray | None = None
     digest: str = ''
+    unknown_load: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
         n = len(self.volts)

@@ -89,6 +89,17 @@ def result(discovery: Discovery) -> dict[str, Any]:
         'where': where,
         'effects': effects,
         'unknown': unknown,
+        'setup': [
+            {
+                'name': f.name,
+                'where': f.where,
+                'value': f.value,
+                'fix': f.fix,
+                'evidence': _number(f.evidence),
+                'equivalent': list(f.equivalent),
+            }
+            for f in discovery.setup
+        ],
         'remaining': {'rms': discovery.gap_after, 'floors': discovery.floors},
         'gap': {
             'unit': 'm',

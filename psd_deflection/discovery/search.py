@@ -25,6 +25,8 @@ P_ACCEPT = 0.01
 """Largest library-wide p of an accepted effect."""
 BIC_ACCEPT = 10.0
 """Smallest improvement of BIC by an accepted effect."""
+FAR = 10.0
+"""Chi-square per value from which on what remains is screened with signatures beside the effects found so far."""
 MAX_EFFECTS = 4
 TRIALS = 7
 BUDGET = 500
@@ -78,6 +80,11 @@ def unphysical(workspace: Workspace, fit: Fit, index: int) -> bool:
     return not on
 
 
+def far(fit: Fit) -> bool:
+    """Whether ``fit`` leaves so much that small signatures beside it would mislead."""
+    return fit.chi2 > FAR * fit.residual.size
+
+
 def unbound(fit: Fit) -> FloatArray:
     """The Jacobian's columns (D, k) of the parameters that are free to move."""
     keep = [j for j, name in enumerate(fit.free) if name not in fit.at_bound]
@@ -105,13 +112,13 @@ class Search:
     def __init__(
         self,
         workspace: Workspace,
-        screen: Callable[[Workspace], Screen],
+        screen: Callable[[Workspace, Fit | None], Screen],
         progress: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.workspace = workspace
         self._make_screen = screen
         self._progress = progress
-        self.screen = screen(workspace)
+        self.screen = screen(workspace, None)
         self.penalty = float(np.log(workspace.effective_size()))
         self.trace: list[str] = []
         self._without: dict[int, tuple[Fit, list[Fit]]] = {}
@@ -166,8 +173,9 @@ class Search:
             self.workspace.noise = before
             return fit
         self._without.clear()
-        self.screen = self._make_screen(self.workspace)
-        return refit(self.workspace, fit.effects, iterations=6)
+        fit = refit(self.workspace, fit.effects, iterations=6)
+        self.screen = self._make_screen(self.workspace, fit)
+        return fit
 
     def run(self) -> SearchResult:
         """Search; the answer may be that nothing is missing."""
@@ -196,6 +204,8 @@ class Search:
                 renoised = True
                 current = self.renoise(current)
                 null = refit(ws, ())
+            if far(current) and ws.simulations < BUDGET:
+                self.screen = self._make_screen(ws, current)
             if len(current.effects) == 2 and ws.simulations < BUDGET:
                 current = self._try_pairs(null, current)
         current = self._drop(null, current)

@@ -78,12 +78,13 @@ def candidates(
     physics: Physics,
     proposals: Mapping[str, Sequence[float]],
     without: Sequence[str] = (),
+    more: Sequence[Effect] = (),
 ) -> Iterator[Candidate]:
-    """Every candidate of the catalogue except those named in ``without``.
+    """Every candidate of the catalogue and of ``more`` except those named in ``without``.
 
     ``proposals``: the values to try, by the name that a parameter's ``propose`` gives.
     """
-    for effect in catalogue().values():
+    for effect in (*catalogue().values(), *more):
         if effect.name in without:
             continue
         for choice in effect.variants():

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from psd_deflection.discovery.hidden import only_in
 from psd_deflection.discovery.noise import NoiseModel, estimate_noise
 from psd_deflection.discovery.observation import Observation, load_cases
 from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
@@ -21,6 +22,7 @@ from psd_deflection.simulation.physics import Physics
 from psd_deflection.simulation.simulator import ForwardModel
 
 FINE_SECONDS = 0.004
+DOTS = list(DOT_CHANNELS)
 MAX_FINE = 60_000
 """Approximate total number of fine blocks; long recordings get longer blocks, which limits memory."""
 
@@ -76,8 +78,8 @@ class Workspace:
         """Estimate the noise (again), with the link's motion simulated with ``effects``."""
         self.noise = []
         self.simulations += 1
-        for o, size in zip(self.observations, self.fine, strict=True):
-            chunk = ForwardModel(o.rig, sort_effects(effects)).expect(o.loads, o.temperature)
+        for i, (o, size) in enumerate(zip(self.observations, self.fine, strict=True)):
+            chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.loads, o.temperature)
             floors = 0.25 * o.rig.noises.ravel()
             self.noise.append(estimate_noise(o, o.volts - chunk.volts.T, size, floors))
 
@@ -85,8 +87,8 @@ class Workspace:
         """Measured minus simulated (n, 6) V of each recording, samples, 0 if lost."""
         self.simulations += 1
         out = []
-        for o in self.observations:
-            chunk = ForwardModel(o.rig, sort_effects(effects)).expect(o.loads, o.temperature)
+        for i, o in enumerate(self.observations):
+            chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.loads, o.temperature)
             difference = o.volts - chunk.volts.T
             out.append(np.where(np.isfinite(difference), difference, 0.0))
         return out
@@ -95,8 +97,8 @@ class Workspace:
         """Fine-block means (6, nf) V of each recording, simulated without noise."""
         self.simulations += 1
         out = []
-        for o, size, present in zip(self.observations, self.fine, self._present, strict=True):
-            chunk = ForwardModel(o.rig, sort_effects(effects)).expect(o.loads, o.temperature)
+        for i, (o, size, present) in enumerate(zip(self.observations, self.fine, self._present, strict=True)):
+            chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.loads, o.temperature)
             out.append(fine_means(chunk.volts, size, present))
         return out
 
@@ -134,8 +136,8 @@ class Workspace:
         out = []
         for f, c, s, o in zip(fine, self.count, self.fine, self.observations, strict=True):
             per_block = o.rig.estimator.block_size // s
-            share = fine_means(c[DOT_CHANNELS], per_block)
-            total = fine_means(f[DOT_CHANNELS] * c[DOT_CHANNELS], per_block)
+            share = fine_means(c[DOTS], per_block)
+            total = fine_means(f[DOTS] * c[DOTS], per_block)
             means = np.where(share >= 0.5, total / np.maximum(share, 0.5), np.nan)
             out.append(means * o.rig.sensitivities.reshape(4, 1))
         return out
@@ -156,8 +158,8 @@ class Workspace:
         """The gap from noise alone, m."""
         total, count = 0.0, 0
         for w, o, c, s in zip(self.noise, self.observations, self.count, self.fine, strict=True):
-            share = fine_means(c[DOT_CHANNELS], o.rig.estimator.block_size // s)
-            variance = (w.block_sigma[DOT_CHANNELS] * o.rig.sensitivities.ravel())[:, None] ** 2
+            share = fine_means(c[DOTS], o.rig.estimator.block_size // s)
+            variance = (w.block_sigma[DOTS] * o.rig.sensitivities.ravel())[:, None] ** 2
             counted = share >= 0.5
             # A block with some samples missing is noisier.
             total += float((variance / np.maximum(share, 0.5))[counted].sum())

@@ -260,6 +260,13 @@ class CsvRecording(Recording):
                 out.append(AppliedLoad(t_ns, fx, fy, tz))
         return out
 
+    def rows_with_load(self) -> tuple[int, int]:
+        """Number of rows that say their load, and the time of the last one, ns; (0, 0) if none does."""
+        count = last = 0
+        for t_ns, _ in self._optional(LOAD_COLUMNS):
+            count, last = count + 1, t_ns
+        return count, last
+
     def references(self) -> list[ReferencePose]:
         """One reference for each row that has one."""
         return [ReferencePose(t_ns, dx, dy, theta) for t_ns, (dx, dy, theta) in self._optional(REFERENCE_COLUMNS)]

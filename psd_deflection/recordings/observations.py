@@ -80,6 +80,13 @@ def read_observation(
         )
     times = np.array([a.t_ns - start for a in applied], dtype=np.int64)
     held = _held(times, np.array([a[1:] for a in applied]), t_ns, grace, np.zeros(3))
+    before, after = int(np.count_nonzero(t_ns + grace < times.min())), 0
+    if isinstance(recording, CsvRecording):
+        count, last = recording.rows_with_load()
+        later = t_ns > last - start + grace
+        # Rows say their load, one after the other, and then no more: it may have changed unseen.
+        if count > 0.9 * np.count_nonzero(~later):
+            after = int(np.count_nonzero(later))
     temperatures = recording.temperatures()
     warm: FloatArray | None = None
     if temperatures:
@@ -91,7 +98,9 @@ def read_observation(
         else:
             warm = np.interp(t_ns, at.astype(np.float64), celsius)
     digest = '' if isinstance(recording, SimulatedRecording) else _digest(path)
-    return Observation(path.name, rig, Wiring.from_rig(rig).to_psds(volts), held, warm, digest=digest)
+    return Observation(
+        path.name, rig, Wiring.from_rig(rig).to_psds(volts), held, warm, digest=digest, unknown_load=(before, after)
+    )
 
 
 def _held(

@@ -17,10 +17,10 @@ import pytest
 from blind import generator
 from psd_deflection.calibration import Wiring
 from psd_deflection.cli.main import main
-from psd_deflection.commissioning.checkup import CANNOT_TELL, RIGHT, WRONG, Checkup, check, line
+from psd_deflection.commissioning.checkup import CANNOT_TELL, RIGHT, WRONG, Checkup, check
 from psd_deflection.commissioning.levels import levels
 from psd_deflection.commissioning.responses import responses
-from psd_deflection.commissioning.wirings import WIRINGS, differences, parameters
+from psd_deflection.commissioning.wirings import WIRINGS, differences, line, parameters
 from psd_deflection.config import Rig, load_rig, read_parameter_file, rig_from_values
 from psd_deflection.errors import ConfigError, RecordingError
 from psd_deflection.records import FloatArray

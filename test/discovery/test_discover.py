@@ -246,7 +246,7 @@ def test_noise_is_known_whatever_it_is(memory: float, level: float) -> None:
     blocks = noise.reshape(-1, 20, 6).mean(axis=1).std(axis=0)
     np.testing.assert_allclose(model.block_sigma, blocks, rtol=0.12)
     fine = noise.reshape(-1, 4, 6).mean(axis=1).T
-    white = model.whiten(fine, np.ones(fine.shape[1], dtype=bool))
+    white = model.whiten(fine, np.ones(fine.shape))
     np.testing.assert_allclose(white.std(axis=1), 1.0, rtol=0.06)
 
 

@@ -22,7 +22,7 @@ from psd_deflection.discovery.coincidence import coincidences
 from psd_deflection.discovery.discover import _accept, _credible, _named, _tied, _unknown
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.localise import Dependence, Localisation, _energies, _layouts, dependences, localise
-from psd_deflection.discovery.noise import NoiseModel, _ar_density, _block_autocovariance, _level
+from psd_deflection.discovery.noise import NoiseModel, _ar_density, _block_autocovariance, _level, estimate_noise
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.screen import Screen
 from psd_deflection.discovery.search import Search, SearchResult
@@ -114,7 +114,7 @@ def without_noise(*at: tuple[FloatArray, float]) -> FloatArray:
 
 def search_of(plant: Plant, library: int = 1, penalty: float = 3.0) -> Search:
     screen = SimpleNamespace(candidates=[None] * library)
-    search = Search(plant, lambda _: cast(Screen, screen))
+    search = Search(plant, lambda *_: cast(Screen, screen))
     search.penalty = penalty
     return search
 
@@ -348,7 +348,7 @@ def test_an_alternative_is_tried_if_it_explains_enough_of_the_same(
     )
     plant = Plant(shown, without_noise((shown[A], gain)))
     found = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'b')]
-    search = Search(plant, lambda workspace: Screen(workspace, found))
+    search = Search(plant, lambda workspace, _: Screen(workspace, found))
     null, fit = refit(plant, ()), refit(plant, [active('a', x=0.0)])
     others = search.alternatives(null, fit, 0, null.chi2 - fit.chi2)
     assert [f.effects[-1].effect.name for f in others] == (['b'] if refitted else [])
@@ -360,7 +360,7 @@ def test_a_search_adds_what_passes_and_nothing_else() -> None:
     plant = Plant(shown, without_noise((shown[A], 4000.0), (shown[B], 500.0)) + noise())
     found = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'b', 'c')]
     said: list[str] = []
-    result = Search(plant, lambda workspace: Screen(workspace, found), said.append).run()
+    result = Search(plant, lambda workspace, _: Screen(workspace, found), said.append).run()
     assert sorted(a.effect.name for a in result.fit.effects) == ['a', 'b']
     assert said[:2] == ['adding a', 'adding b']
     lost = {a.effect.name: g for a, g in zip(result.fit.effects, result.delta_chi2, strict=True)}
@@ -368,7 +368,7 @@ def test_a_search_adds_what_passes_and_nothing_else() -> None:
     assert lost['a'] == pytest.approx(4000.0, abs=4 * 2 * math.sqrt(4000.0))
     assert lost['b'] == pytest.approx(500.0, abs=4 * 2 * math.sqrt(500.0))
     assert [s.candidate.effect.name for s in result.first_scores[:2]] == ['a', 'b']
-    quiet = Search(Plant(shown, noise()), lambda workspace: Screen(workspace, found)).run()
+    quiet = Search(Plant(shown, noise()), lambda workspace, _: Screen(workspace, found)).run()
     assert quiet.fit.effects == ()
 
 
@@ -719,17 +719,38 @@ def test_a_block_mean_has_the_covariance_of_its_samples() -> None:
 def test_counts_gaps_and_floor_of_a_workspace() -> None:
     volts = 2e-3 * np.random.default_rng(0).standard_normal((2000, 6))
     volts[[3, 99, 1001]] = np.nan
+    volts[4:8, 1] = np.nan
+    volts[40:51, 4] = np.nan
     workspace = Workspace([Observation('seen', RIG, volts, np.zeros((2000, 3)))])
     assert workspace.fine == [4]
-    assert workspace.size == 6 * 497
-    assert workspace.effective_size() == pytest.approx(6 * 497 * 4 / 20)
+    # One fine block has no sample of y1, two have none of y2.
+    assert workspace.size == 6 * 500 - 3
+    assert workspace.effective_size() == pytest.approx(np.isfinite(volts).sum() / 20)
     rows = volts[:, [0, 1, 3, 4]] * RIG.sensitivities.reshape(4)
-    blocks = rows.reshape(100, 20, 4).mean(axis=1)
+    blocks = np.nanmean(rows.reshape(100, 20, 4), axis=1)
+    # Eleven of twenty samples are missing: this block of y2 does not count.
+    blocks[2, 3] = np.nan
     each = workspace.gap_per_channel(workspace.measured)
     assert each == pytest.approx(np.sqrt(np.nanmean(blocks**2, axis=0)), rel=1e-9)
     assert workspace.gap(workspace.measured) == pytest.approx(float(np.sqrt(np.nanmean(blocks**2))), rel=1e-9)
     sigma = workspace.noise[0].block_sigma[[0, 1, 3, 4]] * RIG.sensitivities.reshape(4)
-    assert workspace.floor() == pytest.approx(float(np.sqrt(np.mean(sigma**2))), rel=1e-9)
+    there = np.isfinite(rows).reshape(100, 20, 4).mean(axis=1)
+    variance = np.where(np.isfinite(blocks), sigma**2 / there, np.nan)
+    assert workspace.floor() == pytest.approx(float(np.sqrt(np.nanmean(variance))), rel=1e-9)
+
+
+@pytest.mark.parametrize('share', [0.1, 0.3, 0.6])
+def test_the_noise_of_a_recording_with_gaps_is_that_of_the_whole_one(share: float) -> None:
+    """Behind a slow movement of a hundred times the noise, which zeros in the gaps would take for noise."""
+    rng = np.random.default_rng(5)
+    volts = 2e-3 * rng.standard_normal((8000, 6))
+    volts[2000:] += 0.2 * np.sin(np.arange(6000) / 300.0)[:, None]
+    volts[rng.random(8000) < share] = np.nan
+    loads_of = np.zeros((8000, 3))
+    loads_of[2000:, 1] = np.repeat([1.0, 2.0, 1.0], 2000)
+    model = estimate_noise(Observation('gaps', RIG, volts, loads_of), volts, 4, np.full(6, 5e-4))
+    assert model.sigma == pytest.approx(np.full(6, 2e-3), rel=0.08)
+    assert not any(model.coloured)
 
 
 # The experiment that decides.

@@ -1,0 +1,129 @@
+"""What of a recording is no measurement: outliers, a detector that is stuck, time before the first known load.
+
+These samples become NaN and cost precision, nothing else. What a person should know of them is a :class:`Finding`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import maximum_filter1d
+
+from psd_deflection.commissioning.checkup import Finding
+from psd_deflection.discovery.observation import Observation
+from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.simulation.simulator import ForwardModel
+
+FAR = 8.0
+"""A sample this many standard deviations from what its neighbours predict is an outlier."""
+PASSES = 6
+"""Outliers next to each other are found one after the other."""
+_TO_SD = 1.4826
+STUCK_S = 0.03
+"""A channel that keeps the same converter count for so long is stuck."""
+UNKNOWN_SHARE = 0.05
+"""A recording whose loads are unknown for more than this share of its time is told."""
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+def outliers(residual: FloatArray, least: float) -> BoolArray:
+    """(n, 6): samples of ``residual`` (n, 6), measured minus simulated, V, that stand out from their neighbours.
+
+    Each is held against the cubic through the two samples before it and the two after it, so that a movement, hum and
+    ringing are none. ``least``: V, smallest standard deviation assumed.
+    """
+    out = np.zeros(residual.shape, dtype=bool)
+    for c in range(residual.shape[1]):
+        # An outlier spoils its neighbours' cubics: only the worst of five goes, and what is left is looked at again.
+        for _ in range(PASSES):
+            there = np.flatnonzero(np.isfinite(residual[:, c]) & ~out[:, c])
+            if len(there) < 8:
+                break
+            x = residual[there, c]
+            apart = np.zeros(len(x))
+            apart[2:-2] = np.abs(x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0)
+            limit = FAR * max(_TO_SD * float(np.median(apart)), least)
+            worst = (apart > limit) & (apart >= maximum_filter1d(apart, 5))
+            if not worst.any():
+                break
+            out[there[worst], c] = True
+    return out
+
+
+def stuck(volts: FloatArray, period: float, noise: FloatArray, step: float) -> BoolArray:
+    """(n, 6): where a channel keeps one value for ``STUCK_S``, as noise never lets it.
+
+    At its greatest or least value it may be limited. A channel with less ``noise`` (6,) V than the converter's
+    ``step`` V, or with coarse steps, may rest.
+    """
+    out = np.zeros(volts.shape, dtype=bool)
+    shortest = max(8, round(STUCK_S / period))
+    for c in range(volts.shape[1]):
+        values = volts[:, c]
+        finite = values[np.isfinite(values)]
+        if len(finite) < 2 or noise[c] <= step:
+            continue
+        moved = np.concatenate(([True], values[1:] != values[:-1], [True]))
+        edges = np.flatnonzero(moved)
+        lengths = np.diff(edges)
+        long = lengths >= shortest
+        if long.all() and len(lengths) == 1:
+            out[:, c] = True
+            continue
+        # Coarse steps keep their value again and again; a cable that fails does so now and then.
+        if not long.any() or np.median(lengths) > 2.0:
+            continue
+        low, high = float(finite.min()), float(finite.max())
+        for a, n in zip(edges[:-1][long].tolist(), lengths[long].tolist(), strict=True):
+            if np.isfinite(values[a]) and low < values[a] < high:
+                out[a : a + n, c] = True
+    return out
+
+
+def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Observation, list[Finding]]:
+    """The recording without what is no measurement, and what was found. ``base``: effects of the rig file."""
+    o = observation
+    step = o.rig.converter.volts_per_count
+    findings = []
+    volts = o.volts.copy()
+    still = stuck(volts, o.period, o.rig.noises.ravel(), step)
+    for c in np.flatnonzero(still.any(axis=0)).tolist():
+        first = int(np.argmax(still[:, c]))
+        seconds = float(still[:, c].sum()) * o.period
+        findings.append(
+            Finding(
+                'stuck_channel',
+                CHANNELS[c],
+                first * o.period,
+                f'{CHANNELS[c]} of {o.name} keeps one value from {first * o.period:.3f} s on, {seconds:.3f} s in all: '
+                'look at its cable; these samples are left out',
+                seconds / o.duration,
+            )
+        )
+    volts[still] = np.nan
+    simulated = ForwardModel(o.rig, base).expect(o.loads, o.temperature).volts.T
+    volts[outliers(volts - simulated, max(step, 0.25 * float(o.rig.noises.min())))] = np.nan
+    before, after = o.unknown_load
+    if before or after:
+        volts[:before] = np.nan
+        volts[len(volts) - after :] = np.nan
+        share = (before + after) / len(volts)
+        if share > UNKNOWN_SHARE:
+            findings.append(
+                Finding(
+                    'load_coverage',
+                    'load_fx load_fy load_tz',
+                    share,
+                    f'{o.name}: no load is noted in its first {before * o.period:.2f} s and its last '
+                    f'{after * o.period:.2f} s: note it all the time; these samples are left out',
+                    share,
+                )
+            )
+    if np.array_equal(volts, o.volts, equal_nan=True):
+        return o, findings
+    return dataclasses.replace(o, volts=volts, digest=o.digest or o.hashed()), findings

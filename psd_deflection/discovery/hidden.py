@@ -1,0 +1,147 @@
+"""What the search adjusts besides the catalogue's effects: mistakes of the set-up, and how a recording began.
+
+Each is declared as an effect is, so that one search weighs all of them against each other; none is in the catalogue or
+goes into a rig file's ``effects:``. The mistakes become lines for the rig file (:mod:`.setup`). How the link moved
+before the first sample is nobody's mistake: it is adjusted and not told.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from psd_deflection.simulation.chunk import Chunk
+from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter, Stage, State, Values
+from psd_deflection.simulation.physics import Physics
+
+AXES = ('dx', 'dy', 'theta')
+
+
+def only_in(effects: Sequence[ActiveEffect], recording: int) -> list[ActiveEffect]:
+    """Those of ``effects`` that act in this recording, counted from 0."""
+    return [a for a in effects if a.values.get('recording', recording + 1) == recording + 1]
+
+
+def _of_recording(count: int) -> EffectParameter:
+    choices = tuple(range(1, count + 1))
+    return EffectParameter(
+        'recording', '', 1, count, 1, 'which recording', nominal=1, kind='choice', choices=choices, each=True
+    )
+
+
+def _amplitude(name: str, unit: str, least: float, most: float, scale: float, words: str) -> EffectParameter:
+    return EffectParameter(name, unit, least, most, scale, words)
+
+
+def beginning(starts: Sequence[float]) -> Effect:
+    """Free ringing of the link's modes from ``starts`` on, s, one for each recording: it was not at rest there."""
+
+    def ring(chunk: Chunk, values: Values, state: State) -> None:
+        p = chunk.physics
+        t = chunk.t - starts[int(values['recording']) - 1]
+        after = t >= 0.0
+        modes = [(p.bending_frequency, p.bending_damping_ratio)] * 2 + [(p.torsion_frequency, p.torsion_damping_ratio)]
+        for axis, (name, (frequency, ratio)) in enumerate(zip(AXES, modes, strict=True)):
+            w = 2.0 * math.pi * frequency
+            wd = w * math.sqrt(1.0 - ratio**2)
+            fade = np.exp(-ratio * w * np.where(after, t, 0.0))
+            wave = values[f'cos_{name}'] * np.cos(wd * t) + values[f'sin_{name}'] * np.sin(wd * t)
+            chunk.pose[axis] += np.where(after, fade * wave, 0.0)
+
+    sizes = [
+        _amplitude(f'{wave}_{name}', unit, -1.0, 1.0, 1e-6, f'ringing of {name} at the start')
+        for name, unit in zip(AXES, ('m', 'm', 'rad'), strict=True)
+        for wave in ('cos', 'sin')
+    ]
+    return Effect(
+        name=BEGINNING,
+        stage='link',
+        summary='the link is not at rest at the first sample',
+        equation='q += exp(-ζωt) (a cos ωt + b sin ωt)',
+        source='free motion of a damped mode',
+        needs='nothing',
+        parameters=(_of_recording(len(starts)), *sizes),
+        point='pose',
+        apply=ring,
+        order=99,
+    )
+
+
+def _sensitivity(physics: Physics, values: Values) -> None:
+    physics.sensitivity = physics.sensitivity * (1.0 + values['scale'])
+
+
+def _length(physics: Physics, values: Values) -> None:
+    physics.length *= 1.0 + values['scale']
+
+
+def _rate(physics: Physics, values: Values) -> None:
+    physics.period /= 1.0 + values['scale']
+
+
+def _delay(chunk: Chunk, values: Values, state: State) -> None:
+    at = np.arange(chunk.loads.shape[1]) + values['delay'] / chunk.physics.period
+    whole = np.arange(chunk.loads.shape[1])
+    for row in range(3):
+        chunk.loads[row] = np.interp(at, whole, chunk.loads[row])
+
+
+def _zero(physics: Physics, values: Values) -> None:
+    physics.beams = physics.beams + np.array([[values['x1'], values['y1']], [values['x2'], values['y2']]])
+
+
+def _jump(chunk: Chunk, values: Values, state: State) -> None:
+    i = 2 * (int(values['psd']) - 1)
+    # Half a microsecond early: the sample's own time is rounded.
+    after = chunk.t >= 1e-6 * values['time_us'] - 5e-7
+    chunk.dots[i] += values['x'] * after
+    chunk.dots[i + 1] += values['y'] * after
+
+
+def _only(name: str, value: int) -> EffectParameter:
+    return EffectParameter(name, '', value, value, 1, '', value, 'choice', choices=(value,), each=name != 'time_us')
+
+
+def _factor(name: str, configure: Callable[[Physics, Values], None], stage: Stage, words: str) -> Effect:
+    scale = _amplitude('scale', '', -0.95, 20.0, 1e-3, words)
+    return Effect(name, stage, words, '', '', '', (scale,), 'configure', configure=configure, order=98)
+
+
+def mistakes(recordings: int, delays: Sequence[float], jumps: Sequence[tuple[int, int, float]]) -> list[Effect]:
+    """The mistakes of the set-up that have a size.
+
+    ``delays``: by how much the loads may be noted late, s. ``jumps``: recording, PSD, time, s, of steps that the
+    readings seem to have.
+    """
+    out = [
+        _factor('sensitivity', _sensitivity, 'electronics', 'sensitivity of the amplifier, all channels'),
+        _factor('link_length', _length, 'link', 'length of the link'),
+        _factor('sample_rate', _rate, 'electronics', 'sample rate'),
+    ]
+    if delays:
+        late = EffectParameter('delay', 's', -2.0, 2.0, 1e-3, 'the loads are noted late by', grid=tuple(delays))
+        out.append(
+            Effect('load_delay', 'load', 'late loads', '', '', '', (late,), 'load', apply=_delay, order=-1, finite=True)
+        )
+    if recordings > 1:
+        names = ('x1', 'y1', 'x2', 'y2')
+        places = [_amplitude(n, 'm', -0.02, 0.02, 1e-5, 'unloaded dot') for n in names]
+        parameters = (_of_recording(recordings), *places)
+        out.append(Effect('zero', 'optics', 'zero', '', '', '', parameters, 'configure', configure=_zero, order=98))
+    for recording, psd, time in jumps:
+        parameters = (
+            _only('recording', recording),
+            _only('psd', psd),
+            _only('time_us', round(1e6 * time)),
+            _amplitude('x', 'm', -0.02, 0.02, 1e-6, 'jump of the reading'),
+            _amplitude('y', 'm', -0.02, 0.02, 1e-6, 'jump of the reading'),
+        )
+        out.append(Effect('jump', 'psd', 'jump', '', '', '', parameters, 'dots', apply=_jump, order=98))
+    return out
+
+
+BEGINNING = 'beginning'
+SETUP = frozenset(('sensitivity', 'link_length', 'sample_rate', 'load_delay', 'zero', 'jump'))
+"""Names of the effects that are mistakes of the set-up."""

@@ -1,0 +1,317 @@
+"""The recording is checked before the physics: wiring, signs and units of the loads, and what the search found besides.
+
+Signs, exchanged axes and exchanged PSDs make 128 wirings. Each is held against the whole recording: the movement that
+each load alone would cause is simulated, and every wiring's readings are fitted by these movements with free sizes. The
+sizes tell the sign and the unit of each load. A wiring that is not the rig file's must leave ten times less.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from psd_deflection.calibration import Wiring
+from psd_deflection.commissioning.checkup import Finding
+from psd_deflection.commissioning.wirings import WIRINGS, differences, fix_of, line, parameters
+from psd_deflection.config import Rig, replace_values
+from psd_deflection.discovery.fit import Fit
+from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.simulation.catalogue import sort_effects
+from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.simulation.simulator import ForwardModel
+
+LOADS = ('load_fx', 'load_fy', 'load_tz')
+BETTER = 10.0
+"""Another wiring or sign must leave so many times less of the movement than the rig file's."""
+AS_GOOD = 2.0
+"""Wirings that leave up to this much more than the best one count as equally good; the one with the fewest changes is
+taken."""
+FORCE_UNITS = {9.80665: 'kg', 9.80665e-3: 'g', 4.4482216: 'lbf', 1e3: 'kN', 1e-3: 'mN', 0.2780139: 'ozf'}
+TORQUE_UNITS = {9.80665: 'kg m', 0.0980665: 'kg cm', 9.80665e-3: 'kg mm', 1e3: 'kN m', 1e-3: 'N mm', 1e-2: 'N cm'}
+UNIT_TOLERANCE = 0.03
+"""Share by which the size of a load may differ from another unit's; the rest is stiffness."""
+NOISE_FACTOR = 2.0
+"""Noise that is so many times the rig file's, or so many times less, is told."""
+FARTHEST_S = 1.0
+"""Longest delay of the loads that is looked for."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _Movement:
+    """Sums over block means: ``squared`` of the readings; ``cross`` (3, 4, 4): load, simulated dot, device's channel;
+    ``own`` (3, 3): of the simulated movements, load by load."""
+
+    squared: float
+    cross: FloatArray
+    own: FloatArray
+
+
+def _moved(rig: Rig, base: Sequence[ActiveEffect], loads: FloatArray, temperature: FloatArray | None) -> FloatArray:
+    """Dots (4, n), m, as the volts of the simulation show them."""
+    chunk = ForwardModel(rig, sort_effects(base)).expect(loads, temperature)
+    return np.asarray(chunk.volts[list(DOT_CHANNELS)] * rig.sensitivities.reshape(4, 1))
+
+
+def _blocks(rows: FloatArray, size: int) -> FloatArray:
+    """Means over the samples that are there, (k, blocks); NaN for a block with less than half of them."""
+    n = rows.shape[1] // size
+    cut = rows[:, : n * size].reshape(len(rows), n, size)
+    there = np.isfinite(cut)
+    count = there.sum(axis=2)
+    return np.where(count >= size // 2, np.where(there, cut, 0.0).sum(axis=2) / np.maximum(count, 1), np.nan)
+
+
+def _movement(observations: Sequence[Observation], base: Sequence[ActiveEffect]) -> _Movement:
+    squared, cross, own = 0.0, np.zeros((3, 4, 4)), np.zeros((3, 3))
+    for o in observations:
+        size = o.rig.estimator.block_size
+        device = Wiring.from_rig(o.rig).to_device(o.volts)[:, list(DOT_CHANNELS)].T
+        seen = _blocks(device * o.rig.amplifier.sensitivity, size)
+        still = _moved(o.rig, base, np.zeros_like(o.loads), o.temperature)
+        alone = []
+        for k in range(3):
+            only = np.zeros_like(o.loads)
+            only[:, k] = o.loads[:, k]
+            alone.append(_blocks(_moved(o.rig, base, only, o.temperature) - still, size))
+        there = np.isfinite(seen).all(axis=0)
+        if there.sum() < 4:
+            continue
+        seen = seen[:, there] - seen[:, there].mean(axis=1, keepdims=True)
+        moves = np.stack(alone)[:, :, there]
+        moves = moves - moves.mean(axis=2, keepdims=True)
+        # The volts of one PSD may have a sensitivity of their own; the channels are compared by the amplifier's.
+        moves = moves / (o.rig.sensitivities.reshape(4, 1) / o.rig.amplifier.sensitivity)
+        squared += float((seen**2).sum())
+        cross += np.einsum('kdt,ct->kdc', moves, seen)
+        own += np.einsum('kdt,jdt->kj', moves, moves)
+    return _Movement(squared, cross, own)
+
+
+def _sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
+    """What ``wiring`` leaves of the movement, and the size of each load (3,) over the noted one; NaN for none."""
+    columns = [(0, 1, None, 2, 3)[c] for c in np.array(wiring.columns)[list(DOT_CHANNELS)]]
+    signs = np.array(wiring.signs)[list(DOT_CHANNELS)]
+    along = np.array(
+        [sum(s * m.cross[k, d, c] for d, (s, c) in enumerate(zip(signs, columns, strict=True))) for k in range(3)]
+    )
+    applied = np.diag(m.own) > 1e-6 * m.squared * min(1.0, float(np.diag(m.own).max()) / max(m.squared, 1e-300))
+    sizes = np.full(3, np.nan)
+    if not applied.any():
+        return m.squared, sizes
+    at = np.flatnonzero(applied)
+    f = m.own[np.ix_(at, at)]
+    scale = np.sqrt(np.diag(f))
+    sizes[at] = np.linalg.lstsq(f / np.outer(scale, scale), along[at] / scale, rcond=1e-6)[0] / scale
+    return max(m.squared - float(along[at] @ sizes[at]), 0.0), sizes
+
+
+def wire(
+    observations: Sequence[Observation], base: Sequence[ActiveEffect]
+) -> tuple[list[Observation], list[Finding], dict[str, object]]:
+    """The recordings as they would be if wiring, signs and units were right; what was wrong; lines for the rig file."""
+    file = Wiring.from_rig(observations[0].rig)
+    m = _movement(observations, base)
+    if m.squared <= 0.0 or float(np.trace(m.own)) <= 0.0:
+        return list(observations), [], {}
+    noise = _noise_energy(observations)
+    tried = []
+    for wiring in WIRINGS:
+        left, sizes = _sizes(m, wiring)
+        tried.append((left + noise, wiring, sizes))
+    best = min(left for left, _, _ in tried)
+    as_good = [(_changes(w, file, s), left, i) for i, (left, w, s) in enumerate(tried) if left <= AS_GOOD * best]
+    _, left, chosen = min(as_good)
+    _, wiring, sizes = tried[chosen]
+    told, told_sizes = next((x, s) for x, w, s in tried if w == file)
+    # With the wiring and the signs of the rig file: a load that pulled the wrong way explains nothing.
+    plain = told if not np.any(told_sizes < 0.0) else m.squared + noise
+    findings: list[Finding] = []
+    lines: dict[str, object] = {}
+    loads = np.ones(3)
+    if plain > BETTER * left:
+        others = tuple(_words(tried[i][1], file, tried[i][2]) for _, _, i in sorted(as_good)[1:3])
+        lines = parameters(wiring, file)
+        findings = [
+            Finding(
+                d.name,
+                d.where,
+                -1.0 if d.name == 'channel_sign' else None,
+                fix_of(d, wiring, lines),
+                plain / left,
+                others,
+            )
+            for d in differences(wiring, file)
+        ]
+        turned = [k for k in range(3) if sizes[k] < 0.0]
+        loads[turned] = -1.0
+        findings += [
+            Finding(
+                'load_sign', LOADS[k][5:], -1.0, f'turn the sign of {LOADS[k]} in the recording', plain / left, others
+            )
+            for k in turned
+        ]
+    units = _units(np.abs(sizes))
+    for k, (factor, _) in units.items():
+        loads[k] *= factor
+    for factor, unit in dict.fromkeys(units.values()):
+        which = [k for k in units if units[k] == (factor, unit)]
+        names = ' '.join(LOADS[k] for k in which)
+        findings.append(
+            Finding(
+                'load_unit',
+                ' '.join(LOADS[k][5:] for k in which),
+                factor,
+                f'multiply {names} in the recording by {factor:g}: it is noted in {unit}',
+                plain / left,
+            )
+        )
+    if not findings:
+        return list(observations), [], {}
+    return [_mended(o, lines, loads) for o in observations], findings, lines
+
+
+def _noise_energy(observations: Sequence[Observation]) -> float:
+    """What noise adds to the sum over block means, by the rig file, m^2."""
+    out = 0.0
+    for o in observations:
+        dots = o.rig.noises[:, :2] * o.rig.amplifier.sensitivity
+        out += float((dots**2).sum()) * len(o.volts) / o.rig.estimator.block_size**2
+    return out
+
+
+def _changes(wiring: Wiring, file: Wiring, sizes: FloatArray) -> int:
+    return len(differences(wiring, file)) + int(np.sum(sizes < 0.0))
+
+
+def _words(wiring: Wiring, file: Wiring, sizes: FloatArray) -> str:
+    """What is wrong if ``wiring`` is right, in names."""
+    out = [f'{d.name} of {d.where}' for d in differences(wiring, file)]
+    out += [f'load_sign of {LOADS[k][5:]}' for k in range(3) if sizes[k] < 0.0]
+    return ' and '.join(out) or 'as the rig file says'
+
+
+def _units(sizes: FloatArray) -> dict[int, tuple[float, str]]:
+    """Of each load that is noted in another unit the factor to multiply it with, and the unit."""
+    out: dict[int, tuple[float, str]] = {}
+    force = [float(s) for s in sizes[:2] if math.isfinite(s)]
+    torque = float(sizes[2])
+    for factor, unit in _both_ways(FORCE_UNITS, 'N'):
+        if force and all(abs(s / factor - 1.0) < UNIT_TOLERANCE for s in force) and not _power_of_ten(force, torque):
+            out.update({k: (factor, unit) for k in range(2) if math.isfinite(sizes[k])})
+    for factor, unit in _both_ways(TORQUE_UNITS, 'N m'):
+        if math.isfinite(torque) and abs(torque / factor - 1.0) < UNIT_TOLERANCE:
+            out[2] = (factor, unit)
+    return out
+
+
+def _both_ways(units: dict[float, str], own: str) -> list[tuple[float, str]]:
+    return [(f, f'{unit} instead of {own}') for f, unit in units.items()] + [
+        (1.0 / f, f'{own}, and then converted from {unit} once more')
+        for f, unit in units.items()
+        if f not in (1e3, 1e-3)
+    ]
+
+
+def _power_of_ten(force: Sequence[float], torque: float) -> bool:
+    """Whether only the forces are off, and by ten: a digit of Young's modulus, not a unit."""
+    return abs(torque - 1.0) < 0.1 and all(min(abs(s - 0.1), abs(s - 10.0) / 100.0) < 3e-4 for s in force)
+
+
+def _mended(o: Observation, lines: dict[str, object], loads: FloatArray) -> Observation:
+    rig = replace_values(o.rig, lines) if lines else o.rig
+    volts = Wiring.from_rig(rig).to_psds(Wiring.from_rig(o.rig).to_device(o.volts)) if lines else o.volts
+    return dataclasses.replace(o, rig=rig, volts=volts, loads=o.loads * loads, digest=o.digest or o.hashed())
+
+
+def likely_delays(workspace: Workspace) -> list[float]:
+    """By how much the loads may be noted late, s: where the readings fit the simulation best when it is shifted."""
+    simulated = workspace.simulate(workspace.base)
+    total: FloatArray | None = None
+    step = workspace.observations[0].period * workspace.fine[0]
+    reach = round(FARTHEST_S / step)
+    for s, m, c, noise in zip(simulated, workspace.measured, workspace.count, workspace.noise, strict=True):
+        for k in DOT_CHANNELS:
+            there = c[k] > 0.0
+            if there.sum() < 4 * reach:
+                continue
+            a = np.where(there, m[k] - m[k][there].mean(), 0.0) / noise.sigma[k]
+            b = (s[k] - s[k].mean()) / noise.sigma[k]
+            n = 2 * len(a)
+            found = np.fft.irfft(np.fft.rfft(a, n) * np.conj(np.fft.rfft(b, n)), n)
+            around = np.concatenate((found[-reach:], found[: reach + 1]))
+            total = around if total is None else total + around
+    if total is None:
+        return []
+    best = int(np.argmax(total)) - reach
+    # The readings follow later than simulated: the loads are noted early.
+    return sorted({-best * step, -(best + 1) * step, -(best - 1) * step} - {0.0}) if best else []
+
+
+def likely_jumps(workspace: Workspace, residual: FloatArray) -> list[tuple[int, int, float]]:
+    """(recording, PSD, time s) of the greatest step of the residual (D,), whitened, of each PSD in each recording."""
+    out = []
+    for r, part in enumerate(workspace.split(residual)):
+        n = part.shape[1]
+        if n < 50:
+            continue
+        k = np.arange(1, n)
+        for psd in (1, 2):
+            rows = part[3 * psd - 3 : 3 * psd - 1]
+            sums = np.cumsum(rows - rows.mean(axis=1, keepdims=True), axis=1)[:, :-1]
+            gain = (sums**2).sum(axis=0) * n / (k * (n - k))
+            at = int(np.argmax(gain))
+            if gain[at] > 50.0:
+                out.append((r + 1, psd, (at + 1) * workspace.fine[r] * workspace.observations[r].period))
+    return out
+
+
+def said(workspace: Workspace, fit: Fit, index: int, evidence: float) -> tuple[list[Finding], dict[str, object]]:
+    """Effect ``index`` of ``fit``, a mistake of the set-up, in words, and the lines for the rig file."""
+    active = fit.effects[index]
+    v, rig = active.values, workspace.observations[0].rig
+    name = active.effect.name
+    if name == 'jump':
+        o = workspace.observations[int(v['recording']) - 1]
+        words = (
+            f'PSD {int(v["psd"])} of {o.name} jumps by {1e6 * v["x"]:.3g} µm along x and {1e6 * v["y"]:.3g} µm '
+            'along y: see its mount and its laser; split the recording there'
+        )
+        return [Finding(name, f'psd_{int(v["psd"])}', 1e-6 * v['time_us'], words, evidence)], {}
+    if name == 'load_delay':
+        late = 'late' if v['delay'] > 0.0 else 'early'
+        words = f'the loads are noted {abs(v["delay"]):.4g} s {late}: subtract {v["delay"]:.4g} s from their times'
+        return [Finding(name, ' '.join(LOADS), v['delay'], words, evidence)], {}
+    if name == 'zero':
+        o = workspace.observations[int(v['recording']) - 1]
+        moved = np.array([[v['x1'], v['y1']], [v['x2'], v['y2']]])
+        zeros = [[float(f'{x:.7g}') for x in row] for row in (o.rig.zeros + moved).tolist()]
+        words = f'overrides of {o.name}: ' + ', '.join(line(f'psd_{i}.zero', z) for i, z in enumerate(zeros, start=1))
+        return [Finding(name, o.name, float(np.abs(moved).max()), words, evidence)], {}
+    factor = 1.0 + v['scale']
+    key, old = {
+        'sensitivity': ('amplifier.sensitivity', rig.amplifier.sensitivity),
+        'link_length': ('link.length', rig.link.length),
+        'sample_rate': ('converter.sample_rate_hz', rig.converter.sample_rate_hz),
+    }[name]
+    value = float(f'{old * factor:.6g}')
+    return [Finding(name, key, factor, line(key, value), evidence)], {key: value}
+
+
+def noise_finding(workspace: Workspace) -> list[Finding]:
+    """Noise that is many times the rig file's, or many times less."""
+    stated, measured = 0.0, 0.0
+    for o, n in zip(workspace.observations, workspace.noise, strict=True):
+        dots = list(DOT_CHANNELS)
+        stated += float(np.mean(o.rig.noises.ravel()[dots] ** 2) + o.rig.converter.volts_per_count**2 / 12.0)
+        measured += float(np.mean(n.sigma[dots] ** 2))
+    factor = math.sqrt(measured / stated)
+    if 1.0 / NOISE_FACTOR <= factor <= NOISE_FACTOR:
+        return []
+    level = float(f'{factor * workspace.observations[0].rig.amplifier.noise:.2g}')
+    fix = line('amplifier.noise', level)
+    return [Finding('noise_level', 'x1 y1 x2 y2', round(factor, 3), fix, abs(math.log(factor)))]
