@@ -10,10 +10,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import maximum_filter1d, median_filter
 
 from psd_deflection.commissioning.checkup import Finding
 from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.proposals import coarse_step
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.simulation.declaration import ActiveEffect
 from psd_deflection.simulation.simulator import ForwardModel
@@ -39,16 +40,18 @@ def outliers(residual: FloatArray, least: float) -> BoolArray:
     """
     out = np.zeros(residual.shape, dtype=bool)
     for c in range(residual.shape[1]):
-        # An outlier spoils its neighbours' cubics: only the worst of five goes, and what is left is looked at again.
+        # An outlier spoils its neighbours' cubics: of five only the farthest from the median goes, then all are looked
+        # at again.
         for _ in range(PASSES):
             there = np.flatnonzero(np.isfinite(residual[:, c]) & ~out[:, c])
             if len(there) < 8:
                 break
-            x = residual[there, c]
-            apart = np.zeros(len(x))
-            apart[2:-2] = np.abs(x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0)
+            x = np.pad(residual[there, c], 2, mode='reflect')
+            apart = np.abs(x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0)
             limit = FAR * max(_TO_SD * float(np.median(apart)), least)
-            worst = (apart > limit) & (apart >= maximum_filter1d(apart, 5))
+            near = maximum_filter1d(apart, 5) > limit
+            far = np.where(near, np.abs(x[2:-2] - median_filter(x, 5)[2:-2]), 0.0)
+            worst = (far > 0.5 * limit) & (far >= maximum_filter1d(far, 5))
             if not worst.any():
                 break
             out[there[worst], c] = True
@@ -59,7 +62,7 @@ def stuck(volts: FloatArray, period: float, noise: FloatArray, step: float) -> B
     """(n, 6): where a channel keeps one value for ``STUCK_S``, as noise never lets it.
 
     At its greatest or least value it may be limited. A channel with less ``noise`` (6,) V than the converter's
-    ``step`` V, or with coarse steps, may rest.
+    ``step`` V may rest.
     """
     out = np.zeros(volts.shape, dtype=bool)
     shortest = max(8, round(STUCK_S / period))
@@ -75,8 +78,7 @@ def stuck(volts: FloatArray, period: float, noise: FloatArray, step: float) -> B
         if long.all() and len(lengths) == 1:
             out[:, c] = True
             continue
-        # Coarse steps keep their value again and again; a cable that fails does so now and then.
-        if not long.any() or np.median(lengths) > 2.0:
+        if not long.any():
             continue
         low, high = float(finite.min()), float(finite.max())
         for a, n in zip(edges[:-1][long].tolist(), lengths[long].tolist(), strict=True):
@@ -91,7 +93,10 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
     step = o.rig.converter.volts_per_count
     findings = []
     volts = o.volts.copy()
-    still = stuck(volts, o.period, o.rig.noises.ravel(), step)
+    coarse = coarse_step(o)
+    # Coarse steps keep their value for long, and jump for a single sample.
+    still = np.zeros(volts.shape, dtype=bool) if coarse else stuck(volts, o.period, o.rig.noises.ravel(), step)
+    least = max(step if coarse is None else coarse[0], 0.25 * float(o.rig.noises.min()))
     for c in np.flatnonzero(still.any(axis=0)).tolist():
         first = int(np.argmax(still[:, c]))
         seconds = float(still[:, c].sum()) * o.period
@@ -107,7 +112,7 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
         )
     volts[still] = np.nan
     simulated = ForwardModel(o.rig, base).expect(o.loads, o.temperature).volts.T
-    volts[outliers(volts - simulated, max(step, 0.25 * float(o.rig.noises.min())))] = np.nan
+    volts[outliers(volts - simulated, least)] = np.nan
     before, after = o.unknown_load
     if before or after:
         volts[:before] = np.nan

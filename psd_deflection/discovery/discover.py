@@ -8,6 +8,8 @@ unknown.
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -174,20 +176,26 @@ def discover(
     findings = [*(f for _, found in cleaned for f in found), *findings]
     if lines:
         rig = replace_values(rig, lines)
+    physics = Physics.of(rig)
+    of_lattice = [e for e in catalogue().values() if e.lattice]
+    lattice = _lattice(observations, physics, base, [e for e in of_lattice if e.name not in without])
+    if lattice is not None:
+        observations = [_snapped(o, lattice.values[lattice.effect.lattice]) for o in observations]
     progress('simulating the rig as it is described')
     workspace = Workspace(observations, base)
+    delays = likely_delays(workspace)
+    if any(d > 0.0 for d in delays):
+        # The loads of the last moments are noted after the end.
+        observations = [_without_end(o, max(delays)) for o in observations]
+        workspace = Workspace(observations, base)
     workspace.base = (*base, *_beginnings(workspace))
     # Signatures that are kept are those of recordings as they were, from rest.
-    other = bool(findings) or len(workspace.base) > len(base)
+    other = bool(findings) or len(workspace.base) > len(base) or any(d > 0.0 for d in delays)
     kept = SignatureBank() if bank is None or other else bank
     kept.nominal(workspace)
     found = _proposals(workspace)
-    of_lattice = [e for e in catalogue().values() if e.lattice]
-    lattice = _lattice(workspace, base, [e for e in of_lattice if e.name not in without])
     if lattice is not None:
         workspace.base = (*workspace.base, lattice)
-    physics = Physics.of(rig)
-    delays = likely_delays(workspace)
 
     def screen(ws: Workspace, current: Fit | None) -> Screen:
         residual = ws.residual(ws.base)[0] if current is None else current.residual
@@ -252,18 +260,31 @@ def _credible(
     return fit, heldout, left
 
 
-def _lattice(workspace: Workspace, base: Sequence[ActiveEffect], effects: Sequence[Effect]) -> ActiveEffect | None:
+def _lattice(
+    observations: Sequence[Observation], physics: Physics, base: Sequence[ActiveEffect], effects: Sequence[Effect]
+) -> ActiveEffect | None:
     """The first of ``effects`` with the step that the readings themselves show, if there is one."""
     if not effects or any(a.effect.lattice for a in base):
         return None
-    found = [propose.coarse_step(o) for o in workspace.observations]
+    found = [propose.coarse_step(o) for o in observations]
     steps = [s for s in found if s is not None]
     if len(steps) < len(found):
         return None
     effect = effects[0]
-    values = effect.off_values(workspace.physics, next(effect.variants()))
+    values = effect.off_values(physics, next(effect.variants()))
     # The recording with the widest range of values determines it best.
     return ActiveEffect(effect, {**values, effect.lattice: min(steps, key=lambda s: s[1])[0]})
+
+
+def _snapped(o: Observation, step: float) -> Observation:
+    """The readings as multiples of ``step``, V: the converter has rounded each of them once more."""
+    return dataclasses.replace(o, volts=np.rint(o.volts / step) * step, digest=o.digest or o.hashed())
+
+
+def _without_end(o: Observation, seconds: float) -> Observation:
+    volts = o.volts.copy()
+    volts[len(volts) - math.ceil(seconds / o.period) - 1 :] = np.nan
+    return dataclasses.replace(o, volts=volts, digest=o.digest or o.hashed())
 
 
 def _accept(search: Search, result: SearchResult, rng: np.random.Generator) -> tuple[list[HeldOut], Fit]:
@@ -326,7 +347,7 @@ def _answer(
             setup += more
             lines.update(own)
     named = [n for n in named if n.active.effect.name not in SETUP]
-    setup += noise_finding(ws)
+    setup += noise_finding(ws) if lattice is None else []
     if lattice is not None:
         named.append(_named_lattice(ws, lattice))
         ws.base = ws.base[:-1]

@@ -89,7 +89,12 @@ def _delay(chunk: Chunk, values: Values, state: State) -> None:
 
 
 def _zero(physics: Physics, values: Values) -> None:
-    physics.beams = physics.beams + np.array([[values['x1'], values['y1']], [values['x2'], values['y2']]])
+    moved = np.array([[values['x1'], values['y1']], [values['x2'], values['y2']]])
+    if values['of_reading']:
+        # A constant added to the reading, as by an amplifier's offset.
+        physics.centers = physics.centers - moved
+    else:
+        physics.beams = physics.beams + moved
 
 
 def _jump(chunk: Chunk, values: Values, state: State) -> None:
@@ -128,7 +133,8 @@ def mistakes(recordings: int, delays: Sequence[float], jumps: Sequence[tuple[int
     if recordings > 1:
         names = ('x1', 'y1', 'x2', 'y2')
         places = [_amplitude(n, 'm', -0.02, 0.02, 1e-5, 'unloaded dot') for n in names]
-        parameters = (_of_recording(recordings), *places)
+        of_reading = EffectParameter('of_reading', '', 0, 1, 1, '0: beam, 1: reading', kind='choice', choices=(0, 1))
+        parameters = (_of_recording(recordings), of_reading, *places)
         out.append(Effect('zero', 'optics', 'zero', '', '', '', parameters, 'configure', configure=_zero, order=98))
     for recording, psd, time in jumps:
         parameters = (

@@ -23,6 +23,7 @@ from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import DOT_CHANNELS, FloatArray
 from psd_deflection.simulation.catalogue import sort_effects
 from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.simulation.physics import Physics
 from psd_deflection.simulation.simulator import ForwardModel
 
 LOADS = ('load_fx', 'load_fy', 'load_tz')
@@ -37,6 +38,8 @@ UNIT_TOLERANCE = 0.03
 """Share by which the size of a load may differ from another unit's; the rest is stiffness."""
 NOISE_FACTOR = 2.0
 """Noise that is so many times the rig file's, or so many times less, is told."""
+SMALL = 1e-4
+"""m and rad; movements up to this size are in proportion to the load."""
 FARTHEST_S = 1.0
 """Longest delay of the loads that is looked for."""
 
@@ -69,15 +72,17 @@ def _blocks(rows: FloatArray, size: int) -> FloatArray:
 def _movement(observations: Sequence[Observation], base: Sequence[ActiveEffect]) -> _Movement:
     squared, cross, own = 0.0, np.zeros((3, 4, 4)), np.zeros((3, 3))
     for o in observations:
-        size = o.rig.estimator.block_size
+        size, physics = o.rig.estimator.block_size, Physics.of(o.rig)
         device = Wiring.from_rig(o.rig).to_device(o.volts)[:, list(DOT_CHANNELS)].T
         seen = _blocks(device * o.rig.amplifier.sensitivity, size)
         still = _moved(o.rig, base, np.zeros_like(o.loads), o.temperature)
         alone = []
-        for k in range(3):
+        for k, compliance in enumerate((physics.force_compliance, physics.force_compliance, physics.torque_compliance)):
             only = np.zeros_like(o.loads)
-            only[:, k] = o.loads[:, k]
-            alone.append(_blocks(_moved(o.rig, base, only, o.temperature) - still, size))
+            # Loads in a wrong unit may be thousands of times too large: the link is moved a little, in proportion.
+            share = SMALL / max(compliance * float(np.abs(o.loads[:, k]).max()), SMALL)
+            only[:, k] = share * o.loads[:, k]
+            alone.append(_blocks(_moved(o.rig, base, only, o.temperature) - still, size) / share)
         there = np.isfinite(seen).all(axis=0)
         if there.sum() < 4:
             continue
@@ -219,7 +224,7 @@ def _both_ways(units: dict[float, str], own: str) -> list[tuple[float, str]]:
 
 def _power_of_ten(force: Sequence[float], torque: float) -> bool:
     """Whether only the forces are off, and by ten: a digit of Young's modulus, not a unit."""
-    return abs(torque - 1.0) < 0.1 and all(min(abs(s - 0.1), abs(s - 10.0) / 100.0) < 3e-4 for s in force)
+    return abs(torque - 1.0) < 0.1 and all(min(abs(10.0 * s - 1.0), abs(0.1 * s - 1.0)) < 0.01 for s in force)
 
 
 def _mended(o: Observation, lines: dict[str, object], loads: FloatArray) -> Observation:

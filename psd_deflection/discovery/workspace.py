@@ -21,6 +21,8 @@ from psd_deflection.simulation.declaration import ActiveEffect
 from psd_deflection.simulation.physics import Physics
 from psd_deflection.simulation.simulator import ForwardModel
 
+LEAST_NOISE = 0.05
+"""Share of the rig file's noise that is assumed at least."""
 FINE_SECONDS = 0.004
 DOTS = list(DOT_CHANNELS)
 MAX_FINE = 60_000
@@ -80,7 +82,9 @@ class Workspace:
         self.simulations += 1
         for i, (o, size) in enumerate(zip(self.observations, self.fine, strict=True)):
             chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.loads, o.temperature)
-            floors = 0.25 * o.rig.noises.ravel()
+            # Coarse steps hide the noise of a reading that rests.
+            share = 0.25 if any(a.effect.lattice for a in effects) else LEAST_NOISE
+            floors = np.maximum(share * o.rig.noises.ravel(), o.rig.converter.volts_per_count / np.sqrt(12.0))
             self.noise.append(estimate_noise(o, o.volts - chunk.volts.T, size, floors))
 
     def raw_residual(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
