@@ -22,10 +22,11 @@ from collections.abc import Mapping, Sequence
 
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import given_as_option, given_parameters, parameter_option
-from psd_deflection.config import read_parameter_file, rig_from_values
+from psd_deflection.config import rig_from_values
 from psd_deflection.devices.registry import DEVICES, source_names
 from psd_deflection.errors import ConfigError, UsageError
 from psd_deflection.monitor.start import start_monitor
+from psd_deflection.parameter_files import read_parameter_file
 from psd_deflection.runner.headless import run_headless
 from psd_deflection.runner.simulated_rig import simulates, started_early
 from psd_deflection.solvers.registry import SOLVERS, check_live

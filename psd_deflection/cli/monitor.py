@@ -24,11 +24,12 @@ from collections.abc import Iterator
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import given_as_option, given_parameters, namespace_option, parameter_option, refuse
 from psd_deflection.cli._report import warn
-from psd_deflection.config import MONITOR, read_parameter_file, replace_values, rig_from_values
+from psd_deflection.config import MONITOR, replace_values, rig_from_values
 from psd_deflection.errors import UsageError
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.monitor.shown import ShownRecording
 from psd_deflection.monitor.start import need_server, start_monitor
+from psd_deflection.parameter_files import read_parameter_file
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.replay_engine import nominal_rig, open_for_replay, replayed

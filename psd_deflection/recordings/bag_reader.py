@@ -32,8 +32,8 @@ from msg_adapters import (
     wrench_stamped,
 )
 from msg_adapters.header import header, stamp_ns
-from psd_deflection.errors import RecordingError
-from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
+from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.foreign_yaml import tree_of_file
 from psd_deflection.protocol.sequence import WRAP
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.allowance import Warnings
@@ -443,11 +443,9 @@ def read_information(path: Path) -> dict[str, Any]:
     """The content of ``metadata.yaml``. Raises RecordingError if it cannot be used."""
     way_out = '`psd-deflection recover` makes it anew'
     try:
-        tree = parse_yaml(read_text(path, MAX_YAML_BYTES))
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
-    except YamlError as error:
-        raise RecordingError(f'{path}{error.where}: {error}; {way_out}') from None
+        tree = tree_of_file(path, "bag's metadata", MAX_YAML_BYTES)
+    except ConfigError as error:
+        raise RecordingError(f'{error}; {way_out}') from None
     information = tree.get('rosbag2_bagfile_information') if isinstance(tree, dict) else None
     if not isinstance(information, dict):
         raise RecordingError(f'{path}: has no rosbag2_bagfile_information; {way_out}')
