@@ -10,8 +10,10 @@ import itertools
 import typing
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
+from psd_deflection.errors import ConfigError
+from psd_deflection.parameters import Parameter, check_value, shown
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.physics import Physics
@@ -69,6 +71,18 @@ class EffectParameter:
     required: bool = False
     each: bool = False
     within: Callable[[Physics, Values], tuple[float, float]] | None = None
+
+    def checked(self, value: object, source: str) -> float:
+        """``value`` as a number. Raises ConfigError as :func:`check_value` does."""
+        if not self.choices:
+            low, high = self.minimum, self.maximum
+            declared = Parameter(self.name, 'double', self.nominal, self.unit, self.description, low, high)
+            return cast(float, check_value(declared, value, source))
+        number = cast(float, check_value(Parameter(self.name, 'double', 0.0, self.unit, ''), value, source))
+        if number not in self.choices:
+            words = ', '.join(map(str, self.choices))
+            raise ConfigError(f'{source}: {self.name} = {shown(value)}: must be one of {words}')
+        return number
 
     def off(self, physics: Physics) -> float:
         """The nominal value on this rig."""
