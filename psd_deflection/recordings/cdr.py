@@ -232,12 +232,12 @@ def numbers(type_name: str, cdr: bytes) -> tuple[int, tuple[float, ...]]:
         (length,) = _U32.unpack_from(cdr, FRAME_AT)
         # Alignment counts from behind the encapsulation.
         at = 4 + (12 + length + 7) // 8 * 8
-        return stamp_ns(cdr), _doubles(type_name).unpack_from(cdr, at)
+        return header_stamp_ns(cdr), _doubles(type_name).unpack_from(cdr, at)
     except struct.error:
         raise ValueError('is shorter than its type') from None
 
 
-def stamp_ns(cdr: bytes) -> int:
+def header_stamp_ns(cdr: bytes) -> int:
     """The stamp of a little-endian message that begins with a header, ns. Raises struct.error if it is too short."""
     sec, nanosec = _STAMP.unpack_from(cdr, 4)
     return int(sec) * 1_000_000_000 + int(nanosec)

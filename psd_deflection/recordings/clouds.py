@@ -46,7 +46,7 @@ class CloudDecoder:
                     width = cdr.u32(message, width_at)
                     if width * dtype.itemsize != cdr.u32(message, row_step_at + 4):
                         break
-                    return cdr.stamp_ns(message), np.frombuffer(message, dtype, width, row_step_at + 8)
+                    return cdr.header_stamp_ns(message), np.frombuffer(message, dtype, width, row_step_at + 8)
                 except (struct.error, ValueError):
                     raise ValueError('is shorter than it declares') from None
         if _declared_fields(message) > MAX_FIELDS:

@@ -203,4 +203,4 @@ class Comparison:
 
 def _stamp(encoded: bytes, log_time: int) -> int:
     """The header's stamp, ns: all our messages begin with one."""
-    return cdr.stamp_ns(encoded) if len(encoded) >= cdr.FRAME_AT else log_time
+    return cdr.header_stamp_ns(encoded) if len(encoded) >= cdr.FRAME_AT else log_time
