@@ -188,7 +188,9 @@ ALIENS = tuple(n for n in DRAWS if n.startswith('alien_'))
 
 @dataclass(frozen=True)
 class Case:
-    """One run. ``wanted``: (effect, gap in floors), not yet scaled. ``without``: effects left out of the library."""
+    """One run. ``wanted``: (effect, gap in floors), not yet scaled. ``without``: effects left out of the library.
+    ``mistake``: of the set-up, with its size.
+    """
 
     key: str
     kind: str
@@ -196,6 +198,7 @@ class Case:
     wanted: tuple[tuple[str, float], ...]
     noise: str = 'white'
     without: tuple[str, ...] = field(default=())
+    mistake: tuple[str, float] = ('', 0.0)
 
     @property
     def seed(self) -> int:
@@ -256,7 +259,15 @@ def scaled(case_seed: int, name: str, gap: float, design: tuple[Generator, ...])
     return best[1]
 
 
-def all_cases(seeds: int = 4, nulls: int = 300, wrong: int = 102, pairs: int = 60, first: int = 0) -> Iterator[Case]:
+def all_cases(
+    seeds: int = 4,
+    nulls: int = 300,
+    wrong: int = 102,
+    pairs: int = 60,
+    first: int = 0,
+    spreads: int = 60,
+    mistakes: int = 5,
+) -> Iterator[Case]:
     """The whole suite. ``first``: number of the first seed, for a run on cases never seen before."""
     for seed in range(first, first + seeds):
         for name in EFFECTS:
@@ -281,6 +292,51 @@ def all_cases(seeds: int = 4, nulls: int = 300, wrong: int = 102, pairs: int = 6
         yield Case(f'wrong-{i}', 'wrong', 'one', (), noise=('heavy', 'coloured', 'loud')[i % 3])
     for i in range(first, first + nulls):
         yield Case(f'null-{i}', 'null', 'one', ())
+    yield from hard_cases(first, spreads, mistakes)
+
+
+MISTAKES: Mapping[str, tuple[float, ...]] = {
+    'channel_sign': (0, 1, 3, 4, 1),
+    'axis_swap': (1, 2, 1, 2, 1),
+    'psd_swap': (1, 1, 1, 1, 1),
+    'load_sign': (0, 1, 2, 1, 2),
+    'load_unit': (9.80665, 9.80665e-3, 4.4482216, 1e3, 1e-3),
+    'load_delay': (-0.2, -0.02, 0.01, 0.05, 0.3),
+    'sensitivity': (0.5, 0.95, 1.02, 1.2, 2.0),
+    'link_length': (0.9, 0.98, 1.01, 1.05, 1.15),
+    'sample_rate': (0.8, 0.95, 1.02, 1.1, 1.25),
+    'zero': (1e-6, 3e-6, 1e-5, 1e-4, 4e-4),
+    'noise_level': (0.1, 0.3, 3.0, 6.0, 10.0),
+    'load_coverage': (0.1, 0.2, 0.3, 0.4, 0.5),
+    'stuck_channel': (0.05, 0.1, 0.5, 2.0, 8.0),
+    'jump': (1e-6, 3e-6, 1e-5, 3e-5, 1e-4),
+}
+"""Mistakes of the set-up, each with five sizes: a channel, PSD or load; a factor; s, m, or a share of the time."""
+
+SPREADS = ((3.0, 30.0), (3.0, 300.0), (3.0, 30.0, 300.0))
+"""Gaps of effects that act together, in floors: the small ones must not vanish behind the large ones."""
+
+
+def hard_cases(first: int, spreads: int, mistakes: int) -> Iterator[Case]:
+    """Effects of very different size together; mistakes of the set-up; gaps and outliers in faultless recordings."""
+    rng = np.random.default_rng(20261122 + first)
+    for i in range(first, first + spreads):
+        gaps = SPREADS[i % len(SPREADS)]
+        names = [str(n) for n in rng.choice([n for n in EFFECTS if n not in UNSPREAD], len(gaps), replace=False)]
+        two = bool(set(names) & SHOWS_ACROSS_LENGTHS)
+        yield Case(
+            f'spread-{i}-{"-".join(names)}', 'spread', 'two' if two else 'one', tuple(zip(names, gaps, strict=True))
+        )
+    for name, sizes in MISTAKES.items():
+        for k in range(min(mistakes, len(sizes))):
+            yield Case(f'mistake-{name}-{k}-{first}', 'mistake', 'one', (), mistake=(name, float(sizes[k])))
+    for i in range(first, first + 3 * mistakes):
+        kind = ('gaps', 'outliers', 'under_load')[i % 3]
+        yield Case(f'faultless-{kind}-{i}', 'faultless', 'one', (), mistake=(kind, 0.3 if kind == 'gaps' else 0.01))
+
+
+UNSPREAD = frozenset(('amplifier_saturation', 'quantisation', 'plane_tilt', 'sensor_nonlinearity'))
+"""Effects that cannot be 300 floors large within their bounds, or that spoil what is small."""
 
 
 def short_cases() -> list[Case]:

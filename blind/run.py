@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from blind import score
 from blind.cases import Case, all_cases, designs, scaled, short_cases
+from blind.mistakes import observed
 from psd_deflection.config import load_rig, replace_values
 from psd_deflection.discovery.discover import Discovery, discover
 from psd_deflection.discovery.observation import Observation
@@ -38,6 +39,8 @@ def truth_of(case: Case) -> list[dict[str, Any]]:
 def observe(case: Case, truth: Sequence[dict[str, Any]]) -> list[Observation]:
     """The input of discover."""
     rig = load_rig()
+    if case.mistake[0]:
+        return observed(case.mistake, designs(case.design)[0], rig, case.noise, case.seed)
     out = []
     for i, g in enumerate(designs(case.design)):
         own = replace_values(rig, {'link.length': g.length}) if g.length != rig.link.length else rig
@@ -48,14 +51,23 @@ def observe(case: Case, truth: Sequence[dict[str, Any]]) -> list[Observation]:
 
 def answer(case: Case, truth: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], Discovery]:
     """discover's result.json for a case."""
-    bank = _BANKS.setdefault(case.design, SignatureBank())
-    found = discover(observe(case, truth), load_rig(), seed=0, without=case.without, bank=bank)
+    # A mistake may change the rig, the loads or the length of the recording.
+    bank = None if case.mistake[0] else _BANKS.setdefault(case.design, SignatureBank())
+    seen = observe(case, truth)
+    found = discover(seen, seen[0].rig if case.mistake[0] else load_rig(), seed=0, without=case.without, bank=bank)
     return result(found), found
 
 
 def _one(job: tuple[dict[str, Any], list[dict[str, Any]], str]) -> str:
     fields, truth, target = job
-    case = Case(**{**fields, 'wanted': tuple(map(tuple, fields['wanted'])), 'without': tuple(fields['without'])})
+    case = Case(
+        **{
+            **fields,
+            'wanted': tuple(map(tuple, fields['wanted'])),
+            'without': tuple(fields['without']),
+            'mistake': tuple(fields['mistake']),
+        }
+    )
     start = time.perf_counter()
     got, _ = answer(case, truth)
     got['seconds'] = time.perf_counter() - start
@@ -94,12 +106,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--nulls', type=int, default=300)
     parser.add_argument('--wrong', type=int, default=102)
     parser.add_argument('--pairs', type=int, default=60)
+    parser.add_argument('--spreads', type=int, default=60, help='pairs and triples of very different size')
+    parser.add_argument('--mistakes', type=int, default=5, help='sizes of each mistake of the set-up')
     parser.add_argument('--first', type=int, default=0, help='number of the first seed: fresh cases')
     parser.add_argument('--only', default='', help='only cases whose name contains this')
     parser.add_argument('--score', action='store_true', help='only score what is there')
     args = parser.parse_args(argv)
     folder = Path(args.out)
-    whole = all_cases(args.seeds, args.nulls, args.wrong, args.pairs, args.first)
+    whole = all_cases(args.seeds, args.nulls, args.wrong, args.pairs, args.first, args.spreads, args.mistakes)
     listed = short_cases() if args.short else list(whole)
     cases = [c for c in listed if args.only in c.key]
     if not args.score:

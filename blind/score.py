@@ -22,6 +22,9 @@ THRESHOLDS: dict[str, float] = {
     'false_alarm_wrong_noise': 0.03,
     'both_of_a_pair': 0.85,
     'unknown': 0.90,
+    'all_of_a_spread': 0.95,
+    'unsaid_floors': 1.5,
+    'mistake_named': 0.95,
     'heldout_over_floor_median': 1.05,
     'heldout_over_floor_p95': 1.2,
     'coverage_low': 0.92,
@@ -40,6 +43,7 @@ class Row:
     told_apart: bool
     truth: list[dict[str, Any]]
     answer: dict[str, Any]
+    mistake: str = ''
 
     @property
     def named(self) -> list[str]:
@@ -63,7 +67,8 @@ def load(folder: Path, keys: Sequence[str]) -> list[Row]:
         case = sealed['case']
         gap = max((g for _, g in case['wanted']), default=0.0)
         apart = case['design'] == 'two' or not any(n in SHOWS_ACROSS_LENGTHS for n, _ in case['wanted'])
-        out.append(Row(key, case['kind'], gap, apart, sealed['truth'], json.loads(answer.read_text())))
+        mistake = case.get('mistake', ['', 0.0])[0]
+        out.append(Row(key, case['kind'], gap, apart, sealed['truth'], json.loads(answer.read_text()), mistake))
     return out
 
 
@@ -136,6 +141,8 @@ def summary(rows: Sequence[Row]) -> tuple[str, bool]:
     _false_alarms(sheet, rows)
     pair = [r for r in rows if r.kind == 'pair']
     sheet.rate('both of a pair in the answer', pair, [_both(r) for r in pair], THRESHOLDS['both_of_a_pair'], 1.0, True)
+    _spread(sheet, rows)
+    _mistakes(sheet, rows)
     _unknowns(sheet, rows)
     _held_out(sheet, rows)
     cover = [c for r in rows if r.kind == 'single' for c in covered(r)]
@@ -185,6 +192,31 @@ def _unknowns(sheet: _Sheet, rows: Sequence[Row]) -> None:
         f'        truth in the library, gap >= 3 floors, and yet something called unknown: {len(wrongly)}/{len(listed)}'
     )
     sheet.lines += [f'          {r.key}: {_said(r)}' for r in wrongly]
+
+
+def _spread(sheet: _Sheet, rows: Sequence[Row]) -> None:
+    """Effects of very different size: all are named, and nothing above the noise is left unsaid in any answer."""
+    of = [r for r in rows if r.kind == 'spread']
+    hits = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
+    sheet.rate('all of a pair or triple of 1:10:100 floors', of, hits, THRESHOLDS['all_of_a_spread'], 1.0, True)
+    most = THRESHOLDS['unsaid_floors']
+    unsaid = [r for r in rows if r.answer['remaining']['floors'] > most and not r.answer['unknown']]
+    sheet.failures += [f'{r.key}: {_said(r)}' for r in unsaid]
+    sheet.check(not unsaid, f'answers that leave more than {most} floors unsaid: {len(unsaid)}, wanted 0')
+
+
+def _mistakes(sheet: _Sheet, rows: Sequence[Row]) -> None:
+    """A mistake of the set-up is named and nothing else is; a faultless recording has none."""
+    of = [r for r in rows if r.kind == 'mistake']
+    hits = [{s['name'] for s in r.answer['setup']} == {r.mistake} and not r.named for r in of]
+    sheet.rate('mistake of the set-up named, and nothing else', of, hits, THRESHOLDS['mistake_named'], 1.0, True)
+    sound = [r for r in rows if r.kind in ('faultless', 'null', 'single', 'pair', 'spread')]
+    wrongly = [r for r in sound if r.answer['setup']]
+    sheet.failures += [f'{r.key}: set-up {", ".join(s["name"] for s in r.answer["setup"])}' for r in wrongly]
+    sheet.rate('mistake named where there is none', sound, [bool(r.answer['setup']) for r in sound], 0.0, 0.0, False)
+    odd = [r for r in rows if r.kind == 'faultless']
+    alarm = [r.answer['verdict'] != 'nothing_missing' for r in odd]
+    sheet.rate('false alarm, gaps, outliers, start under load', odd, alarm, 0.0, 0.01, True)
 
 
 def _held_out(sheet: _Sheet, rows: Sequence[Row]) -> None:

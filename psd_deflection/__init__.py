@@ -47,8 +47,8 @@ def load_rig(path: str | Path | None = None, /, **overrides: object) -> Rig:
     ``load_rig('my_rig.yaml', **{'psd_1.center': [0.0, 0.08]})``. ``psd-deflection params`` lists them.
     Raises :class:`psd_deflection.errors.ConfigError`, which names file, parameter, value and bound.
     """
-    from psd_deflection.config import flattened
     from psd_deflection.config import load_rig as of_file
+    from psd_deflection.parameter_files import flattened
 
     return of_file(path, flattened(overrides, 'load_rig'))
 
@@ -187,7 +187,7 @@ def discover(
     from psd_deflection.recordings.observations import read_observations
 
     known = None if rig is None else _rig(rig)
-    return of_observations(read_observations(recordings, known), known, seed=seed)
+    return of_observations(read_observations(recordings, known, any_rate=True), known, seed=seed)
 
 
 def _rig(rig: Rig | str | Path | None) -> Rig:

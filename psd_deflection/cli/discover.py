@@ -26,11 +26,12 @@ from tqdm import tqdm
 from psd_deflection.cli._options import namespace_option, seed
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import save, show, warn
-from psd_deflection.config import Rig, load_rig, parameter_text, with_effects_section
+from psd_deflection.config import Rig, load_rig, replace_values
 from psd_deflection.discovery.discover import Discovery, discover
 from psd_deflection.discovery.report import report_html
 from psd_deflection.discovery.result import model_yaml, result, sentence
 from psd_deflection.errors import ConfigError, RecordingError, UsageError
+from psd_deflection.parameter_files import parameter_text, with_effects_section
 from psd_deflection.recordings.observations import read_observations
 from psd_deflection.simulation.catalogue import effect_names, effects_to_values
 
@@ -67,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         if name not in effect_names():
             raise UsageError(f'--without {name}: no effect of that name; there are: {", ".join(effect_names())}')
     with told('reading', quiet=args.quiet or args.json):
-        observations = read_observations(args.recordings, given, namespace=args.namespace, warn=warn)
+        observations = read_observations(args.recordings, given, namespace=args.namespace, warn=warn, any_rate=True)
     out = Path(args.out)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -103,6 +104,8 @@ def run(args: argparse.Namespace) -> int:
         print(in_json)  # noqa: T201 - JSON has no control characters, and its lines may be long
         return 0
     show(sentence(found))
+    for finding in found.setup:
+        show(f'set-up: {finding.name} {finding.where}: {finding.fix}')
     for effect in found.effects:
         if effect.suggestion is not None:
             show(f'to tell {effect.active.effect.name} from {", ".join(effect.equivalent)}: {effect.suggestion.text}')
@@ -114,7 +117,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _model(params_file: str | None, rig: Rig, found: Discovery) -> str:
     """The user's parameter file with the effects, comments kept; without one what describes the rig."""
-    if params_file is not None:
+    if found.lines:
+        # What was wrong in the rig file is right in the model; the file itself is not changed.
+        rig = replace_values(rig, found.lines)
+        if params_file is not None:
+            warn('model.yaml has the lines that put the set-up right, without the comments of the rig file')
+    elif params_file is not None:
         path = Path(params_file)
         try:
             return with_effects_section(parameter_text(path), effects_to_values(found.active_effects), path)

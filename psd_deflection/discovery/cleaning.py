@@ -6,13 +6,16 @@ These samples become NaN and cost precision, nothing else. What a person should 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter1d, median_filter
 
 from psd_deflection.commissioning.checkup import Finding
+from psd_deflection.commissioning.wirings import line
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.proposals import coarse_step
 from psd_deflection.records import CHANNELS, FloatArray
@@ -39,23 +42,38 @@ def outliers(residual: FloatArray, least: float) -> BoolArray:
     ringing are none. ``least``: V, smallest standard deviation assumed.
     """
     out = np.zeros(residual.shape, dtype=bool)
+    at = np.arange(len(residual))
     for c in range(residual.shape[1]):
+        lost = ~np.isfinite(residual[:, c])
+        x = residual[:, c].copy()
         # An outlier spoils its neighbours' cubics: of five only the farthest from the median goes, then all are looked
         # at again.
         for _ in range(PASSES):
-            there = np.flatnonzero(np.isfinite(residual[:, c]) & ~out[:, c])
-            if len(there) < 8:
+            gone = out[:, c] | lost
+            if np.count_nonzero(~gone) < 8:
                 break
-            x = np.pad(residual[there, c], 2, mode='reflect')
-            apart = np.abs(x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0)
+            if gone.any():
+                x[gone] = CubicSpline(at[~gone], residual[~gone, c])(at[gone])
+            apart = _from_cubic(x)
             limit = FAR * max(_TO_SD * float(np.median(apart)), least)
             near = maximum_filter1d(apart, 5) > limit
-            far = np.where(near, np.abs(x[2:-2] - median_filter(x, 5)[2:-2]), 0.0)
+            far = np.where(near & ~gone, np.abs(x - median_filter(x, 5)), 0.0)
             worst = (far > 0.5 * limit) & (far >= maximum_filter1d(far, 5))
             if not worst.any():
                 break
-            out[there[worst], c] = True
+            out[worst, c] = True
     return out
+
+
+def _from_cubic(x: FloatArray) -> FloatArray:
+    """Distance of each sample (n,) from the cubic through two on either side; at the ends from the median of five."""
+    apart = np.empty_like(x)
+    apart[2:-2] = np.abs(x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0)
+    for ends, five in ((slice(0, 2), x[:5]), (slice(-2, None), x[-5:])):
+        # Movement between samples is no outlier.
+        moved = 3.0 * float(np.median(np.abs(np.diff(five))))
+        apart[ends] = np.maximum(np.abs(x[ends] - np.median(five)) - moved, 0.0)
+    return apart
 
 
 def stuck(volts: FloatArray, period: float, noise: FloatArray, step: float) -> BoolArray:
@@ -113,6 +131,11 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
     volts[still] = np.nan
     simulated = ForwardModel(o.rig, base).expect(o.loads, o.temperature).volts.T
     volts[outliers(volts - simulated, least)] = np.nan
+    if o.stated_rate_hz:
+        rate = o.rig.converter.sample_rate_hz
+        factor = rate / o.stated_rate_hz
+        fix = line('converter.sample_rate_hz', rate)
+        findings.append(Finding('sample_rate', 'converter.sample_rate_hz', factor, fix, abs(math.log(factor))))
     before, after = o.unknown_load
     if before or after:
         volts[:before] = np.nan

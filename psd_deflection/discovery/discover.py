@@ -45,6 +45,8 @@ fits as well.
 """
 UNKNOWN_P = 1e-4
 UNKNOWN_EXCESS = 60.0
+STEPS_SHARE = 0.02
+"""Coarse steps cause noise that varies with the signal; up to this share of what they explain it is nothing else."""
 UNSAID = 1.5
 """A gap of more floors than this never remains without being reported as unknown."""
 RIVAL_BIC = 10.0
@@ -168,12 +170,19 @@ def discover(
     rig's effects are malformed.
     """
     rig = recordings[0].rig if rig is None else rig
+    rates = {o.rig.converter.sample_rate_hz for o in recordings if o.stated_rate_hz}
+    lines: dict[str, object] = {'converter.sample_rate_hz': rates.pop()} if len(rates) == 1 else {}
     rng = np.random.default_rng(seed)
     base = effects_of_rig(rig)
     progress('checking the recording')
     cleaned = [clean(o, base) for o in recordings]
-    observations, findings, lines = wire([o for o, _ in cleaned], base)
+    observations, findings, rewired = wire([o for o, _ in cleaned], base)
+    before = 0.0
+    if findings:
+        stated = Workspace([o for o, _ in cleaned], base)
+        before = stated.gap(stated.residual(base)[1])
     findings = [*(f for _, found in cleaned for f in found), *findings]
+    lines.update(rewired)
     if lines:
         rig = replace_values(rig, lines)
     physics = Physics.of(rig)
@@ -217,7 +226,7 @@ def discover(
     fit, heldout, left = _credible(search, result, fit, heldout, seen, rng)
     if lattice is not None:
         workspace.base = tuple(a for a in workspace.base if a is not lattice)
-    checked = _Checked(findings, lines, tuple(base))
+    checked = _Checked(findings, lines, tuple(base), before)
     return _answer(search, result, fit, heldout, left, lattice, rng, seed, progress, checked)
 
 
@@ -234,11 +243,14 @@ def _beginnings(workspace: Workspace) -> list[ActiveEffect]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Checked:
-    """What the check of the recordings found, the lines for the rig file, and the effects that the rig file has."""
+    """What the check of the recordings found, the lines for the rig file, the effects that the rig file has, and the
+    gap before the wiring was put right, m, 0 if that was right.
+    """
 
     findings: Sequence[Finding]
     lines: Mapping[str, object]
     known: tuple[ActiveEffect, ...]
+    gap: float
 
 
 def _credible(
@@ -249,7 +261,7 @@ def _credible(
     while True:
         explained = result.null.residual - fit.residual if fit.free else None
         left = localise(ws, fit.residual, fit.jacobian if fit.free else None, rng, explained=explained)
-        if not fit.effects or not _unknown(left, max(result.null.chi2 - fit.chi2, 0.0) + seen):
+        if not fit.effects or not _unknown(left, max(result.null.chi2 - fit.chi2, 0.0) + seen, steps=seen):
             break
         weakest = int(np.argmin(result.delta_chi2))
         if result.delta_chi2[weakest] >= left.excess:
@@ -355,10 +367,11 @@ def _answer(
     before = left if fit is null else localise(ws, null.residual, None, rng)
     floor = ws.floor()
     # Coarse steps cause noise that varies with the signal; compare what they explain with it.
-    explained = max(null.chi2 - fit.chi2, 0.0) + (0.0 if lattice is None else 2.0 * _lattice_gain(ws, lattice))
-    gap_before, gap_after = ws.gap(null.difference), ws.gap(fit.difference)
+    steps = 0.0 if lattice is None else 2.0 * _lattice_gain(ws, lattice)
+    explained = max(null.chi2 - fit.chi2, 0.0) + steps
+    gap_before, gap_after = checked.gap or ws.gap(null.difference), ws.gap(fit.difference)
     unknown = (
-        _unknown(left, explained, gap_after, floor)
+        _unknown(left, explained, gap_after, floor, steps)
         or _unsaid(gap_before, gap_after, floor)
         or _tied(coincidences(fit, ws.physics), fit, result, before)
     )
@@ -466,9 +479,11 @@ def _unsaid(before: float, after: float, floor: float) -> tuple[Unknown, ...]:
     return (Unknown(words, (), float(min((after / before) ** 2, 1.0)), rms=size),)
 
 
-def _unknown(left: Localisation, explained: float, gap: float = 0.0, floor: float = 0.0) -> tuple[Unknown, ...]:
-    """``gap``, ``floor``: what remains and what noise leaves, m."""
-    if left.p > UNKNOWN_P or left.excess < UNKNOWN_EXCESS:
+def _unknown(
+    left: Localisation, explained: float, gap: float = 0.0, floor: float = 0.0, steps: float = 0.0
+) -> tuple[Unknown, ...]:
+    """``gap``, ``floor``: what remains and what noise leaves, m. ``steps``: chi-square that coarse steps explain."""
+    if left.p > UNKNOWN_P or left.excess < max(UNKNOWN_EXCESS, STEPS_SHARE * steps):
         return ()
     strong = [d for d in left.dependences if d.p < 1e-3][:6]
     channels = list(dict.fromkeys([*(c.channel for c in left.cells if c.p < 0.01), *(d.channel for d in strong)]))

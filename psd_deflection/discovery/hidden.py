@@ -12,9 +12,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter, Stage, State, Values
 from psd_deflection.simulation.physics import Physics
+from psd_deflection.simulation.samples import SimulatedSamples
 
 AXES = ('dx', 'dy', 'theta')
 
@@ -38,7 +38,7 @@ def _amplitude(name: str, unit: str, least: float, most: float, scale: float, wo
 def beginning(starts: Sequence[float]) -> Effect:
     """Free ringing of the link's modes from ``starts`` on, s, one for each recording: it was not at rest there."""
 
-    def ring(chunk: Chunk, values: Values, state: State) -> None:
+    def ring(chunk: SimulatedSamples, values: Values, state: State) -> None:
         p = chunk.physics
         t = chunk.t - starts[int(values['recording']) - 1]
         after = t >= 0.0
@@ -81,7 +81,7 @@ def _rate(physics: Physics, values: Values) -> None:
     physics.period /= 1.0 + values['scale']
 
 
-def _delay(chunk: Chunk, values: Values, state: State) -> None:
+def _delay(chunk: SimulatedSamples, values: Values, state: State) -> None:
     at = np.arange(chunk.loads.shape[1]) + values['delay'] / chunk.physics.period
     whole = np.arange(chunk.loads.shape[1])
     for row in range(3):
@@ -97,7 +97,7 @@ def _zero(physics: Physics, values: Values) -> None:
         physics.beams = physics.beams + moved
 
 
-def _jump(chunk: Chunk, values: Values, state: State) -> None:
+def _jump(chunk: SimulatedSamples, values: Values, state: State) -> None:
     i = 2 * (int(values['psd']) - 1)
     # Half a microsecond early: the sample's own time is rounded.
     after = chunk.t >= 1e-6 * values['time_us'] - 5e-7

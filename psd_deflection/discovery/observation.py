@@ -25,7 +25,8 @@ class Observation:
 
     ``temperature`` (n,) degrees Celsius or None. ``rig``: the rig with this recording's own
     overrides. ``digest``: of its source. ``unknown_load``: numbers of samples before the first known load and
-    after the last; what ``loads`` holds there is only a placeholder.
+    after the last; what ``loads`` holds there is only a placeholder. ``stated_rate_hz``: the rig
+    file's sample rate if the recording's times say another, which ``rig`` then has; else 0.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Observation:
     temperature: FloatArray | None = None
     digest: str = ''
     unknown_load: tuple[int, int] = (0, 0)
+    stated_rate_hz: float = 0.0
 
     def __post_init__(self) -> None:
         n = len(self.volts)

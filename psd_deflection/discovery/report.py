@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from psd_deflection.discovery.discover import Discovery, NamedEffect
-from psd_deflection.discovery.result import parameters_of, provenance, sentence
+from psd_deflection.discovery.result import parameters_of, provenance, sentence, size_of
 from psd_deflection.discovery.screen import Score
 from psd_deflection.discovery.trust import BANDS
 from psd_deflection.pages import page, picture, table
@@ -91,10 +91,10 @@ def _waterfall_figure(discovery: Discovery) -> Figure:
     axis.barh(range(len(bars)), values, color=colors)
     axis.set_yticks(range(len(bars)), names)
     axis.invert_yaxis()
-    axis.set_xscale('log')
-    axis.set_xlim(0.5 * min(values), 2.5 * max(values))
+    # Linear, from zero: the length of a bar is the size of the gap. The numbers say what is too short to be seen.
+    axis.set_xlim(0.0, 1.18 * max(values))
     for i, v in enumerate(values):
-        axis.text(v * 1.05, i, f'{v:.3f} µm', va='center', fontsize=9)
+        axis.text(v + 0.01 * max(values), i, f'{v:.3f} µm', va='center', fontsize=9)
     axis.set_xlabel('gap / µm rms')
     return figure
 
@@ -140,6 +140,9 @@ def _effect_section(effect: NamedEffect) -> str:
             (n, f'{loss:.1f}', f'{bic:.1f}', told[n in effect.equivalent]) for n, loss, bic in effect.alternatives
         ]
         out.append(table(('in its place', 'chi-square lost', 'BIC worse by', 'verdict'), others))
+    if effect.rivals:
+        fitted = [(r.active.label, size_of(r), f'{r.delta_bic:+.1f}') for r in effect.rivals]
+        out.append(table(('rival', 'fitted', 'BIC worse by'), fitted))
     if effect.suggestion is not None:
         out.append(f'<p>To decide: {html.escape(effect.suggestion.text)}.</p>')
     return ''.join(out)
@@ -169,6 +172,10 @@ def report_html(discovery: Discovery) -> str:
     """The page, pictures inside."""
     body = ['<h1>What the model lacks</h1>', f'<p class=verdict>{html.escape(sentence(discovery))}</p>']
     body.append(picture(_waterfall_figure(discovery), 'the gap, step by step'))
+    if discovery.setup:
+        body.append('<h2>Set-up</h2>')
+        wrong = [(f.name, f.where, '' if f.value is None else f'{f.value:.5g}', f.fix) for f in discovery.setup]
+        body.append(table(('mistake', 'where', 'value', 'what puts it right'), wrong))
     body.append('<h2>What</h2>')
     body.append(''.join(_effect_section(e) for e in discovery.effects) or '<p>No effect is named.</p>')
     if discovery.unknown:

@@ -148,8 +148,8 @@ def _nested(flat: Mapping[str, object]) -> dict[str, Any]:
 def model_yaml(rig: Rig, effects: Sequence[ActiveEffect]) -> str:
     """What describes the rig, as a ROS 2 parameter file with ``effects`` instead of its own.
 
-    For a rig without a file of its own; :func:`psd_deflection.config.with_effects_section` adds them to a file. Port,
-    folders and page are left out: they belong to a machine.
+    For a rig without a file of its own; :func:`psd_deflection.parameter_files.with_effects_section` adds them to a
+    file. Port, folders and page are left out: they belong to a machine.
     """
     tree = _nested({name: rig.values[name] for name in DESCRIPTION})
     if effects:
@@ -174,11 +174,22 @@ def _left(discovery: Discovery) -> str:
     return f'{after:.3f} µm, {discovery.floors:.2f} times what noise alone leaves ({floor:.3f} µm)'
 
 
+def _setup(discovery: Discovery) -> str:
+    """What is wrong with the set-up, in a sentence, or nothing."""
+    names = list(dict.fromkeys(f'{f.name} ({f.where})' for f in discovery.setup))
+    return f'The set-up is not as the rig file or the recording says: {", ".join(names)}. ' if names else ''
+
+
 def sentence(discovery: Discovery) -> str:
-    """The verdict in one sentence."""
+    """The verdict in one sentence, after one about the set-up if that is wrong."""
+    return _setup(discovery) + _missing(discovery)
+
+
+def _missing(discovery: Discovery) -> str:
     before, left = 1e6 * discovery.gap_before, _left(discovery)
     if discovery.verdict == 'nothing_missing':
-        return f'Nothing is missing: the gap is {left}.'
+        besides = ' besides' if discovery.setup else ''
+        return f'Nothing is missing{besides}: the gap is {left}.'
     parts = []
     for e in discovery.effects:
         text = e.active.label

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from psd_deflection.calibration import Wiring
-from psd_deflection.config import MAX_FILE_BYTES, Rig, replace_values
+from psd_deflection.config import Rig, replace_values
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.errors import ConfigError, RecordingError
-from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
+from psd_deflection.foreign_yaml import tree_of_file
 from psd_deflection.recordings.csv_reader import CsvRecording
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
@@ -31,11 +31,13 @@ def read_observation(
     *,
     namespace: str | None = None,
     warn: Callable[[str], None] | None = None,
+    any_rate: bool = False,
 ) -> Observation:
     """One recording with its rig (by default from its own parameters), changed by ``overrides``.
 
     ``source``: the recording or its path. ``where``: where the overrides are from, for a message.
-    ``namespace``: as in :func:`open_recording`. ``warn``: told if the recording names no rig.
+    ``namespace``: as in :func:`open_recording`. ``warn``: told if the recording names no rig. ``any_rate``: if its
+    times say another sample rate than the rig file, they are believed, and the observation says so.
 
     Raises RecordingError if it has no loads or cannot be read, ConfigError for a bad override.
 
@@ -54,7 +56,11 @@ def read_observation(
     recording = recording.with_block_size(rig.estimator.block_size)
     samples = recording.samples
     rate = recording.sample_rate_hz
-    if rate > 0.0 and abs(rate / rig.converter.sample_rate_hz - 1.0) > 0.01:
+    stated = 0.0
+    if rate > 0.0 and abs(rate / rig.converter.sample_rate_hz - 1.0) > 0.01 and any_rate:
+        stated = rig.converter.sample_rate_hz
+        rig = replace_values(rig, {'converter.sample_rate_hz': float(f'{rate:.5g}')}, where)
+    elif rate > 0.0 and abs(rate / rig.converter.sample_rate_hz - 1.0) > 0.01:
         raise RecordingError(
             f'{path}: {rate:.1f} samples/s, but the rig file says converter.sample_rate_hz = '
             f'{rig.converter.sample_rate_hz:g}; set it to what was recorded'
@@ -99,7 +105,14 @@ def read_observation(
             warm = np.interp(t_ns, at.astype(np.float64), celsius)
     digest = '' if isinstance(recording, SimulatedRecording) else _digest(path)
     return Observation(
-        path.name, rig, Wiring.from_rig(rig).to_psds(volts), held, warm, digest=digest, unknown_load=(before, after)
+        path.name,
+        rig,
+        Wiring.from_rig(rig).to_psds(volts),
+        held,
+        warm,
+        digest=digest,
+        unknown_load=(before, after),
+        stated_rate_hz=stated,
     )
 
 
@@ -132,6 +145,7 @@ def read_observations(
     *,
     namespace: str | None = None,
     warn: Callable[[str], None] | None = None,
+    any_rate: bool = False,
 ) -> list[Observation]:
     """All of ``sources``: recordings (open or by path), or ``.yaml`` lists with the parameters that differ in each::
 
@@ -143,25 +157,24 @@ def read_observations(
     out: list[Observation] = []
     for source in sources:
         if isinstance(source, Recording):
-            out.append(read_observation(source, rig, namespace=namespace, warn=warn))
+            out.append(read_observation(source, rig, namespace=namespace, warn=warn, any_rate=any_rate))
             continue
         path = Path(source)
         if path.suffix.lower() not in ('.yaml', '.yml') or path.name == 'metadata.yaml':
-            out.append(read_observation(path, rig, namespace=namespace, warn=warn))
+            out.append(read_observation(path, rig, namespace=namespace, warn=warn, any_rate=any_rate))
             continue
         for i, (name, overrides) in enumerate(_listed(path)):
             entry = f'{path}: entry {i + 1}'
-            out.append(read_observation(path.parent / name, rig, overrides, entry, namespace=namespace, warn=warn))
+            out.append(
+                read_observation(
+                    path.parent / name, rig, overrides, entry, namespace=namespace, warn=warn, any_rate=any_rate
+                )
+            )
     return out
 
 
 def _listed(path: Path) -> list[tuple[str, dict[str, object]]]:
-    try:
-        tree = parse_yaml(read_text(path, MAX_FILE_BYTES))
-    except OSError as error:
-        raise ConfigError(f'{path}: cannot be read as a list of recordings ({error.strerror or error})') from None
-    except YamlError as error:
-        raise ConfigError(f'{path}{error.where}: {error}') from None
+    tree = tree_of_file(path, 'list of recordings')
     if not isinstance(tree, list) or not tree:
         raise ConfigError(f'{path}: must be a list of "- recording: FILE" with optional "overrides:"')
     out: list[tuple[str, dict[str, object]]] = []

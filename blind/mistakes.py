@@ -1,0 +1,148 @@
+"""Mistakes that people make with a rig, put into a recording of the second generator; and faultless oddities."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from blind.generator import Array, Generator
+from psd_deflection.config import Rig, replace_values
+from psd_deflection.discovery.observation import Observation
+
+LENGTH = 0.585
+"""m, of the rig file."""
+
+Make = Callable[[float, Observation, np.random.Generator], list[Observation]]
+
+
+def _volts(o: Observation, volts: Array) -> list[Observation]:
+    return [dataclasses.replace(o, volts=volts)]
+
+
+def _sign(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+    signs = np.ones(6)
+    signs[int(size)] = -1.0
+    return _volts(o, o.volts * signs)
+
+
+def _axes(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+    order = [1, 0, 2, 3, 4, 5] if size == 1.0 else [0, 1, 2, 4, 3, 5]
+    return _volts(o, o.volts[:, order])
+
+
+def _psds(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+    return _volts(o, o.volts[:, [3, 4, 5, 0, 1, 2]])
+
+
+def _load_sign(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+    signs = np.ones(3)
+    signs[int(size)] = -1.0
+    return [dataclasses.replace(o, loads=o.loads * signs)]
+
+
+def _unit(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+    return [dataclasses.replace(o, loads=o.loads / np.array([size, size, 1.0]))]
+
+
+def _delay(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+    at = np.clip(np.arange(len(o.loads)) - round(size / o.period), 0, len(o.loads) - 1)
+    return [dataclasses.replace(o, loads=o.loads[at])]
+
+
+def _rig(name: str) -> Make:
+    """The recording is right, the rig file is not: what it says times the size would be."""
+
+    def make(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+        true = o.rig.values[name]
+        if not isinstance(true, float):
+            raise TypeError(f'{name} = {true!r}: must be a number')
+        return [dataclasses.replace(o, rig=replace_values(o.rig, {name: true / size}))]
+
+    return make
+
+
+def _zero(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+    turn = rng.choice((-1.0, 1.0), 4)
+    shift = np.zeros(6)
+    shift[[0, 1, 3, 4]] = size / o.rig.amplifier.sensitivity * turn * rng.uniform(0.5, 1.0, 4)
+    half = len(o.volts) // 2
+    first = dataclasses.replace(o, name='first', volts=o.volts[:half], loads=o.loads[:half])
+    rest = dataclasses.replace(o, name='second', volts=o.volts[half:] + shift, loads=o.loads[half:])
+    if o.temperature is None:
+        return [first, rest]
+    return [
+        dataclasses.replace(first, temperature=np.full(half, 21.0)),
+        dataclasses.replace(rest, temperature=np.full(len(rest.volts), 21.0)),
+    ]
+
+
+def _noise(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+    return [dataclasses.replace(o, rig=replace_values(o.rig, {'amplifier.noise': o.rig.amplifier.noise / size}))]
+
+
+def _coverage(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+    loads, first = o.loads.copy(), round(size * len(o.loads))
+    loads[:first] = 0.0
+    return [dataclasses.replace(o, loads=loads, unknown_load=(first, 0))]
+
+
+def _stuck(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+    volts, channel = o.volts.copy(), int(rng.choice((0, 1, 3, 4)))
+    start = int(rng.uniform(0.1, 0.6) * len(volts))
+    volts[start : start + round(size / o.period), channel] = volts[start, channel]
+    return _volts(o, volts)
+
+
+def _jump(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+    volts, psd, turn = o.volts.copy(), int(rng.integers(0, 2)), rng.uniform(0.0, 2.0 * np.pi)
+    start = int(rng.uniform(0.2, 0.8) * len(volts))
+    along = np.array([np.cos(turn), np.sin(turn)]) * size / o.rig.amplifier.sensitivity
+    volts[start:, 3 * psd : 3 * psd + 2] += along
+    return _volts(o, volts)
+
+
+def _gaps(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+    volts = o.volts.copy()
+    volts[rng.random(len(volts)) < size] = np.nan
+    return _volts(o, volts)
+
+
+def _outliers(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+    bad = rng.random(o.volts.shape) < size
+    return _volts(o, np.where(bad, rng.uniform(-10.0, 10.0, bad.shape), o.volts))
+
+
+def _under_load(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
+    first = int(rng.uniform(0.05, 0.2) * len(o.volts))
+    warm = None if o.temperature is None else np.full(len(o.volts) - first, 21.0)
+    return [dataclasses.replace(o, volts=o.volts[first:], loads=o.loads[first:], temperature=warm)]
+
+
+MAKE: Mapping[str, Make] = {
+    'channel_sign': _sign,
+    'axis_swap': _axes,
+    'psd_swap': _psds,
+    'load_sign': _load_sign,
+    'load_unit': _unit,
+    'load_delay': _delay,
+    'sensitivity': _rig('amplifier.sensitivity'),
+    'link_length': _rig('link.length'),
+    'sample_rate': _rig('converter.sample_rate_hz'),
+    'zero': _zero,
+    'noise_level': _noise,
+    'load_coverage': _coverage,
+    'stuck_channel': _stuck,
+    'jump': _jump,
+    'gaps': _gaps,
+    'outliers': _outliers,
+    'under_load': _under_load,
+}
+
+
+def observed(mistake: tuple[str, float], g: Generator, rig: Rig, noise: str, seed: int) -> list[Observation]:
+    """A recording without any hidden effect, with one mistake."""
+    name, size = mistake
+    o = Observation('recording 1', rig, g.record([], noise, seed), g.loads, g.temperature)
+    return MAKE[name](size, o, np.random.default_rng(seed))

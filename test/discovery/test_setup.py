@@ -1,0 +1,262 @@
+"""Mistakes of the set-up: each is named with its size and the line that puts it right, and nothing else is."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psd_deflection.cli.main import main
+from psd_deflection.config import Rig, load_rig, replace_values
+from psd_deflection.discovery.cleaning import clean, outliers, stuck
+from psd_deflection.discovery.discover import Discovery, discover
+from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.result import result, sentence
+from psd_deflection.discovery.setup import likely_delays, likely_jumps, wire
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.recordings.observations import read_observation
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation import loads
+from psd_deflection.simulation.simulator import RigSimulator
+
+RIG = load_rig()
+PUSHES = [(0.0, -40.0, -15.0), (0.0, -40.0, 0.0), (25.0, 0.0, 0.0), (0.0, 15.0, 20.0)]
+HISTORY = loads.steps([(0.0, 0.0, 0.0), *PUSHES, (0.0, 0.0, 0.0)], 1.0).loads
+
+
+def recorded(seed: int = 0, **true: object) -> Observation:
+    """A recording of a rig that differs by ``true`` from the rig file, which stays the nominal one."""
+    rig = replace_values(RIG, {name.replace('__', '.'): value for name, value in true.items()})
+    counts = RigSimulator(rig, seed).step(HISTORY).counts
+    return Observation('seen', RIG, counts.astype(np.float64) * RIG.converter.volts_per_count, HISTORY.copy())
+
+
+def changed(o: Observation, change: Callable[[FloatArray], FloatArray]) -> Observation:
+    return dataclasses.replace(o, volts=change(o.volts.copy()))
+
+
+def loaded(o: Observation, *factors: float) -> Observation:
+    return dataclasses.replace(o, loads=o.loads * np.array(factors))
+
+
+def turned(*channels: int) -> Callable[[FloatArray], FloatArray]:
+    signs = np.ones(6)
+    signs[list(channels)] = -1.0
+    return lambda volts: volts * signs
+
+
+def ordered(*columns: int) -> Callable[[FloatArray], FloatArray]:
+    return lambda volts: volts[:, list(columns)]
+
+
+@pytest.mark.parametrize(
+    ('mistake', 'named'),
+    [
+        (lambda o: o, []),
+        (lambda o: changed(o, turned(1)), [('channel_sign', 'y1', -1.0, 'psd_1.axes: [x, -y]')]),
+        (lambda o: changed(o, turned(3)), [('channel_sign', 'x2', -1.0, "psd_2.axes: [-x, 'y']")]),
+        (lambda o: changed(o, ordered(1, 0, 2, 3, 4, 5)), [('axis_swap', 'psd_1', None, "psd_1.axes: ['y', x]")]),
+        (lambda o: changed(o, ordered(3, 4, 5, 0, 1, 2)), [('psd_swap', 'psd_1 psd_2', None, 'psds_exchanged: true')]),
+        (lambda o: loaded(o, 1.0, -1.0, 1.0), [('load_sign', 'fy', -1.0, 'turn the sign of load_fy in the recording')]),
+        (lambda o: loaded(o, 1.0, 1.0, -1.0), [('load_sign', 'tz', -1.0, 'turn the sign of load_tz in the recording')]),
+        (
+            lambda o: loaded(o, 1 / 9.80665, 1 / 9.80665, 1.0),
+            [
+                (
+                    'load_unit',
+                    'fx fy',
+                    9.80665,
+                    'multiply load_fx load_fy in the recording by 9.80665: it is noted in kg instead of N',
+                )
+            ],
+        ),
+        (
+            lambda o: loaded(o, 1.0, 1.0, 1e3),
+            [
+                (
+                    'load_unit',
+                    'tz',
+                    1e-3,
+                    'multiply load_tz in the recording by 0.001: it is noted in N mm instead of N m',
+                )
+            ],
+        ),
+    ],
+)
+def test_wiring_signs_and_units_are_put_right(
+    mistake: Callable[[Observation], Observation], named: list[tuple[str, str, float | None, str]]
+) -> None:
+    o = recorded()
+    wrong = mistake(o)
+    (mended,), findings, lines = wire([wrong], ())
+    assert [(f.name, f.where, f.value, f.fix) for f in findings] == named
+    np.testing.assert_array_equal(mended.volts, o.volts)
+    np.testing.assert_allclose(mended.loads, o.loads, rtol=1e-9)
+    # The lines alone wire the rig file right.
+    assert replace_values(RIG, lines).values == mended.rig.values
+
+
+def test_a_soft_or_stiff_link_is_no_other_unit() -> None:
+    for modulus in (6.9e11, 6.9e9, 7.2e10, 5e10):
+        _, findings, _ = wire([recorded(link__youngs_modulus=modulus)], ())
+        assert findings == []
+
+
+def found_in(*observations: Observation) -> Discovery:
+    found = discover(observations, RIG)
+    tree = result(found)
+    assert json.loads(json.dumps(tree, allow_nan=False)) == tree
+    return found
+
+
+def test_a_setup_that_explains_all_leaves_nothing_missing() -> None:
+    """A longer link makes EI and GJ look wrong by a cube and by itself: one length explains both."""
+    found = found_in(recorded(link__length=0.585 * 1.02))
+    assert (found.verdict, found.effects) == ('nothing_missing', ())
+    (mistake,) = found.setup
+    assert (mistake.name, mistake.where) == ('link_length', 'link.length')
+    assert mistake.value == pytest.approx(1.02, abs=1e-4)
+    assert mistake.fix.startswith('link.length: 0.596')
+    assert found.floors < 1.05
+    assert 'The set-up is not as' in sentence(found)
+
+
+def test_an_effect_behind_a_mistake_is_named_beside_it() -> None:
+    o = recorded(effects__e__name='sensor_rotation', effects__e__psd=2, effects__e__angle=0.004)
+    found = found_in(changed(o, turned(1)))
+    assert [f.name for f in found.setup] == ['channel_sign']
+    assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 2)']
+    assert found.verdict == 'effects_found'
+    assert found.gap_before > 100 * found.gap_after
+
+
+def test_late_loads_are_named_with_their_delay_and_the_end_is_left_out() -> None:
+    late = recorded()
+    late = dataclasses.replace(late, loads=np.concatenate((np.zeros((40, 3)), late.loads[:-40])))
+    found = found_in(late)
+    assert found.verdict == 'nothing_missing'
+    assert [f.name for f in found.setup] == ['load_delay']
+    assert found.setup[0].value == pytest.approx(0.040, abs=1e-4)
+
+
+def test_the_zero_of_one_of_two_recordings_is_named_with_its_recording() -> None:
+    second = dataclasses.replace(recorded(seed=2), name='second')
+    shift = np.array([0.3, -0.2, 0.0, 0.1, 0.4, 0.0])
+    found = found_in(recorded(), changed(second, lambda volts: volts + shift))
+    assert found.verdict == 'nothing_missing'
+    assert [(f.name, f.where) for f in found.setup] == [('zero', 'second')]
+    assert found.setup[0].fix.startswith('overrides of second: psd_1.zero: [0.000')
+    (fitted,) = [a for a in found.fit.effects if a.effect.name == 'zero']
+    volts = [fitted.values[n] / RIG.amplifier.sensitivity for n in ('x1', 'y1', 'x2', 'y2')]
+    assert volts == pytest.approx([0.3, -0.2, 0.1, 0.4], abs=1e-3)
+
+
+def test_a_jump_is_found_at_its_sample() -> None:
+    o = recorded()
+    o.volts[2600:, 0] += 0.02
+    workspace = Workspace([o])
+    (recording, psd, time), *_ = likely_jumps(workspace, workspace.residual(())[0])
+    assert (recording, psd) == (1, 1)
+    assert time == pytest.approx(2.6, abs=0.004)
+    assert likely_delays(workspace) == []
+
+
+# What is no measurement.
+
+
+@pytest.mark.parametrize('share', [0.001, 0.05])
+def test_outliers_of_any_rate_and_size_are_left_out_and_movement_is_not(share: float) -> None:
+    o = recorded()
+    rng = np.random.default_rng(3)
+    bad = rng.random(o.volts.shape) < share
+    volts = o.volts + np.where(bad, rng.choice((-1.0, 1.0), bad.shape) * rng.uniform(0.1, 5.0, bad.shape), 0.0)
+    cleaned, findings = clean(dataclasses.replace(o, volts=volts), ())
+    gone = np.isnan(cleaned.volts)
+    assert findings == []
+    assert np.mean(gone[bad]) > 0.999
+    assert np.mean(gone[~bad]) < 1e-3
+    # Neither a step of the load nor hum of a hundred times the noise.
+    t = np.arange(len(o.volts))[:, None] / 1000.0
+    assert not outliers(o.volts + 0.2 * np.sin(2.0 * np.pi * 50.0 * t), 5e-4).any()
+
+
+def test_a_stuck_channel_is_named_and_left_out() -> None:
+    o = recorded()
+    o.volts[2500:2600, 4] = o.volts[2500, 4]
+    cleaned, (finding,) = clean(o, ())
+    assert (finding.name, finding.where, finding.value) == ('stuck_channel', 'y2', 2.5)
+    assert np.isnan(cleaned.volts[2501:2600, 4]).all()
+    assert np.isnan(cleaned.volts).sum() <= 101
+    # At the rail a reading may rest, and without noise anywhere.
+    high = np.minimum(o.volts, np.quantile(o.volts[:, 0], 0.5))
+    assert not stuck(high[:, :1], 1e-3, np.full(1, 2e-3), 3e-4).any()
+    assert not stuck(np.zeros((500, 1)), 1e-3, np.zeros(1), 3e-4).any()
+
+
+def test_what_no_load_is_known_of_does_not_count() -> None:
+    """The first 1.5 s fall into a push; before the first known load it is not taken for zero."""
+    o = recorded()
+    unknown = o.loads.copy()
+    unknown[:1500] = 0.0
+    found = found_in(dataclasses.replace(o, loads=unknown, unknown_load=(1500, 0)))
+    assert found.verdict == 'nothing_missing'
+    assert [f.name for f in found.setup] == ['load_coverage']
+    assert found.floors < 1.1
+
+
+def test_a_recording_may_start_under_load_and_in_motion() -> None:
+    o = recorded()
+    cut = dataclasses.replace(o, volts=o.volts[1100:], loads=o.loads[1100:])
+    found = found_in(cut)
+    assert (found.verdict, found.setup) == ('nothing_missing', ())
+    assert found.floors < 1.05
+
+
+@pytest.mark.parametrize('share', [0.3, 0.6])
+def test_lost_samples_cost_precision_and_nothing_else(share: float) -> None:
+    o = recorded(effects__e__name='sensor_rotation', effects__e__psd=2, effects__e__angle=0.004)
+    o.volts[np.random.default_rng(1).random(len(o.volts)) < share] = np.nan
+    found = found_in(o)
+    assert found.setup == ()
+    (named,) = found.effects
+    assert named.active.effect.name == 'sensor_rotation'
+    assert abs(named.active.values['angle'] - 0.004) < 4.0 * named.sd['angle']
+    # A block counts from half of its samples on; of few blocks the gap is not exact.
+    assert found.floors < 1.2
+
+
+def csv_of(o: Observation, path: Path, step: float, rows: Sequence[int] | None = None) -> Path:
+    lines = ['t,x1,y1,sum1,x2,y2,sum2,load_fx,load_fy,load_tz']
+    for i in range(len(o.volts)) if rows is None else rows:
+        numbers = [i * step, *o.volts[i].tolist(), *o.loads[i].tolist()]
+        lines.append(','.join(f'{v:.9g}' for v in numbers))
+    path.write_text('\n'.join(lines) + '\n')
+    return path
+
+
+def test_the_command_prints_the_lines_and_puts_them_into_the_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Y of PSD 1 turned, and times of 800 samples a second against the 1000 of the rig file."""
+    rig = replace_values(RIG, {'converter.sample_rate_hz': 800.0})
+    counts = RigSimulator(rig, 0).step(HISTORY).counts
+    volts = counts.astype(np.float64) * RIG.converter.volts_per_count * np.array([1, -1, 1, 1, 1, 1])
+    path = csv_of(Observation('seen', RIG, volts, HISTORY), tmp_path / 'seen.csv', 1.0 / 800.0)
+    out = tmp_path / 'out'
+    assert main(['discover', str(path), '--out', str(out), '--quiet']) == 0
+    said = capsys.readouterr().out
+    assert 'set-up: channel_sign y1: psd_1.axes: [x, -y]' in said
+    assert 'set-up: sample_rate converter.sample_rate_hz: converter.sample_rate_hz: 800' in said
+    model: Rig = load_rig(out / 'model.yaml')
+    assert model.psds[0].axes == ('x', '-y')
+    assert model.converter.sample_rate_hz == 800.0
+    tree = json.loads((out / 'result.json').read_text())
+    assert tree['verdict'] == 'nothing_missing'
+    assert [s['name'] for s in tree['setup']] == ['sample_rate', 'channel_sign']
+    # With the model nothing is wrong any more.
+    assert clean(read_observation(path, model), ())[1] == []
+    assert wire([read_observation(path, model)], ())[1] == []
