@@ -151,3 +151,6 @@ def mistakes(recordings: int, delays: Sequence[float], jumps: Sequence[tuple[int
 BEGINNING = 'beginning'
 SETUP = frozenset(('sensitivity', 'link_length', 'sample_rate', 'load_delay', 'zero', 'jump'))
 """Names of the effects that are mistakes of the set-up."""
+FIRST = frozenset(('sensitivity', 'link_length', 'sample_rate', 'load_delay'))
+"""Those that touch every channel: beside an effect a small one would stand in for what no effect explains, so they are
+only looked for before any effect is found."""

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.stats import chi2 as chi2_law
 
 from psd_deflection.discovery.fit import Fit, refit
+from psd_deflection.discovery.hidden import FIRST, SETUP
 from psd_deflection.discovery.screen import Score, Screen
 from psd_deflection.discovery.trust import gain_beyond
 from psd_deflection.discovery.workspace import Workspace
@@ -78,6 +79,11 @@ def unphysical(workspace: Workspace, fit: Fit, index: int) -> bool:
         ):
             return True
     return not on
+
+
+def comes_late(effects: Sequence[ActiveEffect]) -> bool:
+    """Whether ``effects`` has one of the catalogue, so that mistakes of ``FIRST`` are no longer looked for."""
+    return any(a.effect.name not in SETUP for a in effects)
 
 
 def far(fit: Fit) -> bool:
@@ -189,7 +195,13 @@ class Search:
             if current.effects:
                 scores = self.screen.score(current.residual, unbound(current))
             taken = {slot(a.effect, a.values) for a in current.effects}
-            scores = [s for s in scores if slot(s.candidate.effect, s.candidate.start) not in taken]
+            late = comes_late(current.effects)
+            scores = [
+                s
+                for s in scores
+                if slot(s.candidate.effect, s.candidate.start) not in taken
+                and not (late and s.candidate.effect.name in FIRST)
+            ]
             if not scores or min(s.p for s in scores) > P_ACCEPT:
                 break
             # From the second effect on, the residual is smaller and the first guess better.
@@ -240,7 +252,12 @@ class Search:
         starts = []
         for a, b, _ in pairs:
             same = slot(a.candidate.effect, a.candidate.start) == slot(b.candidate.effect, b.candidate.start)
-            if not same and {a.candidate.variant, b.candidate.variant} != {key_of(e) for e in current.effects}:
+            mistaken = {a.candidate.effect.name, b.candidate.effect.name} & FIRST
+            if (
+                not same
+                and not mistaken
+                and {a.candidate.variant, b.candidate.variant} != {key_of(e) for e in current.effects}
+            ):
                 starts.append(
                     [a.candidate.from_coefficients(a.coefficients), b.candidate.from_coefficients(b.coefficients)]
                 )
@@ -285,7 +302,8 @@ class Search:
         best: dict[str, Score] = {}
         for s in scores:
             name = s.candidate.effect.name
-            if name == named.effect.name or name in {a.effect.name for a in rest} or s.gain < bar:
+            late = name in FIRST and comes_late(rest)
+            if name == named.effect.name or name in {a.effect.name for a in rest} or s.gain < bar or late:
                 continue
             if name not in best:
                 best[name] = s

@@ -38,6 +38,8 @@ UNIT_TOLERANCE = 0.03
 """Share by which the size of a load may differ from another unit's; the rest is stiffness."""
 NOISE_FACTOR = 2.0
 """Noise that is so many times the rig file's, or so many times less, is told."""
+SEEN = 100.0
+"""A load whose movement has less than so many times the energy of one block's noise says nothing."""
 SMALL = 1e-4
 """m and rad; movements up to this size are in proportion to the load."""
 FARTHEST_S = 1.0
@@ -47,11 +49,13 @@ FARTHEST_S = 1.0
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Movement:
     """Sums over block means: ``squared`` of the readings; ``cross`` (3, 4, 4): load, simulated dot, device's channel;
-    ``own`` (3, 3): of the simulated movements, load by load."""
+    ``own`` (3, 3): of the simulated movements, load by load; ``noise``: square of a block's noise, m^2, by the rig file.
+    """
 
     squared: float
     cross: FloatArray
     own: FloatArray
+    noise: float
 
 
 def _moved(rig: Rig, base: Sequence[ActiveEffect], loads: FloatArray, temperature: FloatArray | None) -> FloatArray:
@@ -94,7 +98,9 @@ def _movement(observations: Sequence[Observation], base: Sequence[ActiveEffect])
         squared += float((seen**2).sum())
         cross += np.einsum('kdt,ct->kdc', moves, seen)
         own += np.einsum('kdt,jdt->kj', moves, moves)
-    return _Movement(squared, cross, own)
+    first = observations[0].rig
+    noise = float(np.mean(first.noises[:, :2] ** 2)) * first.amplifier.sensitivity**2 / first.estimator.block_size
+    return _Movement(squared, cross, own, noise)
 
 
 def _sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
@@ -112,7 +118,11 @@ def _sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
     f = m.own[np.ix_(at, at)]
     scale = np.sqrt(np.diag(f))
     sizes[at] = np.linalg.lstsq(f / np.outer(scale, scale), along[at] / scale, rcond=1e-6)[0] / scale
-    return max(m.squared - float(along[at] @ sizes[at]), 0.0), sizes
+    left = max(m.squared - float(along[at] @ sizes[at]), 0.0)
+    # A load that moved nothing that stands out has no size.
+    with np.errstate(invalid='ignore'):
+        sizes[sizes**2 * np.diag(m.own) < SEEN * m.noise + 1e-3 * left] = np.nan
+    return left, sizes
 
 
 def wire(
