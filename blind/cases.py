@@ -350,6 +350,8 @@ def short_cases() -> list[Case]:
     ]
     out.append(Case('pair-s', 'pair', 'one', (('sensor_gain', 5.0), ('load_direction', 5.0))))
     out.append(Case('alien-s', 'alien', 'one', (('alien_square_crosstalk', 10.0),)))
+    out.append(Case('spread-s', 'spread', 'one', (('sensor_rotation', 3.0), ('load_direction', 300.0))))
+    out.append(Case('mistake-s', 'mistake', 'one', (), mistake=('link_length', 1.02)))
     out += [Case(f'null-s{i}', 'null', 'one', ()) for i in range(3)]
     out += [Case(f'wrong-s{i}', 'wrong', 'one', (), noise=k) for i, k in enumerate(('heavy', 'coloured', 'loud'))]
     return out

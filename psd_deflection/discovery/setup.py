@@ -49,7 +49,7 @@ FARTHEST_S = 1.0
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Movement:
     """Sums over block means: ``squared`` of the readings; ``cross`` (3, 4, 4): load, simulated dot, device's channel;
-    ``own`` (3, 3): of the simulated movements, load by load; ``noise``: square of a block's noise, m^2, by the rig file.
+    ``own`` (3, 3): of the simulated movements, load by load; ``noise``: variance of a block's mean, m^2.
     """
 
     squared: float

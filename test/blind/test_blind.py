@@ -13,8 +13,10 @@ from scipy.integrate import solve_ivp
 from blind import generator, run, score
 from blind.adapter import Model, PlantEffect, discover_in
 from blind.arm import DATA, Arm
-from blind.cases import Case, all_cases, designs, gap_of, scaled, short_cases
+from blind.cases import MISTAKES, Case, all_cases, designs, gap_of, scaled, short_cases
+from blind.mistakes import observed
 from psd_deflection.config import load_rig
+from psd_deflection.discovery.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.declaration import EffectParameter
 from psd_deflection.simulation.simulator import ForwardModel
@@ -88,6 +90,42 @@ def test_a_run_seals_answers_resumes_and_scores(tmp_path: Path, capsys: pytest.C
     answer.write_text(json.dumps(tree))
     assert run.main([*words, '--score']) == 1
     assert 'null-s0: truth nothing' in capsys.readouterr().out
+
+
+def test_every_mistake_has_five_sizes_and_changes_the_recording() -> None:
+    (g,) = designs('one')
+    rig = load_rig()
+    sound = Observation('recording 1', rig, g.record([], 'white', 1), g.loads, g.temperature)
+    for name, sizes in MISTAKES.items():
+        assert len(sizes) == 5
+        seen = observed((name, sizes[0]), g, rig, 'white', 1)
+        same = [
+            o.rig.values == rig.values and np.array_equal(o.volts, sound.volts) and np.array_equal(o.loads, sound.loads)
+            for o in seen
+        ]
+        assert not all(same), name
+
+
+@pytest.mark.statistics
+def test_a_mistake_is_named_and_no_effect_beside_it() -> None:
+    case = next(c for c in short_cases() if c.kind == 'mistake')
+    answer, _ = run.answer(case, [])
+    row = score.Row(case.key, case.kind, 0.0, True, [], answer, case.mistake[0])
+    text, _ = score.summary([row])
+    assert 'mistake of the set-up named, and nothing else: 100.0 % (1/1' in text
+    assert answer['verdict'] == 'nothing_missing'
+    worse = score.Row(case.key, 'null', 0.0, True, [], answer)
+    assert 'mistake named where there is none: 100.0 % (1/1' in score.summary([worse])[0]
+
+
+def test_what_is_left_unsaid_fails_the_suite() -> None:
+    gap = {'before': 4.0, 'after': 2.0, 'floor': 1.0, 'heldout_after': 1.0}
+    answer = {'verdict': 'effects_found', 'effects': [], 'unknown': [], 'setup': [], 'gap': gap}
+    for floors, unsaid in ((1.4, 0), (1.6, 1)):
+        whole = {**answer, 'remaining': {'floors': floors}, 'provenance': {'forward_simulations': 1}}
+        text, _ = score.summary([score.Row('spread', 'spread', 3.0, True, [{'name': 'creep'}], whole)])
+        assert f'answers that leave more than 1.5 floors unsaid: {unsaid}' in text
+        assert 'all of a pair or triple of 1:10:100 floors: 0.0 % (0/1' in text
 
 
 def test_intervals_are_clopper_and_pearsons() -> None:
