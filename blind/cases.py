@@ -174,7 +174,6 @@ DRAWS: Mapping[str, Draw] = {
     'alien_soft_mode': _one('size', 1e-4),
     'alien_square_crosstalk': _one('size', 1.0),
     'alien_thermal_square': _one('size', 1e-7),
-    'alien_jump': _one('size', 1e-6),
     'alien_gain_drift': _one('size', 1e-4),
     'alien_thermal_gain': _one('size', 1e-4),
     'alien_rectifier': _one('size', 1e-3),

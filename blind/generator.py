@@ -268,8 +268,6 @@ def _alien_sensors(m: Array, t: Array, warm: Array, effects: Sequence[Spec]) -> 
             m[:, 0] += size * m[:, 1] ** 2
         elif e['name'] == 'alien_thermal_square':
             m[:, 3] += size * warm**2
-        elif e['name'] == 'alien_jump':
-            m[:, 1] += size * (t > 0.55 * t[-1])
         elif e['name'] == 'alien_gain_drift':
             m[:, 1] *= 1.0 + size * t
         elif e['name'] == 'alien_thermal_gain':

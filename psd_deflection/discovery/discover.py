@@ -22,7 +22,7 @@ from psd_deflection.discovery.cleaning import clean
 from psd_deflection.discovery.coincidence import Coincidence, coincidences
 from psd_deflection.discovery.experiment import Suggestion, suggest
 from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.hidden import SETUP, beginning, mistakes
+from psd_deflection.discovery.hidden import FIRST, SETUP, beginning, mistakes
 from psd_deflection.discovery.localise import Localisation, localise
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.screen import Screen
@@ -199,16 +199,19 @@ def discover(
         workspace = Workspace(observations, base)
     workspace.base = (*base, *_beginnings(workspace))
     # Signatures that are kept are those of recordings as they were, from rest.
-    other = bool(findings) or len(workspace.base) > len(base) or any(d > 0.0 for d in delays)
-    kept = SignatureBank() if bank is None or other else bank
+    changed = bool(findings) or len(workspace.base) > len(base) or any(d > 0.0 for d in delays)
+    kept = SignatureBank() if bank is None or changed else bank
     kept.nominal(workspace)
     found = _proposals(workspace)
     if lattice is not None:
         workspace.base = (*workspace.base, lattice)
 
+    looked_for = set(FIRST)
+
     def screen(ws: Workspace, current: Fit | None) -> Screen:
         residual = ws.residual(ws.base)[0] if current is None else current.residual
         more = mistakes(len(observations), delays, likely_jumps(ws, residual))
+        more = [e for e in more if e.name not in FIRST or e.name in looked_for]
         listed = candidates(physics, found, (*without, *(e.name for e in of_lattice)), more)
         if current is None or not far(current):
             return Screen(ws, [(c, kept.get(c, ws)) for c in listed])
@@ -220,6 +223,19 @@ def discover(
     progress('signatures of every effect')
     search = Search(workspace, screen, progress)
     result = search.run()
+    names = {a.effect.name for a in result.fit.effects}
+    if names & FIRST and names - SETUP:
+        # A mistake that needs an effect beside it must be much better than effects alone.
+        looked_for.clear()
+        noise = workspace.noise
+        other = Search(workspace, screen, progress)
+        plain = other.run()
+        if plain.fit.chi2 + other.penalty * plain.fit.parameters < (
+            result.fit.chi2 + search.penalty * result.fit.parameters + BIC_ACCEPT
+        ):
+            search, result = other, plain
+        else:
+            workspace.noise = noise
     progress('weighing')
     heldout, fit = _accept(search, result, rng)
     seen = 0.0 if lattice is None else 2.0 * _lattice_gain(workspace, lattice)

@@ -28,6 +28,11 @@ BIC_ACCEPT = 10.0
 """Smallest improvement of BIC by an accepted effect."""
 FAR = 10.0
 """Chi-square per value from which on what remains is screened with signatures beside the effects found so far."""
+LIKELY = 0.3
+"""A mistake of the set-up is tried if it explains, to first order, this share of what the best candidate explains."""
+NEARLY_ALL = 0.01
+"""It is taken before any effect if it alone leaves less than this share of the chi-square beyond noise."""
+OTHER_RATES = (-0.2, -0.1, -0.04, 0.04, 0.1, 0.25)
 MAX_EFFECTS = 4
 TRIALS = 7
 BUDGET = 500
@@ -124,10 +129,16 @@ class Search:
         self.workspace = workspace
         self._make_screen = screen
         self._progress = progress
+        self._begun = workspace.simulations
         self.screen = screen(workspace, None)
         self.penalty = float(np.log(workspace.effective_size()))
         self.trace: list[str] = []
         self._without: dict[int, tuple[Fit, list[Fit]]] = {}
+
+    @property
+    def spent(self) -> int:
+        """Forward simulations of this search."""
+        return self.workspace.simulations - self._begun
 
     def without_each(self, fit: Fit, null: Fit) -> list[Fit]:
         """``fit`` refitted without each of its effects in turn; ``null``: the fit of no effect."""
@@ -189,18 +200,16 @@ class Search:
         null = refit(ws, ())
         scores = self.screen.score(null.residual)
         first_scores = scores
-        current = null
+        current = self._mistake(null, scores)
         renoised = False
-        while len(current.effects) < MAX_EFFECTS and ws.simulations < BUDGET:
+        while len(current.effects) < MAX_EFFECTS and self.spent < BUDGET:
             if current.effects:
                 scores = self.screen.score(current.residual, unbound(current))
             taken = {slot(a.effect, a.values) for a in current.effects}
-            late = comes_late(current.effects)
             scores = [
                 s
                 for s in scores
-                if slot(s.candidate.effect, s.candidate.start) not in taken
-                and not (late and s.candidate.effect.name in FIRST)
+                if slot(s.candidate.effect, s.candidate.start) not in taken and s.candidate.effect.name not in FIRST
             ]
             if not scores or min(s.p for s in scores) > P_ACCEPT:
                 break
@@ -216,9 +225,9 @@ class Search:
                 renoised = True
                 current = self.renoise(current)
                 null = refit(ws, ())
-            if far(current) and ws.simulations < BUDGET:
+            if far(current) and self.spent < BUDGET:
                 self.screen = self._make_screen(ws, current)
-            if len(current.effects) == 2 and ws.simulations < BUDGET:
+            if len(current.effects) == 2 and self.spent < BUDGET:
                 current = self._try_pairs(null, current)
         current = self._drop(null, current)
         if current.effects:
@@ -227,6 +236,29 @@ class Search:
         current, others = self._swap(null, current)
         p, delta_bic, delta_chi2 = self._weigh(null, current)
         return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace)
+
+    def _mistake(self, null: Fit, scores: Sequence[Score]) -> Fit:
+        """One of the mistakes that touch every channel if it explains nearly all by itself, else ``null``."""
+        if not scores or min(s.p for s in scores) > P_ACCEPT:
+            return null
+        best = max(s.gain for s in scores)
+        starts: list[list[ActiveEffect]] = []
+        for s in scores:
+            if s.candidate.effect.name not in FIRST:
+                continue
+            if s.gain > LIKELY * best:
+                starts.append([s.candidate.from_coefficients(s.coefficients)])
+            if s.candidate.effect.name == 'sample_rate' and far(null):
+                # A linear step does not reach another frequency of the ringing.
+                starts += [[ActiveEffect(s.candidate.effect, {'scale': v})] for v in OTHER_RATES]
+        found = self._best_of(starts, 2, 12)
+        size = self.workspace.size
+        if found is None or not self._passes(null, found, null):
+            return null
+        if found.chi2 - size > NEARLY_ALL * (null.chi2 - size):
+            return null
+        self._say('the set-up: ' + found.effects[-1].label)
+        return found
 
     def _swap(self, null: Fit, current: Fit) -> tuple[Fit, list[list[Fit]]]:
         """Try to replace each effect by its alternatives and keep the better model; at most two rounds."""
@@ -239,7 +271,7 @@ class Search:
                 fits = self.alternatives(null, current, i, gains[i])
                 others.append(fits)
                 best = min([best, *fits], key=self._bic)
-            spent = self.workspace.simulations > 1.5 * BUDGET
+            spent = self.spent > 1.5 * BUDGET
             if swaps == 2 or spent or self._bic(best) > self._bic(current) - 2.0:
                 break
             self._say('swapping to ' + ', '.join(a.label for a in best.effects))
@@ -290,7 +322,7 @@ class Search:
 
         ``gain``: what the named effect explains, in chi-square; ``null``: the fit of no effect.
         """
-        if self.workspace.simulations > 2 * BUDGET:
+        if self.spent > 2 * BUDGET:
             return []
         named = current.effects[index]
         rest = [a for j, a in enumerate(current.effects) if j != index]
@@ -309,12 +341,12 @@ class Search:
                 best[name] = s
         # The best eight: an exact confounder scores as high as the named effect itself. If the search was
         # already expensive, the case is complicated; try two only.
-        ranked = sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.workspace.simulations < BUDGET else 2]
+        ranked = sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.spent < BUDGET else 2]
         fits = []
         for s in ranked:
             start = [*rest, s.candidate.from_coefficients(s.coefficients)]
             quick = refit(self.workspace, start, iterations=3)
-            if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain) and self.workspace.simulations < 2 * BUDGET:
+            if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain) and self.spent < 2 * BUDGET:
                 quick = refit(self.workspace, quick.effects, iterations=8)
             fits.append(quick)
         fits.sort(key=lambda f: f.chi2)

@@ -105,12 +105,11 @@ def _movement(observations: Sequence[Observation], base: Sequence[ActiveEffect])
 
 def _sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
     """What ``wiring`` leaves of the movement, and the size of each load (3,) over the noted one; NaN for none."""
-    columns = [(0, 1, None, 2, 3)[c] for c in np.array(wiring.columns)[list(DOT_CHANNELS)]]
+    columns = [DOT_CHANNELS.index(wiring.columns[c]) for c in DOT_CHANNELS]
     signs = np.array(wiring.signs)[list(DOT_CHANNELS)]
-    along = np.array(
-        [sum(s * m.cross[k, d, c] for d, (s, c) in enumerate(zip(signs, columns, strict=True))) for k in range(3)]
-    )
-    applied = np.diag(m.own) > 1e-6 * m.squared * min(1.0, float(np.diag(m.own).max()) / max(m.squared, 1e-300))
+    along = np.einsum('d,kd->k', signs, m.cross[:, range(4), columns])
+    # A load in kN or mN is a million times weaker or stronger than the others.
+    applied = np.diag(m.own) > 1e-18 * float(np.diag(m.own).max())
     sizes = np.full(3, np.nan)
     if not applied.any():
         return m.squared, sizes
