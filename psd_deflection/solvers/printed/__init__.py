@@ -1,0 +1,1 @@
+"""The methods as the thesis prints them, for comparison only: a live run never publishes them as its answer."""
