@@ -45,6 +45,7 @@ COMMANDS: dict[str, str] = {
     'discover': 'find the physical effect that the simulation of a recording lacks',
     'effects': 'list the effects that can be simulated and discovered, or explain one',
     'check': 'check the wiring of a rig: guided by hand, or from a recording with known loads',
+    'validate': 'compare the estimates of a recording with a camera, a stage or a tracker',
     'devices': 'list the serial ports and the devices on them, and suggest parameters',
     'plot': 'draw a recording as PNG, SVG, PDF or HTML',
     'info': 'summarise a recording',
