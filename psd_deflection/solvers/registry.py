@@ -35,10 +35,10 @@ SOLVERS: MappingProxyType[str, Entry] = MappingProxyType(
         'minimum_tilt': Entry('psd_deflection.solvers.minimum_tilt:MinimumTiltSolver'),
         'pose': Entry('psd_deflection.solvers.pose:PoseSolver'),
         'base_pair': Entry('psd_deflection.solvers.base_pair:BasePairSolver'),
-        'iterative_printed': Entry('psd_deflection.solvers.printed.iterative:IterativePrintedSolver', 'iterative'),
-        'appendix_d': Entry('psd_deflection.solvers.printed.appendix_d:AppendixDSolver', 'iterative'),
-        'appendix_d_ols': Entry('psd_deflection.solvers.printed.appendix_d_least_squares:AppendixDOlsSolver', 'ols'),
-        'appendix_d_wls': Entry('psd_deflection.solvers.printed.appendix_d_least_squares:AppendixDWlsSolver', 'wls'),
+        'iterative_printed': Entry('psd_deflection.thesis.iterative_printed:IterativePrintedSolver', 'iterative'),
+        'appendix_d': Entry('psd_deflection.thesis.appendix_d:AppendixDSolver', 'iterative'),
+        'appendix_d_ols': Entry('psd_deflection.thesis.appendix_d_least_squares:AppendixDOlsSolver', 'ols'),
+        'appendix_d_wls': Entry('psd_deflection.thesis.appendix_d_least_squares:AppendixDWlsSolver', 'wls'),
     }
 )
 """The default first."""

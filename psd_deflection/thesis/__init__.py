@@ -1,1 +1,1 @@
-"""How the methods of the thesis compare with the corrected ones, its figures and its scaling study."""
+"""The methods of the thesis as printed, how they compare with the corrected ones, and its scaling study."""

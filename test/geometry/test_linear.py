@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.geometry.linear import condition_number, design_matrix, error_bound, gain_matrix
-from psd_deflection.solvers.printed.appendix_d_least_squares import printed_design_matrix
+from psd_deflection.thesis.appendix_d_least_squares import printed_design_matrix
 from psd_deflection.thesis.comparison import DIRECT, SIDEBAR, printed_bound
 
 

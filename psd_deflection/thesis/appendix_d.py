@@ -23,7 +23,7 @@ from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.geometry.plate import flat_points
 from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
-from psd_deflection.solvers.printed.iterative import NO_COVARIANCE
+from psd_deflection.thesis.iterative_printed import NO_COVARIANCE
 
 Branch = Literal['A', 'B', 'none']
 
