@@ -130,9 +130,9 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
         )
     volts[still] = np.nan
     simulated = ForwardModel(o.rig, base).expect(o.loads, o.temperature).volts.T
-    # What the simulation does, as with loads in a wrong unit, is none, nor what the link does at a step of the load.
-    rough = maximum_filter1d(outliers(volts, least), 7, axis=0)
-    volts[outliers(volts - simulated, least) & rough] = np.nan
+    rough, left = outliers(volts, least), outliers(volts - simulated, least)
+    # Loads in a wrong unit make the simulation rougher than the readings; else it explains their steps.
+    volts[rough if left.sum() > 2 * rough.sum() else left] = np.nan
     if o.stated_rate_hz:
         rate = o.rig.converter.sample_rate_hz
         factor = rate / o.stated_rate_hz
