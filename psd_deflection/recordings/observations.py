@@ -79,7 +79,7 @@ def read_observation(
             f'(CSV columns load_fx, load_fy, load_tz, or the topic /link_tip/load)'
         )
     times = np.array([a.t_ns - start for a in applied], dtype=np.int64)
-    held = _held(times, np.array([a[1:] for a in applied]), t_ns, grace, np.zeros(3))
+    held = held_at(times, np.array([a[1:] for a in applied]), t_ns, grace, np.zeros(3))
     temperatures = recording.temperatures()
     warm: FloatArray | None = None
     if temperatures:
@@ -87,14 +87,14 @@ def read_observation(
         celsius = np.array([r.celsius for r in temperatures])
         if isinstance(recording, CsvRecording | SimulatedRecording):
             # A row's value holds until the next differs; a thermometer's messages are points on a curve.
-            warm = _held(at, celsius, t_ns, grace, celsius[0])
+            warm = held_at(at, celsius, t_ns, grace, celsius[0])
         else:
             warm = np.interp(t_ns, at.astype(np.float64), celsius)
-    digest = '' if isinstance(recording, SimulatedRecording) else _digest(path)
+    digest = '' if isinstance(recording, SimulatedRecording) else digest_of(path)
     return Observation(path.name, rig, Wiring.from_rig(rig).to_psds(volts), held, warm, digest=digest)
 
 
-def _held(
+def held_at(
     times: IntArray, values: FloatArray, t_ns: FloatArray, grace: float, before: FloatArray | float
 ) -> FloatArray:
     order = np.argsort(times, kind='stable')
@@ -104,7 +104,7 @@ def _held(
     return out
 
 
-def _digest(path: Path) -> str:
+def digest_of(path: Path) -> str:
     digest = hashlib.sha256()
     files = sorted(p for p in path.rglob('*') if p.is_file()) if path.is_dir() else [path]
     try:
