@@ -21,13 +21,15 @@ from psd_deflection.calibrating.fit import (
     SIZE,
     Fit,
     Kind,
-    Noise,
+    Mask,
     Prior,
     compliances,
     fit,
     linearised,
     posterior,
     prior_of_rig,
+    refitted,
+    residual_at,
     weight_matrices,
 )
 from psd_deflection.calibrating.observation import Rows, Run, joined, noise_of, rows_of, smoothed, usable_dots
@@ -35,10 +37,8 @@ from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, RecordingError
 from psd_deflection.misalignment.model import COUNT, INDEX, ZERO
 from psd_deflection.misalignment.rig import RigVector, vector_of_rig
-from psd_deflection.records import FloatArray
+from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.solvers.registry import psds_at_base
-
-Mask = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 OPEN = 0.9
 """A standard deviation above this share of the tolerance: undetermined."""
@@ -47,9 +47,9 @@ CONTRADICTED = 3.5
 WIDER = 10.0
 FOLDS = 8
 """Pieces of a recording, every second of which is held out in turn."""
-OFTEN = 1000
+OFTEN = 300
 """Rows used to find the clock's offset roughly."""
-CLOCK_RANGE, CLOCK_STEP = 0.060, 0.002
+CLOCK_RANGE, CLOCK_STEP = 0.060, 0.004
 """s, within which the offset of the reference's clock is looked for, and in what steps."""
 
 
@@ -145,7 +145,7 @@ def calibrate(
     first = fit(rows, rig, prior, kind, free=free)
     first, prior, widened = _believed(first, rows, rig, prior, kind, free)
     free = _determined(first, prior, free)
-    whole = fit(rows, rig, prior, kind, free=free, start=first.values)
+    whole = fit(rows, rig, prior, kind, free=free, start=first)
     progress('held-out motion')
     whole, dropped = _without_refused_terms(whole, rows, rig, prior, kind)
     before = before_of(vector, prior)
@@ -236,7 +236,7 @@ def _believed(
         covariance[worst] *= WIDER
         covariance[:, worst] *= WIDER
         prior = Prior(prior.mean, covariance)
-        first = fit(rows, rig, prior, kind, free=free, start=first.values)
+        first = fit(rows, rig, prior, kind, free=free, start=first)
     return first, prior, widened
 
 
@@ -251,7 +251,7 @@ def _determined(first: Fit, prior: Prior, free: Mask) -> Mask:
         free[worst] = False
 
 
-def _pieces(rows: Rows) -> FloatArray:
+def _pieces(rows: Rows) -> IntArray:
     """Which of two halves each row belongs to: every second of ``FOLDS`` pieces of its recording."""
     out = np.zeros(len(rows), dtype=np.int64)
     for run in np.unique(rows.run):
@@ -260,37 +260,33 @@ def _pieces(rows: Rows) -> FloatArray:
     return out
 
 
-def _misfit(z: FloatArray, rows: Rows, rig: Rig, kind: Kind, noise: Noise, good: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Weighted and plain squares (n,) of the residuals at ``z``."""
-    linear = linearised(rows, z, rig, kind)
-    inverse = weight_matrices(linear, rows, noise) * good[:, None, None]
-    weighted = np.einsum('ni,nij,nj->n', linear.residual, inverse, linear.residual)
+def _misfit(
+    residual: FloatArray, whole: Fit, inverse: FloatArray, rows: Rows, kind: Kind
+) -> tuple[FloatArray, FloatArray]:
+    """Weighted and plain squares (n,) of ``residual`` (n, 4)."""
+    weighted = np.einsum('ni,nij,nj->n', residual, inverse, residual) * whole.weights
     if kind == 'self':
-        across = np.linalg.svd(linear.by_pose)[0][:, :, 3]
-        plain = np.einsum('ni,ni->n', across, linear.residual) ** 2
-    else:
-        plain = np.mean(linear.residual**2, axis=1)
-    return weighted, plain * good
+        across = np.linalg.svd(whole.linear.by_pose)[0][:, :, 3]
+        return weighted, np.einsum('ni,ni->n', across, residual) ** 2 * whole.weights
+    return weighted, np.mean(residual**2, axis=1) * whole.weights
 
 
-def _held_values(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask, out: int) -> FloatArray:
-    """Parameters fitted without the half ``out``."""
-    kept = np.flatnonzero(_pieces(rows) != out)
-    return fit(
-        rows.at(kept), rig, prior, kind, free=free, noise=whole.noise, weights=whole.weights[kept], start=whole.values
-    ).values
+def _held_out(whole: Fit, rows: Rows, prior: Prior, free: Mask) -> FloatArray:
+    """Residuals (n, 4) of each half of the rows by the parameters that the other half gives."""
+    half = _pieces(rows)
+    out = np.empty_like(whole.linear.residual)
+    for number in (0, 1):
+        z = refitted(whole, rows, prior, (half != number).astype(np.float64), free)
+        out[half == number] = residual_at(whole, z)[half == number]
+    return out
 
 
 def _heldout(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, before: FloatArray) -> tuple[Gap, bool]:
     """The gaps, and whether unseen motion is predicted worse than with the rig file."""
-    half = _pieces(rows)
-    old, old_plain = _misfit(before, rows, rig, kind, whole.noise, whole.weights)
-    _, new_plain = _misfit(whole.values, rows, rig, kind, whole.noise, whole.weights)
-    new, held_plain = np.zeros(len(rows)), np.zeros(len(rows))
-    for out in (0, 1):
-        z = _held_values(whole, rows, rig, prior, kind, whole.free, out)
-        own = np.flatnonzero(half == out)
-        new[own], held_plain[own] = _misfit(z, rows.at(own), rig, kind, whole.noise, whole.weights[own])
+    inverse = weight_matrices(whole.linear, rows, whole.noise)
+    old, old_plain = _misfit(linearised(rows, before, rig, kind).residual, whole, inverse, rows, kind)
+    _, new_plain = _misfit(whole.linear.residual, whole, inverse, rows, kind)
+    new, held_plain = _misfit(_held_out(whole, rows, prior, whole.free), whole, inverse, rows, kind)
 
     def rms(plain: FloatArray) -> float:
         return float(np.sqrt(plain.sum() / max(whole.weights.sum(), 1.0)))
@@ -304,23 +300,18 @@ def _without_refused_terms(
 ) -> tuple[Fit, list[str]]:
     """Drop a non-linearity that unseen motion contradicts: it then keeps the file's value and tolerance."""
     dropped: list[str] = []
-    half = _pieces(rows)
     for name in ('psd_1.nonlinearity', 'psd_2.nonlinearity'):
         i = INDEX[name]
         if not whole.free[i]:
             continue
         without = whole.free.copy()
         without[i] = False
-        costs = np.zeros((2, len(rows)))
-        for out in (0, 1):
-            own = np.flatnonzero(half == out)
-            for j, free in enumerate((whole.free, without)):
-                z = _held_values(whole, rows, rig, prior, kind, free, out)
-                costs[j, own] = _misfit(z, rows.at(own), rig, kind, whole.noise, whole.weights[own])[0]
+        inverse = weight_matrices(whole.linear, rows, whole.noise)
+        costs = [_misfit(_held_out(whole, rows, prior, f), whole, inverse, rows, kind)[0] for f in (whole.free, without)]
         more = costs[0] - costs[1]
         if more.sum() > 2.0 * float(np.sqrt(np.sum(more**2))):
             dropped.append(name)
-            whole = fit(rows, rig, prior, kind, free=without, start=whole.values)
+            whole = fit(rows, rig, prior, kind, free=without, start=whole)
     return whole, dropped
 
 

@@ -25,6 +25,7 @@ from psd_deflection.misalignment.model import ALL, COUNT, TOLERANCES, ZERO, by_p
 from psd_deflection.misalignment.rig import CLAMP, RigVector, known_of_rig, stated_sd, vector_of_rig
 from psd_deflection.records import FloatArray
 
+Mask = np.ndarray[tuple[int], np.dtype[np.bool_]]
 Kind = Literal['reference', 'loads', 'self']
 
 NAMES = (*(p.name for p in ALL), *CLAMP.values(), 'reference.clock')
@@ -109,7 +110,7 @@ class Fit:
     linear: Linear
     weights: FloatArray
     noise: Noise
-    free: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    free: Mask
 
 
 def compliances(rig: Rig, z: FloatArray) -> FloatArray:
@@ -166,44 +167,55 @@ def fit(
     prior: Prior,
     kind: Kind = 'reference',
     *,
-    free: np.ndarray[tuple[int], np.dtype[np.bool_]] | None = None,
-    noise: Noise | None = None,
-    weights: FloatArray | None = None,
-    start: FloatArray | None = None,
+    free: Mask,
+    start: Fit | None = None,
 ) -> Fit:
-    """Fit ``rows``. ``noise``, ``weights``: taken as given (for parts of the rows of another fit), else estimated.
+    """Fit ``rows``. ``start``: an earlier fit of the same rows, to begin from.
 
     ``free``: parameters that are not fitted keep the prior's value; their spread enters the covariance of the rest.
     """
-    free = np.ones(SIZE, dtype=bool) if free is None else free
-    z = prior.mean.copy() if start is None else start.copy()
+    z = prior.mean.copy() if start is None else start.values.copy()
     z[~free] = prior.mean[~free]
-    given = noise
-    noise = Noise(np.array([2e-4, 2e-4, 2e-3]), 3.0) if noise is None else noise
+    noise = Noise(np.array([2e-4, 2e-4, 2e-3]), 3.0) if start is None else start.noise
     if kind == 'self':
         noise = Noise(np.full(3, _FREE), noise.dots)
-    robust = np.ones(len(rows)) if weights is None else weights
-    for number in range(PASSES if given is None else 1):
+    linear = linearised(rows, z, rig, kind)
+    for number in range(0 if start is None else PASSES - 2, PASSES):
         for _ in range(STEPS):
-            linear = linearised(rows, z, rig, kind)
             inverse = weight_matrices(linear, rows, noise)
-            if weights is None:
-                distance = np.einsum('ni,nij,nj->n', linear.residual, inverse, linear.residual) * noise.fewer
-                far = np.sqrt(np.maximum(distance, 1e-300))
-                robust = np.minimum(1.0, _HUBER / far) if number == 0 else (distance < FAR).astype(np.float64)
+            robust = _robust(linear, inverse, noise, number)
             step, information = _step(linear, inverse, robust, z, prior, free)
             z = z + step
-            if np.all(np.abs(step) <= 1e-4 * prior.sd):
+            linear = linearised(rows, z, rig, kind)
+            if np.all(np.abs(step) <= 1e-2 * np.sqrt(np.diag(posterior(information, prior, free)))):
                 break
-        linear = linearised(rows, z, rig, kind)
-        if given is None:
-            noise = _components(linear, rows, robust, kind, noise, number, information, prior)
+        noise = _components(linear, rows, robust, kind, number, information, prior)
     inverse = weight_matrices(linear, rows, noise)
-    if weights is None:
-        distance = np.einsum('ni,nij,nj->n', linear.residual, inverse, linear.residual) * noise.fewer
-        robust = (distance < FAR).astype(np.float64)
+    robust = _robust(linear, inverse, noise, PASSES)
     _, information = _step(linear, inverse, robust, z, prior, free)
     return Fit(z, posterior(information, prior, free), information, linear, robust, noise, free)
+
+
+def _robust(linear: Linear, inverse: FloatArray, noise: Noise, number: int) -> FloatArray:
+    """Weights (n,): Huber's in the first pass, then 0 of outliers."""
+    distance = np.einsum('ni,nij,nj->n', linear.residual, inverse, linear.residual) * noise.fewer
+    if number == 0:
+        return np.minimum(1.0, _HUBER / np.sqrt(np.maximum(distance, 1e-300)))
+    return (distance < FAR).astype(np.float64)
+
+
+def refitted(whole: Fit, rows: Rows, prior: Prior, kept: FloatArray, free: Mask) -> FloatArray:
+    """Parameters (SIZE,) from some of the rows, ``kept`` (n,) 1 or 0, by one step from the fit of all of them."""
+    inverse = weight_matrices(whole.linear, rows, whole.noise)
+    z = whole.values.copy()
+    z[~free] = prior.mean[~free]
+    shifted = Linear(residual_at(whole, z), whole.linear.slopes, whole.linear.by_pose)
+    return z + _step(shifted, inverse, whole.weights * kept, z, prior, free)[0]
+
+
+def residual_at(whole: Fit, z: FloatArray) -> FloatArray:
+    """Residuals (n, 4), m, for parameters near those of the fit, to first order."""
+    return whole.linear.residual - whole.linear.slopes @ (z - whole.values)
 
 
 def _step(
@@ -212,7 +224,7 @@ def _step(
     robust: FloatArray,
     z: FloatArray,
     prior: Prior,
-    free: np.ndarray[tuple[int], np.dtype[np.bool_]],
+    free: Mask,
 ) -> tuple[FloatArray, FloatArray]:
     """Gauss-Newton's step (SIZE,) and the information (SIZE, SIZE) of the rows."""
     weighted = np.einsum('nij,njk->nik', inverse * robust[:, None, None], linear.slopes)
@@ -231,7 +243,7 @@ def _step(
 
 
 def posterior(
-    information: FloatArray, prior: Prior, free: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    information: FloatArray, prior: Prior, free: Mask
 ) -> FloatArray:
     """Covariance (SIZE, SIZE) of the fit, and of what was not fitted (Schmidt's consider covariance)."""
     scale = prior.sd
@@ -259,7 +271,6 @@ def _components(
     rows: Rows,
     robust: FloatArray,
     kind: Kind,
-    before: Noise,
     number: int,
     information: FloatArray,
     prior: Prior,

@@ -13,6 +13,7 @@ zero that is taken anew is independent of all other parameters.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,7 +79,7 @@ _NEWTON = 6
 
 
 def reading_of_place(p: FloatArray, psd: int, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What PSD ``psd`` (0, 1) reads of a dot at (x, y), m; ``p`` (COUNT, ...) broadcasts against both."""
+    """What PSD ``psd`` (0, 1) reads of a dot at (x, y), m; ``p`` (COUNT,)."""
     a, gx, gy, xy, yx = p[_PER_PSD * psd : _PER_PSD * psd + 5]
     c, s = np.cos(a), np.sin(a)
     u, v = c * x + s * y, c * y - s * x
@@ -105,29 +106,65 @@ def place_of_reading(p: FloatArray, psd: int, x: FloatArray, y: FloatArray) -> t
 
 
 def readings(p: FloatArray, pose: FloatArray, length: float) -> FloatArray:
-    """x1 y1 x2 y2, m, on the first axis.
+    """x1 y1 x2 y2, m, (4, n). ``p`` (COUNT,); ``pose`` (3, n): dX m, dY m, theta rad; ``length`` L, m."""
+    out = np.empty((4, pose.shape[1]))
+    for psd in range(2):
+        center = p[_PER_PSD * psd + _CENTER : _PER_PSD * psd + _CENTER + 2]
+        m0 = place_of_reading(p, psd, p[ZERO + 2 * psd], p[ZERO + 2 * psd + 1])
+        place = _points(p, psd, center + m0, pose, length) - center[:, None]
+        out[2 * psd : 2 * psd + 2] = reading_of_place(p, psd, *place)
+    return out
 
-    ``p`` (COUNT,), or (COUNT, K, 1) for K rigs at once; ``pose`` (3, n): dX m, dY m, theta rad; ``length`` L, m.
-    """
+
+def _points(p: FloatArray, psd: int, beam: FloatArray, pose: FloatArray, length: float) -> FloatArray:
+    """Plate points (2, n) under the beam that is at ``beam`` (2,) on the plate at rest."""
     dx, dy, theta = pose
     k = p[SLOPE] / length
-    phi, omega = -k * dy, k * dx
-    out = []
-    for psd in range(2):
-        cx, cy, height = p[_PER_PSD * psd + _CENTER : _PER_PSD * psd + _CENTER + 3]
-        m0x, m0y = place_of_reading(p, psd, p[ZERO + 2 * psd], p[ZERO + 2 * psd + 1])
-        slope_x, slope_y = np.tan(p[_BEAMS + 2 * psd]), np.tan(p[_BEAMS + 2 * psd + 1])
-        qx, qy = points_under_leaning(cx + m0x, cy + m0y, slope_x, slope_y, height, dx, dy, theta, phi, omega)
-        out += reading_of_place(p, psd, qx - cx, qy - cy)
-    return np.stack(np.broadcast_arrays(*out))
+    slope_x, slope_y = np.tan(p[_BEAMS + 2 * psd : _BEAMS + 2 * psd + 2])
+    height = p[_PER_PSD * psd + _HEIGHT]
+    return np.stack(points_under_leaning(beam[0], beam[1], slope_x, slope_y, height, dx, dy, theta, -k * dy, k * dx))
 
 
 def by_parameters(p: FloatArray, pose: FloatArray, length: float) -> FloatArray:
-    """Derivatives of the readings (4, COUNT, n) at ``p`` (COUNT,) and ``pose`` (3, n), by central differences."""
-    step = 1e-3 * TOLERANCES
-    moved = p[:, None, None] + np.concatenate([np.diag(step), -np.diag(step)], axis=1)[:, :, None]
-    both = readings(moved, pose, length)
-    return (both[:, :COUNT] - both[:, COUNT:]) / (2.0 * step[:, None])
+    """Derivatives of the readings (4, COUNT, n) at ``p`` (COUNT,) and ``pose`` (3, n), by central differences.
+
+    By parts, r = S(q - c) with q under l = c + m_0 and m_0 = S^-1(r_0), so that each is moved by itself.
+    """
+    n = pose.shape[1]
+    out = np.zeros((4, COUNT, n))
+    for psd in range(2):
+        own, first = slice(2 * psd, 2 * psd + 2), _PER_PSD * psd
+        at, zero = slice(first + _CENTER, first + _CENTER + 2), slice(ZERO + 2 * psd, ZERO + 2 * psd + 2)
+        m0 = np.array(place_of_reading(p, psd, *p[zero]))
+        beam = p[at] + m0
+        place = _points(p, psd, beam, pose, length) - p[at, None]
+        turned = by_place(p, psd, *place)
+        # How the dot goes with the beam, and its reading with the beam.
+        under = np.stack([_difference(lambda d: _points(p, psd, beam + d, pose, length), u * 1e-6) for u in np.eye(2)], 1)
+        read = np.einsum('ijn,jkn->ikn', turned, under)
+        from_zero = np.linalg.inv(by_place(p, psd, *m0))
+        out[own, at] = read - turned
+        out[own, zero] = np.einsum('ijn,jk->ikn', read, from_zero)
+        for i in (*range(first, first + _CENTER), first + _CUBIC):
+            step = _step(i)
+            moved = _difference(lambda d: np.stack(reading_of_place(p + d, psd, *place)), step)
+            away = _difference(lambda d: np.array(place_of_reading(p + d, psd, *p[zero])), step)
+            out[own, i] = moved + np.einsum('ijn,j->in', read, away)
+        for i in (first + _HEIGHT, _BEAMS + 2 * psd, _BEAMS + 2 * psd + 1, SLOPE):
+            moved = _difference(lambda d: _points(p + d, psd, beam, pose, length), _step(i))
+            out[own, i] = np.einsum('ijn,jn->in', turned, moved)
+    return out
+
+
+def _step(index: int) -> FloatArray:
+    out = np.zeros(COUNT)
+    out[index] = 1e-3 * TOLERANCES[index]
+    return out
+
+
+def _difference(of: Callable[[FloatArray], FloatArray], step: FloatArray) -> FloatArray:
+    """The derivative of ``of`` along ``step``, which has one part that is not 0."""
+    return (of(step) - of(-step)) / (2.0 * step.max())
 
 
 def by_pose(p: FloatArray, pose: FloatArray, length: float) -> FloatArray:
