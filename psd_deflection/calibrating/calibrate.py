@@ -377,7 +377,9 @@ def undetermined(whole: Fit, prior: Prior) -> list[Direction]:
     # The zero is measured at every start, and the clock is no parameter of the rig.
     reported = np.array([not ZERO <= i < COUNT and i != CLOCK for i in range(SIZE)])
     out = [Direction({NAMES[i]: 1.0}, needs_of([NAMES[i]])) for i in np.flatnonzero(~whole.free & reported)]
-    at = np.flatnonzero(whole.free & reported)
+    # The clamp's were determined one by one.
+    alone = np.isin(np.arange(SIZE), (CLAMP_AT, CLAMP_AT + 1)) & (np.diag(whole.information) == 0.0)
+    at = np.flatnonzero(whole.free & reported & ~alone)
     if not len(at):
         return out
     own = np.ix_(at, at)

@@ -1,13 +1,14 @@
 """Parameters and their covariance from rows of readings and poses: Gauss-Newton with the tolerances as a prior.
 
-The reference y of row j is the pose with an error e (errors in variables). To first order the reading minus the
-model at y is
+The reference y of row j is the pose with an error e (errors in variables). With the pose x_j that the readings m_j give,
+which is far more precise, and the derivatives taken there,
 
-    r_j = m_j - f(y_j - v_j tau; p) = J_p dp + n_j - J_y e_j,    C_j = J_y S_ref J_y^T + S_dots,
+    r_j = m_j - f(x_j; p) - J_y (y_j - v_j tau - x_j) = J_p dp + n_j - J_y e_j,    C_j = J_y S_ref J_y^T + S_dots.
 
-so the pose drops out, and generalised least squares with C_j is the exact joint answer. J_y is (4, 3): along the
-direction that it does not reach, the one redundant reading, the reference's noise does not enter, and the weight
-is that of the detectors. tau is the offset of the reference's clock. S_ref (three variances) and a factor on S_dots are
+The pose drops out, and generalised least squares with C_j is the joint answer for parameters and poses. Derivatives at
+y_j would go with its errors and pull the gains towards zero (attenuation). J_y is (4, 3): along the direction that it
+does not reach, the one redundant reading, the reference's noise does not enter, and the weight is that of the detectors.
+Known loads take the place of y, with the link's compliance; without either S_ref is as good as infinite. tau is the offset of the reference's clock. S_ref (three variances) and a factor on S_dots are
 variance components: estimated from the residuals, in turn with p. Rows beyond ``FAR`` are outliers and count for
 nothing. A reference whose errors are correlated from row to row counts as the fewer rows that it is worth.
 """
@@ -125,31 +126,31 @@ def linearised(rows: Rows, z: FloatArray, rig: Rig, kind: Kind) -> Linear:
     length = rig.link.length
     p = z[:COUNT]
     slopes = np.zeros((len(rows), 4, SIZE))
-    if kind == 'reference':
-        pose = rows.pose - z[CLOCK] * rows.velocity
-    elif kind == 'loads':
-        pose = rows.loads * compliances(rig, z)
-    else:
-        pose = pose_of_readings(rows.dots, p, length)
+    pose = pose_of_readings(rows.dots, p, length)
     turned = by_pose(p, pose.T, length).transpose(2, 0, 1)
     slopes[:, :, :COUNT] = by_parameters(p, pose.T, length).transpose(2, 0, 1)
+    residual = rows.dots - readings(p, pose.T, length).T
     if kind == 'reference':
+        residual -= np.einsum('nij,nj->ni', turned, rows.pose - z[CLOCK] * rows.velocity - pose)
         slopes[:, :, CLOCK] = -np.einsum('nij,nj->ni', turned, rows.velocity)
     elif kind == 'loads':
+        residual -= np.einsum('nij,nj->ni', turned, rows.loads * compliances(rig, z) - pose)
         fx, fy, tz = rows.loads.T
         flat = np.zeros_like(fx)
         bent = length**2 * np.stack((fx, fy, flat), axis=1)
         slopes[:, :, CLAMP_AT] = np.einsum('nij,nj->ni', turned, bent)
         slopes[:, :, CLAMP_AT + 1] = turned[:, :, 2] * tz[:, None]
-    return Linear(rows.dots - readings(p, pose.T, length).T, slopes, turned)
+    return Linear(residual, slopes, turned)
 
 
 def pose_of_readings(dots: FloatArray, p: FloatArray, length: float) -> FloatArray:
     """Poses (n, 3) that fit the readings (n, 4) best, each reading with the same weight."""
-    pose = np.zeros((len(dots), 3))
-    for _ in range(6):
-        turned = by_pose(p, pose.T, length).transpose(2, 0, 1)
-        pose = pose + np.einsum('nij,nj->ni', np.linalg.pinv(turned), dots - readings(p, pose.T, length).T)
+    rest = np.zeros((3, 1))
+    pose = (dots - readings(p, rest, length).T) @ np.linalg.pinv(by_pose(p, rest, length)[:, :, 0]).T
+    inverse = np.linalg.pinv(by_pose(p, pose.T, length).transpose(2, 0, 1))
+    # Each step leaves what the derivatives have changed since, a thousandth.
+    for _ in range(3):
+        pose = pose + np.einsum('nij,nj->ni', inverse, dots - readings(p, pose.T, length).T)
     return pose
 
 

@@ -19,16 +19,27 @@ from psd_deflection.misalignment.model import ZERO, by_parameters, by_place, pla
 from psd_deflection.misalignment.rig import is_calibrated, known_of_rig, vector_of_rig
 from psd_deflection.records import FloatArray
 
+RANGE: FloatArray = np.array([0.006, 0.006, 0.06])
+"""Poses (m, m, rad) within which the quartic is fitted: about what detectors of 10 mm see."""
+LEVELS = 6
+
 
 class ParameterSpread:
     """The spread of the dots that the calibration of one rig file leaves. Make it with :meth:`from_rig`."""
 
     def __init__(self, values: FloatArray, covariance: FloatArray, length: float) -> None:
         """``values`` (COUNT,), ``covariance`` (COUNT, COUNT): as the readings' model has them; ``length``: L, m."""
-        self._values, self._length = values, length
-        size, vectors = np.linalg.eigh(covariance / np.outer(scale := _scale(covariance), scale))
+        scale = _scale(covariance)
+        size, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
         kept = size > 1e-14
-        self._root = scale[:, None] * vectors[:, kept] * np.sqrt(size[kept])
+        root = scale[:, None] * vectors[:, kept] * np.sqrt(size[kept])
+        levels = np.linspace(-1.0, 1.0, LEVELS)
+        points = np.stack(np.meshgrid(levels, levels, levels), axis=0).reshape(3, -1)
+        slopes = _dots_by_parameters(values, points * RANGE[:, None], length) @ root
+        basis = np.stack([_terms(*point) for point in points.T.tolist()])
+        self._shape = (4, root.shape[1])
+        # Smooth as they are, a quartic gives them to 1e-4; a block has no time for differences.
+        self._quartic = np.linalg.lstsq(basis, slopes.reshape(len(basis), -1), rcond=None)[0]
 
     @classmethod
     def from_rig(cls, rig: Rig, zero_variances: tuple[float, ...] = ()) -> ParameterSpread | None:
@@ -46,13 +57,40 @@ class ParameterSpread:
 
     def factor(self, dx: float, dy: float, theta: float) -> FloatArray:
         """B (4, k), m, at a pose (m, m, rad): the corrected dots spread by B B^T."""
-        pose = np.array([[dx], [dy], [theta]])
-        slopes = by_parameters(self._values, pose, self._length)[:, :, 0]
-        read = readings(self._values, pose, self._length)[:, 0]
-        for psd in range(2):
-            at = place_of_reading(self._values, psd, read[2 * psd], read[2 * psd + 1])
-            slopes[2 * psd : 2 * psd + 2] = np.linalg.solve(by_place(self._values, psd, *at), slopes[2 * psd : 2 * psd + 2])
-        return np.einsum('ij,jk->ik', slopes, self._root)
+        across, twist = float(RANGE[0]), float(RANGE[2])
+        terms = np.array(_terms(dx / across, dy / across, theta / twist))
+        return np.einsum('t,ti->i', terms, self._quartic).reshape(self._shape)
+
+
+def _pairs() -> list[tuple[int, int]]:
+    """Which products of two make the products of four, each once."""
+    second = [(i, j) for i in range(4) for j in range(i, 4)]
+    found: dict[tuple[int, ...], tuple[int, int]] = {}
+    for a, left in enumerate(second):
+        for b, right in enumerate(second):
+            found.setdefault(tuple(sorted(left + right)), (a, b))
+    return list(found.values())
+
+
+_PAIRS = _pairs()
+
+
+def _terms(x: float, y: float, t: float) -> list[float]:
+    """The 35 products of up to four factors."""
+    first = (1.0, x, y, t)
+    second = [a * b for i, a in enumerate(first) for b in first[i:]]
+    return [second[a] * second[b] for a, b in _PAIRS]
+
+
+def _dots_by_parameters(p: FloatArray, pose: FloatArray, length: float) -> FloatArray:
+    """S^-1 (df/dp), (n, 4, COUNT), at poses (3, n)."""
+    slopes = by_parameters(p, pose, length).transpose(2, 0, 1).copy()
+    read = readings(p, pose, length)
+    for psd in range(2):
+        own = slice(2 * psd, 2 * psd + 2)
+        turned = by_place(p, psd, *place_of_reading(p, psd, *read[own])).transpose(2, 0, 1)
+        slopes[:, own] = np.linalg.solve(turned, slopes[:, own])
+    return slopes
 
 
 def _scale(covariance: FloatArray) -> FloatArray:
