@@ -17,11 +17,13 @@ from concurrent.futures import ProcessPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from blind import generator, misaligned
 from blind.generator import Array
-from psd_deflection.calibrating.calibrate import NAMES, OPEN, calibrate
+from psd_deflection.calibrating.calibrate import OPEN, Calibration, calibrate
 from psd_deflection.calibrating.check import check
+from psd_deflection.calibrating.fit import NAMES
 from psd_deflection.calibrating.observation import Run
 from psd_deflection.calibrating.result import values_of
 from psd_deflection.config import Rig, flattened, replace_values, rig_from_values
@@ -55,9 +57,9 @@ class Score(NamedTuple):
 
     ``z``: by parameter, error over its standard deviation. ``inside``: share of published poses within their 95 %
     ellipsoid; ``axes`` (3,): within 1.96 standard deviations; ``noise_only``: within the ellipsoid of the noise.
-    ``before``, ``after`` (3,): rms errors of the pose. ``gap``: held out, before and after, m. ``unsaid``: parameters that
-    the Fisher information leaves open and calibrate does not report; ``said``: the reverse. ``moved``: the group that was
-    moved, or ''; ``named``: what --check says, '' if it holds; ``like``: what it says it cannot tell that from.
+    ``before``, ``after`` (3,): rms errors of the pose. ``gap``: held out, before and after, m. ``unsaid``: parameters
+    that the Fisher information leaves open and calibrate does not report; ``said``: the reverse. ``moved``: the group
+    that was moved, or ''; ``named``: what --check says, '' if it holds; ``like``: what it cannot tell that from.
     """
 
     z: dict[str, float]
@@ -80,7 +82,7 @@ def run_of(recorded: misaligned.Recorded) -> Run:
     return Run('blind', t, recorded.volts, t[recorded.frames], recorded.reference)
 
 
-def calibrated_rig(rig: Rig, run: Run) -> tuple[Rig, object]:
+def calibrated_rig(rig: Rig, run: Run) -> tuple[Rig, Calibration]:
     """The rig file's content after the calibration, and what was found."""
     found = calibrate([run], rig)
     values, effects = values_of(found, 'today')
@@ -113,7 +115,7 @@ def measured(rig: Rig, volts: Array, zero_after: int = 25) -> tuple[Array, Array
     )
 
 
-def shares_left_open(truth: Mapping[str, float], pose: Array, frames: Array) -> dict[str, float]:
+def shares_left_open(truth: Mapping[str, float], pose: Array, frames: npt.NDArray[np.int64]) -> dict[str, float]:
     """Of each parameter the standard deviation after over before, by this generator's own derivatives."""
     at = pose[frames][::4]
     names = list(truth)
@@ -260,7 +262,7 @@ def table(scores: Sequence[Score]) -> Iterator[str]:
     yield f'- parameters reported otherwise than the Fisher information has it: {total.unsaid}'
     moved = [s for s in scores if s.moved]
     like = sum(s.moved in (s.named, *s.like) for s in moved) / max(len(moved), 1)
-    yield f'- --check: the moved group is named in {total.named:.1%} of {len(moved)}; it or one told as alike in {like:.1%}'
+    yield f'- --check: the moved group is named in {total.named:.1%} of {len(moved)}, or among the like: {like:.1%}'
     yield f'- --check: false alarms in {total.alarms:.1%} of {len(scores) - len(moved)}'
 
 
@@ -276,7 +278,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(line)
     for number, s in enumerate(scores):
         if s.moved != s.named or s.unsaid or s.said:
-            print(f'rig {number}: moved {s.moved or "nothing"}, named {s.named or "nothing"} {s.like}; {s.unsaid} {s.said}')
+            told = f'moved {s.moved or "nothing"}, named {s.named or "nothing"} {s.like}'
+            print(f'rig {number}: {told}; {s.unsaid} {s.said}')
     return 0
 
 

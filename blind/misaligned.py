@@ -75,7 +75,9 @@ def dots(rig: Mapping[str, float], pose: Array) -> Array:
     tip = np.column_stack((pose[:, :2], np.full(n, LENGTH)))
     out = np.empty((n, 4))
     for i, (fx, fy) in enumerate(generator.PLACES):
-        own = {name.partition('.')[2]: v for name, v in rig.items() if name.startswith((f'psd_{i + 1}.', f'beam_{i + 1}.'))}
+        own = {
+            name.partition('.')[2]: v for name, v in rig.items() if name.startswith((f'psd_{i + 1}.', f'beam_{i + 1}.'))
+        }
         along = np.array([math.tan(own['angle_x']), math.tan(own['angle_y']), 1.0])
         start = np.array([fx + own['x'], fy + own['y'], LENGTH + own['height']])
         origin = tip + turn @ np.array([own['center_x'], own['center_y'], own['height']])

@@ -127,9 +127,7 @@ class CalibrationConfig:
     names: tuple[str, ...] = parameter(
         ('none',), '', 'calibrated parameters, such as psd_1.rotation; none: the rig was not calibrated'
     )
-    sds: tuple[float, ...] = parameter(
-        (0.0,), '', 'standard deviation of each, in SI units', minimum=0.0, maximum=1e9
-    )
+    sds: tuple[float, ...] = parameter((0.0,), '', 'standard deviation of each, in SI units', minimum=0.0, maximum=1e9)
     correlations: tuple[float, ...] = parameter(
         (0.0,),
         '',

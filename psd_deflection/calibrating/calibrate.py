@@ -160,7 +160,20 @@ def calibrate(
             f'the rig file keeps its values'
         )
     return Calibration(
-        rig, kind, vector, prior, whole, rows, runs, noise, gap, undetermined(whole, prior), clock, refused, widened, dropped
+        rig,
+        kind,
+        vector,
+        prior,
+        whole,
+        rows,
+        runs,
+        noise,
+        gap,
+        undetermined(whole, prior),
+        clock,
+        refused,
+        widened,
+        dropped,
     )
 
 
@@ -219,9 +232,7 @@ def roughly_late(runs: Sequence[Run], rig: Rig, noise: FloatArray) -> float:
     return float(lates[best]) if costs[best] < 0.9 * costs[middle] else 0.0
 
 
-def _believed(
-    first: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask
-) -> tuple[Fit, Prior, list[str]]:
+def _believed(first: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask) -> tuple[Fit, Prior, list[str]]:
     """Widen what the rows contradict, the worst at a time."""
     widened: list[str] = []
     while len(widened) < 6:
@@ -295,9 +306,7 @@ def _heldout(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, before:
     return gap, bool(new.sum() > old.sum())
 
 
-def _without_refused_terms(
-    whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind
-) -> tuple[Fit, list[str]]:
+def _without_refused_terms(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind) -> tuple[Fit, list[str]]:
     """Drop a non-linearity that unseen motion contradicts: it then keeps the file's value and tolerance."""
     dropped: list[str] = []
     for name in ('psd_1.nonlinearity', 'psd_2.nonlinearity'):
@@ -307,7 +316,9 @@ def _without_refused_terms(
         without = whole.free.copy()
         without[i] = False
         inverse = weight_matrices(whole.linear, rows, whole.noise)
-        costs = [_misfit(_held_out(whole, rows, prior, f), whole, inverse, rows, kind)[0] for f in (whole.free, without)]
+        costs = [
+            _misfit(_held_out(whole, rows, prior, f), whole, inverse, rows, kind)[0] for f in (whole.free, without)
+        ]
         more = costs[0] - costs[1]
         if more.sum() > 2.0 * float(np.sqrt(np.sum(more**2))):
             dropped.append(name)
@@ -360,7 +371,9 @@ _NEEDS = {
     'torsional_compliance': 'known torques held for some seconds each',
     'zero': 'the unloaded link, with its reference',
 }
-_TURNED = 'no motion of the link: a turned PSD and one whose axes are not square look alike; the estimate needs only the sum'
+_TURNED = (
+    'no motion of the link: a turned PSD and one whose axes are not square look alike; the estimate needs only the sum'
+)
 
 
 def needs_of(names: Sequence[str]) -> str:
@@ -396,7 +409,7 @@ def undetermined(whole: Fit, prior: Prior) -> list[Direction]:
 def _sparse(vectors: FloatArray) -> list[FloatArray]:
     """Directions (each of unit length) that span the columns of ``vectors`` (n, k), with few large parts each."""
     rest = vectors.copy()
-    n, k = rest.shape
+    k = rest.shape[1]
     pivots: list[int] = []
     for column in range(k):
         sizes = np.abs(rest[:, column:]).max(axis=1)

@@ -7,8 +7,8 @@ moved, b ~ N(0, N + N P N). What is left of b after P has explained what it can 
 
 and T = b'_g^T M_gg^-1 b'_g of a group g of parameters is chi-square with as many degrees of freedom as the rows show
 directions of it. The smallest p over the groups, times their number, below ``LEVEL`` says that something moved
-(Bonferroni). What moved is the group of the largest Bayes factor, for shifts of the size of the tolerances. The zero and
-the reference's clock are free in any case.
+(Bonferroni). What moved is the group of the largest Bayes factor, for shifts of the size of the tolerances. The zero
+and the reference's clock are free in any case.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from psd_deflection.calibrating.observation import Run, joined, noise_of, rows_o
 from psd_deflection.config import Rig
 from psd_deflection.misalignment.model import COUNT, PARAMETERS, TOLERANCES, ZERO
 from psd_deflection.misalignment.rig import vector_of_rig
-from psd_deflection.records import FloatArray
+from psd_deflection.records import FloatArray, IntArray
 
 LEVEL = 0.05
 """Share of rigs that did not move and are said to have moved."""
@@ -49,8 +49,8 @@ class Moved(NamedTuple):
 
 
 class Checked(NamedTuple):
-    """``holds``: nothing moved. ``p``: over all groups. ``groups``: the likeliest first. ``like``: groups that the first
-    cannot be told from. ``zero``: how far the unloaded readings are from the file's, (4,) m, and their deviations.
+    """``holds``: nothing moved. ``p``: over all groups. ``groups``: the likeliest first. ``like``: groups that the
+    first cannot be told from. ``zero``: the unloaded readings less the file's, (4,) m, and their deviations.
     """
 
     holds: bool
@@ -106,7 +106,7 @@ def check(
     )
 
 
-def _moved(name: str, at: FloatArray, left: FloatArray, m: FloatArray, scale: FloatArray) -> Moved:
+def _moved(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale: FloatArray) -> Moved:
     own = [i for i, index in enumerate(at) if index < ZERO and PARAMETERS[int(index)].group == name]
     block, score = m[np.ix_(own, own)], left[own]
     size, vectors = np.linalg.eigh(0.5 * (block + block.T))

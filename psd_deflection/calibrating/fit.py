@@ -1,16 +1,18 @@
 """Parameters and their covariance from rows of readings and poses: Gauss-Newton with the tolerances as a prior.
 
-The reference y of row j is the pose with an error e (errors in variables). With the pose x_j that the readings m_j give,
-which is far more precise, and the derivatives taken there,
+The reference y of row j is the pose with an error e (errors in variables). With the pose x_j that the readings m_j
+give, which is far more precise, and the derivatives taken there,
 
     r_j = m_j - f(x_j; p) - J_y (y_j - v_j tau - x_j) = J_p dp + n_j - J_y e_j,    C_j = J_y S_ref J_y^T + S_dots.
 
 The pose drops out, and generalised least squares with C_j is the joint answer for parameters and poses. Derivatives at
 y_j would go with its errors and pull the gains towards zero (attenuation). J_y is (4, 3): along the direction that it
-does not reach, the one redundant reading, the reference's noise does not enter, and the weight is that of the detectors.
-Known loads take the place of y, with the link's compliance; without either S_ref is as good as infinite. tau is the offset of the reference's clock. S_ref (three variances) and a factor on S_dots are
-variance components: estimated from the residuals, in turn with p. Rows beyond ``FAR`` are outliers and count for
-nothing. A reference whose errors are correlated from row to row counts as the fewer rows that it is worth.
+does not reach, the one redundant reading, the reference's noise does not enter, and the weight is that of the
+detectors. Known loads take the place of y, with the link's compliance; without either S_ref is as good as infinite.
+
+tau is the offset of the reference's clock. S_ref (three variances) and a factor on S_dots are variance components:
+estimated from the residuals, in turn with p. Rows beyond ``FAR`` are outliers and count for nothing. A reference whose
+errors are correlated from row to row counts as the fewer rows that it is worth.
 """
 
 from __future__ import annotations
@@ -201,8 +203,8 @@ def _robust(linear: Linear, inverse: FloatArray, noise: Noise, number: int) -> F
     """Weights (n,): Huber's in the first pass, then 0 of outliers."""
     distance = np.einsum('ni,nij,nj->n', linear.residual, inverse, linear.residual) * noise.fewer
     if number == 0:
-        return np.minimum(1.0, _HUBER / np.sqrt(np.maximum(distance, 1e-300)))
-    return (distance < FAR).astype(np.float64)
+        return np.asarray(np.minimum(1.0, _HUBER / np.sqrt(np.maximum(distance, 1e-300))))
+    return np.asarray(distance < FAR, dtype=np.float64)
 
 
 def refitted(whole: Fit, rows: Rows, prior: Prior, kept: FloatArray, free: Mask) -> FloatArray:
@@ -243,9 +245,7 @@ def _step(
     return step, 0.5 * (information + information.T)
 
 
-def posterior(
-    information: FloatArray, prior: Prior, free: Mask
-) -> FloatArray:
+def posterior(information: FloatArray, prior: Prior, free: Mask) -> FloatArray:
     """Covariance (SIZE, SIZE) of the fit, and of what was not fitted (Schmidt's consider covariance)."""
     scale = prior.sd
     p0 = prior.covariance / np.outer(scale, scale)
@@ -285,7 +285,9 @@ def _components(
     redundant = np.einsum('ni,ni->n', across, linear.residual)[good]
     expected = np.sqrt(np.einsum('ni,ni->n', across**2, rows.variances))[good]
     scale = prior.sd
-    known = np.linalg.inv(np.linalg.inv(prior.covariance / np.outer(scale, scale)) + information * np.outer(scale, scale))
+    known = np.linalg.inv(
+        np.linalg.inv(prior.covariance / np.outer(scale, scale)) + information * np.outer(scale, scale)
+    )
     used = float(np.trace(known @ (information * np.outer(scale, scale))))
     # Each of the four equations of a row pays its part of the parameters that were fitted.
     share = max(1.0 - used / (4.0 * len(errors)), 0.2)

@@ -7,6 +7,7 @@ every sample is averaged over a block together with the dots.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -149,7 +150,7 @@ def at_rest(loads: FloatArray | None, t: FloatArray) -> np.ndarray[tuple[int], n
     if loads is None:
         return out
     cuts = [0, *(np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1).tolist(), len(t)]
-    for a, b in zip(cuts, cuts[1:], strict=False):
+    for a, b in itertools.pairwise(cuts):
         held = t[b - 1] - t[a]
         if held >= LEAST_HOLD:
             out[a:b] = t[a:b] >= t[a] + SETTLE * held

@@ -63,11 +63,13 @@ def advice(found: Calibration) -> list[str]:
     out += [f'To determine {" with ".join(d.parts)}: {d.needs}.' for d in found.undetermined[:4]]
     if found.kind == 'loads':
         out.append(
-            'Known loads know the scale of the gains no better than the stiffness of the link and its clamp: a reference '
-            'separates them.'
+            'Known loads know the scale of the gains no better than the stiffness of the link and its clamp: '
+            'a reference separates them.'
         )
     if found.kind == 'self':
-        out.append('The redundant reading knows relative gains and turns only; take the zero (~/zero) with the new file.')
+        out.append(
+            'The redundant reading knows relative gains and turns only; take the zero (~/zero) with the new file.'
+        )
     out.append('Use the file: --params-file rig.yaml. Later: psd-deflection calibrate --check rig.yaml REC.')
     return out
 

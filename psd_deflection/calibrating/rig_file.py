@@ -20,7 +20,9 @@ def with_values(text: str, values: Mapping[str, object], source: str, path: Path
     """
 
     def edit(tree: Any) -> None:
-        bodies = [body['ros__parameters'] for body in tree.values() if isinstance(body, dict) and body.get('ros__parameters')]
+        bodies = [
+            body['ros__parameters'] for body in tree.values() if isinstance(body, dict) and body.get('ros__parameters')
+        ]
         for name, value in values.items():
             places = [place for body in bodies for place in _places(body, name.split('.'))]
             for holder, key in places or [_new(bodies[-1], name.split('.'))]:

@@ -126,34 +126,47 @@ def _points(p: FloatArray, psd: int, beam: FloatArray, pose: FloatArray, length:
 
 
 def by_parameters(p: FloatArray, pose: FloatArray, length: float) -> FloatArray:
-    """Derivatives of the readings (4, COUNT, n) at ``p`` (COUNT,) and ``pose`` (3, n), by central differences.
+    """Derivatives of the readings (4, COUNT, n) at ``p`` (COUNT,) and ``pose`` (3, n), by central differences."""
+    out = np.zeros((4, COUNT, pose.shape[1]))
+    for psd in range(2):
+        _psd_by_parameters(out[2 * psd : 2 * psd + 2], p, psd, pose, length)
+    return out
+
+
+def _psd_by_parameters(out: FloatArray, p: FloatArray, psd: int, pose: FloatArray, length: float) -> None:
+    """The rows ``out`` (2, COUNT, n) of one PSD.
 
     By parts, r = S(q - c) with q under l = c + m_0 and m_0 = S^-1(r_0), so that each is moved by itself.
     """
-    n = pose.shape[1]
-    out = np.zeros((4, COUNT, n))
-    for psd in range(2):
-        own, first = slice(2 * psd, 2 * psd + 2), _PER_PSD * psd
-        at, zero = slice(first + _CENTER, first + _CENTER + 2), slice(ZERO + 2 * psd, ZERO + 2 * psd + 2)
-        m0 = np.array(place_of_reading(p, psd, *p[zero]))
-        beam = p[at] + m0
-        place = _points(p, psd, beam, pose, length) - p[at, None]
-        turned = by_place(p, psd, *place)
-        # How the dot goes with the beam, and its reading with the beam.
-        under = np.stack([_difference(lambda d: _points(p, psd, beam + d, pose, length), u * 1e-6) for u in np.eye(2)], 1)
-        read = np.einsum('ijn,jkn->ikn', turned, under)
-        from_zero = np.linalg.inv(by_place(p, psd, *m0))
-        out[own, at] = read - turned
-        out[own, zero] = np.einsum('ijn,jk->ikn', read, from_zero)
-        for i in (*range(first, first + _CENTER), first + _CUBIC):
-            step = _step(i)
-            moved = _difference(lambda d: np.stack(reading_of_place(p + d, psd, *place)), step)
-            away = _difference(lambda d: np.array(place_of_reading(p + d, psd, *p[zero])), step)
-            out[own, i] = moved + np.einsum('ijn,j->in', read, away)
-        for i in (first + _HEIGHT, _BEAMS + 2 * psd, _BEAMS + 2 * psd + 1, SLOPE):
-            moved = _difference(lambda d: _points(p + d, psd, beam, pose, length), _step(i))
-            out[own, i] = np.einsum('ijn,jn->in', turned, moved)
-    return out
+    first = _PER_PSD * psd
+    at, zero = slice(first + _CENTER, first + _CENTER + 2), slice(ZERO + 2 * psd, ZERO + 2 * psd + 2)
+    m0 = np.array(place_of_reading(p, psd, *p[zero]))
+    beam = p[at] + m0
+    place = _points(p, psd, beam, pose, length) - p[at, None]
+    turned = by_place(p, psd, *place)
+
+    def moved_beam(d: FloatArray) -> FloatArray:
+        return _points(p, psd, beam + d, pose, length)
+
+    def read_there(d: FloatArray) -> FloatArray:
+        return np.stack(reading_of_place(p + d, psd, *place))
+
+    def rest_place(d: FloatArray) -> FloatArray:
+        return np.array(place_of_reading(p + d, psd, *p[zero]))
+
+    def point(d: FloatArray) -> FloatArray:
+        return _points(p + d, psd, beam, pose, length)
+
+    # How the dot goes with the beam, and its reading with the beam.
+    under = np.stack([_difference(moved_beam, 1e-6 * unit) for unit in np.eye(2)], axis=1)
+    read = np.einsum('ijn,jkn->ikn', turned, under)
+    out[:, at] = read - turned
+    out[:, zero] = np.einsum('ijn,jk->ikn', read, np.linalg.inv(by_place(p, psd, *m0)))
+    for i in (*range(first, first + _CENTER), first + _CUBIC):
+        away = np.einsum('ijn,j->in', read, _difference(rest_place, _step(i)))
+        out[:, i] = _difference(read_there, _step(i)) + away
+    for i in (first + _HEIGHT, _BEAMS + 2 * psd, _BEAMS + 2 * psd + 1, SLOPE):
+        out[:, i] = np.einsum('ijn,jn->in', turned, _difference(point, _step(i)))
 
 
 def _step(index: int) -> FloatArray:
@@ -164,7 +177,7 @@ def _step(index: int) -> FloatArray:
 
 def _difference(of: Callable[[FloatArray], FloatArray], step: FloatArray) -> FloatArray:
     """The derivative of ``of`` along ``step``, which has one part that is not 0."""
-    return (of(step) - of(-step)) / (2.0 * step.max())
+    return np.asarray((of(step) - of(-step)) / (2.0 * step.max()))
 
 
 def by_pose(p: FloatArray, pose: FloatArray, length: float) -> FloatArray:

@@ -11,7 +11,7 @@ from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.misalignment.model import ALL, INDEX, SLOPE, TOLERANCES, ZERO, place_of_reading, reading_of_place
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import effects_of_rig, sort_effects
+from psd_deflection.simulation.catalogue import effects_of_rig, make_active, sort_effects
 from psd_deflection.simulation.declaration import ActiveEffect
 
 _OF_PSD = {
@@ -150,13 +150,13 @@ def known_of_rig(rig: Rig) -> Known:
     return Known(covariance, True)
 
 
-def rig_values(vector: RigVector, p: FloatArray, clamp: Mapping[str, float]) -> tuple[dict[str, object], list[ActiveEffect]]:
+def rig_values(
+    vector: RigVector, p: FloatArray, clamp: Mapping[str, float]
+) -> tuple[dict[str, object], list[ActiveEffect]]:
     """Flat values and effects of a rig file with the parameters ``p`` (COUNT,) and ``clamp``.
 
     ``vector``: of the rig file that is changed; its other effects are kept.
     """
-    from psd_deflection.simulation.catalogue import make_active
-
     values: dict[str, object] = {'link.slope_ratio': float(p[SLOPE])}
     effects = list(vector.others)
 
@@ -175,7 +175,7 @@ def rig_values(vector: RigVector, p: FloatArray, clamp: Mapping[str, float]) -> 
             if name != 'sensor_position':
                 add(name, {'psd': float(n), **{key: own[f'psd_{n}.{to}'] for key, to in called.items()}})
     add(TILT, {'slope_ratio': float(p[SLOPE])})
-    for name, called in CLAMP.items():
+    for name, clamp_name in CLAMP.items():
         # A clamp that gives less than nothing is the link's stiffness, not the clamp.
-        add(name, {'compliance': max(clamp[called], 0.0)})
+        add(name, {'compliance': max(clamp[clamp_name], 0.0)})
     return values, sort_effects(effects)

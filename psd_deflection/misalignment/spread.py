@@ -59,7 +59,7 @@ class ParameterSpread:
         """B (4, k), m, at a pose (m, m, rad): the corrected dots spread by B B^T."""
         across, twist = float(RANGE[0]), float(RANGE[2])
         terms = np.array(_terms(dx / across, dy / across, theta / twist))
-        return np.einsum('t,ti->i', terms, self._quartic).reshape(self._shape)
+        return np.asarray(np.einsum('t,ti->i', terms, self._quartic).reshape(self._shape))
 
 
 def _pairs() -> list[tuple[int, int]]:

@@ -97,6 +97,7 @@ def read_observation(
 def held_at(
     times: IntArray, values: FloatArray, t_ns: FloatArray, grace: float, before: FloatArray | float
 ) -> FloatArray:
+    """``values`` (k, ...) from ``times`` (k,) ns on, at ``t_ns`` or up to ``grace`` ns later; ``before`` the first."""
     order = np.argsort(times, kind='stable')
     index = np.searchsorted(times[order], t_ns + grace, side='right') - 1
     out = values[order][np.maximum(index, 0)].astype(np.float64)
@@ -105,6 +106,7 @@ def held_at(
 
 
 def digest_of(path: Path) -> str:
+    """SHA-256 of a file, or of all files of a folder. Raises RecordingError if one cannot be read."""
     digest = hashlib.sha256()
     files = sorted(p for p in path.rglob('*') if p.is_file()) if path.is_dir() else [path]
     try:
