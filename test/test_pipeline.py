@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import re
 import itertools
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -305,7 +305,9 @@ def test_a_zero_is_refused_while_the_link_moves(rig: Rig) -> None:
     pipeline = Pipeline(rig)
     run(pipeline.process, exact_chunk(dots))
     assert pipeline.zero() is None
-    assert re.fullmatch(r'the link moves: y1 varied by 1\d\.\d um rms in the last 25 blocks, noise .*', why_no_zero(pipeline))
+    assert re.fullmatch(
+        r'the link moves: y1 varied by 1\d\.\d um rms in the last 25 blocks, noise .*', why_no_zero(pipeline)
+    )
     assert pipeline.rig.psds[0].zero == (0.0, 0.0)
     run(pipeline.process, exact_chunk(np.zeros((600, 4)), 600))
     assert pipeline.zero() is not None

@@ -32,7 +32,17 @@ from psd_deflection.calibrating.fit import (
     residual_at,
     weight_matrices,
 )
-from psd_deflection.calibrating.observation import Rows, Run, joined, noise_of, rows_of, smoothed, usable_dots
+from psd_deflection.calibrating.observation import (
+    LEAST_HOLD,
+    Rows,
+    Run,
+    joined,
+    noise_of,
+    rows_of,
+    settled,
+    smoothed,
+    usable_dots,
+)
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, RecordingError
 from psd_deflection.misalignment.model import COUNT, INDEX, ZERO
@@ -42,9 +52,13 @@ from psd_deflection.solvers.registry import psds_at_base
 
 OPEN = 0.9
 """A standard deviation above this share of the tolerance: undetermined."""
+SPOILT = 1.1
+"""How much the standard deviation of another parameter may grow when one is held at its tolerance."""
 CONTRADICTED = 3.5
 """Standard deviations of the prior beyond which a determined parameter says that its tolerance was too small."""
 WIDER = 10.0
+WORSE = 1.01
+"""Ratio of the gaps on unseen motion above which a calibration is refused; less is chance."""
 FOLDS = 8
 """Pieces of a recording, every second of which is held out in turn."""
 OFTEN = 300
@@ -134,12 +148,12 @@ def calibrate(
     parts = [rows_of(run, rig, noise, late=clock, blocks=kind != 'reference') for run in runs]
     rows = joined(parts)
     if kind == 'loads':
-        rows = rows.at(rows.rest)
-        if len(rows) < 20:
+        if not rows.rest.any():
             raise RecordingError(
-                f'{runs[0].name}: {len(rows)} blocks of a link at rest under a known load; hold each load for '
-                f'some seconds, or give a recording with a reference'
+                f'{runs[0].name}: no load is held for {LEAST_HOLD} s; hold each for some seconds, '
+                f'or give a recording with a reference'
             )
+        rows = settled(rows, rig, noise)
     progress('fitting')
     free = fitted_parameters(kind)
     first = fit(rows, rig, prior, kind, free=free)
@@ -147,9 +161,9 @@ def calibrate(
     free = _determined(first, prior, free)
     whole = fit(rows, rig, prior, kind, free=free, start=first)
     progress('held-out motion')
-    whole, dropped = _without_refused_terms(whole, rows, rig, prior, kind)
+    whole, believed, dropped = _without_refused_terms(whole, rows, rig, prior, kind)
     before = before_of(vector, prior)
-    gap, worse = _heldout(whole, rows, rig, prior, kind, before)
+    gap, worse = _heldout(whole, rows, rig, believed, kind, before)
     if kind == 'reference':
         whole = _with_clamp(whole, rows, rig, prior)
     refused = ''
@@ -252,14 +266,21 @@ def _believed(first: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: 
 
 
 def _determined(first: Fit, prior: Prior, free: Mask) -> Mask:
-    """Which parameters the rows determine; the others are held, the least known first."""
-    free = free.copy()
-    while True:
-        ratio = np.where(free, np.sqrt(np.diag(posterior(first.information, prior, free))) / prior.sd, 0.0)
-        worst = int(np.argmax(ratio))
-        if ratio[worst] <= OPEN:
-            return free
-        free[worst] = False
+    """Which parameters are fitted; the others are held at the file's values, the least known first.
+
+    One is held only if the rest then knows hardly less: of parameters that the rows tie together, such as a turn and a
+    crosstalk, none can be held at its tolerance without spoiling the others.
+    """
+    every = np.sqrt(np.diag(posterior(first.information, prior, free)))
+    ratio = np.where(free, every / prior.sd, 0.0)
+    held = free.copy()
+    for i in np.argsort(-ratio):
+        if ratio[i] <= OPEN:
+            break
+        held[i] = False
+        if np.any((np.sqrt(np.diag(posterior(first.information, prior, held))) > SPOILT * every)[held]):
+            held[i] = True
+    return held
 
 
 def _pieces(rows: Rows) -> IntArray:
@@ -303,11 +324,11 @@ def _heldout(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, before:
         return float(np.sqrt(plain.sum() / max(whole.weights.sum(), 1.0)))
 
     gap = Gap(rms(old_plain), rms(new_plain), rms(old_plain), rms(held_plain))
-    return gap, bool(new.sum() > old.sum())
+    return gap, bool(new.sum() > old.sum() or gap.heldout_after > WORSE * gap.heldout_before)
 
 
-def _without_refused_terms(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind) -> tuple[Fit, list[str]]:
-    """Drop a non-linearity that unseen motion contradicts: it then keeps the file's value and tolerance."""
+def _without_refused_terms(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind) -> tuple[Fit, Prior, list[str]]:
+    """Drop a non-linearity that unseen motion contradicts: it keeps the file's value, within what the rows leave open."""
     dropped: list[str] = []
     for name in ('psd_1.nonlinearity', 'psd_2.nonlinearity'):
         i = INDEX[name]
@@ -322,8 +343,15 @@ def _without_refused_terms(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind:
         more = costs[0] - costs[1]
         if more.sum() > 2.0 * float(np.sqrt(np.sum(more**2))):
             dropped.append(name)
+            # The rows bound it all the same: by what they gave it and left open.
+            away = whole.covariance[i, i] + (whole.values[i] - prior.mean[i]) ** 2
+            covariance = prior.covariance.copy()
+            shrunk = min(1.0, float(away / covariance[i, i]) ** 0.5)
+            covariance[i] *= shrunk
+            covariance[:, i] *= shrunk
+            prior = Prior(prior.mean, covariance)
             whole = fit(rows, rig, prior, kind, free=without, start=whole)
-    return whole, dropped
+    return whole, prior, dropped
 
 
 def _with_clamp(whole: Fit, rows: Rows, rig: Rig, prior: Prior) -> Fit:
@@ -389,7 +417,9 @@ def undetermined(whole: Fit, prior: Prior) -> list[Direction]:
     """Directions whose spread stays above ``OPEN`` of the tolerances: single parameters, then combinations."""
     # The zero is measured at every start, and the clock is no parameter of the rig.
     reported = np.array([not ZERO <= i < COUNT and i != CLOCK for i in range(SIZE)])
-    out = [Direction({NAMES[i]: 1.0}, needs_of([NAMES[i]])) for i in np.flatnonzero(~whole.free & reported)]
+    open_still = np.sqrt(np.diag(whole.covariance)) > OPEN * prior.sd
+    held = np.flatnonzero(~whole.free & reported & open_still)
+    out = [Direction({NAMES[i]: 1.0}, needs_of([NAMES[i]])) for i in held]
     # The clamp's were determined one by one.
     alone = np.isin(np.arange(SIZE), (CLAMP_AT, CLAMP_AT + 1)) & (np.diag(whole.information) == 0.0)
     at = np.flatnonzero(whole.free & reported & ~alone)

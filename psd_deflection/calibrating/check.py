@@ -21,7 +21,7 @@ from scipy.stats import chi2
 
 from psd_deflection.calibrating.calibrate import fitted_parameters, kind_of, roughly_late
 from psd_deflection.calibrating.fit import NAMES, Prior, fit, prior_of_rig
-from psd_deflection.calibrating.observation import Run, joined, noise_of, rows_of
+from psd_deflection.calibrating.observation import Run, joined, noise_of, rows_of, settled
 from psd_deflection.config import Rig
 from psd_deflection.misalignment.model import COUNT, PARAMETERS, TOLERANCES, ZERO
 from psd_deflection.misalignment.rig import vector_of_rig
@@ -71,7 +71,7 @@ def check(
     clock = roughly_late(runs, rig, noise) if kind == 'reference' else 0.0
     rows = joined([rows_of(run, rig, noise, late=clock, blocks=kind != 'reference') for run in runs])
     if kind == 'loads':
-        rows = rows.at(rows.rest)
+        rows = settled(rows, rig, noise)
     progress('fitting')
     vector = vector_of_rig(rig)
     told = prior_of_rig(rig, vector)

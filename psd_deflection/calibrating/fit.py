@@ -186,7 +186,7 @@ def fit(
     for number in range(0 if start is None else PASSES - 2, PASSES):
         for _ in range(STEPS):
             inverse = weight_matrices(linear, rows, noise)
-            robust = _robust(linear, inverse, noise, number)
+            robust = _robust(linear, inverse, noise, kind, number)
             step, information = _step(linear, inverse, robust, z, prior, free)
             z = z + step
             linear = linearised(rows, z, rig, kind)
@@ -194,15 +194,15 @@ def fit(
                 break
         noise = _components(linear, rows, robust, kind, number, information, prior)
     inverse = weight_matrices(linear, rows, noise)
-    robust = _robust(linear, inverse, noise, PASSES)
+    robust = _robust(linear, inverse, noise, kind, PASSES)
     _, information = _step(linear, inverse, robust, z, prior, free)
     return Fit(z, posterior(information, prior, free), information, linear, robust, noise, free)
 
 
-def _robust(linear: Linear, inverse: FloatArray, noise: Noise, number: int) -> FloatArray:
-    """Weights (n,): Huber's in the first pass, then 0 of outliers."""
+def _robust(linear: Linear, inverse: FloatArray, noise: Noise, kind: Kind, number: int) -> FloatArray:
+    """Weights (n,): Huber's in the first pass, then 0 of outliers. Holds of a load are too few to cast one out."""
     distance = np.einsum('ni,nij,nj->n', linear.residual, inverse, linear.residual) * noise.fewer
-    if number == 0:
+    if number == 0 or kind == 'loads':
         return np.asarray(np.minimum(1.0, _HUBER / np.sqrt(np.maximum(distance, 1e-300))))
     return np.asarray(distance < FAR, dtype=np.float64)
 
@@ -291,7 +291,7 @@ def _components(
     used = float(np.trace(known @ (information * np.outer(scale, scale))))
     # Each of the four equations of a row pays its part of the parameters that were fitted.
     share = max(1.0 - used / (4.0 * len(errors)), 0.2)
-    robustly = number == 0
+    robustly = number == 0 and kind != 'loads'
     dots = _deviation(redundant / expected, robustly) / share**0.5
     if kind == 'self':
         return Noise(np.full(3, _FREE), max(dots, 0.3), 1.0)

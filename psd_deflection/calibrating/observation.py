@@ -28,6 +28,8 @@ SETTLE = 0.5
 LEAST_HOLD = 0.8
 """s. A load that is held for less says nothing of the link at rest."""
 LEAST_ROWS = 20
+CALM, CALM_LEAST = 0.25, 1.0 / 250.0
+"""s, of a mean over a link at rest; the least variance of one over that of a sample."""
 
 _OFFSETS = np.arange(-HALF, HALF + 1) / HALF
 _BASIS = np.vander(_OFFSETS, DEGREE + 1, increasing=True)
@@ -197,6 +199,12 @@ def rows_of(run: Run, rig: Rig, noise: FloatArray, *, late: float = 0.0, blocks:
     return rows
 
 
+def settled(rows: Rows, rig: Rig, noise: FloatArray) -> Rows:
+    """Means over ``CALM`` of a link at rest under a known load, in which what still rings is small."""
+    sample = rig.sensitivities.ravel() ** 2 * noise**2
+    return _by_block(rows.at(rows.rest), rig, CALM, sample * CALM_LEAST)
+
+
 def _pose_of_dots(rig: Rig) -> FloatArray:
     """(3, 4): how the pose goes with the dots of the nominal rig at rest."""
     x, y = (rig.centers + rig.zeros).T
@@ -209,6 +217,8 @@ def _pose_of_dots(rig: Rig) -> FloatArray:
 def _by_block(rows: Rows, rig: Rig, seconds: float, variances: FloatArray) -> Rows:
     """Means over blocks of ``seconds``. What the mean of a curved function differs by is taken off the dots."""
     block = np.floor((rows.t - rows.t[0]) / seconds).astype(np.int64)
+    # Never over a change of the load.
+    block += np.cumsum(np.any(np.diff(rows.loads, axis=0, prepend=rows.loads[:1]) != 0.0, axis=1))
     _, index, counts = np.unique(block, return_inverse=True, return_counts=True)
 
     def mean(values: FloatArray) -> FloatArray:

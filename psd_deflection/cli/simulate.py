@@ -105,9 +105,7 @@ def run(args: argparse.Namespace) -> int:
     reference = args.reference or noise is not None
     kinds: list[type[Record]] = [AppliedLoad]
     kinds += [TemperatureReading] * (temperature is not None) + [ReferencePose] * reference
-    simulated = SimulatedRun(
-        rig, known, history.loads, temperature, args.seed, reference, noise or (0.0, 0.0, 0.0)
-    )
+    simulated = SimulatedRun(rig, known, history.loads, temperature, args.seed, reference, noise or (0.0, 0.0, 0.0))
     count = len(history)
     sink = open_sink(args.out, known.flat(), samples_with=kinds)
     bar = tqdm(total=count, unit=' samples', delay=1.0, leave=False, disable=args.json or None, ncols=80)
@@ -131,5 +129,7 @@ def _reference_noise(text: str) -> tuple[float, float, float]:
     except ValueError:
         across = twist = -1.0
     if not (0.0 <= across <= 1.0 and 0.0 <= twist <= 1.0):
-        raise UsageError(f'--reference-noise {text}: must be two numbers of at least 0 and at most 1, such as 1e-5,5e-4')
+        raise UsageError(
+            f'--reference-noise {text}: must be two numbers of at least 0 and at most 1, such as 1e-5,5e-4'
+        )
     return across, across, twist

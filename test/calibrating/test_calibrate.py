@@ -11,6 +11,7 @@ from psd_deflection.calibrating.calibrate import Calibration, calibrate
 from psd_deflection.calibrating.check import check
 from psd_deflection.calibrating.fit import NAMES
 from psd_deflection.calibrating.observation import Run
+from psd_deflection.calibrating.result import values_of
 from psd_deflection.config import Rig, rig_from_values
 from psd_deflection.errors import RecordingError
 
@@ -104,8 +105,10 @@ def test_a_reference_that_is_no_reference_is_refused(nominal: Rig, pose: misalig
     run = campaign.run_of(misaligned.record(only(), pose, np.random.default_rng(2)))
     wrong = Run(run.name, run.t, run.volts, run.reference_t, np.random.default_rng(1).permutation(run.reference))
     found = calibrate([wrong], nominal)
-    # Nothing is learnt from it: what it leaves open is no less than before by much, or it is refused.
-    assert found.refused or found.gap.heldout_after <= found.gap.heldout_before
+    assert found.refused.startswith('on motion that was not fitted')
+    values, effects = values_of(found, 'today')
+    assert not effects
+    assert set(values) == {'psd_1.noise', 'psd_2.noise'}
 
 
 def test_a_recording_without_reference_and_loads_is_refused(nominal: Rig, pose: misaligned.Array) -> None:
@@ -117,8 +120,11 @@ def test_a_recording_without_reference_and_loads_is_refused(nominal: Rig, pose: 
 def test_the_redundant_reading_alone_tells_a_relative_gain(nominal: Rig, pose: misaligned.Array) -> None:
     run = campaign.run_of(misaligned.record(only(psd_1__gain_x=0.02), pose, np.random.default_rng(2)))
     found = calibrate([Run(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0])], nominal, alone=True)
-    relative = found.values[AT['psd_1.gain_x']] - found.values[AT['psd_2.gain_x']]
-    assert relative == pytest.approx(0.02, abs=0.004)
+    # Along the base line (0.1, 0.07), which the one reading too many sees when the plate goes along X.
+    v = {name: found.values[i] for name, i in AT.items()}
+    along = v['psd_1.gain_x'] - v['psd_2.gain_x']
+    across = v['psd_1.crosstalk_yx'] - v['psd_2.crosstalk_yx'] - v['psd_1.rotation'] + v['psd_2.rotation']
+    assert 0.1 * along + 0.07 * across == pytest.approx(0.1 * 0.02, rel=0.1)
     assert found.gap.heldout_after < 0.2 * found.gap.heldout_before
 
 
@@ -130,7 +136,7 @@ def test_known_loads_alone_leave_the_scale_to_the_clamp(nominal: Rig) -> None:
     held = Run(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0], loads)
     found = calibrate([held], nominal)
     relative = found.values[AT['psd_1.gain_x']] - found.values[AT['psd_2.gain_x']]
-    assert relative == pytest.approx(0.02, abs=0.004)
+    assert relative == pytest.approx(0.02, abs=0.006)
     # Common to all gains, against the clamp: no better than the tolerance of four of them.
     assert found.sd[AT['psd_1.gain_x']] > 0.003
 
