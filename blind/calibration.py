@@ -26,7 +26,8 @@ from psd_deflection.calibrating.check import check
 from psd_deflection.calibrating.fit import NAMES
 from psd_deflection.calibrating.observation import Run
 from psd_deflection.calibrating.result import values_of
-from psd_deflection.config import Rig, flattened, replace_values, rig_from_values
+from psd_deflection.config import Rig, replace_values, rig_from_values
+from psd_deflection.parameter_files import flattened
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import DeflectionEstimate, RawChunk
 from psd_deflection.simulation.catalogue import effects_to_values

@@ -328,7 +328,7 @@ def _heldout(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, before:
 
 
 def _without_refused_terms(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind) -> tuple[Fit, Prior, list[str]]:
-    """Drop a non-linearity that unseen motion contradicts: it keeps the file's value, within what the rows leave open."""
+    """Drop a non-linearity that unseen motion contradicts: the file's value stays, within what the rows leave open."""
     dropped: list[str] = []
     for name in ('psd_1.nonlinearity', 'psd_2.nonlinearity'):
         i = INDEX[name]

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.config import flat_parameters
 from psd_deflection.errors import ConfigError
 from psd_deflection.foreign_yaml import YamlError, edited
+from psd_deflection.parameter_files import flat_parameters
 
 HEADER = '# Calibrated by '
 

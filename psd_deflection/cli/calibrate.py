@@ -31,10 +31,11 @@ from psd_deflection.calibrating.rig_file import with_values
 from psd_deflection.cli._options import namespace_option
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save, show, warn
-from psd_deflection.config import Rig, load_rig, parameter_text, with_effects_section
+from psd_deflection.config import Rig, load_rig
 from psd_deflection.discovery.result import model_yaml
 from psd_deflection.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.misalignment.rig import is_calibrated
+from psd_deflection.parameter_files import parameter_text, with_effects_section
 from psd_deflection.recordings.calibration_runs import read_runs
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end

@@ -11,10 +11,9 @@ from psd_deflection.calibrating.observation import Run
 from psd_deflection.calibration import Wiring
 from psd_deflection.config import Rig
 from psd_deflection.errors import RecordingError
-from psd_deflection.recordings.observations import MAX_SAMPLES, digest_of, held_at
+from psd_deflection.recordings.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.simulated_recording import SimulatedRecording
 from psd_deflection.records import CHANNELS, FloatArray
 
 
@@ -49,7 +48,7 @@ def read_run(source: Recording | str | Path, rig: Rig, *, namespace: str | None 
         np.array([(r.t_ns - start) * 1e-9 for r in references]),
         np.array([(r.dx, r.dy, r.theta) for r in references], dtype=np.float64).reshape(-1, 3),
         loads,
-        '' if isinstance(recording, SimulatedRecording) else digest_of(path),
+        digest_of(path) if path.exists() else '',
     )
 
 

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from psd_deflection.calibration import Wiring
-from psd_deflection.config import MAX_FILE_BYTES, Rig, replace_values
+from psd_deflection.config import Rig, replace_values
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.errors import ConfigError, RecordingError
-from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
+from psd_deflection.foreign_yaml import tree_of_file
 from psd_deflection.recordings.csv_reader import CsvRecording
+from psd_deflection.recordings.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end
 from psd_deflection.recordings.simulated_recording import SimulatedRecording
-from psd_deflection.records import CHANNELS, FloatArray, IntArray
-
-MAX_SAMPLES = 20_000_000
+from psd_deflection.records import CHANNELS, FloatArray
 
 
 def read_observation(
@@ -94,31 +92,6 @@ def read_observation(
     return Observation(path.name, rig, Wiring.from_rig(rig).to_psds(volts), held, warm, digest=digest)
 
 
-def held_at(
-    times: IntArray, values: FloatArray, t_ns: FloatArray, grace: float, before: FloatArray | float
-) -> FloatArray:
-    """``values`` (k, ...) from ``times`` (k,) ns on, at ``t_ns`` or up to ``grace`` ns later; ``before`` the first."""
-    order = np.argsort(times, kind='stable')
-    index = np.searchsorted(times[order], t_ns + grace, side='right') - 1
-    out = values[order][np.maximum(index, 0)].astype(np.float64)
-    out[index < 0] = before
-    return out
-
-
-def digest_of(path: Path) -> str:
-    """SHA-256 of a file, or of all files of a folder. Raises RecordingError if one cannot be read."""
-    digest = hashlib.sha256()
-    files = sorted(p for p in path.rglob('*') if p.is_file()) if path.is_dir() else [path]
-    try:
-        for file in files:
-            with file.open('rb') as stream:
-                while piece := stream.read(1 << 20):
-                    digest.update(piece)
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
-    return digest.hexdigest()
-
-
 def read_observations(
     sources: Sequence[Recording | str | Path],
     rig: Rig | None = None,
@@ -149,12 +122,7 @@ def read_observations(
 
 
 def _listed(path: Path) -> list[tuple[str, dict[str, object]]]:
-    try:
-        tree = parse_yaml(read_text(path, MAX_FILE_BYTES))
-    except OSError as error:
-        raise ConfigError(f'{path}: cannot be read as a list of recordings ({error.strerror or error})') from None
-    except YamlError as error:
-        raise ConfigError(f'{path}{error.where}: {error}') from None
+    tree = tree_of_file(path, 'list of recordings')
     if not isinstance(tree, list) or not tree:
         raise ConfigError(f'{path}: must be a list of "- recording: FILE" with optional "overrides:"')
     out: list[tuple[str, dict[str, object]]] = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from psd_deflection.calibrating.observation import Run
 from psd_deflection.calibrating.result import values_of
 from psd_deflection.config import Rig, rig_from_values
 from psd_deflection.errors import RecordingError
+from psd_deflection.records import FloatArray
 
 AT = {name: i for i, name in enumerate(NAMES)}
 
@@ -24,7 +27,7 @@ def nominal() -> Rig:
 
 
 @pytest.fixture(scope='module')
-def pose() -> misaligned.Array:
+def pose() -> FloatArray:
     return misaligned.poses(misaligned.pushes(np.random.default_rng(3), 12, 2.0))
 
 
@@ -33,12 +36,12 @@ def only(**parameters: float) -> dict[str, float]:
     return misaligned.nominal() | {name.replace('__', '.'): v for name, v in parameters.items()}
 
 
-def calibrated(rig: Rig, truth: dict[str, float], pose: misaligned.Array, seed: int = 1, **more: float) -> Calibration:
+def calibrated(rig: Rig, truth: dict[str, float], pose: FloatArray, seed: int = 1, **more: Any) -> Calibration:
     recorded = misaligned.record(truth, pose, np.random.default_rng(seed), **more)
     return calibrate([campaign.run_of(recorded)], rig)
 
 
-def test_a_turned_psd_is_found_with_its_sign(nominal: Rig, pose: misaligned.Array) -> None:
+def test_a_turned_psd_is_found_with_its_sign(nominal: Rig, pose: FloatArray) -> None:
     found = calibrated(nominal, only(psd_2__rotation=0.02), pose)
     turned = found.values[AT['psd_2.rotation']]
     # Half the difference of the crosstalks looks the same, and gets its share.
@@ -47,7 +50,7 @@ def test_a_turned_psd_is_found_with_its_sign(nominal: Rig, pose: misaligned.Arra
     assert turned > 0.015
 
 
-def test_errors_are_those_that_are_said(nominal: Rig, pose: misaligned.Array) -> None:
+def test_errors_are_those_that_are_said(nominal: Rig, pose: FloatArray) -> None:
     """All tolerances at once, a few rigs: the sum of squares of whitened errors is a chi-square."""
     rng = np.random.default_rng(5)
     total = count = 0.0
@@ -63,7 +66,7 @@ def test_errors_are_those_that_are_said(nominal: Rig, pose: misaligned.Array) ->
     assert 0.55 * count < total < 1.6 * count
 
 
-def test_outliers_do_not_move_it(nominal: Rig, pose: misaligned.Array) -> None:
+def test_outliers_do_not_move_it(nominal: Rig, pose: FloatArray) -> None:
     truth = misaligned.draw(np.random.default_rng(8))
     clean, dirty = (calibrated(nominal, truth, pose, outliers=share) for share in (0.0, 0.1))
     assert dirty.fit.weights.mean() == pytest.approx(0.9, abs=0.05)
@@ -72,7 +75,7 @@ def test_outliers_do_not_move_it(nominal: Rig, pose: misaligned.Array) -> None:
     assert off[: AT['psd_1.zero_x']].max() < 3.0
 
 
-def test_the_noise_of_reference_and_channels_is_told(nominal: Rig, pose: misaligned.Array) -> None:
+def test_the_noise_of_reference_and_channels_is_told(nominal: Rig, pose: FloatArray) -> None:
     found = calibrated(nominal, only(), pose, spread=(5e-6, 20e-6, 1e-3))
     assert found.fit.noise.reference == pytest.approx((5e-6, 20e-6, 1e-3), rel=0.12)
     assert found.noise == pytest.approx(np.full(4, 2e-3), rel=0.03)
@@ -91,7 +94,7 @@ def test_what_the_recording_cannot_show_keeps_value_and_tolerance(nominal: Rig) 
     assert 'psd_1.gain_y' not in alone
 
 
-def test_a_late_reference_is_put_right(nominal: Rig, pose: misaligned.Array) -> None:
+def test_a_late_reference_is_put_right(nominal: Rig, pose: FloatArray) -> None:
     recorded = misaligned.record(only(), pose, np.random.default_rng(2))
     run = campaign.run_of(recorded)
     late = Run(run.name, run.t, run.volts, run.reference_t + 0.0123, run.reference)
@@ -101,7 +104,7 @@ def test_a_late_reference_is_put_right(nominal: Rig, pose: misaligned.Array) -> 
     assert found.gap.heldout_after < 1.2 * calibrate([run], nominal).gap.heldout_after
 
 
-def test_a_reference_that_is_no_reference_is_refused(nominal: Rig, pose: misaligned.Array) -> None:
+def test_a_reference_that_is_no_reference_is_refused(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(), pose, np.random.default_rng(2)))
     wrong = Run(run.name, run.t, run.volts, run.reference_t, np.random.default_rng(1).permutation(run.reference))
     found = calibrate([wrong], nominal)
@@ -111,13 +114,13 @@ def test_a_reference_that_is_no_reference_is_refused(nominal: Rig, pose: misalig
     assert set(values) == {'psd_1.noise', 'psd_2.noise'}
 
 
-def test_a_recording_without_reference_and_loads_is_refused(nominal: Rig, pose: misaligned.Array) -> None:
+def test_a_recording_without_reference_and_loads_is_refused(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(), pose[:2000], np.random.default_rng(2)))
-    with pytest.raises(RecordingError, match='neither a reference .* nor known loads; --self'):
+    with pytest.raises(RecordingError, match=r'neither a reference .* nor known loads; --self'):
         calibrate([Run(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0])], nominal)
 
 
-def test_the_redundant_reading_alone_tells_a_relative_gain(nominal: Rig, pose: misaligned.Array) -> None:
+def test_the_redundant_reading_alone_tells_a_relative_gain(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(psd_1__gain_x=0.02), pose, np.random.default_rng(2)))
     found = calibrate([Run(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0])], nominal, alone=True)
     # Along the base line (0.1, 0.07), which the one reading too many sees when the plate goes along X.
@@ -141,7 +144,7 @@ def test_known_loads_alone_leave_the_scale_to_the_clamp(nominal: Rig) -> None:
     assert found.sd[AT['psd_1.gain_x']] > 0.003
 
 
-def test_check_names_what_moved(nominal: Rig, pose: misaligned.Array) -> None:
+def test_check_names_what_moved(nominal: Rig, pose: FloatArray) -> None:
     rng = np.random.default_rng(9)
     truth = misaligned.draw(rng)
     rig, _ = campaign.calibrated_rig(nominal, campaign.run_of(misaligned.record(truth, pose, rng)))

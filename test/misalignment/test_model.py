@@ -35,7 +35,7 @@ def truth() -> dict[str, float]:
 
 @pytest.fixture
 def poses() -> FloatArray:
-    return np.random.default_rng(2).uniform(-1.0, 1.0, (3, 50)) * np.array([[3e-3], [3e-3], [0.03]])
+    return np.asarray(np.random.default_rng(2).uniform(-1.0, 1.0, (3, 50)) * np.array([[3e-3], [3e-3], [0.03]]))
 
 
 def vector_of(truth: dict[str, float]) -> FloatArray:

@@ -116,4 +116,4 @@ def test_a_zero_taken_now_replaces_what_the_file_left_open() -> None:
     other = Pipeline(rig)
     list(other.process(chunk_of(dots[:600])))
     other.apply(change)
-    assert [*other.process(chunk_of(dots[600:], 600))][0] == records[0]
+    assert next(other.process(chunk_of(dots[600:], 600))) == records[0]
