@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from tqdm import tqdm
 
 from blind import generator, misaligned
 from blind.generator import Array
@@ -33,7 +34,7 @@ from psd_deflection.records import DeflectionEstimate, RawChunk
 from psd_deflection.simulation.catalogue import effects_to_values
 
 HOLDS, SECONDS = 24, 2.5
-AFTER, AFTER_SECONDS = 9, 2.0
+AFTER, AFTER_SECONDS = 8, 1.5
 SIZE = 20
 BORDER = 0.04
 """How far from the limit a share must be for the two Fisher informations to agree on its side."""
@@ -274,7 +275,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--jobs', type=int, default=2, help='processes at once')
     args = parser.parse_args(argv)
     with ProcessPoolExecutor(args.jobs) as pool:
-        scores = list(pool.map(score, range(args.rigs)))
+        scores = list(tqdm(pool.map(score, range(args.rigs)), total=args.rigs, unit=' rigs'))
     for line in table(scores):
         print(line)
     for number, s in enumerate(scores):

@@ -103,7 +103,8 @@ class Pipeline:
         config = rig.estimator
         self._cutter = BlockCutter(config.block_size)
         self._period_ns = 1e9 / rig.converter.sample_rate_hz
-        self.tip_loads = TipLoads(rig, effects_of_rig(rig) if config.wrench == 'effects' else ())
+        self._effects = effects_of_rig(rig)
+        self.tip_loads = TipLoads(rig, self._effects if config.wrench == 'effects' else ())
         self._recent: list[Dots] = []
         self._environment: dict[str, float] = {}
         self._zero_variances: tuple[float, ...] = ()
@@ -120,11 +121,11 @@ class Pipeline:
     def _build(self, rig: Rig) -> None:
         self.rig = rig
         self._calibration = Calibration.from_rig(rig)
-        self._correction = Correction.from_rig(rig)
+        self._correction = Correction(rig, self._effects)
         self._optics = OpticsHealth(rig)
         self._one_psd = OnePsd(Geometry.from_rig(rig))
         config = rig.estimator
-        self._spread = None if psds_at_base(rig) else ParameterSpread.from_rig(rig, self._zero_variances)
+        self._spread = None if psds_at_base(rig) else ParameterSpread.from_rig(rig, self._zero_variances, self._effects)
         names = [config.solver, *(name for name in config.solvers if name != config.solver)]
         self._solvers = [(name, solver_from_rig(name, rig), name == config.solver) for name in names]
 
@@ -219,7 +220,10 @@ class Pipeline:
         if isinstance(loads, list):
             self.tip_loads.restore(tuple(loads))
         if values:
-            self._build(replace_values(self.rig, values, 'change'))
+            rig = replace_values(self.rig, values, 'change')
+            if rig.effects != self.rig.effects:
+                self._effects = effects_of_rig(rig)
+            self._build(rig)
             self.stamped.set_zeros(self.rig)
         self.stamped.restore(told)
 

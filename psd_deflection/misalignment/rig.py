@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -51,8 +51,11 @@ class RigVector(NamedTuple):
         return out
 
 
-def vector_of_rig(rig: Rig) -> RigVector:
-    """The parameters as ``rig`` has them. Raises ConfigError if an effect is listed twice."""
+def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> RigVector:
+    """The parameters as ``rig`` has them; ``effects``: its effects, if they are known.
+
+    Raises ConfigError if an effect is listed twice.
+    """
     v = np.zeros(len(ALL))
     clamp = dict.fromkeys(CLAMP.values(), 0.0)
     others: list[ActiveEffect] = []
@@ -64,7 +67,7 @@ def vector_of_rig(rig: Rig) -> RigVector:
         v[INDEX[f'psd_{i + 1}.height']] = psd.height
         for axis, angle in zip('xy', rig.beams[i].angle, strict=True):
             v[INDEX[f'beam_{i + 1}.angle_{axis}']] = angle
-    for active in effects_of_rig(rig):
+    for active in effects_of_rig(rig) if effects is None else effects:
         name = active.effect.name
         if name not in (*_OF_PSD, *CLAMP, TILT):
             others.append(active)

@@ -12,16 +12,19 @@ independent of the rest.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from psd_deflection.config import Rig
 from psd_deflection.misalignment.model import ZERO, by_parameters, by_place, place_of_reading, readings
 from psd_deflection.misalignment.rig import is_calibrated, known_of_rig, vector_of_rig
 from psd_deflection.records import FloatArray
+from psd_deflection.simulation.declaration import ActiveEffect
 
 RANGE: FloatArray = np.array([0.006, 0.006, 0.06])
 """Poses (m, m, rad) within which the quartic is fitted: about what detectors of 10 mm see."""
-LEVELS = 6
+LEVELS = 5
 
 
 class ParameterSpread:
@@ -42,10 +45,13 @@ class ParameterSpread:
         self._quartic = np.linalg.lstsq(basis, slopes.reshape(len(basis), -1), rcond=None)[0]
 
     @classmethod
-    def from_rig(cls, rig: Rig, zero_variances: tuple[float, ...] = ()) -> ParameterSpread | None:
+    def from_rig(
+        cls, rig: Rig, zero_variances: tuple[float, ...] = (), effects: Sequence[ActiveEffect] | None = None
+    ) -> ParameterSpread | None:
         """None if the rig was not calibrated or its covariances are not to be total.
 
-        ``zero_variances`` (4,) m^2: of a zero that was taken after the calibration. Raises ConfigError.
+        ``zero_variances`` (4,) m^2: of a zero that was taken after the calibration. ``effects``: those of the rig, if
+        they are known. Raises ConfigError.
         """
         if rig.estimator.covariance != 'total' or not is_calibrated(rig):
             return None
@@ -53,7 +59,7 @@ class ParameterSpread:
         if zero_variances:
             covariance[ZERO:] = covariance[:, ZERO:] = 0.0
             covariance[ZERO:, ZERO:] = np.diag(zero_variances)
-        return cls(vector_of_rig(rig).as_used, covariance, rig.link.length)
+        return cls(vector_of_rig(rig, effects).as_used, covariance, rig.link.length)
 
     def factor(self, dx: float, dy: float, theta: float) -> FloatArray:
         """B (4, k), m, at a pose (m, m, rad): the corrected dots spread by B B^T."""
