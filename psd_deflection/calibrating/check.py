@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from psd_deflection.calibrating.calibrate import fitted_parameters, kind_of, roughly_late
-from psd_deflection.calibrating.fit import NAMES, Prior, fit, prior_of_rig
+from psd_deflection.calibrating.fit import NAMES, Prior, fit, prior_of_rig, score_at
 from psd_deflection.calibrating.observation import Run, joined, noise_of, rows_of, settled
 from psd_deflection.config import Rig
 from psd_deflection.misalignment.model import COUNT, PARAMETERS, TOLERANCES, ZERO
@@ -77,15 +77,17 @@ def check(
     told = prior_of_rig(rig, vector)
     # The noise is that about the best fit of a rig that may have moved.
     wide = told.covariance.copy()
-    wide[:COUNT, :COUNT] += np.diag((10.0 * TOLERANCES) ** 2)
+    wide[:COUNT, :COUNT] += np.diag((3.0 * TOLERANCES) ** 2)
     free = fitted_parameters(kind)
     best = fit(rows, rig, Prior(told.mean, wide), kind, free=free)
+    # Gradient and information at the file's values: from a rig that far off k and the heights would not be linear.
+    z = told.mean.copy()
+    z[ZERO:] = best.values[ZERO:]
+    gradient, whole = score_at(rows, z, rig, kind, best)
     at = np.flatnonzero(free)
     scale = np.concatenate((TOLERANCES, told.sd[COUNT:]))[at]
-    information = best.information[np.ix_(at, at)] * np.outer(scale, scale)
-    # The gradient at the file's values: at the best fit it balances the wide prior.
-    pull = np.linalg.solve(wide[np.ix_(at, at)], (best.values - told.mean)[at])
-    right = information @ ((best.values - told.mean)[at] / scale) + scale * pull
+    information = whole[np.ix_(at, at)] * np.outer(scale, scale)
+    right = scale * gradient[at] + information @ ((z - told.mean)[at] / scale)
     p = told.covariance[np.ix_(at, at)] / np.outer(scale, scale)
     q = np.linalg.solve(np.eye(len(at)) + p @ information, p)
     left = right - information @ (q @ right)

@@ -207,6 +207,15 @@ def _robust(linear: Linear, inverse: FloatArray, noise: Noise, kind: Kind, numbe
     return np.asarray(distance < FAR, dtype=np.float64)
 
 
+def score_at(rows: Rows, z: FloatArray, rig: Rig, kind: Kind, best: Fit) -> tuple[FloatArray, FloatArray]:
+    """J^T C^-1 r (SIZE,) and J^T C^-1 J (SIZE, SIZE) at ``z``, with the noise and the outliers of the fit ``best``."""
+    linear = linearised(rows, z, rig, kind)
+    inverse = weight_matrices(linear, rows, best.noise) * best.weights[:, None, None]
+    weighted = np.einsum('nij,njk->nik', inverse, linear.slopes).reshape(-1, SIZE)
+    information = linear.slopes.reshape(-1, SIZE).T @ weighted
+    return weighted.T @ linear.residual.ravel(), 0.5 * (information + information.T)
+
+
 def refitted(whole: Fit, rows: Rows, prior: Prior, kept: FloatArray, free: Mask) -> FloatArray:
     """Parameters (SIZE,) from some of the rows, ``kept`` (n,) 1 or 0, by one step from the fit of all of them."""
     inverse = weight_matrices(whole.linear, rows, whole.noise)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ def with_values(text: str, values: Mapping[str, object], source: str, path: Path
 
     ``path``: for a message. Raises ConfigError if the file cannot be edited so that it says the same otherwise.
     """
+
+    values = {name: _readable(value) for name, value in values.items()}
 
     def edit(tree: Any) -> None:
         bodies = [
@@ -42,6 +45,15 @@ def with_values(text: str, values: Mapping[str, object], source: str, path: Path
         raise ConfigError(f'{path}: cannot be written again with the same values')
     kept = ''.join(line for line in out.splitlines(keepends=True) if not line.startswith(HEADER))
     return f'{HEADER}{source}\n{kept}'
+
+
+def _readable(value: object) -> object:
+    """``value``, or a float of its last digit away: YAML 1.1 takes 1e-05, which is how it is written, for text."""
+    if isinstance(value, list):
+        return [_readable(item) for item in value]
+    if isinstance(value, float) and 'e' in repr(value) and '.' not in repr(value):
+        return math.nextafter(value, math.inf)
+    return value
 
 
 def _in_a_line(value: object) -> object:

@@ -160,6 +160,8 @@ def rig_values(
 
     ``vector``: of the rig file that is changed; its other effects are kept.
     """
+    # Editors of YAML keep twelve digits of a number with an exponent, not all of them sixteen.
+    p = np.array([float(f'{v:.12g}') for v in p])
     values: dict[str, object] = {'link.slope_ratio': float(p[SLOPE])}
     effects = list(vector.others)
 
@@ -173,12 +175,12 @@ def rig_values(
         values[f'psd_{n}.height'] = own[f'psd_{n}.height']
         values[f'beam_{n}.angle'] = [own[f'beam_{n}.angle_x'], own[f'beam_{n}.angle_y']]
         place = place_of_reading(p, n - 1, p[ZERO + 2 * n - 2], p[ZERO + 2 * n - 1])
-        values[f'psd_{n}.zero'] = [float(x) for x in place]
+        values[f'psd_{n}.zero'] = [float(f'{x:.12g}') for x in place]
         for name, called in _OF_PSD.items():
             if name != 'sensor_position':
                 add(name, {'psd': float(n), **{key: own[f'psd_{n}.{to}'] for key, to in called.items()}})
     add(TILT, {'slope_ratio': float(p[SLOPE])})
     for name, clamp_name in CLAMP.items():
         # A clamp that gives less than nothing is the link's stiffness, not the clamp.
-        add(name, {'compliance': max(clamp[clamp_name], 0.0)})
+        add(name, {'compliance': max(float(f'{clamp[clamp_name]:.12g}'), 0.0)})
     return values, sort_effects(effects)
