@@ -20,8 +20,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from psd_deflection.calibrating.calibrate import fitted_parameters, kind_of, roughly_late
-from psd_deflection.calibrating.fit import NAMES, Prior, fit, prior_of_rig, score_at
-from psd_deflection.calibrating.observation import Run, joined, noise_of, rows_of, settled
+from psd_deflection.calibrating.fit import NAMES, Fit, Kind, Mask, Prior, explained, fit, prior_of_rig, score_at
+from psd_deflection.calibrating.observation import Rows, Run, joined, noise_of, rows_of, settled
 from psd_deflection.config import Rig
 from psd_deflection.misalignment.model import COUNT, PARAMETERS, TOLERANCES, ZERO
 from psd_deflection.misalignment.rig import vector_of_rig
@@ -31,6 +31,12 @@ LEVEL = 0.05
 """Share of rigs that did not move and are said to have moved."""
 LIKE = 3.0
 """Natural logarithm of a Bayes factor below which two groups cannot be told apart."""
+BELIEVED = 0.02
+"""Share of the tolerances below which a calibration is not believed: its covariance is that of a linear model."""
+SHIFT = 3.0
+"""Size of the shifts that are looked for, in tolerances."""
+FITTED = 7
+"""Groups, the likeliest, that are fitted in full if something moved."""
 _SEEN = 1e-4
 """A direction that the rows show by less than this share of a tolerance's inverse variance counts as unseen."""
 
@@ -75,6 +81,7 @@ def check(
     progress('fitting')
     vector = vector_of_rig(rig)
     told = prior_of_rig(rig, vector)
+    told.covariance[:COUNT, :COUNT] += np.diag((BELIEVED * TOLERANCES) ** 2)
     # The noise is that about the best fit of a rig that may have moved.
     wide = told.covariance.copy()
     wide[:COUNT, :COUNT] += np.diag((3.0 * TOLERANCES) ** 2)
@@ -96,6 +103,11 @@ def check(
     seen = [g for g in groups if g.freedom]
     seen.sort(key=lambda g: -g.evidence)
     overall = min([1.0, *(len(seen) * g.p for g in seen)])
+    if overall < LEVEL:
+        # A shift of several tolerances is beyond the linear: the likely ones are fitted in full.
+        null = explained(rows, rig, told, kind, free, best)[0]
+        fitted = [_fitted(g, rows, rig, told, kind, free, best, null) for g in seen[:FITTED]]
+        seen = [*sorted(fitted, key=lambda g: -g.evidence), *seen[FITTED:]]
     like = [g.group for g in seen[1:] if seen[0].evidence - g.evidence < LIKE] if overall < LEVEL else []
     zeros = slice(ZERO, COUNT)
     return Checked(
@@ -125,6 +137,17 @@ def _moved(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale: Floa
         for j, i in enumerate(own)
     }
     return Moved(name, float(chi2.sf(statistic, freedom)) if freedom else 1.0, evidence, freedom, named)
+
+
+def _fitted(group: Moved, rows: Rows, rig: Rig, told: Prior, kind: Kind, free: Mask, best: Fit, null: float) -> Moved:
+    """The group with the evidence and the shifts of a full fit; ``null``: what :func:`explained` says if none moved."""
+    covariance = told.covariance.copy()
+    for name in group.shifts:
+        i = NAMES.index(name)
+        covariance[i, i] += (SHIFT * TOLERANCES[i]) ** 2
+    evidence, z = explained(rows, rig, Prior(told.mean, covariance), kind, free, best)
+    moved = {name: (float((z - told.mean)[NAMES.index(name)]), sd) for name, (_, sd) in group.shifts.items()}
+    return group._replace(evidence=evidence - null, shifts=moved)
 
 
 def result(found: Checked) -> dict[str, Any]:

@@ -216,6 +216,29 @@ def score_at(rows: Rows, z: FloatArray, rig: Rig, kind: Kind, best: Fit) -> tupl
     return weighted.T @ linear.residual.ravel(), 0.5 * (information + information.T)
 
 
+def explained(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask, best: Fit) -> tuple[float, FloatArray]:
+    """How well rows and ``prior`` go together, and the parameters (SIZE,) that fit both.
+
+    The natural logarithm of the rows' probability, but for a constant, with the noise and the outliers of ``best``.
+    """
+    z = prior.mean.copy()
+    z[ZERO:] = best.values[ZERO:]
+    at = np.flatnonzero(free)
+    for _ in range(STEPS):
+        linear = linearised(rows, z, rig, kind)
+        inverse = weight_matrices(linear, rows, best.noise)
+        step, information = _step(linear, inverse, best.weights, z, prior, free)
+        z = z + step
+    residual = linearised(rows, z, rig, kind).residual
+    misfit = float(np.einsum('ni,nij,nj,n->', residual, inverse, residual, best.weights))
+    scale = prior.sd[at]
+    p = prior.covariance[np.ix_(at, at)] / np.outer(scale, scale)
+    away = (z - prior.mean)[at] / scale
+    told = information[np.ix_(at, at)] * np.outer(scale, scale)
+    spread = float(np.linalg.slogdet(np.eye(len(at)) + p @ told)[1])
+    return -0.5 * (misfit + float(away @ np.linalg.solve(p, away)) + spread), z
+
+
 def refitted(whole: Fit, rows: Rows, prior: Prior, kept: FloatArray, free: Mask) -> FloatArray:
     """Parameters (SIZE,) from some of the rows, ``kept`` (n,) 1 or 0, by one step from the fit of all of them."""
     inverse = weight_matrices(whole.linear, rows, whole.noise)

@@ -1,7 +1,7 @@
 """One recording as arrays, and the rows that a calibration fits: the dots at the times of the reference.
 
-A polynomial of degree 4 through 21 samples gives the dots at a time, their speed and their noise. It follows the
-link's modes to a thousandth of their amplitude, which a mean of 20 samples does not. A reference that comes in almost
+A polynomial of degree 6 through 21 samples gives the dots at a time, their speed and their noise. It follows the
+link's modes to 1e-5 of their amplitude, which a mean of 20 samples does not. A reference that comes in almost
 every sample is averaged over a block together with the dots.
 """
 
@@ -20,9 +20,9 @@ from psd_deflection.misalignment.model import readings
 from psd_deflection.misalignment.rig import vector_of_rig
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray, IntArray
 
-HALF, DEGREE = 10, 4
+HALF, DEGREE = 10, 6
 """Samples to either side of a time, and degree of the polynomial through them."""
-LEAST_PRESENT = 15
+LEAST_PRESENT = 17
 SETTLE = 0.5
 """Share of the time that a load is held which is not fitted: the link rings."""
 LEAST_HOLD = 0.8
@@ -140,8 +140,8 @@ def noise_of(run: Run, rig: Rig) -> FloatArray:
     s = smoothed(dots, 1.0, places)
     if not s.good.any():
         return rig.noises[:, :2].ravel()
-    # The median is not moved by jumps; of chi-square over its 16 degrees of freedom it is 0.9588.
-    variances = np.median(s.squares[s.good], axis=0) / 0.9588
+    # The median is not moved by jumps; of chi-square over its 14 degrees of freedom it is 0.9531.
+    variances = np.median(s.squares[s.good], axis=0) / 0.9531
     variances = variances / rig.sensitivities.ravel() ** 2 - rig.converter.volts_per_count**2 / 12.0
     return np.asarray(np.sqrt(np.maximum(variances, (0.1 * rig.converter.volts_per_count) ** 2)))
 
