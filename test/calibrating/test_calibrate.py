@@ -51,19 +51,15 @@ def test_a_turned_psd_is_found_with_its_sign(nominal: Rig, pose: FloatArray) -> 
 
 
 def test_errors_are_those_that_are_said(nominal: Rig, pose: FloatArray) -> None:
-    """All tolerances at once, a few rigs: the sum of squares of whitened errors is a chi-square."""
+    """All tolerances at once, two rigs; the campaign has many."""
     rng = np.random.default_rng(5)
-    total = count = 0.0
-    for _ in range(3):
+    errors: list[float] = []
+    for _ in range(2):
         truth = misaligned.draw(rng)
         found = calibrated(nominal, truth, pose, seed=int(rng.integers(1 << 30)), outliers=0.02)
-        at = [AT[n] for n in truth if n in AT]
-        error = found.values[at] - np.array([truth[NAMES[i]] for i in at])
-        covariance = found.covariance[np.ix_(at, at)]
-        scale = np.sqrt(np.diag(covariance))
-        total += float(error / scale @ np.linalg.solve(covariance / np.outer(scale, scale), error / scale))
-        count += len(at)
-    assert 0.55 * count < total < 1.6 * count
+        errors += [float((found.values[AT[n]] - v) / found.sd[AT[n]]) for n, v in truth.items() if n in AT]
+    assert 0.3 < np.mean(np.square(errors)) < 2.0
+    assert np.max(np.abs(errors)) < 4.5
 
 
 def test_outliers_do_not_move_it(nominal: Rig, pose: FloatArray) -> None:
