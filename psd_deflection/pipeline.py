@@ -53,8 +53,9 @@ from psd_deflection.uncertainty.stamped import FIT, HELD_RESIDUAL, NOISE, Stampe
 ZERO_BLOCKS = 25
 """Number of blocks that :meth:`Pipeline.zero` averages: half a second."""
 
-MOVING, STILL = 5.0, 2e-6
-"""A zero is refused if the dots scatter by so many times the noise and by more than so much, m: see :func:`motion`."""
+MOVING, RINGS, STILL = 5.0, 10e-6, 2e-6
+"""A zero is refused if the dots scatter or drift by so many times the noise and by more than so much, m: see
+:func:`motion`."""
 
 START, FIRST_TEMPERATURE, TEMPERATURE = ENVIRONMENT
 HELD, FROZEN, TIP_LOADS = 'state.held_twist', 'state.frozen_blocks', 'state.tip_loads'
@@ -486,13 +487,17 @@ def _through(gain: FloatArray, factor: FloatArray) -> FloatArray:
 def motion(dots: FloatArray, noise: tuple[float, ...]) -> str:
     """Why ``dots`` (n, 4), m, of the last blocks are not those of a link at rest; '' if they may be.
 
-    ``noise`` (4,): variance of a block's dots, m^2. Moving is what scatters ``MOVING`` times as much as the noise says,
-    and by more than ``STILL``: hum and a coarse converter do less.
+    ``noise`` (4,): variance of a block's dots, m^2. Moving is what scatters ``MOVING`` times as much as the noise says
+    and by more than ``RINGS``, or what drifts by as much and by more than ``STILL`` from the first half to the second.
+    A mean over whole periods leaves little of what rings, and all of what drifts.
     """
     if len(dots) < 3:
         return ''
     scatter = dots.std(axis=0, ddof=1)
-    beyond = scatter / np.maximum(MOVING * np.sqrt(noise), STILL)
+    half = len(dots) // 2
+    drift = np.abs(dots[half:].mean(axis=0) - dots[:half].mean(axis=0))
+    least = MOVING * np.sqrt(noise)
+    beyond = np.maximum(scatter / np.maximum(least, RINGS), drift / np.maximum(least, STILL))
     worst = int(np.argmax(beyond))
     if beyond[worst] <= 1.0:
         return ''

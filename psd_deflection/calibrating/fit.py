@@ -202,7 +202,8 @@ def fit(
 def _robust(linear: Linear, inverse: FloatArray, noise: Noise, kind: Kind, number: int) -> FloatArray:
     """Weights (n,): Huber's in the first pass, then 0 of outliers. Holds of a load are too few to cast one out."""
     distance = np.einsum('ni,nij,nj->n', linear.residual, inverse, linear.residual) * noise.fewer
-    if number == 0 or kind == 'loads':
+    # Where most would be outliers it is the noise that is not known yet.
+    if number == 0 or kind == 'loads' or np.mean(distance < FAR) < 0.5:
         return np.asarray(np.minimum(1.0, _HUBER / np.sqrt(np.maximum(distance, 1e-300))))
     return np.asarray(distance < FAR, dtype=np.float64)
 
