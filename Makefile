@@ -19,6 +19,7 @@
 # make rerun    recordings converted for the Rerun viewer (170 MB, in an environment of its own) and looked at in it
 # make shots    the pictures of the live page in docs/figures anew (needs Chromium)
 # make blind    hide effects with a second generator and see whether discover names them (an hour or two on two cores; JOBS=1 for one)
+# make blind-calibration  200 rigs of the second generator, misaligned by chance, calibrated and checked (half an hour on two idle cores; RIGS=20 for a look)
 # make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
 # make clean    remove what the above made
 PYTHON ?= python3
@@ -33,7 +34,7 @@ PYTEST ?=
 WORKERS ?= 2
 BIN := $(VENV)/bin
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks axe shots blind demo-discover colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks axe shots blind blind-calibration demo-discover colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -162,6 +163,10 @@ rerun:
 JOBS ?= $(shell nproc)
 blind: $(VENV)/.installed
 	$(BIN)/python -m blind.run --jobs $(JOBS) $(BLIND)
+
+RIGS ?= 200
+blind-calibration: $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m blind.calibration --rigs $(RIGS) --jobs $(JOBS)
 
 demo-discover: $(VENV)/.installed
 	rm -rf build/demo && mkdir -p build/demo

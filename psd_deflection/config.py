@@ -106,6 +106,33 @@ class PsdConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class BeamConfig:
+    """One laser beam."""
+
+    angle: tuple[float, float] = parameter(
+        (0.0, 0.0), 'rad', 'lean of the beam on its way to the tip, towards +X and +Y', minimum=-0.5, maximum=0.5
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationConfig:
+    """What a calibration left open; `psd-deflection calibrate` writes it."""
+
+    names: tuple[str, ...] = parameter(
+        ('none',), '', 'calibrated parameters, such as psd_1.rotation; none: the rig was not calibrated'
+    )
+    sds: tuple[float, ...] = parameter((0.0,), '', 'standard deviation of each, in SI units', minimum=0.0, maximum=1e9)
+    correlations: tuple[float, ...] = parameter(
+        (0.0,),
+        '',
+        'correlations between them: each with those before it, the second name first; 0: none',
+        minimum=-1.0,
+        maximum=1.0,
+    )
+    source: str = parameter('', '', 'recordings (by hash), software and date of the calibration')
+
+
+@dataclass(frozen=True, slots=True)
 class AmplifierConfig:
     """The amplifier of both detectors."""
 
@@ -167,10 +194,12 @@ class EstimatorConfig:
         before='mean',
     )
     covariance: str = parameter(
-        'measured',
+        'total',
         '',
-        "noise behind the covariances: the rig file's, or measured in the stream after 100 blocks",
-        choices=('measured', 'file'),
+        'what the covariances hold: the noise measured in the stream after 100 blocks and what calibration.* leaves '
+        "open (total), that noise alone (measured, or noise), or the rig file's noise alone (file)",
+        choices=('total', 'measured', 'file'),
+        synonyms=(('noise', 'measured'),),
         before='file',
     )
     consistency: str = parameter(
@@ -378,6 +407,8 @@ PSDS = (
     Section(PsdConfig, 'psd_1.', center=(0.0, 0.070)),
     Section(PsdConfig, 'psd_2.', center=(-0.100, 0.0)),
 )
+BEAMS = (Section(BeamConfig, 'beam_1.'), Section(BeamConfig, 'beam_2.'))
+CALIBRATION = Section(CalibrationConfig, 'calibration.')
 AMPLIFIER = Section(AmplifierConfig, 'amplifier.')
 CONVERTER = Section(ConverterConfig, 'converter.')
 DYNAMICS = Section(DynamicsConfig, 'dynamics.')
@@ -388,9 +419,11 @@ MONITOR = Section(MonitorConfig)
 SECTIONS: tuple[Section[Any], ...] = (
     LINK,
     *PSDS,
+    *BEAMS,
     AMPLIFIER,
     CONVERTER,
     DYNAMICS,
+    CALIBRATION,
     ESTIMATOR,
     ACQUISITION,
     MONITOR,
@@ -408,7 +441,7 @@ _DESCRIBED = tuple(
 DESCRIPTION = (
     *(
         p.name
-        for section in (LINK, *PSDS, AMPLIFIER, CONVERTER, DYNAMICS, ESTIMATOR)
+        for section in (LINK, *PSDS, *BEAMS, AMPLIFIER, CONVERTER, DYNAMICS, CALIBRATION, ESTIMATOR)
         for p in section.parameters.values()
     ),
     *(ACQUISITION.parameters[name].name for name in ('psds_exchanged', 'latency_offset', 'thorlabs_x_sign')),
@@ -434,9 +467,11 @@ class Rig:
 
     link: LinkConfig
     psds: tuple[PsdConfig, ...]
+    beams: tuple[BeamConfig, ...]
     amplifier: AmplifierConfig
     converter: ConverterConfig
     dynamics: DynamicsConfig
+    calibration: CalibrationConfig
     estimator: EstimatorConfig
     acquisition: AcquisitionConfig
     monitor: MonitorConfig
@@ -477,6 +512,11 @@ class Rig:
     def heights(self) -> FloatArray:
         """h_i, (number of PSDs,), m."""
         return np.array([p.height for p in self.psds], dtype=np.float64)
+
+    @property
+    def beam_slopes(self) -> FloatArray:
+        """Lean of each beam along X and Y, (number of PSDs, 2), m/m."""
+        return np.tan([b.angle for b in self.beams])
 
     @property
     def sensitivities(self) -> FloatArray:
@@ -531,9 +571,11 @@ def _rig(values: Mapping[str, Value], effects: Mapping[str, Any], changes: Mappi
     return Rig(
         link=LINK.of(v),
         psds=tuple(psd.of(v) for psd in PSDS),
+        beams=tuple(beam.of(v) for beam in BEAMS),
         amplifier=AMPLIFIER.of(v),
         converter=CONVERTER.of(v),
         dynamics=DYNAMICS.of(v),
+        calibration=CALIBRATION.of(v),
         estimator=ESTIMATOR.of(v),
         acquisition=ACQUISITION.of(v),
         monitor=MONITOR.of(v),

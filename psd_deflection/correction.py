@@ -28,7 +28,7 @@ PASSES = 3
 """Fixed-point passes for the pose; each reduces the error by the relative size of the effect (< 1
 %).
 """
-OPTICS = ('centers', 'beams', 'heights', 'slope_ratio')
+OPTICS = ('centers', 'beams', 'slopes', 'heights', 'slope_ratio')
 """The constants that decide where the beams meet the plate (fields of :class:`Physics`)."""
 
 
@@ -41,9 +41,13 @@ class Correction:
 
     def __init__(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
         self._nominal, self._true = Physics.of(rig), Physics.of(rig)
+        # The solvers take every beam as parallel to Z.
+        self._nominal.slopes = np.zeros((2, 2))
         self._sensors: list[tuple[Callable[[Reading, Values], None], Values]] = []
         self._beams: list[ActiveEffect] = []
-        self._moves_optics = False
+        self._moves_optics = bool(self._true.slopes.any())
+        if self._moves_optics and self._true.psds_at_base:
+            raise ConfigError('beam_N.angle: a beam that leans is not corrected for PSDs at the base; set it to 0')
         uses: set[Use] = set()
         for active in effects:
             try:

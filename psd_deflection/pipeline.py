@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from math import expm1, nan
+from math import cos, expm1, nan, sin
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,7 @@ from psd_deflection.calibration.health import OpticsHealth, Verdict
 from psd_deflection.config import ZEROS, Rig, replace_values
 from psd_deflection.correction import Correction
 from psd_deflection.geometry import Geometry
+from psd_deflection.misalignment.spread import ParameterSpread
 from psd_deflection.records import (
     ENVIRONMENT,
     RESTART,
@@ -46,14 +47,19 @@ from psd_deflection.solvers.interface import Solution, SolverStatus
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 from psd_deflection.solvers.one_psd import OnePsd
 from psd_deflection.solvers.registry import psds_at_base
-from psd_deflection.uncertainty.consistency import Checked, widened
+from psd_deflection.uncertainty.consistency import NAMES, Checked, widened
 from psd_deflection.uncertainty.stamped import FIT, HELD_RESIDUAL, NOISE, StampedDots
 
 ZERO_BLOCKS = 25
 """Number of blocks that :meth:`Pipeline.zero` averages: half a second."""
 
+MOVING, RINGS, STILL = 5.0, 10e-6, 2e-6
+"""A zero is refused if the dots scatter or drift by so many times the noise and by more than so much, m: see
+:func:`motion`."""
+
 START, FIRST_TEMPERATURE, TEMPERATURE = ENVIRONMENT
 HELD, FROZEN, TIP_LOADS = 'state.held_twist', 'state.frozen_blocks', 'state.tip_loads'
+ZERO_VARIANCES = 'state.zero_variances'
 REMEMBERED = (NOISE, FIT, HELD_RESIDUAL)
 """Names of the values in the record of :meth:`Pipeline.memory`."""
 
@@ -98,9 +104,13 @@ class Pipeline:
         config = rig.estimator
         self._cutter = BlockCutter(config.block_size)
         self._period_ns = 1e9 / rig.converter.sample_rate_hz
-        self.tip_loads = TipLoads(rig, effects_of_rig(rig) if config.wrench == 'effects' else ())
+        self._effects = effects_of_rig(rig)
+        self.tip_loads = TipLoads(rig, self._effects if config.wrench == 'effects' else ())
         self._recent: list[Dots] = []
         self._environment: dict[str, float] = {}
+        self._zero_variances: tuple[float, ...] = ()
+        self.zero_refused = ''
+        self._factor: FloatArray | None = None
         self._held: _Held | None = None
         self._frozen = (0, 0)
         variances = dot_noise_variances(rig)
@@ -112,10 +122,11 @@ class Pipeline:
     def _build(self, rig: Rig) -> None:
         self.rig = rig
         self._calibration = Calibration.from_rig(rig)
-        self._correction = Correction.from_rig(rig)
+        self._correction = Correction(rig, self._effects)
         self._optics = OpticsHealth(rig)
         self._one_psd = OnePsd(Geometry.from_rig(rig))
         config = rig.estimator
+        self._spread = None if psds_at_base(rig) else ParameterSpread.from_rig(rig, self._zero_variances, self._effects)
         names = [config.solver, *(name for name in config.solvers if name != config.solver)]
         self._solvers = [(name, solver_from_rig(name, rig), name == config.solver) for name in names]
 
@@ -154,12 +165,23 @@ class Pipeline:
     def zero(self) -> ParameterChange | None:
         """Use the mean dots of the last blocks as the unloaded dots, from the next block on.
 
-        None if the last block was not good or there is none yet. Replay applies the returned record again.
+        None if the last block was not good, if there is none yet, or if the link moves; ``zero_refused`` says the
+        last. Replay applies the returned record again.
         """
+        self.zero_refused = ''
         if not self._recent or self.last_spots is None:
             return None
+        recent = np.array(self._recent)
+        noise = self.stamped.mean_variances(self._cutter.block_size) if self.stamped.flat else self._variances[-1]
+        self.zero_refused = motion(recent, noise)
+        if self.zero_refused:
+            return None
         x1, y1, x2, y2 = (sum(column) / len(self._recent) for column in zip(*self._recent, strict=True))
-        return self.change(dict(zip(ZEROS, ((x1, y1), (x2, y2)), strict=True)))
+        values: dict[str, float | str | tuple[float, ...]] = dict(zip(ZEROS, ((x1, y1), (x2, y2)), strict=True))
+        if self._spread is not None:
+            scatter = recent.var(axis=0, ddof=1) if len(recent) > 1 else np.zeros(4)
+            values[ZERO_VARIANCES] = tuple((np.maximum(scatter, noise) / len(recent)).tolist())
+        return self.change(values)
 
     def change(self, values: Mapping[str, float | str | tuple[float, ...]]) -> ParameterChange:
         """Change parameters from the next block on; returns the change as a record.
@@ -188,12 +210,21 @@ class Pipeline:
             self._held = _Held(int(held[0]), held[1], held[2])
         if isinstance(frozen, list) and len(frozen) == 2:
             self._frozen = (int(frozen[0]), int(frozen[1]))
+        variances = values.pop(ZERO_VARIANCES, None)
+        if isinstance(variances, list) and len(variances) == 4:
+            self._zero_variances = tuple(variances)
         if any(name in ZEROS for name in values):
             self.tip_loads.zeroed = True
+            if variances is None:
+                # A zero from elsewhere: of as many blocks, with the noise of the rig file.
+                self._zero_variances = tuple(v / ZERO_BLOCKS for v in self._variances[-1])
         if isinstance(loads, list):
             self.tip_loads.restore(tuple(loads))
         if values:
-            self._build(replace_values(self.rig, values, 'change'))
+            rig = replace_values(self.rig, values, 'change')
+            if rig.effects != self.rig.effects:
+                self._effects = effects_of_rig(rig)
+            self._build(rig)
             self.stamped.set_zeros(self.rig)
         self.stamped.restore(told)
 
@@ -207,6 +238,8 @@ class Pipeline:
         for name, value in changed.items():
             values.append((name, tuple(map(float, value)) if isinstance(value, list) else value))
         values += self._environment.items()
+        if self._spread is not None and self._zero_variances:
+            values.append((ZERO_VARIANCES, self._zero_variances))
         if self._held is not None and self.rig.estimator.degraded == 'hold':
             values.append((HELD, tuple(self._held)))
         if self._frozen != (0, 0):
@@ -281,7 +314,7 @@ class Pipeline:
             elif best is not None:
                 self._held = _Held(t_ns, best.theta, best.variances[2])
         elif verdict.faulty:
-            if self.rig.estimator.covariance == 'measured' and self.stamped.flat:
+            if self.rig.estimator.covariance != 'file' and self.stamped.flat:
                 variances = self.stamped.mean_variances(present)
             best = self._from_the_other(verdict.faulty, t_ns, block.index, dots, variances)
             degraded = best is not None
@@ -346,8 +379,12 @@ class Pipeline:
         if solution is None:
             return None, None, (BlockStatus.NOT_SOLVED, failure)
         checked: Checked | None = None
+        self._factor = None if self._spread is None else self._spread.factor(solution.dx, solution.dy, solution.theta)
         if self.stamped.flat:
-            checked = self.stamped.check(dots, solution.residual, np.diag(variances) if spread is None else spread)
+            allowed = np.diag(variances) if spread is None else spread
+            if self._factor is not None:
+                allowed = allowed + np.einsum('ik,jk->ij', self._factor, self._factor)
+            checked = self.stamped.check(dots, solution.residual, allowed)
         if checked is not None and checked.contradict and self.rig.estimator.consistency == 'refuse':
             reason = f'the four readings contradict each other: chi-square {checked.chi_square:.0f} of 1'
             return None, checked, (BlockStatus.INCONSISTENT, reason)
@@ -378,12 +415,15 @@ class Pipeline:
         covariance: tuple[float, ...] = s.covariance
         widen = checked is not None and any(checked.possible) and self.rig.estimator.consistency == 'widen'
         # A printed threshold method has no covariance, and no slope either.
-        if (spread is not None or widen) and covariance[0] == covariance[0]:
+        factor = self._factor
+        if (spread is not None or widen or factor is not None) and covariance[0] == covariance[0]:
             gain = solver.gain(dots, variances, s)
             if spread is not None:
                 own = np.einsum('ic,ck,jk->ij', gain, spread, gain)
             else:
                 own = np.array(covariance).reshape(3, 3)
+            if factor is not None:
+                own = own + _through(gain, factor)
             if widen and checked is not None:
                 own = widened(own, gain, checked.possible)
             covariance = tuple(own.ravel().tolist())
@@ -429,4 +469,39 @@ class Pipeline:
         x, y = dots[2 * psd], dots[2 * psd + 1]
         vx, vy = variances[2 * psd], variances[2 * psd + 1]
         dx, dy, cov = self._one_psd.solve(psd, (x, y), (vx, vy), theta, variance)
+        if self._spread is not None:
+            gain = np.zeros((3, 4))
+            c, s = cos(theta), sin(theta)
+            gain[:2, 2 * psd : 2 * psd + 2] = [[-c, s], [-s, -c]]
+            own = np.array(cov).reshape(3, 3) + _through(gain, self._spread.factor(dx, dy, theta))
+            cov = tuple(own.ravel().tolist())
         return DeflectionEstimate(t_ns, block, ONE_PSD, dx, dy, theta, 0.0, 0.0, cov, 0.0, True)
+
+
+def _through(gain: FloatArray, factor: FloatArray) -> FloatArray:
+    """(3, 3): what dots that spread by ``factor`` (4, k) m do to an answer with ``gain`` (3, 4)."""
+    moved = np.einsum('ij,jk->ik', gain, factor)
+    return np.asarray(np.einsum('ik,jk->ij', moved, moved))
+
+
+def motion(dots: FloatArray, noise: tuple[float, ...]) -> str:
+    """Why ``dots`` (n, 4), m, of the last blocks are not those of a link at rest; '' if they may be.
+
+    ``noise`` (4,): variance of a block's dots, m^2. Moving is what scatters ``MOVING`` times as much as the noise says
+    and by more than ``RINGS``, or what drifts by as much and by more than ``STILL`` from the first half to the second.
+    A mean over whole periods leaves little of what rings, and all of what drifts.
+    """
+    if len(dots) < 3:
+        return ''
+    scatter = dots.std(axis=0, ddof=1)
+    half = len(dots) // 2
+    drift = np.abs(dots[half:].mean(axis=0) - dots[:half].mean(axis=0))
+    least = MOVING * np.sqrt(noise)
+    beyond = np.maximum(scatter / np.maximum(least, RINGS), drift / np.maximum(least, STILL))
+    worst = int(np.argmax(beyond))
+    if beyond[worst] <= 1.0:
+        return ''
+    return (
+        f'the link moves: {NAMES[worst]} varied by {scatter[worst] * 1e6:.1f} um rms in the last '
+        f'{len(dots)} blocks, noise explains {noise[worst] ** 0.5 * 1e6:.1f} um; wait until it is at rest'
+    )

@@ -145,8 +145,8 @@ def test_every_parameter_reaches_its_field_and_nothing_else(name: str) -> None:
 
 def flattened(rig: Rig) -> list[object]:
     """The fields of all sections, in the order in which parameters are listed."""
-    sections: tuple[Any, ...] = (rig.link, *rig.psds, rig.amplifier, rig.converter, rig.dynamics)
-    sections += (rig.estimator, rig.acquisition, rig.monitor)
+    sections: tuple[Any, ...] = (rig.link, *rig.psds, *rig.beams, rig.amplifier, rig.converter)
+    sections += (rig.dynamics, rig.calibration, rig.estimator, rig.acquisition, rig.monitor)
     return [getattr(section, f.name) for section in sections for f in fields(section)]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -284,15 +285,32 @@ def exact_chunk(dots: npt.NDArray[np.float64], first: int = 0) -> RawChunk:
 
 
 def test_a_zero_is_the_mean_of_the_last_half_second(rig: Rig) -> None:
-    """25 blocks of 20 ms: of dots that creep by a micrometre a block, those of blocks 5 to 29."""
-    dots = np.outer(np.repeat(np.arange(30.0), 20) * 1e-6, [1.0, 2.0, -1.0, 3.0])
+    """25 blocks of 20 ms: of dots that creep by some nanometres a block, those of blocks 5 to 29."""
+    dots = np.outer(np.repeat(np.arange(30.0), 20) * 1e-8, [1.0, 2.0, -1.0, 3.0])
     pipeline = Pipeline(rig)
     run(pipeline.process, exact_chunk(dots))
     change = pipeline.zero()
     assert change is not None
     values = dict(change.values)
-    assert values['psd_1.zero'] == pytest.approx((17e-6, 34e-6), rel=1e-5)
-    assert values['psd_2.zero'] == pytest.approx((-17e-6, 51e-6), rel=1e-5)
+    assert values['psd_1.zero'] == pytest.approx((17e-8, 34e-8), rel=1e-4)
+    assert values['psd_2.zero'] == pytest.approx((-17e-8, 51e-8), rel=1e-4)
+    assert pipeline.zero_refused == ''
+
+
+def test_a_zero_is_refused_while_the_link_moves(rig: Rig) -> None:
+    """14 Hz of 20 um on y1, which the mean of half a second would hide."""
+    t = np.arange(600) * 1e-3
+    dots = np.zeros((600, 4))
+    dots[:, 1] = 20e-6 * np.sin(2.0 * np.pi * 14.0 * t)
+    pipeline = Pipeline(rig)
+    run(pipeline.process, exact_chunk(dots))
+    assert pipeline.zero() is None
+    assert re.fullmatch(
+        r'the link moves: y1 varied by 1\d\.\d um rms in the last 25 blocks, noise .*', why_no_zero(pipeline)
+    )
+    assert pipeline.rig.psds[0].zero == (0.0, 0.0)
+    run(pipeline.process, exact_chunk(np.zeros((600, 4)), 600))
+    assert pipeline.zero() is not None
 
 
 def test_what_the_readings_contradict_is_half_a_length_over_the_root_of_two(rig: Rig) -> None:

@@ -76,6 +76,7 @@ SHORTEST = {
     'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=1000 FUZZ_HELLOS=1000',
     'soak': 'SOAK_MINUTES=0.05 SOAK_HOURS=0.05',
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
+    'blind-calibration': 'RIGS=1',
     'shots': 'SHOT_SECONDS=2',
 }
 """Variables with which a ``make`` target takes only seconds."""

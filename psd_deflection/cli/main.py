@@ -43,6 +43,7 @@ COMMANDS: dict[str, str] = {
     'replay': 'compute the estimates of a recording again, as the daemon did',
     'simulate': 'simulate the rig: write a recording, or act as a device on a pseudo-terminal',
     'discover': 'find the physical effect that the simulation of a recording lacks',
+    'calibrate': 'estimate how the real rig differs from its rig file, with a reference or known loads',
     'effects': 'list the effects that can be simulated and discovered, or explain one',
     'check': 'check the wiring of a rig: guided by hand, or from a recording with known loads',
     'validate': 'compare the estimates of a recording with a camera, a stage or a tracker',
@@ -283,6 +284,7 @@ def _executable(command: str) -> Callable[[], int]:
     return lambda: main([command, *sys.argv[1:]])
 
 
-estimator, replay, simulate, discover, check, effects = map(
-    _executable, ('estimator', 'replay', 'simulate', 'discover', 'check', 'effects')
+estimator, replay, simulate, discover, calibrate, check, effects, validate, identify = map(
+    _executable,
+    ('estimator', 'replay', 'simulate', 'discover', 'calibrate', 'check', 'effects', 'validate', 'identify'),
 )

@@ -4,7 +4,7 @@ The rig file describes the rig and its known effects. --effect adds a hidden eff
 contain it, but the estimates do not correct for it and the recorded parameters do not list it.
 --world sets a parameter of the simulated rig alone, so that the rig file has it wrong.
 A recording contains the samples, the estimates and the loads, the temperature if --temperature is
-given, and the true pose with --reference. A .csv has no estimates.
+given, and the true pose with --reference or, with noise, --reference-noise. A .csv has no estimates.
 
   psd-deflection simulate --out run --loads thesis --temperature 20,24
   psd-deflection simulate --out odd.csv --effect axis_crosstalk,psd=1,xy=0.02
@@ -42,6 +42,7 @@ OF_A_RECORDING: dict[str, object] = {
     'temperature': None,
     'effect': [],
     'reference': False,
+    'reference_noise': None,
     'json': False,
 }
 """Options of a recording and their defaults."""
@@ -69,6 +70,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='add a hidden effect; repeatable',
     )
     group.add_argument('--reference', action='store_true', help='record the true pose as a reference measurement')
+    group.add_argument(
+        '--reference-noise',
+        metavar='XY,THETA',
+        help='record the pose with noise of so much (1 sd: m, rad), as a camera has; 1e-5,5e-4 is that of the thesis',
+    )
     group.add_argument('--json', action='store_true', help='print the summary as JSON')
     serve.add_arguments(parser)
 
@@ -95,9 +101,11 @@ def run(args: argparse.Namespace) -> int:
         temperature = (
             None if args.temperature is None else temperature_history(args.temperature, len(history), '--temperature')
         )
+    noise = None if args.reference_noise is None else _reference_noise(args.reference_noise)
+    reference = args.reference or noise is not None
     kinds: list[type[Record]] = [AppliedLoad]
-    kinds += [TemperatureReading] * (temperature is not None) + [ReferencePose] * args.reference
-    simulated = SimulatedRun(rig, known, history.loads, temperature, args.seed, args.reference)
+    kinds += [TemperatureReading] * (temperature is not None) + [ReferencePose] * reference
+    simulated = SimulatedRun(rig, known, history.loads, temperature, args.seed, reference, noise or (0.0, 0.0, 0.0))
     count = len(history)
     sink = open_sink(args.out, known.flat(), samples_with=kinds)
     bar = tqdm(total=count, unit=' samples', delay=1.0, leave=False, disable=args.json or None, ncols=80)
@@ -112,3 +120,16 @@ def run(args: argparse.Namespace) -> int:
     else:
         show(f'{Path(args.out)}: {count} samples, {count / rate:.1f} s; effects: {", ".join(names) or "none"}')
     return 0
+
+
+def _reference_noise(text: str) -> tuple[float, float, float]:
+    """The value of --reference-noise, for dX, dY and theta; raises UsageError."""
+    try:
+        across, twist = map(float, text.split(','))
+    except ValueError:
+        across = twist = -1.0
+    if not (0.0 <= across <= 1.0 and 0.0 <= twist <= 1.0):
+        raise UsageError(
+            f'--reference-noise {text}: must be two numbers of at least 0 and at most 1, such as 1e-5,5e-4'
+        )
+    return across, across, twist

@@ -117,6 +117,34 @@ def points_under(
     return _point(lx, ly, height, dx, dy, turns_of(theta, phi, omega))[2:]
 
 
+def points_under_leaning(
+    lx: FloatArray,
+    ly: FloatArray,
+    slope_x: FloatArray,
+    slope_y: FloatArray,
+    height: FloatArray,
+    dx: FloatArray,
+    dy: FloatArray,
+    theta: FloatArray,
+    phi: FloatArray,
+    omega: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """:func:`points_under` for beams that lean by ``slope_x`` and ``slope_y`` (m/m) along Z.
+
+    (l_x, l_y): where the beam crosses the surface of the plate at rest, z = h. The surface meets it at z, where the
+    beam is at l + slope (z - h). Each pass leaves the product of the plate's tilt and the slope, below 1e-3, of the
+    error before it.
+    """
+    turns = turns_of(theta, phi, omega)
+    _, _, cp, sp, co, so = turns
+    x, y, qx, qy = _point(lx, ly, height, dx, dy, turns)
+    for _ in range(3):
+        # (x', y') is q turned by theta about the plate's normal; what is left of R is Ry(omega) Rx(phi).
+        z = -so * x + co * sp * y + co * cp * height
+        x, y, qx, qy = _point(lx + slope_x * (z - height), ly + slope_y * (z - height), height, dx, dy, turns)
+    return qx, qy
+
+
 def flat_points(poses: FloatArray, beams: FloatArray) -> FloatArray:
     """q_i = R(-theta)(l_i - d), (..., P, 2) m: the points of a plate that does not tilt; ``poses`` (..., 3)."""
     c = np.cos(poses[..., 2, None])

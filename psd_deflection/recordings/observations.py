@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -14,13 +13,12 @@ from psd_deflection.discovery.observation import Observation
 from psd_deflection.errors import ConfigError, RecordingError
 from psd_deflection.foreign_yaml import tree_of_file
 from psd_deflection.recordings.csv_reader import CsvRecording
+from psd_deflection.recordings.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end
 from psd_deflection.recordings.simulated_recording import SimulatedRecording
-from psd_deflection.records import CHANNELS, FloatArray, IntArray
-
-MAX_SAMPLES = 20_000_000
+from psd_deflection.records import CHANNELS, FloatArray
 
 
 def read_observation(
@@ -85,7 +83,7 @@ def read_observation(
             f'(CSV columns load_fx, load_fy, load_tz, or the topic /link_tip/load)'
         )
     times = np.array([a.t_ns - start for a in applied], dtype=np.int64)
-    held = _held(times, np.array([a[1:] for a in applied]), t_ns, grace, np.zeros(3))
+    held = held_at(times, np.array([a[1:] for a in applied]), t_ns, grace, np.zeros(3))
     before, after = int(np.count_nonzero(t_ns + grace < times.min())), 0
     if isinstance(recording, CsvRecording):
         count, last = recording.rows_with_load()
@@ -100,10 +98,10 @@ def read_observation(
         celsius = np.array([r.celsius for r in temperatures])
         if isinstance(recording, CsvRecording | SimulatedRecording):
             # A row's value holds until the next differs; a thermometer's messages are points on a curve.
-            warm = _held(at, celsius, t_ns, grace, celsius[0])
+            warm = held_at(at, celsius, t_ns, grace, celsius[0])
         else:
             warm = np.interp(t_ns, at.astype(np.float64), celsius)
-    digest = '' if isinstance(recording, SimulatedRecording) else _digest(path)
+    digest = '' if isinstance(recording, SimulatedRecording) else digest_of(path)
     return Observation(
         path.name,
         rig,
@@ -114,29 +112,6 @@ def read_observation(
         unknown_load=(before, after),
         stated_rate_hz=stated,
     )
-
-
-def _held(
-    times: IntArray, values: FloatArray, t_ns: FloatArray, grace: float, before: FloatArray | float
-) -> FloatArray:
-    order = np.argsort(times, kind='stable')
-    index = np.searchsorted(times[order], t_ns + grace, side='right') - 1
-    out = values[order][np.maximum(index, 0)].astype(np.float64)
-    out[index < 0] = before
-    return out
-
-
-def _digest(path: Path) -> str:
-    digest = hashlib.sha256()
-    files = sorted(p for p in path.rglob('*') if p.is_file()) if path.is_dir() else [path]
-    try:
-        for file in files:
-            with file.open('rb') as stream:
-                while piece := stream.read(1 << 20):
-                    digest.update(piece)
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
-    return digest.hexdigest()
 
 
 def read_observations(

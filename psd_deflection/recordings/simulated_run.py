@@ -30,7 +30,8 @@ class SimulatedRun:
     """One run. ``rig``: the true rig. ``known``: the rig that the daemon assumes; only its effects are corrected.
 
     ``loads`` (n, 3): N, N, N m, one row a sample. ``temperature`` (n,): degrees Celsius, or None.
-    ``reference``: whether the true pose is recorded, once per block.
+    ``reference``: whether the true pose is recorded, once per block; ``reference_noise``: its standard deviations, m,
+    m, rad.
     """
 
     rig: Rig
@@ -39,11 +40,13 @@ class SimulatedRun:
     temperature: FloatArray | None = None
     seed: int = 0
     reference: bool = False
+    reference_noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def records(self, start_ns: int = BAG_START_NS) -> Iterator[Record]:
         """All records in order of time; the first sample is at ``start_ns``."""
         rig, loads, temperature = self.rig, self.loads, self.temperature
         simulator, pipeline = RigSimulator(rig, self.seed), Pipeline(self.known)
+        measured = np.random.default_rng([self.seed, 1])
         period = 1e9 / rig.converter.sample_rate_hz
         block = rig.estimator.block_size
         # A temperature takes effect with the next block, so process block by block.
@@ -71,7 +74,8 @@ class SimulatedRun:
                 for i in range(0, stop - start, block):
                     # The estimate is for the middle of the block.
                     k = min(i + block // 2, stop - start - 1)
-                    yield ReferencePose(int(t_ns[k]), *(float(v) for v in part.pose[k]))
+                    off = self.reference_noise * measured.standard_normal(3)
+                    yield ReferencePose(int(t_ns[k]), *(float(v) for v in part.pose[k] + off))
             flags = np.zeros(stop - start, dtype=np.uint8)
             yield from pipeline.process(RawChunk(seq, t_ns, part.counts, flags, rig.converter.volts_per_count))
         yield from pipeline.flush()

@@ -60,6 +60,8 @@ def load_text(load: AppliedLoad) -> str:
 
 def why_no_zero(pipeline: Pipeline) -> str:
     """Why :meth:`Pipeline.zero` took no zero, as text."""
+    if pipeline.zero_refused:
+        return pipeline.zero_refused
     last = pipeline.last_spots
     return f'no good block now: {last.reason}' if last is not None and last.reason else 'no good block yet'
 

@@ -124,7 +124,10 @@ def make_active(name: str, values: Mapping[str, object], source: str) -> ActiveE
 
     Raises ConfigError naming source, key, value, bound, or the file that cannot be loaded.
     """
-    places = _places()
+    return _made(name, values, source, _places())
+
+
+def _made(name: str, values: Mapping[str, object], source: str, places: Mapping[str, Place]) -> ActiveEffect:
     if name not in places:
         hint = did_you_mean(name, places) or f'; there are: {", ".join(sorted(places))}'
         raise ConfigError(f'{source}: name = {name!r}: no effect of that name{hint}')
@@ -158,9 +161,11 @@ def effects_of_rig(rig: Rig) -> list[ActiveEffect]:
             raise ConfigError(f'effects.{key} = {value!r}: must be a map with the name and the parameters of an effect')
         groups.setdefault(group, {})[name] = value
     found = []
+    # Looked up once: it takes as long as a block.
+    places = _places() if groups else {}
     for group, body in groups.items():
         name = str(body.pop('name', group))
-        found.append(make_active(name, body, f'effects.{group}'))
+        found.append(_made(name, body, f'effects.{group}', places))
     return sort_effects(found)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from psd_deflection.geometry.landing import landings
-from psd_deflection.geometry.plate import points_under
+from psd_deflection.geometry.plate import points_under, points_under_leaning
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.physics import Physics
 
@@ -17,8 +17,13 @@ def dots_on_plate(pose: FloatArray, beams: FloatArray, physics: Physics) -> Floa
     """
     k = physics.slope_ratio / physics.length
     phi, omega = (-k * pose[1], k * pose[0]) if k != 0.0 else (np.zeros(1), np.zeros(1))
-    fall = landings if physics.psds_at_base else points_under
-    qx, qy = fall(beams[0::2], beams[1::2], physics.heights[:, None], pose[0], pose[1], pose[2], phi, omega)
+    place = beams[0::2], beams[1::2]
+    rest = physics.heights[:, None], pose[0], pose[1], pose[2], phi, omega
+    if physics.slopes.any() and not physics.psds_at_base:
+        qx, qy = points_under_leaning(*place, physics.slopes[:, :1], physics.slopes[:, 1:], *rest)
+    else:
+        fall = landings if physics.psds_at_base else points_under
+        qx, qy = fall(*place, *rest)
     dots = np.empty_like(beams)
     np.subtract(qx, physics.centers[:, :1], out=dots[0::2])
     np.subtract(qy, physics.centers[:, 1:], out=dots[1::2])

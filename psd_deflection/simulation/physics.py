@@ -19,9 +19,9 @@ class Physics:
     ``bending_stiffness`` EI, ``torsional_stiffness`` GJ, N m^2. ``clamp_bending`` and
     ``clamp_torsion``: clamp rotation per moment, rad/(N m). ``static_offset``: (dX, dY) of the
     link without load, m. ``slope_ratio``: k of phi = -k dY/L; 0 is the nominal, parallel planes.
-    ``beams``: l_i, on the plate if ``psds_at_base``. ``half_area``: half width and height of the
-    active areas. ``noise`` (6,), V rms of each channel. ``phase``: how long after each sample the
-    quantities are taken, below ``period``, s.
+    ``beams``: l_i, on the plate if ``psds_at_base``; ``slopes``: how much each goes sideways along Z.
+    ``half_area``: half width and height of the active areas. ``noise`` (6,), V rms of each channel.
+    ``phase``: how long after each sample the quantities are taken, below ``period``, s.
     """
 
     period: float
@@ -38,6 +38,7 @@ class Physics:
     slope_ratio: float
     centers: FloatArray
     beams: FloatArray
+    slopes: FloatArray
     heights: FloatArray
     half_area: FloatArray
     sensitivity: FloatArray
@@ -68,6 +69,7 @@ class Physics:
             slope_ratio=rig.link.slope_ratio if at_base else 0.0,
             centers=rig.centers,
             beams=rig.centers + rig.zeros,
+            slopes=rig.beam_slopes,
             heights=rig.heights,
             half_area=0.5 * np.array([p.active_area for p in rig.psds], dtype=np.float64),
             sensitivity=rig.sensitivities,

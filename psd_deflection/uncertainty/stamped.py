@@ -36,7 +36,7 @@ class StampedDots:
         self.flat = flat
         poly = config.block_fit == 'poly'
         # What does not move with the link tells the noise.
-        self._measures = flat and config.covariance == 'measured'
+        self._measures = flat and config.covariance != 'file'
         self.active = poly or self._measures
         self._beams = rig.centers + rig.zeros
         variances = dot_noise_variances(rig)

@@ -339,7 +339,7 @@ def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[s
     # repeated have an action of their own, and none is a path.
     assert {str(values[name]) for name in set(values) - as_path} == {
         '/NAME', 'ADDRESS', 'M', 'N', 'NAME', 'PPM', 'S', 'SEED', 'SOURCE',
-        'T0[,T1...]', 'TZ', 'URL', 'X', "('FX', 'FY', 'TZ')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
+        'T0[,T1...]', 'TZ', 'URL', 'X', 'XY,THETA', "('FX', 'FY', 'TZ')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
     }  # fmt: skip
 
 

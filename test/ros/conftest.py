@@ -111,6 +111,19 @@ class Peer:
         self.node.create_subscription(kind, topic, got.append, qos)
         return got
 
+    def zero(self) -> Any:
+        """The answer of ``~/zero`` once it is taken: while the simulated rig rings under its load it is refused."""
+        from std_srvs.srv import Trigger
+
+        answers: list[Any] = []
+
+        def taken() -> bool:
+            answers.append(self.call(Trigger, '/estimator/zero', Trigger.Request()))
+            return bool(answers[-1].success)
+
+        self.until(taken, 'a zero of a link at rest')
+        return answers[-1]
+
     def until(self, condition: Callable[[], bool], what: str) -> None:
         deadline = time.monotonic() + WAIT_S
         while not condition():

@@ -40,7 +40,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
-from std_srvs.srv import SetBool, Trigger  # noqa: E402
+from std_srvs.srv import SetBool  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
 from msg_adapters import point_cloud2  # noqa: E402
@@ -165,8 +165,7 @@ def test_zero_and_record(start: Callable[..., Any], peer: Any, tmp_path: Path, s
     peer.until(lambda: len(poses) >= 30, 'estimates')
     # The file's zero is wrong by tenths of a millimetre, and so is the deflection.
     assert abs(poses[-1].pose.position.x) > 5e-5
-    answer = peer.call(Trigger, '/estimator/zero', Trigger.Request())
-    assert answer.success
+    answer = peer.zero()
     assert 'psd_1 (' in answer.message
     peer.until_of_now(poses, 'estimates after the zero')
     assert abs(poses[-1].pose.position.x) < 1e-5
@@ -211,7 +210,7 @@ def test_the_rig_is_latched_and_told_again_when_it_changes(
     assert len(first['parameters']) >= 65
     assert first['hello']['serial'] == 'SIM-0001'
     assert first['zero'] == {'psd_1': [0.0, 0.0], 'psd_2': [0.0, 0.0]}
-    assert peer.call(Trigger, '/estimator/zero', Trigger.Request()).success
+    peer.zero()
     peer.until(lambda: len(texts) >= 2, 'the zero')
     zeroed = json.loads(texts[1].data)
     assert zeroed['zero'] != first['zero']
@@ -245,7 +244,7 @@ def test_a_disk_that_hangs_holds_up_its_own_requests_alone(
     begun = [client.call_async(SetBool.Request(data=True)) for _ in range(2)]
     waits = 'a recording was asked for; the disk has not answered yet'
     peer.until(lambda: told_of_recording()[-3:] == [waits] * 3, 'three reports')
-    assert peer.call(Trigger, '/estimator/zero', Trigger.Request()).success
+    peer.zero()
     peer.until_of_now(poses, 'estimates')
     assert not any(future.done() for future in begun)
     assert peer.call(SetBool, '/estimator/record', SetBool.Request(data=False)).message == 'no recording runs'

@@ -165,7 +165,7 @@ def test_parameters_that_are_set_while_unconfigured_are_read_and_kept(
     for fixed in ({'port': '/dev/other'}, {'effects__axis_crosstalk__xy': 0.03}):
         assert 'is read when the node is configured' in put(peer, **fixed)
     assert put(peer, sum_min=2.3) == ''
-    assert peer.call(Trigger, '/estimator/zero', Trigger.Request()).success
+    peer.zero()
     taken = parameters(peer, 'psd_1.zero', 'psd_2.zero')
     cycle(peer, 'deactivate', 'cleanup')
     assert value_of(peer, 'sum_min') == 2.3
@@ -225,7 +225,7 @@ def test_the_zero_holds_for_the_next_run(
     first.until(r'changed: psd_1.zero = \[0.0002, 0.0001\]')
     peer.until_of_now(poses, 'estimates after the change')
     assert abs(poses[-1].pose.position.x) > 5e-5
-    assert peer.call(Trigger, '/estimator/zero', Trigger.Request()).success
+    peer.zero()
     taken = parameters(peer, 'psd_1.zero', 'psd_2.zero')
     assert taken[0] != [0.0002, 0.0001]
     assert taken != [[0.0, 0.0], [0.0, 0.0]]

@@ -262,6 +262,8 @@ def test_no_other_file_names_an_effect() -> None:
     places = Path(effects.__file__).parent
     # The terms of the error budget are a list of their own; some have the name of the effect they are due to.
     files = [f for f in PACKAGE.rglob('*.py') if places not in f.parents and PACKAGE / 'budget' not in f.parents]
+    # A calibrated rig file has its parameters as effects.
+    files.remove(PACKAGE / 'misalignment' / 'rig.py')
     assert len(files) > 100
     names = {f.stem for f in places.glob('[a-z]*.py')} - LINK
     assert len(names) >= 26

@@ -1,0 +1,6 @@
+"""Estimates how a real rig differs from its rig file, from recordings with a reference or with known loads.
+
+``observation``: a recording as arrays, and the rows that are fitted. ``fit``: parameters with their covariance.
+``calibrate``: which of them the recordings determine, held-out motion, the answer. ``check``: whether an old
+calibration still holds. ``result``, ``report``: calibration.json, the rig file, the page. This room reads no files.
+"""

@@ -1,0 +1,455 @@
+"""What recordings say of a rig: the fit, what it cannot determine, whether unseen motion agrees.
+
+A parameter is undetermined if its standard deviation stays above ``OPEN`` of its tolerance. It keeps the file's
+value and tolerance, and the rest is fitted again with it held there; its tolerance enters the covariance of the rest.
+Of what is left, a direction (a combination, each parameter in units of its tolerance) is undetermined by the same
+measure. A prior that the recordings contradict is widened: a tolerance is a guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from psd_deflection.calibrating.fit import (
+    CLAMP_AT,
+    CLOCK,
+    NAMES,
+    SIZE,
+    Fit,
+    Kind,
+    Mask,
+    Prior,
+    compliances,
+    fit,
+    linearised,
+    posterior,
+    prior_of_rig,
+    refitted,
+    residual_at,
+    weight_matrices,
+)
+from psd_deflection.calibrating.observation import (
+    LEAST_HOLD,
+    Rows,
+    Run,
+    joined,
+    noise_of,
+    rows_of,
+    settled,
+    smoothed,
+    usable_dots,
+)
+from psd_deflection.config import Rig
+from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.misalignment.model import COUNT, INDEX, ZERO
+from psd_deflection.misalignment.rig import RigVector, vector_of_rig
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.solvers.registry import psds_at_base
+
+OPEN = 0.9
+"""A standard deviation above this share of the tolerance: undetermined."""
+SPOILT = 1.1
+"""How much the standard deviation of another parameter may grow when one is held at its tolerance."""
+CONTRADICTED = 3.5
+"""Standard deviations of the prior beyond which a determined parameter says that its tolerance was too small."""
+WIDER = 10.0
+WORSE = 1.01
+"""Ratio of the gaps on unseen motion above which a calibration is refused; less is chance."""
+FOLDS = 8
+"""Pieces of a recording, every second of which is held out in turn."""
+OFTEN = 300
+"""Rows used to find the clock's offset roughly."""
+CLOCK_RANGE, CLOCK_STEP = 0.060, 0.004
+"""s, within which the offset of the reference's clock is looked for, and in what steps."""
+
+
+class Direction(NamedTuple):
+    """``parts``: parameter to its share, unit length in units of the tolerances. ``needs``: what would determine it."""
+
+    parts: dict[str, float]
+    needs: str
+
+
+class Gap(NamedTuple):
+    """rms of reading minus model, m: of all rows, and of rows that were not fitted."""
+
+    before: float
+    after: float
+    heldout_before: float
+    heldout_after: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """The answer. ``values``, ``sd`` by name of ``NAMES``; ``covariance`` (SIZE, SIZE).
+
+    ``vector``, ``prior``: what the rig file says. ``noise`` (4,): of a sample of each reading, V rms. ``clock``: the
+    offset of the reference's clock, s, to be added to its times. ``refused``: why the rig file was left as it is, or
+    ''. ``widened``: parameters whose tolerance the recordings contradict. ``dropped``: terms that unseen motion
+    refused. ``rows``, ``fit``: for pictures.
+    """
+
+    rig: Rig
+    kind: Kind
+    vector: RigVector
+    prior: Prior
+    fit: Fit
+    rows: Rows
+    runs: Sequence[Run]
+    noise: FloatArray
+    gap: Gap
+    undetermined: list[Direction]
+    clock: float
+    refused: str = ''
+    widened: list[str] = field(default_factory=list)
+    dropped: list[str] = field(default_factory=list)
+
+    @property
+    def values(self) -> FloatArray:
+        """Values (SIZE,)."""
+        return self.fit.values
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (SIZE, SIZE)."""
+        return self.fit.covariance
+
+    @property
+    def sd(self) -> FloatArray:
+        """Standard deviations (SIZE,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def calibrate(
+    runs: Sequence[Run],
+    rig: Rig,
+    *,
+    alone: bool = False,
+    progress: Callable[[str], None] = lambda words: None,
+) -> Calibration:
+    """Calibrate ``rig`` by ``runs``; ``alone``: by the one redundant reading, without reference and loads.
+
+    Raises RecordingError if a run has neither reference nor loads or too few of them, ConfigError for a rig that
+    cannot be calibrated.
+    """
+    if psds_at_base(rig):
+        raise ConfigError('solver = base_pair: PSDs at the base are not calibrated')
+    progress('noise')
+    noise = np.median([noise_of(run, rig) for run in runs], axis=0)
+    kind = kind_of(runs, alone)
+    vector = vector_of_rig(rig)
+    prior = prior_of_rig(rig, vector)
+    progress('rows')
+    clock = roughly_late(runs, rig, noise) if kind == 'reference' else 0.0
+    parts = [rows_of(run, rig, noise, late=clock, blocks=kind != 'reference') for run in runs]
+    rows = joined(parts)
+    if kind == 'loads':
+        if not rows.rest.any():
+            raise RecordingError(
+                f'{runs[0].name}: no load is held for {LEAST_HOLD} s; hold each for some seconds, '
+                f'or give a recording with a reference'
+            )
+        rows = settled(rows, rig, noise)
+    progress('fitting')
+    free = fitted_parameters(kind)
+    first = fit(rows, rig, prior, kind, free=free)
+    first, prior, widened = _believed(first, rows, rig, prior, kind, free)
+    free = _determined(first, prior, free)
+    whole = fit(rows, rig, prior, kind, free=free, start=first)
+    progress('held-out motion')
+    whole, believed, dropped = _without_refused_terms(whole, rows, rig, prior, kind)
+    before = before_of(vector, prior)
+    gap, worse = _heldout(whole, rows, rig, believed, kind, before)
+    if kind == 'reference':
+        whole = _with_clamp(whole, rows, rig, prior)
+    refused = ''
+    if worse:
+        refused = (
+            f'on motion that was not fitted the calibrated rig predicts the readings worse than the rig file '
+            f'({gap.heldout_after * 1e6:.2f} um rms against {gap.heldout_before * 1e6:.2f} um); '
+            f'the rig file keeps its values'
+        )
+    return Calibration(
+        rig,
+        kind,
+        vector,
+        prior,
+        whole,
+        rows,
+        runs,
+        noise,
+        gap,
+        undetermined(whole, prior),
+        clock,
+        refused,
+        widened,
+        dropped,
+    )
+
+
+def kind_of(runs: Sequence[Run], alone: bool) -> Kind:
+    """What the recordings are fitted to. Raises RecordingError if some have nothing."""
+    if alone:
+        return 'self'
+    if all(len(run.reference_t) for run in runs):
+        return 'reference'
+    for run in runs:
+        if run.loads is None:
+            raise RecordingError(
+                f'{run.name}: has neither a reference (CSV columns ref_dx, ref_dy, ref_theta; topic '
+                f'/reference/deflection) nor known loads; --self takes a recording without either'
+            )
+    return 'loads'
+
+
+def fitted_parameters(kind: Kind) -> Mask:
+    """Which parameters the rows depend on."""
+    free = np.ones(SIZE, dtype=bool)
+    free[CLOCK] = kind == 'reference'
+    free[CLAMP_AT : CLAMP_AT + 2] = kind == 'loads'
+    return free
+
+
+def before_of(vector: RigVector, prior: Prior) -> FloatArray:
+    """Parameters (SIZE,) as the pipeline takes them before a calibration."""
+    out = prior.mean.copy()
+    out[:COUNT] = vector.as_used
+    return out
+
+
+def roughly_late(runs: Sequence[Run], rig: Rig, noise: FloatArray) -> float:
+    """Seconds to add to the reference's times so that it fits the dots best, in steps; 0 if nothing moves."""
+    costs = np.zeros(2 * round(CLOCK_RANGE / CLOCK_STEP) + 1)
+    lates = (np.arange(len(costs)) - len(costs) // 2) * CLOCK_STEP
+    for run in runs:
+        rows = rows_of(run, rig, noise)
+        quick = np.argsort(-np.abs(rows.velocity @ [1.0, 1.0, 0.1]))[:OFTEN]
+        moving = rows.at(np.sort(quick))
+        dots = usable_dots(run, rig)
+        period = float(np.median(np.diff(run.t)))
+        linear = linearised(moving, prior_of_rig(rig).mean, rig, 'reference')
+        # What does not depend on the clock is taken off as a mean: the fit has not begun.
+        for i, late in enumerate(lates):
+            places = np.interp(moving.t + late, run.t, np.arange(len(run.t)))
+            s = smoothed(dots, period, places)
+            off = linear.residual + s.dots - moving.dots
+            off = off[s.good]
+            if len(off):
+                costs[i] += float(np.abs(off - np.median(off, axis=0)).mean())
+    best = int(np.argmin(costs))
+    middle = len(costs) // 2
+    # Only if it shows: what no motion tells is noise.
+    return float(lates[best]) if costs[best] < 0.9 * costs[middle] else 0.0
+
+
+def _believed(first: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask) -> tuple[Fit, Prior, list[str]]:
+    """Widen what the rows contradict, the worst at a time."""
+    widened: list[str] = []
+    while len(widened) < 6:
+        sd = np.sqrt(np.diag(first.covariance))
+        off = np.where(free & (sd < 0.7 * prior.sd), np.abs(first.values - prior.mean) / prior.sd, 0.0)
+        off[[INDEX[n] for n in widened if n in INDEX]] = 0.0
+        worst = int(np.argmax(off))
+        if off[worst] < CONTRADICTED:
+            break
+        widened.append(NAMES[worst])
+        covariance = prior.covariance.copy()
+        covariance[worst] *= WIDER
+        covariance[:, worst] *= WIDER
+        prior = Prior(prior.mean, covariance)
+        first = fit(rows, rig, prior, kind, free=free, start=first)
+    return first, prior, widened
+
+
+def _determined(first: Fit, prior: Prior, free: Mask) -> Mask:
+    """Which parameters are fitted; the others are held at the file's values, the least known first.
+
+    One is held only if the rest then knows hardly less: of parameters that the rows tie together, such as a turn and a
+    crosstalk, none can be held at its tolerance without spoiling the others.
+    """
+    every = np.sqrt(np.diag(posterior(first.information, prior, free)))
+    ratio = np.where(free, every / prior.sd, 0.0)
+    held = free.copy()
+    for i in np.argsort(-ratio):
+        if ratio[i] <= OPEN:
+            break
+        held[i] = False
+        if np.any((np.sqrt(np.diag(posterior(first.information, prior, held))) > SPOILT * every)[held]):
+            held[i] = True
+    return held
+
+
+def _pieces(rows: Rows) -> IntArray:
+    """Which of two halves each row belongs to: every second of ``FOLDS`` pieces of its recording."""
+    out = np.zeros(len(rows), dtype=np.int64)
+    for run in np.unique(rows.run):
+        own = np.flatnonzero(rows.run == run)
+        out[own] = (np.arange(len(own)) * FOLDS // len(own)) % 2
+    return out
+
+
+def _misfit(
+    residual: FloatArray, whole: Fit, inverse: FloatArray, rows: Rows, kind: Kind
+) -> tuple[FloatArray, FloatArray]:
+    """Weighted and plain squares (n,) of ``residual`` (n, 4)."""
+    weighted = np.einsum('ni,nij,nj->n', residual, inverse, residual) * whole.weights
+    if kind == 'self':
+        across = np.linalg.svd(whole.linear.by_pose)[0][:, :, 3]
+        return weighted, np.einsum('ni,ni->n', across, residual) ** 2 * whole.weights
+    return weighted, np.mean(residual**2, axis=1) * whole.weights
+
+
+def _held_out(whole: Fit, rows: Rows, prior: Prior, free: Mask) -> FloatArray:
+    """Residuals (n, 4) of each half of the rows by the parameters that the other half gives."""
+    half = _pieces(rows)
+    out = np.empty_like(whole.linear.residual)
+    for number in (0, 1):
+        z = refitted(whole, rows, prior, (half != number).astype(np.float64), free)
+        out[half == number] = residual_at(whole, z)[half == number]
+    return out
+
+
+def _heldout(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, before: FloatArray) -> tuple[Gap, bool]:
+    """The gaps, and whether unseen motion is predicted worse than with the rig file."""
+    inverse = weight_matrices(whole.linear, rows, whole.noise)
+    old, old_plain = _misfit(linearised(rows, before, rig, kind).residual, whole, inverse, rows, kind)
+    _, new_plain = _misfit(whole.linear.residual, whole, inverse, rows, kind)
+    new, held_plain = _misfit(_held_out(whole, rows, prior, whole.free), whole, inverse, rows, kind)
+
+    def rms(plain: FloatArray) -> float:
+        return float(np.sqrt(plain.sum() / max(whole.weights.sum(), 1.0)))
+
+    gap = Gap(rms(old_plain), rms(new_plain), rms(old_plain), rms(held_plain))
+    return gap, bool(new.sum() > old.sum() or gap.heldout_after > WORSE * gap.heldout_before)
+
+
+def _without_refused_terms(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind) -> tuple[Fit, Prior, list[str]]:
+    """Drop a non-linearity that unseen motion contradicts: the file's value stays, within what the rows leave open."""
+    dropped: list[str] = []
+    for name in ('psd_1.nonlinearity', 'psd_2.nonlinearity'):
+        i = INDEX[name]
+        if not whole.free[i]:
+            continue
+        without = whole.free.copy()
+        without[i] = False
+        inverse = weight_matrices(whole.linear, rows, whole.noise)
+        costs = [
+            _misfit(_held_out(whole, rows, prior, f), whole, inverse, rows, kind)[0] for f in (whole.free, without)
+        ]
+        more = costs[0] - costs[1]
+        if more.sum() > 2.0 * float(np.sqrt(np.sum(more**2))):
+            dropped.append(name)
+            # The rows bound it all the same: by what they gave it and left open.
+            away = whole.covariance[i, i] + (whole.values[i] - prior.mean[i]) ** 2
+            covariance = prior.covariance.copy()
+            shrunk = min(1.0, float(away / covariance[i, i]) ** 0.5)
+            covariance[i] *= shrunk
+            covariance[:, i] *= shrunk
+            prior = Prior(prior.mean, covariance)
+            whole = fit(rows, rig, prior, kind, free=without, start=whole)
+    return whole, prior, dropped
+
+
+def _with_clamp(whole: Fit, rows: Rows, rig: Rig, prior: Prior) -> Fit:
+    """The clamp's compliances from the reference's poses at rest under known loads, if there are any.
+
+    The link's own stiffness is taken as the rig file has it: at one length a clamp that gives way is a softer link.
+    """
+    rest = rows.rest & (whole.weights > 0.0)
+    values, covariance, free = whole.values.copy(), whole.covariance.copy(), whole.free.copy()
+    length = rig.link.length
+    own = compliances(rig, np.zeros(SIZE))
+    sds = whole.noise.reference
+    for i, (axes, lever) in enumerate((((0, 1), length**2), ((2,), 1.0))):
+        information = right = 0.0
+        for axis in axes:
+            load = rows.loads[rest, axis]
+            if len(load) < 4 or not np.ptp(load) > 0.0:
+                continue
+            y = rows.pose[rest, axis] - load * own[axis]
+            x = lever * (load - load.mean())
+            spread = max(float(np.std(y - np.polyval(np.polyfit(load, y, 1), load))), float(sds[axis]))
+            information += float(x @ x) / (spread**2 * whole.noise.fewer)
+            right += float(x @ (y - y.mean())) / (spread**2 * whole.noise.fewer)
+        at = CLAMP_AT + i
+        before = prior.covariance[at, at]
+        after = 1.0 / (information + 1.0 / before)
+        covariance[at] = covariance[:, at] = 0.0
+        if after**0.5 > OPEN * before**0.5:
+            values[at], covariance[at, at], free[at] = prior.mean[at], before, False
+        else:
+            values[at], covariance[at, at], free[at] = after * (right + prior.mean[at] / before), after, True
+    return Fit(values, covariance, whole.information, whole.linear, whole.weights, whole.noise, free)
+
+
+_NEEDS = {
+    'rotation': 'forces along X and along Y, so that both dots move by millimetres',
+    'gain': 'a motion of the dot along that axis, by forces along X and Y and a torque',
+    'crosstalk': 'motions of the dot along both axes, one at a time',
+    'center': 'a twist of 1° or more, in both directions',
+    'height': 'forces of 50 N along X and Y: the height shows by the tilt of the plate',
+    'nonlinearity': 'dots 3 mm or more from the centre',
+    'angle': 'forces well above 50 N and a reference of a micrometre: the lean shows by the tilt of the plate',
+    'slope_ratio': 'forces of 50 N along X and Y and a reference of some micrometres',
+    'bending_compliance': 'known forces held for some seconds each',
+    'torsional_compliance': 'known torques held for some seconds each',
+    'zero': 'the unloaded link, with its reference',
+}
+_TURNED = (
+    'no motion of the link: a turned PSD and one whose axes are not square look alike; the estimate needs only the sum'
+)
+
+
+def needs_of(names: Sequence[str]) -> str:
+    """What would determine parameters that move together."""
+    kinds = [name.partition('.')[2] for name in names]
+    short = [next(k for k in _NEEDS if kind.startswith(k)) for kind in kinds]
+    if set(short) == {'rotation', 'crosstalk'}:
+        return _TURNED
+    return '; '.join(dict.fromkeys(_NEEDS[k] for k in short))
+
+
+def undetermined(whole: Fit, prior: Prior) -> list[Direction]:
+    """Directions whose spread stays above ``OPEN`` of the tolerances: single parameters, then combinations."""
+    # The zero is measured at every start, and the clock is no parameter of the rig.
+    reported = np.array([not ZERO <= i < COUNT and i != CLOCK for i in range(SIZE)])
+    open_still = np.sqrt(np.diag(whole.covariance)) > OPEN * prior.sd
+    held = np.flatnonzero(~whole.free & reported & open_still)
+    out = [Direction({NAMES[i]: 1.0}, needs_of([NAMES[i]])) for i in held]
+    # The clamp's were determined one by one.
+    alone = np.isin(np.arange(SIZE), (CLAMP_AT, CLAMP_AT + 1)) & (np.diag(whole.information) == 0.0)
+    at = np.flatnonzero(whole.free & reported & ~alone)
+    if not len(at):
+        return out
+    own = np.ix_(at, at)
+    sd = prior.sd[at]
+    # Against the prior of these alone, which may be correlated (an earlier calibration).
+    size, vectors = np.linalg.eigh(posterior(whole.information, prior, whole.free)[own] / np.outer(sd, sd))
+    open_ones = vectors[:, size > OPEN**2]
+    for parts in _sparse(open_ones):
+        named = {NAMES[at[i]]: float(round(parts[i], 4)) for i in np.argsort(-np.abs(parts)) if abs(parts[i]) > 0.15}
+        out.append(Direction(named, needs_of(list(named))))
+    return out
+
+
+def _sparse(vectors: FloatArray) -> list[FloatArray]:
+    """Directions (each of unit length) that span the columns of ``vectors`` (n, k), with few large parts each."""
+    rest = vectors.copy()
+    k = rest.shape[1]
+    pivots: list[int] = []
+    for column in range(k):
+        sizes = np.abs(rest[:, column:]).max(axis=1)
+        sizes[pivots] = 0.0
+        row = int(np.argmax(sizes))
+        swap = column + int(np.argmax(np.abs(rest[row, column:])))
+        rest[:, [column, swap]] = rest[:, [swap, column]]
+        rest[:, column] /= rest[row, column]
+        for other in range(k):
+            if other != column:
+                rest[:, other] -= rest[row, other] * rest[:, column]
+        pivots.append(row)
+    return [column / np.linalg.norm(column) for column in rest.T]

@@ -1,0 +1,184 @@
+"""Whether an old calibration still holds: which group of parameters moved, by how much, how sure.
+
+The rig file gives p with covariance P. New rows with normal matrix N = J^T C^-1 J and b = J^T C^-1 r(p) are, if nothing
+moved, b ~ N(0, N + N P N). What is left of b after P has explained what it can is
+
+    b' = b - N Q b,    M = N - N Q N,    Q = (P^-1 + N)^-1,
+
+and T = b'_g^T M_gg^-1 b'_g of a group g of parameters is chi-square with as many degrees of freedom as the rows show
+directions of it. The smallest p over the groups, times their number, below ``LEVEL`` says that something moved
+(Bonferroni). What moved is the group of the largest Bayes factor, for shifts of the size of the tolerances. The zero
+and the reference's clock are free in any case.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from psd_deflection.calibrating.calibrate import fitted_parameters, kind_of, roughly_late
+from psd_deflection.calibrating.fit import NAMES, Fit, Kind, Mask, Prior, explained, fit, prior_of_rig, score_at
+from psd_deflection.calibrating.observation import Rows, Run, joined, noise_of, rows_of, settled
+from psd_deflection.config import Rig
+from psd_deflection.misalignment.model import COUNT, PARAMETERS, TOLERANCES, ZERO
+from psd_deflection.misalignment.rig import vector_of_rig
+from psd_deflection.records import FloatArray, IntArray
+
+LEVEL = 0.05
+"""Share of rigs that did not move and are said to have moved."""
+LIKE = 3.0
+"""Natural logarithm of a Bayes factor below which two groups cannot be told apart."""
+BELIEVED = 0.02
+"""Share of the tolerances below which a calibration is not believed: its covariance is that of a linear model."""
+SHIFT = 3.0
+"""Size of the shifts that are looked for, in tolerances."""
+FITTED = 7
+"""Groups, the likeliest, that are fitted in full if something moved."""
+_SEEN = 1e-4
+"""A direction that the rows show by less than this share of a tolerance's inverse variance counts as unseen."""
+
+
+class Moved(NamedTuple):
+    """One group: ``p`` that it did not move, ``evidence`` (natural logarithm of the Bayes factor) that it did.
+
+    ``shifts``: by parameter, the value that it moved by if it alone did, and its standard deviation.
+    """
+
+    group: str
+    p: float
+    evidence: float
+    freedom: int
+    shifts: dict[str, tuple[float, float]]
+
+
+class Checked(NamedTuple):
+    """``holds``: nothing moved. ``p``: over all groups. ``groups``: the likeliest first. ``like``: groups that the
+    first cannot be told from. ``zero``: the unloaded readings less the file's, (4,) m, and their deviations.
+    """
+
+    holds: bool
+    p: float
+    groups: list[Moved]
+    like: list[str]
+    zero: FloatArray
+    zero_sd: FloatArray
+
+
+def check(
+    runs: Sequence[Run], rig: Rig, *, alone: bool = False, progress: Callable[[str], None] = lambda words: None
+) -> Checked:
+    """Hold the rig file against recordings made since. Raises RecordingError as a calibration does."""
+    kind = kind_of(runs, alone)
+    progress('rows')
+    noise = np.median([noise_of(run, rig) for run in runs], axis=0)
+    clock = roughly_late(runs, rig, noise) if kind == 'reference' else 0.0
+    rows = joined([rows_of(run, rig, noise, late=clock, blocks=kind != 'reference') for run in runs])
+    if kind == 'loads':
+        rows = settled(rows, rig, noise)
+    progress('fitting')
+    vector = vector_of_rig(rig)
+    told = prior_of_rig(rig, vector)
+    told.covariance[:COUNT, :COUNT] += np.diag((BELIEVED * TOLERANCES) ** 2)
+    # The noise is that about the best fit of a rig that may have moved.
+    wide = told.covariance.copy()
+    wide[:COUNT, :COUNT] += np.diag((3.0 * TOLERANCES) ** 2)
+    free = fitted_parameters(kind)
+    best = fit(rows, rig, Prior(told.mean, wide), kind, free=free)
+    # Gradient and information at the file's values: from a rig that far off k and the heights would not be linear.
+    z = told.mean.copy()
+    z[ZERO:] = best.values[ZERO:]
+    gradient, whole = score_at(rows, z, rig, kind, best)
+    at = np.flatnonzero(free)
+    scale = np.concatenate((TOLERANCES, told.sd[COUNT:]))[at]
+    information = whole[np.ix_(at, at)] * np.outer(scale, scale)
+    right = scale * gradient[at] + information @ ((z - told.mean)[at] / scale)
+    p = told.covariance[np.ix_(at, at)] / np.outer(scale, scale)
+    q = np.linalg.solve(np.eye(len(at)) + p @ information, p)
+    left = right - information @ (q @ right)
+    m = information - information @ q @ information
+    groups = [_moved(name, at, left, m, scale) for name in dict.fromkeys(d.group for d in PARAMETERS)]
+    seen = [g for g in groups if g.freedom]
+    seen.sort(key=lambda g: -g.evidence)
+    overall = min([1.0, *(len(seen) * g.p for g in seen)])
+    if overall < LEVEL:
+        # A shift of several tolerances is beyond the linear: the likely ones are fitted in full.
+        null = explained(rows, rig, told, kind, free, best)[0]
+        fitted = [_fitted(g, rows, rig, told, kind, free, best, null) for g in seen[:FITTED]]
+        seen = [*sorted(fitted, key=lambda g: -g.evidence), *seen[FITTED:]]
+    like = [g.group for g in seen[1:] if seen[0].evidence - g.evidence < LIKE] if overall < LEVEL else []
+    zeros = slice(ZERO, COUNT)
+    return Checked(
+        overall >= LEVEL,
+        overall,
+        seen,
+        like,
+        best.values[zeros] - vector.values[zeros],
+        np.sqrt(np.diag(best.covariance)[zeros]),
+    )
+
+
+def _moved(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale: FloatArray) -> Moved:
+    own = [i for i, index in enumerate(at) if index < ZERO and PARAMETERS[int(index)].group == name]
+    block, score = m[np.ix_(own, own)], left[own]
+    size, vectors = np.linalg.eigh(0.5 * (block + block.T))
+    shown = size > _SEEN
+    along = vectors.T @ score
+    statistic = float(np.sum(along[shown] ** 2 / size[shown]))
+    freedom = int(shown.sum())
+    size = np.maximum(size, 0.0)
+    evidence = 0.5 * float(np.sum(along**2 / (size + 1.0) - np.log1p(size)))
+    covariance = (vectors / (size + 1.0)) @ vectors.T
+    shift = covariance @ score
+    named = {
+        NAMES[int(at[i])]: (float(scale[i] * shift[j]), float(scale[i] * covariance[j, j] ** 0.5))
+        for j, i in enumerate(own)
+    }
+    return Moved(name, float(chi2.sf(statistic, freedom)) if freedom else 1.0, evidence, freedom, named)
+
+
+def _fitted(group: Moved, rows: Rows, rig: Rig, told: Prior, kind: Kind, free: Mask, best: Fit, null: float) -> Moved:
+    """The group with the evidence and the shifts of a full fit; ``null``: what :func:`explained` says if none moved."""
+    covariance = told.covariance.copy()
+    for name in group.shifts:
+        i = NAMES.index(name)
+        covariance[i, i] += (SHIFT * TOLERANCES[i]) ** 2
+    evidence, z = explained(rows, rig, Prior(told.mean, covariance), kind, free, best)
+    moved = {name: (float((z - told.mean)[NAMES.index(name)]), sd) for name, (_, sd) in group.shifts.items()}
+    return group._replace(evidence=evidence - null, shifts=moved)
+
+
+def result(found: Checked) -> dict[str, Any]:
+    """As JSON."""
+    return {
+        'verdict': 'holds' if found.holds else 'moved',
+        'level': LEVEL,
+        'p': found.p,
+        'moved': None if found.holds else found.groups[0].group,
+        'or': found.like,
+        'groups': [
+            {
+                'name': g.group,
+                'p': min(1.0, g.p),
+                'evidence': g.evidence,
+                'shifts': {name: {'value': v, 'sd': sd} for name, (v, sd) in g.shifts.items()},
+            }
+            for g in found.groups
+        ],
+        'zero': {
+            NAMES[ZERO + i]: {'value': float(v), 'sd': float(sd)}
+            for i, (v, sd) in enumerate(zip(found.zero, found.zero_sd, strict=True))
+        },
+    }
+
+
+def sentence(found: Checked) -> str:
+    """The answer in one sentence."""
+    if found.holds:
+        return f'The calibration holds: nothing moved (p {found.p:.2g}; false alarms at most {LEVEL:.0%}).'
+    first = found.groups[0]
+    shifts = ', '.join(f'{name} by {v:+.3g} ± {sd:.1g}' for name, (v, sd) in first.shifts.items())
+    other = f' (or {", ".join(found.like)}: this recording cannot tell)' if found.like else ''
+    return f'{first.group} moved{other}: {shifts} (p {found.p:.2g}). Calibrate again.'

@@ -1,0 +1,353 @@
+"""Parameters and their covariance from rows of readings and poses: Gauss-Newton with the tolerances as a prior.
+
+The reference y of row j is the pose with an error e (errors in variables). With the pose x_j that the readings m_j
+give, which is far more precise, and the derivatives taken there,
+
+    r_j = m_j - f(x_j; p) - J_y (y_j - v_j tau - x_j) = J_p dp + n_j - J_y e_j,    C_j = J_y S_ref J_y^T + S_dots.
+
+The pose drops out, and generalised least squares with C_j is the joint answer for parameters and poses. Derivatives at
+y_j would go with its errors and pull the gains towards zero (attenuation). J_y is (4, 3): along the direction that it
+does not reach, the one redundant reading, the reference's noise does not enter, and the weight is that of the
+detectors. Known loads take the place of y, with the link's compliance; without either S_ref is as good as infinite.
+
+tau is the offset of the reference's clock. S_ref (three variances) and a factor on S_dots are variance components:
+estimated from the residuals, in turn with p. Rows beyond ``FAR`` are outliers and count for nothing. A reference whose
+errors are correlated from row to row counts as the fewer rows that it is worth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from psd_deflection.calibrating.observation import Rows
+from psd_deflection.config import Rig
+from psd_deflection.misalignment.model import ALL, COUNT, TOLERANCES, ZERO, by_parameters, by_pose, readings
+from psd_deflection.misalignment.rig import CLAMP, RigVector, known_of_rig, stated_sd, vector_of_rig
+from psd_deflection.records import FloatArray
+
+Mask = np.ndarray[tuple[int], np.dtype[np.bool_]]
+Kind = Literal['reference', 'loads', 'self']
+
+NAMES = (*(p.name for p in ALL), *CLAMP.values(), 'reference.clock')
+SIZE = len(NAMES)
+CLAMP_AT, CLOCK = COUNT, COUNT + 2
+CLOCK_SD = 0.005
+"""s. Tolerance of the reference's clock, once the offset that is seen roughly is taken off."""
+CLAMP_SHARE = 0.2
+"""Tolerance of the clamp's compliance, as a share of the link's own."""
+FAR = 27.0
+"""Squared distance of an outlier, of four residuals: one good row in 50 000."""
+STEPS, PASSES = 4, 4
+_FREE = 1.0
+"""Standard deviation, m and rad, of a pose that nothing but the dots tells."""
+_HUBER = 3.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """``mean`` (SIZE,), ``covariance`` (SIZE, SIZE): what is known before the recordings."""
+
+    mean: FloatArray
+    covariance: FloatArray
+
+    @property
+    def sd(self) -> FloatArray:
+        """Standard deviations (SIZE,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def prior_of_rig(rig: Rig, vector: RigVector | None = None) -> Prior:
+    """From the rig file: its values and standard deviations, or the tolerances that it need not give."""
+    vector = vector_of_rig(rig) if vector is None else vector
+    covariance = np.zeros((SIZE, SIZE))
+    covariance[:COUNT, :COUNT] = known_of_rig(rig).covariance
+    # The beams may stand elsewhere today: a zero is taken anew for every session.
+    covariance[ZERO:COUNT] = covariance[:, ZERO:COUNT] = 0.0
+    covariance[ZERO:COUNT, ZERO:COUNT] = np.diag(TOLERANCES[ZERO:] ** 2)
+    stated = stated_sd(rig)
+    own = (rig.link.length / rig.link.bending_stiffness, rig.link.length / rig.link.torsional_stiffness)
+    # A tip force F gives L^3 F/3EI; a clamp that turns by c F L moves the tip by c F L^2.
+    shares = (CLAMP_SHARE * own[0] / 3.0, CLAMP_SHARE * own[1])
+    for i, (name, share) in enumerate(zip(CLAMP.values(), shares, strict=True)):
+        covariance[CLAMP_AT + i, CLAMP_AT + i] = (stated.get(name) or share) ** 2
+    covariance[CLOCK, CLOCK] = CLOCK_SD**2
+    mean = np.concatenate((vector.values, list(vector.clamp.values()), [0.0]))
+    return Prior(mean, covariance)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Noise:
+    """``reference`` (3,): standard deviations of the reference, m, m, rad. ``dots``: factor on the dots' noise.
+
+    ``fewer``: rows that are worth one, because the reference's errors are correlated.
+    """
+
+    reference: FloatArray
+    dots: float = 1.0
+    fewer: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linear:
+    """Rows about one set of parameters: ``residual`` (n, 4) m, ``slopes`` (n, 4, SIZE), ``by_pose`` (n, 4, 3)."""
+
+    residual: FloatArray
+    slopes: FloatArray
+    by_pose: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """``values`` (SIZE,), ``covariance`` (SIZE, SIZE), ``information`` (SIZE, SIZE) of the rows alone.
+
+    ``linear``: the rows about ``values``; ``weights`` (n,): 0 of an outlier. ``noise``: the variance components.
+    ``free``: which parameters were fitted; the others keep the prior's mean and spread.
+    """
+
+    values: FloatArray
+    covariance: FloatArray
+    information: FloatArray
+    linear: Linear
+    weights: FloatArray
+    noise: Noise
+    free: Mask
+
+
+def compliances(rig: Rig, z: FloatArray) -> FloatArray:
+    """(3,): m/N, m/N, rad/(N m) of the tip, with the clamp of ``z``."""
+    length = rig.link.length
+    bending = length**3 / (3.0 * rig.link.bending_stiffness) + z[CLAMP_AT] * length**2
+    return np.array([bending, bending, length / rig.link.torsional_stiffness + z[CLAMP_AT + 1]])
+
+
+def linearised(rows: Rows, z: FloatArray, rig: Rig, kind: Kind) -> Linear:
+    """Residuals and their derivatives at ``z`` (SIZE,)."""
+    length = rig.link.length
+    p = z[:COUNT]
+    slopes = np.zeros((len(rows), 4, SIZE))
+    pose = pose_of_readings(rows.dots, p, length)
+    turned = by_pose(p, pose.T, length).transpose(2, 0, 1)
+    slopes[:, :, :COUNT] = by_parameters(p, pose.T, length).transpose(2, 0, 1)
+    residual = rows.dots - readings(p, pose.T, length).T
+    if kind == 'reference':
+        residual -= np.einsum('nij,nj->ni', turned, rows.pose - z[CLOCK] * rows.velocity - pose)
+        slopes[:, :, CLOCK] = -np.einsum('nij,nj->ni', turned, rows.velocity)
+    elif kind == 'loads':
+        residual -= np.einsum('nij,nj->ni', turned, rows.loads * compliances(rig, z) - pose)
+        fx, fy, tz = rows.loads.T
+        flat = np.zeros_like(fx)
+        bent = length**2 * np.stack((fx, fy, flat), axis=1)
+        slopes[:, :, CLAMP_AT] = np.einsum('nij,nj->ni', turned, bent)
+        slopes[:, :, CLAMP_AT + 1] = turned[:, :, 2] * tz[:, None]
+    return Linear(residual, slopes, turned)
+
+
+def pose_of_readings(dots: FloatArray, p: FloatArray, length: float) -> FloatArray:
+    """Poses (n, 3) that fit the readings (n, 4) best, each reading with the same weight."""
+    rest = np.zeros((3, 1))
+    pose = (dots - readings(p, rest, length).T) @ np.linalg.pinv(by_pose(p, rest, length)[:, :, 0]).T
+    inverse = np.linalg.pinv(by_pose(p, pose.T, length).transpose(2, 0, 1))
+    # Each step leaves what the derivatives have changed since, a thousandth.
+    for _ in range(3):
+        pose = pose + np.einsum('nij,nj->ni', inverse, dots - readings(p, pose.T, length).T)
+    return pose
+
+
+def weight_matrices(linear: Linear, rows: Rows, noise: Noise) -> FloatArray:
+    """C^-1 (n, 4, 4), 1/m^2."""
+    spread = linear.by_pose * noise.reference
+    covariance = np.einsum('nij,nkj->nik', spread, spread)
+    covariance[:, range(4), range(4)] += noise.dots**2 * rows.variances
+    return np.asarray(np.linalg.inv(covariance)) / noise.fewer
+
+
+def fit(
+    rows: Rows,
+    rig: Rig,
+    prior: Prior,
+    kind: Kind = 'reference',
+    *,
+    free: Mask,
+    start: Fit | None = None,
+) -> Fit:
+    """Fit ``rows``. ``start``: an earlier fit of the same rows, to begin from.
+
+    ``free``: parameters that are not fitted keep the prior's value; their spread enters the covariance of the rest.
+    """
+    z = prior.mean.copy() if start is None else start.values.copy()
+    z[~free] = prior.mean[~free]
+    noise = Noise(np.array([2e-4, 2e-4, 2e-3]), 3.0) if start is None else start.noise
+    if kind == 'self':
+        noise = Noise(np.full(3, _FREE), noise.dots)
+    linear = linearised(rows, z, rig, kind)
+    for number in range(0 if start is None else PASSES - 2, PASSES):
+        for _ in range(STEPS):
+            inverse = weight_matrices(linear, rows, noise)
+            robust = _robust(linear, inverse, noise, kind, number)
+            step, information = _step(linear, inverse, robust, z, prior, free)
+            z = z + step
+            linear = linearised(rows, z, rig, kind)
+            if np.all(np.abs(step) <= 1e-2 * np.sqrt(np.diag(posterior(information, prior, free)))):
+                break
+        noise = _components(linear, rows, robust, kind, number, information, prior)
+    inverse = weight_matrices(linear, rows, noise)
+    robust = _robust(linear, inverse, noise, kind, PASSES)
+    _, information = _step(linear, inverse, robust, z, prior, free)
+    return Fit(z, posterior(information, prior, free), information, linear, robust, noise, free)
+
+
+def _robust(linear: Linear, inverse: FloatArray, noise: Noise, kind: Kind, number: int) -> FloatArray:
+    """Weights (n,): Huber's in the first pass, then 0 of outliers. Holds of a load are too few to cast one out."""
+    distance = np.einsum('ni,nij,nj->n', linear.residual, inverse, linear.residual) * noise.fewer
+    # Where most would be outliers it is the noise that is not known yet.
+    if number == 0 or kind == 'loads' or np.mean(distance < FAR) < 0.5:
+        return np.asarray(np.minimum(1.0, _HUBER / np.sqrt(np.maximum(distance, 1e-300))))
+    return np.asarray(distance < FAR, dtype=np.float64)
+
+
+def score_at(rows: Rows, z: FloatArray, rig: Rig, kind: Kind, best: Fit) -> tuple[FloatArray, FloatArray]:
+    """J^T C^-1 r (SIZE,) and J^T C^-1 J (SIZE, SIZE) at ``z``, with the noise and the outliers of the fit ``best``."""
+    linear = linearised(rows, z, rig, kind)
+    inverse = weight_matrices(linear, rows, best.noise) * best.weights[:, None, None]
+    weighted = np.einsum('nij,njk->nik', inverse, linear.slopes).reshape(-1, SIZE)
+    information = linear.slopes.reshape(-1, SIZE).T @ weighted
+    return weighted.T @ linear.residual.ravel(), 0.5 * (information + information.T)
+
+
+def explained(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask, best: Fit) -> tuple[float, FloatArray]:
+    """How well rows and ``prior`` go together, and the parameters (SIZE,) that fit both.
+
+    The natural logarithm of the rows' probability, but for a constant, with the noise and the outliers of ``best``.
+    """
+    z = prior.mean.copy()
+    z[ZERO:] = best.values[ZERO:]
+    at = np.flatnonzero(free)
+    for _ in range(STEPS):
+        linear = linearised(rows, z, rig, kind)
+        inverse = weight_matrices(linear, rows, best.noise)
+        step, information = _step(linear, inverse, best.weights, z, prior, free)
+        z = z + step
+    residual = linearised(rows, z, rig, kind).residual
+    misfit = float(np.einsum('ni,nij,nj,n->', residual, inverse, residual, best.weights))
+    scale = prior.sd[at]
+    p = prior.covariance[np.ix_(at, at)] / np.outer(scale, scale)
+    away = (z - prior.mean)[at] / scale
+    told = information[np.ix_(at, at)] * np.outer(scale, scale)
+    spread = float(np.linalg.slogdet(np.eye(len(at)) + p @ told)[1])
+    return -0.5 * (misfit + float(away @ np.linalg.solve(p, away)) + spread), z
+
+
+def refitted(whole: Fit, rows: Rows, prior: Prior, kept: FloatArray, free: Mask) -> FloatArray:
+    """Parameters (SIZE,) from some of the rows, ``kept`` (n,) 1 or 0, by one step from the fit of all of them."""
+    inverse = weight_matrices(whole.linear, rows, whole.noise)
+    z = whole.values.copy()
+    z[~free] = prior.mean[~free]
+    shifted = Linear(residual_at(whole, z), whole.linear.slopes, whole.linear.by_pose)
+    return z + _step(shifted, inverse, whole.weights * kept, z, prior, free)[0]
+
+
+def residual_at(whole: Fit, z: FloatArray) -> FloatArray:
+    """Residuals (n, 4), m, for parameters near those of the fit, to first order."""
+    return whole.linear.residual - whole.linear.slopes @ (z - whole.values)
+
+
+def _step(
+    linear: Linear,
+    inverse: FloatArray,
+    robust: FloatArray,
+    z: FloatArray,
+    prior: Prior,
+    free: Mask,
+) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Newton's step (SIZE,) and the information (SIZE, SIZE) of the rows."""
+    weighted = np.einsum('nij,njk->nik', inverse * robust[:, None, None], linear.slopes)
+    flat = linear.slopes.reshape(-1, SIZE)
+    information = flat.T @ weighted.reshape(-1, SIZE)
+    right = weighted.reshape(-1, SIZE).T @ linear.residual.ravel()
+    at = np.flatnonzero(free)
+    own = np.ix_(at, at)
+    scale = prior.sd[at]
+    precision = np.linalg.inv(prior.covariance[own] / np.outer(scale, scale))
+    normal = precision + information[own] * np.outer(scale, scale)
+    gradient = scale * right[at] - precision @ ((z - prior.mean)[at] / scale)
+    step = np.zeros(SIZE)
+    step[at] = scale * np.linalg.solve(normal, gradient)
+    return step, 0.5 * (information + information.T)
+
+
+def posterior(information: FloatArray, prior: Prior, free: Mask) -> FloatArray:
+    """Covariance (SIZE, SIZE) of the fit, and of what was not fitted (Schmidt's consider covariance)."""
+    scale = prior.sd
+    p0 = prior.covariance / np.outer(scale, scale)
+    info = information * np.outer(scale, scale)
+    d, u = np.flatnonzero(free), np.flatnonzero(~free)
+    # z_d - truth = A (prior error of d) + noise - P_d N_du (error of u); d and u may be correlated before.
+    p_d = np.linalg.inv(np.linalg.inv(p0[np.ix_(d, d)]) + info[np.ix_(d, d)])
+    out = np.zeros((SIZE, SIZE))
+    out[np.ix_(d, d)] = p_d
+    if len(u):
+        kept = p_d @ np.linalg.inv(p0[np.ix_(d, d)])
+        by_u = -p_d @ info[np.ix_(d, u)]
+        p_u, p_du = p0[np.ix_(u, u)], p0[np.ix_(d, u)]
+        cross = kept @ p_du @ by_u.T
+        out[np.ix_(d, d)] += by_u @ p_u @ by_u.T + cross + cross.T
+        out[np.ix_(d, u)] = kept @ p_du + by_u @ p_u
+        out[np.ix_(u, d)] = out[np.ix_(d, u)].T
+        out[np.ix_(u, u)] = p_u
+    return np.asarray(out * np.outer(scale, scale))
+
+
+def _components(
+    linear: Linear,
+    rows: Rows,
+    robust: FloatArray,
+    kind: Kind,
+    number: int,
+    information: FloatArray,
+    prior: Prior,
+) -> Noise:
+    """The variance components from the residuals."""
+    good = robust > 0.0 if number else np.ones(len(rows), dtype=bool)
+    inverse = np.linalg.pinv(linear.by_pose)
+    errors = np.einsum('nij,nj->ni', inverse, linear.residual)[good]
+    # Two PSDs leave one direction that no pose reaches.
+    across = np.linalg.svd(linear.by_pose)[0][:, :, 3]
+    redundant = np.einsum('ni,ni->n', across, linear.residual)[good]
+    expected = np.sqrt(np.einsum('ni,ni->n', across**2, rows.variances))[good]
+    scale = prior.sd
+    known = np.linalg.inv(
+        np.linalg.inv(prior.covariance / np.outer(scale, scale)) + information * np.outer(scale, scale)
+    )
+    used = float(np.trace(known @ (information * np.outer(scale, scale))))
+    # Each of the four equations of a row pays its part of the parameters that were fitted.
+    share = max(1.0 - used / (4.0 * len(errors)), 0.2)
+    robustly = number == 0 and kind != 'loads'
+    dots = _deviation(redundant / expected, robustly) / share**0.5
+    if kind == 'self':
+        return Noise(np.full(3, _FREE), max(dots, 0.3), 1.0)
+    own = np.einsum('nij,nj->ni', inverse**2, rows.variances)[good].mean(axis=0) * dots**2
+    seen = np.array([_deviation(e, robustly) ** 2 for e in errors.T]) / share
+    reference = np.sqrt(np.maximum(seen - own, 0.01 * own))
+    return Noise(reference, max(dots, 0.3), _fewer(errors, rows.run[good]))
+
+
+def _deviation(values: FloatArray, robustly: bool) -> float:
+    if robustly:
+        return float(1.4826 * np.median(np.abs(values - np.median(values))))
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _fewer(errors: FloatArray, run: np.ndarray[tuple[int], np.dtype[np.int64]]) -> float:
+    """Rows that are worth one if errors follow on each other like an autoregression of the first order."""
+    same = run[1:] == run[:-1]
+    sums, worst = np.sum(errors**2, axis=0), 0.0
+    for e, total in zip(errors.T, sums, strict=True):
+        if total > 0.0:
+            worst = max(worst, float(np.sum(e[1:] * e[:-1] * same) / total))
+    if worst < 3.0 / len(errors) ** 0.5:
+        return 1.0
+    worst = min(worst, 0.98)
+    return (1.0 + worst) / (1.0 - worst)

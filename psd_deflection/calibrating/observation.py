@@ -1,0 +1,256 @@
+"""One recording as arrays, and the rows that a calibration fits: the dots at the times of the reference.
+
+A polynomial of degree 6 through 21 samples gives the dots at a time, their speed and their noise. It follows the
+link's modes to 1e-5 of their amplitude, which a mean of 20 samples does not. A reference that comes in almost
+every sample is averaged over a block together with the dots.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from psd_deflection.calibration import Calibration
+from psd_deflection.config import Rig
+from psd_deflection.errors import RecordingError
+from psd_deflection.misalignment.model import readings
+from psd_deflection.misalignment.rig import vector_of_rig
+from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray, IntArray
+
+HALF, DEGREE = 10, 6
+"""Samples to either side of a time, and degree of the polynomial through them."""
+LEAST_PRESENT = 17
+SETTLE = 0.5
+"""Share of the time that a load is held which is not fitted: the link rings."""
+LEAST_HOLD = 0.8
+"""s. A load that is held for less says nothing of the link at rest."""
+LEAST_ROWS = 20
+CALM, CALM_LEAST = 0.25, 1.0 / 250.0
+"""s, of a mean over a link at rest; the least variance of one over that of a sample."""
+
+_OFFSETS = np.arange(-HALF, HALF + 1) / HALF
+_BASIS = np.vander(_OFFSETS, DEGREE + 1, increasing=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """One recording. ``t`` (n,) s of the whole grid; ``volts`` (n, 6) V of the PSDs, NaN if a sample is lost.
+
+    ``reference_t`` (m,) s, ``reference`` (m, 3) m, m, rad; ``loads`` (n, 3) N, N, N m, held, or None. ``digest``: of
+    its source.
+    """
+
+    name: str
+    t: FloatArray
+    volts: FloatArray
+    reference_t: FloatArray
+    reference: FloatArray
+    loads: FloatArray | None = None
+    digest: str = ''
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """``t`` (n,) s; ``run`` (n,): which recording. ``pose`` (n, 3): the reference, or zeros if there is none.
+
+    ``dots`` (n, 4) m: as the detectors give them; ``variances`` (n, 4) of them by the noise alone. ``velocity``
+    (n, 3): of the pose. ``loads`` (n, 3). ``rest`` (n,): whether the link has come to rest under its load.
+    """
+
+    t: FloatArray
+    run: IntArray
+    pose: FloatArray
+    dots: FloatArray
+    variances: FloatArray
+    velocity: FloatArray
+    loads: FloatArray
+    rest: np.ndarray[tuple[int], np.dtype[np.bool_]]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def at(self, which: np.ndarray[tuple[int], np.dtype[np.bool_]] | IntArray) -> Rows:
+        """Some of the rows."""
+        names = ('t', 'run', 'pose', 'dots', 'variances', 'velocity', 'loads', 'rest')
+        return Rows(*(getattr(self, name)[which] for name in names))
+
+
+@dataclass(slots=True)
+class Smoothed:
+    """Dots at times: ``dots``, ``speed`` (n, 4) m, m/s, ``gain`` (n,): variance of a dot over that of a sample."""
+
+    dots: FloatArray
+    speed: FloatArray
+    gain: FloatArray
+    good: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    squares: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
+
+
+def usable_dots(run: Run, rig: Rig) -> FloatArray:
+    """Dots (n, 4), m, as the detectors give them; NaN where a sample is lost, dark, saturated or has other light."""
+    volts = run.volts.copy()
+    full = 0.99 * rig.converter.full_scale
+    for psd in range(2):
+        with np.errstate(invalid='ignore'):
+            v = volts[:, 3 * psd : 3 * psd + 3]
+            bad = (np.abs(v[:, :2]) >= full).any(axis=1)
+            bad |= (v[:, 2] < rig.estimator.sum_min) | (v[:, 2] > rig.estimator.sum_max)
+        volts[bad] = np.nan
+    return Calibration.from_rig(rig).dots(volts.astype(np.float32))
+
+
+def smoothed(dots: FloatArray, period: float, places: FloatArray) -> Smoothed:
+    """The polynomial through the samples about each of ``places`` (m,), in samples from the first."""
+    middle = np.clip(np.rint(places).astype(np.int64), 0, len(dots) - 1)
+    index = middle[:, None] + np.arange(-HALF, HALF + 1)
+    inside = (index >= 0) & (index < len(dots))
+    window = dots[np.clip(index, 0, len(dots) - 1)]
+    present = inside & np.isfinite(window).all(axis=2)
+    mask = present.astype(np.float64)
+    good = (present.sum(axis=1) >= LEAST_PRESENT) & present[:, :HALF].any(axis=1) & present[:, HALF + 1 :].any(axis=1)
+    window = np.where(present[:, :, None], window, 0.0)
+    normal = np.einsum('nw,wi,wj->nij', mask, _BASIS, _BASIS)
+    normal[~good] = np.eye(DEGREE + 1)
+    right = np.einsum('wi,nwc->nic', _BASIS, window)
+    inverse = np.linalg.inv(normal)
+    coefficients = inverse @ right
+    at = (places - middle) / HALF
+    basis = np.vander(at, DEGREE + 1, increasing=True)
+    slope = np.zeros_like(basis)
+    slope[:, 1:] = basis[:, :-1] * np.arange(1, DEGREE + 1)
+    fitted = np.einsum('wi,nic->nwc', _BASIS, coefficients)
+    freedom = np.maximum(mask.sum(axis=1) - DEGREE - 1, 1.0)
+    squares = (mask[:, :, None] * (window - fitted) ** 2).sum(axis=1) / freedom[:, None]
+    return Smoothed(
+        np.einsum('ni,nic->nc', basis, coefficients),
+        np.einsum('ni,nic->nc', slope, coefficients) / (HALF * period),
+        np.einsum('ni,nij,nj->n', basis, inverse, basis),
+        good & (np.abs(places - middle) <= 0.51),
+        squares,
+    )
+
+
+def noise_of(run: Run, rig: Rig) -> FloatArray:
+    """Noise (4,) of a sample of x1, y1, x2, y2, V rms, from what is left of the polynomials."""
+    dots = usable_dots(run, rig)
+    places = np.arange(HALF, len(dots) - HALF, 2 * HALF + 1, dtype=np.float64)
+    s = smoothed(dots, 1.0, places)
+    if not s.good.any():
+        return rig.noises[:, :2].ravel()
+    # The median is not moved by jumps; of chi-square over its 14 degrees of freedom it is 0.9531.
+    variances = np.median(s.squares[s.good], axis=0) / 0.9531
+    variances = variances / rig.sensitivities.ravel() ** 2 - rig.converter.volts_per_count**2 / 12.0
+    return np.asarray(np.sqrt(np.maximum(variances, (0.1 * rig.converter.volts_per_count) ** 2)))
+
+
+def at_rest(loads: FloatArray | None, t: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which samples belong to the second half of the time that a load is held."""
+    out = np.zeros(len(t), dtype=bool)
+    if loads is None:
+        return out
+    cuts = [0, *(np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1).tolist(), len(t)]
+    for a, b in itertools.pairwise(cuts):
+        held = t[b - 1] - t[a]
+        if held >= LEAST_HOLD:
+            out[a:b] = t[a:b] >= t[a] + SETTLE * held
+    return out
+
+
+def rows_of(run: Run, rig: Rig, noise: FloatArray, *, late: float = 0.0, blocks: bool = False) -> Rows:
+    """The rows of one recording: one for each reference, or one a block if the reference is as fast as that.
+
+    ``noise`` (4,) V. ``late``: seconds to add to the reference's times. ``blocks``: one a block, without reference.
+    Raises RecordingError if there are too few.
+    """
+    period = float(np.median(np.diff(run.t)))
+    dots = usable_dots(run, rig)
+    size = rig.estimator.block_size
+    if blocks or not len(run.reference_t):
+        times, poses = run.t[size // 2 :: size], None
+    else:
+        times, poses = run.reference_t + late, run.reference
+    places = np.interp(times, run.t, np.arange(len(run.t)), left=-np.inf, right=np.inf)
+    inside = np.isfinite(places)
+    places, times = places[inside], times[inside]
+    poses = np.zeros((len(places), 3)) if poses is None else poses[inside]
+    s = smoothed(dots, period, places)
+    loads = np.zeros((len(run.t), 3)) if run.loads is None else run.loads
+    middle = np.clip(np.rint(places).astype(np.int64), 0, len(run.t) - 1)
+    sample = rig.sensitivities.ravel() ** 2 * (noise**2 + rig.converter.volts_per_count**2 / 12.0)
+    speed = s.speed @ _pose_of_dots(rig).T
+    rows = Rows(
+        times,
+        np.zeros(len(times), np.int64),
+        poses,
+        s.dots,
+        s.gain[:, None] * sample,
+        speed,
+        loads[middle],
+        at_rest(run.loads, run.t)[middle],
+    ).at(s.good)
+    if len(rows) > 1 and float(np.median(np.diff(rows.t))) < (size - 0.5) * period:
+        rows = _by_block(rows, rig, size * period, sample / size)
+    if len(rows) < LEAST_ROWS:
+        what = 'blocks' if blocks else 'reference measurements with good samples about them'
+        raise RecordingError(f'{run.name}: {len(rows)} {what}; a calibration needs at least {LEAST_ROWS}')
+    return rows
+
+
+def settled(rows: Rows, rig: Rig, noise: FloatArray) -> Rows:
+    """Means over ``CALM`` of a link at rest under a known load, in which what still rings is small."""
+    sample = rig.sensitivities.ravel() ** 2 * noise**2
+    return _by_block(rows.at(rows.rest), rig, CALM, sample * CALM_LEAST)
+
+
+def _pose_of_dots(rig: Rig) -> FloatArray:
+    """(3, 4): how the pose goes with the dots of the nominal rig at rest."""
+    x, y = (rig.centers + rig.zeros).T
+    design = np.zeros((4, 3))
+    design[0::2, 0] = design[1::2, 1] = -1.0
+    design[0::2, 2], design[1::2, 2] = y, -x
+    return np.asarray(np.linalg.pinv(design))
+
+
+def _by_block(rows: Rows, rig: Rig, seconds: float, variances: FloatArray) -> Rows:
+    """Means over blocks of ``seconds``. What the mean of a curved function differs by is taken off the dots."""
+    block = np.floor((rows.t - rows.t[0]) / seconds).astype(np.int64)
+    # Never over a change of the load.
+    block += np.cumsum(np.any(np.diff(rows.loads, axis=0, prepend=rows.loads[:1]) != 0.0, axis=1))
+    _, index, counts = np.unique(block, return_inverse=True, return_counts=True)
+
+    def mean(values: FloatArray) -> FloatArray:
+        out = np.zeros((len(counts), values.shape[1]))
+        np.add.at(out, index, values)
+        return out / counts[:, None]
+
+    nominal = vector_of_rig(rig).values
+    pose = mean(rows.pose)
+    bent = mean(readings(nominal, rows.pose.T, rig.link.length).T) - readings(nominal, pose.T, rig.link.length).T
+    first = np.flatnonzero(np.diff(index, prepend=-1))
+    return Rows(
+        mean(rows.t[:, None])[:, 0],
+        rows.run[first],
+        pose,
+        mean(rows.dots) - bent,
+        # Windows overlap: the mean is that of the samples of a block, or of all those of one window.
+        np.maximum(mean(rows.variances) / counts[:, None], variances),
+        mean(rows.velocity),
+        rows.loads[first],
+        rows.rest[first],
+    )
+
+
+def joined(parts: Sequence[Rows]) -> Rows:
+    """All rows, each with the number of its recording."""
+    run = np.concatenate([np.full(len(p), i) for i, p in enumerate(parts)])
+    names = ('pose', 'dots', 'variances', 'velocity', 'loads', 'rest')
+    return Rows(
+        np.concatenate([p.t for p in parts]), run, *(np.concatenate([getattr(p, n) for p in parts]) for n in names)
+    )
+
+
+CHANNEL_NAMES = tuple(CHANNELS[i] for i in DOT_CHANNELS)
+"""x1, y1, x2, y2."""

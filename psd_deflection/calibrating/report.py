@@ -1,0 +1,153 @@
+"""report.html of a calibration: one self-contained page."""
+
+from __future__ import annotations
+
+import html
+import json
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from psd_deflection.calibrating.calibrate import Calibration, before_of
+from psd_deflection.calibrating.fit import CLOCK, NAMES, linearised
+from psd_deflection.calibrating.observation import CHANNEL_NAMES
+from psd_deflection.calibrating.result import REPORTED, UNITS, result, sentence
+from psd_deflection.misalignment.model import ALL, COUNT, ZERO
+from psd_deflection.pages import page, picture, table
+
+BEFORE, AFTER = '#c44e52', '#4c72b0'
+_READ = {'rad': (1e3, 'mrad'), 'm': (1e3, 'mm'), 's': (1e3, 'ms'), '': (1.0, '')}
+_WORDS = {p.name: p.words for p in ALL} | {
+    'clamp.bending_compliance': 'turn of the clamp per moment',
+    'clamp.torsional_compliance': 'twist of the clamp per torque',
+}
+
+
+def report_html(found: Calibration, date: str) -> str:
+    """The page, pictures inside."""
+    body = ['<h1>Calibration</h1>', f'<p class=verdict>{html.escape(sentence(found))}</p>']
+    body.append('<h2>Before and after</h2>')
+    body.append(picture(_residuals(found), 'reading minus model over time, before and after'))
+    body.append(_gap(found))
+    body.append('<h2>Parameters</h2>')
+    body.append(
+        '<p class=quiet>Left open: the standard deviation over that of the rig file or its tolerance; 1: nothing was '
+        'learnt, and the file keeps its value.</p>'
+    )
+    body.append(_parameters(found))
+    body.append(picture(_correlations(found), 'correlations of the parameters'))
+    body.append('<h2>What these recordings cannot determine</h2>')
+    body.append(_undetermined(found))
+    body.append('<h2>Noise</h2>')
+    body.append(_noise(found))
+    body.append('<h2>What to do next</h2><ul>')
+    body.append(''.join(f'<li>{html.escape(words)}</li>' for words in advice(found)))
+    source = html.escape(json.dumps(result(found, date)['provenance'], indent=1))
+    body.append(f'</ul><h2>Provenance</h2><pre role="group" tabindex="0" aria-label="provenance">{source}</pre>')
+    return page('psd-deflection calibrate', body)
+
+
+def advice(found: Calibration) -> list[str]:
+    """What a person should do with the answer."""
+    out = []
+    if found.refused:
+        out.append('Check the reference: its axes, units, signs and clock. The rig file was left as it is.')
+    for name in found.widened:
+        out.append(
+            f'{name} is {_in_words(NAMES.index(name), found.values[NAMES.index(name)])}: outside the tolerance of the '
+            f'file. Look at the mount; if it is right, state the tolerance in the file.'
+        )
+    for name in found.dropped:
+        out.append(f'{name}: unseen motion refuses it, so the file keeps its value.')
+    out += [f'To determine {" with ".join(d.parts)}: {d.needs}.' for d in found.undetermined[:4]]
+    if found.kind == 'loads':
+        out.append(
+            'Known loads know the scale of the gains no better than the stiffness of the link and its clamp: '
+            'a reference separates them.'
+        )
+    if found.kind == 'self':
+        out.append(
+            'The redundant reading knows relative gains and turns only; take the zero (~/zero) with the new file.'
+        )
+    out.append('Use the file: --params-file rig.yaml. Later: psd-deflection calibrate --check rig.yaml REC.')
+    return out
+
+
+def _in_words(i: int, value: float, sd: float | None = None) -> str:
+    factor, unit = _READ.get(UNITS[i], (1.0, UNITS[i]))
+    text = f'{factor * value:.5g}' if sd is None else f'{factor * value:.5g} ± {factor * sd:.2g}'
+    return f'{text} {unit}'.strip()
+
+
+def _parameters(found: Calibration) -> str:
+    rows = []
+    for i in (*REPORTED, *range(ZERO, COUNT)):
+        sd, before = float(found.sd[i]), float(found.prior.sd[i])
+        words = (_in_words(i, float(found.prior.mean[i]), before), _in_words(i, float(found.values[i]), sd))
+        rows.append((NAMES[i], _WORDS[NAMES[i]], *words, f'{sd / before:.2g}' if before else ''))
+    return table(('parameter', 'meaning', 'rig file', 'calibrated', 'left open'), rows)
+
+
+def _gap(found: Calibration) -> str:
+    g = found.gap
+    rows = [
+        ('all motion', f'{g.before * 1e6:.3f} µm', f'{g.after * 1e6:.3f} µm'),
+        ('motion that was not fitted', f'{g.heldout_before * 1e6:.3f} µm', f'{g.heldout_after * 1e6:.3f} µm'),
+    ]
+    return table(('reading minus model, rms', 'before', 'after'), rows)
+
+
+def _undetermined(found: Calibration) -> str:
+    if not found.undetermined:
+        return '<p>Nothing: every parameter is determined.</p>'
+    rows = []
+    for d in found.undetermined:
+        parts = ', '.join(f'{name} {part:+.2f}' for name, part in d.parts.items())
+        how = 'keeps the value and the tolerance of the file' if len(d.parts) == 1 else 'move together'
+        rows.append((parts, how, d.needs))
+    return table(('direction, in units of the tolerances', '', 'what would determine it'), rows)
+
+
+def _noise(found: Calibration) -> str:
+    rows = [(name, f'{v * 1e3:.3f} mV a sample') for name, v in zip(CHANNEL_NAMES, found.noise, strict=True)]
+    if found.kind == 'reference':
+        x, y, theta = found.fit.noise.reference
+        rows.append(('reference', f'{x * 1e6:.2f} µm, {y * 1e6:.2f} µm, {np.degrees(theta) * 1e3:.2f} mdeg a frame'))
+        clock = found.clock + float(found.values[CLOCK])
+        rows.append(('clock of the reference', f'add {clock * 1e3:.3f} ± {found.sd[CLOCK] * 1e3:.2g} ms to its times'))
+        rows.append(('outliers of the reference', f'{int(np.sum(found.fit.weights == 0.0))} of {len(found.rows)}'))
+    return table(('what', 'noise, 1 sd'), rows)
+
+
+def _residuals(found: Calibration) -> Figure:
+    before: Any = linearised(found.rows, before_of(found.vector, found.prior), found.rig, found.kind).residual
+    after = found.fit.linear.residual
+    figure = Figure(figsize=(10, 6.4), layout='constrained')
+    axes = figure.subplots(4, 1, sharex=True)
+    starts = np.concatenate(([0.0], np.cumsum([run.t[-1] for run in found.runs])))
+    t = found.rows.t + starts[found.rows.run]
+    for row, axis in enumerate(axes):
+        axis.plot(t, before[:, row] * 1e6, '.', ms=2, color=BEFORE, label='before' if row == 0 else None)
+        axis.plot(t, after[:, row] * 1e6, '.', ms=2, color=AFTER, label='after' if row == 0 else None)
+        axis.set_ylabel(f'{CHANNEL_NAMES[row]} / µm')
+        axis.grid(alpha=0.25)
+        low, high = np.percentile(np.concatenate((before[:, row], after[:, row])) * 1e6, [0.5, 99.5])
+        axis.set_ylim(low - 0.2 * (high - low), high + 0.2 * (high - low))
+    axes[0].legend(loc='upper right', ncols=2, frameon=False)
+    axes[-1].set_xlabel('time / s (recordings one after another)')
+    return figure
+
+
+def _correlations(found: Calibration) -> Figure:
+    at = [i for i in REPORTED if found.fit.free[i]]
+    figure = Figure(figsize=(8, 7), layout='constrained')
+    axis = figure.subplots()
+    if at:
+        sd = found.sd[at]
+        matrix = found.covariance[np.ix_(at, at)] / np.outer(sd, sd)
+        drawn = axis.imshow(matrix, vmin=-1.0, vmax=1.0, cmap='RdBu_r')
+        axis.set_xticks(range(len(at)), [NAMES[i] for i in at], rotation=90, fontsize=7)
+        axis.set_yticks(range(len(at)), [NAMES[i] for i in at], fontsize=7)
+        figure.colorbar(drawn, ax=axis, label='correlation')
+    return figure

@@ -1,0 +1,57 @@
+"""Reads recordings for calibrate into arrays on a sample grid without gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from psd_deflection.calibrating.observation import Run
+from psd_deflection.calibration import Wiring
+from psd_deflection.config import Rig
+from psd_deflection.errors import RecordingError
+from psd_deflection.recordings.grid import MAX_SAMPLES, digest_of, held_at
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.records import CHANNELS, FloatArray
+
+
+def read_run(source: Recording | str | Path, rig: Rig, *, namespace: str | None = None) -> Run:
+    """One recording: the recording or its path. Raises RecordingError if it cannot be read."""
+    recording = source if isinstance(source, Recording) else open_recording(source, namespace=namespace)
+    path = recording.path
+    samples = recording.samples
+    first = int(samples['seq'][0])
+    n = int(samples['seq'][-1]) - first + 1
+    if n > MAX_SAMPLES:
+        raise RecordingError(f'{path}: {n} samples; calibrate takes at most {MAX_SAMPLES}')
+    if n < 4 * rig.estimator.block_size:
+        raise RecordingError(f'{path}: {n} samples; calibrate needs at least 4 blocks')
+    place = (samples['seq'] - first).astype(np.int64)
+    volts = np.full((n, 6), np.nan)
+    for i, channel in enumerate(CHANNELS):
+        volts[place, i] = samples[channel]
+    start = int(samples['t_ns'][0])
+    t = np.interp(np.arange(n), place, (samples['t_ns'] - start).astype(np.float64)) * 1e-9
+    references = recording.references()
+    applied = recording.loads()
+    loads: FloatArray | None = None
+    if applied:
+        times = np.array([a.t_ns - start for a in applied], dtype=np.int64)
+        grace = 0.25e9 / rig.converter.sample_rate_hz
+        loads = held_at(times, np.array([a[1:] for a in applied]), t * 1e9, grace, np.zeros(3))
+    return Run(
+        path.name,
+        t,
+        Wiring.from_rig(rig).to_psds(volts),
+        np.array([(r.t_ns - start) * 1e-9 for r in references]),
+        np.array([(r.dx, r.dy, r.theta) for r in references], dtype=np.float64).reshape(-1, 3),
+        loads,
+        digest_of(path) if path.exists() else '',
+    )
+
+
+def read_runs(sources: Sequence[Recording | str | Path], rig: Rig, *, namespace: str | None = None) -> list[Run]:
+    """All of ``sources``."""
+    return [read_run(source, rig, namespace=namespace) for source in sources]

@@ -1,0 +1,163 @@
+"""Calibration against rigs of the second generator in blind/, whose optics are not ours."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from blind import calibration as campaign
+from blind import misaligned
+from psd_deflection.calibrating.calibrate import Calibration, calibrate
+from psd_deflection.calibrating.check import check
+from psd_deflection.calibrating.fit import NAMES
+from psd_deflection.calibrating.observation import Run
+from psd_deflection.calibrating.result import values_of
+from psd_deflection.config import Rig, rig_from_values
+from psd_deflection.errors import RecordingError
+from psd_deflection.records import FloatArray
+
+AT = {name: i for i, name in enumerate(NAMES)}
+
+
+@pytest.fixture(scope='module')
+def nominal() -> Rig:
+    return rig_from_values({})
+
+
+@pytest.fixture(scope='module')
+def pose() -> FloatArray:
+    return misaligned.poses(misaligned.pushes(np.random.default_rng(3), 12, 2.0))
+
+
+def only(**parameters: float) -> dict[str, float]:
+    """The nominal rig (k = 1.5) but for these; ``psd_2__rotation`` is psd_2.rotation."""
+    return misaligned.nominal() | {name.replace('__', '.'): v for name, v in parameters.items()}
+
+
+def calibrated(rig: Rig, truth: dict[str, float], pose: FloatArray, seed: int = 1, **more: Any) -> Calibration:
+    recorded = misaligned.record(truth, pose, np.random.default_rng(seed), **more)
+    return calibrate([campaign.run_of(recorded)], rig)
+
+
+def test_a_turned_psd_is_found_with_its_sign(nominal: Rig, pose: FloatArray) -> None:
+    found = calibrated(nominal, only(psd_2__rotation=0.02), pose)
+    turned = found.values[AT['psd_2.rotation']]
+    # Half the difference of the crosstalks looks the same, and gets its share.
+    skew = found.values[AT['psd_2.crosstalk_xy']] - found.values[AT['psd_2.crosstalk_yx']]
+    assert turned + skew / 2.0 == pytest.approx(0.02, abs=2e-4)
+    assert turned > 0.015
+
+
+def test_errors_are_those_that_are_said(nominal: Rig, pose: FloatArray) -> None:
+    """All tolerances at once, two rigs; the campaign has many."""
+    rng = np.random.default_rng(5)
+    errors: list[float] = []
+    for _ in range(2):
+        truth = misaligned.draw(rng)
+        found = calibrated(nominal, truth, pose, seed=int(rng.integers(1 << 30)), outliers=0.02)
+        errors += [float((found.values[AT[n]] - v) / found.sd[AT[n]]) for n, v in truth.items() if n in AT]
+    assert 0.3 < np.mean(np.square(errors)) < 2.0
+    assert np.max(np.abs(errors)) < 4.5
+
+
+def test_outliers_do_not_move_it(nominal: Rig, pose: FloatArray) -> None:
+    truth = misaligned.draw(np.random.default_rng(8))
+    clean, dirty = (calibrated(nominal, truth, pose, outliers=share) for share in (0.0, 0.1))
+    assert dirty.fit.weights.mean() == pytest.approx(0.9, abs=0.05)
+    assert dirty.gap.heldout_after == pytest.approx(clean.gap.heldout_after, rel=0.1)
+    off = np.abs(dirty.values - clean.values) / clean.sd
+    assert off[: AT['psd_1.zero_x']].max() < 3.0
+
+
+def test_the_noise_of_reference_and_channels_is_told(nominal: Rig, pose: FloatArray) -> None:
+    found = calibrated(nominal, only(), pose, spread=(5e-6, 20e-6, 1e-3))
+    assert found.fit.noise.reference == pytest.approx((5e-6, 20e-6, 1e-3), rel=0.12)
+    assert found.noise == pytest.approx(np.full(4, 2e-3), rel=0.03)
+
+
+def test_what_the_recording_cannot_show_keeps_value_and_tolerance(nominal: Rig) -> None:
+    """Forces along Y alone move no dot along x and turn nothing."""
+    rng = np.random.default_rng(4)
+    loads = misaligned.pushes(rng, 12, 2.0) * (0.0, 1.0, 0.0)
+    found = calibrated(nominal, misaligned.draw(rng), misaligned.poses(loads))
+    alone = {next(iter(d.parts)) for d in found.undetermined if len(d.parts) == 1}
+    for name in ('psd_1.center_y', 'psd_2.center_x', 'beam_1.angle_x'):
+        assert name in alone
+        assert found.values[AT[name]] == found.prior.mean[AT[name]]
+        assert found.sd[AT[name]] == pytest.approx(found.prior.sd[AT[name]])
+    assert 'psd_1.gain_y' not in alone
+
+
+def test_a_late_reference_is_put_right(nominal: Rig, pose: FloatArray) -> None:
+    recorded = misaligned.record(only(), pose, np.random.default_rng(2))
+    run = campaign.run_of(recorded)
+    late = Run(run.name, run.t, run.volts, run.reference_t + 0.0123, run.reference)
+    found = calibrate([late], nominal)
+    clock = found.clock + found.values[AT['reference.clock']]
+    assert clock == pytest.approx(-0.0123, abs=2e-4)
+    assert found.gap.heldout_after < 1.2 * calibrate([run], nominal).gap.heldout_after
+
+
+def test_a_reference_that_is_no_reference_is_refused(nominal: Rig, pose: FloatArray) -> None:
+    run = campaign.run_of(misaligned.record(only(), pose, np.random.default_rng(2)))
+    wrong = Run(run.name, run.t, run.volts, run.reference_t, np.random.default_rng(1).permutation(run.reference))
+    found = calibrate([wrong], nominal)
+    assert found.refused.startswith('on motion that was not fitted')
+    values, effects = values_of(found, 'today')
+    assert not effects
+    assert set(values) == {'psd_1.noise', 'psd_2.noise'}
+
+
+def test_a_recording_without_reference_and_loads_is_refused(nominal: Rig, pose: FloatArray) -> None:
+    run = campaign.run_of(misaligned.record(only(), pose[:2000], np.random.default_rng(2)))
+    with pytest.raises(RecordingError, match=r'neither a reference .* nor known loads; --self'):
+        calibrate([Run(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0])], nominal)
+
+
+def test_the_redundant_reading_alone_tells_a_relative_gain(nominal: Rig, pose: FloatArray) -> None:
+    run = campaign.run_of(misaligned.record(only(psd_1__gain_x=0.02), pose, np.random.default_rng(2)))
+    found = calibrate([Run(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0])], nominal, alone=True)
+    # Along the base line (0.1, 0.07), which the one reading too many sees when the plate goes along X.
+    v = {name: found.values[i] for name, i in AT.items()}
+    along = v['psd_1.gain_x'] - v['psd_2.gain_x']
+    across = v['psd_1.crosstalk_yx'] - v['psd_2.crosstalk_yx'] - v['psd_1.rotation'] + v['psd_2.rotation']
+    assert 0.1 * along + 0.07 * across == pytest.approx(0.1 * 0.02, rel=0.25)
+    assert found.gap.heldout_after < 0.2 * found.gap.heldout_before
+
+
+def test_known_loads_alone_leave_the_scale_to_the_clamp(nominal: Rig) -> None:
+    rng = np.random.default_rng(6)
+    loads = misaligned.pushes(rng, 14, 3.0)
+    truth = only(psd_1__gain_x=0.02, psd_2__rotation=0.015)
+    run = campaign.run_of(misaligned.record(truth, misaligned.poses(loads), rng))
+    held = Run(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0], loads)
+    found = calibrate([held], nominal)
+    relative = found.values[AT['psd_1.gain_x']] - found.values[AT['psd_2.gain_x']]
+    assert relative == pytest.approx(0.02, abs=0.006)
+    # Common to all gains, against the clamp: no better than the tolerance of four of them.
+    assert found.sd[AT['psd_1.gain_x']] > 0.003
+
+
+def test_check_names_what_moved(nominal: Rig, pose: FloatArray) -> None:
+    rng = np.random.default_rng(9)
+    truth = misaligned.draw(rng)
+    rig, _ = campaign.calibrated_rig(nominal, campaign.run_of(misaligned.record(truth, pose, rng)))
+    assert check([campaign.run_of(misaligned.record(truth, pose, rng))], rig).holds
+    moved = truth | {'psd_1.rotation': truth['psd_1.rotation'] + 0.03}
+    found = check([campaign.run_of(misaligned.record(moved, pose, rng))], rig)
+    assert not found.holds
+    assert found.groups[0].group == 'psd_1.rotation'
+    value, sd = found.groups[0].shifts['psd_1.rotation']
+    assert abs(value - 0.03) < 4.0 * sd
+
+
+@pytest.mark.statistics
+def test_a_short_campaign_covers_the_truth() -> None:
+    """`make blind-calibration` in its shortest form: wide bounds, for it is one rig, and it is moved."""
+    found = campaign.summary([campaign.score(1)])
+    assert found.parameters > 0.7
+    assert found.poses > 0.5
+    assert found.worse == 0
+    assert found.named == 1.0

@@ -1,0 +1,153 @@
+"""``psd-deflection calibrate`` from files to files."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psd_deflection.calibrating.rig_file import HEADER, with_values
+from psd_deflection.cli.main import main
+from psd_deflection.config import load_rig
+from psd_deflection.parameter_files import flat_parameters
+
+RIG = Path(__file__).parents[2] / 'config' / 'thesis_rig.yaml'
+HIDDEN = [
+    *('--effect', 'sensor_rotation,psd=2,angle=0.012', '--effect', 'plane_tilt,slope_ratio=1.6'),
+    *('--world', 'psd_1.zero=[0.0003, -0.0002]'),
+]
+LOADS = 'steps:0,0,0;0,-50,-29;50,0,20;-40,30,0;0,40,29;-50,-40,-20:1'
+NAMES = {
+    *(
+        f'psd_{n}.{name}'
+        for n in (1, 2)
+        for name in [
+            'rotation',
+            'gain_x',
+            'gain_y',
+            'crosstalk_xy',
+            'crosstalk_yx',
+            'center_x',
+            'center_y',
+            'height',
+            'nonlinearity',
+        ]
+    ),
+    *(f'beam_{n}.angle_{axis}' for n in (1, 2) for axis in 'xy'),
+    *('link.slope_ratio', 'clamp.bending_compliance', 'clamp.torsional_compliance'),
+}
+
+
+@pytest.fixture(scope='module')
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a recording and its calibration."""
+    folder = tmp_path_factory.mktemp('calibrate')
+    recording = ['--out', str(folder / 'run.csv'), '--loads', LOADS, '--reference-noise', '1e-5,5e-4']
+    assert main(['simulate', *recording, *HIDDEN]) == 0
+    done = main(
+        ['calibrate', str(folder / 'run.csv'), '--params-file', str(RIG), '--out', str(folder / 'out'), '--quiet']
+    )
+    assert done == 0
+    return folder
+
+
+def test_calibration_json_has_the_documented_shape(made: Path) -> None:
+    found: dict[str, Any] = json.loads((made / 'out' / 'calibration.json').read_text())
+    assert set(found['parameters']) == NAMES
+    for one in found['parameters'].values():
+        assert set(one) == {'value', 'sd', 'unit', 'file'}
+    matrix = np.array(found['covariance']['matrix'])
+    at = found['covariance']['names']
+    assert set(at) == NAMES
+    assert np.sqrt(np.diag(matrix)) == pytest.approx([found['parameters'][n]['sd'] for n in at])
+    assert set(found['noise']) == {'x1', 'y1', 'x2', 'y2'}
+    assert found['noise']['x1'] == pytest.approx(2e-3, rel=0.15)
+    assert found['gap']['heldout_after'] < 0.5 * found['gap']['heldout_before']
+    for direction in found['undetermined']:
+        assert sum(v * v for v in direction['direction'].values()) == pytest.approx(1.0, abs=0.2)
+        assert direction['needs']
+    (recording,) = found['provenance']['recordings']
+    assert len(recording['sha256']) == 64
+    # It was turned by 12 mrad, of which the crosstalk takes its share.
+    assert found['parameters']['psd_2.rotation']['value'] > 0.009
+
+
+def test_the_rig_file_is_the_one_that_was_given_and_corrects(made: Path, tmp_path: Path) -> None:
+    text = (made / 'out' / 'rig.yaml').read_text()
+    assert text.startswith(HEADER)
+    assert 'run.csv (sha256 ' in text
+    assert '# k: 3/2 for a force at the tip' in text
+    rig = load_rig(made / 'out' / 'rig.yaml')
+    assert rig.psds[0].zero == pytest.approx((3e-4, -2e-4), abs=5e-6)
+    assert rig.values['min_samples'] == 10
+    errors = {}
+    loads = 'steps:0,0,0;20,-40,-10:1'
+    later = str(tmp_path / 'later.csv')
+    assert main(['simulate', '--out', later, '--loads', loads, '--reference', '--seed', '4', *HIDDEN]) == 0
+    for name, file in (('before', RIG), ('after', made / 'out' / 'rig.yaml')):
+        out = tmp_path / f'{name}.csv'
+        assert main(['replay', later, '--params-file', str(file), '--out', str(out)]) == 0
+        got = np.genfromtxt(out, delimiter=',', names=True)
+        truth = np.genfromtxt(later, delimiter=',', names=True)
+        truth = truth[np.isfinite(truth['ref_dx'])]
+        dx = np.interp(got['t'], truth['t'], truth['ref_dx'])[-20:]
+        errors[name] = float(np.abs(got['dx'][-20:] - dx).mean())
+        if name == 'after':
+            assert got['sd_dx'][-1] > 1e-6
+    assert errors['after'] < 0.1 * errors['before']
+
+
+def test_the_check_of_the_same_rig_holds(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['calibrate', str(made / 'run.csv'), '--check', str(made / 'out' / 'rig.yaml'), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['verdict'] == 'holds'
+    assert found['moved'] is None
+    assert set(found['zero']) == {'psd_1.zero_x', 'psd_1.zero_y', 'psd_2.zero_x', 'psd_2.zero_y'}
+
+
+def test_the_page_is_self_contained(made: Path) -> None:
+    page = (made / 'out' / 'report.html').read_text()
+    assert page.count('data:image/png;base64,') == 2
+    assert 'http' not in page.replace('data:image/png;base64,', '')
+    for words in ('psd_2.rotation', 'What to do next', 'left open', 'sha256'):
+        assert words in page
+
+
+@pytest.mark.parametrize(
+    ('argv', 'status', 'words'),
+    [
+        ([], 2, '--out DIR .* or --check'),
+        (['--check', str(RIG), '--out', 'x'], 2, 'give neither --params-file nor --out'),
+        (['--check', str(RIG)], 3, 'calibration.names: not there; --check takes the rig.yaml of a calibration'),
+    ],
+)
+def test_what_does_not_fit_is_refused(
+    made: Path, argv: list[str], status: int, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        ended = main(['calibrate', str(made / 'run.csv'), *argv])
+    except SystemExit as stop:
+        ended = int(str(stop.code))
+    assert ended == status
+    assert re.search(words, capsys.readouterr().err)
+
+
+def test_values_are_written_where_they_are() -> None:
+    """Nested, dotted and in a section of the node; numbers that YAML 1.1 takes for text."""
+    text = '/**:\n  ros__parameters:\n    psd_1.height: 0.0 # mm\n    psd_2:\n      center: [0.1, 0.2] # both\n'
+    out = with_values(
+        text, {'psd_1.height': 1e-05, 'psd_2.center': [0.3, 0.4], 'psd_2.height': -3e-05}, 'us', Path('rig.yaml')
+    )
+    assert flat_parameters(out, Path('rig.yaml')) == {
+        'psd_1.height': pytest.approx(1e-05, rel=1e-12),
+        'psd_2.center': [0.3, 0.4],
+        'psd_2.height': pytest.approx(-3e-05, rel=1e-12),
+    }
+    assert out.startswith('# Calibrated by us\n')
+    assert '[0.3, 0.4] # both' in out
+    assert '# mm' in out
+    assert with_values(out, {'psd_1.height': 0.25}, 'them', Path('rig.yaml')).count('# Calibrated by') == 1

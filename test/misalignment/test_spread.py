@@ -1,0 +1,119 @@
+"""The covariance of a calibrated rig: against many rigs whose parameters are wrong by what the file says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psd_deflection.config import Rig, rig_from_values
+from psd_deflection.misalignment.model import COUNT, INDEX, readings
+from psd_deflection.misalignment.rig import known_of_rig, vector_of_rig
+from psd_deflection.misalignment.spread import ParameterSpread
+from psd_deflection.pipeline import ZERO_VARIANCES, Pipeline
+from psd_deflection.records import DeflectionEstimate, FloatArray, ParameterChange, RawChunk, Record
+
+NAMES = ['psd_1.rotation', 'psd_1.gain_x', 'psd_2.gain_y', 'psd_2.center_x', 'psd_1.zero_x']
+SDS = [0.005, 0.004, 0.003, 2e-4, 3e-6]
+POSE = (1.5e-3, -2e-3, 0.015)
+
+
+def calibrated(**more: object) -> Rig:
+    rest = [n for n in INDEX if n not in NAMES]
+    own = {'calibration.names': [*NAMES, *rest], 'calibration.sds': [*SDS, *([0.0] * len(rest))]}
+    return rig_from_values({**own, 'solvers': ['exact', 'wls', 'iterative', 'ols'], **more})
+
+
+def chunk_of(dots: FloatArray, first: int = 0) -> RawChunk:
+    n = len(dots)
+    volts = np.full((n, 6), 5.0)
+    volts[:, [0, 1, 3, 4]] = dots / 5e-4
+    seq = np.arange(first, first + n)
+    return RawChunk(seq, seq * 1_000_000, volts.astype(np.float32), np.zeros(n, np.uint8))
+
+
+def estimates(records: list[Record]) -> dict[str, DeflectionEstimate]:
+    return {r.solver: r for r in records if isinstance(r, DeflectionEstimate)}
+
+
+def still(rig: Rig, pose: tuple[float, ...], n: int) -> FloatArray:
+    p = vector_of_rig(rig).as_used
+    return np.repeat(readings(p, np.array(pose)[:, None], rig.link.length).T, n, axis=0)
+
+
+def test_every_solver_spreads_as_rigs_that_differ_by_that_much() -> None:
+    """300 rigs drawn from the file's covariance show the same pose; the file knows none of them."""
+    # Each rig is a jump for the one that measures; only the parameters are asked about.
+    rig = calibrated(consistency='report')
+    rng = np.random.default_rng(1)
+    p = vector_of_rig(rig).as_used
+    known = known_of_rig(rig).covariance
+    drawn = p + rng.multivariate_normal(np.zeros(COUNT), known, 300)
+    pose = np.array(POSE)[:, None]
+    dots = np.concatenate([readings(q, pose, rig.link.length) for q in drawn], axis=1).T
+    pipeline = Pipeline(rig)
+    solved: dict[str, list[tuple[float, ...]]] = {}
+    told: dict[str, DeflectionEstimate] = {}
+    for i, row in enumerate(dots):
+        for name, e in estimates([*pipeline.process(chunk_of(np.repeat(row[None], 20, axis=0), 20 * i))]).items():
+            solved.setdefault(name, []).append(e.pose)
+            told.setdefault(name, e)
+    for name, poses in solved.items():
+        seen, said = np.cov(np.array(poses).T), np.array(told[name].covariance).reshape(3, 3)
+        sd = np.sqrt(np.diag(seen))
+        assert np.sqrt(np.diag(said)) == pytest.approx(sd, rel=0.17), name
+        assert said / np.outer(sd, sd) == pytest.approx(seen / np.outer(sd, sd), abs=0.25), name
+
+
+def test_noise_alone_on_request() -> None:
+    total, noise, file = (
+        estimates([*Pipeline(rig).process(chunk_of(still(rig, POSE, 20)))])['exact'].covariance[0] ** 0.5
+        for rig in (calibrated(), calibrated(covariance='noise'), calibrated(covariance='file'))
+    )
+    assert total > 4e-6
+    assert noise < 1e-6
+    assert file < 1e-6
+
+
+def test_a_rig_that_was_not_calibrated_has_no_spread() -> None:
+    assert ParameterSpread.from_rig(rig_from_values({})) is None
+
+
+def test_the_polynomial_is_what_it_stands_for() -> None:
+    from psd_deflection.misalignment.spread import _dots_by_parameters
+
+    rig = calibrated()
+    spread = ParameterSpread.from_rig(rig)
+    assert spread is not None
+    rng = np.random.default_rng(2)
+    for dx, dy, theta in rng.uniform(-1.0, 1.0, (20, 3)) * (4e-3, 4e-3, 0.04):
+        slopes = _dots_by_parameters(vector_of_rig(rig).as_used, np.array([[dx], [dy], [theta]]), 0.585)[0]
+        wanted = slopes @ known_of_rig(rig).covariance @ slopes.T
+        factor = spread.factor(dx, dy, theta)
+        assert factor @ factor.T == pytest.approx(wanted, rel=2e-3, abs=1e-3 * float(np.diag(wanted).max()))
+
+
+def test_a_zero_taken_now_replaces_what_the_file_left_open() -> None:
+    """Next to the zero nothing but the noise of zero and block is left, whatever the gains are."""
+    rig = calibrated()
+    rng = np.random.default_rng(3)
+    dots = still(rig, (0.0, 0.0, 0.0), 1200) + rng.normal(0.0, 1e-6, (1200, 4))
+    pipeline = Pipeline(rig)
+    before = estimates([*pipeline.process(chunk_of(dots[:600]))])['exact']
+    change = pipeline.zero()
+    assert change is not None
+    variances = dict(change.values)[ZERO_VARIANCES]
+    assert isinstance(variances, tuple)
+    # 1 um a sample, 20 a block, 25 blocks.
+    assert np.sqrt(variances) == pytest.approx(np.full(4, 1e-6 / 500**0.5), rel=0.5)
+    records = [*pipeline.process(chunk_of(dots[600:], 600))]
+    after = estimates(records)['exact']
+    assert before.covariance[0] ** 0.5 > 0.9e-6
+    assert after.covariance[0] ** 0.5 < 0.5e-6
+    # As it was recorded, bit for bit; and a recording that starts now tells the same.
+    for told in (change, pipeline.memory(rig)):
+        assert isinstance(told, ParameterChange)
+        assert ZERO_VARIANCES in dict(told.values)
+    other = Pipeline(rig)
+    list(other.process(chunk_of(dots[:600])))
+    other.apply(change)
+    assert next(other.process(chunk_of(dots[600:], 600))) == records[0]
