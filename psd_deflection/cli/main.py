@@ -44,6 +44,7 @@ COMMANDS: dict[str, str] = {
     'simulate': 'simulate the rig: write a recording, or act as a device on a pseudo-terminal',
     'discover': 'find the physical effect that the simulation of a recording lacks',
     'effects': 'list the effects that can be simulated and discovered, or explain one',
+    'camera': 'measure the tip by a camera: a reference beside the PSDs; print its target',
     'check': 'check the wiring of a rig: guided by hand, or from a recording with known loads',
     'devices': 'list the serial ports and the devices on them, and suggest parameters',
     'plot': 'draw a recording as PNG, SVG, PDF or HTML',
@@ -281,6 +282,6 @@ def _executable(command: str) -> Callable[[], int]:
     return lambda: main([command, *sys.argv[1:]])
 
 
-estimator, replay, simulate, discover, check, effects = map(
-    _executable, ('estimator', 'replay', 'simulate', 'discover', 'check', 'effects')
+estimator, replay, simulate, discover, camera, check, effects = map(
+    _executable, ('estimator', 'replay', 'simulate', 'discover', 'camera', 'check', 'effects')
 )
