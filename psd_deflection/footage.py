@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,13 +36,11 @@ class Frame(NamedTuple):
     image: Any
 
 
-def read_settings(path: str | Path | None) -> CameraSettings:
-    """The settings in ``CAMERA.yaml``: plain keys, dotted or nested, or a ROS 2 parameter file. None: the defaults.
+def read_values(path: str | Path) -> dict[str, object]:
+    """The values in ``CAMERA.yaml`` by their names: plain keys, dotted or nested, or a ROS 2 parameter file.
 
     Raises ConfigError.
     """
-    if path is None:
-        return CameraSettings()
     path = Path(path)
     try:
         tree = parse_yaml(parameter_text(path))
@@ -50,6 +48,8 @@ def read_settings(path: str | Path | None) -> CameraSettings:
         raise ConfigError(f'{path}{error.where}: {error}') from None
     if not isinstance(tree, dict):
         raise ConfigError(f'{path}: has no parameters of a camera, as in "target.spacing: 0.025"')
+    if 'camera_matrix' in tree:
+        return _of_camera_info(tree, path)
     values: dict[str, object] = {}
     for name, body in tree.items():
         if isinstance(body, dict) and isinstance(body.get('ros__parameters'), dict):
@@ -57,7 +57,24 @@ def read_settings(path: str | Path | None) -> CameraSettings:
                 values |= flattened(body['ros__parameters'], str(path))
         else:
             values |= flattened({name: body}, str(path))
-    return settings_from(values, str(path))
+    return values
+
+
+def _of_camera_info(tree: Mapping[str, Any], path: Path) -> dict[str, object]:
+    """Matrix and distortion of ROS's ``camera_info`` YAML, which may have our own keys beside its own."""
+    values: dict[str, object] = {}
+    for theirs, ours in (('camera_matrix', 'camera.matrix'), ('distortion_coefficients', 'camera.distortion')):
+        body = tree.get(theirs)
+        if not isinstance(body, dict) or 'data' not in body:
+            raise ConfigError(f'{path}: {theirs}.data is missing: not a camera_info file')
+        values[ours] = body['data']
+    own = {k: v for k, v in tree.items() if str(k).partition('.')[0] in {'target', 'camera', 'rest'}}
+    return values | flattened(own, str(path))
+
+
+def read_settings(path: str | Path | None) -> CameraSettings:
+    """The settings in ``CAMERA.yaml``; None: the defaults. Raises ConfigError."""
+    return CameraSettings() if path is None else settings_from(read_values(path), str(path))
 
 
 class Footage:
@@ -174,6 +191,15 @@ def _seconds(text: str | None, where: str, column: str) -> int:
     return round(value * 1e9)
 
 
+def read_image(path: str | Path) -> Any:
+    """The grey image in a file, None if it is none. Raises RecordingError if the file cannot be read."""
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
+    return decoded(np.frombuffer(content, dtype=np.uint8), opencv())
+
+
 def decoded(content: Any, cv2: Any) -> Any:
     """A grey image of the bytes of a file (PNG, JPEG …), None if they are none."""
     if not len(content):
@@ -194,3 +220,37 @@ def grey(image: Any) -> Any:
         return image
     conversion = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}.get(image.shape[2])
     return None if conversion is None else cv2.cvtColor(image, conversion)
+
+
+_ENCODINGS = {
+    'mono8': (np.uint8, 1, ''),
+    '8UC1': (np.uint8, 1, ''),
+    'mono16': (np.uint16, 1, ''),
+    '16UC1': (np.uint16, 1, ''),
+    'bgr8': (np.uint8, 3, 'COLOR_BGR2GRAY'),
+    '8UC3': (np.uint8, 3, 'COLOR_BGR2GRAY'),
+    'rgb8': (np.uint8, 3, 'COLOR_RGB2GRAY'),
+    'bgra8': (np.uint8, 4, 'COLOR_BGRA2GRAY'),
+    'rgba8': (np.uint8, 4, 'COLOR_RGBA2GRAY'),
+    # OpenCV names the pattern by its second row and column, ROS by its first.
+    'bayer_rggb8': (np.uint8, 1, 'COLOR_BayerBG2GRAY'),
+    'bayer_bggr8': (np.uint8, 1, 'COLOR_BayerRG2GRAY'),
+    'bayer_gbrg8': (np.uint8, 1, 'COLOR_BayerGR2GRAY'),
+    'bayer_grbg8': (np.uint8, 1, 'COLOR_BayerGB2GRAY'),
+}
+
+
+def of_ros_image(height: int, width: int, encoding: str, big_endian: bool, step: int, content: bytes) -> Any:
+    """The grey image of a sensor_msgs/Image; None if it is of an encoding without brightness, or damaged."""
+    found = _ENCODINGS.get(encoding)
+    if found is None:
+        return None
+    kind, channels, conversion = found
+    wide = width * channels * np.dtype(kind).itemsize
+    if not (0 < wide <= step and height > 0 and step * height <= len(content) <= MOST_PIXELS):
+        return None
+    rows = np.frombuffer(content, dtype=np.uint8, count=step * height).reshape(height, step)[:, :wide]
+    image = np.ascontiguousarray(rows).view(np.dtype(kind).newbyteorder('>' if big_endian else '<')).astype(kind)
+    image = image.reshape((height, width, channels) if channels > 1 else (height, width))
+    cv2 = opencv()
+    return cv2.cvtColor(image, getattr(cv2, conversion)) if conversion else image

@@ -18,6 +18,7 @@ class Status(StrEnum):
     OUTSIDE = 'outside the image'
     DOUBLED = 'more than one target'
     SATURATED = 'saturated'
+    GHOST = 'doubled'
     BLURRED = 'motion blur too long'
     DEFOCUSED = 'out of focus'
     SMALL = 'target too small'
@@ -42,6 +43,7 @@ class TargetPose(NamedTuple):
     ``points`` (n, 2): pixels of what was found (centres of discs, corners). ``blur``: length of the motion blur, px.
     ``scale``: apparent radius of the discs, in units of what the spacing makes it (1.0 for other targets).
     ``noise``: rms of the residuals, grey levels or px. ``planar``: the distance is not known (no camera matrix).
+    ``misfit``: difference between picture and model beyond noise, rms in units of the contrast.
     """
 
     rotation: FloatArray
@@ -53,12 +55,14 @@ class TargetPose(NamedTuple):
     scale: float = 1.0
     noise: float = 0.0
     planar: bool = False
+    misfit: float = 0.0
 
 
 class FrameAnswer(NamedTuple):
     """The tip in ``link_tip_rest`` at the middle of the exposure.
 
-    ``dx``, ``dy`` m, ``theta``, ``phi``, ``omega`` rad (NaN without an answer); ``covariance`` (3, 3) of (dx, dy, theta).
+    ``dx``, ``dy`` m, ``theta``, ``phi``, ``omega`` rad (NaN without an answer);
+    ``covariance`` (3, 3) of (dx, dy, theta).
     """
 
     t_ns: int

@@ -70,7 +70,8 @@ def find_discs(grey: Any, ratio: float) -> list[Region]:
 def _binaries(grey: Any) -> Iterator[Any]:
     """The image cut at several levels: the one between the two commonest first."""
     cv2 = opencv()
-    low, high = np.percentile(grey[::4, ::4], (2.0, 99.9))
+    thin = max(min(grey.shape) // 120, 1)
+    low, high = np.percentile(grey[::thin, ::thin], (2.0, 99.8))
     if high - low < _MIN_CONTRAST:
         raise RefusedError(Status.MISSING)
     # Noise of a pixel must not fray the outline; the sub-pixel fit sees the image as it is.

@@ -1,7 +1,7 @@
 """From the target in each image to the tip in ``link_tip_rest``: the rest is found, and taken off turn and place alike.
 
-The rest is the mean of the first good frames: as many as ``rest.frames`` says, or, if it says 0, those that do not differ
-from the first by more than noise, at most :data:`MOST_REST`. Their frames are answered as soon as the rest is known.
+The rest is the mean of the first good frames: as many as ``rest.frames`` says, or, if it says 0, those that do not
+differ from the first by more than noise, at most :data:`MOST_REST`. They are answered as soon as the rest is known.
 The rest's own variance is part of every covariance.
 """
 
@@ -15,15 +15,12 @@ import numpy as np
 
 from psd_deflection.camera.answer import FrameAnswer, RefusedError, Status, TargetPose
 from psd_deflection.camera.lens import Lens
-from psd_deflection.camera.rim_fit import turned
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.records import FloatArray
 
 MOST_REST = 20
 _STILL = 4.0
 """A frame belongs to the rest if each of dX, dY and theta is within so many sd of it."""
-
-_LENGTH_SCALE = 1e-6
 
 
 class Target(Protocol):
@@ -140,28 +137,31 @@ def relative(rest: TargetPose, pose: TargetPose) -> FloatArray:
 
 
 def relative_covariance(rest: TargetPose, pose: TargetPose) -> FloatArray:
-    """Covariance (3, 3) of (dX, dY, theta) from those of both poses, by central differences."""
-    total = np.zeros((3, 3))
-    for which in (0, 1):
-        derivative = np.empty((3, 6))
-        for i in range(6):
-            step = np.zeros(6)
-            step[i] = _LENGTH_SCALE
-            ends = []
-            for sign in (1.0, -1.0):
-                pair = [rest, pose]
-                pair[which] = _shifted(pair[which], sign * step)
-                ends.append(relative(*pair)[:3])
-            difference = ends[0] - ends[1]
-            difference[2] = math.remainder(difference[2], 2 * math.pi)
-            derivative[:, i] = difference / (2 * _LENGTH_SCALE)
-        covariance = (rest, pose)[which].covariance
-        total += derivative @ covariance @ derivative.T
-    return (total + total.T) / 2
+    """Covariance (3, 3) of (dX, dY, theta) from those of both poses."""
+    r = rest.rotation.T @ pose.rotation
+    if pose.planar:
+        # As seen from the plane of the rest: no distance, no tilt.
+        place = np.diag([1.0, 1.0, 0.0]) @ rest.rotation.T
+        moved = np.zeros(3)
+    else:
+        place = rest.rotation.T
+        moved = rest.rotation.T @ (pose.place - rest.place)
+    of_rest, of_pose = np.zeros((3, 6)), np.zeros((3, 6))
+    of_pose[:2, 3:], of_rest[:2, 3:] = place[:2], -place[:2]
+    # A small turn a of the rest's axes takes R0^T v to R0^T v - a x (R0^T v).
+    of_rest[:2, :3] = _cross(moved)[:2]
+    # theta = atan2(r10, r11); r goes to r (1 + [b]x), or to (1 - [a]x) r.
+    scale = 1.0 / (r[1, 0] ** 2 + r[1, 1] ** 2)
+    by = np.array([r[1, 1], -r[1, 0], 0.0]) * scale
+    of_pose[2, :3] = np.cross(by, r[1])
+    of_rest[2, :3] = [-by @ r[2], 0.0, by @ r[0]]
+    of_rest[2, [0, 2]] *= -1.0
+    total = of_rest @ rest.covariance @ of_rest.T + of_pose @ pose.covariance @ of_pose.T
+    return np.asarray((total + total.T) / 2)
 
 
-def _shifted(pose: TargetPose, step: FloatArray) -> TargetPose:
-    return pose._replace(rotation=pose.rotation @ turned(step[:3]), place=pose.place + step[3:])
+def _cross(v: FloatArray) -> FloatArray:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def mean_pose(poses: list[TargetPose]) -> TargetPose:

@@ -1,18 +1,18 @@
 """Fits the picture of three discs to the pixels at their rims: one least squares for the pose of the whole target.
 
-Every pixel near a rim has a signed distance s (px) from it: its ray meets the target's plane at a distance rho from a
-disc's centre, and s = (radius - rho) / |grad rho|. So lens distortion and perspective, by which the centre of a disc's
-picture is not the picture of its centre, are in the model and leave no bias (Heikkila 2000; Song et al. 2024). The grey
-level goes from outside to inside as
+Every pixel near a rim has a signed distance s (px) from it: its ray meets the target's plane at a distance rho from
+a disc's centre, and s = (radius - rho) / |grad rho|. So lens distortion and perspective, by which the centre of a
+disc's picture is not the picture of its centre, are in the model and leave no bias (Heikkila 2000; Song et al. 2024).
+The grey level goes from outside to inside as
 
     I = outside + (inside - outside) (Phi(z) - gamma(n) / 6 (z^2 - 1) phi(z)),  z = (s - t^T S t / 2 R) / sqrt(n^T S n)
 
-with n, t the rim's normal and tangent in the image, R its radius of curvature and S (2, 2) the variance of the blur, px^2.
-``gamma`` is the skewness of the motion within the exposure along n: with it, s = 0 stays the place of the *mean* over
-the exposure (Gram-Charlier) for a motion that is not uniform. ``inside`` and ``outside`` are linear in the image for each
-disc, which takes uneven light; they are eliminated from the normal equations. Pixels are taken as they are, not
-interpolated: their noise stays independent, and the fit reaches the Cramer-Rao bound. The first steps use each third
-pixel. Pixels are kept as float32, which is good to 1e-5 px here and twice as fast; the normal equations are float64.
+with n, t the rim's normal and tangent in the image, R its radius of curvature and S (2, 2) the variance of the blur,
+px^2. ``gamma`` is the skewness of the motion within the exposure along n: with it, s = 0 stays the place of the *mean*
+over the exposure (Gram-Charlier) for a motion that is not uniform. ``inside`` and ``outside`` are linear in the image
+for each disc, which takes uneven light; they are eliminated from the normal equations. Pixels are taken as they are,
+not interpolated: their noise stays independent, and the fit reaches the Cramer-Rao bound. The first steps use each
+third pixel. Pixels are kept as float32, which is good to 1e-5 px here and twice as fast; the normal equations are float64.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _SECTORS = 16
 """Parts of a rim whose residuals are taken together: what is correlated along a rim widens the covariance."""
 
 RADIUS_SD = 0.03
-"""Standard deviation of the radius that is seen against the one that is declared: print, exposure, response. Relative."""
+"""Standard deviation of the radius that is seen against the declared one (print, exposure, response), relative."""
 
 CENTRE_FLOOR = 0.002
 """Error of a disc's centre that no residual shows, one sd in px."""
@@ -54,6 +54,26 @@ MOST_BLUR = 1.0
 MEAN_OF_BLUR = 0.05
 """Error of the mean place over the exposure, one sd in units of the standard deviation of the motion within it."""
 
+MOST_DEFOCUS = 0.15
+"""Largest blur (sd) of an image at rest with an answer, in units of a disc's radius."""
+
+MOST_MISFIT, MISFIT_OF_BLUR = 0.012, 0.03
+"""Largest difference between picture and model beyond noise with an answer, rms in units of the contrast; and what a
+motion blur adds to it, whose profile is not Gaussian."""
+
+HIDDEN_SECTOR = 0.06
+"""The same for one sector of one rim."""
+
+UNEVEN = 0.004
+"""Largest unevenness of the rise of a disc that reaches full scale, in units of the contrast."""
+
+DIP = 0.6
+"""Two peaks of the time at a place, with less than this share of the lower one between them, are two pictures."""
+
+_ZONES = 8
+_DWELL = 24
+_DOUBLED_FROM = 1.0
+
 MOST_NOISE = 0.2
 """Largest rms of the residuals with an answer, in units of the contrast."""
 
@@ -68,8 +88,8 @@ class Prior(NamedTuple):
 
 
 class _Rims(NamedTuple):
-    """The pixels near the rims, disc after disc: ``begin`` (4) of each disc, grey levels, rays x and y, place (3, n) in the
-    image as (1, u, v) from the disc's centre in units of its size; ``bend`` (3, 2, 2): d ray / d pixel at the centres."""
+    """The pixels near the rims, disc after disc: ``begin`` (4) of each disc, grey levels, rays x and y, place (3, n)
+    in the image as (1, u, v) from the disc's centre in units of its size; ``bend`` (3, 2, 2): d ray / d pixel there."""
 
     begin: IntArray
     level: Pixels
@@ -104,10 +124,10 @@ class _Normal(NamedTuple):
 
     hessian: FloatArray
     gradient: FloatArray
-    inverses: list[FloatArray]
+    back: FloatArray
     rows: Pixels
     z: Pixels
-    out: tuple[Pixels, Pixels]
+    side: tuple[Pixels, Pixels]
     root: Pixels | None
     squares: float
 
@@ -120,6 +140,7 @@ class Fitter:
         grid = lens.grid(image_shape)
         self._x = np.ascontiguousarray(grid[..., 0], dtype=np.float32)
         self._y = np.ascontiguousarray(grid[..., 1], dtype=np.float32)
+        self._step = 1.0 / lens.focal
         turn = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
         self._circle = radius * np.column_stack([np.cos(turn), np.sin(turn), np.zeros(24)])
         self._points = np.column_stack([centres, np.zeros(len(centres))])
@@ -127,7 +148,7 @@ class Fitter:
     def fit(self, image: Any, rotation: FloatArray, place: FloatArray, prior: Prior, full_scale: float) -> TargetPose:
         """The pose, from a first guess that is good to a pixel or two.
 
-        ``image`` (rows, columns): grey levels; ``full_scale``: the level at which the camera saturates. Raises RefusedError.
+        ``image`` (rows, columns): grey levels; ``full_scale``: where the camera saturates. Raises RefusedError.
         """
         shape = _Shape(rotation, place, 1.0, np.eye(2), np.zeros(0), np.zeros((len(self._centres), _LIGHTS)))
         pixel_radius = self._radius * self._lens.focal / float(place[2])
@@ -135,7 +156,7 @@ class Fitter:
         rims = self._gather(image, shape, half)
         shape = shape._replace(light=self._first_light(rims, shape))
         for _ in range(4):
-            shape = self._converge(rims.thinned(), shape, prior)
+            shape, noise = self._converge(rims, shape, prior)
             widest = math.sqrt(float(np.linalg.eigvalsh(shape.blur)[1]))
             wanted = min(max(3.2 * widest + 1.0, 4.0), 0.75 * pixel_radius)
             skewed = _motion(shape.blur) > _SKEW_BLUR and not shape.skew.size
@@ -146,7 +167,7 @@ class Fitter:
             half = max(wanted, half)
             rims = self._gather(image, shape, half)
         for _ in range(3):
-            normal = self._linearise(rims, shape, self._noise(rims, shape))
+            normal = self._linearise(rims, shape, noise)
             shape, step, deviation = self._stepped(normal, shape, prior, len(rims.level))
             if np.all(np.abs(step) < 2.0 * deviation):
                 break
@@ -155,60 +176,69 @@ class Fitter:
     def _gather(self, image: Any, shape: _Shape, half: float) -> _Rims:
         rows, columns = self._x.shape
         inverse = _to_plane(shape)
-        begin, parts, bends = [0], [], []
-        for centre, point in zip(self._centres, self._points, strict=True):
-            seen = self._lens.project((self._circle + point) @ shape.rotation.T + shape.place)
-            (left, top), (right, bottom) = seen.min(axis=0) - half - 1, seen.max(axis=0) + half + 2
-            if not (left >= 1 and top >= 1 and right < columns - 1 and bottom < rows - 1):
-                raise RefusedError(Status.OUTSIDE)
-            window = np.s_[int(top) : int(bottom), int(left) : int(right)]
+        turned_points = self._points @ shape.rotation.T + shape.place
+        middles = self._lens.project(turned_points)
+        seen = self._lens.project((self._circle @ shape.rotation.T)[None] + turned_points[:, None])
+        low, high = seen.min(axis=1), seen.max(axis=1)
+        if low.min() < half + 2 or (high > (columns - half - 3, rows - half - 3)).any():
+            raise RefusedError(Status.OUTSIDE)
+        bends = self._bends(middles)
+        # Wide enough for the direction in which the picture is the longest.
+        bands = half * np.linalg.norm(self._slopes(inverse, shape, bends), 2, axis=(1, 2))
+        starts = np.floor(low - half - 1).astype(int).tolist()
+        ends = np.ceil(high + half + 2).astype(int).tolist()
+        begin, parts = [0], []
+        for k, ((left, top), (right, bottom)) in enumerate(zip(starts, ends, strict=True)):
+            window = np.s_[top:bottom, left:right]
             x, y = self._x[window], self._y[window]
-            px, py, _ = _on_plane(inverse, x, y)
-            rho = np.hypot(px - np.float32(centre[0]), py - np.float32(centre[1]))
-            middle = self._lens.project(point @ shape.rotation.T + shape.place)
-            bend = self._bend(middle)
-            # Wide enough for the direction in which the picture is the longest.
-            widest = 1.0 / float(np.linalg.norm(self._slope(inverse, centre, bend), 2))
-            near = np.nonzero(np.abs(rho - self._radius) < half / widest)
-            size = float(seen[:, 0].max() - seen[:, 0].min()) / 2
-            u = (near[1] + (int(left) - middle[0])) / size
-            v = (near[0] + (int(top) - middle[1])) / size
-            parts.append((image[window][near], x[near], y[near], u, v))
-            begin.append(begin[-1] + len(u))
-            bends.append(bend)
+            px, py = _on_plane(inverse, x, y)
+            px -= float(self._centres[k, 0])
+            py -= float(self._centres[k, 1])
+            px *= px
+            py *= py
+            px += py
+            least = max(self._radius - float(bands[k]), 0.0) ** 2
+            near = np.flatnonzero((px > least) & (px < (self._radius + float(bands[k])) ** 2))
+            v, u = np.divmod(near, right - left)
+            size = 2.0 / float(high[k, 0] - low[k, 0])
+            u = (u + (left - float(middles[k, 0]))) * size
+            v = (v + (top - float(middles[k, 1]))) * size
+            parts.append((image[window].ravel()[near], x.ravel()[near], y.ravel()[near], u, v))
+            begin.append(begin[-1] + len(near))
         level, x, y, u, v = (np.concatenate(p).astype(np.float32) for p in zip(*parts, strict=True))
-        return _Rims(np.array(begin), level, x, y, np.stack([np.ones_like(u), u, v]), np.array(bends))
+        return _Rims(np.array(begin), level, x, y, np.stack([np.ones_like(u), u, v]), bends)
 
-    def _bend(self, pixel: FloatArray) -> FloatArray:
-        """d ray / d pixel (2, 2) at a pixel."""
-        ends = self._lens.rays(pixel + np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]]))
-        return np.column_stack([ends[0] - ends[1], ends[2] - ends[3]])
+    def _bends(self, pixels: FloatArray) -> FloatArray:
+        """d ray / d pixel (n, 2, 2) at pixels (n, 2)."""
+        offsets = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+        ends = self._lens.rays(pixels[:, None] + offsets)
+        return np.stack([ends[:, 0] - ends[:, 1], ends[:, 2] - ends[:, 3]], axis=-1)
 
-    @staticmethod
-    def _slope(inverse: FloatArray, centre: FloatArray, bend: FloatArray) -> FloatArray:
-        """d plane point / d pixel (2, 2) at a disc's centre; it changes little over the disc."""
-        forward = np.linalg.inv(inverse)
-        ray = forward @ np.append(centre, 1.0)
-        depth = float(inverse[2] @ (ray / ray[2]))
-        return np.asarray((inverse[:2, :2] - np.outer(centre, inverse[2, :2])) / depth @ bend)
+    def _slopes(self, inverse: FloatArray, shape: _Shape, bends: FloatArray) -> FloatArray:
+        """d plane point / d pixel (n, 2, 2) at the discs' centres; it changes little over a disc."""
+        far = self._centres @ shape.rotation[2, :2] + shape.place[2]
+        forward = inverse[:2, :2] - self._centres[:, :, None] * inverse[2, :2]
+        return np.asarray((forward * far[:, None, None]) @ bends)
 
     def _first_light(self, rims: _Rims, shape: _Shape) -> FloatArray:
         light = np.zeros((len(self._centres), _LIGHTS))
-        inverse = _to_plane(shape)
-        px, py, _ = _on_plane(inverse, rims.x, rims.y)
+        px, py = _on_plane(_to_plane(shape), rims.x, rims.y)
         for k, centre in enumerate(self._centres):
             of = slice(rims.begin[k], rims.begin[k + 1])
-            inside = np.hypot(px[of] - np.float32(centre[0]), py[of] - np.float32(centre[1])) < self._radius
-            light[k, 0], light[k, 3] = (float(np.median(rims.level[of][side])) for side in (~inside, inside))
+            away = (px[of] - float(centre[0])) ** 2 + (py[of] - float(centre[1])) ** 2
+            inside = away < self._radius**2
+            light[k, 0], light[k, 3] = float(rims.level[of][~inside].mean()), float(rims.level[of][inside].mean())
         return light
 
-    def _converge(self, rims: _Rims, shape: _Shape, prior: Prior) -> _Shape:
+    def _converge(self, rims: _Rims, shape: _Shape, prior: Prior) -> tuple[_Shape, tuple[float, float] | None]:
+        """The shape by each third pixel, and the noise outside and inside."""
+        rims = rims.thinned()
         for _ in range(_STEPS):
             normal = self._linearise(rims, shape, None)
             shape, step, deviation = self._stepped(normal, shape, prior, len(rims.level))
-            if np.all(np.abs(step) < 0.3 * deviation):
+            if np.all(np.abs(step) < deviation):
                 break
-        return shape
+        return shape, self._noise(normal)
 
     def _stepped(
         self, normal: _Normal, shape: _Shape, prior: Prior, count: int
@@ -226,9 +256,7 @@ class Fitter:
         if not np.all(np.isfinite(step)):
             raise RefusedError(Status.MISFIT)
         step *= min(1.0, 0.2 / max(float(np.max(np.abs(step[:3]))), 1e-12))
-        light = shape.light.copy()
-        for k, back in enumerate(normal.inverses):
-            light[k] += back[:, -1] - back[:, :-1] @ step
+        light = shape.light + normal.back[:, :, -1] - normal.back[:, :, :-1] @ step
         deviation = np.sqrt(np.maximum(np.diag(inverse), 0.0))
         return _moved(shape, step, light), step, deviation
 
@@ -236,7 +264,7 @@ class Fitter:
         """Normal equations at ``shape``; ``noise``: variances outside and inside, None: equal."""
         lengths = np.diff(rims.begin)
         inverse = _to_plane(shape)
-        px, py, _ = _on_plane(inverse, rims.x, rims.y)
+        px, py = _on_plane(inverse, rims.x, rims.y)
 
         def each(values: FloatArray) -> Pixels:
             """One number a disc to one a pixel."""
@@ -246,7 +274,7 @@ class Fitter:
         rho = np.sqrt(ox * ox + oy * oy)
         ox /= rho
         oy /= rho
-        slopes = np.array([self._slope(inverse, c, b) for c, b in zip(self._centres, rims.bend, strict=True)])
+        slopes = self._slopes(inverse, shape, rims.bend)
         nx = ox * each(slopes[:, 0, 0]) + oy * each(slopes[:, 1, 0])
         ny = ox * each(slopes[:, 0, 1]) + oy * each(slopes[:, 1, 1])
         steep = np.sqrt(nx * nx + ny * ny)
@@ -292,40 +320,35 @@ class Fitter:
         root = None
         if noise is not None:
             root = 1.0 / np.sqrt(noise[0] + (noise[1] - noise[0]) * np.clip((z + 1.5) / 3.0, 0.0, 1.0))
+        begin = rims.begin.tolist()
         for k, light in enumerate(shape.light.astype(np.float32)):
-            of = slice(rims.begin[k], rims.begin[k + 1])
+            of = slice(begin[k], begin[k + 1])
             parameters[:, of] *= (light[3:] - light[:3]) @ rims.flat[:, of]
             rows[-1, of] = rims.level[of] - light @ rows[:6, of]
         if root is not None:
             rows *= root
-        return self._eliminated(rims, rows, z, (ox, oy), root)
+        return self._eliminated(rims, rows, z, (nx, ny), root)
 
     def _eliminated(
-        self, rims: _Rims, rows: Pixels, z: Pixels, out: tuple[Pixels, Pixels], root: Pixels | None
+        self, rims: _Rims, rows: Pixels, z: Pixels, side: tuple[Pixels, Pixels], root: Pixels | None
     ) -> _Normal:
-        count = len(rows) - _LIGHTS - 1
-        hessian, gradient, inverses, squares = np.zeros((count, count)), np.zeros(count), [], 0.0
-        for k in range(len(self._centres)):
-            part = rows[:, rims.begin[k] : rims.begin[k + 1]]
-            gram = (part @ part.T).astype(float)
-            lights = gram[:_LIGHTS, :_LIGHTS]
-            back = np.linalg.solve(lights + 1e-7 * np.trace(lights) * np.eye(_LIGHTS), gram[:_LIGHTS, _LIGHTS:])
-            rest = gram[_LIGHTS:, _LIGHTS:] - gram[_LIGHTS:, :_LIGHTS] @ back
-            hessian += rest[:-1, :-1]
-            gradient += rest[:-1, -1]
-            squares += max(float(rest[-1, -1]), 0.0)
-            inverses.append(back)
-        return _Normal(hessian, gradient, inverses, rows, z, out, root, squares)
+        spans = zip(rims.begin[:-1].tolist(), rims.begin[1:].tolist(), strict=True)
+        gram = np.stack([part @ part.T for part in (rows[:, a:b] for a, b in spans)]).astype(float)
+        lights = gram[:, :_LIGHTS, :_LIGHTS]
+        stiff = 1e-7 * np.trace(lights, axis1=1, axis2=2)[:, None, None] * np.eye(_LIGHTS)
+        back = np.linalg.solve(lights + stiff, gram[:, :_LIGHTS, _LIGHTS:])
+        rest = (gram[:, _LIGHTS:, _LIGHTS:] - gram[:, _LIGHTS:, :_LIGHTS] @ back).sum(axis=0)
+        return _Normal(rest[:-1, :-1], rest[:-1, -1], back, rows, z, side, root, max(float(rest[-1, -1]), 0.0))
 
-    def _noise(self, rims: _Rims, shape: _Shape) -> tuple[float, float] | None:
+    @staticmethod
+    def _noise(normal: _Normal) -> tuple[float, float] | None:
         """Variances outside and inside the discs: bright pixels may be noisier than dark ones."""
-        thin = rims.thinned()
-        normal = self._linearise(thin, shape, None)
-        dark, bright = normal.rows[-1][normal.z < -1.5], normal.rows[-1][normal.z > 1.5]
+        residual = normal.rows[-1]
+        dark, bright = residual[normal.z < -1.5], residual[normal.z > 1.5]
         if min(len(dark), len(bright)) < 30:
             return None
         # Quantisation alone is 1/12. A side that clips is not much better than the other.
-        low, high = max(float(np.mean(dark * dark)), 0.1), max(float(np.mean(bright * bright)), 0.1)
+        low, high = max(float(dark @ dark) / len(dark), 0.1), max(float(bright @ bright) / len(bright), 0.1)
         return max(low, high / 9), max(high, low / 9)
 
     def _judge(
@@ -338,7 +361,7 @@ class Fitter:
         pixel_radius: float,
         full_scale: float,
     ) -> TargetPose:
-        """The pose with the covariance that the residuals show. Raises RefusedError if they show that this is no target."""
+        """The pose with the covariance that the residuals show. Raises RefusedError if they show another picture."""
         contrast = shape.light[:, 3] - shape.light[:, 0]
         if contrast.min() <= 0.0 or contrast.min() < 0.3 * contrast.max():
             raise RefusedError(Status.HIDDEN)
@@ -346,31 +369,43 @@ class Fitter:
         sharp = math.sqrt(float(np.linalg.eigvalsh(shape.blur)[0]))
         if math.sqrt(12.0) * motion > MOST_BLUR * pixel_radius:
             raise RefusedError(Status.BLURRED)
-        if sharp > 0.3 * pixel_radius:
+        if sharp > MOST_DEFOCUS * pixel_radius:
             raise RefusedError(Status.DEFOCUSED)
         # The residuals after the last step, which was small.
         residual = normal.rows[-1].copy()
         scored = normal.rows[_LIGHTS:-1].copy()
-        for k, back in enumerate(normal.inverses):
+        for k, back in enumerate(normal.back):
             of = slice(rims.begin[k], rims.begin[k + 1])
             part = back.astype(np.float32)
             scored[:, of] -= part[:, :-1].T @ normal.rows[:_LIGHTS, of]
             residual[of] -= part[:, -1] @ normal.rows[:_LIGHTS, of]
         residual -= step.astype(np.float32) @ scored
         raw = residual if normal.root is None else residual / normal.root
-        sector = _sectors(normal.out, rims)
-        self._refuse_misfit(normal.z, raw / float(contrast.mean()), sector, rims, shape.swell, full_scale)
+        sector = _sectors(normal.side, rims)
+        relative = raw / float(contrast.mean())
+        if motion > _DOUBLED_FROM * max(sharp, 0.5) and self._doubled(normal, relative, shape.blur):
+            raise RefusedError(Status.GHOST)
+        misfit = self._misfit(normal.z, relative, sector, rims, full_scale)
+        if misfit > MOST_MISFIT + MISFIT_OF_BLUR * min(motion / sharp, 2.0):
+            raise RefusedError(Status.MISFIT)
         count = len(residual)
         chi_square = float(residual @ residual) / (count - 30)
         stiff, pull = _beforehand(shape, prior)
         inverse = np.linalg.inv(normal.hessian / chi_square + np.diag(stiff))
-        scored *= residual
-        scores = np.array([np.bincount(sector, row, 3 * _SECTORS) for row in scored]) / chi_square
-        sandwich = inverse @ (scores @ scores.T) @ inverse
-        wider = np.sqrt(np.maximum(np.diag(sandwich)[:6] / np.diag(inverse)[:6], 1.0))
+        scored *= residual / chi_square
+        wider = np.ones(6)
+        # Pixels may be wrong together: along a rim, or along the rows or columns in which a camera is read.
+        lines = (np.rint(a / a.dtype.type(self._step)) for a in (rims.x - rims.x.min(), rims.y - rims.y.min()))
+        for together in (sector, *(line.astype(int) for line in lines)):
+            scores = np.array([np.bincount(together, row) for row in scored])
+            sandwich = inverse @ (scores @ scores.T) @ inverse
+            wider = np.maximum(wider, np.sqrt(np.maximum(np.diag(sandwich)[:6] / np.diag(inverse)[:6], 1.0)))
         covariance = inverse[:6, :6] * np.outer(wider, wider)
-        # What the first three moments of the motion do not say of its mean.
-        covariance += self._moved_centres(shape, math.hypot(CENTRE_FLOOR, MEAN_OF_BLUR * motion))
+        # What the first three moments of the motion do not say of its mean, and what the model does not say at all: a
+        # level that is off by the misfit moves the rim by that over the steepest rise.
+        wrong = misfit * _ROOT_2PI * math.hypot(sharp, motion)
+        floor = math.sqrt(CENTRE_FLOOR**2 + (MEAN_OF_BLUR * max(motion - 0.15, 0.0)) ** 2 + wrong**2)
+        covariance += self._moved_centres(shape, floor)
         noise = float(np.sqrt(np.mean(raw * raw)))
         return TargetPose(
             shape.rotation,
@@ -382,6 +417,7 @@ class Fitter:
             shape.swell,
             noise,
             planar=not self._lens.known,
+            misfit=misfit,
         )
 
     def _moved_centres(self, shape: _Shape, pixels: float) -> FloatArray:
@@ -393,25 +429,66 @@ class Fitter:
         return out
 
     @staticmethod
-    def _refuse_misfit(z: Pixels, raw: Pixels, sector: IntArray, rims: _Rims, swell: float, full_scale: float) -> None:
-        """``raw``: residuals in units of the contrast."""
-        full = float(np.mean(rims.level[z > 1.5] >= full_scale - 1.0))
-        # Blooming: the rise ends at full scale before it has reached its level.
-        if full > 0.5:
-            high, low = (z > 0.3) & (z < 1.2), (z < -0.3) & (z > -1.2)
-            uneven = abs(float(np.mean(raw[high]) + np.mean(raw[low])) / 2) if high.any() and low.any() else 0.0
-            if uneven > 0.02 or abs(swell - 1.0) > 0.06:
-                raise RefusedError(Status.SATURATED)
-        parts = 3 * _SECTORS
-        count = np.maximum(np.bincount(sector, minlength=parts), 1)
-        rms = np.sqrt(np.bincount(sector, raw * raw, parts) / count)
-        mean = np.abs(np.bincount(sector, raw, parts)) / count
-        usual = float(np.median(rms))
-        # A rim that something covers in part has sectors of another picture.
-        if np.any(rms > 3.0 * usual + 0.06) or np.any(mean > 5.0 * usual / np.sqrt(count) + 0.04):
-            raise RefusedError(Status.HIDDEN)
+    def _misfit(z: Pixels, raw: Pixels, sector: IntArray, rims: _Rims, full_scale: float) -> float:
+        """How far the picture is from the model beyond noise, rms in units of the contrast, as ``raw`` is.
+
+        Pixels are taken together by sector and by their distance from the rim. What all sectors have in common is the
+        camera's own profile, which moves no centre. Raises RefusedError.
+        """
+        parts, worst = 3 * _SECTORS, 0.0
+        for k in range(3):
+            of = slice(rims.begin[k], rims.begin[k + 1])
+            here, off = z[of], raw[of]
+            full = float(np.mean(rims.level[of][here > 1.0] >= full_scale - 1.0))
+            if full > 0.1:
+                # Blooming: the rise ends at full scale before it has reached its level.
+                high, low = off[(here > 0.3) & (here < 1.2)], off[(here < -0.3) & (here > -1.2)]
+                uneven = abs(float(high.mean() + low.mean())) / 2 if len(high) and len(low) else 0.0
+                worst = max(worst, uneven)
+                if uneven > UNEVEN:
+                    raise RefusedError(Status.SATURATED)
         if math.sqrt(float(np.mean(raw * raw))) > MOST_NOISE:
             raise RefusedError(Status.MISFIT)
+        zone = np.clip((z + 3.0) * (_ZONES / 6.0), 0, _ZONES - 1).astype(int)
+        cell = sector * _ZONES + zone
+        count = np.bincount(cell, minlength=parts * _ZONES).reshape(parts, _ZONES).astype(float)
+        total = np.bincount(cell, raw, parts * _ZONES).reshape(parts, _ZONES)
+        square = np.bincount(cell, raw * raw, parts * _ZONES).reshape(parts, _ZONES)
+        mean = total / np.maximum(count, 1.0)
+        common = total.sum(axis=0) / np.maximum(count.sum(axis=0), 1.0)
+        within = max(float((square - mean * total).sum() / max(count.sum() - np.count_nonzero(count), 1.0)), 0.0)
+        filled = count > 3
+        excess = np.where(filled, (mean - common) ** 2 - within / np.maximum(count, 1.0), 0.0)
+        by_sector = excess.sum(axis=1) / np.maximum(filled.sum(axis=1), 1)
+        usual = within * np.sqrt(2.0 / np.maximum(filled.sum(axis=1), 1)) / np.maximum(count.sum(axis=1) / _ZONES, 1.0)
+        # A rim that something covers in part has sectors of another picture.
+        if np.any(by_sector > HIDDEN_SECTOR**2 + 6.0 * usual):
+            raise RefusedError(Status.HIDDEN)
+        return math.hypot(math.sqrt(max(float(excess.sum() / max(filled.sum(), 1)), 0.0)), worst)
+
+    @staticmethod
+    def _doubled(normal: _Normal, raw: Pixels, blur: FloatArray) -> bool:
+        """Whether the plate was seen in two places, not in motion: the places between were not exposed.
+
+        The rims that lie across the blur show how long it was where, as the steepness of the grey level there.
+        """
+        along = np.linalg.eigh(blur)[1][:, 1]
+        across = normal.side[0] * float(along[0]) + normal.side[1] * float(along[1])
+        level = normal.rows[3] if normal.root is None else normal.rows[3] / normal.root
+        seen = level + raw
+        dwell = np.zeros(_DWELL)
+        for end in (1.0, -1.0):
+            of = across * end > 0.9
+            place = np.clip((normal.z[of] * end + 3.0) * (_DWELL / 6.0), 0, _DWELL).astype(int)
+            count = np.bincount(place, minlength=_DWELL + 1)
+            if count[:-1].min() < 4:
+                return False
+            mean = np.bincount(place, seen[of], _DWELL + 1) / np.maximum(count, 1)
+            dwell[1:] += end * np.diff(mean[:-1])
+        # The two highest places with the lowest between them.
+        left = np.maximum.accumulate(dwell)
+        right = np.maximum.accumulate(dwell[::-1])[::-1]
+        return bool(np.any(dwell[1:-1] < DIP * np.minimum(left[:-2], right[2:]) - 0.015))
 
 
 def _to_plane(shape: _Shape) -> FloatArray:
@@ -419,15 +496,25 @@ def _to_plane(shape: _Shape) -> FloatArray:
     return np.asarray(np.linalg.inv(np.column_stack([shape.rotation[:, 0], shape.rotation[:, 1], shape.place])))
 
 
-def _on_plane(inverse: FloatArray, x: Pixels, y: Pixels) -> tuple[Pixels, Pixels, Pixels]:
-    """Plane points and depths of rays."""
-    h = [[float(v) for v in row] for row in inverse]
-    depth = 1.0 / (h[2][0] * x + h[2][1] * y + h[2][2])
-    return (h[0][0] * x + h[0][1] * y + h[0][2]) * depth, (h[1][0] * x + h[1][1] * y + h[1][2]) * depth, depth
+def _on_plane(inverse: FloatArray, x: Pixels, y: Pixels) -> tuple[Pixels, Pixels]:
+    """Points of the plane that rays meet."""
+    h = inverse.tolist()
+    depth = h[2][0] * x
+    depth += h[2][1] * y
+    depth += h[2][2]
+    px = h[0][0] * x
+    px += h[0][1] * y
+    px += h[0][2]
+    px /= depth
+    py = h[1][0] * x
+    py += h[1][1] * y
+    py += h[1][2]
+    py /= depth
+    return px, py
 
 
 def _beforehand(shape: _Shape, prior: Prior) -> tuple[FloatArray, FloatArray]:
-    """What is known without this image: inverse variances of the parameters, and how far each is from its expectation."""
+    """What is known without this image: inverse variances of the parameters; how far each is from what is expected."""
     stiff, pull = np.zeros(10 + shape.skew.size), np.zeros(10 + shape.skew.size)
     # The tilt against the prior's plane in the target's own axes: a turn in the plane does not change it.
     off = prior.rotation.T @ shape.rotation
@@ -467,8 +554,8 @@ def _motion(blur: FloatArray) -> float:
     return math.sqrt(max(float(large - small), 0.0))
 
 
-def _sectors(out: tuple[Pixels, Pixels], rims: _Rims) -> IntArray:
+def _sectors(side: tuple[Pixels, Pixels], rims: _Rims) -> IntArray:
     """The part of a rim to which each pixel belongs, counted through all discs."""
-    part = np.floor((np.arctan2(out[1], out[0]) * (0.5 / np.pi) + 0.5) * _SECTORS).astype(int)
+    part = np.floor((np.arctan2(side[1], side[0]) * (0.5 / np.pi) + 0.5) * _SECTORS).astype(int)
     of = np.repeat(np.arange(len(rims.begin) - 1), np.diff(rims.begin))
     return of * _SECTORS + np.minimum(part, _SECTORS - 1)

@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import collections
 import contextlib
+import importlib.util
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,14 +28,17 @@ from pathlib import Path
 from tqdm import tqdm
 
 from psd_deflection.camera.answer import FrameAnswer, Status
+from psd_deflection.camera.intrinsics import calibrated
 from psd_deflection.camera.opencv import opencv
+from psd_deflection.camera.print_target import printed, sizes
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import TARGETS, CameraSettings
 from psd_deflection.camera.targets import target_of
-from psd_deflection.cli._options import FOREIGN, need_folder, whole
+from psd_deflection.cli._options import FOREIGN, need_folder, picture_name, whole
 from psd_deflection.cli._report import print_json, show, warn
-from psd_deflection.errors import UsageError
-from psd_deflection.footage import Footage, Frame, read_settings
+from psd_deflection.errors import RecordingError, UsageError
+from psd_deflection.files import replace_file
+from psd_deflection.footage import Footage, Frame, read_image, read_settings, read_values
 from psd_deflection.recordings.csv_writer import CsvReferenceFile
 from psd_deflection.recordings.reference_sink import ReferenceSink
 
@@ -54,15 +58,78 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, print a target, or find the lens."""
     if not args.what:
-        raise UsageError('IN is missing: a video, a folder of images or a device; see --help')
+        return _node(args)
     if args.out is None:
         raise UsageError('--out is missing: X.csv, X.mcap or a bag folder')
     settings = read_settings(args.params_file)
     if args.target is not None:
         settings = settings.of_kind(args.target)
+    if args.what == ['target']:
+        return _print_target(args, settings)
+    if args.what[0] == 'intrinsics':
+        return _intrinsics(args, settings)
     if len(args.what) > 1:
         raise UsageError(f'{args.what[1]}: one IN at a time')
     return _measure(args, settings)
+
+
+def _node(args: argparse.Namespace) -> int:
+    """The ROS node: it has no IN, but subscribes to images."""
+    if args.out is not None or importlib.util.find_spec('rclpy') is None:
+        raise UsageError('IN is missing: a video, a folder of images or a device; without IN it is a ROS node')
+    from psd_deflection.ros.camera import run_camera
+
+    values = {} if args.params_file is None else read_values(args.params_file)
+    if args.target is not None:
+        values['target.kind'] = args.target
+    run_camera(args.ros_arguments, values, show)
+    return 0
+
+
+def _print_target(args: argparse.Namespace, settings: CameraSettings) -> int:
+    out = Path(picture_name('.pdf', '.png', '.svg')(args.out))
+    need_folder(out)
+    with _saved(out):
+        replace_file(out, printed(settings, out.suffix[1:].lower()))
+    if args.json:
+        print_json({'out': args.out, 'parameters': sizes(settings)})
+        return 0
+    show(f'{out}: print it at 100 %, measure the line of 50 mm, and put this into CAMERA.yaml:')
+    show(*sizes(settings))
+    return 0
+
+
+def _intrinsics(args: argparse.Namespace, settings: CameraSettings) -> int:
+    out = Path(args.out)
+    if out.suffix.lower() not in {'.yaml', '.yml'}:
+        raise UsageError(f'--out {out}: the name must end in .yaml')
+    need_folder(out)
+    paths = args.what[1:]
+    if not paths:
+        raise UsageError('intrinsics: name the images of a ChArUco board, as in shots/*.png')
+    board = settings.of_kind(args.target or 'charuco')
+    bar = tqdm(paths, unit=' images', delay=1.0, leave=False, disable=True if args.json else None, ncols=80)
+    with contextlib.closing(bar):
+        found = calibrated(board, ((path, read_image(path)) for path in bar))
+    with _saved(out):
+        replace_file(out, found.as_yaml(out.stem).encode())
+    if args.json:
+        print_json({'out': args.out, **found.summary()})
+        return 0
+    show(f'{out}: {found.used} of {len(paths)} images used, rms {found.rms:.3f} px')
+    show(*found.lines())
+    for path, reason in found.left_out:
+        warn(f'{path}: not used: {reason}')
+    return 0
+
+
+@contextlib.contextmanager
+def _saved(out: Path) -> Iterator[None]:
+    """Turn what the disk refuses into a RecordingError."""
+    try:
+        yield
+    except OSError as error:
+        raise RecordingError(f'--out {out}: cannot be written ({error.strerror or error})') from None
 
 
 def _measure(args: argparse.Namespace, settings: CameraSettings) -> int:
@@ -135,9 +202,8 @@ def _tell(
         show(f'  {count} refused: {reason}')
     if rest is not None and median:
         dx, dy, theta = median
-        show(
-            f'one sd: ΔX {dx * 1e6:.2f} µm, ΔY {dy * 1e6:.2f} µm, θ {math.degrees(theta):.5f}° (median of the last frames)'
-        )
+        sds = f'ΔX {dx * 1e6:.2f} µm, ΔY {dy * 1e6:.2f} µm, θ {math.degrees(theta):.5f}°'
+        show(f'one sd, median of the last frames: {sds}')
         show(f'the camera is turned by {math.degrees(reference.turn):+.3f}° in its plane, which is taken off')
         if settings.target == 'circles':
             show(f'the discs look {100 * (rest.scale - 1):+.2f} % larger than target.spacing and target.radius say')

@@ -7,6 +7,7 @@ noise of two kinds, and the converter. Nothing here is taken from the package.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -104,11 +105,22 @@ def undistort(x: Array, y: Array, distortion: Sequence[float]) -> tuple[Array, A
     return a, b
 
 
-def on_plate(scene: Scene, pose: Pose, u: Array, v: Array) -> tuple[Array, Array]:
-    """The point of the tip plate, in its own axes, that is seen at pixel (u, v)."""
-    x = (u - scene.centre[0]) / scene.focal
-    y = (v - scene.centre[1]) / scene.focal
-    x, y = undistort(x, y, scene.distortion)
+@functools.lru_cache(maxsize=4)
+def rays(
+    width: int, height: int, focal: float, centre: tuple[float, float], distortion: tuple[float, ...]
+) -> tuple[Array, Array, Array]:
+    """Rays x and y (rows, columns) of all pixels, and d (x, y) / d (u, v) (4, rows, columns)."""
+    v, u = np.mgrid[:height, :width].astype(float)
+    x, y = undistort((u - centre[0]) / focal, (v - centre[1]) / focal, distortion)
+    return (
+        x,
+        y,
+        np.stack([np.gradient(x, axis=1), np.gradient(x, axis=0), np.gradient(y, axis=1), np.gradient(y, axis=0)]),
+    )
+
+
+def on_plate(scene: Scene, pose: Pose, x: Array, y: Array) -> tuple[Array, Array]:
+    """The point of the tip plate, in its own axes, that the ray (x, y) meets."""
     rotation, origin = camera_of(scene)
     tip = rotation @ about(1, pose.omega) @ about(0, pose.phi) @ about(2, pose.theta)
     at = origin + rotation @ np.array([pose.dx, pose.dy, pose.z])
@@ -135,9 +147,12 @@ def centres_of(scene: Scene) -> list[tuple[float, float]]:
     return [(0.0, (half - i) * scene.spacing) for i in range(scene.discs)]
 
 
-def coverage(scene: Scene, pose: Pose) -> Array:
-    """The share (rows, columns) of each pixel that is white."""
+def coverage(scene: Scene, pose: Pose, parts: int = PARTS) -> Array:
+    """The share (rows, columns) of each pixel that is white; rims are cut in ``parts`` x ``parts``."""
     out = np.zeros((scene.height, scene.width))
+    everywhere = rays(scene.width, scene.height, scene.focal, tuple(scene.centre), tuple(scene.distortion))
+    offsets = (np.arange(parts) + 0.5) / parts - 0.5
+    du, dv = np.meshgrid(offsets, offsets)
     for cx, cy in centres_of(scene):
         turns = np.linspace(0, 2 * np.pi, 60)
         rim = np.array(
@@ -148,15 +163,17 @@ def coverage(scene: Scene, pose: Pose) -> Array:
         u1, v1 = min(u1, scene.width), min(v1, scene.height)
         if u1 <= u0 or v1 <= v0:
             continue
-        v, u = np.mgrid[v0:v1, u0:u1].astype(float)
-        x, y = on_plate(scene, pose, u, v)
+        ray_x, ray_y, slope = (a[..., v0:v1, u0:u1] for a in everywhere)
+        x, y = on_plate(scene, pose, ray_x, ray_y)
         away = np.hypot(x - cx, y - cy) - scene.radius
         pixel = scene.radius * 2 * math.pi / float(np.sum(np.hypot(*np.diff(rim, axis=0).T)))
         part = (away < 0).astype(float)
         edge = np.abs(away) < 1.0 * pixel
-        offsets = (np.arange(PARTS) + 0.5) / PARTS - 0.5
-        du, dv = np.meshgrid(offsets, offsets)
-        ex, ey = on_plate(scene, pose, u[edge][:, None] + du.ravel(), v[edge][:, None] + dv.ravel())
+        # Within a pixel the lens is linear to a millionth of it.
+        k = slope[:, edge][..., None]
+        sub_x = ray_x[edge][:, None] + k[0] * du.ravel() + k[1] * dv.ravel()
+        sub_y = ray_y[edge][:, None] + k[2] * du.ravel() + k[3] * dv.ravel()
+        ex, ey = on_plate(scene, pose, sub_x, sub_y)
         part[edge] = np.mean(np.hypot(ex - cx, ey - cy) < scene.radius, axis=1)
         out[v0:v1, u0:u1] += part
     for left, top, right, bottom in scene.hide:
@@ -166,7 +183,8 @@ def coverage(scene: Scene, pose: Pose) -> Array:
 
 def clean(scene: Scene, poses: Sequence[Pose]) -> Array:
     """Grey levels without noise: the mean over ``poses``, which are equal parts of the exposure."""
-    part = np.mean([coverage(scene, p) for p in poses], axis=0)
+    parts = max(PARTS // len(poses), 4)
+    part = np.mean([coverage(scene, p, parts) for p in poses], axis=0)
     if scene.blur > 0:
         part = gaussian_filter(part, scene.blur, mode='nearest', truncate=5.0)
     v, u = np.mgrid[: scene.height, : scene.width]
@@ -179,6 +197,28 @@ def photograph(scene: Scene, poses: Sequence[Pose], rng: np.random.Generator) ->
     grey = clean(scene, poses)
     sd = np.sqrt(scene.read_noise**2 + scene.shot_noise**2 * np.maximum(grey, 0.0))
     return np.clip(np.rint(grey + sd * rng.standard_normal(grey.shape)), 0, 255).astype(np.uint8)
+
+
+def board(scene: Scene, pose: Pose, texture: Array, size: tuple[float, float], parts: int = 4) -> Array:
+    """A flat picture on the tip plate in place of discs: the white share; ``size`` m, its middle at the origin."""
+    ray_x, ray_y, k = rays(scene.width, scene.height, scene.focal, tuple(scene.centre), tuple(scene.distortion))
+    out = np.zeros((scene.height, scene.width))
+    sign = 1.0 if scene.view == 'outside' else -1.0
+    high, wide = texture.shape
+    for i in range(parts * parts):
+        du, dv = (i // parts + 0.5) / parts - 0.5, (i % parts + 0.5) / parts - 0.5
+        x, y = on_plate(scene, pose, ray_x + k[0] * du + k[1] * dv, ray_y + k[2] * du + k[3] * dv)
+        column = np.floor((sign * x / size[0] + 0.5) * wide).astype(int)
+        row = np.floor((0.5 - y / size[1]) * high).astype(int)
+        on = (column >= 0) & (column < wide) & (row >= 0) & (row < high)
+        out += np.where(on, texture[np.clip(row, 0, high - 1), np.clip(column, 0, wide - 1)], 1.0)
+    return out / parts**2
+
+
+def photograph_of(scene: Scene, part: Array, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
+    """A frame of a white share: blur, light and noise as in :func:`photograph`."""
+    grey = scene.black + (scene.white - scene.black) * gaussian_filter(part, scene.blur, mode='nearest')
+    return np.clip(np.rint(grey + scene.read_noise * rng.standard_normal(grey.shape)), 0, 255).astype(np.uint8)
 
 
 def over_exposure(motion: Callable[[float], Pose], t: float, exposure: float, instants: int = 12) -> list[Pose]:
