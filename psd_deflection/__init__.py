@@ -47,8 +47,8 @@ def load_rig(path: str | Path | None = None, /, **overrides: object) -> Rig:
     ``load_rig('my_rig.yaml', **{'psd_1.center': [0.0, 0.08]})``. ``psd-deflection params`` lists them.
     Raises :class:`psd_deflection.errors.ConfigError`, which names file, parameter, value and bound.
     """
-    from psd_deflection.config import flattened
     from psd_deflection.config import load_rig as of_file
+    from psd_deflection.parameter_files import flattened
 
     return of_file(path, flattened(overrides, 'load_rig'))
 

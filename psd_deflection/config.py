@@ -1,12 +1,11 @@
-"""The rig: turns a parameter file or flat values into frozen sections and checks every bound.
+"""The rig: every parameter, declared once, and the frozen sections that checked values make.
 
 Each field of a section declares one parameter: its type, default, unit, bounds and a sentence.
 Everything else is derived from these: :data:`PARAMETERS`, the checks, ``psd-deflection params``,
 the node's descriptors and the documentation. A new parameter is one more field.
 
-:func:`load_rig` reads a ROS 2 parameter file (``/**: ros__parameters:``) without ROS;
-:func:`rig_from_values` makes the frozen :class:`Rig` from flat values (``link.length``). The node
-calls it with the values from rclpy.
+:func:`rig_from_values` makes the frozen :class:`Rig` from flat values (``link.length``), which the node has from
+rclpy; :func:`load_rig` has them from a parameter file.
 """
 
 from __future__ import annotations
@@ -22,16 +21,11 @@ from typing import Any
 import numpy as np
 
 from psd_deflection.errors import ConfigError, did_you_mean
-from psd_deflection.foreign_yaml import YamlError, edited, parse_yaml, read_text
+from psd_deflection.parameter_files import EFFECTS_PREFIX, read_parameter_file
 from psd_deflection.parameters import Parameter, Section, Value, check_value, parameter, shown
 from psd_deflection.records import FloatArray
 from psd_deflection.tables import html_table
 
-MAX_FILE_BYTES = 1_000_000
-MAX_KEYS = 10_000
-
-EFFECTS_PREFIX = 'effects.'
-"""Keys below it describe simulated effects; ``psd_deflection.simulation`` checks them."""
 FRAME_PREFIX = 'frame_prefix'
 SIMULATED = 'simulated'
 """Set by the node: whether its samples are those of the simulated rig. A file of ``ros2 param dump`` has it too."""
@@ -566,100 +560,6 @@ def _check_wiring(v: Mapping[str, Any], source: str) -> None:
     for p in (section.parameters['axes'] for section in PSDS):
         if sorted(axis[-1] for axis in v[p.name]) != ['x', 'y']:
             raise ConfigError(f'{source}: {p.with_value(v[p.name])}: must name x once and y once')
-
-
-def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[str, object]:
-    """Flat values of a ROS 2 parameter file: those for ``/**`` and for ``node_name``.
-
-    Lists stay lists; maps become dotted keys. Raises ConfigError naming the file when it is
-    missing, too large, not YAML, or not a parameter file.
-    """
-    path = Path(path)
-    return flat_parameters(parameter_text(path), path, node_name)
-
-
-def parameter_text(path: Path) -> str:
-    """The text of a parameter file. Raises ConfigError naming the file when it is missing or too large."""
-    try:
-        return read_text(path, MAX_FILE_BYTES)
-    except FileNotFoundError:
-        raise ConfigError(f'{path}: no such parameter file') from None
-    except OSError as error:
-        raise ConfigError(f'{path}: cannot be read as a parameter file ({error.strerror or error})') from None
-    except YamlError as error:
-        raise ConfigError(f'{path}: cannot be read as a parameter file ({error})') from None
-
-
-def flat_parameters(text: str, path: Path, node_name: str = 'estimator') -> dict[str, object]:
-    """Flat values of the text of a parameter file, as of :func:`read_parameter_file`. Raises ConfigError."""
-    try:
-        tree = parse_yaml(text)
-    except YamlError as error:
-        raise ConfigError(f'{path}{error.where}: {error}') from None
-    if not isinstance(tree, dict):
-        raise ConfigError(f'{path}: not a ROS 2 parameter file: expected "/**:" then "ros__parameters:"')
-    flat: dict[str, object] = {}
-    wanted = _sections_of(node_name)
-    for name, body in tree.items():
-        if not isinstance(body, dict) or not isinstance(body.get('ros__parameters'), dict):
-            raise ConfigError(f'{path}: {name}: not a ROS 2 parameter file: "ros__parameters:" is missing below it')
-        if name in wanted:
-            flat.update(flattened(body['ros__parameters'], str(path)))
-    if not any(name in wanted for name in tree):
-        raise ConfigError(f'{path}: has no parameters for /** or {node_name} (found: {", ".join(map(str, tree))})')
-    return flat
-
-
-def _sections_of(node_name: str) -> tuple[str, ...]:
-    """Names of the sections of a parameter file that a node reads."""
-    return '/**', node_name, '/' + node_name, '/**/' + node_name
-
-
-def with_effects_section(text: str, effects: Mapping[str, Mapping[str, object]], path: Path) -> str:
-    """The text of a parameter file with ``effects`` instead of its own; all else is as it was, comments too.
-
-    ``path``: for a message. Raises ConfigError if the file cannot be edited so that it says the same otherwise.
-    """
-    sections = _sections_of('estimator')
-
-    def edit(tree: Any) -> None:
-        found = [body['ros__parameters'] for name, body in tree.items() if name in sections]
-        for body in found:
-            for key in [k for k in body if k == EFFECTS_PREFIX.rstrip('.') or str(k).startswith(EFFECTS_PREFIX)]:
-                del body[key]
-        if effects:
-            found[-1][EFFECTS_PREFIX.rstrip('.')] = effects
-
-    wanted = {k: v for k, v in flat_parameters(text, path).items() if not k.startswith(EFFECTS_PREFIX)}
-    wanted.update(flattened({EFFECTS_PREFIX.rstrip('.'): effects}, str(path)))
-    try:
-        out = edited(text, edit)
-    except YamlError as error:
-        raise ConfigError(f'{path}: {error}') from None
-    # The editor reads YAML 1.2, ROS and our reader YAML 1.1.
-    if flat_parameters(out, path) != wanted:
-        raise ConfigError(f'{path}: cannot be written again with the same values')
-    return out
-
-
-def flattened(tree: Mapping[Any, Any], source: str) -> dict[str, object]:
-    """``tree`` with maps as dotted keys; lists stay lists. Raises ConfigError naming ``source``."""
-    out: dict[str, object] = {}
-    _flatten(tree, '', out, source, 0)
-    return out
-
-
-def _flatten(tree: Mapping[Any, Any], prefix: str, out: dict[str, object], source: str, depth: int) -> None:
-    if depth > 8:
-        raise ConfigError(f'{source}: {prefix} is nested too deep')
-    for key, value in tree.items():
-        name = f'{prefix}{key}'
-        if isinstance(value, Mapping):
-            _flatten(value, name + '.', out, source, depth + 1)
-        else:
-            out[name] = value
-        if len(out) > MAX_KEYS:
-            raise ConfigError(f'{source}: more than {MAX_KEYS} parameters')
 
 
 def left_as_in_the_thesis(values: Mapping[str, object]) -> tuple[str, ...]:

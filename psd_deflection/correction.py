@@ -19,10 +19,10 @@ from psd_deflection.errors import ConfigError
 from psd_deflection.geometry.plate import flat_poses
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.catalogue import effects_of_rig
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import ActiveEffect, Reading, Use, Values
 from psd_deflection.simulation.optics import dots_on_plate
 from psd_deflection.simulation.physics import Physics
+from psd_deflection.simulation.samples import SimulatedSamples
 
 PASSES = 3
 """Fixed-point passes for the pose; each reduces the error by the relative size of the effect (< 1
@@ -97,12 +97,12 @@ class Correction:
 
     def _wandered(self, effects: Sequence[ActiveEffect], t: FloatArray, warmer: FloatArray, n: int) -> FloatArray:
         """The true beams (4, n), m."""
-        chunk = Chunk(t, warmer, np.empty((3, n)), self._true)
-        chunk.beams = np.repeat(self._true.beams.reshape(4, 1), n, axis=1)
+        samples = SimulatedSamples(t, warmer, np.empty((3, n)), self._true)
+        samples.beams = np.repeat(self._true.beams.reshape(4, 1), n, axis=1)
         for active in effects:
             if active.effect.apply is not None:
-                active.effect.apply(chunk, active.values, {})
-        return chunk.beams
+                active.effect.apply(samples, active.values, {})
+        return samples.beams
 
     def apply(
         self,

@@ -17,9 +17,9 @@ import numpy as np
 
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.settings import CameraSettings, settings_from
-from psd_deflection.config import flattened, parameter_text
 from psd_deflection.errors import ConfigError, DeviceError, RecordingError
-from psd_deflection.foreign_yaml import YamlError, parse_yaml
+from psd_deflection.foreign_yaml import tree_of_text
+from psd_deflection.parameter_files import flattened, parameter_text
 
 FRAMES = 'frames.csv'
 SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.webp')
@@ -42,10 +42,7 @@ def read_values(path: str | Path) -> dict[str, object]:
     Raises ConfigError.
     """
     path = Path(path)
-    try:
-        tree = parse_yaml(parameter_text(path))
-    except YamlError as error:
-        raise ConfigError(f'{path}{error.where}: {error}') from None
+    tree = tree_of_text(parameter_text(path), path)
     if not isinstance(tree, dict):
         raise ConfigError(f'{path}: has no parameters of a camera, as in "target.spacing: 0.025"')
     if 'camera_matrix' in tree:

@@ -13,6 +13,9 @@ from typing import Any
 
 import yaml
 
+from psd_deflection.errors import ConfigError
+
+MAX_FILE_BYTES = 1_000_000
 MAX_DEPTH = 50
 MAX_NODES = 50_000
 """Keys, values, lists and maps of one file, each counted as often as aliases and merge keys repeat it."""
@@ -30,6 +33,34 @@ class YamlError(ValueError):
     def __init__(self, problem: str, mark: Any = None) -> None:
         super().__init__(problem)
         self.where = f':{mark.line + 1}:{mark.column + 1}' if mark is not None else ''
+
+
+def tree_of_file(path: Path, what: str, most: int = MAX_FILE_BYTES) -> object:
+    """The tree of a YAML file, None for an empty one. Raises ConfigError as the two functions below do."""
+    return tree_of_text(text_of_file(path, what, most), path)
+
+
+def text_of_file(path: Path, what: str, most: int = MAX_FILE_BYTES) -> str:
+    """The text of a file that ought to be a ``what`` (``parameter file``).
+
+    Raises ConfigError naming the file if it is missing, cannot be read, has more than ``most`` bytes or is no text.
+    """
+    try:
+        return read_text(path, most)
+    except FileNotFoundError:
+        raise ConfigError(f'{path}: no such {what}') from None
+    except OSError as error:
+        raise ConfigError(f'{path}: cannot be read as a {what} ({error.strerror or error})') from None
+    except YamlError as error:
+        raise ConfigError(f'{path}: cannot be read as a {what} ({error})') from None
+
+
+def tree_of_text(text: str, path: Path) -> object:
+    """The tree of the text of the file ``path``. Raises ConfigError naming file, line and column."""
+    try:
+        return parse_yaml(text)
+    except YamlError as error:
+        raise ConfigError(f'{path}{error.where}: {error}') from None
 
 
 def read_text(path: Path, most: int) -> str:

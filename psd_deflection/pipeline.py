@@ -240,6 +240,14 @@ class Pipeline:
         t: FloatArray = (block.t_ns - held.get(START, float(block.t_ns[0]))) * np.float64(1e-9)
         return self._correction.apply(samples, sums, warmer, t)
 
+    def dots(self, block: SampleBlock) -> FloatArray:
+        """Dots (n, 4), m, of the samples of ``block``, calibrated and corrected as for the estimate."""
+        volts = self._calibration.seen(block.volts)
+        samples = self._calibration.dots(volts)
+        if not self._correction.active:
+            return samples
+        return self._corrected(block, samples, volts[:, 2::3].astype(np.float64))
+
     def _block(self, block: SampleBlock) -> Iterator[Record]:
         size = self._cutter.block_size
         present = len(block.seq)
@@ -247,9 +255,7 @@ class Pipeline:
         self.counters.blocks += 1
         volts = self._calibration.seen(block.volts)
         sums = volts[:, 2::3].astype(np.float64)
-        samples = self._calibration.dots(volts)
-        if self._correction.active:
-            samples = self._corrected(block, samples, sums)
+        samples = self.dots(block)
         x1, y1, x2, y2 = (samples.sum(axis=0) / present).tolist()
         dots: Dots = (x1, y1, x2, y2)
         if self._optics.refuses_frozen:

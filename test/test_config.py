@@ -15,11 +15,9 @@ from psd_deflection.config import (
     Rig,
     left_as_in_the_thesis,
     load_rig,
-    read_parameter_file,
     replace_values,
     rig_as_recorded,
     rig_from_values,
-    with_effects_section,
 )
 from psd_deflection.errors import ConfigError
 from psd_deflection.parameters import Parameter, Section, Value, check_value, parameter
@@ -67,25 +65,6 @@ def test_a_dump_of_a_node_is_a_parameter_file() -> None:
     assert rig_from_values({**load_rig().values, **of_every_node}) == load_rig()
 
 
-@pytest.mark.parametrize(
-    ('text', 'said'),
-    [
-        ('a: [1', ':'),
-        ('[]', 'not a ROS 2 parameter file'),
-        ('x: 1', 'ros__parameters'),
-        ('other:\n  ros__parameters:\n    a: 1', 'no parameters for /** or estimator'),
-        ('!!python/object/apply:os.system ["true"]', 'malformed'),
-    ],
-)
-def test_a_malformed_file_is_refused_by_name(tmp_path: Path, text: str, said: str) -> None:
-    path = tmp_path / 'mine.yaml'
-    path.write_text(text)
-    with pytest.raises(ConfigError) as error:
-        read_parameter_file(path)
-    assert 'mine.yaml' in str(error.value)
-    assert said in str(error.value)
-
-
 def test_a_number_that_yaml_takes_for_text_is_a_number_as_in_ros(tmp_path: Path) -> None:
     path = tmp_path / 'mine.yaml'
     path.write_text('/**:\n  ros__parameters:\n    link:\n      youngs_modulus: 70e9\n')
@@ -95,17 +74,6 @@ def test_a_number_that_yaml_takes_for_text_is_a_number_as_in_ros(tmp_path: Path)
 def test_whole_bounds_are_written_whole() -> None:
     with pytest.raises(ConfigError, match='must be at least 1000000 and at most 1000000000000'):
         load_rig(overrides={'disk_reserve': 0})
-
-
-@pytest.mark.parametrize(('content', 'why'), [(None, r'Is a directory'), (b'\xd0\xff', 'it is no text')])
-def test_what_is_no_text_is_no_parameter_file(tmp_path: Path, content: bytes | None, why: str) -> None:
-    path = tmp_path / 'rig.yaml'
-    if content is None:
-        path.mkdir()
-    else:
-        path.write_bytes(content)
-    with pytest.raises(ConfigError, match=rf'rig\.yaml: cannot be read as a parameter file \({why}\)$'):
-        load_rig(path)
 
 
 @pytest.mark.parametrize('value', [10**400, 10**6000, -(10**400)], ids=['long', 'longer', 'negative'])
@@ -222,59 +190,3 @@ def test_no_estimate_from_one_detector_has_three_words(tmp_path: Path, word: str
 def test_other_words_for_it_are_refused(word: object) -> None:
     with pytest.raises(ConfigError, match=r'degraded = '):
         load_rig(None, {'degraded': word})
-
-
-USERS_FILE = """\
-# Our rig in the cellar.
-/**:
-  ros__parameters:
-    link: {length: 0.8, youngs_modulus: 69e9}  # measured
-    degraded: off
-    psd_2:
-      center: [-0.100, 0.0]   # drilled 2024-03-01
-      axes: ['y', x]
-    bag_dir: "over/there"
-    effects:                  # from the first run
-      creep: {amplitude: 0.03, time_constant: 5.0}
-    # The port follows.
-    port: /dev/ttyACM0
-other_node:
-  ros__parameters: {rate: 010}
-"""
-
-
-def test_effects_are_put_into_the_users_file(tmp_path: Path) -> None:
-    path = tmp_path / 'rig.yaml'
-    path.write_text(USERS_FILE)
-    rotation = {'name': 'sensor_rotation', 'psd': 2, 'angle': 0.01}
-    out = with_effects_section(USERS_FILE, {'sensor_rotation_2': rotation}, path)
-    for kept in ('# Our rig in the cellar.', '# measured', '# drilled 2024-03-01', '# The port follows.', 'rate: 010'):
-        assert kept in out
-    assert 'link: {length: 0.8, youngs_modulus: 69e9}' in out
-    assert "axes: ['y', x]" in out
-    assert 'creep' not in out
-    before = load_rig(path)
-    path.write_text(out)
-    after = load_rig(path)
-    assert after.values == before.values
-    assert dict(after.effects) == {f'sensor_rotation_2.{key}': value for key, value in rotation.items()}
-    # Without effects it is the file without its own.
-    path.write_text(with_effects_section(USERS_FILE, {}, path))
-    assert load_rig(path).effects == {}
-
-
-@pytest.mark.parametrize(
-    ('text', 'why'),
-    [
-        # Twice the same key: our reader takes the last, the editor none.
-        ('/**:\n  ros__parameters:\n    block_size: 10\n    block_size: 20\n', 'cannot be written again'),
-        ('/**:\n  ros__parameters: {a: &a [x, x, x, x, x, x, x, x, x], ' + ', '.join(
-            f'{chr(98 + i)}: &{chr(98 + i)} [{", ".join([f"*{chr(97 + i)}"] * 9)}]' for i in range(6)) + '}\n',
-         'aliases stand for more than'),
-        ('/**:\n  ros__parameters: {block_size: !!python/object/apply:os.system [ls]}\n', 'malformed YAML'),
-    ],
-)  # fmt: skip
-def test_a_file_that_cannot_be_edited_is_refused(text: str, why: str, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=why) as caught:
-        with_effects_section(text, {'creep': {'amplitude': 0.1}}, tmp_path / 'rig.yaml')
-    assert str(tmp_path / 'rig.yaml') in str(caught.value)

@@ -256,11 +256,11 @@ def test_a_drift_in_the_rig_file_is_corrected_and_replayed_to_the_bit(
     body = ''.join(f'        {k}: {v}\n' for k, v in effect.items())
     model.write_text(f'/**:\n  ros__parameters:\n    effects:\n      one:\n{body}')
     bag = tmp_path / 'drifting'
-    argv = ['simulate', '--params-file', str(model), '--loads', 'constant:0,0,0:10', '--out', str(bag), *words]
+    argv = ['simulate', '--params-file', str(model), '--loads', 'constant:0,0,0:4', '--out', str(bag), *words]
     assert main(argv) == 0
     recorded = open_recording(bag).estimates()['/link_tip/deflection'].pose
     # At rest, and so it is measured, from the first second to the last.
-    assert abs(recorded[-100:].mean(axis=0) - recorded[:100].mean(axis=0)).max() < 5e-7
+    assert (abs(recorded[-50:].mean(axis=0) - recorded[:50].mean(axis=0)) < [5e-7, 5e-7, 2e-6]).all()
     # And it is where the link is: a drift counts from the first temperature and the first sample.
     assert (abs(recorded.mean(axis=0)) < [3e-7, 3e-7, 2e-6]).all()
     assert main(['replay', str(bag), '--compare']) == 0
@@ -271,7 +271,7 @@ def test_a_drift_in_the_rig_file_is_corrected_and_replayed_to_the_bit(
     again = tmp_path / 'again.mcap'
     assert main(['replay', str(bag), '--params-file', str(nominal), '--out', str(again)]) == 0
     blind = open_recording(again).estimates()['/link_tip/deflection'].pose
-    assert abs(blind[-100:].mean(axis=0) - blind[:100].mean(axis=0)).max() > 3e-6
+    assert abs(blind[-50:].mean(axis=0) - blind[:50].mean(axis=0)).max() > 3e-6
 
 
 def exact_chunk(dots: npt.NDArray[np.float64], first: int = 0) -> RawChunk:

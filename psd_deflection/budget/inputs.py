@@ -13,9 +13,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import cast
 
-from psd_deflection.config import MAX_FILE_BYTES
 from psd_deflection.errors import ConfigError, did_you_mean
-from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
+from psd_deflection.foreign_yaml import tree_of_file
 from psd_deflection.parameters import Parameter, check_value
 
 
@@ -142,14 +141,7 @@ def read_inputs(
 
 
 def _read(path: Path) -> dict[object, object]:
-    try:
-        tree = parse_yaml(read_text(path, MAX_FILE_BYTES))
-    except FileNotFoundError:
-        raise ConfigError(f'{path}: no such file of inputs') from None
-    except OSError as error:
-        raise ConfigError(f'{path}: cannot be read as inputs ({error.strerror or error})') from None
-    except YamlError as error:
-        raise ConfigError(f'{path}{error.where}: cannot be read as inputs ({error})') from None
+    tree = tree_of_file(path, 'file of inputs')
     if tree is None:
         return {}
     if not isinstance(tree, dict):

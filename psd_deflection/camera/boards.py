@@ -15,6 +15,7 @@ import numpy as np
 from psd_deflection.camera.answer import RefusedError, Status, TargetPose
 from psd_deflection.camera.lens import Lens
 from psd_deflection.camera.opencv import opencv
+from psd_deflection.camera.refine_corners import LEAST_REACH, refined
 from psd_deflection.camera.rim_fit import turned
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.errors import ConfigError
@@ -27,13 +28,14 @@ LEAST_SPREAD = 0.35
 WORST_CORNER = 1.5
 """Largest residual of a corner, px, with which it counts; and the share of the corners that must count is 3/4."""
 
-SHARPNESS = 0.12
-"""Smallest steepness of the edges with an answer: rise over one px in units of the contrast. Blur makes it less."""
+MOST_BLUR = 0.4
+"""Largest blur (sd) across an edge with an answer, in units of what is free around a corner."""
 
-CORNER_FLOOR = 0.01
-"""Error that all corners share and no residual shows, one sd in px."""
+CORNER_FLOOR, BLUR_FLOOR = 0.004, 0.05
+"""Error that all corners share and no residual shows, one sd in px; and the part of the motion's sd that adds to it."""
 
 _STEPS = 20
+_TAG_MODULES = 10
 
 
 class Board:
@@ -52,8 +54,14 @@ class Board:
             self._by_id = dict(zip(np.ravel(self.board.getIds()).tolist(), self.board.getObjPoints(), strict=True))
         # OpenCV's board: origin in the corner, x right, y down as it is seen. Ours: middle, y up.
         wide, high = board_size(settings)
+        # Around a corner of the chessboard there is nothing up to the markers; a tag has a rim of one of its modules.
+        charuco = settings.target == 'charuco'
+        self._free = (settings.square - settings.marker) / 2 if charuco else settings.marker / _TAG_MODULES
+        # From the corners of a tag (as OpenCV has them, clockwise from the upper left) to its inside, in our axes.
+        self._inwards = np.array([[1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
         self._middle = np.array([wide / 2, high / 2])
         self._mirror = 1.0 if settings.view == 'outside' else -1.0
+        self._inwards[:, 0] *= self._mirror
         self._spread = np.array([wide, high]) / math.sqrt(12.0)
 
     def set_rest(self, rotation: FloatArray) -> None:
@@ -63,15 +71,18 @@ class Board:
         """The board in one image. Raises RefusedError."""
         plane, pixels = self.corners(grey)
         points = np.column_stack([plane, np.zeros(len(plane))])
-        sharp = steepness(image, pixels)
-        if sharp < SHARPNESS:
-            raise RefusedError(Status.BLURRED)
         rotation, place = self._guess(plane, lens.rays(pixels))
+        rotation, place, _, _ = _fitted(points, pixels, lens, rotation, place)
+        pixels, shared_blur = self._refined(image, points, pixels, lens, rotation, place)
+        kept = np.isfinite(pixels[:, 0])
+        if kept.sum() < max(LEAST_CORNERS, 0.6 * len(points)):
+            raise RefusedError(Status.MISFIT)
+        plane, points, pixels = plane[kept], points[kept], pixels[kept]
         good = np.ones(len(points), dtype=bool)
         for _ in range(3):
             rotation, place, inverse, residual = _fitted(points[good], pixels[good], lens, rotation, place)
             off = np.linalg.norm(lens.project(points @ rotation.T + place) - pixels, axis=1)
-            keep = off < WORST_CORNER
+            keep = off < min(WORST_CORNER, max(5.0 * float(np.median(off)), 0.05))
             if np.array_equal(keep, good):
                 break
             good = keep
@@ -81,7 +92,7 @@ class Board:
         # Corners near each other have errors in common; an error of all of them shows in no residual.
         covariance = 2.0 * variance * inverse
         metre = float(place[2]) / lens.focal
-        shared = (CORNER_FLOOR * metre) ** 2
+        shared = (math.hypot(CORNER_FLOOR, BLUR_FLOOR * shared_blur) * metre) ** 2
         covariance[3:, 3:] += rotation @ np.diag([shared, shared, 0.0]) @ rotation.T
         covariance[2, 2] += shared / float(np.sum(plane.var(axis=0))) / 10
         return TargetPose(
@@ -93,6 +104,29 @@ class Board:
             noise=math.sqrt(variance),
             planar=not lens.known,
         )
+
+    def _refined(
+        self, image: Any, points: FloatArray, pixels: FloatArray, lens: Lens, rotation: FloatArray, place: FloatArray
+    ) -> tuple[FloatArray, float]:
+        """Corners by the grey levels around them, and the sd of the motion blur, px. Raises RefusedError."""
+        step = 0.5 * self._free
+        here = lens.project(points @ rotation.T + place)
+        towards = np.sign(self._inwards) if self._charuco is None else np.ones((1, 2))
+        towards = np.resize(towards, (len(points), 2))
+        edges = []
+        for axis in (0, 1):
+            ahead = points.copy()
+            ahead[:, axis] += step * towards[:, axis]
+            vector = lens.project(ahead @ rotation.T + place) - here
+            edges.append(vector / np.linalg.norm(vector, axis=1)[:, None])
+        free = self._free * lens.focal / float(place[2])
+        if free < LEAST_REACH:
+            raise RefusedError(Status.SMALL)
+        found = refined(image, pixels, np.stack(edges, axis=1), 0.95 * free, self._charuco is not None)
+        blur = np.sort(np.nanmedian(found.blur, axis=0))
+        if blur[1] > MOST_BLUR * free:
+            raise RefusedError(Status.BLURRED)
+        return found.pixels, math.sqrt(max(float(blur[1] ** 2 - blur[0] ** 2), 0.0))
 
     def corners(self, grey: Any) -> tuple[FloatArray, FloatArray]:
         """Corners on the plate (n, 2) m and in the image (n, 2) px. Raises RefusedError."""
@@ -172,20 +206,6 @@ def _fitted(
     if place[2] <= 0.0:
         raise RefusedError(Status.MISFIT)
     return rotation, place, inverse, residual
-
-
-def steepness(image: Any, pixels: FloatArray) -> float:
-    """Median over corners of the steepest rise near each, a pixel, in units of the contrast there."""
-    found = []
-    for u, v in np.rint(pixels).astype(int).tolist():
-        part = image[max(v - 6, 0) : v + 7, max(u - 6, 0) : u + 7].astype(float)
-        if min(part.shape) < 5:
-            continue
-        low, high = np.percentile(part, (5, 95))
-        # In each direction by itself: motion blurs one of them only.
-        steep = min(np.percentile(np.abs(np.diff(part, axis=axis)), 95) for axis in (0, 1))
-        found.append(float(steep) / max(float(high - low), 1.0))
-    return float(np.median(found)) if found else 0.0
 
 
 def board_size(settings: CameraSettings) -> tuple[float, float]:

@@ -98,7 +98,7 @@ class Discs:
         """A turn about the long axis of the ellipse that makes it as narrow as it is, in the target's axes, rad."""
         values, vectors = np.linalg.eigh(region.shape)
         ratio = math.sqrt(min(max(values[0] / values[1], 0.0), 1.0))
-        return (frontal.T @ np.append(vectors[:, 1], 0.0)) * max(math.acos(ratio), 0.03)
+        return np.asarray((frontal.T @ np.append(vectors[:, 1], 0.0)) * max(math.acos(ratio), 0.03))
 
     def _place(self, rays: FloatArray, rotation: FloatArray) -> FloatArray:
         """Where a target of this rotation has its centres on ``rays`` (3, 2): linear least squares."""

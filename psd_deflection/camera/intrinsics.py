@@ -93,8 +93,11 @@ def calibrated(settings: CameraSettings, images: Iterable[tuple[str, Any]]) -> I
         raise ConfigError(
             f'{len(points)} images show the board, at least {LEAST_IMAGES} are needed, tilted in all directions{why}'
         )
-    # The board is symmetric in nothing: OpenCV wants its points as they are.
-    rms, matrix, distortion, _, _, deviation, _, _ = opencv().calibrateCameraExtended(points, pixels, size, None, None)
+    cv2 = opencv()
+    # Without the third radial term: it is only told from the second by what lies in the corners of the image.
+    rms, matrix, distortion, _, _, deviation, _, _ = cv2.calibrateCameraExtended(
+        points, pixels, size, None, None, flags=cv2.CALIB_FIX_K3
+    )
     found = np.ravel(deviation)[:4]
     if not (rms < _MOST_RMS and np.all(np.isfinite(matrix)) and np.all(found < 0.05 * matrix[0, 0])):
         raise ConfigError(

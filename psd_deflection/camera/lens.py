@@ -50,10 +50,10 @@ class Lens:
 
     def rays(self, pixels: FloatArray) -> FloatArray:
         """Rays (..., 2) of pixels (..., 2)."""
-        bent = pixels @ self._inverse[:2, :2].T + self._inverse[:2, 2]
+        bent: FloatArray = pixels @ self._inverse[:2, :2].T + self._inverse[:2, 2]
         if not self.distortion.any():
             return bent
-        ray = bent
+        ray: FloatArray = bent
         for _ in range(_ITERATIONS):
             step = bent - self._bend(ray)
             ray = ray + step
@@ -70,7 +70,7 @@ class Lens:
 
     def pixels(self, rays: FloatArray) -> FloatArray:
         """Pixels (..., 2) of rays (..., 2)."""
-        return self._bend(rays) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
+        return np.asarray(self._bend(rays) @ self.matrix[:2, :2].T + self.matrix[:2, 2])
 
     def project(self, points: FloatArray) -> FloatArray:
         """Pixels (..., 2) of points (..., 3) in the camera's axes, m."""

@@ -12,7 +12,8 @@ px^2. ``gamma`` is the skewness of the motion within the exposure along n: with 
 over the exposure (Gram-Charlier) for a motion that is not uniform. ``inside`` and ``outside`` are linear in the image
 for each disc, which takes uneven light; they are eliminated from the normal equations. Pixels are taken as they are,
 not interpolated: their noise stays independent, and the fit reaches the Cramer-Rao bound. The first steps use each
-third pixel. Pixels are kept as float32, which is good to 1e-5 px here and twice as fast; the normal equations are float64.
+third pixel. Pixels are kept as float32, which is good to 1e-5 px here and twice as fast; the normal equations are in
+float64.
 """
 
 from __future__ import annotations
@@ -544,8 +545,9 @@ def turned(v: FloatArray) -> FloatArray:
     angle = float(np.linalg.norm(v))
     cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
     if angle < 1e-9:
-        return np.eye(3) + cross
-    return np.eye(3) + math.sin(angle) / angle * cross + (1.0 - math.cos(angle)) / angle**2 * cross @ cross
+        return np.asarray(np.eye(3) + cross)
+    sine, versed = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    return np.asarray(np.eye(3) + sine * cross + versed * cross @ cross)
 
 
 def _motion(blur: FloatArray) -> float:
@@ -558,4 +560,4 @@ def _sectors(side: tuple[Pixels, Pixels], rims: _Rims) -> IntArray:
     """The part of a rim to which each pixel belongs, counted through all discs."""
     part = np.floor((np.arctan2(side[1], side[0]) * (0.5 / np.pi) + 0.5) * _SECTORS).astype(int)
     of = np.repeat(np.arange(len(rims.begin) - 1), np.diff(rims.begin))
-    return of * _SECTORS + np.minimum(part, _SECTORS - 1)
+    return np.asarray(of * _SECTORS + np.minimum(part, _SECTORS - 1))

@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from psd_deflection.config import BY_NAME, Rig, replace_values
+from psd_deflection.config import BY_NAME, Rig, replace_values, rig_from_values
 from psd_deflection.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.foreign_yaml import YamlError, parse_yaml
+from psd_deflection.parameter_files import read_parameter_file
 
 _FOREIGN = """
 .7z .arrow .avi .bag .bmp .bz2 .db .db3 .eps .feather .gif .gz .h5 .hdf .hdf5 .htm .html .jpeg .jpg .json .jsonl .log
@@ -74,13 +75,28 @@ def parameter_option(parser: argparse._ActionsContainer, option: str, name: str)
 
 
 def given_parameters(args: argparse.Namespace) -> dict[str, object]:
-    """Values of the given options that set parameters; ``--record FOLDER`` sets ``bag_dir`` as well."""
+    """Values of the given options that set parameters; ``--record FOLDER`` sets ``bag_dir`` as well.
+
+    Raises UsageError for a value that cannot be.
+    """
     values = {name: v for name, v in vars(args).items() if name in BY_NAME and v is not None and v is not False}
     folder = values.get('record')
     if folder is not None:
         values['record'] = True
     if folder:
         values['bag_dir'] = folder
+    with given_as_option():
+        rig_from_values(values, 'command line')
+    return values
+
+
+def over_file(params_file: str | None, given: Mapping[str, object]) -> dict[str, object]:
+    """The flat values of ``params_file``, if there is one, with the ``given`` ones on top. Raises ConfigError."""
+    if params_file is None:
+        return dict(given)
+    values = {**read_parameter_file(params_file), **given}
+    # Refuse them here, where the file's name is known.
+    rig_from_values(values, params_file)
     return values
 
 

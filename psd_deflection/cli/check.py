@@ -107,13 +107,13 @@ def _guided(args: argparse.Namespace) -> tuple[Rig, Checkup, list[str]]:
     rig = load_rig(args.params_file, values)
     if rig.acquisition.port:
         refuse(args, {'world': []}, 'is for the simulated rig: give no --port')
-    shown = Shown(quiet=args.json)
+    shown = GuideDisplay(quiet=args.json)
     found = run_guided(rig, in_the_world(rig, args.world), shown.say, shown.update)
     shown.end()
     return rig, found, []
 
 
-class Shown:
+class GuideDisplay:
     """Prompts, and one live line below them where there is a terminal."""
 
     def __init__(self, quiet: bool) -> None:

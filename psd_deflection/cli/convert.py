@@ -13,19 +13,17 @@ estimates, dots, loads and losses with a layout, and cannot be read back.
 from __future__ import annotations
 
 import argparse
-import contextlib
 from pathlib import Path
 
 from psd_deflection.cli._options import namespace_option, recording_name
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show, warn
 from psd_deflection.config import load_rig
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.conversion import Beside, convert
+from psd_deflection.recordings.conversion import Beside, convert, convert_computed
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.replay_engine import nominal_rig, open_for_replay, replayed
-from psd_deflection.recordings.sinks import open_sink
+from psd_deflection.recordings.replay_engine import nominal_rig, open_for_replay
+from psd_deflection.recordings.sinks import is_for_viewing
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,13 +47,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert and say what was written."""
-    if Path(args.out).suffix.lower() == '.rrd':
-        return _to_rerun(args)
+    if is_for_viewing(args.out):
+        return _to_viewer(args)
     recording = open_recording(args.recording, namespace=args.namespace)
-    parameters: dict[str, object] = dict(recording.parameters)
-    if args.params_file is not None:
-        rig = load_rig(args.params_file)
-        parameters = rig.flat()
+    parameters = recording.parameters if args.params_file is None else load_rig(args.params_file).flat()
     with told('reading loads, references, temperatures', quiet=args.json):
         beside = Beside.of(recording)
     with progress_of(recording.blocks(), quiet=args.json) as blocks:
@@ -68,21 +63,16 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _to_rerun(args: argparse.Namespace) -> int:
+def _to_viewer(args: argparse.Namespace) -> int:
     out, in_json = Path(args.out), args.json
     recording, rig = open_for_replay(args.recording, args.params_file, args.namespace)
-    pipeline = Pipeline(rig)
-    bar = progress_of(recording.blocks(), quiet=in_json)
-    with contextlib.closing(open_sink(out, rig.flat(), title=recording.path.stem)) as sink, bar:
-        for records in replayed(recording, pipeline, bar):
-            for record in records:
-                sink.put(record)
-    estimates, blocks = pipeline.counters.estimates, pipeline.counters.blocks
+    with progress_of(recording.blocks(), quiet=in_json) as blocks:
+        done = convert_computed(recording, out, rig, blocks)
     if in_json:
-        found = {'out': str(out), 'blocks': blocks, 'estimates': estimates, 'warnings': list(recording.warnings)}
-        print_json(found)
+        warnings = list(recording.warnings)
+        print_json({'out': str(out), 'blocks': done.blocks, 'estimates': done.estimates, 'warnings': warnings})
     else:
-        show(f'{out}: {estimates} estimates of {blocks} blocks; look at it: rerun {out}')
+        show(f'{out}: {done.estimates} estimates of {done.blocks} blocks; look at it: rerun {out}')
     _warn(recording, args.params_file)
     return 0
 

@@ -26,11 +26,12 @@ from tqdm import tqdm
 from psd_deflection.cli._options import namespace_option, seed
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import save, show, warn
-from psd_deflection.config import Rig, load_rig, parameter_text, with_effects_section
+from psd_deflection.config import Rig, load_rig
 from psd_deflection.discovery.discover import Discovery, discover
 from psd_deflection.discovery.report import report_html
 from psd_deflection.discovery.result import model_yaml, result, sentence
 from psd_deflection.errors import ConfigError, RecordingError, UsageError
+from psd_deflection.parameter_files import parameter_text, with_effects_section
 from psd_deflection.recordings.observations import read_observations
 from psd_deflection.simulation.catalogue import effect_names, effects_to_values
 

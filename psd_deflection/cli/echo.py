@@ -22,7 +22,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
-from psd_deflection.cli._daemon import url_option
+from psd_deflection.cli._daemon import daemon_of, url_option
 from psd_deflection.cli._options import whole
 from psd_deflection.cli._report import print_json, show
 from psd_deflection.errors import DaemonError
@@ -49,10 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print until Ctrl-C, or ``--count`` lines."""
     need_server()
-    # Imported here: only these commands and the page need aiohttp.
-    from psd_deflection.monitor.client import find_daemon
-
-    daemon = find_daemon(args.url)
+    daemon = daemon_of(args)
     with contextlib.ExitStack() as stack:
         if args.count is None:
             stack.enter_context(contextlib.suppress(KeyboardInterrupt))

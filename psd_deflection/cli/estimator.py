@@ -21,8 +21,7 @@ import importlib.util
 from collections.abc import Mapping, Sequence
 
 from psd_deflection.cli._display import Display
-from psd_deflection.cli._options import given_as_option, given_parameters, parameter_option
-from psd_deflection.config import read_parameter_file, rig_from_values
+from psd_deflection.cli._options import given_as_option, given_parameters, over_file, parameter_option
 from psd_deflection.devices.registry import DEVICES, source_names
 from psd_deflection.errors import ConfigError, UsageError
 from psd_deflection.monitor.start import start_monitor
@@ -64,20 +63,6 @@ def _live_solver(name: str) -> str:
     return name
 
 
-def overrides_of(args: argparse.Namespace) -> dict[str, object]:
-    """The parameters from the arguments; single options override the file."""
-    values = given_parameters(args)
-    if args.source is not None and args.source not in source_names():
-        raise UsageError(f'--source {args.source}: must be one of {", ".join(source_names())}')
-    with given_as_option():
-        rig_from_values(values, 'command line')
-    if args.params_file:
-        values = {**read_parameter_file(args.params_file), **values}
-        # Refuse it here, where the file's name is known.
-        rig_from_values(values, args.params_file)
-    return values
-
-
 def simulates_at_once(overrides: Mapping[str, object], ros_arguments: Sequence[str] = ()) -> bool:
     """Whether a simulated rig will probably be started; ROS has not read its arguments yet."""
     told_to_ros = any(a == '--params-file' or a.startswith(('port:=', 'source:=')) for a in ros_arguments)
@@ -91,7 +76,9 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(
             'parameters behind --ros-args are not read with --no-ros: put them into a --params-file before it'
         )
-    overrides = overrides_of(args)
+    if args.source is not None and args.source not in source_names():
+        raise UsageError(f'--source {args.source}: must be one of {", ".join(source_names())}')
+    overrides = over_file(args.params_file, given_parameters(args))
     display = Display()
     with started_early(simulates_at_once(overrides, args.ros_arguments)):
         status = _run(args, overrides, display)

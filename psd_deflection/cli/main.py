@@ -46,6 +46,7 @@ COMMANDS: dict[str, str] = {
     'effects': 'list the effects that can be simulated and discovered, or explain one',
     'camera': 'measure the tip by a camera: a reference beside the PSDs; print its target',
     'check': 'check the wiring of a rig: guided by hand, or from a recording with known loads',
+    'validate': 'compare the estimates of a recording with a camera, a stage or a tracker',
     'devices': 'list the serial ports and the devices on them, and suggest parameters',
     'plot': 'draw a recording as PNG, SVG, PDF or HTML',
     'info': 'summarise a recording',
@@ -282,6 +283,6 @@ def _executable(command: str) -> Callable[[], int]:
     return lambda: main([command, *sys.argv[1:]])
 
 
-estimator, replay, simulate, discover, camera, check, effects = map(
-    _executable, ('estimator', 'replay', 'simulate', 'discover', 'camera', 'check', 'effects')
+estimator, replay, simulate, discover, camera, check, effects, validate = map(
+    _executable, ('estimator', 'replay', 'simulate', 'discover', 'camera', 'check', 'effects', 'validate')
 )

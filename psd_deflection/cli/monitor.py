@@ -22,9 +22,9 @@ import threading
 from collections.abc import Iterator
 
 from psd_deflection.cli._display import Display
-from psd_deflection.cli._options import given_as_option, given_parameters, namespace_option, parameter_option, refuse
+from psd_deflection.cli._options import given_parameters, namespace_option, over_file, parameter_option, refuse
 from psd_deflection.cli._report import warn
-from psd_deflection.config import MONITOR, read_parameter_file, replace_values, rig_from_values
+from psd_deflection.config import MONITOR, replace_values
 from psd_deflection.errors import UsageError
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.monitor.shown import ShownRecording
@@ -39,6 +39,7 @@ from psd_deflection.runner.simulated_rig import simulates, started_early
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
+    parser.set_defaults(monitor=True)
     parser.add_argument('recording', nargs='?', metavar='REC', help='a bag folder, an .mcap or a .csv to play')
     parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig')
     page = parser.add_argument_group('the page')
@@ -80,17 +81,12 @@ def _check(args: argparse.Namespace) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     _check(args)
-    overrides = {'monitor': True, **given_parameters(args)}
-    with given_as_option():
-        rig_from_values(overrides, 'command line')
+    overrides = given_parameters(args)
     need_server()
     if args.recording is not None:
         return _play(args, overrides)
-    values = dict(read_parameter_file(args.params_file)) if args.params_file else {}
-    if args.params_file:
-        rig_from_values({**values, **overrides}, args.params_file)
+    values = over_file(args.params_file, overrides)
     display = Display()
-    values |= overrides
     with started_early(simulates(values)):
         status = run_headless(values, display.say, display.watch, start_monitor)
     display.tell_recorded()

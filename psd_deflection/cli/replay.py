@@ -127,6 +127,8 @@ def run(args: argparse.Namespace) -> int:
     text = comparison.summary()
     if comparison.different and args.params_file is None and not recording.parameters:
         text += '\n  the recording names no rig and was evaluated with the nominal one: give its own with --params-file'
+    if comparison.same and not comparison.identical:
+        text += ' (--strict counts them as differences)'
     show_text(text, aside=args.json)
     return 0 if comparison.identical or (comparison.same and not args.strict) else DIFFERS
 

@@ -14,11 +14,11 @@ from psd_deflection.commissioning.wirings import (
     DOTS,
     LIMIT,
     MARGIN,
-    Candidate,
     Difference,
     Response,
-    candidates,
+    WiringFit,
     differences,
+    fitting_wirings,
     misfit,
     parameters,
 )
@@ -67,7 +67,7 @@ class Checkup:
     lines: Mapping[str, object]
     pushes: tuple[Response, ...]
     sizes: tuple[float, ...]
-    found: tuple[Candidate, ...]
+    found: tuple[WiringFit, ...]
     levels: Levels
     drift: FloatArray
     drift_sd: FloatArray
@@ -79,12 +79,12 @@ def check(rig: Rig, pushes: Sequence[Response], measured: Levels, drift: FloatAr
     file = Wiring.from_rig(rig)
     seen = tuple(p for p in pushes if p.seen)
     dead = [*measured.stuck, *(c for c in _dead(seen) if c not in measured.stuck)]
-    found = candidates(seen) if seen else []
+    found = fitting_wirings(seen) if seen else []
     findings: list[Finding] = []
     lines: dict[str, object] = {}
     for channel in dead:
         findings.append(Finding('stuck_channel', channel, None, f'{channel} does not answer: look at its cable'))
-    best = min(found, key=lambda c: len(differences(c.wiring, file)), default=Candidate(file, 0.0))
+    best = min(found, key=lambda c: len(differences(c.wiring, file)), default=WiringFit(file, 0.0))
     if not dead and found:
         findings += _wiring_findings(file, seen, found, best, lines)
         findings += _load_findings(seen, best)
@@ -117,7 +117,7 @@ def _dead(seen: Sequence[Response]) -> list[str]:
 
 
 def _wiring_findings(
-    file: Wiring, seen: Sequence[Response], found: Sequence[Candidate], best: Candidate, lines: dict[str, object]
+    file: Wiring, seen: Sequence[Response], found: Sequence[WiringFit], best: WiringFit, lines: dict[str, object]
 ) -> list[Finding]:
     """How ``best`` differs from the rig file's wiring; nothing if that explains the pushes too."""
     if any(c.wiring == file for c in found):
@@ -142,7 +142,7 @@ def _wiring_findings(
     ]
 
 
-def _same_to_first_order(file: Wiring, seen: Sequence[Response], best: Candidate) -> tuple[str, ...]:
+def _same_to_first_order(file: Wiring, seen: Sequence[Response], best: WiringFit) -> tuple[str, ...]:
     """Whether the rig file's wiring explains the pushes as well if some went the other way than was said."""
     turned = tuple(load for p in seen if p.misfit(file)[1] < 0.0 for load in p.loads)
     total, worst = misfit(file, seen, turned)
@@ -161,7 +161,7 @@ def _fix(difference: Difference, wiring: Wiring, right: Mapping[str, object]) ->
     return line(name, right[name] if name in right else list(wiring.axes[int(name[4]) - 1]))
 
 
-def _load_findings(seen: Sequence[Response], found: Candidate) -> list[Finding]:
+def _load_findings(seen: Sequence[Response], found: WiringFit) -> list[Finding]:
     out = [Finding('load_sign', load, -1.0, f'the sign of load_{load} is turned') for load in found.reversed_loads]
     sizes = [p.misfit(found.wiring)[1] for p in seen if p.sized]
     for factor, words in UNITS.items():
@@ -198,7 +198,7 @@ def _channel_findings(rig: Rig, measured: Levels, wiring: Wiring, psd: int, line
     return [Finding('noise_level', f'{"xy"[worst]}{psd}', round(float(factors[worst]), 3), line(name, level))]
 
 
-def _coverage(pushes: Sequence[Response], seen: Sequence[Response], found: Sequence[Candidate]) -> list[Finding]:
+def _coverage(pushes: Sequence[Response], seen: Sequence[Response], found: Sequence[WiringFit]) -> list[Finding]:
     missing = [load for load in ('fx', 'fy', 'tz') if (load,) not in {p.loads for p in seen}]
     weak = [p.name for p in pushes if not p.seen]
     if seen and not found:

@@ -39,7 +39,7 @@ SHIFT = 2e-6
 """m. What a rest may shift by handling alone; drift is told beyond it."""
 
 
-class Step(Enum):
+class Phase(Enum):
     """What is waited for."""
 
     REST = 'rest'
@@ -66,8 +66,8 @@ def _landmark(rig: Rig, axis: int) -> str:
 
 
 class Guide:
-    """``step``: what is waited for. ``number``: which push, 0 to 2. ``moved`` (4,): movement of the device's channels
-    from rest now, m. ``progress``: how much of the present step is done, 0 to 1. ``pushes``: those that were taken.
+    """``phase``: what is waited for. ``number``: which push, 0 to 2. ``moved`` (4,): movement of the device's channels
+    from rest now, m. ``progress``: how much of the present phase is done, 0 to 1. ``pushes``: those that were taken.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -78,7 +78,7 @@ class Guide:
         self._noise = rig.amplifier.noise * self._sensitivity
         self._texts = directions(rig)
         self._expected = pattern(rig)
-        self.step = Step.REST
+        self.phase = Phase.REST
         self.number = 0
         self.moved = np.zeros(4)
         self.progress = 0.0
@@ -94,11 +94,11 @@ class Guide:
 
     def prompt(self) -> str:
         """What to do now."""
-        if self.step is Step.REST:
+        if self.phase is Phase.REST:
             return 'Leave the link alone.'
-        if self.step is Step.PUSH:
+        if self.phase is Phase.PUSH:
             return f'{self.number + 1} of 3: {self._texts[self.number]}'
-        return 'Let go.' if self.step is Step.RELEASE else 'Done.'
+        return 'Let go.' if self.phase is Phase.RELEASE else 'Done.'
 
     def feed(self, volts: FloatArray) -> str:
         """Take the next samples (n, 6), V, of the device's channels. What to tell the person, or ''."""
@@ -107,7 +107,7 @@ class Guide:
         self._t += n * self._period
         self._means.append((dots, n))
         self._samples.append(volts)
-        wanted = round((HOLD_S if self.step in (Step.PUSH, Step.RELEASE) else REST_S) / self._period)
+        wanted = round((HOLD_S if self.phase in (Phase.PUSH, Phase.RELEASE) else REST_S) / self._period)
         while sum(count for _, count in self._means) - self._means[0][1] >= wanted:
             self._means.popleft()
             self._samples.popleft()
@@ -116,19 +116,19 @@ class Guide:
         self.moved = dots - self._rests[-1][1] if self._rests else dots - here.mean(axis=0)
         # A block's mean wanders less than a sample.
         quiet = STILL * self._noise * np.sqrt(len(here) / max(sum(count for _, count in self._means), 1))
-        match self.step:
-            case Step.REST:
+        match self.phase:
+            case Phase.REST:
                 said = self._resting(here, filled, max(quiet, LEAST_PUSH / STAND_OUT))
-            case Step.PUSH:
+            case Phase.PUSH:
                 said = self._pushed(here, filled)
-            case Step.RELEASE:
+            case Phase.RELEASE:
                 said = self._released(here, filled)
             case _:
                 said = ''
         return said
 
-    def _next(self, step: Step) -> None:
-        self.step, self.progress, self._since = step, 0.0, self._t
+    def _next(self, phase: Phase) -> None:
+        self.phase, self.progress, self._since = phase, 0.0, self._t
         self._means.clear()
         self._samples.clear()
 
@@ -148,7 +148,7 @@ class Guide:
         self._rest_sd = np.maximum(here.std(axis=0), self._noise * np.sqrt(len(here) * self._period / REST_S))
         self._rests.append((self._t, here.mean(axis=0)))
         self._rest_volts = list(self._samples)
-        self._next(Step.PUSH)
+        self._next(Phase.PUSH)
         return ''
 
     def _pushed(self, here: FloatArray, filled: float) -> str:
@@ -168,7 +168,7 @@ class Guide:
         if filled < 1.0:
             return ''
         self._held, self._held_sd = here.mean(axis=0), here.std(axis=0)
-        self._next(Step.RELEASE)
+        self._next(Phase.RELEASE)
         return 'Got it: ' + ', '.join(f'{c} {v * 1e6:+.0f}' for c, v in zip(DOTS, moved, strict=True)) + ' µm.'
 
     def _released(self, here: FloatArray, filled: float) -> str:
@@ -190,7 +190,7 @@ class Guide:
         )
         self._rests.append((self._t, after))
         self.number += 1
-        self._next(Step.PUSH if self.number < 3 else Step.DONE)
+        self._next(Phase.PUSH if self.number < 3 else Phase.DONE)
         return ''
 
     def rest(self) -> FloatArray:

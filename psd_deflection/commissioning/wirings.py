@@ -121,7 +121,7 @@ def _pattern(dots: FloatArray, only_twist: bool) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class WiringFit:
     """A wiring that explains the pushes, if ``reversed_loads`` went the other way; ``misfit`` is summed over them."""
 
     wiring: Wiring
@@ -140,20 +140,20 @@ def misfit(wiring: Wiring, responses: Sequence[Response], reversed_loads: Sequen
     return sum(shares), max(shares, default=0.0)
 
 
-def candidates(responses: Sequence[Response]) -> list[Candidate]:
+def fitting_wirings(responses: Sequence[Response]) -> list[WiringFit]:
     """The wirings that explain the pushes about as well as the best one does, best first; [] if none does.
 
     First with the loads as they are said to be. Only if no wiring explains these, with the sign of loads turned.
     """
     told = [response.loads for response in responses]
     for turned in range(len(told) + 1):
-        found: list[Candidate] = []
+        found: list[WiringFit] = []
         for some in itertools.combinations(told, turned):
             loads = tuple(itertools.chain.from_iterable(some))
             for wiring in WIRINGS:
                 total, worst = misfit(wiring, responses, loads)
                 if worst <= LIMIT:
-                    found.append(Candidate(wiring, total, loads))
+                    found.append(WiringFit(wiring, total, loads))
         if found:
             found.sort(key=lambda c: c.misfit)
             return [c for c in found if c.misfit <= found[0].misfit + MARGIN]

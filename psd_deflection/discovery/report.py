@@ -2,62 +2,23 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 import itertools
 import json
-from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from psd_deflection.discovery.discover import Discovery, NamedEffect
 from psd_deflection.discovery.localise import BANDS
 from psd_deflection.discovery.result import parameters_of, provenance, sentence
 from psd_deflection.discovery.screen import Score
+from psd_deflection.pages import page, picture, table
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 
 BEFORE, AFTER, HELD, FLOOR = '#c44e52', '#4c72b0', '#55a868', '#8c8c8c'
 DOTS = ('x1', 'y1', 'x2', 'y2')
-
-STYLE = """
-:root{color-scheme:light dark;--bg:#fff;--text:#222;--quiet:#5d5d5d;--line:#ddd;--card:#f3f6fa}
-@media(prefers-color-scheme:dark){:root{--bg:#12171c;--text:#e4e8ec;--quiet:#a3adb8;--line:#39434d;--card:#1c242c}}
-body{font:16px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:var(--text);
-background:var(--bg);overflow-wrap:anywhere}
-h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2.2rem;border-bottom:1px solid var(--line)}
-.verdict{font-size:1.25rem;padding:1rem 1.2rem;border-left:6px solid #4c72b0;background:var(--card)}
-table{border-collapse:collapse;width:100%;font-size:.9rem}
-th,td{text-align:left;padding:.3rem .6rem;border-bottom:1px solid var(--line);
-font-variant-numeric:tabular-nums;overflow-wrap:normal}
-.wide{overflow-x:auto}.wide:focus-visible,pre:focus-visible{outline:2px solid #4c72b0}
-img{max-width:100%;background:#fff}.quiet{color:var(--quiet);font-size:.85rem}
-pre{background:var(--card);padding:.8rem;overflow:auto;font-size:.8rem}
-@media(max-width:46rem){img{max-width:none;width:46rem}body{margin-top:1rem}}
-"""
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A table; every cell is escaped."""
-    lines = [''.join(f'<td>{html.escape(str(cell))}</td>' for cell in row) for row in rows]
-    head = ''.join(f'<th>{html.escape(h)}</th>' for h in header)
-    return _wide(f'<table><tr>{head}</tr>' + ''.join(f'<tr>{line}</tr>' for line in lines) + '</table>', 'table')
-
-
-def _wide(content: str, words: str) -> str:
-    """What may be wider than a phone: it is moved by itself, also with the keyboard."""
-    return f'<div class="wide" role="group" tabindex="0" aria-label="{html.escape(words)}">{content}</div>'
-
-
-def _image(figure: Figure, words: str) -> str:
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure)
-    figure.savefig(buffer, format='png', dpi=110)
-    code = base64.b64encode(buffer.getvalue()).decode()
-    return _wide(f'<img alt="{html.escape(words)}" src="data:image/png;base64,{code}">', f'picture: {words}')
 
 
 def _residual_figure(discovery: Discovery) -> Figure:
@@ -168,7 +129,7 @@ def _effect_section(effect: NamedEffect) -> str:
             rows.append((name, f'{v["value"]:.6g}', f'{v["sd"]:.2g}', v['unit']))
         else:
             rows.append((name, v, '', ''))
-    out.append(_table(('parameter', 'value', '± sd', 'unit'), rows))
+    out.append(table(('parameter', 'value', '± sd', 'unit'), rows))
     out.append(
         f'<p>Evidence: BIC better by {effect.delta_bic:.1f}; library-wide p {effect.p:.2g}; log-likelihood on unseen '
         f'load cases {effect.heldout.gain:+.1f} ± {effect.heldout.error:.1f}.</p>'
@@ -178,7 +139,7 @@ def _effect_section(effect: NamedEffect) -> str:
         others = [
             (n, f'{loss:.1f}', f'{bic:.1f}', told[n in effect.equivalent]) for n, loss, bic in effect.alternatives
         ]
-        out.append(_table(('in its place', 'chi-square lost', 'BIC worse by', 'verdict'), others))
+        out.append(table(('in its place', 'chi-square lost', 'BIC worse by', 'verdict'), others))
     if effect.suggestion is not None:
         out.append(f'<p>To decide: {html.escape(effect.suggestion.text)}.</p>')
     return ''.join(out)
@@ -201,13 +162,13 @@ def _where_table(discovery: Discovery) -> str:
     ]
     if not rows:
         return '<p>Nowhere beyond noise.</p>'
-    return _table(('channel', 'recording', 'when', 'band', 'depends on', 'σ', 'p'), rows)
+    return table(('channel', 'recording', 'when', 'band', 'depends on', 'σ', 'p'), rows)
 
 
 def report_html(discovery: Discovery) -> str:
     """The page, pictures inside."""
     body = ['<h1>What the model lacks</h1>', f'<p class=verdict>{html.escape(sentence(discovery))}</p>']
-    body.append(_image(_waterfall_figure(discovery), 'the gap, step by step'))
+    body.append(picture(_waterfall_figure(discovery), 'the gap, step by step'))
     body.append('<h2>What</h2>')
     body.append(''.join(_effect_section(e) for e in discovery.effects) or '<p>No effect is named.</p>')
     if discovery.unknown:
@@ -218,27 +179,23 @@ def report_html(discovery: Discovery) -> str:
             f'<p>{html.escape(u.signature)}. It is {100 * u.explains:.0f} % of what was to be explained; {where}.</p>'
         )
     body.append('<h2>Where</h2>')
-    body.append(_image(_where_figure(discovery), 'where simulation and data part'))
+    body.append(picture(_where_figure(discovery), 'where simulation and data part'))
     body.append(_where_table(discovery))
     body.append('<h2>Before and after</h2>')
-    body.append(_image(_residual_figure(discovery), 'residual before and after'))
-    body.append(_image(_spectrum_figure(discovery), 'spectrum before and after'))
+    body.append(picture(_residual_figure(discovery), 'residual before and after'))
+    body.append(picture(_spectrum_figure(discovery), 'spectrum before and after'))
     first: dict[str, Score] = {}
     for score in discovery.search.first_scores:
         first.setdefault(score.candidate.effect.name, score)
     rows = [(n, f'{s.gain:.1f}', s.dof, f'{s.p:.2g}') for n, s in list(first.items())[:10]]
     body.append('<h2>Candidates at first sight</h2>')
     body.append('<p class=quiet>Gain in chi-square if added alone, to first order.</p>')
-    body.append(_table(('effect', 'gain', 'parameters', 'p'), rows))
+    body.append(table(('effect', 'gain', 'parameters', 'p'), rows))
     trace = '; '.join(discovery.search.trace) or 'nothing passed the screen'
     body.append(f'<h2>Provenance</h2><p class=quiet>Steps: {html.escape(trace)}.</p>')
     source = html.escape(json.dumps(_plain(provenance(discovery)), indent=1))
     body.append(f'<pre role="group" tabindex="0" aria-label="provenance">{source}</pre>')
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1"><title>psd-deflection discover</title>'
-        f'<style>{STYLE}</style></head><body><main>{"".join(body)}</main></body></html>'
-    )
+    return page('psd-deflection discover', body)
 
 
 def _plain(tree: Any) -> Any:

@@ -121,8 +121,8 @@ def _nested(flat: Mapping[str, object]) -> dict[str, Any]:
 def model_yaml(rig: Rig, effects: Sequence[ActiveEffect]) -> str:
     """What describes the rig, as a ROS 2 parameter file with ``effects`` instead of its own.
 
-    For a rig without a file of its own; :func:`psd_deflection.config.with_effects_section` adds them to a file. Port,
-    folders and page are left out: they belong to a machine.
+    For a rig without a file of its own; :func:`psd_deflection.parameter_files.with_effects_section` adds them to a
+    file. Port, folders and page are left out: they belong to a machine.
     """
     tree = _nested({name: rig.values[name] for name in DESCRIPTION})
     if effects:

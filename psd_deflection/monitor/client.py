@@ -12,7 +12,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import aiohttp
 
-from psd_deflection.errors import DaemonError, UsageError
+from psd_deflection.errors import ConfigError, DaemonError
 from psd_deflection.monitor.served import served_pages
 from psd_deflection.monitor.server import TOKEN_HEADER, TOKEN_VARIABLE
 
@@ -36,7 +36,7 @@ class Daemon(NamedTuple):
 def find_daemon(url: str | None) -> Daemon:
     """The daemon at ``url`` (a printed address, with or without its token), else the one of this user.
 
-    Raises DaemonError if several are running, UsageError if ``url`` is no address.
+    Raises DaemonError if several are running, ConfigError if ``url`` is no address.
     """
     pages = served_pages()
     if url is not None:
@@ -48,13 +48,13 @@ def find_daemon(url: str | None) -> Daemon:
         except ValueError:
             given = False
         if not given:
-            raise UsageError(f'--url {url}: is no address such as {DEFAULT_URL}')
+            raise ConfigError(f'url = {url}: is no address such as {DEFAULT_URL}')
         base = f'{parts.scheme}://{parts.netloc}/'
         token = parse_qs(parts.fragment).get('token', [''])[0] or next((p.token for p in pages if p.url == base), '')
         return Daemon(base, token or os.environ.get(TOKEN_VARIABLE, ''))
     if len(pages) > 1:
         listed = ', '.join(f'{p.url} ({p.name})' for p in pages)
-        raise DaemonError(f'several daemons are running: {listed}; choose one with --url')
+        raise DaemonError(f'several daemons are running: {listed}; give the address of one')
     if pages:
         return Daemon(pages[0].url, pages[0].token)
     # One of another user, such as a service.
@@ -83,7 +83,7 @@ async def _ask(daemon: Daemon, path: str, body: Mapping[str, object]) -> str:
     if not isinstance(message, str):
         raise DaemonError(f'{daemon.url}: {text[:200]!r} is no answer of a daemon (HTTP status {status})')
     if status != 200:
-        hint = '; give --url with that token' if status == 401 else ''
+        hint = '; give the address with that token' if status == 401 else ''
         raise DaemonError(f'{daemon.url}: {message}{hint}')
     return message
 
@@ -113,5 +113,5 @@ def _unreachable(daemon: Daemon, error: Exception) -> DaemonError:
     why = error.strerror if isinstance(error, OSError) and error.strerror else str(error) or 'no answer in time'
     return DaemonError(
         f'{daemon.url}: no daemon answers ({why}); start one with `psd-deflection monitor` or '
-        '`psd-deflection estimator --monitor`, or give the address that it printed as --url'
+        '`psd-deflection estimator --monitor`, or give the address that it printed'
     )

@@ -8,7 +8,12 @@ numbers. The few numbers between belong to no sample.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import Enum
+
+import numpy as np
+
+from psd_deflection.records import IntArray
 
 WRAP = 1 << 32
 
@@ -59,7 +64,7 @@ class SequenceExtender:
         behind = -ahead % WRAP
         if behind == 0 or (behind < NEARBY and t_device_us <= self._last_time):
             return last - behind, Step.REPEAT, 0
-        number = self._next_base() + seq % self._alignment
+        number = next_block(last, self._alignment) + seq % self._alignment
         self._offset = (number - seq) % WRAP
         self._last, self._last_time = number, t_device_us
         return number, Step.RESTART, 0
@@ -71,9 +76,72 @@ class SequenceExtender:
         """
         if self._last is None:
             return None
-        base = self._next_base()
+        base = next_block(self._last, self._alignment)
         self._offset, self._last, self._last_time = base % WRAP, base - 1, -1
         return base
 
-    def _next_base(self) -> int:
-        return -(-((self._last or 0) + 1) // self._alignment) * self._alignment
+
+class RecordedSequence:
+    """Extends the sample numbers of a recording, which has host times and no device times.
+
+    A number that goes back is a wrap if that many samples fit into the elapsed time; any other one is a restart, and
+    no block mixes the two runs. ``warn`` is called with a sentence, ``note_restart`` with the extended numbers before
+    and after. Numbers that were recorded ``whole`` do not wrap.
+    """
+
+    _FASTEST_HZ = 20_000
+
+    def __init__(self, block_size: int, warn: Callable[[str], None], note_restart: Callable[[int, int], None]) -> None:
+        self._block_size = block_size
+        self._warn = warn
+        self._note_restart = note_restart
+        self._wrapped = 0
+        self._moved = 0
+        self._last: int | None = None
+        self._last_t = -1
+
+    def follows(self, seq: IntArray, t_ns: IntArray, whole: bool) -> bool:
+        """Whether these samples continue the last ones without a number or time going back."""
+        return (
+            (self._last is None or int(seq[0]) + self._base(whole) > self._last)
+            and int(t_ns[0]) > self._last_t
+            and bool((np.diff(seq) > 0).all())
+            and bool((np.diff(t_ns) > 0).all())
+        )
+
+    def _base(self, whole: bool) -> int:
+        return self._moved if whole else self._moved + self._wrapped
+
+    def extended(self, seq: IntArray, t_ns: IntArray, whole: bool) -> IntArray:
+        """Numbers that increase from call to call. Raises ValueError if they do not increase within one call."""
+        seq = seq.copy()
+        if seq[-1] < seq[0] and not whole:
+            seq[seq < seq[0]] += WRAP
+        if bool((np.diff(seq) <= 0).any()):
+            raise ValueError('seq does not rise within the message')
+        if bool((np.diff(t_ns) <= 0).any()):
+            raise ValueError('dt does not rise within the message')
+        first = int(seq[0]) + self._base(whole)
+        if self._last is not None and first <= self._last:
+            self._go_on(self._last, first, int(t_ns[0]), whole)
+        if t_ns[0] <= self._last_t:
+            self._warn(f'time goes back to {t_ns[0]} ns')
+        seq += self._base(whole)
+        self._last, self._last_t = int(seq[-1]), int(t_ns[-1])
+        return seq
+
+    def _go_on(self, last: int, first: int, t_ns: int, whole: bool) -> None:
+        """Continue counting after ``last`` at ``first``, which is not greater."""
+        step = (first - last) % WRAP
+        if not whole and 0 < step <= 1000 + (t_ns - self._last_t) * self._FASTEST_HZ // 1_000_000_000:
+            self._wrapped += last + step - first
+            return
+        self._warn(f'sample numbers start again after {last}')
+        number = next_block(last, self._block_size) + first % self._block_size
+        self._moved += number - first
+        self._note_restart(last, number)
+
+
+def next_block(last: int, block_size: int) -> int:
+    """First number of the block after that of the sample ``last``: there the numbers of a restart continue."""
+    return (last // block_size + 1) * block_size

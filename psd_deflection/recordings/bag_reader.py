@@ -1,7 +1,7 @@
 """Reads bags (folders) and single MCAP files: our own and those of ``ros2 bag record`` and other programs.
 
-Sample numbers are recorded modulo 2^32. They are extended again here, so that the blocks are those of
-the writer (2^32 is not a multiple of 20).
+Sample numbers are recorded modulo 2^32. They are extended again, so that the blocks are those of the writer (2^32 is
+not a multiple of 20).
 """
 
 from __future__ import annotations
@@ -32,19 +32,18 @@ from msg_adapters import (
     wrench_stamped,
 )
 from msg_adapters.header import header, stamp_ns
-from psd_deflection.errors import RecordingError
-from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
-from psd_deflection.protocol.sequence import WRAP
+from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.foreign_yaml import tree_of_file
+from psd_deflection.protocol.sequence import RecordedSequence
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.allowance import Warnings
 from psd_deflection.recordings.bag_writer import META_CHANGE, META_HELLO, META_NODE, META_PARAMETERS, META_SOFTWARE
-from psd_deflection.recordings.clouds import CloudDecoder, Samples, joined_points
+from psd_deflection.recordings.clouds import CloudDecoder, joined_points
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.mcap_reader import McapReader, RawMessage
 from psd_deflection.recordings.recording import Recording, from_json
 from psd_deflection.records import (
     AppliedLoad,
-    IntArray,
     ParameterChange,
     RawChunk,
     ReferencePose,
@@ -132,6 +131,10 @@ class BagRecording(Recording):
     def _warn(self, text: str) -> None:
         self._own_warnings.add(f'{self.path}: {text}')
 
+    def _note_restart(self, last: int, first: int) -> None:
+        if len(self.restarts) < MAX_RESTARTS:
+            self.restarts.add((last, first))
+
     def _changes_in(self, metadata: Mapping[str, Mapping[str, str]]) -> list[ParameterChange]:
         out = []
         for name in sorted(n for n in metadata if n.startswith(META_CHANGE)):
@@ -200,7 +203,7 @@ class BagRecording(Recording):
         if len(found) > 1:
             choices = ', '.join(topic.removesuffix(SAMPLES) for topic in found)
             raise RecordingError(
-                f'{self.path}: holds the samples of {len(found)} rigs; choose one with --namespace: {choices}'
+                f'{self.path}: holds the samples of {len(found)} rigs; give the namespace of one: {choices}'
             )
         return found[0].removesuffix(SAMPLES) if found else ''
 
@@ -254,13 +257,17 @@ class BagRecording(Recording):
         yield from blocks
 
     def _chunks(self) -> Iterator[RawChunk]:
-        count = _SequenceCounter(self.block_size, self._warn, self.restarts)
+        count = RecordedSequence(self.block_size, self._warn, self._note_restart)
         for log_time, messages in self._clouds():
             together = joined_points(messages)
-            parts = [together] if count.follows(together) else [joined_points([m]) for m in messages]
+            parts = (
+                [together]
+                if count.follows(together.seq, together.t_ns, together.whole)
+                else [joined_points([m]) for m in messages]
+            )
             for part in parts:
                 try:
-                    seq = count.extended(part)
+                    seq = count.extended(part.seq, part.t_ns, part.whole)
                 except ValueError as error:
                     raise RecordingError(f'{self.path}: {SAMPLES} at log time {log_time} ns: {error}') from None
                 _, _, t_ns, volts, flags = part
@@ -341,70 +348,6 @@ class BagRecording(Recording):
         return {topic: _series(topic, found) for topic, found in rows.items()}
 
 
-class _SequenceCounter:
-    """Extends 32-bit sample numbers, as in recordings of other programs and in ours before the first wrap.
-
-    A number that goes back is a wrap if that many samples fit into the elapsed time. Otherwise the device
-    has restarted; then counting continues in the next block, so that no block mixes the two runs.
-    """
-
-    _FASTEST_HZ = 20_000
-
-    def __init__(self, block_size: int, warn: Callable[[str], None], restarts: set[tuple[int, int]]) -> None:
-        self._restarts = restarts
-        self._wrapped = 0
-        self._moved = 0
-        self._block_size = block_size
-        self._warn = warn
-        self._last: int | None = None
-        self._last_t = -1
-
-    def follows(self, samples: Samples) -> bool:
-        """Whether these samples continue the last ones without a number or time going back."""
-        return (
-            (self._last is None or int(samples.seq[0]) + self._base_of(samples) > self._last)
-            and int(samples.t_ns[0]) > self._last_t
-            and bool((np.diff(samples.seq) > 0).all())
-            and bool((np.diff(samples.t_ns) > 0).all())
-        )
-
-    def _base_of(self, samples: Samples) -> int:
-        return self._moved if samples.whole else self._moved + self._wrapped
-
-    def extended(self, samples: Samples) -> IntArray:
-        """Numbers that increase from call to call. Raises ValueError if they do not increase within one call."""
-        seq, t_ns = samples.seq.copy(), samples.t_ns
-        if seq[-1] < seq[0] and not samples.whole:
-            seq[seq < seq[0]] += WRAP
-        if bool((np.diff(seq) <= 0).any()):
-            raise ValueError('seq does not rise within the message')
-        if bool((np.diff(t_ns) <= 0).any()):
-            raise ValueError('dt does not rise within the message')
-        base = self._base_of(samples)
-        first = int(seq[0]) + base
-        if self._last is not None and first <= self._last:
-            self._go_on(self._last, first, int(t_ns[0]), samples.whole)
-            base = self._base_of(samples)
-        if t_ns[0] <= self._last_t:
-            self._warn(f'time goes back in {SAMPLES} to {t_ns[0]} ns')
-        seq += base
-        self._last, self._last_t = int(seq[-1]), int(t_ns[-1])
-        return seq
-
-    def _go_on(self, last: int, first: int, t_ns: int, whole: bool) -> None:
-        """Continue counting after ``last`` at ``first``, which is not greater."""
-        step = (first - last) % WRAP
-        if not whole and 0 < step <= 1000 + (t_ns - self._last_t) * self._FASTEST_HZ // 1_000_000_000:
-            self._wrapped += last + step - first
-            return
-        self._warn(f'sample numbers start again after {last}')
-        size = self._block_size
-        move = (last // size + 1 - first // size) * size
-        self._moved += move
-        if len(self._restarts) < MAX_RESTARTS:
-            self._restarts.add((last, first + move))
-
-
 def _to_change(t_ns: int, block: int, tree: Mapping[str, object]) -> ParameterChange:
     def number(value: object) -> float:
         # Unchanged: an integer must be read back as an integer.
@@ -443,11 +386,9 @@ def read_information(path: Path) -> dict[str, Any]:
     """The content of ``metadata.yaml``. Raises RecordingError if it cannot be used."""
     way_out = '`psd-deflection recover` makes it anew'
     try:
-        tree = parse_yaml(read_text(path, MAX_YAML_BYTES))
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
-    except YamlError as error:
-        raise RecordingError(f'{path}{error.where}: {error}; {way_out}') from None
+        tree = tree_of_file(path, "bag's metadata", MAX_YAML_BYTES)
+    except ConfigError as error:
+        raise RecordingError(f'{error}; {way_out}') from None
     information = tree.get('rosbag2_bagfile_information') if isinstance(tree, dict) else None
     if not isinstance(information, dict):
         raise RecordingError(f'{path}: has no rosbag2_bagfile_information; {way_out}')

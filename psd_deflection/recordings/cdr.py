@@ -27,8 +27,11 @@ _Writer = Callable[[bytearray, Any], None]
 
 _ENCAPSULATION = b'\x00\x01\x00\x00'
 LITTLE = b'\x00\x01'
-STAMP = struct.Struct('<iI')
-U32 = struct.Struct('<I')
+FRAME_AT = 12
+"""Offset of a header's frame: behind the encapsulation and the stamp."""
+_STAMP = struct.Struct('<iI')
+_U32 = struct.Struct('<I')
+_U32_BIG = struct.Struct('>I')
 _FLOAT64 = re.compile(r'float64(?:\[(\d+)\])?')
 _ARRAY = re.compile(r'(.+)\[(\d*)\]')
 _FORMATS = {
@@ -87,7 +90,7 @@ def _writer(message: MessageType, kind: str) -> _Writer:
 
 
 def _write_size(out: bytearray, size: int) -> None:
-    out += bytes(-len(out) % 4) + U32.pack(size)
+    out += bytes(-len(out) % 4) + _U32.pack(size)
 
 
 def _write_text(out: bytearray, value: str) -> None:
@@ -226,13 +229,29 @@ def numbers(type_name: str, cdr: bytes) -> tuple[int, tuple[float, ...]]:
     if cdr[:2] != LITTLE:
         raise ValueError('is not little-endian CDR')
     try:
-        sec, nanosec = STAMP.unpack_from(cdr, 4)
-        (length,) = U32.unpack_from(cdr, 12)
+        (length,) = _U32.unpack_from(cdr, FRAME_AT)
         # Alignment counts from behind the encapsulation.
         at = 4 + (12 + length + 7) // 8 * 8
-        return sec * 1_000_000_000 + nanosec, _doubles(type_name).unpack_from(cdr, at)
+        return header_stamp_ns(cdr), _doubles(type_name).unpack_from(cdr, at)
     except struct.error:
         raise ValueError('is shorter than its type') from None
+
+
+def header_stamp_ns(cdr: bytes) -> int:
+    """The stamp of a little-endian message that begins with a header, ns. Raises struct.error if it is too short."""
+    sec, nanosec = _STAMP.unpack_from(cdr, 4)
+    return int(sec) * 1_000_000_000 + int(nanosec)
+
+
+def u32(cdr: bytes, at: int) -> int:
+    """The uint32 at the offset ``at``, in the message's byte order. Raises struct.error behind the end."""
+    (value,) = (_U32 if cdr[:2] == LITTLE else _U32_BIG).unpack_from(cdr, at)
+    return int(value)
+
+
+def after_text(cdr: bytes, at: int) -> int:
+    """Offset of a number of four bytes that follows the text at the offset ``at``. Raises struct.error."""
+    return at + 4 + (u32(cdr, at) + 3) // 4 * 4
 
 
 def _plain(value: Any) -> Any:

@@ -16,7 +16,6 @@ import numpy.typing as npt
 from msg_adapters import point_cloud2
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.allowance import MAX_FIELDS
-from psd_deflection.recordings.cdr import LITTLE, STAMP, U32
 from psd_deflection.records import CHANNELS, IntArray
 
 
@@ -42,49 +41,38 @@ class CloudDecoder:
     def decode(self, message: bytes) -> tuple[int, npt.NDArray[np.void]]:
         """(header.stamp in ns, the points). Raises ValueError if it is not a PointCloud2."""
         for width_at, row_step_at, before_width, after_width, dtype in self._layouts:
-            if message[12:width_at] == before_width and message[width_at + 4 : row_step_at] == after_width:
+            if message[cdr.FRAME_AT : width_at] == before_width and message[width_at + 4 : row_step_at] == after_width:
                 try:
-                    sec, nanosec = STAMP.unpack_from(message, 4)
-                    (width,) = U32.unpack_from(message, width_at)
-                    (size,) = U32.unpack_from(message, row_step_at + 4)
-                    if width * dtype.itemsize != size:
+                    width = cdr.u32(message, width_at)
+                    if width * dtype.itemsize != cdr.u32(message, row_step_at + 4):
                         break
-                    return sec * 1_000_000_000 + nanosec, np.frombuffer(message, dtype, width, row_step_at + 8)
+                    return cdr.header_stamp_ns(message), np.frombuffer(message, dtype, width, row_step_at + 8)
                 except (struct.error, ValueError):
                     raise ValueError('is shorter than it declares') from None
         if _declared_fields(message) > MAX_FIELDS:
             raise ValueError(f'it declares more than {MAX_FIELDS} fields')
         stamp, points = point_cloud2.to_points(cdr.decode(point_cloud2.MESSAGE.name, message))
-        if message[:2] == LITTLE and len(self._layouts) < self._MOST:
+        if message[:2] == cdr.LITTLE and len(self._layouts) < self._MOST:
             self._layouts.append(_learn(message, points.dtype))
         return stamp, points
 
 
 def _declared_fields(message: bytes) -> int:
     """How many fields a PointCloud2 declares, before any is decoded; 0 if the message ends before that."""
-    order = '<I' if message[:2] == LITTLE else '>I'
     try:
-        (length,) = struct.unpack_from(order, message, 12)
-        (count,) = struct.unpack_from(order, message, 16 + (length + 3) // 4 * 4 + 8)
+        return cdr.u32(message, cdr.after_text(message, cdr.FRAME_AT) + 8)
     except struct.error:
         return 0
-    return int(count)
 
 
 def _learn(message: bytes, dtype: np.dtype[np.void]) -> _Layout:
     """Offsets of the parts that change from one message to the next; ``message`` must be valid."""
-
-    def after_text(at: int) -> int:
-        (length,) = U32.unpack_from(message, at)
-        return at + 4 + (int(length) + 3) // 4 * 4
-
-    width_at = after_text(12) + 4
-    (count,) = U32.unpack_from(message, width_at + 4)
+    width_at = cdr.after_text(message, cdr.FRAME_AT) + 4
     at = width_at + 8
-    for _ in range(count):
-        at = after_text(at) + 12
+    for _ in range(cdr.u32(message, width_at + 4)):
+        at = cdr.after_text(message, at) + 12
     row_step_at = at + 8
-    return _Layout(width_at, row_step_at, message[12:width_at], message[width_at + 4 : row_step_at], dtype)
+    return _Layout(width_at, row_step_at, message[cdr.FRAME_AT : width_at], message[width_at + 4 : row_step_at], dtype)
 
 
 class Samples(NamedTuple):

@@ -119,7 +119,7 @@ class Comparison:
             return (
                 f'compared: {self.equal} messages that both hold, no bit differs\n'
                 f'  the recording is partial: {self.only_recorded} messages are only in it, '
-                f'{self.only_replayed} only in the replay (--strict counts them as differences)'
+                f'{self.only_replayed} only in the replay'
             )
         lines = [
             f'compared: {self.equal} messages equal, {self.different} differ, '
@@ -203,7 +203,4 @@ class Comparison:
 
 def _stamp(encoded: bytes, log_time: int) -> int:
     """The header's stamp, ns: all our messages begin with one."""
-    if len(encoded) < 12:
-        return log_time
-    sec = int.from_bytes(encoded[4:8], 'little', signed=True)
-    return sec * 1_000_000_000 + int.from_bytes(encoded[8:12], 'little')
+    return cdr.header_stamp_ns(encoded) if len(encoded) >= cdr.FRAME_AT else log_time

@@ -1,4 +1,4 @@
-"""Copies the samples of a recording, and what was recorded beside them, to a recording of another format."""
+"""Converts a recording: copies its samples and what was recorded beside them, or writes what is computed of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from psd_deflection.config import Rig
+from psd_deflection.pipeline import Pipeline, PipelineCounters
 from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.replay_engine import replayed
 from psd_deflection.recordings.sinks import is_csv, open_sink
 from psd_deflection.records import AppliedLoad, ParameterChange, Record, ReferencePose, SampleBlock, TemperatureReading
 
@@ -50,3 +53,13 @@ def convert(
             sink.put(record)
             samples += len(record.seq) if isinstance(record, SampleBlock) else 0
     return samples
+
+
+def convert_computed(recording: Recording, out: Path, rig: Rig, blocks: Iterable[SampleBlock]) -> PipelineCounters:
+    """Write what ``rig`` computes of ``recording`` and its ``blocks`` to ``out``. Raises RecordingError."""
+    pipeline = Pipeline(rig)
+    with contextlib.closing(open_sink(out, rig.flat(), title=recording.path.stem)) as sink:
+        for records in replayed(recording, pipeline, blocks):
+            for record in records:
+                sink.put(record)
+    return pipeline.counters

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from psd_deflection.calibration import Wiring
-from psd_deflection.config import MAX_FILE_BYTES, Rig, replace_values
+from psd_deflection.config import Rig, replace_values
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.errors import ConfigError, RecordingError
-from psd_deflection.foreign_yaml import YamlError, parse_yaml, read_text
+from psd_deflection.foreign_yaml import tree_of_file
 from psd_deflection.recordings.csv_reader import CsvRecording
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
@@ -147,12 +147,7 @@ def read_observations(
 
 
 def _listed(path: Path) -> list[tuple[str, dict[str, object]]]:
-    try:
-        tree = parse_yaml(read_text(path, MAX_FILE_BYTES))
-    except OSError as error:
-        raise ConfigError(f'{path}: cannot be read as a list of recordings ({error.strerror or error})') from None
-    except YamlError as error:
-        raise ConfigError(f'{path}{error.where}: {error}') from None
+    tree = tree_of_file(path, 'list of recordings')
     if not isinstance(tree, list) or not tree:
         raise ConfigError(f'{path}: must be a list of "- recording: FILE" with optional "overrides:"')
     out: list[tuple[str, dict[str, object]]] = []

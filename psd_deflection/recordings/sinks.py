@@ -28,6 +28,11 @@ def is_csv(path: str | Path) -> bool:
     return Path(path).suffix.lower() == '.csv'
 
 
+def is_for_viewing(path: str | Path) -> bool:
+    """Whether :func:`open_sink` writes a file there that holds what is computed and cannot be read back."""
+    return Path(path).suffix.lower() == '.rrd'
+
+
 def open_sink(
     path: str | Path,
     rig_values: Mapping[str, object],
@@ -43,13 +48,12 @@ def open_sink(
     Raises RecordingError if ``path`` exists or cannot be made, ConfigError if rerun is not installed.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
     if is_csv(path):
         if samples_with is not None:
             return CsvSampleSink(path, samples_with)
         return CsvEstimateSink(path, rig_from_values(rig_values, str(path)).estimator.solvers)
-    if suffix == '.rrd':
+    if is_for_viewing(path):
         return RerunFile(path, rig_from_values(rig_values, str(path)), title)
-    if suffix == '.mcap':
+    if path.suffix.lower() == '.mcap':
         return McapFile(path, rig_values=rig_values, device_hello=device_hello)
     return BagWriter(path, rig_values=rig_values, device_hello=device_hello)

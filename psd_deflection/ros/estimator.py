@@ -139,11 +139,11 @@ class EstimatorNode:
         shown = session.rig.monitor
         if shown.publish_volts:
             session.processing.sinks.append(VoltsPublisher(self._wire, shown.frame_prefix))
-        if shown.publish_tf and not installed():
-            self._say('tf2_msgs is not installed: no frames on /tf (publish_tf)')
-        elif shown.publish_tf:
+        if shown.publish_tf and installed():
             self._transforms = TransformPublisher(self.node, session.rig)
             session.processing.sinks.append(self._transforms)
+        elif shown.publish_tf and 'publish_tf' in self._live.given:
+            self._say(Warned('tf2_msgs is not installed: no frames on /tf (publish_tf)'))
         if shown.markers:
             # Imported here: only the markers need visualization_msgs.
             from psd_deflection.ros.markers import RigMarkers

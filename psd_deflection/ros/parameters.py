@@ -50,8 +50,8 @@ _SIMULATED = ParameterDescriptor(
 )
 
 
-def rig_of_node(node: Node) -> Rig:
-    """The rig that the node's overrides describe; its parameters are declared.
+def rig_of_node(node: Node) -> tuple[Rig, set[str]]:
+    """The rig that the node's overrides describe, and their names; its parameters are declared.
 
     The node was made with ``automatically_declare_parameters_from_overrides``. Raises ConfigError
     for an unknown parameter, a wrong type or a value out of bounds.
@@ -66,7 +66,7 @@ def rig_of_node(node: Node) -> Rig:
         if name in given:
             node.undeclare_parameter(name)
         node.declare_parameter(name, value, descriptor, ignore_override=True)
-    return rig
+    return rig, set(given)
 
 
 def _ros_values(rig: Rig) -> dict[str, Any]:
@@ -126,13 +126,14 @@ class _UnknownParameterError(ParameterNotDeclaredException):  # type: ignore[mis
 class LiveParameters:
     """Carries out changes of the node's parameters, or refuses them.
 
-    ``rig``: as the parameters describe it. ``session``: the one that runs while the node is configured, or None.
+    ``rig``: as the parameters describe it. ``given``: names of those that the user has set. ``session``: the one that
+    runs while the node is configured, or None.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._showing = False
-        self.rig = rig_of_node(node)
+        self.rig, self.given = rig_of_node(node)
         self._zeros = {name: self.rig.values[name] for name in ZEROS}
         self.session: Session | None = None
         node.add_pre_set_parameters_callback(self._known)
@@ -199,6 +200,7 @@ class LiveParameters:
             rig = replace_values(self.rig, new, SOURCE)
             _check_solvers(rig)
             self.rig = rig
+            self.given |= set(new)
             self._zeros |= {name: rig.values[name] for name in ZEROS if name in new}
             return
         fixed = [name for name in new if name not in BY_NAME or not BY_NAME[name].live]

@@ -9,7 +9,7 @@ import numpy as np
 
 from psd_deflection.calibration import counts_to_volts
 from psd_deflection.commissioning.checkup import Checkup, check
-from psd_deflection.commissioning.guide import Guide, Step
+from psd_deflection.commissioning.guide import Guide, Phase
 from psd_deflection.commissioning.levels import levels
 from psd_deflection.config import Rig, replace_values
 from psd_deflection.errors import DeviceError
@@ -62,7 +62,7 @@ def _lead(
     guide = Guide(rig)
     prompt = ''
     silent = 0
-    while guide.step is not Step.DONE:
+    while guide.phase is not Phase.DONE:
         if guide.prompt() != prompt:
             prompt = guide.prompt()
             say(prompt)
@@ -92,7 +92,7 @@ def _lead(
 
 def _simulated_push(rig: Rig, guide: Guide) -> tuple[float, float, float]:
     """The load that a helpful hand holds now: N, N, N m."""
-    if guide.step is not Step.PUSH:
+    if guide.phase is not Phase.PUSH:
         return (0.0, 0.0, 0.0)
     statics = LinkStatics.from_rig(rig)
     lever = float(abs(rig.centers + rig.zeros).max())

@@ -140,21 +140,7 @@ def make_active(name: str, values: Mapping[str, object], source: str) -> ActiveE
                 raise ConfigError(f'{source}: {p.name} is missing: {name} needs it ({p.description}, {p.unit or "1"})')
             out[p.name] = p.nominal
             continue
-        raw = values[p.name]
-        try:
-            value = float(raw)  # type: ignore[arg-type]
-        except (TypeError, ValueError):
-            raise ConfigError(f'{source}: {p.name} = {raw!r}: must be a number') from None
-        if isinstance(raw, bool) or not math.isfinite(value):
-            raise ConfigError(f'{source}: {p.name} = {raw!r}: must be a finite number')
-        if p.choices and value not in p.choices:
-            raise ConfigError(f'{source}: {p.name} = {raw!r}: must be one of {", ".join(map(str, p.choices))}')
-        if not p.minimum <= value <= p.maximum:
-            unit = f' {p.unit}' if p.unit else ''
-            raise ConfigError(
-                f'{source}: {p.name} = {raw!r}{unit}: must be at least {p.minimum:g} and at most {p.maximum:g}'
-            )
-        out[p.name] = value
+        out[p.name] = p.checked(values[p.name], source)
     sizes = [p.name for p in effect.parameters if p.kind == 'amplitude']
     if not any(name in values for name in sizes):
         raise ConfigError(

@@ -10,11 +10,13 @@ import itertools
 import typing
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
+from psd_deflection.errors import ConfigError
+from psd_deflection.parameters import Parameter, check_value, shown
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.physics import Physics
+from psd_deflection.simulation.samples import SimulatedSamples
 
 Stage = Literal['load', 'link', 'optics', 'psd', 'electronics']
 Point = Literal['configure', 'load', 'static', 'pose', 'beam', 'dots', 'volts', 'output']
@@ -69,6 +71,18 @@ class EffectParameter:
     required: bool = False
     each: bool = False
     within: Callable[[Physics, Values], tuple[float, float]] | None = None
+
+    def checked(self, value: object, source: str) -> float:
+        """``value`` as a number. Raises ConfigError as :func:`check_value` does."""
+        if not self.choices:
+            low, high = self.minimum, self.maximum
+            declared = Parameter(self.name, 'double', self.nominal, self.unit, self.description, low, high)
+            return cast(float, check_value(declared, value, source))
+        number = cast(float, check_value(Parameter(self.name, 'double', 0.0, self.unit, ''), value, source))
+        if number not in self.choices:
+            words = ', '.join(map(str, self.choices))
+            raise ConfigError(f'{source}: {self.name} = {shown(value)}: must be one of {words}')
+        return number
 
     def off(self, physics: Physics) -> float:
         """The nominal value on this rig."""
@@ -134,7 +148,7 @@ class Effect:
     """One physical effect: its description, where it acts, and how.
 
     ``equation`` and ``source`` are for the reader. ``needs``: the excitation that shows it.
-    ``configure`` changes the constants before a run; ``apply`` changes a chunk at ``point``;
+    ``configure`` changes the constants before a run; ``apply`` changes samples at ``point``;
     ``correct`` undoes it on a reading, if that is possible without the load. An effect that moves
     the beams (``point`` is ``beam``) or changes the constants of the optics needs no ``correct``.
     ``trace_back`` undoes it on a block's pose (``point`` is ``static`` or ``pose``) or on the loads (``load``), for the
@@ -154,7 +168,7 @@ class Effect:
     parameters: tuple[EffectParameter, ...]
     point: Point
     configure: Callable[[Physics, Values], None] | None = None
-    apply: Callable[[Chunk, Values, State], None] | None = None
+    apply: Callable[[SimulatedSamples, Values, State], None] | None = None
     correct: Callable[[Reading, Values], None] | None = None
     trace_back: Callable[[Traced, Values, list[float]], None] | None = None
     uses: frozenset[Use] = frozenset()

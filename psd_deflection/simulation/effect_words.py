@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from psd_deflection.config import EFFECTS_PREFIX, Rig, flattened, replace_values
+from psd_deflection.config import Rig, replace_values
 from psd_deflection.errors import ConfigError
+from psd_deflection.parameter_files import EFFECTS_PREFIX, flattened
 from psd_deflection.parameters import shown
 from psd_deflection.simulation.catalogue import effects_of_rig
 

@@ -1,7 +1,7 @@
 """The forward model: from loads to converter counts, all at once or in steps of any size.
 
-Theory of operation. A :class:`Chunk` holds consecutive samples, one row per quantity, and passes
-the stages in order. The simulator keeps the state between chunks (modes, hysteresis, delays), so a
+Theory of operation. A :class:`SimulatedSamples` holds consecutive samples, one row per quantity, and passes
+the stages in order. The simulator keeps the state between steps (modes, hysteresis, delays), so a
 history cut anywhere gives the same samples bit for bit. For this reason every operation is
 elementwise or a recursive filter, and the noise is drawn sample by sample. Effects act at named
 points (:data:`~psd_deflection.simulation.declaration.Point`).
@@ -20,16 +20,16 @@ from psd_deflection.calibration import Wiring
 from psd_deflection.config import Rig
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.catalogue import effects_of_rig
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import ActiveEffect, State
 from psd_deflection.simulation.modes import Filter, mode_coefficients
 from psd_deflection.simulation.optics import dots_on_plate
 from psd_deflection.simulation.physics import Physics
+from psd_deflection.simulation.samples import SimulatedSamples
 from psd_deflection.solvers.registry import check_arrangement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SimulatedChunk:
+class SimulatedStep:
     """The result of :meth:`RigSimulator.step` for n samples.
 
     ``counts`` int32 (n, 6): converter counts in the order of ``CHANNELS``. ``pose`` (n, 3): true
@@ -70,7 +70,7 @@ class ForwardModel:
         self._count = 0
         self._first_temperature: float | None = None
 
-    def run(self, loads: FloatArray, temperature: FloatArray | None = None) -> Chunk:
+    def run(self, loads: FloatArray, temperature: FloatArray | None = None) -> SimulatedSamples:
         """The next n samples, up to the amplifier's volts: ``loads`` (n, 3) N, N, N m.
 
         ``temperature`` (n,), degrees Celsius; None is a steady one.
@@ -87,40 +87,40 @@ class ForwardModel:
             t += p.phase
         self._count += n
         self._asked = {}
-        chunk = Chunk(t, warmer, np.array(np.asarray(loads, dtype=np.float64).T, order='C'), p)
-        self._at('load', chunk)
-        chunk.static = np.empty((3, n))
-        chunk.static[0] = chunk.loads[0] * p.force_compliance
-        chunk.static[1] = chunk.loads[1] * p.force_compliance
-        chunk.static[2] = chunk.loads[2] * p.torque_compliance
-        self._at('static', chunk)
-        chunk.pose = np.empty((3, n))
+        samples = SimulatedSamples(t, warmer, np.array(np.asarray(loads, dtype=np.float64).T, order='C'), p)
+        self._at('load', samples)
+        samples.static = np.empty((3, n))
+        samples.static[0] = samples.loads[0] * p.force_compliance
+        samples.static[1] = samples.loads[1] * p.force_compliance
+        samples.static[2] = samples.loads[2] * p.torque_compliance
+        self._at('static', samples)
+        samples.pose = np.empty((3, n))
         for axis, mode in enumerate(self._modes):
-            held = chunk.static[axis] + p.static_offset[axis] if axis < 2 else chunk.static[axis]
-            chunk.pose[axis] = mode(held)
-        self._at('pose', chunk)
-        chunk.beams = np.repeat(p.beams.reshape(4, 1), n, axis=1)
-        self._at('beam', chunk)
-        chunk.true_dots = dots_on_plate(chunk.pose, chunk.beams, p)
-        chunk.dots = chunk.true_dots.copy()
-        chunk.sums = np.full((2, n), p.sum_nominal)
-        self._at('dots', chunk)
-        chunk.volts = np.empty((6, n))
+            held = samples.static[axis] + p.static_offset[axis] if axis < 2 else samples.static[axis]
+            samples.pose[axis] = mode(held)
+        self._at('pose', samples)
+        samples.beams = np.repeat(p.beams.reshape(4, 1), n, axis=1)
+        self._at('beam', samples)
+        samples.true_dots = dots_on_plate(samples.pose, samples.beams, p)
+        samples.dots = samples.true_dots.copy()
+        samples.sums = np.full((2, n), p.sum_nominal)
+        self._at('dots', samples)
+        samples.volts = np.empty((6, n))
         for psd in range(2):
-            chunk.volts[3 * psd : 3 * psd + 2] = chunk.dots[2 * psd : 2 * psd + 2] / p.sensitivity[psd, :, None]
-            chunk.volts[3 * psd + 2] = chunk.sums[psd]
+            samples.volts[3 * psd : 3 * psd + 2] = samples.dots[2 * psd : 2 * psd + 2] / p.sensitivity[psd, :, None]
+            samples.volts[3 * psd + 2] = samples.sums[psd]
         for i, active in enumerate(self.effects):
             if active.effect.point == 'volts':
-                chunk.between = partial(self._volts_between, i, chunk, loads, temperature)
-                self._apply(i, chunk)
-        return chunk
+                samples.between = partial(self._volts_between, i, samples, loads, temperature)
+                self._apply(i, samples)
+        return samples
 
     def _volts_between(
-        self, before: int, chunk: Chunk, loads: FloatArray, temperature: FloatArray | None, phase: float
+        self, before: int, samples: SimulatedSamples, loads: FloatArray, temperature: FloatArray | None, phase: float
     ) -> FloatArray:
         """The volts (6, n) ``phase`` s after each sample, by the effects before effect number ``before``."""
         if phase == self.physics.phase:
-            return chunk.volts.copy()
+            return samples.volts.copy()
         key = (before, phase)
         if key not in self._between:
             self._between[key] = ForwardModel(self._rig, self.effects[:before], phase)
@@ -128,31 +128,31 @@ class ForwardModel:
             self._asked[key] = self._between[key].run(loads, temperature).volts
         return self._asked[key].copy()
 
-    def finish(self, chunk: Chunk) -> None:
+    def finish(self, samples: SimulatedSamples) -> None:
         """Apply the effects that act on the noisy signal: clipping and coarse steps."""
-        self._at('output', chunk)
+        self._at('output', samples)
 
-    def expect(self, loads: FloatArray, temperature: FloatArray | None = None) -> Chunk:
+    def expect(self, loads: FloatArray, temperature: FloatArray | None = None) -> SimulatedSamples:
         """Like :meth:`run`, then the mean of the output over the rig's noise.
 
         Values beyond the converter's range are limited to its ends, as in a recording.
         """
-        chunk = self.run(loads, temperature)
-        chunk.noise = self.physics.noise
-        self.finish(chunk)
+        samples = self.run(loads, temperature)
+        samples.noise = self.physics.noise
+        self.finish(samples)
         full = self.physics.full_scale
-        np.clip(chunk.volts, -full, full - self.physics.volts_per_count, out=chunk.volts)
-        return chunk
+        np.clip(samples.volts, -full, full - self.physics.volts_per_count, out=samples.volts)
+        return samples
 
-    def _at(self, point: str, chunk: Chunk) -> None:
+    def _at(self, point: str, samples: SimulatedSamples) -> None:
         for i, active in enumerate(self.effects):
             if active.effect.point == point:
-                self._apply(i, chunk)
+                self._apply(i, samples)
 
-    def _apply(self, number: int, chunk: Chunk) -> None:
+    def _apply(self, number: int, samples: SimulatedSamples) -> None:
         active = self.effects[number]
         if active.effect.apply is not None:
-            active.effect.apply(chunk, active.values, self._states[number])
+            active.effect.apply(samples, active.values, self._states[number])
 
 
 class RigSimulator:
@@ -169,18 +169,20 @@ class RigSimulator:
         self._noise = np.random.default_rng(seed)
         self._wiring = Wiring.from_rig(rig)
 
-    def step(self, loads: FloatArray, temperature: FloatArray | None = None) -> SimulatedChunk:
+    def step(self, loads: FloatArray, temperature: FloatArray | None = None) -> SimulatedStep:
         """The next n samples: ``loads`` (n, 3) Fx N, Fy N, Tz N m at the tip centroid.
 
         ``temperature`` (n,), degrees Celsius, or None.
         """
-        chunk = self._model.run(loads, temperature)
+        samples = self._model.run(loads, temperature)
         p = self._model.physics
-        chunk.volts += (p.noise * self._noise.standard_normal((len(loads), 6))).T
-        self._model.finish(chunk)
+        samples.volts += (p.noise * self._noise.standard_normal((len(loads), 6))).T
+        self._model.finish(samples)
         limit = round(p.full_scale / p.volts_per_count)
-        volts = self._wiring.to_device(chunk.volts.T)
+        volts = self._wiring.to_device(samples.volts.T)
         counts = np.clip(np.rint(volts / p.volts_per_count), -limit, limit - 1).astype(np.int32)
-        return SimulatedChunk(
-            np.ascontiguousarray(counts), np.ascontiguousarray(chunk.pose.T), np.ascontiguousarray(chunk.true_dots.T)
+        return SimulatedStep(
+            np.ascontiguousarray(counts),
+            np.ascontiguousarray(samples.pose.T),
+            np.ascontiguousarray(samples.true_dots.T),
         )

@@ -6,6 +6,7 @@ method's own error, without noise. ``psd-deflection compare-methods`` prints it.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -135,7 +136,14 @@ def solve(method: Method, geometry: Geometry, dots: FloatArray) -> Solutions:
 
 
 def errors(method: Method, condition: str) -> Errors:
-    """One cell of the table."""
+    """One cell of the table; ``method`` is one of :func:`methods`."""
+    return _cell(method.label, condition)
+
+
+@functools.cache
+def _cell(label: str, condition: str) -> Errors:
+    # The table and two figures of one command need it: of the slow methods it takes seconds.
+    (method,) = (m for m in methods() if m.label == label)
     geometry = thesis_geometry()
     poses = grid(condition, geometry)
     found = solve(method, geometry, dots_of(geometry, poses))

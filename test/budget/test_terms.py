@@ -295,7 +295,7 @@ def test_a_bad_input_is_refused_by_name(settings: dict[str, object], said: str) 
     assert next(iter(settings)) in str(error.value)
 
 
-@pytest.mark.parametrize(('text', 'said'), [('- 1', 'name: value'), ('{', 'cannot be read'), ('x: 1', 'no such input')])
+@pytest.mark.parametrize(('text', 'said'), [('- 1', 'name: value'), ('{', 'malformed YAML'), ('x: 1', 'no such input')])
 def test_a_bad_file_of_inputs_is_refused_by_name(tmp_path: Path, text: str, said: str) -> None:
     path = tmp_path / 'inputs.yaml'
     path.write_text(text)

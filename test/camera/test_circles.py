@@ -72,4 +72,4 @@ def test_a_tilt_of_the_plate_is_seen_and_does_not_turn_theta() -> None:
     poses = [*STILL, Pose(theta=0.1, phi=0.12, omega=-0.1)]
     answer = measured(Scene(tilt=(0.2, 0.1)), poses)[-1]
     assert answer.theta == pytest.approx(0.1, abs=5e-4)
-    assert (answer.phi, answer.omega) == (pytest.approx(0.12, abs=0.01), pytest.approx(-0.1, abs=0.01))
+    assert [answer.phi, answer.omega] == pytest.approx([0.12, -0.1], abs=0.01)

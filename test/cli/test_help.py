@@ -25,9 +25,10 @@ ENDLESS = (
     'discover',
     'devices',
     'simulate --serve',
+    'validate',
     'compare-methods --out',
 )
-"""Examples that go on until Ctrl-C, take long, or want a device: only their options are parsed."""
+"""Examples that go on until Ctrl-C, take long, or want a device or a reference: only their options are parsed."""
 
 
 def help_of(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, columns: int) -> str:

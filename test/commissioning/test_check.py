@@ -21,8 +21,9 @@ from psd_deflection.commissioning.checkup import CANNOT_TELL, RIGHT, WRONG, Chec
 from psd_deflection.commissioning.levels import levels
 from psd_deflection.commissioning.responses import responses
 from psd_deflection.commissioning.wirings import WIRINGS, differences, parameters
-from psd_deflection.config import Rig, load_rig, read_parameter_file, rig_from_values
+from psd_deflection.config import Rig, load_rig, rig_from_values
 from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.parameter_files import read_parameter_file
 from psd_deflection.records import FloatArray
 
 CLOUD = 2e-3 * 0.5e-3

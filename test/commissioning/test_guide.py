@@ -9,7 +9,7 @@ import pytest
 
 from psd_deflection.calibration import Wiring
 from psd_deflection.commissioning.checkup import RIGHT, WRONG, Checkup, check
-from psd_deflection.commissioning.guide import Guide, Step, directions
+from psd_deflection.commissioning.guide import Guide, Phase, directions
 from psd_deflection.commissioning.levels import levels
 from psd_deflection.commissioning.wirings import WIRINGS, parameters
 from psd_deflection.config import Rig, load_rig, rig_from_values
@@ -42,9 +42,9 @@ def led(known: Rig, bench: Bench, hand: tuple[FloatArray, ...], most: float = 60
     now, wanted = np.zeros(3), np.zeros(3)
     late: list[FloatArray] = [np.zeros(3)] * 16
     for _ in range(round(most * 50)):
-        if guide.step is Step.DONE:
+        if guide.phase is Phase.DONE:
             break
-        wanted = hand[guide.number] if guide.step is Step.PUSH else np.zeros(3)
+        wanted = hand[guide.number] if guide.phase is Phase.PUSH else np.zeros(3)
         late.append(wanted)
         now = late.pop(0)
         said.append(guide.feed(bench.block(now)))
@@ -69,7 +69,7 @@ def test_a_wiring_is_named_by_hand(number: int, clumsy: float) -> None:
     wiring, known = WIRINGS[number], load_rig()
     world = rig_from_values(parameters(wiring, Wiring()))
     guide, said = led(known, Bench(world, number), hand_of(known, 0.2e-3, clumsy))
-    assert guide.step is Step.DONE
+    assert guide.phase is Phase.DONE
     assert sum(text.startswith('Got it: ') for text in said) == 3
     found = verdict(known, guide)
     assert found.verdict == (WRONG if number else RIGHT)
@@ -91,7 +91,7 @@ def test_a_turn_the_other_way_is_told_beside_exchanged_psds() -> None:
 def test_a_push_that_is_too_small_or_too_shaky_is_not_taken_and_said() -> None:
     known = load_rig()
     guide, said = led(known, Bench(known, 2), hand_of(known, 2e-6), most=30.0)
-    assert (guide.step, guide.number) == (Step.PUSH, 0)
+    assert (guide.phase, guide.number) == (Phase.PUSH, 0)
     assert any(text.startswith('No push yet: the dots have moved by') for text in said)
     guide, said = led(known, Bench(known, 3, tremor=1.0), hand_of(known, 0.2e-3), most=30.0)
     assert not guide.pushes
@@ -104,7 +104,7 @@ def test_a_link_that_is_not_let_go_is_waited_for() -> None:
     push, _, _ = hand_of(known, 0.2e-3)
     said = [guide.feed(bench.block(np.zeros(3))) for _ in range(150)]
     said += [guide.feed(bench.block(push)) for _ in range(900)]
-    assert guide.step is Step.RELEASE
+    assert guide.phase is Phase.RELEASE
     assert 'Let go of the link.' in said
     assert guide.prompt() == 'Let go.'
 
@@ -114,7 +114,7 @@ def test_a_link_that_moves_is_not_at_rest() -> None:
     bench, guide = Bench(known, 5, tremor=1.0), Guide(known)
     push, _, _ = hand_of(known, 0.2e-3)
     said = [guide.feed(bench.block(push)) for _ in range(800)]
-    assert guide.step is Step.REST
+    assert guide.phase is Phase.REST
     assert any('leave it alone' in text for text in said)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 import psd_deflection
 from psd_deflection.cli.main import main
-from psd_deflection.config import DESCRIPTION, Rig, load_rig, read_parameter_file, replace_values
+from psd_deflection.config import DESCRIPTION, Rig, load_rig, replace_values
 from psd_deflection.discovery import proposals
 from psd_deflection.discovery.coincidence import coincidences
 from psd_deflection.discovery.discover import Discovery, discover
@@ -24,6 +24,7 @@ from psd_deflection.discovery.screen import solve_seen
 from psd_deflection.discovery.signatures import SignatureBank
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.errors import RecordingError
+from psd_deflection.parameter_files import read_parameter_file
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.replay_engine import rig_at_end
 from psd_deflection.records import FloatArray, ParameterChange

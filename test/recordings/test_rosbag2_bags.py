@@ -163,7 +163,7 @@ def test_every_command_says_that_it_takes_the_nominal_rig(
         argv = [command[0], str(bare), *command[1:]]
         assert main(argv) == (1 if '--compare' in command else 0)
     answer = capsys.readouterr()
-    assert 'lacks parameters: the nominal rig is taken where --params-file gives no other' in answer.err
+    assert 'lacks parameters: without a rig file the nominal rig is taken' in answer.err
     assert ('evaluated with the nominal one' in answer.out) == ('--compare' in command)
     (tmp_path / 'c.mcap').unlink(missing_ok=True)
     main([*argv, '--params-file', str(rig)])
@@ -227,7 +227,7 @@ def test_a_namespaced_recording_is_read_as_it_is(run: Path, tmp_path: Path, caps
 
 def test_of_several_rigs_one_is_chosen(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     two = copied(tmp_path / 'two.mcap', [('/left', CLEAN), ('/right', run)])
-    with pytest.raises(RecordingError, match='2 rigs; choose one with --namespace: /left, /right'):
+    with pytest.raises(RecordingError, match='2 rigs; give the namespace of one: /left, /right'):
         open_recording(two)
     assert main(['replay', str(two)]) == 4
     assert '/left, /right' in capsys.readouterr().err

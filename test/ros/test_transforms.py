@@ -111,5 +111,11 @@ def test_the_node_publishes_the_tree_by_default(start: Callable[..., Any], peer:
 
 
 @pytest.mark.skipif(importlib.util.find_spec('tf2_msgs') is not None, reason='tf2_msgs is there')
-def test_without_tf2_msgs_the_node_says_that_there_are_no_frames(start: Callable[..., Any]) -> None:
-    start().until(r'tf2_msgs is not installed: no frames on /tf \(publish_tf\)')
+def test_without_tf2_msgs_the_node_says_that_there_are_no_frames_if_they_were_asked_for(
+    start: Callable[..., Any],
+) -> None:
+    unasked = start()
+    unasked.until('publishing on ROS')
+    unasked.end()
+    assert 'tf2_msgs' not in unasked.text
+    start('--ros-args', '-p', 'publish_tf:=true').until(r'tf2_msgs is not installed: no frames on /tf \(publish_tf\)')

@@ -114,7 +114,9 @@ def test_a_correction_that_reads_what_it_does_not_declare_is_refused(folder: Pat
 
 
 def test_a_beam_that_reads_what_it_does_not_declare_is_refused(folder: Path) -> None:
-    code = CODE.replace('chunk.dots', 'chunk.beams').replace("'dots'", "'beam'").replace('    correct=_correct,\n', '')
+    code = (
+        CODE.replace('samples.dots', 'samples.beams').replace("'dots'", "'beam'").replace('    correct=_correct,\n', '')
+    )
     (folder / f'{NAME}.py').write_text(code.replace("{'temperature'}", ''))
     with pytest.raises(ConfigError, match='fails on a reading'):
         Pipeline(load_rig(overrides=EFFECT))
@@ -138,8 +140,8 @@ EFFECT = Effect('taller', 'optics', 's', 'e', 's', 'n', (EffectParameter('by', '
 LOADED = """
 from psd_deflection.simulation.declaration import Effect, EffectParameter
 
-def _apply(chunk, values, state):
-    chunk.loads *= 1.0 + values['by']
+def _apply(samples, values, state):
+    samples.loads *= 1.0 + values['by']
 
 def _trace_back(block, values, remembered):
     block.loads[:] = [load / (1.0 + values['by']) for load in block.loads]

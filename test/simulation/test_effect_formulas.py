@@ -18,9 +18,9 @@ from psd_deflection.config import load_rig
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.simulation import loads
 from psd_deflection.simulation.catalogue import catalogue
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import ActiveEffect, Effect, Traced
 from psd_deflection.simulation.physics import Physics
+from psd_deflection.simulation.samples import SimulatedSamples
 from psd_deflection.simulation.simulator import ForwardModel
 
 LENGTHS = (0.585, 0.400)
@@ -74,9 +74,9 @@ def ours(effects: list[ActiveEffect], length: float) -> FloatArray:
     rig = load_rig()
     rig = dataclasses.replace(rig, link=dataclasses.replace(rig.link, length=length))
     model = ForwardModel(rig, effects)
-    chunk = model.run(HISTORY, WARM)
-    model.finish(chunk)
-    return chunk.volts.T
+    samples = model.run(HISTORY, WARM)
+    model.finish(samples)
+    return samples.volts.T
 
 
 def theirs(effects: list[dict[str, Any]], length: float) -> FloatArray:
@@ -119,11 +119,11 @@ def test_it_does_what_the_second_formula_says(active: ActiveEffect, length: floa
 def test_a_signal_without_its_noise_shows_the_mean_over_it(name: str, size: dict[str, float], sigma: float) -> None:
     volts = np.linspace(-0.46, 0.47, 41)
     physics = Physics.of(load_rig())
-    chunk = Chunk(np.zeros(41), np.zeros(41), np.zeros((3, 41)), physics, volts=np.tile(volts, (6, 1)))
-    chunk.noise[:] = sigma
+    samples = SimulatedSamples(np.zeros(41), np.zeros(41), np.zeros((3, 41)), physics, volts=np.tile(volts, (6, 1)))
+    samples.noise[:] = sigma
     effect = catalogue()[name]
     assert effect.apply is not None
-    effect.apply(chunk, {**effect.off_values(physics, next(effect.variants())), **size}, {})
+    effect.apply(samples, {**effect.off_values(physics, next(effect.variants())), **size}, {})
     # The mean by adding up: 20001 values of the noise with their weights.
     deviate = np.linspace(-8.0, 8.0, 20_001)
     weight = np.exp(-0.5 * deviate**2)
@@ -132,7 +132,7 @@ def test_a_signal_without_its_noise_shows_the_mean_over_it(name: str, size: dict
     want = (each * weight).sum(axis=1) / weight.sum()
     # Forty-one nodes stand for the noise where the steps are sharp.
     allowed = 0.08 * 0.05 if 0.0 < sigma < 0.006 else 2e-5
-    assert np.abs(chunk.volts - want).max() < allowed
+    assert np.abs(samples.volts - want).max() < allowed
 
 
 def traced(name: str, values: dict[str, float], poses: FloatArray, seconds: float) -> FloatArray:

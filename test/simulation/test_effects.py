@@ -71,11 +71,11 @@ def rig_values(effects: list[ActiveEffect]) -> dict[str, object]:
 
 
 def volts_of(effects: list[ActiveEffect]) -> FloatArray:
-    chunk = ForwardModel(RIG, effects).run(HISTORY, WARM)
+    samples = ForwardModel(RIG, effects).run(HISTORY, WARM)
     model = ForwardModel(RIG, effects)
     model.run(HISTORY, WARM)
-    model.finish(chunk)
-    return chunk.volts
+    model.finish(samples)
+    return samples.volts
 
 
 def test_the_fixed_names_are_in_the_catalogue() -> None:

@@ -64,12 +64,12 @@ def test_settled_pose_is_the_beam_formula() -> None:
 
 def test_dots_obey_the_contract_equation() -> None:
     rig = load_rig()
-    chunk = ForwardModel(rig).run(loads.identification().loads)
-    for i, (c, m) in enumerate(zip(rig.centers, (chunk.dots[:2], chunk.dots[2:]), strict=True)):
+    samples = ForwardModel(rig).run(loads.identification().loads)
+    for i, (c, m) in enumerate(zip(rig.centers, (samples.dots[:2], samples.dots[2:]), strict=True)):
         turn = np.array(
-            [[np.cos(chunk.pose[2]), -np.sin(chunk.pose[2])], [np.sin(chunk.pose[2]), np.cos(chunk.pose[2])]]
+            [[np.cos(samples.pose[2]), -np.sin(samples.pose[2])], [np.sin(samples.pose[2]), np.cos(samples.pose[2])]]
         )
-        back = np.einsum('ijn,jn->in', turn, np.asarray(c)[:, None] + m) + chunk.pose[:2]
+        back = np.einsum('ijn,jn->in', turn, np.asarray(c)[:, None] + m) + samples.pose[:2]
         np.testing.assert_allclose(back, np.tile(np.asarray(c)[:, None], back.shape[1]), atol=1e-15, err_msg=str(i))
 
 

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.simulation.physics import Physics
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
 def _on_the_detector(axis: int) -> Callable[[Physics, Values], tuple[float, float]]:
@@ -20,13 +20,13 @@ def _on_the_detector(axis: int) -> Callable[[Physics, Values], tuple[float, floa
     return within
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     psd = int(values['psd']) - 1
-    laser, level = chunk.sums[psd], values['level']
+    laser, level = samples.sums[psd], values['level']
     whole = laser + level
     for row, center in ((2 * psd, values['x']), (2 * psd + 1, values['y'])):
-        chunk.dots[row] = (laser * chunk.dots[row] + level * center) / whole
-    chunk.sums[psd] = whole
+        samples.dots[row] = (laser * samples.dots[row] + level * center) / whole
+    samples.sums[psd] = whole
 
 
 def _correct(reading: Reading, values: Values) -> None:

@@ -8,21 +8,21 @@ import numpy as np
 from scipy.signal import lfilter
 
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
 from psd_deflection.simulation.modes import LAG_NODES, lag_weights
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
-    tau, p = values['time_constant'], chunk.physics
-    if chunk.t.size == 0 or tau <= 1e-9:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
+    tau, p = values['time_constant'], samples.physics
+    if samples.t.size == 0 or tau <= 1e-9:
         return
     first, *weights, last = lag_weights(tau, p.period)
-    here = chunk.between(0.0)
+    here = samples.between(0.0)
     # What each interval's inputs add at its end, but for the one there.
     added = first * here
     for weight, node in zip(weights, LAG_NODES[1:], strict=False):
-        added += weight * chunk.between(node * p.period)
+        added += weight * samples.between(node * p.period)
     kept = math.exp(-p.period / tau)
     if not state:
         # Settled until the first sample.
@@ -31,15 +31,15 @@ def _apply(chunk: Chunk, values: Values, state: State) -> None:
     drive = np.concatenate((state['added'], added[:, :-1]), axis=1) + last * here
     lagging, state['lag'] = lfilter([1.0], [1.0, -kept], drive, zi=state['lag'])
     state['added'] = added[:, -1:]
-    chunk.volts[:] = lagging if p.phase == 0.0 else _later(chunk, lagging, tau)
+    samples.volts[:] = lagging if p.phase == 0.0 else _later(samples, lagging, tau)
 
 
-def _later(chunk: Chunk, lagging: FloatArray, tau: float) -> FloatArray:
+def _later(samples: SimulatedSamples, lagging: FloatArray, tau: float) -> FloatArray:
     """The output ``phase`` after the samples at which it is ``lagging`` (6, n)."""
-    phase = chunk.physics.phase
+    phase = samples.physics.phase
     out = math.exp(-phase / tau) * lagging
     for weight, node in zip(lag_weights(tau, phase), LAG_NODES, strict=True):
-        out += weight * chunk.between(node * phase)
+        out += weight * samples.between(node * phase)
     return np.asarray(out)
 
 

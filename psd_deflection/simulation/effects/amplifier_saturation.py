@@ -1,6 +1,6 @@
 """The amplifier clips before the converter does.
 
-If the signal is without noise (``chunk.noise`` > 0), the result is the mean of the clipped noisy
+If the signal is without noise (``samples.noise`` > 0), the result is the mean of the clipped noisy
 signal. This keeps a comparison fair where the signal is close to the limit.
 """
 
@@ -10,8 +10,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from psd_deflection.records import DOT_CHANNELS, FloatArray
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
 def _excess(v: FloatArray, sigma: float) -> FloatArray:
@@ -22,11 +22,11 @@ def _excess(v: FloatArray, sigma: float) -> FloatArray:
     return np.asarray(v * ndtr(z) + sigma * np.exp(-0.5 * np.minimum(z * z, 1e3)) / np.sqrt(2.0 * np.pi))
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     rows = range(6) if values['sums'] else DOT_CHANNELS
     for row in rows:
-        v, noise = chunk.volts[row], float(chunk.noise[row])
-        chunk.volts[row] = v - _excess(v - values['limit'], noise) + _excess(-v - values['limit'], noise)
+        v, noise = samples.volts[row], float(samples.noise[row])
+        samples.volts[row] = v - _excess(v - values['limit'], noise) + _excess(-v - values['limit'], noise)
 
 
 EFFECT = Effect(

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     i = 2 * (int(values['psd']) - 1)
-    x, y = chunk.dots[i].copy(), chunk.dots[i + 1].copy()
-    chunk.dots[i] += values['xy'] * y
-    chunk.dots[i + 1] += values['yx'] * x
+    x, y = samples.dots[i].copy(), samples.dots[i + 1].copy()
+    samples.dots[i] += values['xy'] * y
+    samples.dots[i + 1] += values['yx'] * x
 
 
 def _correct(reading: Reading, values: Values) -> None:

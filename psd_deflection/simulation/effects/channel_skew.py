@@ -10,14 +10,14 @@ import math
 
 import numpy as np
 
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, State, Values
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
-    if chunk.t.size == 0:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
+    if samples.t.size == 0:
         return
-    p = chunk.physics
+    p = samples.physics
     steps = (values['delay'] - p.phase) / p.period
     whole = math.ceil(steps)
     if abs(steps - round(steps)) < 1e-9:
@@ -25,13 +25,13 @@ def _apply(chunk: Chunk, values: Values, state: State) -> None:
         steps = float(whole)
     psd = int(values['psd']) - 1
     rows = slice(3 * psd, 3 * psd + 3)
-    now = chunk.between((whole - steps) * p.period)[rows]
+    now = samples.between((whole - steps) * p.period)[rows]
     if 'before' not in state:
         # At rest until the first sample.
-        state['before'] = np.repeat(chunk.between(0.0)[rows, :1], whole, axis=1)
+        state['before'] = np.repeat(samples.between(0.0)[rows, :1], whole, axis=1)
     line = np.concatenate((state['before'], now), axis=1)
     state['before'] = line[:, line.shape[1] - whole :].copy()
-    chunk.volts[rows] = line[:, : now.shape[1]]
+    samples.volts[rows] = line[:, : now.shape[1]]
 
 
 EFFECT = Effect(

@@ -1,7 +1,7 @@
 """The clamp sticks: the deflection lags behind the load by half a loop, whichever way it moves.
 
 A play operator y <- min(max(y, x - r), x + r) of half width r. Each sample clamps the state, and a
-composition of clamps is a clamp. So a prefix scan computes the whole chunk without a loop.
+composition of clamps is a clamp. So a prefix scan computes the whole samples without a loop.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
 def play(x: FloatArray, half_width: float, start: float) -> FloatArray:
@@ -64,14 +64,14 @@ def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:
         block.pose[row] += now * half
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
-    if chunk.t.size == 0 or values['width'] <= 0.0:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
+    if samples.t.size == 0 or values['width'] <= 0.0:
         return
-    for row, lever in enumerate(_levers(values['axis'], chunk.physics.length)):
+    for row, lever in enumerate(_levers(values['axis'], samples.physics.length)):
         if lever > 0.0:
-            lagging = play(chunk.static[row], 0.5 * values['width'] * lever, state.get(str(row), 0.0))
+            lagging = play(samples.static[row], 0.5 * values['width'] * lever, state.get(str(row), 0.0))
             state[str(row)] = float(lagging[-1])
-            chunk.static[row] = lagging
+            samples.static[row] = lagging
 
 
 EFFECT = Effect(

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
 from psd_deflection.simulation.modes import Filter, held_lag_coefficients
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     for row in range(3):
         key = str(row)
         if key not in state:
-            state[key] = Filter(held_lag_coefficients(values['time_constant'], chunk.physics.period))
-        chunk.static[row] += values['amplitude'] * state[key](chunk.static[row])
+            state[key] = Filter(held_lag_coefficients(values['time_constant'], samples.physics.period))
+        samples.static[row] += values['amplitude'] * state[key](samples.static[row])
 
 
 def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:

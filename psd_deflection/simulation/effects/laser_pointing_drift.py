@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, State, Values
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     i = 2 * (int(values['psd']) - 1)
-    chunk.beams[i] += values['rate_x'] * chunk.t
-    chunk.beams[i + 1] += values['rate_y'] * chunk.t
+    samples.beams[i] += values['rate_x'] * samples.t
+    samples.beams[i + 1] += values['rate_y'] * samples.t
 
 
 EFFECT = Effect(

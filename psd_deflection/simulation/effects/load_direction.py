@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     c, s = math.cos(values['angle']), math.sin(values['angle'])
-    fx, fy = chunk.loads[0].copy(), chunk.loads[1].copy()
-    chunk.loads[0] = c * fx - s * fy
-    chunk.loads[1] = s * fx + c * fy
+    fx, fy = samples.loads[0].copy(), samples.loads[1].copy()
+    samples.loads[0] = c * fx - s * fy
+    samples.loads[1] = s * fx + c * fy
 
 
 def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
-    chunk.loads[2] += values['x'] * chunk.loads[1] - values['y'] * chunk.loads[0]
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
+    samples.loads[2] += values['x'] * samples.loads[1] - values['y'] * samples.loads[0]
 
 
 def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:

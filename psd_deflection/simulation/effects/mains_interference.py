@@ -7,17 +7,17 @@ import math
 import numpy as np
 
 from psd_deflection.records import CHANNELS
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
-    angle = 2.0 * math.pi * values['frequency'] * chunk.t
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
+    angle = 2.0 * math.pi * values['frequency'] * samples.t
     c, s = np.cos(angle), np.sin(angle)
     for row, name in enumerate(CHANNELS):
         size, phase = values['amplitude_' + name], values['phase_' + name]
         if size != 0.0:
-            chunk.volts[row] += size * (math.cos(phase) * s + math.sin(phase) * c)
+            samples.volts[row] += size * (math.cos(phase) * s + math.sin(phase) * c)
 
 
 EFFECT = Effect(

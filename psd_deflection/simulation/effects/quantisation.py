@@ -1,6 +1,6 @@
 """The converter steps more coarsely than the rig file says.
 
-If the signal is without noise (``chunk.noise`` > 0), the result is the mean over the noise: the
+If the signal is without noise (``samples.noise`` > 0), the result is the mean over the noise: the
 bias of rounding is a Fourier series whose terms the noise damps as exp(-2 (pi k sigma/step)^2).
 """
 
@@ -11,8 +11,8 @@ import math
 import numpy as np
 
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
 def _rounded(volts: FloatArray, noise: float, step: float) -> FloatArray:
@@ -34,10 +34,10 @@ def _rounded(volts: FloatArray, noise: float, step: float) -> FloatArray:
     return volts + step / math.pi * bias
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     if values['step'] > 0.0:
-        for row, noise in enumerate(chunk.noise.tolist()):
-            chunk.volts[row] = _rounded(chunk.volts[row], noise, values['step'])
+        for row, noise in enumerate(samples.noise.tolist()):
+            samples.volts[row] = _rounded(samples.volts[row], noise, values['step'])
 
 
 EFFECT = Effect(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     for i in (0, 2):
-        chunk.beams[i] += values['x'] * chunk.warmer
-        chunk.beams[i + 1] += values['y'] * chunk.warmer
+        samples.beams[i] += values['x'] * samples.warmer
+        samples.beams[i + 1] += values['y'] * samples.warmer
 
 
 EFFECT = Effect(

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
 from psd_deflection.simulation.modes import Filter, mode_coefficients
 from psd_deflection.simulation.physics import Physics
+from psd_deflection.simulation.samples import SimulatedSamples
 
 HIGHER = 1.6
 """Smallest ratio to the first mode's frequency: a closer second mode would only mimic the first."""
@@ -15,20 +15,20 @@ def _above_the_first(physics: Physics, values: Values) -> tuple[float, float]:
     return HIGHER * physics.bending_frequency, float('inf')
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     for row in range(2):
         key = str(row)
         if key not in state:
-            p = chunk.physics
+            p = samples.physics
             state[key] = Filter(mode_coefficients(values['frequency'], values['damping_ratio'], p.period, p.phase))
             first = mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period, p.phase)
             state['first' + key] = Filter(first)
-        ringing = state[key](chunk.static[row])
+        ringing = state[key](samples.static[row])
         if values['shares'] == 1:
-            ringing = ringing - state['first' + key](chunk.static[row])
+            ringing = ringing - state['first' + key](samples.static[row])
         elif values['shares'] == 2:
-            ringing = ringing - chunk.static[row]
-        chunk.pose[row] += values['gain'] * ringing
+            ringing = ringing - samples.static[row]
+        samples.pose[row] += values['gain'] * ringing
 
 
 def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:

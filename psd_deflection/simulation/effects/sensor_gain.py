@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     i = 2 * (int(values['psd']) - 1)
-    chunk.dots[i] *= 1.0 + values['x']
-    chunk.dots[i + 1] *= 1.0 + values['y']
+    samples.dots[i] *= 1.0 + values['x']
+    samples.dots[i + 1] *= 1.0 + values['y']
 
 
 def _correct(reading: Reading, values: Values) -> None:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     i = 2 * (int(values['psd']) - 1)
-    grown = 1.0 + values['k'] * (chunk.dots[i] ** 2 + chunk.dots[i + 1] ** 2)
-    chunk.dots[i] *= grown
-    chunk.dots[i + 1] *= grown
+    grown = 1.0 + values['k'] * (samples.dots[i] ** 2 + samples.dots[i + 1] ** 2)
+    samples.dots[i] *= grown
+    samples.dots[i + 1] *= grown
 
 
 def _correct(reading: Reading, values: Values) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
 def _turn(dots: FloatArray, psd: float, angle: float) -> None:
@@ -17,8 +17,8 @@ def _turn(dots: FloatArray, psd: float, angle: float) -> None:
     dots[i + 1] = c * y - s * x
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
-    _turn(chunk.dots, values['psd'], values['angle'])
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
+    _turn(samples.dots, values['psd'], values['angle'])
 
 
 def _correct(reading: Reading, values: Values) -> None:

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.chunk import Chunk
 from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, State, Values
+from psd_deflection.simulation.samples import SimulatedSamples
 
 
 def _cut_disc(distance: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
@@ -30,22 +30,22 @@ def _cut_gauss(position: FloatArray, half: float, radius: float) -> tuple[FloatA
     return left, sigma * density / (np.sqrt(2.0 * np.pi) * left)
 
 
-def _apply(chunk: Chunk, values: Values, state: State) -> None:
+def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     psd, radius = int(values['psd']) - 1, values['radius']
     if radius <= 0.0:
         return
     for axis in range(2):
-        row, half = 2 * psd + axis, float(chunk.physics.half_area[psd, axis])
-        place = chunk.dots[row].copy()
+        row, half = 2 * psd + axis, float(samples.physics.half_area[psd, axis])
+        place = samples.dots[row].copy()
         if values['profile'] == 1:
             for side in (1.0, -1.0):
                 left, moved = _cut_disc(half - side * place, radius)
-                chunk.dots[row] -= side * moved
-                chunk.sums[psd] *= left
+                samples.dots[row] -= side * moved
+                samples.sums[psd] *= left
         else:
             left, moved = _cut_gauss(place, half, radius)
-            chunk.dots[row] += moved
-            chunk.sums[psd] *= left
+            samples.dots[row] += moved
+            samples.sums[psd] *= left
 
 
 EFFECT = Effect(

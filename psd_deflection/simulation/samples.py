@@ -16,7 +16,7 @@ def _none() -> FloatArray:
 
 
 @dataclass(slots=True, eq=False)
-class Chunk:
+class SimulatedSamples:
     """n samples, one row a quantity, filled stage by stage; effects change rows in place.
 
     ``t`` (n,): s since the first sample. ``warmer`` (n,): K above the first temperature.
@@ -26,7 +26,7 @@ class Chunk:
     report them. ``sums`` (2, n), ``volts`` (6, n): V. ``noise`` (6,): V rms, when ``volts`` are to be the
     mean over a noise that is not on them; 0 when they are samples as they are. ``between``: during an
     effect on ``volts``, gives these (6, n) as they are ``phase`` s after each sample, below the period;
-    ask for the same phases with each chunk.
+    ask for the same phases with each samples.
     """
 
     t: FloatArray

@@ -1,0 +1,137 @@
+"""How well ``validate`` tells the offset between two clocks: ``python -m blind.clock --runs 200``.
+
+A link rings after two steps. Two detectors see it at 1 kHz, a camera at 30 frames a second whose clock is
+off by up to 0.4 s. The dots are where two fixed beams meet a flat plate that is displaced and turned about Z; the
+motion and the dots share no code with the package.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from tqdm import tqdm
+
+from blind.generator import Array
+from psd_deflection.calibration import dot_noise_variances
+from psd_deflection.config import load_rig
+from psd_deflection.solvers import solver_from_rig
+from psd_deflection.validation.clock import Offset, clock_offset
+from psd_deflection.validation.motion import Motion
+
+CENTERS = ((0.0, 0.07), (-0.1, 0.0))
+"""m, of the thesis rig."""
+MODES = ((14.0, 2.0e-3), (14.0, -1.2e-3), (21.0, 8.0e-3))
+"""Hz, and m, m, rad a step."""
+
+
+def truth(t: Array, steps: tuple[float, ...] = (1.0, 3.7)) -> Array:
+    """Poses (k, 3) at ``t``, s: steps up and down in turn, each with its ringing (damping ratio 0.02)."""
+    out = np.zeros((len(t), 3))
+    for number, start in enumerate(steps):
+        since = np.clip(t - start, 0.0, None)
+        for axis, (hertz, size) in enumerate(MODES):
+            w = 2.0 * np.pi * hertz
+            rung = 1.0 - np.exp(-0.02 * w * since) * np.cos(w * since)
+            out[:, axis] += (-1.0) ** number * size * np.where(t > start, rung, 0.0)
+    return out
+
+
+def dots(poses: Array) -> Array:
+    """Dots (k, 4), m, of ``poses`` (k, 3)."""
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    out = np.empty((len(poses), 4))
+    for i, (x, y) in enumerate(CENTERS):
+        dx, dy = x - poses[:, 0], y - poses[:, 1]
+        out[:, 2 * i] = cos * dx + sin * dy - x
+        out[:, 2 * i + 1] = -sin * dx + cos * dy - y
+    return out
+
+
+@dataclass
+class Seen:
+    """``t`` and ``dots`` of the samples; ``stamps``, s, and ``poses`` of a reference; ``offset`` that it is behind."""
+
+    t: Array
+    dots: Array
+    stamps: Array
+    poses: Array
+    offset: float
+
+
+REFERENCE_SD = np.array([10e-6, 10e-6, 3e-4])
+
+
+def seen(
+    seed: int,
+    *,
+    seconds: float = 6.0,
+    rate: float = 30.0,
+    exposure: float = 0.008,
+    steps: tuple[float, ...] = (1.0, 3.7),
+) -> Seen:
+    """Samples at 1 kHz with 2 µm of noise, and a camera at ``rate`` a second that takes means over ``exposure``, s."""
+    rng = np.random.default_rng(seed)
+    t: Array = np.arange(int(1000 * seconds)) * np.float64(1e-3)
+    offset = float(rng.uniform(-0.4, 0.4))
+    middles = np.arange(0.0, seconds, 1.0 / rate) + float(rng.uniform(0.0, 1.0 / rate))
+    within = np.linspace(-0.5, 0.5, 41) * exposure
+    poses = np.mean([truth(middles + u, steps) for u in within], axis=0)
+    return Seen(
+        t,
+        dots(truth(t, steps)) + rng.normal(0.0, 2e-6, (len(t), 4)),
+        middles - offset,
+        poses + rng.normal(0.0, REFERENCE_SD, poses.shape),
+        offset,
+    )
+
+
+RIG = load_rig(None)
+SOLVER = solver_from_rig('exact', RIG)
+VARIANCES = dot_noise_variances(RIG) / RIG.estimator.block_size
+
+
+def motion_of(t: Array, readings: Array) -> Motion:
+    """The motion as the default solver sees it."""
+    return Motion(t, readings, 1e-3, lambda d: SOLVER.solve_many(d, VARIANCES).pose)
+
+
+@dataclass
+class Score:
+    """``errors``: of the offset, s. ``inside``: 95 % intervals that hold the truth. ``told``: runs with an answer."""
+
+    errors: list[float]
+    inside: int = 0
+    told: int = 0
+
+
+def scored(runs: Iterable[int], exposure: float = 0.008) -> Score:
+    """One run for each seed of ``runs``."""
+    score = Score([])
+    for seed in runs:
+        run = seen(seed, seconds=4.0, steps=(1.0, 2.7), exposure=exposure)
+        found: Offset = clock_offset(motion_of(run.t, run.dots), run.stamps, run.poses, exposure=exposure)
+        low, high = found.interval
+        score.errors.append(found.value - run.offset)
+        score.inside += low <= run.offset <= high
+        score.told += found.told
+    return score
+
+
+def main() -> None:
+    """Print the score."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--runs', type=int, default=200, metavar='N')
+    parser.add_argument('--first', type=int, default=1000, metavar='SEED')
+    args = parser.parse_args()
+    score = scored(tqdm(range(args.first, args.first + args.runs), delay=1.0, leave=False, disable=None))
+    errors = np.abs(score.errors)
+    print(f'offset told         {score.told} of {args.runs}')
+    print(f'inside its interval {100.0 * score.inside / args.runs:.1f} % (95 % expected)')
+    print(f'error               {1e6 * np.sqrt((errors**2).mean()):.0f} µs rms, {1e6 * errors.max():.0f} µs at most')
+
+
+if __name__ == '__main__':
+    main()

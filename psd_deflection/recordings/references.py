@@ -1,0 +1,167 @@
+"""Independent measurements of the tip beside a recording: a table of a camera or a stage, or another recording.
+
+The table is a CSV with a header: ``t`` (s) and ``dx,dy,theta`` (m, m, rad); ``sd_dx,sd_dy,sd_theta`` and ``status`` if
+there are any. A row whose status is not ``ok`` has no measurement. ``psd-deflection camera`` writes such tables.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from psd_deflection.errors import RecordingError, printable
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.csv_reader import MAX_LINE, MAX_SECONDS
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.replay_engine import replayed
+from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, IntArray, SampleBlock, SpotMeans
+
+POSE = ('dx', 'dy', 'theta')
+DEVIATIONS = ('sd_dx', 'sd_dy', 'sd_theta')
+MAX_ROWS = 10_000_000
+LONGEST_STATUS = 80
+
+
+@dataclass(frozen=True)
+class References:
+    """Measurements in order of time.
+
+    ``t_ns`` int64 (k,). ``poses`` (k, 3): m, m, rad. ``sd`` (k, 3) if the instrument states them. ``refused``: status
+    of the measurements that have no answer, and how many there are of each.
+    """
+
+    t_ns: IntArray
+    poses: FloatArray
+    sd: FloatArray | None = None
+    refused: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Run:
+    """All trusted samples of a recording.
+
+    ``t_ns`` int64 (n,). ``dots`` (n, 4), m, calibrated and corrected. ``estimate_sd`` (3,): median standard deviation
+    of the published estimates, m, m, rad.
+    """
+
+    t_ns: IntArray
+    dots: FloatArray
+    estimate_sd: FloatArray
+
+
+def references_of(recording: Recording) -> References:
+    """The references in the recording; raises RecordingError if it has none."""
+    found = recording.references()
+    if not found:
+        raise RecordingError(
+            f'{recording.path}: holds no reference (CSV columns ref_dx, ref_dy, ref_theta, or the topic '
+            f'/reference/deflection); give one with --reference FILE'
+        )
+    return _in_order(np.array([r.t_ns for r in found], dtype=np.int64), np.array([r[1:] for r in found]), None, {})
+
+
+def read_references(path: str | Path) -> References:
+    """The references of a table, or of a recording. Raises RecordingError naming file, line and column of a fault."""
+    path = Path(path)
+    if path.suffix.lower() == '.csv' and (columns := _columns(path)) is not None:
+        return _table(path, columns)
+    return references_of(open_recording(path))
+
+
+def _in_order(t_ns: IntArray, poses: FloatArray, sd: FloatArray | None, refused: Mapping[str, int]) -> References:
+    order = np.argsort(t_ns, kind='stable')
+    return References(t_ns[order], poses[order], None if sd is None else sd[order], refused)
+
+
+def _columns(path: Path) -> dict[str, int] | None:
+    """Columns of the table by name; None if the file is a recording."""
+    try:
+        with path.open(encoding='utf-8-sig', newline='') as stream:
+            names = [name.strip() for name in stream.readline(MAX_LINE).split(',')]
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
+    except UnicodeDecodeError:
+        raise RecordingError(f'{path}: is not text in UTF-8') from None
+    if 'x1' in names:
+        return None
+    missing = [name for name in ('t', *POSE) if name not in names]
+    if missing:
+        raise RecordingError(f'{path}:1: the header lacks {", ".join(missing)}; a table has t,{",".join(POSE)}')
+    return {name: i for i, name in enumerate(names)}
+
+
+def _table(path: Path, columns: Mapping[str, int]) -> References:
+    wanted = [columns[name] for name in ('t', *POSE)]
+    deviations = [columns[name] for name in DEVIATIONS] if all(name in columns for name in DEVIATIONS) else []
+    status = columns.get('status')
+    rows: list[list[float]] = []
+    refused: Counter[str] = Counter()
+    with path.open(encoding='utf-8-sig', newline='') as stream:
+        reader = csv.reader(stream, strict=True, skipinitialspace=True)
+        try:
+            next(reader)
+            for cells in reader:
+                if not any(cell.strip() for cell in cells):
+                    continue
+                if len(rows) >= MAX_ROWS:
+                    raise RecordingError(f'{path}:{reader.line_num}: has more than {MAX_ROWS} rows')
+                if len(cells) < len(columns):
+                    raise RecordingError(f'{path}:{reader.line_num}: has {len(cells)} cells: must be {len(columns)}')
+                word = 'ok' if status is None else cells[status].strip()
+                if word != 'ok':
+                    refused[printable(word, LONGEST_STATUS)] += 1
+                    continue
+                rows.append([_number(path, reader.line_num, cells[i]) for i in (*wanted, *deviations)])
+        except csv.Error as error:
+            raise RecordingError(f'{path}:{reader.line_num}: is no row of a CSV ({error})') from None
+        except UnicodeDecodeError:
+            raise RecordingError(f'{path}: is not text in UTF-8') from None
+    if not rows:
+        raise RecordingError(f'{path}: holds no measurement with the status ok')
+    values = np.array(rows)
+    t_ns = np.rint(values[:, 0] * 1e9).astype(np.int64)
+    return _in_order(t_ns, values[:, 1:4], values[:, 4:7] if deviations else None, dict(refused))
+
+
+def _number(path: Path, line: int, cell: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = math.nan
+    if not abs(value) < MAX_SECONDS:
+        raise RecordingError(f'{path}:{line}: {printable(cell, LONGEST_STATUS)!r} is no finite number below 2^31')
+    return value
+
+
+def read_run(recording: Recording, pipeline: Pipeline, blocks: Iterable[SampleBlock] | None = None) -> Run:
+    """The samples of all blocks that ``pipeline``, made with the recording's block size, trusts.
+
+    ``blocks``: the recording's, for a caller that counts them. Raises RecordingError if it trusts none.
+    """
+    times: list[IntArray] = []
+    dots: list[FloatArray] = []
+    deviations: list[FloatArray] = []
+    trusted = False
+    for records in replayed(recording, pipeline, blocks):
+        for record in records:
+            if isinstance(record, SpotMeans):
+                trusted = record.status is BlockStatus.OK
+            elif isinstance(record, SampleBlock) and trusted:
+                times.append(record.t_ns)
+                dots.append(pipeline.dots(record))
+            elif isinstance(record, DeflectionEstimate) and record.primary:
+                deviations.append(np.array(record.covariance).reshape(3, 3).diagonal())
+    if not times:
+        raise RecordingError(f'{recording.path}: no block has an estimate, so there is nothing to compare')
+    return Run(
+        np.concatenate(times).astype(np.int64),
+        np.concatenate(dots),
+        np.sqrt(np.median(np.array(deviations), axis=0)) if deviations else np.full(3, np.nan),
+    )

@@ -1,0 +1,1 @@
+"""Estimates against an independent reference: the offset between the clocks, and what the two differ by."""

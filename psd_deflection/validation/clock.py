@@ -1,0 +1,297 @@
+"""The offset between the clock of a reference and that of the samples, with its uncertainty.
+
+First every offset on the grid of the samples is tried: the reference is regressed on the motion, axis by axis, by
+correlation with the FFT, so that scale and bias of either instrument do not matter. Then the best are refined on the
+fitted motion: Gauss-Newton on offset, bias and a 3 x 3 matrix of scales, with Tukey's biweight against outliers
+(Beaton and Tukey, Technometrics 16, 147, 1974). The standard deviation is that of least squares, or
+the one of Newey and West (Econometrica 55, 703, 1987) if that is larger: what is left over may have a memory.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import minimum_filter1d
+
+from psd_deflection.errors import RecordingError
+from psd_deflection.records import FloatArray
+from psd_deflection.validation.motion import Motion
+
+FEWEST = 20
+"""References, at least."""
+TRIED = 5
+"""Offsets that are refined."""
+APART = 5
+"""Samples between two offsets that are tried, at least."""
+RIVAL = 20.0
+"""An offset is a rival if its chi-square is larger by less."""
+MOVES = 100.0
+"""The motion explains the reference if it lowers chi-square by more. With noise alone the best of thousands of offsets,
+each with nine scales, lowers it by 30 to 40."""
+PASSES = 12
+SETTLED = 1e-7
+"""s. A smaller step ends the refinement."""
+VAGUE = 0.01
+"""s. The motion does not tell an offset that is less certain."""
+BIWEIGHT = 4.685
+"""Tukey's constant: 95 % as precise as least squares without outliers."""
+
+
+@dataclass(frozen=True)
+class Offset:
+    """What to add to the reference's stamps, s.
+
+    ``value``, ``sd``: s. ``drift``, ``drift_sd``: by how much the offset grows with time, s/s. ``explained``: whether
+    the motion explains the reference at this offset. ``rivals``: other offsets that fit as well, s. ``used``:
+    references in the fit.
+    """
+
+    value: float
+    sd: float
+    drift: float
+    drift_sd: float
+    explained: bool
+    rivals: tuple[float, ...]
+    used: int
+
+    @property
+    def told(self) -> bool:
+        """Whether the motion tells the offset."""
+        return self.explained and self.sd < VAGUE and not self.rivals
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The 95 % interval, s."""
+        return self.value - 1.96 * self.sd, self.value + 1.96 * self.sd
+
+    @property
+    def sentence(self) -> str:
+        """Which clock is ahead, and what to add to what."""
+        if not self.told:
+            if self.explained and self.rivals:
+                others = ', '.join(f'{1e3 * r:+.1f}' for r in self.rivals)
+                return (
+                    'The offset between the clocks is not told: the motion repeats itself, so that '
+                    f'{1e3 * self.value:+.1f} and {others} ms fit alike. '
+                    'Record an event that comes once, such as a push or a step of the load.'
+                )
+            return (
+                'The offset between the clocks is not told: the link moves too little or too slowly. '
+                'Record a few seconds in which it rings.'
+            )
+        size = 1e3 * abs(self.value)
+        error = 1e3 * 1.96 * self.sd
+        if size < error:
+            return f'The clocks agree: the offset is {1e3 * self.value:+.3f} ms ± {error:.3f} ms (95 %).'
+        # A stamp that needs something added is early: its clock is behind.
+        side = 'behind' if self.value > 0.0 else 'ahead of'
+        verb = 'add' if self.value > 0.0 else 'subtract'
+        towards = 'to' if self.value > 0.0 else 'from'
+        text = (
+            f"The reference's clock is {size:.3f} ms ± {error:.3f} ms (95 %) {side} that of the samples: "
+            f"{verb} {size:.3f} ms {towards} the reference's stamps."
+        )
+        if abs(self.drift) > 3.0 * self.drift_sd:
+            text += f' It drifts by {1e6 * self.drift:+.1f} ± {1.96e6 * self.drift_sd:.1f} µs/s (95 %).'
+        return text
+
+
+@dataclass
+class _Fit:
+    """``left``: what the fit leaves (k, 3), m, m, rad; ``sizes`` (3,): its scatter."""
+
+    value: float
+    sd: float
+    drift: float
+    drift_sd: float
+    left: FloatArray
+    sizes: FloatArray
+
+    def chi_square(self, sizes: FloatArray) -> float:
+        """Mean over the references of what the fit leaves, in ``sizes``; an outlier counts like any other."""
+        return _robust(self.left / sizes)
+
+
+def _robust(u: FloatArray) -> float:
+    """Tukey's biweight in place of u^2, summed over the axes, mean over the references."""
+    inside = np.clip(1.0 - (u / BIWEIGHT) ** 2, 0.0, None)
+    return float((BIWEIGHT**2 / 3.0 * (1.0 - inside**3)).sum(axis=1).mean())
+
+
+def clock_offset(
+    motion: Motion, t: FloatArray, poses: FloatArray, *, largest: float = 1.0, exposure: float = 0.0
+) -> Offset:
+    """The offset of a reference with stamps ``t`` (k,), s, and ``poses`` (k, 3), m, m, rad.
+
+    ``largest``: offset that is looked for, s. If the stamps lie outside the motion by more, the clocks count from
+    different days, and every offset is looked for at which half of the references lie within the motion.
+    ``exposure``: time over which the reference takes its mean, s.
+    Raises RecordingError if fewer than 20 references lie within the motion.
+    """
+    base = 0.0
+    if t[0] - largest > motion.t[-1] or t[-1] + largest < motion.t[0]:
+        base = float(motion.t[0] - t[0])
+        largest = float(max(t[-1] - t[0], motion.t[-1] - motion.t[0]))
+    found = _offset(motion, t + base, poses, largest, exposure)
+    return replace(found, value=found.value + base, rivals=tuple(r + base for r in found.rivals))
+
+
+def _offset(motion: Motion, t: FloatArray, poses: FloatArray, largest: float, exposure: float) -> Offset:
+    fits: list[_Fit] = []
+    best: _Fit | None = None
+    for start in _coarse(motion, t, poses, largest):
+        found = _refined(motion, t, poses, start, exposure, best)
+        if found is not None and abs(found.value) <= largest + APART * motion.period:
+            fits.append(found)
+            if best is None or found.chi_square(best.sizes) < best.chi_square(best.sizes):
+                best = found
+    if best is None:
+        raise RecordingError(
+            f'the reference and the samples do not overlap enough: fewer than {FEWEST} of the references lie within '
+            f'the recording at any offset up to {largest:g} s'
+        )
+    used = len(best.left)
+    least = best.chi_square(best.sizes)
+    near = APART * motion.period
+    rivals = tuple(
+        f.value for f in fits if abs(f.value - best.value) > near and used * (f.chi_square(best.sizes) - least) < RIVAL
+    )
+    explained = used * (_robust((poses - np.median(poses, axis=0)) / best.sizes) - least)
+    return Offset(best.value, best.sd, best.drift, best.drift_sd, explained > MOVES, rivals, used)
+
+
+def _coarse(motion: Motion, t: FloatArray, poses: FloatArray, largest: float) -> list[float]:
+    """Offsets, s, at which the motion explains the reference best, the best first."""
+    single, there = motion.grid()
+    n, period = len(single), motion.period
+    place = np.rint((t - motion.t[0]) / period).astype(np.int64)
+    lags = np.arange(-math.ceil(largest / period), math.ceil(largest / period) + 1)
+    reach = place[:, None].min() + lags[0], place.max() + lags[-1]
+    if reach[1] < 0 or reach[0] >= n:
+        return []
+    first = int(place.min())
+    length = int(place.max()) - first + 1
+    size = 1 << int(n + length + 1).bit_length()
+    comb = np.zeros((length, 3))
+    count = np.zeros(length)
+    np.add.at(count, place - first, 1.0)
+    centred = poses - np.median(poses, axis=0)
+    np.add.at(comb, place - first, centred)
+    square = np.zeros((length, 3))
+    np.add.at(square, place - first, centred * centred)
+    moved = (single - single.mean(axis=0)) * there[:, None]
+
+    def correlated(a: FloatArray, b: FloatArray) -> FloatArray:
+        """For each lag the sum over the references of ``a`` times ``b`` at their places moved by the lag."""
+        spectrum = np.conj(np.fft.rfft(a, size)) * np.fft.rfft(b, size)
+        full = np.fft.irfft(spectrum, size)
+        out: FloatArray = full[(first + lags) % size]
+        # Beyond the length of either there is no overlap; the transform would wrap around.
+        out[(first + lags <= -length) | (first + lags >= n)] = 0.0
+        return out
+
+    valid = there.astype(np.float64)
+    overlap = correlated(count, valid)
+    cost = np.zeros(len(lags))
+    with np.errstate(divide='ignore', invalid='ignore'):
+        for axis in range(3):
+            m, r = moved[:, axis], comb[:, axis]
+            sm, sr = correlated(count, m) / overlap, correlated(r, valid) / overlap
+            vm = correlated(count, m * m) / overlap - sm * sm
+            vr = correlated(square[:, axis], valid) / overlap - sr * sr
+            both = correlated(r, m) / overlap - sm * sr
+            explained = np.where((vm > 0.0) & (vr > 0.0), both * both / (vm * vr), 0.0)
+            cost += np.log1p(-np.clip(np.nan_to_num(explained), 0.0, 1.0 - 1e-12))
+    cost *= np.maximum(overlap, 0.0)
+    # Half of the references that can overlap must; an offset at the edge with few of them explains anything.
+    cost[overlap < max(FEWEST, 0.5 * overlap.max())] = np.inf
+    lowest = minimum_filter1d(cost, 2 * APART + 1)
+    minima = np.flatnonzero(np.isfinite(cost) & (cost == lowest))
+    best = minima[np.argsort(cost[minima], kind='stable')][:TRIED]
+    return [float(lag) * period for lag in lags[best]]
+
+
+def _refined(
+    motion: Motion, t: FloatArray, poses: FloatArray, start: float, exposure: float, best: _Fit | None
+) -> _Fit | None:
+    """The offset near ``start``, s; None if fewer than 20 references have samples about them.
+
+    ``best``: another fit. One that stays far above its chi-square is not finished.
+    """
+    value = start
+    middle = float(t.mean())
+    weights = np.ones((len(t), 3))
+    fit: _Fit | None = None
+    for passed in range(PASSES):
+        seen, rates = motion.poses_at(t + value, exposure)
+        good = np.isfinite(seen).all(axis=1)
+        if good.sum() < FEWEST:
+            return None
+        used = _Used(t[good] - middle, poses[good], seen[good], rates[good])
+        step, fit, weights[good] = used.solved(weights[good])
+        value += step
+        fit.value = value
+        if passed > 0 and best is not None:
+            worse = len(fit.left) * (fit.chi_square(best.sizes) - best.chi_square(best.sizes))
+            if worse > 10.0 * RIVAL:
+                break
+        if passed > 1 and abs(step) < SETTLED:
+            break
+    return fit
+
+
+@dataclass(frozen=True)
+class _Used:
+    """The references in the fit: times from their middle (k,), references, motion and its rates (k, 3)."""
+
+    t: FloatArray
+    poses: FloatArray
+    seen: FloatArray
+    rates: FloatArray
+
+    def solved(self, weights: FloatArray) -> tuple[float, _Fit, FloatArray]:
+        """The step of the offset, s, the fit there, and the weights of the next pass (k, 3)."""
+        k = len(self.t)
+        # Of an axis that does not move, the readings are noise and explain nothing.
+        moving = [i for i in range(3) if np.ptp(self.seen[:, i]) > 0.0]
+        causes = np.column_stack([np.ones(k), *(self.seen[:, i] - self.seen[:, i].mean() for i in moving)])
+        scale = np.maximum(np.sqrt((causes * causes).mean(axis=0)), 1e-300)
+        causes = causes / scale
+        left = np.empty((k, 3))
+        own = np.empty((k, 3))
+        sizes = np.empty(3)
+        for axis in range(3):
+            root = np.sqrt(weights[:, axis])[:, None]
+            terms = np.linalg.lstsq(causes * root, self.poses[:, axis, None] * root, rcond=1e-10)[0][:, 0]
+            left[:, axis] = self.poses[:, axis] - causes @ terms
+            sizes[axis] = max(1.4826 * float(np.median(np.abs(left[:, axis] - np.median(left[:, axis])))), 1e-12)
+            # What the offset does to this axis, without what bias and scales could do as well.
+            does = sum((terms[1 + c] / scale[1 + c] * self.rates[:, i] for c, i in enumerate(moving)), np.zeros(k))
+            own[:, axis] = does - causes @ np.linalg.lstsq(causes * root, does[:, None] * root, rcond=1e-10)[0][:, 0]
+        next_weights = np.clip(1.0 - (left / (BIWEIGHT * sizes)) ** 2, 0.0, None) ** 2
+        w = next_weights / sizes**2
+        information = float((w * own * own).sum())
+        if information <= 0.0:
+            return 0.0, _Fit(0.0, math.inf, 0.0, math.inf, left, sizes), next_weights
+        step = float((w * own * left).sum()) / information
+        scores = (w * own * left).sum(axis=1)
+        spread = max(variance_of_sum(scores) / information**2, 1.0 / information)
+        # The offset's growth with time, by what is left.
+        ramp = own * self.t[:, None]
+        ramp = ramp - own * (float((w * own * ramp).sum()) / information)
+        grows = float((w * ramp * ramp).sum())
+        drift = float((w * ramp * left).sum()) / grows if grows > 0.0 else 0.0
+        drift_spread = variance_of_sum((w * ramp * left).sum(axis=1)) / grows**2 if grows > 0.0 else math.inf
+        drift_sd = math.sqrt(max(drift_spread, 1.0 / grows)) if grows > 0.0 else math.inf
+        return step, _Fit(0.0, math.sqrt(spread), drift, drift_sd, left, sizes), next_weights
+
+
+def variance_of_sum(scores: FloatArray) -> float:
+    """Variance of the sum of ``scores`` (k,), which follow each other in time (Newey and West 1987, eq. 5)."""
+    lags = math.floor(4.0 * (len(scores) / 100.0) ** (2.0 / 9.0))
+    total = float(scores @ scores)
+    for lag in range(1, min(lags, len(scores) - 1) + 1):
+        total += 2.0 * (1.0 - lag / (lags + 1.0)) * float(scores[lag:] @ scores[:-lag])
+    return max(total, 0.0)

@@ -1,0 +1,91 @@
+"""``psd-deflection validate``: what it prints, writes and refuses."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.cli.main import main
+from psd_deflection.config import load_rig
+
+
+@pytest.fixture(scope='module')
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight seconds with two steps, and the true pose in it as a reference."""
+    path = tmp_path_factory.mktemp('run') / 'run.csv'
+    loads = 'steps:0,0,0;0,-10,-5.85;0,0,0:2.5'
+    assert main(['simulate', '--out', str(path), '--loads', loads, '--reference']) == 0
+    return path
+
+
+@pytest.fixture(scope='module')
+def late(run: Path) -> Path:
+    """The reference in a table of its own, 12.5 ms late, with one refused frame."""
+    path = run.parent / 'camera.csv'
+    with run.open() as stream, path.open('w') as out:
+        out.write('t,dx,dy,theta,sd_dx,sd_dy,sd_theta,status\n')
+        for row in csv.DictReader(stream):
+            if row['ref_dx']:
+                pose = ','.join(row[name] for name in ('ref_dx', 'ref_dy', 'ref_theta'))
+                out.write(f'{float(row["t"]) + 0.0125:.6f},{pose},1e-7,1e-7,1e-6,ok\n')
+        out.write('7.6,,,,,,,blurred\n')
+    return path
+
+
+def test_the_offset_is_told_and_removed_if_asked(run: Path, late: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['validate', str(run), '--reference', str(late), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    # The blocks' stamps lie in the middle of 20 samples; the row of the reference is the next one, half a sample on.
+    assert found['offset']['value'] == pytest.approx(-0.0125, abs=0.6e-3)
+    assert found['offset']['told']
+    assert not found['offset']['applied']
+    assert found['refused'] == {'blurred': 1}
+    without = found['solvers']['exact']['dy']['rms']
+    assert main(['validate', str(run), '--reference', str(late), '--align', '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['offset']['applied']
+    assert found['solvers']['exact']['dy']['rms'] < 0.01 * without
+
+
+def test_a_person_reads_sentences_and_a_table(
+    run: Path, late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / 'new' / 'out'
+    assert main(['validate', str(run), '--reference', str(late), '--align', '--out', str(out)]) == 0
+    said = capsys.readouterr().out
+    assert 'ahead of that of the samples: subtract 12.' in said
+    assert 'The offset is removed in what follows.' in said
+    assert 'The reference gave no answer 1 times: blurred 1.' in said
+    lines = said.splitlines()
+    assert any(line.startswith('exact ') for line in lines)
+    assert any(line.startswith('appendix_d ') for line in lines)
+    page = (out / 'report.html').read_text()
+    assert page.count('data:image/png') == 3
+    assert 'ahead of that of the samples' in page
+    assert json.loads((out / 'validate.json').read_text())['solver'] == 'exact'
+
+
+def test_a_wrong_gain_is_the_scale(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wide = 1.01 * load_rig(None).amplifier.sensitivity
+    rig = tmp_path / 'rig.yaml'
+    rig.write_text(
+        f'/**:\n  ros__parameters:\n    psd_1:\n      sensitivity: [{wide}, {wide}]\n'
+        f'    psd_2:\n      sensitivity: [{wide}, {wide}]\n'
+    )
+    assert main(['validate', str(run), '--params-file', str(rig), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['solvers']['exact']['dy']['scale'] == pytest.approx(0.01, rel=0.05)
+    assert found['solvers']['exact']['theta']['scale'] == pytest.approx(0.01, rel=0.05)
+
+
+def test_a_recording_without_a_reference_says_how_to_give_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / 'bare.csv'
+    assert main(['simulate', '--out', str(path), '--loads', 'constant:0,0,0:1']) == 0
+    capsys.readouterr()
+    assert main(['validate', str(path)]) == 4
+    assert 'holds no reference' in capsys.readouterr().err

@@ -1,0 +1,47 @@
+"""Bias, scale and noise of made-up differences, against figures written down beside them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psd_deflection.validation.agreement import agreement
+
+
+def test_bias_scale_and_noise_are_told_apart() -> None:
+    rng = np.random.default_rng(0)
+    true = 2e-3 * np.sin(np.linspace(0.0, 40.0, 3000))
+    reference = true + rng.normal(0.0, 10e-6, 3000)
+    found = agreement(1.004 * true + 5e-6, reference)
+    assert found.bias == pytest.approx(5e-6 + 0.004 * true.mean(), abs=4 * found.bias_sd)
+    assert found.scale == pytest.approx(0.004, abs=4 * found.scale_sd)
+    assert found.scale_sd < 3e-4
+    assert found.noise == pytest.approx(10e-6, rel=0.05)
+    assert found.share == pytest.approx(found.rms / np.abs(reference).max())
+
+
+def test_a_noisy_reference_does_not_shrink_the_scale() -> None:
+    rng = np.random.default_rng(1)
+    true = 1e-4 * np.sin(np.linspace(0.0, 300.0, 20000))
+    found = agreement(true, true + rng.normal(0.0, 50e-6, 20000))
+    # The slope of the estimate on this reference would be 1/3 too small.
+    assert abs(found.scale) < 4 * found.scale_sd < 0.1
+
+
+def test_limits_are_those_of_bland_and_altman() -> None:
+    estimate = np.array([1.0, 2.0, 3.0, 4.0, 6.0])
+    reference = np.array([1.1, 1.8, 3.3, 3.9, 5.7])
+    found = agreement(estimate, reference)
+    d = estimate - reference
+    assert found.bias == pytest.approx(d.mean())
+    assert found.limits == pytest.approx((d.mean() - 1.96 * d.std(ddof=1), d.mean() + 1.96 * d.std(ddof=1)))
+    assert found.rms == pytest.approx(np.sqrt((d**2).mean()))
+    assert found.largest == pytest.approx(0.3)
+
+
+def test_an_axis_that_does_not_move_has_no_scale() -> None:
+    rng = np.random.default_rng(2)
+    found = agreement(rng.normal(0.0, 1e-6, 500), rng.normal(0.0, 1e-5, 500))
+    assert np.isnan(found.scale)
+    assert np.isnan(found.share)
+    assert found.noise == pytest.approx(1e-5, rel=0.1)
