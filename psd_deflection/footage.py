@@ -118,10 +118,10 @@ class Footage:
         cv2 = opencv()
         number = 0
         while True:
-            t_ms = float(self._video.get(cv2.CAP_PROP_POS_MSEC))
             read, image = self._video.read()
             if not read:
                 break
+            t_ms = float(self._video.get(cv2.CAP_PROP_POS_MSEC))
             yield Frame(f'{path.name}:{number}', round(t_ms * 1e6) + self._exposure_ns // 2, grey(image))
             number += 1
         self._video.release()

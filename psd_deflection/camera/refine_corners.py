@@ -35,9 +35,7 @@ class Refined(NamedTuple):
     misfit: FloatArray
 
 
-def refined(
-    image: Any, pixels: FloatArray, edges: FloatArray, reach: float, crossing: bool
-) -> Refined:
+def refined(image: Any, pixels: FloatArray, edges: FloatArray, reach: float, crossing: bool) -> Refined:
     """``pixels`` (n, 2) to within a pixel; ``edges`` (n, 2, 2): unit directions of the two edges at each.
 
     ``reach``: half-width around a corner that shows nothing else, px. ``crossing``: a chessboard's corner; of a tag's

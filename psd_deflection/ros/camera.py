@@ -21,6 +21,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 
 from msg_adapters import DIAGNOSTICS, REFERENCE, REFERENCE_WITH_COVARIANCE, TOPIC_TYPES, to_messages
@@ -33,10 +34,11 @@ from psd_deflection.errors import ConfigError
 from psd_deflection.footage import decoded, of_ros_image
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport, Record, ReferencePose
-from psd_deflection.ros.wires import PublisherWire, message_class
+from psd_deflection.ros.wires import message_class, relative
 
 NODE_NAME = 'camera'
 STATUS = 'psd_deflection: camera'
+_DEPTH = 10
 _OK, _WARN, _ERROR, _STALE = range(4)
 
 
@@ -59,10 +61,16 @@ class CameraNode:
             given = self.node.get_parameters_by_prefix('')
             values = {name: _plain(p.value) for name, p in given.items() if name.partition('.')[0] not in _NOT_OURS}
             self.settings = settings_from(values, 'ROS parameters')
-            self._wire = PublisherWire(
-                self.node, {t: TOPIC_TYPES[t] for t in (REFERENCE, REFERENCE_WITH_COVARIANCE, DIAGNOSTICS)}
-            )
-            self._wire.active = True
+            # Reliable: a subscriber may ask for less, as the estimator does.
+            self._publishers = {
+                topic: self.node.create_publisher(
+                    message_class(TOPIC_TYPES[topic]),
+                    relative(topic),
+                    _DEPTH,
+                    qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+                )
+                for topic in (REFERENCE, REFERENCE_WITH_COVARIANCE, DIAGNOSTICS)
+            }
             newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
             for topic, kind, take in (
                 ('image', 'sensor_msgs/msg/Image', self._image),
@@ -74,7 +82,7 @@ class CameraNode:
         except BaseException:
             self.node.destroy_node()
             raise
-        topics = ', '.join(self._wire.names((REFERENCE, REFERENCE_WITH_COVARIANCE)))
+        topics = ', '.join(self._publishers[t].topic_name for t in (REFERENCE, REFERENCE_WITH_COVARIANCE))
         self._say(f'waiting for images on {self.node.resolve_topic_name("image")}; publishing {topics}')
 
     def _take_info(self, message: Any) -> None:
@@ -124,7 +132,7 @@ class CameraNode:
 
     def _send(self, record: Record) -> None:
         for message in to_messages(record):
-            self._wire.put(message.topic, message.type, cdr.encode(message.type, message.fields), message.t_ns)
+            self._publishers[message.topic].publish(cdr.encode(message.type, message.fields))
 
     def _report(self) -> None:
         since, self._since = self._since, collections.Counter()

@@ -12,9 +12,9 @@ from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.camera.targets import target_of
-from test.camera.render import Pose, Scene, photograph
+from test.camera.render import Pose, Scene, mean_of, over_exposure, photograph
 
-STILL = [Pose()] * 4
+STILL = [Pose()] * 2
 
 
 def settings_of(scene: Scene) -> CameraSettings:
@@ -59,7 +59,7 @@ SCENES = {
 
 @pytest.mark.parametrize('name', SCENES)
 def test_a_rendered_motion_is_found_again(name: str) -> None:
-    moved = [Pose(3e-3, -2e-3, 0.05, 0.01, -0.008), Pose(-4e-3, 1e-3, -0.1), Pose(0.0, 4e-3, 0.3, -0.01, 0.01)]
+    moved = [Pose(3e-3, -2e-3, 0.05, 0.01, -0.008), Pose(-4e-3, 3e-3, 0.3, -0.01, 0.01)]
     assert_within(measured(SCENES[name], STILL + moved), STILL + moved)
 
 
@@ -73,3 +73,64 @@ def test_a_tilt_of_the_plate_is_seen_and_does_not_turn_theta() -> None:
     answer = measured(Scene(tilt=(0.2, 0.1)), poses)[-1]
     assert answer.theta == pytest.approx(0.1, abs=5e-4)
     assert [answer.phi, answer.omega] == pytest.approx([0.12, -0.1], abs=0.01)
+
+
+def test_without_a_lens_the_spacing_is_the_scale() -> None:
+    poses = [*STILL, Pose(2e-3, -1e-3, 0.1)]
+    settings = CameraSettings(spacing=0.025, radius=0.008)
+    answer = measured(Scene(turn=0.2), poses, settings)[-1]
+    assert [answer.dx, answer.dy, answer.theta] == pytest.approx([2e-3, -1e-3, 0.1], abs=20e-6)
+
+
+def test_the_mean_over_the_exposure_is_what_counts() -> None:
+    """A link at its turning point: the middle of the exposure is not the mean, the blur is not symmetric."""
+
+    def motion(t: float) -> Pose:
+        return Pose(4e-3 * math.cos(2 * math.pi * 14.0 * t))
+
+    scene, rng = Scene(), np.random.default_rng(5)
+    poses = over_exposure(motion, 0.0, 8e-3, 24)
+    reference = CameraReference(settings_of(scene), target_of)
+    for number in range(2):
+        reference.take(number, photograph(scene, [Pose()], rng))
+    (*_, answer) = reference.take(2, photograph(scene, poses, rng))
+    mean = mean_of(poses)[0]
+    assert abs(mean - poses[12].dx) > 50e-6
+    assert abs(answer.dx - mean) < 10e-6
+    assert answer.target is not None
+    assert answer.covariance is not None
+    still = 1e-6
+    assert math.sqrt(answer.covariance[0, 0]) > 2 * still
+
+
+@pytest.mark.parametrize(
+    ('status', 'scene'),
+    [
+        (Status.MISSING, Scene(discs=0)),
+        (Status.HIDDEN, Scene(discs=2)),
+        (Status.HIDDEN, Scene(hide=((300.0, 90.0, 335.0, 110.0),))),
+        (Status.OUTSIDE, Scene(aim=(0.0, 0.03))),
+        (Status.DOUBLED, Scene(discs=4, radius=0.006, spacing=0.018)),
+        (Status.SMALL, Scene(distance=5.0)),
+        (Status.DEFOCUSED, Scene(blur=9.0)),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_with_the_reason(status: Status, scene: Scene) -> None:
+    (answer,) = measured(scene, [Pose()])
+    assert (answer.status, answer.covariance) == (status, None)
+
+
+def test_an_overexposed_target_is_refused() -> None:
+    scene, rng = Scene(black=60.0, white=900.0), np.random.default_rng(1)
+    reference = CameraReference(settings_of(scene), target_of)
+    assert reference.take(0, photograph(scene, [Pose()], rng)) == []
+    (answer,) = reference.finish()
+    assert answer.status == Status.SATURATED
+
+
+def test_two_places_in_one_exposure_are_not_a_motion() -> None:
+    scene, rng = Scene(), np.random.default_rng(2)
+    reference = CameraReference(settings_of(scene), target_of)
+    reference.take(0, photograph(scene, [Pose(), Pose(dx=1.5e-3)], rng))
+    (answer,) = reference.finish()
+    assert answer.status == Status.GHOST
