@@ -108,7 +108,7 @@ def test_the_mean_over_the_exposure_is_what_counts() -> None:
     [
         (Status.MISSING, Scene(discs=0)),
         (Status.HIDDEN, Scene(discs=2)),
-        (Status.HIDDEN, Scene(hide=((300.0, 90.0, 335.0, 110.0),))),
+        (Status.HIDDEN, Scene(hide=((280.0, 90.0, 300.0, 110.0),))),
         (Status.OUTSIDE, Scene(aim=(0.0, 0.03))),
         (Status.DOUBLED, Scene(discs=4, radius=0.006, spacing=0.018)),
         (Status.SMALL, Scene(distance=5.0)),

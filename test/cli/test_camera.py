@@ -42,7 +42,7 @@ def test_the_table_has_each_frame_with_its_answer_or_reason(
     said = capsys.readouterr().out
     assert '4 of 5 frames have an answer' in said
     assert '1 refused: no target' in said
-    rows = list(csv.DictReader(out.open()))
+    rows = list(csv.DictReader(out.read_text().splitlines()))
     assert list(rows[0]) == ['t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta', 'status']
     assert [r['t'] for r in rows[:2]] == ['0.002000000', '0.035333000']
     assert [r['status'] for r in rows] == ['ok', 'ok', 'ok', 'no target', 'ok']
