@@ -52,7 +52,7 @@ _ROOT_2PI = math.sqrt(2.0 * math.pi)
 MOST_BLUR = 1.0
 """Longest motion blur with an answer, in units of a disc's radius."""
 
-MEAN_OF_BLUR = 0.05
+MEAN_OF_BLUR = 0.12
 """Error of the mean place over the exposure, one sd in units of the standard deviation of the motion within it."""
 
 MOST_DEFOCUS = 0.15
@@ -73,7 +73,7 @@ DIP = 0.6
 
 _ZONES = 8
 _DWELL = 24
-_DOUBLED_FROM = 1.0
+_DOUBLED_FROM = 0.5
 
 MOST_NOISE = 0.2
 """Largest rms of the residuals with an answer, in units of the contrast."""
@@ -404,7 +404,8 @@ class Fitter:
         covariance = inverse[:6, :6] * np.outer(wider, wider)
         # What the first three moments of the motion do not say of its mean, and what the model does not say at all: a
         # level that is off by the misfit moves the rim by that over the steepest rise.
-        wrong = misfit * _ROOT_2PI * math.hypot(sharp, motion)
+        # It may be one disc's alone, which a mean over three would hide.
+        wrong = 2.0 * misfit * _ROOT_2PI * math.hypot(sharp, motion)
         floor = math.sqrt(CENTRE_FLOOR**2 + (MEAN_OF_BLUR * max(motion - 0.15, 0.0)) ** 2 + wrong**2)
         covariance += self._moved_centres(shape, floor)
         noise = float(np.sqrt(np.mean(raw * raw)))

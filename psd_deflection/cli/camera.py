@@ -8,11 +8,11 @@ show the whole target clearly has no answer, and its reason.
 OUT.csv has t,dx,dy,theta,sd_dx,sd_dy,sd_theta,status (s, m, m, rad; t is the middle of the exposure); OUT.mcap and a
 bag folder have /reference/deflection and /reference/deflection_with_covariance.
 
-  psd-deflection camera frames --params-file camera.yaml --out reference.csv
-  psd-deflection camera /dev/video0 --params-file camera.yaml --out reference.mcap
   psd-deflection camera target --out target.pdf
+  psd-deflection camera frames --params-file camera.yaml --out reference.csv
+  psd-deflection camera /dev/video0 --params-file camera.yaml --out run.mcap
   psd-deflection camera intrinsics shots/*.png --out camera_info.yaml
-  ros2 run psd_deflection camera --ros-args --params-file camera.yaml -r image:=/camera/image_raw
+  ros2 run psd_deflection camera --ros-args -r image:=/camera/image_raw
 """
 
 from __future__ import annotations
