@@ -52,7 +52,7 @@ _ROOT_2PI = math.sqrt(2.0 * math.pi)
 MOST_BLUR = 1.0
 """Longest motion blur with an answer, in units of a disc's radius."""
 
-MEAN_OF_BLUR = 0.12
+MEAN_OF_BLUR = 0.18
 """Error of the mean place over the exposure, one sd in units of the standard deviation of the motion within it."""
 
 MOST_DEFOCUS = 0.15
@@ -62,13 +62,13 @@ MOST_MISFIT, MISFIT_OF_BLUR = 0.012, 0.03
 """Largest difference between picture and model beyond noise with an answer, rms in units of the contrast; and what a
 motion blur adds to it, whose profile is not Gaussian."""
 
-HIDDEN_SECTOR = 0.06
+HIDDEN_SECTOR = 0.04
 """The same for one sector of one rim."""
 
 UNEVEN = 0.004
 """Largest unevenness of the rise of a disc that reaches full scale, in units of the contrast."""
 
-DIP = 0.6
+DIP = 0.7
 """Two peaks of the time at a place, with less than this share of the lower one between them, are two pictures."""
 
 _ZONES = 8
@@ -405,7 +405,7 @@ class Fitter:
         # What the first three moments of the motion do not say of its mean, and what the model does not say at all: a
         # level that is off by the misfit moves the rim by that over the steepest rise.
         # It may be one disc's alone, which a mean over three would hide.
-        wrong = 2.0 * misfit * _ROOT_2PI * math.hypot(sharp, motion)
+        wrong = 4.0 * misfit * _ROOT_2PI * math.hypot(sharp, motion)
         floor = math.sqrt(CENTRE_FLOOR**2 + (MEAN_OF_BLUR * max(motion - 0.15, 0.0)) ** 2 + wrong**2)
         covariance += self._moved_centres(shape, floor)
         noise = float(np.sqrt(np.mean(raw * raw)))
