@@ -14,7 +14,7 @@ from pathlib import Path
 from setuptools import setup
 
 PACKAGE = 'psd_deflection'
-EXECUTABLES = ('estimator', 'replay', 'simulate', 'discover', 'camera', 'check', 'effects', 'validate')
+EXECUTABLES = ('estimator', 'replay', 'simulate', 'discover', 'camera', 'check', 'effects', 'validate', 'identify')
 BUILDS_WHEEL = bool({'bdist_wheel', 'editable_wheel', 'dist_info'} & set(sys.argv))
 
 SHIM = """#!/bin/sh

@@ -84,6 +84,8 @@ SHORTEST = {
 SHORTER = {
     r'^python -m blind\.run\b': '--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation',
     r'^python -m blind\.coverage$': '--rows 1 --losses 1',
+    r'^python -m blind\.clock$': '--runs 5',
+    r'^python -m blind\.modes$': '--rigs 3',
     r'^python -m bench\.campaign\.hellos$': '1000',
     r'^ros2 topic echo\b': '--once',
 }

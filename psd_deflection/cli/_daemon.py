@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from psd_deflection.cli._options import given_as_option
 from psd_deflection.cli._report import show
+from psd_deflection.errors import DaemonError
 from psd_deflection.monitor.start import need_server
 
 if TYPE_CHECKING:
@@ -39,4 +40,7 @@ def daemon_of(args: argparse.Namespace) -> Daemon:
     from psd_deflection.monitor.client import find_daemon
 
     with given_as_option('url'):
-        return find_daemon(args.url)
+        try:
+            return find_daemon(args.url)
+        except DaemonError as error:
+            raise DaemonError(f'{error} as --url') from None

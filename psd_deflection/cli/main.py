@@ -47,6 +47,7 @@ COMMANDS: dict[str, str] = {
     'camera': 'measure the tip by a camera: a reference beside the PSDs; print its target',
     'check': 'check the wiring of a rig: guided by hand, or from a recording with known loads',
     'validate': 'compare the estimates of a recording with a camera, a stage or a tracker',
+    'identify': 'find the modes of the link, and the input shaper that does not ring them',
     'devices': 'list the serial ports and the devices on them, and suggest parameters',
     'plot': 'draw a recording as PNG, SVG, PDF or HTML',
     'info': 'summarise a recording',
@@ -283,6 +284,7 @@ def _executable(command: str) -> Callable[[], int]:
     return lambda: main([command, *sys.argv[1:]])
 
 
-estimator, replay, simulate, discover, camera, check, effects, validate = map(
-    _executable, ('estimator', 'replay', 'simulate', 'discover', 'camera', 'check', 'effects', 'validate')
+estimator, replay, simulate, discover, camera, check, effects, validate, identify = map(
+    _executable,
+    ('estimator', 'replay', 'simulate', 'discover', 'camera', 'check', 'effects', 'validate', 'identify'),
 )

@@ -10,7 +10,7 @@ from psd_deflection.config import BY_NAME, left_as_in_the_thesis
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import SampleBlock
 
-NO_PARAMETERS = 'parameters: without a rig file the nominal rig is taken'
+NO_PARAMETERS = 'parameters: the nominal rig is taken if no rig file is given'
 
 _BREAK = 0.5
 """If time and sample numbers disagree by this share, the device was stopped or restarted between two blocks."""

@@ -29,6 +29,7 @@ ENDLESS = (
     'devices',
     'simulate --serve',
     'validate',
+    'identify',
     'compare-methods --out',
 )
 """Examples that go on until Ctrl-C, take long, or want a device or a reference: only their options are parsed."""

@@ -158,7 +158,7 @@ def test_without_a_daemon_the_error_says_how_to_start_one(
 @pytest.mark.parametrize('url', ['ftp://rig/', 'http://', 'http://rig:99999/', 'http://[::1/'])
 def test_an_address_that_is_none_is_a_mistake_of_the_command_line(url: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['zero', '--url', url]) == 2
-    assert f'--url {url}: is no address' in capsys.readouterr().err
+    assert f'--url = {url}: is no address' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('values', [['nan', '0', '0'], ['0', 'inf', '0']])

@@ -163,7 +163,7 @@ def test_every_command_says_that_it_takes_the_nominal_rig(
         argv = [command[0], str(bare), *command[1:]]
         assert main(argv) == (1 if '--compare' in command else 0)
     answer = capsys.readouterr()
-    assert 'lacks parameters: without a rig file the nominal rig is taken' in answer.err
+    assert 'lacks parameters: the nominal rig is taken if no rig file is given' in answer.err
     assert ('evaluated with the nominal one' in answer.out) == ('--compare' in command)
     (tmp_path / 'c.mcap').unlink(missing_ok=True)
     main([*argv, '--params-file', str(rig)])

@@ -1,0 +1,87 @@
+"""Find the modes of the link in a recording: frequencies, damping ratios, and the input shaper that does not ring them.
+
+Record a few seconds in which the link rings: release a load, or knock on the link. Stretches in which it
+rings alone are found without knowing the loads. If it never does, the spectrum of its motion in operation is
+fitted instead, with wider intervals. --out writes a page with spectra, ring-downs and shapers, identify.json, and
+rig.yaml with the modes in it.
+
+  psd-deflection identify recordings/run
+  psd-deflection identify run.csv --params-file my_rig.yaml --out modes
+  psd-deflection identify run.csv --json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+
+from psd_deflection.calibration import dot_noise_variances
+from psd_deflection.cli._options import namespace_option
+from psd_deflection.cli._progress import progress_of, told
+from psd_deflection.cli._report import print_json, save, show, warn
+from psd_deflection.config import load_rig
+from psd_deflection.errors import RecordingError
+from psd_deflection.identification.modes import modes_of
+from psd_deflection.identification.report import Identified, as_json, report_html, sentences
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.references import read_run
+from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end
+from psd_deflection.solvers.registry import solver_from_rig
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
+    parser.add_argument(
+        '--params-file', metavar='RIG.yaml', help='use this rig instead of the parameters in the recording'
+    )
+    parser.add_argument('--out', metavar='DIR', help='write report.html, identify.json and rig.yaml into this folder')
+    namespace_option(parser)
+    parser.add_argument('--json', action='store_true', help='print the modes as JSON in SI units')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Identify."""
+    if args.out is not None:
+        try:
+            Path(args.out).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RecordingError(f'--out {args.out}: cannot be made a folder ({error.strerror or error})') from None
+    recording = open_recording(args.recording, namespace=args.namespace)
+    rig = rig_at_end(recording) if args.params_file is None else load_rig(args.params_file)
+    for warning in nominal_rig(recording, args.params_file):
+        warn(warning)
+    recording = recording.with_block_size(rig.estimator.block_size)
+    with progress_of(recording.blocks(), quiet=args.json) as bar:
+        seen = read_run(recording, Pipeline(rig), bar)
+    with told('looking for modes', quiet=args.json):
+        rate = rig.converter.sample_rate_hz
+        solver = solver_from_rig(rig.estimator.solver, rig)
+        solved = solver.solve_many(seen.dots, dot_noise_variances(rig))
+        place = np.rint((seen.t_ns - seen.t_ns[0]) * 1e-9 * rate).astype(np.int64)
+        poses = np.full((int(place[-1]) + 1, 3), np.nan)
+        good = solved.status == 0
+        poses[place[good]] = solved.pose[good]
+        x, y, twist = (modes_of(poses[:, i], rate) for i in range(3))
+        found = Identified(poses, rate, (x, y, twist))
+    answer = as_json(found)
+    if args.json:
+        print_json(answer)
+    else:
+        show(*sentences(found))
+        if found.values:
+            show('', 'Lines for the rig file, below ros__parameters:', '')
+            show(*(f'    {name}: {value:g}' for name, value in found.values.items()))
+    if args.out is not None:
+        out = Path(args.out)
+        sources = {'recording': args.recording, 'rig': args.params_file or 'the parameters in the recording'}
+        with told('drawing', quiet=args.json):
+            page = report_html(found, sources)
+        save(page.encode(), out / 'report.html')
+        save((json.dumps(answer, indent=1) + '\n').encode(), out / 'identify.json')
+        show(f'wrote {out / "report.html"}', aside=args.json)
+    return 0
