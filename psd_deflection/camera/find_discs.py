@@ -17,6 +17,9 @@ from psd_deflection.camera.answer import RefusedError, Status
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.records import FloatArray
 
+CLEAR = 8.0
+"""Least distance of another bright thing from the rim of a disc, px."""
+
 MIN_RADIUS = 4.0
 """Smallest half-width of a disc, px."""
 
@@ -62,6 +65,8 @@ def find_discs(grey: Any, ratio: float) -> list[Region]:
         if len(lines) > 1:
             raise RefusedError(Status.DOUBLED)
         if lines:
+            if _crowded(lines[0], regions):
+                raise RefusedError(Status.DOUBLED)
             return lines[0]
         best = max(best, _why(regions, ratio), key=lambda b: b[0])
     raise RefusedError(best[1])
@@ -137,6 +142,18 @@ def _lines(regions: list[Region], ratio: float) -> list[list[Region]]:
                 if abs(middle.half_width(along) - mean) <= _SIZE_TOLERANCE * mean:
                     lines.append([first, middle, last])
     return lines
+
+
+def _crowded(line: list[Region], regions: list[Region]) -> bool:
+    """Whether something as bright and not much smaller is so near to a disc that it lights its rim."""
+    for disc in line:
+        size = disc.axes[1]
+        for other in regions:
+            if any(other is d for d in line) or not 0.2 * size < other.axes[1] < 1.5 * size:
+                continue
+            if np.linalg.norm(other.centre - disc.centre) < size + other.axes[1] + CLEAR:
+                return True
+    return False
 
 
 def _why(regions: list[Region], ratio: float) -> tuple[int, Status]:

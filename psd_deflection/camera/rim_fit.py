@@ -52,7 +52,7 @@ _ROOT_2PI = math.sqrt(2.0 * math.pi)
 MOST_BLUR = 1.0
 """Longest motion blur with an answer, in units of a disc's radius."""
 
-MEAN_OF_BLUR = 0.18
+MEAN_OF_BLUR = 0.22
 """Error of the mean place over the exposure, one sd in units of the standard deviation of the motion within it."""
 
 MOST_DEFOCUS = 0.15
@@ -68,7 +68,7 @@ HIDDEN_SECTOR = 0.04
 UNEVEN = 0.004
 """Largest unevenness of the rise of a disc that reaches full scale, in units of the contrast."""
 
-DIP = 0.7
+DIP = 0.75
 """Two peaks of the time at a place, with less than this share of the lower one between them, are two pictures."""
 
 _ZONES = 8
