@@ -387,7 +387,7 @@ class Fitter:
         if motion > _DOUBLED_FROM * max(sharp, 0.5) and self._doubled(normal, relative, shape.blur):
             raise RefusedError(Status.GHOST)
         misfit = self._misfit(normal.z, relative, sector, rims, full_scale)
-        if misfit > MOST_MISFIT + MISFIT_OF_BLUR * min(motion / sharp, 2.0):
+        if misfit > MOST_MISFIT + MISFIT_OF_BLUR * min(max(motion / sharp - 0.5, 0.0), 1.5):
             raise RefusedError(Status.MISFIT)
         count = len(residual)
         chi_square = float(residual @ residual) / (count - 30)
