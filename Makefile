@@ -20,6 +20,7 @@
 # make shots    the pictures of the live page in docs/figures anew (needs Chromium)
 # make blind    hide effects with a second generator and see whether discover names them (an hour or two on two cores; JOBS=1 for one)
 # make blind-calibration  200 rigs of the second generator, misaligned by chance, calibrated and checked (half an hour on two idle cores; RIGS=20 for a look)
+# make camera-campaign  render 10,000 frames, most of them bad, and see whether the camera is right about each (two hours)
 # make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
 # make clean    remove what the above made
 PYTHON ?= python3
@@ -34,7 +35,7 @@ PYTEST ?=
 WORKERS ?= 2
 BIN := $(VENV)/bin
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks axe shots blind blind-calibration demo-discover colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks axe shots blind blind-calibration camera-campaign demo-discover colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -148,7 +149,7 @@ wheel: $(VENV)/.installed
 	$(BIN)/python -m build --outdir dist . > build/wheel/log
 	$(PYTHON) -m venv build/wheel/use && build/wheel/use/bin/pip install --quiet --disable-pip-version-check dist/*.whl
 	cd build/wheel && use/bin/psd-deflection --help && use/bin/psd-deflection info ../../bags/clean
-	build/wheel/use/bin/pip install --quiet --disable-pip-version-check 'psd_deflection[monitor]' 'psd_deflection[ros]' 'psd_deflection[pandas]'
+	build/wheel/use/bin/pip install --quiet --disable-pip-version-check 'psd_deflection[monitor]' 'psd_deflection[ros]' 'psd_deflection[pandas]' 'psd_deflection[camera]'
 	build/wheel/use/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/*.tar.gz
 	cd build/wheel && use/bin/psd-deflection --version && use/lib/psd_deflection/replay --help > log
 
@@ -167,6 +168,11 @@ blind: $(VENV)/.installed
 RIGS ?= 200
 blind-calibration: $(VENV)/.installed
 	OMP_NUM_THREADS=1 $(BIN)/python -m blind.calibration --rigs $(RIGS) --jobs $(JOBS)
+
+# Rendered frames: errors, cost, and adverse frames, of which no answer may be wrong (two hours on an idle core).
+CAMERA_FRAMES ?= 10000
+camera-campaign: $(VENV)/.installed
+	$(BIN)/python -m bench.campaign.camera --frames $(CAMERA_FRAMES)
 
 demo-discover: $(VENV)/.installed
 	rm -rf build/demo && mkdir -p build/demo

@@ -14,7 +14,18 @@ from pathlib import Path
 from setuptools import setup
 
 PACKAGE = 'psd_deflection'
-EXECUTABLES = ('estimator', 'replay', 'simulate', 'discover', 'calibrate', 'check', 'effects', 'validate', 'identify')
+EXECUTABLES = (
+    'estimator',
+    'replay',
+    'simulate',
+    'discover',
+    'calibrate',
+    'camera',
+    'check',
+    'effects',
+    'validate',
+    'identify',
+)
 BUILDS_WHEEL = bool({'bdist_wheel', 'editable_wheel', 'dist_info'} & set(sys.argv))
 
 SHIM = """#!/bin/sh

@@ -31,6 +31,7 @@ from psd_deflection.records import (
     ParameterChange,
     Record,
     ReferencePose,
+    ReferenceWithCovariance,
     RigState,
     SampleBlock,
     SpotMeans,
@@ -38,7 +39,7 @@ from psd_deflection.records import (
     TipLoad,
 )
 
-Input = AppliedLoad | ReferencePose | TemperatureReading
+Input = AppliedLoad | ReferencePose | ReferenceWithCovariance | TemperatureReading
 
 SAMPLES = '/psd/samples'
 SPOTS = ('/psd_1/spot', '/psd_2/spot')
@@ -48,6 +49,7 @@ DIAGNOSTICS = '/diagnostics'
 RIG = '/link_tip/rig'
 LOAD = '/link_tip/load'
 REFERENCE = '/reference/deflection'
+REFERENCE_WITH_COVARIANCE = '/reference/deflection_with_covariance'
 TEMPERATURE = '/environment/temperature'
 
 
@@ -82,6 +84,13 @@ TOPICS = (
     Topic(RIG, string.MESSAGE, RigState, string.from_rig, latched=True),
     Topic(LOAD, wrench_stamped.MESSAGE, AppliedLoad, wrench_stamped.from_load, wrench_stamped.to_applied_load),
     Topic(REFERENCE, pose_stamped.MESSAGE, ReferencePose, pose_stamped.from_reference, pose_stamped.to_reference),
+    Topic(
+        REFERENCE_WITH_COVARIANCE,
+        pose_with_covariance_stamped.MESSAGE,
+        ReferenceWithCovariance,
+        pose_with_covariance_stamped.from_estimate,
+        pose_with_covariance_stamped.to_reference,
+    ),
     Topic(TEMPERATURE, temperature.MESSAGE, TemperatureReading, temperature.from_reading, temperature.to_reading),
 )
 """Every fixed topic: a new message is one line here. Each solver adds :func:`solver_topic`, a PoseStamped."""

@@ -1,13 +1,17 @@
-"""geometry_msgs/PoseWithCovarianceStamped: the primary estimate with its covariance."""
+"""geometry_msgs/PoseWithCovarianceStamped: the primary estimate or a reference, with its covariance."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
-from msg_adapters.header import Fields, header
+from msg_adapters.header import Fields, header, stamp_ns
 from msg_adapters.message_type import MessageType
+from msg_adapters.orientation import angles
 from msg_adapters.pose_stamped import FRAME, pose
-from psd_deflection.records import DeflectionEstimate, FloatArray
+from psd_deflection.records import DeflectionEstimate, FloatArray, ReferenceWithCovariance
 
 MESSAGE = MessageType(
     'geometry_msgs/msg/PoseWithCovarianceStamped',
@@ -23,8 +27,8 @@ _OBSERVED = (0, 1, 5)
 """x, y and yaw in ROS order (x, y, z, roll, pitch, yaw)."""
 
 
-def from_estimate(e: DeflectionEstimate) -> Fields:
-    """Fields of the estimate: covariance 6 x 6, row by row, in ROS order."""
+def from_estimate(e: DeflectionEstimate | ReferenceWithCovariance) -> Fields:
+    """Fields of an estimate or a reference: covariance 6 x 6, row by row, in ROS order."""
     covariance = [0.0] * 36
     for axis in (2, 3, 4):
         covariance[7 * axis] = UNOBSERVED_VARIANCE
@@ -35,6 +39,17 @@ def from_estimate(e: DeflectionEstimate) -> Fields:
         'header': header(e.t_ns, FRAME),
         'pose': {'pose': pose(e.dx, e.dy, e.theta, e.phi, e.omega), 'covariance': covariance},
     }
+
+
+def to_reference(fields: Mapping[str, Any]) -> ReferenceWithCovariance:
+    """The record of a reference message: m, m, rad."""
+    pose_fields = fields['pose']['pose']
+    theta, phi, omega = angles(pose_fields['orientation'])
+    place, numbers = pose_fields['position'], fields['pose']['covariance']
+    covariance = tuple(float(numbers[6 * i + j]) for i in _OBSERVED for j in _OBSERVED)
+    return ReferenceWithCovariance(
+        stamp_ns(fields), float(place['x']), float(place['y']), theta, phi, omega, covariance
+    )
 
 
 def to_covariances(numbers: FloatArray) -> FloatArray:

@@ -162,6 +162,18 @@ class ReferencePose(NamedTuple):
     theta: float
 
 
+class ReferenceWithCovariance(NamedTuple):
+    """The same with its uncertainty: m, m, rad; tilts in rad; ``covariance`` as of :class:`DeflectionEstimate`."""
+
+    t_ns: int
+    dx: float
+    dy: float
+    theta: float
+    phi: float
+    omega: float
+    covariance: tuple[float, ...]
+
+
 class TemperatureReading(NamedTuple):
     """Ambient temperature, degrees Celsius (as sensor_msgs/Temperature has it)."""
 
@@ -236,6 +248,7 @@ Record = (
     | TipLoad
     | AppliedLoad
     | ReferencePose
+    | ReferenceWithCovariance
     | TemperatureReading
     | DiagnosticReport
     | ParameterChange

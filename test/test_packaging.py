@@ -73,6 +73,7 @@ def test_the_version_is_the_same_everywhere() -> None:
 
 FROM_PYPI = {
     'cobs': 'python-cobs-pip',
+    'cv2': 'python3-opencv',
     'ruamel': 'python3-ruamel.yaml',
     # It brings the others.
     **dict.fromkeys(('mcap', 'mcap_ros2', 'zstandard', 'lz4'), 'mcap-ros2-support'),

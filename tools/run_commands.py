@@ -48,7 +48,7 @@ CI_RUNS = (
     (r'^make colcon$', '.ci/run', 'make colcon '),
     (r'^colcon build$', 'Makefile', 'bin/colcon --log-base log build '),
     (
-        r"^pip install 'psd_deflection\[(ros|monitor|pandas)\]'$",
+        r"^pip install 'psd_deflection\[(ros|monitor|pandas|camera)\]'$",
         'Makefile',
         "pip install --quiet --disable-pip-version-check 'psd_deflection[",
     ),
@@ -75,6 +75,7 @@ SHORTEST = {
     'crash': 'CRASH_TIMES=1',
     'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=1000 FUZZ_HELLOS=1000',
     'soak': 'SOAK_MINUTES=0.05 SOAK_HOURS=0.05',
+    'camera-campaign': 'CAMERA_FRAMES=20',
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
     'blind-calibration': 'RIGS=1',
     'shots': 'SHOT_SECONDS=2',
@@ -95,6 +96,7 @@ VERDICTS = {
     'faults': r'between the faults +\d',
     'crash': r'\d+ kills: ',
     'soak': r'real time: \d+ samples lost',
+    'camera-campaign': r'adverse frames: ',
     'blind': r'failures \(\d+\)',
 }
 """What a campaign says at its end: cut short, on a busy machine, it may come to another verdict than in full."""

@@ -45,6 +45,7 @@ COMMANDS: dict[str, str] = {
     'discover': 'find the physical effect that the simulation of a recording lacks',
     'calibrate': 'estimate how the real rig differs from its rig file, with a reference or known loads',
     'effects': 'list the effects that can be simulated and discovered, or explain one',
+    'camera': 'measure the tip by a camera: a reference beside the PSDs; print its target',
     'check': 'check the wiring of a rig: guided by hand, or from a recording with known loads',
     'validate': 'compare the estimates of a recording with a camera, a stage or a tracker',
     'identify': 'find the modes of the link, and the input shaper that does not ring them',
@@ -284,7 +285,7 @@ def _executable(command: str) -> Callable[[], int]:
     return lambda: main([command, *sys.argv[1:]])
 
 
-estimator, replay, simulate, discover, calibrate, check, effects, validate, identify = map(
+estimator, replay, simulate, discover, calibrate, camera, check, effects, validate, identify = map(
     _executable,
-    ('estimator', 'replay', 'simulate', 'discover', 'calibrate', 'check', 'effects', 'validate', 'identify'),
+    ('estimator', 'replay', 'simulate', 'discover', 'calibrate', 'camera', 'check', 'effects', 'validate', 'identify'),
 )

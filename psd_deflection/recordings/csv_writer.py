@@ -21,6 +21,7 @@ from psd_deflection.records import (
     DeflectionEstimate,
     Record,
     ReferencePose,
+    ReferenceWithCovariance,
     SampleBlock,
     TemperatureReading,
 )
@@ -157,3 +158,18 @@ class CsvEstimateSink(_CsvFile):
         cells.append(repr(primary.chi_square) if primary is not None and known else '')
         self._block = []
         self._write([','.join(cells)])
+
+
+class CsvReferenceFile(_CsvFile):
+    """A camera's poses: ``t,dx,dy,theta,sd_dx,sd_dy,sd_theta,status`` (s, m, m, rad), a row a frame."""
+
+    def __init__(self, path: str | Path) -> None:
+        super().__init__(path, ['t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta', 'status'])
+
+    def put(self, t_ns: int, reference: ReferenceWithCovariance | None, status: str) -> None:
+        """Write one frame: its pose, or None and the reason why there is none."""
+        cells = [''] * 6
+        if reference is not None:
+            deviations = [math.sqrt(reference.covariance[i]) for i in (0, 4, 8)]
+            cells = [repr(v) for v in (reference.dx, reference.dy, reference.theta, *deviations)]
+        self._write([','.join([seconds(t_ns), *cells, status])])

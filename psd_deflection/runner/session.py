@@ -220,7 +220,7 @@ class Session:
             record = from_fields(topic, cdr.decode(TOPIC_TYPES[topic], message))
         except ValueError:
             return None
-        if not all(map(math.isfinite, record)):
+        if not all(math.isfinite(n) for field in record for n in (field if isinstance(field, tuple) else (field,))):
             return None
         if record.t_ns == 0:
             record = record._replace(t_ns=self.acquisition.now_ns())

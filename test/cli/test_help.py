@@ -15,6 +15,9 @@ from psd_deflection.errors import EXIT_STATUSES
 ROOT = Path(__file__).parent.parent.parent
 OURS = 'psd-deflection '
 ENDLESS = (
+    'camera frames',
+    'camera /dev/video0',
+    'camera intrinsics',
     'check',
     'echo',
     'zero',

@@ -18,6 +18,7 @@ from psd_deflection.records import (
     DiagnosticReport,
     Record,
     ReferencePose,
+    ReferenceWithCovariance,
     SampleBlock,
     SpotMeans,
     TemperatureReading,
@@ -64,6 +65,7 @@ def run(blocks: int) -> Iterator[Record]:
         if i % 10 == 0:
             yield AppliedLoad(T0 + 20 * STEP * i, 0.5 * i, 0.0, 0.1)
             yield ReferencePose(T0 + 20 * STEP * i, 1e-3, 2e-3, 3e-3)
+            yield ReferenceWithCovariance(T0 + 20 * STEP * i, 1e-3, 2e-3, 3e-3, 0.0, 0.0, (1e-12,) * 9)
         if i % 50 == 49:
             entry = DiagnosticEntry('psd_deflection: samples', 1, '2 lost', (('rate', '998.0'),))
             yield DiagnosticReport(T0 + 20 * STEP * i, (entry,))

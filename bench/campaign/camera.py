@@ -1,0 +1,369 @@
+"""How true the camera is: rendered frames, 10,000 of them as bad as a laboratory makes them.
+
+    python -m bench.campaign.camera --frames 10000
+    python -m bench.campaign.camera --frames 300 --only adverse
+
+Three tables: errors at the thesis's scale (rms of the discs' centres, their Cramer-Rao bound, the tip); the cost of a
+frame beside OpenCV's ``findCirclesGrid`` on the same images in the same run; adverse frames, of which no answer may be
+further off than 5 sigma of its own covariance. It ends with status 1 if a bound is broken.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import math
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from psd_deflection.camera.answer import FrameAnswer, Status
+from psd_deflection.camera.boards import board_of, board_size
+from psd_deflection.camera.opencv import opencv
+from psd_deflection.camera.reference import CameraReference
+from psd_deflection.camera.settings import CameraSettings
+from psd_deflection.camera.targets import target_of
+
+ROOT = Path(__file__).resolve().parents[2]
+REST = 4
+RUN = 20
+"""Frames of one rendered rig, after those at rest."""
+
+SIGMAS = 5.0
+
+
+def renderer() -> Any:
+    """The judge's renderer, which lies beside the tests; ``test`` is also the name of a package of Python."""
+    spec = importlib.util.spec_from_file_location('render', ROOT / 'test' / 'camera' / 'render.py')
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules['render'] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+render = renderer()
+
+
+def settings_of(scene: Any, rest: int = 0) -> CameraSettings:
+    return CameraSettings(
+        rest_frames=rest,
+        matrix=tuple(scene.matrix),
+        distortion=tuple(scene.distortion),
+        view=scene.view,
+        spacing=scene.spacing,
+        radius=scene.radius,
+    )
+
+
+def random_scene(rng: np.random.Generator) -> Any:
+    """A camera, a target and a light as a laboratory may have them."""
+    lens = rng.uniform(-0.25, 0.1)
+    white = rng.uniform(120.0, 250.0)
+    return render.Scene(
+        focal=rng.uniform(1200.0, 2600.0),
+        centre=(rng.uniform(300.0, 340.0), rng.uniform(220.0, 260.0)),
+        distortion=(lens, rng.uniform(-0.1, 0.1), *rng.uniform(-1e-3, 1e-3, 2)) if rng.random() < 0.7 else (),
+        distance=rng.uniform(0.38, 0.6),
+        turn=rng.uniform(-0.6, 0.6),
+        tilt=tuple(rng.uniform(-0.3, 0.3, 2)),
+        aim=tuple(rng.uniform(-0.012, 0.012, 2)),
+        view='base' if rng.random() < 0.3 else 'outside',
+        black=rng.uniform(5.0, 50.0),
+        white=white,
+        slope=tuple(rng.uniform(-0.6, 0.6, 2)),
+        blur=rng.uniform(0.3, 2.0),
+        read_noise=rng.uniform(0.5, 6.0),
+        shot_noise=rng.uniform(0.0, 0.4),
+    )
+
+
+def random_motion(rng: np.random.Generator) -> Any:
+    """A link that rings: bending and twist together, some mm and degrees."""
+    amplitude = rng.uniform(0.0, 4e-3, 2)
+    twist = rng.uniform(0.0, 0.05)
+    phase = rng.uniform(0.0, 2 * np.pi, 3)
+    still = rng.uniform(-2e-3, 2e-3, 2)
+
+    def motion(t: float) -> Any:
+        dx = still[0] + amplitude[0] * math.sin(2 * math.pi * 14.0 * t + phase[0])
+        dy = still[1] + amplitude[1] * math.sin(2 * math.pi * 14.0 * t + phase[1])
+        theta = twist * math.sin(2 * math.pi * 21.0 * t + phase[2])
+        return render.Pose(dx, dy, theta, -1.5 * dy / 0.585, 1.5 * dx / 0.585)
+
+    return motion
+
+
+HURTS = (
+    'none',
+    'motion blur',
+    'long exposure',
+    'occluder',
+    'occluder of its colour',
+    'missing disc',
+    'second target',
+    'ghost',
+    'over-exposed',
+    'blooming',
+    'out of focus',
+    'dark',
+    'far away',
+    'outside',
+    'glare',
+    'clutter',
+    'nothing',
+    'lines of noise',
+)
+
+
+def adverse(rng: np.random.Generator, scene: Any, motion: Any, hurt: str) -> tuple[Any, tuple[float, float, float]]:
+    """One frame with ``hurt`` done to it, and the truth: the mean over the exposure."""
+    t = rng.uniform(0.0, 1.0)
+    if hurt in {'far away', 'outside'}:
+        # The plate is really there: the camera stays where it was.
+        away = render.Pose(*rng.choice([-1, 1], 2) * rng.uniform(0.02, 0.08, 2), z=rng.uniform(-0.02, 0.02))
+        if hurt == 'far away':
+            away = render.Pose(z=(-1.0 if scene.view == 'outside' else 1.0) * rng.uniform(0.3, 6.0))
+        near = motion
+
+        def motion(t: float) -> Any:
+            return replace(near(t), dx=near(t).dx + away.dx, dy=near(t).dy + away.dy, z=away.z)
+
+    exposure = {'motion blur': rng.uniform(2e-3, 8e-3), 'long exposure': rng.uniform(8e-3, 33e-3)}.get(hurt, 3e-4)
+    instants = 24 if exposure > 1e-3 else 2
+    poses = render.over_exposure(motion, t, exposure, instants)
+    truth = render.mean_of(poses)
+    if hurt == 'out of focus':
+        scene = replace(scene, blur=rng.uniform(2.0, 12.0))
+    if hurt == 'dark':
+        scene = replace(scene, black=rng.uniform(2, 6), white=rng.uniform(8, 30))
+    if hurt == 'missing disc':
+        scene = replace(scene, discs=2)
+    if hurt == 'nothing':
+        scene = replace(scene, discs=0)
+    grey = render.clean(scene, poses)
+    rows, columns = grey.shape
+    v, u = np.mgrid[:rows, :columns]
+    cx, cy = render.seen_at(scene, poses[0], 0.0, scene.spacing * rng.integers(-1, 2))
+    pixel = scene.focal / scene.distance
+    r = scene.radius * pixel
+    turn = rng.uniform(0, 2 * np.pi)
+    at = (cx + r * math.cos(turn), cy + r * math.sin(turn))
+    size = rng.uniform(0.05, 1.2) * r
+    if hurt in {'occluder', 'occluder of its colour'}:
+        across = (u - at[0]) * math.cos(turn) + (v - at[1]) * math.sin(turn)
+        along = -(u - at[0]) * math.sin(turn) + (v - at[1]) * math.cos(turn)
+        cover = (np.abs(across) < size) & (np.abs(along) < size * rng.uniform(0.3, 3.0))
+        edge = gaussian_filter(cover.astype(float), rng.uniform(0.3, 2.0))
+        colour = rng.choice([scene.black, scene.white]) if 'colour' in hurt else rng.uniform(0, 255)
+        grey = grey * (1 - edge) + colour * edge
+    if hurt == 'second target':
+        shift = rng.integers(-200, 200, 2)
+        grey = np.maximum(grey, np.roll(grey, shift, (0, 1)))
+    if hurt == 'ghost':
+        # Nearer than that, two pictures are a motion that was exposed twice, and their mean is right.
+        away = rng.uniform(4.0, 14.0)
+        shift = np.rint([away * math.sin(turn), away * math.cos(turn)]).astype(int)
+        grey = grey + rng.uniform(0.1, 1.0) * (np.roll(grey, shift, (0, 1)) - scene.black)
+    if hurt in {'over-exposed', 'blooming'}:
+        grey = grey * rng.uniform(1.2, 6.0)
+    if hurt == 'blooming':
+        grey = np.minimum(grey, 2000.0)
+        spill = np.maximum(grey - 255.0, 0.0)
+        down = np.cumsum(spill, axis=0) * (spill > 0)
+        grey = grey + 0.02 * np.roll(down, 3, axis=0) + gaussian_filter(spill, 6.0) * rng.uniform(0.1, 1.0)
+    if hurt == 'glare':
+        spot = np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / (2 * (size + 3) ** 2))
+        grey = grey + rng.uniform(20, 400) * spot
+    if hurt == 'clutter':
+        for _ in range(int(rng.integers(3, 25))):
+            x, y, q = rng.uniform(0, columns), rng.uniform(0, rows), rng.uniform(3, 50)
+            near = np.hypot(u - x, (v - y) * rng.uniform(0.6, 1.6)) < q
+            grey = np.where(near, rng.uniform(0, 255), grey)
+    if hurt == 'lines of noise':
+        grey = grey + rng.normal(0, rng.uniform(2, 15), (rows, 1))
+    sd = np.sqrt(scene.read_noise**2 + scene.shot_noise**2 * np.maximum(grey, 0.0))
+    return np.clip(np.rint(grey + sd * rng.standard_normal(grey.shape)), 0, 255).astype(np.uint8), truth
+
+
+def runs(
+    frames: int, seed: int, hurts: Sequence[str] = HURTS
+) -> Iterator[tuple[str, FrameAnswer, tuple[float, float, float]]]:
+    """What was done to a frame, its answer, the truth."""
+    number = done = 0
+    while done < frames:
+        number += 1
+        rng = np.random.default_rng([seed, number])
+        scene, motion = random_scene(rng), random_motion(rng)
+        reference = CameraReference(settings_of(scene, REST), target_of)
+        for _ in range(REST):
+            reference.take(0, render.photograph(scene, [render.Pose()], rng))
+        if reference.rest is None:
+            # The plate at rest is not whole in the picture: another rig.
+            continue
+        for _ in range(min(RUN, frames - done)):
+            hurt = str(rng.choice(hurts))
+            image, truth = adverse(rng, scene, motion, hurt)
+            yield hurt, reference.take(0, image)[0], truth
+            done += 1
+
+
+def off_by(answer: FrameAnswer, truth: tuple[float, float, float]) -> float:
+    """The largest error of the three in units of its own sd."""
+    assert answer.covariance is not None
+    off = np.array([answer.dx, answer.dy, answer.theta]) - truth
+    return float(np.max(np.abs(off) / np.sqrt(np.diag(answer.covariance))))
+
+
+def adverse_table(frames: int, seed: int, hurts: Sequence[str] = HURTS) -> bool:
+    """Print what became of each kind of frame; True if no answer is wrong."""
+    refused: Counter[str] = Counter()
+    reasons: dict[str, Counter[str]] = {}
+    sigmas: dict[str, list[float]] = {}
+    sds: dict[str, list[float]] = {}
+    for hurt, answer, truth in runs(frames, seed, hurts):
+        sigmas.setdefault(hurt, [])
+        if answer.status is not Status.OK:
+            refused[hurt] += 1
+            reasons.setdefault(hurt, Counter())[str(answer.status)] += 1
+            continue
+        sigmas[hurt].append(off_by(answer, truth))
+        assert answer.covariance is not None
+        sds.setdefault(hurt, []).append(1e6 * math.sqrt(max(answer.covariance[0, 0], answer.covariance[1, 1])))
+    print('frame with               frames  refused  worst/sd  rms/sd  sd um  reason')
+    total = wrong = 0
+    for hurt in hurts:
+        found = np.array(sigmas.get(hurt, []))
+        count = len(found) + refused[hurt]
+        total, wrong = total + count, wrong + int(np.sum(found > SIGMAS))
+        worst = f'{found.max():8.2f} {np.sqrt(np.mean(found**2)):7.2f}' if len(found) else f'{"":8} {"":7}'
+        sd = f'{np.median(sds[hurt]):6.2f}' if hurt in sds else f'{"":6}'
+        reason = ', '.join(f'{r} {n}' for r, n in reasons.get(hurt, Counter()).most_common(3))
+        print(f'{hurt:24} {count:6} {100 * refused[hurt] / max(count, 1):7.1f}%  {worst} {sd}  {reason}')
+    share = 100 * sum(refused.values()) / max(total, 1)
+    print(f'{total} adverse frames: {share:.1f} % refused, {wrong} answers beyond {SIGMAS:g} sd of their own')
+    return wrong == 0
+
+
+SCALES = {
+    '640 x 480': render.Scene(),
+    '1920 x 1080': render.Scene(width=1920, height=1080, focal=5000.0, centre=(960.0, 520.0), blur=1.0),
+}
+"""The thesis's scale: a target of 66 mm fills most of the height."""
+
+
+def bound_of(scene: Any) -> float:
+    """Cramer-Rao bound of the place of the middle disc in the image, px a coordinate: noise over the summed slopes."""
+    shift = 0.05 * scene.distance / scene.focal
+    one = replace(scene, discs=1)
+    ends = [render.clean(one, [render.Pose(dx=s * shift)]) for s in (1.0, -1.0)]
+    slope = (ends[0] - ends[1]) / 0.1
+    # Rounding to whole grey levels is noise too.
+    return math.sqrt((scene.read_noise**2 + 1.0 / 12.0) / float(np.sum(slope**2)))
+
+
+def accuracy_table(frames: int, seed: int) -> bool:
+    """Print errors at the thesis's scale, discs and ChArUco; True if all bounds are kept."""
+    fine = True
+    print('images       target   frames  centre px  bound px  dX um  dY um  theta deg')
+    for name, scene in SCALES.items():
+        rng = np.random.default_rng(seed)
+        reference = CameraReference(settings_of(scene, 8), target_of)
+        for _ in range(8):
+            reference.take(0, render.photograph(scene, [render.Pose()], rng))
+        off, centres = [], []
+        for _ in range(frames):
+            pose = render.Pose(*rng.uniform(-3e-3, 3e-3, 2), rng.uniform(-0.05, 0.05))
+            (answer,) = reference.take(0, render.photograph(scene, [pose], rng))
+            assert answer.target is not None
+            off.append([answer.dx - pose.dx, answer.dy - pose.dy, answer.theta - pose.theta])
+            true = [render.seen_at(scene, pose, *c) for c in render.centres_of(scene)]
+            centres.append(answer.target.points - np.array(true))
+        rms = np.sqrt(np.mean(np.square(off), axis=0)) * [1e6, 1e6, math.degrees(1.0)]
+        centre, bound = float(np.sqrt(np.mean(np.square(centres)))), bound_of(scene)
+        print(
+            f'{name:12} discs    {frames:6}  {centre:9.4f}  {bound:8.4f}  {rms[0]:5.2f}  {rms[1]:5.2f}  {rms[2]:9.5f}'
+        )
+        fine &= centre < 0.03 and centre < 1.5 * bound and max(rms[0], rms[1]) < 10.0 and rms[2] < 0.03
+    fine &= charuco_row(max(frames // 10, 5), seed)
+    return fine
+
+
+def charuco_row(frames: int, seed: int) -> bool:
+    """The same for a ChArUco board of 70 x 90 mm; True if theta is good to 0.003 degrees."""
+    scene = SCALES['640 x 480']
+    scene = replace(scene, focal=1700.0)
+    settings = replace(settings_of(scene, 4), target='charuco')
+    board, size = board_of(settings), board_size(settings)
+    texture = board.generateImage((1400, 1800), None, 0, 1) / 255.0
+    rng = np.random.default_rng(seed)
+    reference = CameraReference(settings, target_of)
+
+    def shot(pose: Any) -> Any:
+        return render.photograph_of(scene, render.board(scene, pose, texture, size), rng)
+
+    for _ in range(4):
+        reference.take(0, shot(render.Pose()))
+    off = []
+    for _ in range(frames):
+        pose = render.Pose(*rng.uniform(-3e-3, 3e-3, 2), rng.uniform(-0.05, 0.05))
+        (answer,) = reference.take(0, shot(pose))
+        off.append([answer.dx - pose.dx, answer.dy - pose.dy, answer.theta - pose.theta])
+    rms = np.sqrt(np.mean(np.square(off), axis=0)) * [1e6, 1e6, math.degrees(1.0)]
+    print(f'640 x 480    ChArUco  {frames:6}  {"":9}  {"":8}  {rms[0]:5.2f}  {rms[1]:5.2f}  {rms[2]:9.5f}')
+    return bool(rms[2] < 0.003)
+
+
+def cost_table(frames: int, seed: int) -> None:
+    """Print the processor time of a frame beside OpenCV's own finder of circles, which gives no pose."""
+    cv2 = opencv()
+    print('images       ms a frame  findCirclesGrid')
+    for name, scene in SCALES.items():
+        rng = np.random.default_rng(seed)
+        images = [render.photograph(scene, [render.Pose(dx=1e-4 * i)], rng) for i in range(frames)]
+        reference = CameraReference(settings_of(scene, 2), target_of)
+        for image in images[:3]:
+            reference.take(0, image)
+        began = time.process_time()
+        for image in images:
+            reference.take(0, image)
+        ours = (time.process_time() - began) / frames
+        wanted = cv2.SimpleBlobDetector_Params()
+        wanted.blobColor, wanted.minArea, wanted.maxArea = 255, 50.0, 1e5
+        finder = cv2.SimpleBlobDetector_create(wanted)
+        began = time.process_time()
+        for image in images:
+            cv2.findCirclesGrid(image, (1, 3), flags=cv2.CALIB_CB_SYMMETRIC_GRID, blobDetector=finder)
+        theirs = (time.process_time() - began) / frames
+        print(f'{name:12} {1e3 * ours:10.1f}  {1e3 * theirs:15.1f}')
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--frames', type=int, default=10_000)
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--hurts', nargs='+', choices=HURTS, default=HURTS, metavar='NAME')
+    parser.add_argument('--only', choices=('adverse', 'accuracy'))
+    args = parser.parse_args()
+    opencv().setNumThreads(1)
+    began = time.perf_counter()
+    fine = True
+    if args.only in (None, 'accuracy'):
+        fine &= accuracy_table(min(args.frames // 10, 200), args.seed)
+        cost_table(min(20, args.frames // 10 + 3), args.seed)
+    if args.only in (None, 'adverse'):
+        fine &= adverse_table(args.frames, args.seed, args.hurts)
+    print(f'{time.perf_counter() - began:.0f} s')
+    return 0 if fine else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""What one frame gives: a pose with its covariance, or the reason why there is none."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import NamedTuple
+
+from psd_deflection.records import FloatArray, ReferenceWithCovariance
+
+
+class Status(StrEnum):
+    """Why a frame has no answer; the value is what the CSV and ``/diagnostics`` say."""
+
+    OK = 'ok'
+    UNREADABLE = 'unreadable image'
+    MISSING = 'no target'
+    HIDDEN = 'partly hidden'
+    OUTSIDE = 'outside the image'
+    DOUBLED = 'more than one target'
+    SATURATED = 'saturated'
+    GHOST = 'doubled'
+    BLURRED = 'motion blur too long'
+    DEFOCUSED = 'out of focus'
+    SMALL = 'target too small'
+    OBLIQUE = 'too oblique'
+    MISFIT = 'image does not fit the target'
+    HALF_TURN = 'turned too far since the last answer'
+
+
+class RefusedError(Exception):
+    """This frame has no answer, for the reason ``status``."""
+
+    def __init__(self, status: Status) -> None:
+        super().__init__(str(status))
+        self.status = status
+
+
+class TargetPose(NamedTuple):
+    """Where the target is in the camera's axes: a point P of the target lies at ``rotation @ P + place``, m.
+
+    ``covariance`` (6, 6) of a small turn about the target's own axes (rad) and of ``place`` (m).
+    ``cost``: weighted sum of squares of the residuals, to compare two poses of one image.
+    ``points`` (n, 2): pixels of what was found (centres of discs, corners). ``blur``: length of the motion blur, px.
+    ``scale``: apparent radius of the discs, in units of what the spacing makes it (1.0 for other targets).
+    ``noise``: rms of the residuals, grey levels or px. ``planar``: the distance is not known (no camera matrix).
+    ``misfit``: difference between picture and model beyond noise, rms in units of the contrast.
+    """
+
+    rotation: FloatArray
+    place: FloatArray
+    covariance: FloatArray
+    cost: float
+    points: FloatArray
+    blur: float = 0.0
+    scale: float = 1.0
+    noise: float = 0.0
+    planar: bool = False
+    misfit: float = 0.0
+
+
+class FrameAnswer(NamedTuple):
+    """The tip in ``link_tip_rest`` at the middle of the exposure.
+
+    ``dx``, ``dy`` m, ``theta``, ``phi``, ``omega`` rad (NaN without an answer);
+    ``covariance`` (3, 3) of (dx, dy, theta).
+    """
+
+    t_ns: int
+    status: Status
+    dx: float = float('nan')
+    dy: float = float('nan')
+    theta: float = float('nan')
+    phi: float = float('nan')
+    omega: float = float('nan')
+    covariance: FloatArray | None = None
+    target: TargetPose | None = None
+
+    def as_record(self) -> ReferenceWithCovariance | None:
+        """What is recorded and published of it."""
+        if self.covariance is None:
+            return None
+        covariance = tuple(map(float, self.covariance.ravel()))
+        angles = (float(self.theta), float(self.phi), float(self.omega))
+        return ReferenceWithCovariance(self.t_ns, float(self.dx), float(self.dy), *angles, covariance)

@@ -1,0 +1,116 @@
+"""The thesis's target: three white discs in a line on black (section 5.2). Image -> pose of the target."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from psd_deflection.camera.answer import RefusedError, Status, TargetPose
+from psd_deflection.camera.find_discs import MIN_RADIUS, Region, find_discs
+from psd_deflection.camera.lens import Lens
+from psd_deflection.camera.rim_fit import Fitter, Prior, turned
+from psd_deflection.camera.settings import CameraSettings
+from psd_deflection.records import FloatArray
+
+FIRST_TILT_SD = 0.3
+"""Tilt of the camera against the target's normal before anything is known of it, one sd, rad."""
+
+AFFINE_TILT_SD = 0.05
+"""The same for a camera of unknown focal length, in whose images the sign of a tilt does not show."""
+
+MOTION_TILT_SD = 0.05
+"""Tilt of the plate against its rest, one sd, rad: a link of this kind tilts by some hundredths."""
+
+_OBLIQUE = math.radians(60.0)
+_UNSURE = math.cos(math.radians(75.0))
+
+
+class Discs:
+    """Finds and fits the three discs, frame by frame. What it remembers: which end of the line was up, and the rest."""
+
+    def __init__(self, settings: CameraSettings) -> None:
+        self._spacing, self._radius = settings.spacing, settings.radius
+        self._towards = -1.0 if settings.view == 'outside' else 1.0
+        self._centres = np.array([[0.0, settings.spacing], [0.0, 0.0], [0.0, -settings.spacing]])
+        self._up = np.array([math.sin(settings.turn), -math.cos(settings.turn)])
+        self._answered = False
+        self._rest: FloatArray | None = None
+        self._fitter: Fitter | None = None
+
+    def set_rest(self, rotation: FloatArray) -> None:
+        """From now on the plate's tilt is expected near that of ``rotation``, its rest."""
+        self._rest = rotation
+
+    def locate(self, image: Any, grey: Any, lens: Lens, full_scale: float) -> TargetPose:
+        """The target in one image; ``grey`` is its 8-bit form. Raises RefusedError."""
+        regions = find_discs(grey, self._spacing / self._radius)
+        if min(r.axes[0] for r in regions) < MIN_RADIUS:
+            raise RefusedError(Status.SMALL)
+        if regions[1].axes[0] < math.cos(_OBLIQUE) * regions[1].axes[1]:
+            raise RefusedError(Status.OBLIQUE)
+        apart = regions[0].centre - regions[2].centre
+        upright = float(apart @ self._up) / float(np.linalg.norm(apart))
+        if self._answered and abs(upright) < _UNSURE:
+            # The target looks the same after half a turn.
+            raise RefusedError(Status.HALF_TURN)
+        if upright < 0.0:
+            regions = regions[::-1]
+        found = self._fit(image, regions, lens, full_scale)
+        seen = found.points[0] - found.points[2]
+        self._up, self._answered = seen / np.linalg.norm(seen), True
+        return found
+
+    def _fit(self, image: Any, regions: list[Region], lens: Lens, full_scale: float) -> TargetPose:
+        rays = lens.rays(np.array([r.centre for r in regions]))
+        frontal = self._frontal(rays)
+        if self._rest is None:
+            prior = Prior(frontal, FIRST_TILT_SD if lens.known else AFFINE_TILT_SD)
+            guesses = [frontal @ turned(sign * self._tilt(regions[1], frontal)) for sign in (1.0, -1.0)]
+        else:
+            prior = Prior(self._rest, MOTION_TILT_SD)
+            # The plate of the rest, turned in its own plane to where the line of discs is now.
+            line = self._rest.T @ frontal[:, 1]
+            angle = math.atan2(-line[0], line[1])
+            guesses = [self._rest @ turned(np.array([0.0, 0.0, angle]))]
+        if self._fitter is None:
+            self._fitter = Fitter(lens, image.shape, self._centres, self._radius)
+        fits, reason = [], RefusedError(Status.MISFIT)
+        for guess in guesses:
+            try:
+                place = self._place(rays, guess)
+                fits.append(self._fitter.fit(image, guess, place, prior, full_scale))
+            except RefusedError as error:
+                reason = error
+        if not fits:
+            raise reason
+        return min(fits, key=lambda f: f.cost)
+
+    def _frontal(self, rays: FloatArray) -> FloatArray:
+        """The rotation of a plate that faces the camera, by the line of discs."""
+        up = np.append(rays[0] - rays[2], 0.0)
+        up /= np.linalg.norm(up)
+        normal = np.array([0.0, 0.0, self._towards])
+        return np.column_stack([np.cross(up, normal), up, normal])
+
+    def _tilt(self, region: Region, frontal: FloatArray) -> FloatArray:
+        """A turn about the long axis of the ellipse that makes it as narrow as it is, in the target's axes, rad."""
+        values, vectors = np.linalg.eigh(region.shape)
+        ratio = math.sqrt(min(max(values[0] / values[1], 0.0), 1.0))
+        return np.asarray((frontal.T @ np.append(vectors[:, 1], 0.0)) * max(math.acos(ratio), 0.03))
+
+    def _place(self, rays: FloatArray, rotation: FloatArray) -> FloatArray:
+        """Where a target of this rotation has its centres on ``rays`` (3, 2): linear least squares."""
+        turned_points = np.column_stack([self._centres, np.zeros(3)]) @ rotation.T
+        rows, right = [], []
+        for ray, point in zip(rays, turned_points, strict=True):
+            for axis in (0, 1):
+                row = np.zeros(3)
+                row[axis], row[2] = 1.0, -ray[axis]
+                rows.append(row)
+                right.append(ray[axis] * point[2] - point[axis])
+        place = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
+        if place[2] <= 0.0:
+            raise RefusedError(Status.MISFIT)
+        return np.asarray(place)

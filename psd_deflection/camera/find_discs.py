@@ -1,0 +1,176 @@
+"""Finds three white discs in a line on black: where to look closer, or why there is nothing to look at.
+
+Candidates are the bright regions whose outline is an ellipse. Three of them are the target if the middle one halves the
+distance of the others and if the distance, in units of the ellipse's half-width along the line, is the target's
+spacing / radius: a ratio that no view of a plane changes as long as perspective is weak.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from psd_deflection.camera.answer import RefusedError, Status
+from psd_deflection.camera.opencv import opencv
+from psd_deflection.records import FloatArray
+
+CLEAR = 8.0
+"""Least distance of another bright thing from the rim of a disc, px."""
+
+MIN_RADIUS = 4.0
+"""Smallest half-width of a disc, px."""
+
+_MIN_AXIS_RATIO = 0.42
+_ELLIPSE_MISFIT = 0.06
+"""Largest difference between the area of a region and that of the ellipse with its second moments, relative."""
+
+_MIDDLE_TOLERANCE = 0.25
+_RATIO_TOLERANCE = 0.12
+_SIZE_TOLERANCE = 0.25
+_MAX_REGIONS = 400
+_MIN_CONTRAST = 8.0
+
+
+class Region(NamedTuple):
+    """An outline: centre (x, y) px, ``shape`` (2, 2) with (u - centre)^T shape^-1 (u - centre) = 1 on the ellipse."""
+
+    centre: FloatArray
+    shape: FloatArray
+    round: bool
+    at_border: bool
+
+    @property
+    def axes(self) -> tuple[float, float]:
+        """Half-axes, px: the shorter, the longer."""
+        small, large = np.linalg.eigvalsh(self.shape)
+        return math.sqrt(max(small, 0.0)), math.sqrt(max(large, 0.0))
+
+    def half_width(self, direction: FloatArray) -> float:
+        """Half-width through the centre along a unit vector, px."""
+        return 1.0 / math.sqrt(float(direction @ np.linalg.solve(self.shape, direction)))
+
+
+def find_discs(grey: Any, ratio: float) -> list[Region]:
+    """The three discs in an 8-bit image, from one end of the line to the other; ``ratio``: spacing / radius.
+
+    Raises RefusedError with the reason if there is no target, or more than one.
+    """
+    best: tuple[int, Status] = (0, Status.MISSING)
+    for binary in _binaries(grey):
+        regions = _regions(binary)
+        lines = _lines([r for r in regions if r.round and not r.at_border], ratio)
+        if len(lines) > 1:
+            raise RefusedError(Status.DOUBLED)
+        if lines:
+            if _crowded(lines[0], regions):
+                raise RefusedError(Status.DOUBLED)
+            return lines[0]
+        best = max(best, _why(regions, ratio), key=lambda b: b[0])
+    raise RefusedError(best[1])
+
+
+def _binaries(grey: Any) -> Iterator[Any]:
+    """The image cut at several levels: the one between the two commonest first."""
+    cv2 = opencv()
+    thin = max(min(grey.shape) // 120, 1)
+    low, high = np.percentile(grey[::thin, ::thin], (2.0, 99.8))
+    if high - low < _MIN_CONTRAST:
+        raise RefusedError(Status.MISSING)
+    # Noise of a pixel must not fray the outline; the sub-pixel fit sees the image as it is.
+    smooth = cv2.blur(grey, (3, 3))
+    level, binary = cv2.threshold(smooth, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
+    yield binary
+    for part in (0.5, 0.25, 0.75):
+        other = low + part * (high - low)
+        if abs(other - level) > 0.05 * (high - low):
+            yield cv2.threshold(smooth, other, 255, cv2.THRESH_BINARY)[1]
+    block = 2 * (min(grey.shape) // 6) + 1
+    yield cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, block, -0.1 * (high - low))
+
+
+def _regions(binary: Any) -> list[Region]:
+    cv2 = opencv()
+    outlines, tree = cv2.findContours(binary, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    rows, columns = binary.shape
+    found = []
+    for outline, links in zip(outlines, tree.reshape(-1, 4) if tree is not None else (), strict=True):
+        # The second level has the holes.
+        if links[3] != -1 or len(outline) < 12:
+            continue
+        m = cv2.moments(outline)
+        area = m['m00']
+        if area < 20.0:
+            continue
+        # The outline joins the centres of the outer pixels: half a pixel is missing all around.
+        shape = 4.0 / area * np.array([[m['mu20'], m['mu11']], [m['mu11'], m['mu02']]])
+        small, large = np.sqrt(np.maximum(np.linalg.eigvalsh(shape), 1e-9))
+        is_round = (
+            abs(math.pi * small * large / area - 1.0) < _ELLIPSE_MISFIT + 0.3 / small
+            and small > _MIN_AXIS_RATIO * large
+        )
+        x, y, w, h = cv2.boundingRect(outline)
+        at_border = x <= 1 or y <= 1 or x + w >= columns - 1 or y + h >= rows - 1
+        centre = np.array([m['m10'], m['m01']]) / area
+        found.append(Region(centre, shape * ((small + 0.5) / small) ** 2, bool(is_round), at_border))
+    found.sort(key=lambda r: -float(np.linalg.det(r.shape)))
+    return found[:_MAX_REGIONS]
+
+
+def _lines(regions: list[Region], ratio: float) -> list[list[Region]]:
+    """Every three of ``regions`` that may be the target."""
+    lines = []
+    large = [r for r in regions if r.axes[0] >= 2.0][:60]
+    for i, first in enumerate(large):
+        for last in large[i + 1 :]:
+            apart = last.centre - first.centre
+            distance = float(np.linalg.norm(apart)) / 2
+            along = apart / (2 * distance)
+            widths = [first.half_width(along), last.half_width(along)]
+            mean = sum(widths) / 2
+            if abs(widths[0] - widths[1]) > _SIZE_TOLERANCE * mean:
+                continue
+            # Where an outline was cut is known to a pixel or so.
+            if abs(distance / mean / ratio - 1.0) > _RATIO_TOLERANCE + 1.0 / mean:
+                continue
+            for middle in large:
+                off = float(np.linalg.norm(middle.centre - (first.centre + last.centre) / 2))
+                if off > _MIDDLE_TOLERANCE * mean or middle is first or middle is last:
+                    continue
+                if abs(middle.half_width(along) - mean) <= _SIZE_TOLERANCE * mean:
+                    lines.append([first, middle, last])
+    return lines
+
+
+def _crowded(line: list[Region], regions: list[Region]) -> bool:
+    """Whether something as bright and not much smaller is so near to a disc that it lights its rim."""
+    for disc in line:
+        size = disc.axes[1]
+        for other in regions:
+            if any(other is d for d in line) or not 0.2 * size < other.axes[1] < 1.5 * size:
+                continue
+            if np.linalg.norm(other.centre - disc.centre) < size + other.axes[1] + CLEAR:
+                return True
+    return False
+
+
+def _why(regions: list[Region], ratio: float) -> tuple[int, Status]:
+    """Why ``regions`` hold no target, the more telling reason with the higher number."""
+    fair = [r for r in regions if r.axes[0] >= MIN_RADIUS]
+    whole = [r for r in fair if r.round and not r.at_border]
+    if len(whole) in (1, 2):
+        reach = 2.4 * ratio * max(r.axes[1] for r in whole)
+        if any(
+            r.at_border and np.linalg.norm(r.centre - w.centre) < reach and r.axes[1] < 1.5 * w.axes[1]
+            for r in fair
+            for w in whole
+        ):
+            return 4, Status.OUTSIDE
+        return 3, Status.HIDDEN
+    if len(whole) >= 3:
+        return 2, Status.HIDDEN
+    if len(_lines([r for r in regions if not r.at_border], ratio)) == 1:
+        return 1, Status.OBLIQUE
+    return 0, Status.MISSING

@@ -1,0 +1,180 @@
+"""From the target in each image to the tip in ``link_tip_rest``: the rest is found, and taken off turn and place alike.
+
+The rest is the mean of the first good frames: as many as ``rest.frames`` says, or, if it says 0, those that do not
+differ from the first by more than noise, at most :data:`MOST_REST`. They are answered as soon as the rest is known.
+The rest's own variance is part of every covariance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from psd_deflection.camera.answer import FrameAnswer, RefusedError, Status, TargetPose
+from psd_deflection.camera.lens import Lens
+from psd_deflection.camera.settings import CameraSettings
+from psd_deflection.records import FloatArray
+
+MOST_REST = 20
+_STILL = 4.0
+"""A frame belongs to the rest if each of dX, dY and theta is within so many sd of it."""
+
+
+class Target(Protocol):
+    """A kind of target."""
+
+    def locate(self, image: Any, grey: Any, lens: Lens, full_scale: float) -> TargetPose:
+        """The target in one image. Raises RefusedError."""
+
+    def set_rest(self, rotation: FloatArray) -> None:
+        """What the target's rotation is at rest."""
+
+
+class CameraReference:
+    """Images in, poses of the tip out. One target, one camera, one size of image."""
+
+    def __init__(self, settings: CameraSettings, make: Callable[[CameraSettings], Target]) -> None:
+        self._settings = settings
+        self._target = make(settings)
+        self._lens: Lens | None = None
+        self._shape: tuple[int, int] = (0, 0)
+        self._waiting: list[tuple[int, TargetPose | Status]] = []
+        self._rest: TargetPose | None = None
+
+    @property
+    def rest(self) -> TargetPose | None:
+        """The target at rest, once it is known."""
+        return self._rest
+
+    @property
+    def turn(self) -> float:
+        """How far the image of the plate at rest is turned clockwise, rad; NaN before the rest is known."""
+        if self._rest is None:
+            return math.nan
+        up = self._rest.rotation[:, 1]
+        return math.atan2(float(up[0]), -float(up[1]))
+
+    @property
+    def lens(self) -> Lens | None:
+        """The lens, once an image has come."""
+        return self._lens
+
+    def take(self, t_ns: int, image: Any) -> list[FrameAnswer]:
+        """The answers that are known now, in the order of the frames.
+
+        ``t_ns``: middle of the exposure. ``image``: (rows, columns) of uint8 or uint16, None if it cannot be read.
+        """
+        found: TargetPose | Status
+        try:
+            found = self._locate(image)
+        except RefusedError as error:
+            found = error.status
+        if self._rest is not None:
+            return [self._answer(t_ns, found)]
+        self._waiting.append((t_ns, found))
+        good = [f for _, f in self._waiting if isinstance(f, TargetPose)]
+        if self._settings.rest_frames:
+            complete = len(good) >= self._settings.rest_frames
+        else:
+            complete = len(good) >= MOST_REST or (len(good) > 1 and not _still(good[:-1], good[-1]))
+            if complete and len(good) < MOST_REST:
+                good = good[:-1]
+        # Frames without a target are not kept for ever.
+        if complete or (good and len(self._waiting) > 20 * MOST_REST):
+            return self._decide(good)
+        return []
+
+    def finish(self) -> list[FrameAnswer]:
+        """The answers of the frames that still wait for the rest: there are no further frames."""
+        good = [f for _, f in self._waiting if isinstance(f, TargetPose)]
+        if self._rest is None and good:
+            return self._decide(good)
+        waiting, self._waiting = self._waiting, []
+        return [self._answer(t_ns, found) for t_ns, found in waiting]
+
+    def _locate(self, image: Any) -> TargetPose:
+        if image is None or image.ndim != 2 or min(image.shape) < 16:
+            raise RefusedError(Status.UNREADABLE)
+        if self._lens is None:
+            self._shape = image.shape
+            self._lens = self._settings.lens(image.shape)
+        elif image.shape != self._shape:
+            raise RefusedError(Status.UNREADABLE)
+        if image.dtype == np.uint8:
+            return self._target.locate(image, image, self._lens, 255.0)
+        grey = (image >> 8).astype(np.uint8)
+        return self._target.locate(image.astype(float) / 257.0, grey, self._lens, 255.0)
+
+    def _decide(self, good: list[TargetPose]) -> list[FrameAnswer]:
+        self._rest = mean_pose(good)
+        self._target.set_rest(self._rest.rotation)
+        waiting, self._waiting = self._waiting, []
+        return [self._answer(t_ns, found) for t_ns, found in waiting]
+
+    def _answer(self, t_ns: int, found: TargetPose | Status) -> FrameAnswer:
+        if isinstance(found, Status):
+            return FrameAnswer(t_ns, found)
+        if self._rest is None:
+            raise RuntimeError('a pose is answered before the rest is known')
+        dx, dy, theta, phi, omega = relative(self._rest, found)
+        return FrameAnswer(t_ns, Status.OK, dx, dy, theta, phi, omega, relative_covariance(self._rest, found), found)
+
+
+def relative(rest: TargetPose, pose: TargetPose) -> FloatArray:
+    """(dX m, dY m, theta, phi, omega rad) of ``pose`` against ``rest``: R = Ry(omega) Rx(phi) Rz(theta)."""
+    r = rest.rotation.T @ pose.rotation
+    place = pose.place
+    if pose.planar:
+        # Where the ray meets the plane of the rest: an unknown distance must not become a displacement.
+        normal = rest.rotation[:, 2]
+        place = place * (float(normal @ rest.place) / float(normal @ place))
+    moved = rest.rotation.T @ (place - rest.place)
+    theta, phi = math.atan2(r[1, 0], r[1, 1]), -math.asin(min(max(r[1, 2], -1.0), 1.0))
+    return np.array([moved[0], moved[1], theta, phi, math.atan2(r[0, 2], r[2, 2])])
+
+
+def relative_covariance(rest: TargetPose, pose: TargetPose) -> FloatArray:
+    """Covariance (3, 3) of (dX, dY, theta) from those of both poses."""
+    r = rest.rotation.T @ pose.rotation
+    if pose.planar:
+        # As seen from the plane of the rest: no distance, no tilt.
+        place = np.diag([1.0, 1.0, 0.0]) @ rest.rotation.T
+        moved = np.zeros(3)
+    else:
+        place = rest.rotation.T
+        moved = rest.rotation.T @ (pose.place - rest.place)
+    of_rest, of_pose = np.zeros((3, 6)), np.zeros((3, 6))
+    of_pose[:2, 3:], of_rest[:2, 3:] = place[:2], -place[:2]
+    # A small turn a of the rest's axes takes R0^T v to R0^T v - a x (R0^T v).
+    of_rest[:2, :3] = _cross(moved)[:2]
+    # theta = atan2(r10, r11); r goes to r (1 + [b]x), or to (1 - [a]x) r.
+    scale = 1.0 / (r[1, 0] ** 2 + r[1, 1] ** 2)
+    by = np.array([r[1, 1], -r[1, 0], 0.0]) * scale
+    of_pose[2, :3] = np.cross(by, r[1])
+    of_rest[2, :3] = [-by @ r[2], 0.0, by @ r[0]]
+    of_rest[2, [0, 2]] *= -1.0
+    total = of_rest @ rest.covariance @ of_rest.T + of_pose @ pose.covariance @ of_pose.T
+    return np.asarray((total + total.T) / 2)
+
+
+def _cross(v: FloatArray) -> FloatArray:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def mean_pose(poses: list[TargetPose]) -> TargetPose:
+    """The mean of poses that are near each other, with its covariance."""
+    summed = np.sum([p.rotation for p in poses], axis=0)
+    u, _, vt = np.linalg.svd(summed)
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    covariance = np.mean([p.covariance for p in poses], axis=0) / len(poses)
+    return poses[0]._replace(rotation=rotation, place=np.mean([p.place for p in poses], axis=0), covariance=covariance)
+
+
+def _still(before: list[TargetPose], pose: TargetPose) -> bool:
+    rest = mean_pose(before)
+    off = relative(rest, pose)[:3]
+    sd = np.sqrt(np.diag(relative_covariance(rest, pose)))
+    return bool(np.all(np.abs(off) < _STILL * sd))

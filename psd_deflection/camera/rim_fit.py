@@ -1,0 +1,564 @@
+"""Fits the picture of three discs to the pixels at their rims: one least squares for the pose of the whole target.
+
+Every pixel near a rim has a signed distance s (px) from it: its ray meets the target's plane at a distance rho from
+a disc's centre, and s = (radius - rho) / |grad rho|. So lens distortion and perspective, by which the centre of a
+disc's picture is not the picture of its centre, are in the model and leave no bias (Heikkila 2000; Song et al. 2024).
+The grey level goes from outside to inside as
+
+    I = outside + (inside - outside) (Phi(z) - gamma(n) / 6 (z^2 - 1) phi(z)),  z = (s - t^T S t / 2 R) / sqrt(n^T S n)
+
+with n, t the rim's normal and tangent in the image, R its radius of curvature and S (2, 2) the variance of the blur,
+px^2. ``gamma`` is the skewness of the motion within the exposure along n: with it, s = 0 stays the place of the *mean*
+over the exposure (Gram-Charlier) for a motion that is not uniform. ``inside`` and ``outside`` are linear in the image
+for each disc, which takes uneven light; they are eliminated from the normal equations. Pixels are taken as they are,
+not interpolated: their noise stays independent, and the fit reaches the Cramer-Rao bound. The first steps use each
+third pixel. Pixels are kept as float32, which is good to 1e-5 px here and twice as fast; the normal equations are in
+float64.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtr
+
+from psd_deflection.camera.answer import RefusedError, Status, TargetPose
+from psd_deflection.camera.lens import Lens
+from psd_deflection.records import FloatArray, IntArray
+
+_STEPS = 15
+_THINNED = 3
+_LIGHTS = 6
+_SECTORS = 16
+"""Parts of a rim whose residuals are taken together: what is correlated along a rim widens the covariance."""
+
+RADIUS_SD = 0.03
+"""Standard deviation of the radius that is seen against the declared one (print, exposure, response), relative."""
+
+CENTRE_FLOOR = 0.002
+"""Error of a disc's centre that no residual shows, one sd in px."""
+
+_SKEW_BLUR = 0.6
+"""Motion blur (sd, px) from which on the skewness of the motion is estimated."""
+
+_SHARPEST = 0.25
+"""Smallest blur, px: a pixel's own width."""
+
+_ROOT_2PI = math.sqrt(2.0 * math.pi)
+
+MOST_BLUR = 1.0
+"""Longest motion blur with an answer, in units of a disc's radius."""
+
+MEAN_OF_BLUR = 0.22
+"""Error of the mean place over the exposure, one sd in units of the standard deviation of the motion within it."""
+
+MOST_DEFOCUS = 0.15
+"""Largest blur (sd) of an image at rest with an answer, in units of a disc's radius."""
+
+MOST_MISFIT, MISFIT_OF_BLUR = 0.012, 0.03
+"""Largest difference between picture and model beyond noise with an answer, rms in units of the contrast; and what a
+motion blur adds to it, whose profile is not Gaussian."""
+
+HIDDEN_SECTOR = 0.04
+"""The same for one sector of one rim."""
+
+UNEVEN = 0.004
+"""Largest unevenness of the rise of a disc that reaches full scale, in units of the contrast."""
+
+DIP = 0.75
+"""Two peaks of the time at a place, with less than this share of the lower one between them, are two pictures."""
+
+_ZONES = 8
+_DWELL = 24
+_DOUBLED_FROM = 0.5
+
+MOST_NOISE = 0.2
+"""Largest rms of the residuals with an answer, in units of the contrast."""
+
+Pixels = npt.NDArray[np.float32]
+
+
+class Prior(NamedTuple):
+    """What is known of the pose beforehand: tilts about the target's X and Y against ``rotation``, one ``sd``, rad."""
+
+    rotation: FloatArray
+    sd: float
+
+
+class _Rims(NamedTuple):
+    """The pixels near the rims, disc after disc: ``begin`` (4) of each disc, grey levels, rays x and y, place (3, n)
+    in the image as (1, u, v) from the disc's centre in units of its size; ``bend`` (3, 2, 2): d ray / d pixel there."""
+
+    begin: IntArray
+    level: Pixels
+    x: Pixels
+    y: Pixels
+    flat: Pixels
+    bend: FloatArray
+
+    def thinned(self) -> _Rims:
+        """Each third pixel, for the first steps."""
+        chosen = np.arange(0, self.begin[-1], _THINNED)
+        begin = np.searchsorted(chosen, self.begin)
+        return _Rims(begin, self.level[chosen], self.x[chosen], self.y[chosen], self.flat[:, chosen], self.bend)
+
+
+class _Shape(NamedTuple):
+    """The parameters that are iterated; ``light`` (3, 6): outside and inside of each disc, constant and slopes."""
+
+    rotation: FloatArray
+    place: FloatArray
+    swell: float
+    blur: FloatArray
+    skew: FloatArray
+    light: FloatArray
+
+
+class _Normal(NamedTuple):
+    """Normal equations of the pose and blur, with the lights eliminated, and what the judgement needs.
+
+    ``rows`` (6 + p + 1, n): derivatives by the lights and the parameters, then the residuals, all weighted.
+    """
+
+    hessian: FloatArray
+    gradient: FloatArray
+    back: FloatArray
+    rows: Pixels
+    z: Pixels
+    side: tuple[Pixels, Pixels]
+    root: Pixels | None
+    squares: float
+
+
+class Fitter:
+    """Fits the discs of one target in images of one size."""
+
+    def __init__(self, lens: Lens, image_shape: tuple[int, int], centres: FloatArray, radius: float) -> None:
+        self._lens, self._centres, self._radius = lens, centres, radius
+        grid = lens.grid(image_shape)
+        self._x = np.ascontiguousarray(grid[..., 0], dtype=np.float32)
+        self._y = np.ascontiguousarray(grid[..., 1], dtype=np.float32)
+        self._step = 1.0 / lens.focal
+        turn = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
+        self._circle = radius * np.column_stack([np.cos(turn), np.sin(turn), np.zeros(24)])
+        self._points = np.column_stack([centres, np.zeros(len(centres))])
+
+    def fit(self, image: Any, rotation: FloatArray, place: FloatArray, prior: Prior, full_scale: float) -> TargetPose:
+        """The pose, from a first guess that is good to a pixel or two.
+
+        ``image`` (rows, columns): grey levels; ``full_scale``: where the camera saturates. Raises RefusedError.
+        """
+        shape = _Shape(rotation, place, 1.0, np.eye(2), np.zeros(0), np.zeros((len(self._centres), _LIGHTS)))
+        pixel_radius = self._radius * self._lens.focal / float(place[2])
+        half = min(4.5, 0.6 * pixel_radius)
+        rims = self._gather(image, shape, half)
+        shape = shape._replace(light=self._first_light(rims, shape))
+        for _ in range(4):
+            shape, noise = self._converge(rims, shape, prior)
+            widest = math.sqrt(float(np.linalg.eigvalsh(shape.blur)[1]))
+            wanted = min(max(3.2 * widest + 1.0, 4.0), 0.75 * pixel_radius)
+            skewed = _motion(shape.blur) > _SKEW_BLUR and not shape.skew.size
+            if skewed:
+                shape = shape._replace(skew=np.zeros(4))
+            if not skewed and wanted < 1.15 * half:
+                break
+            half = max(wanted, half)
+            rims = self._gather(image, shape, half)
+        for _ in range(3):
+            normal = self._linearise(rims, shape, noise)
+            shape, step, deviation = self._stepped(normal, shape, prior, len(rims.level))
+            if np.all(np.abs(step) < 2.0 * deviation):
+                break
+        return self._judge(normal, rims, shape, step, prior, pixel_radius, full_scale)
+
+    def _gather(self, image: Any, shape: _Shape, half: float) -> _Rims:
+        rows, columns = self._x.shape
+        inverse = _to_plane(shape)
+        turned_points = self._points @ shape.rotation.T + shape.place
+        middles = self._lens.project(turned_points)
+        seen = self._lens.project((self._circle @ shape.rotation.T)[None] + turned_points[:, None])
+        low, high = seen.min(axis=1), seen.max(axis=1)
+        if low.min() < half + 2 or (high > (columns - half - 3, rows - half - 3)).any():
+            raise RefusedError(Status.OUTSIDE)
+        bends = self._bends(middles)
+        # Wide enough for the direction in which the picture is the longest.
+        bands = half * np.linalg.norm(self._slopes(inverse, shape, bends), 2, axis=(1, 2))
+        starts = np.floor(low - half - 1).astype(int).tolist()
+        ends = np.ceil(high + half + 2).astype(int).tolist()
+        begin, parts = [0], []
+        for k, ((left, top), (right, bottom)) in enumerate(zip(starts, ends, strict=True)):
+            window = np.s_[top:bottom, left:right]
+            x, y = self._x[window], self._y[window]
+            px, py = _on_plane(inverse, x, y)
+            px -= float(self._centres[k, 0])
+            py -= float(self._centres[k, 1])
+            px *= px
+            py *= py
+            px += py
+            least = max(self._radius - float(bands[k]), 0.0) ** 2
+            near = np.flatnonzero((px > least) & (px < (self._radius + float(bands[k])) ** 2))
+            v, u = np.divmod(near, right - left)
+            size = 2.0 / float(high[k, 0] - low[k, 0])
+            u = (u + (left - float(middles[k, 0]))) * size
+            v = (v + (top - float(middles[k, 1]))) * size
+            parts.append((image[window].ravel()[near], x.ravel()[near], y.ravel()[near], u, v))
+            begin.append(begin[-1] + len(near))
+        level, x, y, u, v = (np.concatenate(p).astype(np.float32) for p in zip(*parts, strict=True))
+        return _Rims(np.array(begin), level, x, y, np.stack([np.ones_like(u), u, v]), bends)
+
+    def _bends(self, pixels: FloatArray) -> FloatArray:
+        """d ray / d pixel (n, 2, 2) at pixels (n, 2)."""
+        offsets = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+        ends = self._lens.rays(pixels[:, None] + offsets)
+        return np.stack([ends[:, 0] - ends[:, 1], ends[:, 2] - ends[:, 3]], axis=-1)
+
+    def _slopes(self, inverse: FloatArray, shape: _Shape, bends: FloatArray) -> FloatArray:
+        """d plane point / d pixel (n, 2, 2) at the discs' centres; it changes little over a disc."""
+        far = self._centres @ shape.rotation[2, :2] + shape.place[2]
+        forward = inverse[:2, :2] - self._centres[:, :, None] * inverse[2, :2]
+        return np.asarray((forward * far[:, None, None]) @ bends)
+
+    def _first_light(self, rims: _Rims, shape: _Shape) -> FloatArray:
+        light = np.zeros((len(self._centres), _LIGHTS))
+        px, py = _on_plane(_to_plane(shape), rims.x, rims.y)
+        for k, centre in enumerate(self._centres):
+            of = slice(rims.begin[k], rims.begin[k + 1])
+            away = (px[of] - float(centre[0])) ** 2 + (py[of] - float(centre[1])) ** 2
+            inside = away < self._radius**2
+            light[k, 0], light[k, 3] = float(rims.level[of][~inside].mean()), float(rims.level[of][inside].mean())
+        return light
+
+    def _converge(self, rims: _Rims, shape: _Shape, prior: Prior) -> tuple[_Shape, tuple[float, float] | None]:
+        """The shape by each third pixel, and the noise outside and inside."""
+        rims = rims.thinned()
+        for _ in range(_STEPS):
+            normal = self._linearise(rims, shape, None)
+            shape, step, deviation = self._stepped(normal, shape, prior, len(rims.level))
+            if np.all(np.abs(step) < deviation):
+                break
+        return shape, self._noise(normal)
+
+    def _stepped(
+        self, normal: _Normal, shape: _Shape, prior: Prior, count: int
+    ) -> tuple[_Shape, FloatArray, FloatArray]:
+        """The shape after a Gauss-Newton step, the step and the standard deviations."""
+        variance = max(normal.squares / max(count - 30, 1), 1e-9)
+        stiff, pull = _beforehand(shape, prior)
+        hessian = normal.hessian / variance + np.diag(stiff)
+        gradient = normal.gradient / variance + stiff * pull
+        try:
+            inverse = np.linalg.inv(hessian + 1e-9 * np.diag(np.diag(hessian)))
+        except np.linalg.LinAlgError:
+            raise RefusedError(Status.MISFIT) from None
+        step = inverse @ gradient
+        if not np.all(np.isfinite(step)):
+            raise RefusedError(Status.MISFIT)
+        step *= min(1.0, 0.2 / max(float(np.max(np.abs(step[:3]))), 1e-12))
+        light = shape.light + normal.back[:, :, -1] - normal.back[:, :, :-1] @ step
+        deviation = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+        return _moved(shape, step, light), step, deviation
+
+    def _linearise(self, rims: _Rims, shape: _Shape, noise: tuple[float, float] | None) -> _Normal:
+        """Normal equations at ``shape``; ``noise``: variances outside and inside, None: equal."""
+        lengths = np.diff(rims.begin)
+        inverse = _to_plane(shape)
+        px, py = _on_plane(inverse, rims.x, rims.y)
+
+        def each(values: FloatArray) -> Pixels:
+            """One number a disc to one a pixel."""
+            return np.repeat(values.astype(np.float32), lengths)
+
+        ox, oy = px - each(self._centres[:, 0]), py - each(self._centres[:, 1])
+        rho = np.sqrt(ox * ox + oy * oy)
+        ox /= rho
+        oy /= rho
+        slopes = self._slopes(inverse, shape, rims.bend)
+        nx = ox * each(slopes[:, 0, 0]) + oy * each(slopes[:, 1, 0])
+        ny = ox * each(slopes[:, 0, 1]) + oy * each(slopes[:, 1, 1])
+        steep = np.sqrt(nx * nx + ny * ny)
+        nx /= steep
+        ny /= steep
+        bxx, bxy, byy = (float(b) for b in (shape.blur[0, 0], shape.blur[0, 1], shape.blur[1, 1]))
+        xx, xy, yy = nx * nx, 2 * nx * ny, ny * ny
+        across = bxx * xx + bxy * xy + byy * yy
+        per_sigma = 1.0 / np.sqrt(across)
+        # The rim's curvature moves the half level by the blur along it.
+        z = (self._radius * shape.swell - rho) / steep - (bxx + byy - across) * steep * (0.5 / self._radius)
+        z *= per_sigma
+        bell = np.exp(-0.5 * z * z) * (1.0 / _ROOT_2PI)
+        rise = bell * per_sigma
+        level = ndtr(z)
+        count = 10 + shape.skew.size
+        rows = np.empty((_LIGHTS + count + 1, len(z)), dtype=np.float32)
+        parameters = rows[_LIGHTS:-1]
+        if shape.skew.size:
+            cubes = np.stack([xx * nx, xx * ny, nx * yy, yy * ny])
+            skew = np.asarray(shape.skew.astype(np.float32) @ cubes)
+            zz = z * z
+            level = level - skew * (zz - 1) * bell * (1 / 6)
+            rise = rise - skew * z * (3 - zz) * bell * per_sigma * (1 / 6)
+            parameters[10:] = cubes * ((1 - zz) * bell * (1 / 6))
+        r = shape.rotation
+        # The ray's direction in the target's axes; a small turn or shift moves the target's point along the normal.
+        dx, dy, dz = (float(r[0, i]) * rims.x + float(r[1, i]) * rims.y + float(r[2, i]) for i in range(3))
+        towards = (ox * dx + oy * dy) / dz
+        by_rho = rise / steep
+        side = towards * by_rho
+        parameters[0] = -py * side
+        parameters[1] = px * side
+        parameters[2] = (oy * px - ox * py) * by_rho
+        ox_rise, oy_rise = ox * by_rho, oy * by_rho
+        for i in range(3):
+            parameters[3 + i] = float(r[i, 0]) * ox_rise + float(r[i, 1]) * oy_rise - float(r[i, 2]) * side
+        parameters[6] = by_rho * self._radius
+        widening = z * rise * per_sigma * -0.5
+        parameters[7], parameters[8], parameters[9] = widening * xx, widening * xy, widening * yy
+        rows[:3] = rims.flat * (1 - level)
+        rows[3:6] = rims.flat * level
+        root = None
+        if noise is not None:
+            root = 1.0 / np.sqrt(noise[0] + (noise[1] - noise[0]) * np.clip((z + 1.5) / 3.0, 0.0, 1.0))
+        begin = rims.begin.tolist()
+        for k, light in enumerate(shape.light.astype(np.float32)):
+            of = slice(begin[k], begin[k + 1])
+            parameters[:, of] *= (light[3:] - light[:3]) @ rims.flat[:, of]
+            rows[-1, of] = rims.level[of] - light @ rows[:6, of]
+        if root is not None:
+            rows *= root
+        return self._eliminated(rims, rows, z, (nx, ny), root)
+
+    def _eliminated(
+        self, rims: _Rims, rows: Pixels, z: Pixels, side: tuple[Pixels, Pixels], root: Pixels | None
+    ) -> _Normal:
+        spans = zip(rims.begin[:-1].tolist(), rims.begin[1:].tolist(), strict=True)
+        gram = np.stack([part @ part.T for part in (rows[:, a:b] for a, b in spans)]).astype(float)
+        lights = gram[:, :_LIGHTS, :_LIGHTS]
+        stiff = 1e-7 * np.trace(lights, axis1=1, axis2=2)[:, None, None] * np.eye(_LIGHTS)
+        back = np.linalg.solve(lights + stiff, gram[:, :_LIGHTS, _LIGHTS:])
+        rest = (gram[:, _LIGHTS:, _LIGHTS:] - gram[:, _LIGHTS:, :_LIGHTS] @ back).sum(axis=0)
+        return _Normal(rest[:-1, :-1], rest[:-1, -1], back, rows, z, side, root, max(float(rest[-1, -1]), 0.0))
+
+    @staticmethod
+    def _noise(normal: _Normal) -> tuple[float, float] | None:
+        """Variances outside and inside the discs: bright pixels may be noisier than dark ones."""
+        residual = normal.rows[-1]
+        dark, bright = residual[normal.z < -1.5], residual[normal.z > 1.5]
+        if min(len(dark), len(bright)) < 30:
+            return None
+        # Quantisation alone is 1/12. A side that clips is not much better than the other.
+        low, high = max(float(dark @ dark) / len(dark), 0.1), max(float(bright @ bright) / len(bright), 0.1)
+        return max(low, high / 9), max(high, low / 9)
+
+    def _judge(
+        self,
+        normal: _Normal,
+        rims: _Rims,
+        shape: _Shape,
+        step: FloatArray,
+        prior: Prior,
+        pixel_radius: float,
+        full_scale: float,
+    ) -> TargetPose:
+        """The pose with the covariance that the residuals show. Raises RefusedError if they show another picture."""
+        contrast = shape.light[:, 3] - shape.light[:, 0]
+        if contrast.min() <= 0.0 or contrast.min() < 0.3 * contrast.max():
+            raise RefusedError(Status.HIDDEN)
+        motion = _motion(shape.blur)
+        sharp = math.sqrt(float(np.linalg.eigvalsh(shape.blur)[0]))
+        if math.sqrt(12.0) * motion > MOST_BLUR * pixel_radius:
+            raise RefusedError(Status.BLURRED)
+        if sharp > MOST_DEFOCUS * pixel_radius:
+            raise RefusedError(Status.DEFOCUSED)
+        # The residuals after the last step, which was small.
+        residual = normal.rows[-1].copy()
+        scored = normal.rows[_LIGHTS:-1].copy()
+        for k, back in enumerate(normal.back):
+            of = slice(rims.begin[k], rims.begin[k + 1])
+            part = back.astype(np.float32)
+            scored[:, of] -= part[:, :-1].T @ normal.rows[:_LIGHTS, of]
+            residual[of] -= part[:, -1] @ normal.rows[:_LIGHTS, of]
+        residual -= step.astype(np.float32) @ scored
+        raw = residual if normal.root is None else residual / normal.root
+        sector = _sectors(normal.side, rims)
+        relative = raw / float(contrast.mean())
+        if motion > _DOUBLED_FROM * max(sharp, 0.5) and self._doubled(normal, relative, shape.blur):
+            raise RefusedError(Status.GHOST)
+        misfit = self._misfit(normal.z, relative, sector, rims, full_scale)
+        if misfit > MOST_MISFIT + MISFIT_OF_BLUR * min(max(motion / sharp - 0.5, 0.0), 1.5):
+            raise RefusedError(Status.MISFIT)
+        count = len(residual)
+        chi_square = float(residual @ residual) / (count - 30)
+        stiff, pull = _beforehand(shape, prior)
+        inverse = np.linalg.inv(normal.hessian / chi_square + np.diag(stiff))
+        scored *= residual / chi_square
+        wider = np.ones(6)
+        # Pixels may be wrong together: along a rim, or along the rows or columns in which a camera is read.
+        lines = (np.rint(a / a.dtype.type(self._step)) for a in (rims.x - rims.x.min(), rims.y - rims.y.min()))
+        for together in (sector, *(line.astype(int) for line in lines)):
+            scores = np.array([np.bincount(together, row) for row in scored])
+            sandwich = inverse @ (scores @ scores.T) @ inverse
+            wider = np.maximum(wider, np.sqrt(np.maximum(np.diag(sandwich)[:6] / np.diag(inverse)[:6], 1.0)))
+        covariance = inverse[:6, :6] * np.outer(wider, wider)
+        # What the first three moments of the motion do not say of its mean, and what the model does not say at all: a
+        # level that is off by the misfit moves the rim by that over the steepest rise.
+        # It may be one disc's alone, which a mean over three would hide.
+        wrong = 4.0 * misfit * _ROOT_2PI * math.hypot(sharp, motion)
+        floor = math.sqrt(CENTRE_FLOOR**2 + (MEAN_OF_BLUR * max(motion - 0.15, 0.0)) ** 2 + wrong**2)
+        covariance += self._moved_centres(shape, floor)
+        noise = float(np.sqrt(np.mean(raw * raw)))
+        return TargetPose(
+            shape.rotation,
+            shape.place,
+            covariance,
+            2 * count * math.log(max(noise, 1e-3)) + float(np.sum(stiff * pull**2)),
+            self._lens.project(self._points @ shape.rotation.T + shape.place),
+            math.sqrt(12.0) * motion,
+            shape.swell,
+            noise,
+            planar=not self._lens.known,
+            misfit=misfit,
+        )
+
+    def _moved_centres(self, shape: _Shape, pixels: float) -> FloatArray:
+        """Covariance (6, 6) of an error of ``pixels`` at each disc: in place, and about the normal."""
+        variance = (pixels * float(shape.place[2]) / self._lens.focal) ** 2
+        out = np.zeros((6, 6))
+        out[2, 2] = variance / float(np.sum(self._centres**2))
+        out[3:, 3:] = shape.rotation @ np.diag([variance, variance, 0.0]) @ shape.rotation.T / len(self._centres)
+        return out
+
+    @staticmethod
+    def _misfit(z: Pixels, raw: Pixels, sector: IntArray, rims: _Rims, full_scale: float) -> float:
+        """How far the picture is from the model beyond noise, rms in units of the contrast, as ``raw`` is.
+
+        Pixels are taken together by sector and by their distance from the rim. What all sectors have in common is the
+        camera's own profile, which moves no centre. Raises RefusedError.
+        """
+        parts, worst = 3 * _SECTORS, 0.0
+        for k in range(3):
+            of = slice(rims.begin[k], rims.begin[k + 1])
+            here, off = z[of], raw[of]
+            full = float(np.mean(rims.level[of][here > 1.0] >= full_scale - 1.0))
+            if full > 0.1:
+                # Blooming: the rise ends at full scale before it has reached its level.
+                high, low = off[(here > 0.3) & (here < 1.2)], off[(here < -0.3) & (here > -1.2)]
+                uneven = abs(float(high.mean() + low.mean())) / 2 if len(high) and len(low) else 0.0
+                worst = max(worst, uneven)
+                if uneven > UNEVEN:
+                    raise RefusedError(Status.SATURATED)
+        if math.sqrt(float(np.mean(raw * raw))) > MOST_NOISE:
+            raise RefusedError(Status.MISFIT)
+        zone = np.clip((z + 3.0) * (_ZONES / 6.0), 0, _ZONES - 1).astype(int)
+        cell = sector * _ZONES + zone
+        count = np.bincount(cell, minlength=parts * _ZONES).reshape(parts, _ZONES).astype(float)
+        total = np.bincount(cell, raw, parts * _ZONES).reshape(parts, _ZONES)
+        square = np.bincount(cell, raw * raw, parts * _ZONES).reshape(parts, _ZONES)
+        mean = total / np.maximum(count, 1.0)
+        common = total.sum(axis=0) / np.maximum(count.sum(axis=0), 1.0)
+        within = max(float((square - mean * total).sum() / max(count.sum() - np.count_nonzero(count), 1.0)), 0.0)
+        filled = count > 3
+        excess = np.where(filled, (mean - common) ** 2 - within / np.maximum(count, 1.0), 0.0)
+        by_sector = excess.sum(axis=1) / np.maximum(filled.sum(axis=1), 1)
+        usual = within * np.sqrt(2.0 / np.maximum(filled.sum(axis=1), 1)) / np.maximum(count.sum(axis=1) / _ZONES, 1.0)
+        # A rim that something covers in part has sectors of another picture.
+        if np.any(by_sector > HIDDEN_SECTOR**2 + 6.0 * usual):
+            raise RefusedError(Status.HIDDEN)
+        return math.hypot(math.sqrt(max(float(excess.sum() / max(filled.sum(), 1)), 0.0)), worst)
+
+    @staticmethod
+    def _doubled(normal: _Normal, raw: Pixels, blur: FloatArray) -> bool:
+        """Whether the plate was seen in two places, not in motion: the places between were not exposed.
+
+        The rims that lie across the blur show how long it was where, as the steepness of the grey level there.
+        """
+        along = np.linalg.eigh(blur)[1][:, 1]
+        across = normal.side[0] * float(along[0]) + normal.side[1] * float(along[1])
+        level = normal.rows[3] if normal.root is None else normal.rows[3] / normal.root
+        seen = level + raw
+        dwell = np.zeros(_DWELL)
+        for end in (1.0, -1.0):
+            of = across * end > 0.9
+            place = np.clip((normal.z[of] * end + 3.0) * (_DWELL / 6.0), 0, _DWELL).astype(int)
+            count = np.bincount(place, minlength=_DWELL + 1)
+            if count[:-1].min() < 4:
+                return False
+            mean = np.bincount(place, seen[of], _DWELL + 1) / np.maximum(count, 1)
+            dwell[1:] += end * np.diff(mean[:-1])
+        # The two highest places with the lowest between them.
+        left = np.maximum.accumulate(dwell)
+        right = np.maximum.accumulate(dwell[::-1])[::-1]
+        return bool(np.any(dwell[1:-1] < DIP * np.minimum(left[:-2], right[2:]) - 0.015))
+
+
+def _to_plane(shape: _Shape) -> FloatArray:
+    """The homography (3, 3) from rays to the target's plane."""
+    return np.asarray(np.linalg.inv(np.column_stack([shape.rotation[:, 0], shape.rotation[:, 1], shape.place])))
+
+
+def _on_plane(inverse: FloatArray, x: Pixels, y: Pixels) -> tuple[Pixels, Pixels]:
+    """Points of the plane that rays meet."""
+    h = inverse.tolist()
+    depth = h[2][0] * x
+    depth += h[2][1] * y
+    depth += h[2][2]
+    px = h[0][0] * x
+    px += h[0][1] * y
+    px += h[0][2]
+    px /= depth
+    py = h[1][0] * x
+    py += h[1][1] * y
+    py += h[1][2]
+    py /= depth
+    return px, py
+
+
+def _beforehand(shape: _Shape, prior: Prior) -> tuple[FloatArray, FloatArray]:
+    """What is known without this image: inverse variances of the parameters; how far each is from what is expected."""
+    stiff, pull = np.zeros(10 + shape.skew.size), np.zeros(10 + shape.skew.size)
+    # The tilt against the prior's plane in the target's own axes: a turn in the plane does not change it.
+    off = prior.rotation.T @ shape.rotation
+    stiff[:2], pull[:2] = prior.sd**-2, (-off[2, 1], off[2, 0])
+    stiff[6], pull[6] = RADIUS_SD**-2, 1.0 - shape.swell
+    # No motion is skewed by more than about one.
+    stiff[10:], pull[10:] = 1.0, -shape.skew
+    return stiff, pull
+
+
+def _moved(shape: _Shape, step: FloatArray, light: FloatArray) -> _Shape:
+    blur = shape.blur + np.array([[step[7], step[8]], [step[8], step[9]]])
+    values, vectors = np.linalg.eigh(blur)
+    blur = (vectors * np.clip(values, _SHARPEST**2, 900.0)) @ vectors.T
+    return _Shape(
+        shape.rotation @ turned(step[:3]),
+        shape.place + step[3:6],
+        float(np.clip(shape.swell + step[6], 0.7, 1.4)),
+        blur,
+        np.clip(shape.skew + step[10:], -1.5, 1.5),
+        light,
+    )
+
+
+def turned(v: FloatArray) -> FloatArray:
+    """The rotation (3, 3) about ``v`` by its length, rad (Rodrigues)."""
+    angle = float(np.linalg.norm(v))
+    cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    if angle < 1e-9:
+        return np.asarray(np.eye(3) + cross)
+    sine, versed = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    return np.asarray(np.eye(3) + sine * cross + versed * cross @ cross)
+
+
+def _motion(blur: FloatArray) -> float:
+    """Standard deviation of the motion within the exposure, px: what the blur has more along one axis."""
+    small, large = np.linalg.eigvalsh(blur)
+    return math.sqrt(max(float(large - small), 0.0))
+
+
+def _sectors(side: tuple[Pixels, Pixels], rims: _Rims) -> IntArray:
+    """The part of a rim to which each pixel belongs, counted through all discs."""
+    part = np.floor((np.arctan2(side[1], side[0]) * (0.5 / np.pi) + 0.5) * _SECTORS).astype(int)
+    of = np.repeat(np.arange(len(rims.begin) - 1), np.diff(rims.begin))
+    return np.asarray(of * _SECTORS + np.minimum(part, _SECTORS - 1))

@@ -1,0 +1,214 @@
+"""Measure the tip by a camera: a reference beside the PSDs, with the uncertainty of each frame.
+
+IN is a folder of images with frames.csv (file,t,exposure; s, t is the start of the exposure), a video, or a device
+(/dev/video0, or its number). The target is on the tip plate: three white discs in a line on black, a ChArUco
+board or AprilTags. The first good frames are the rest: the camera may be turned in its plane. A frame that does not
+show the whole target clearly has no answer, and its reason.
+
+OUT.csv has t,dx,dy,theta,sd_dx,sd_dy,sd_theta,status (s, m, m, rad; t is the middle of the exposure); OUT.mcap and a
+bag folder have /reference/deflection and /reference/deflection_with_covariance.
+
+  psd-deflection camera target --out target.pdf
+  psd-deflection camera frames --params-file camera.yaml --out reference.csv
+  psd-deflection camera /dev/video0 --params-file camera.yaml --out run.mcap
+  psd-deflection camera intrinsics shots/*.png --out camera_info.yaml
+  ros2 run psd_deflection camera --ros-args -r image:=/camera/image_raw
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import contextlib
+import importlib.util
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+from tqdm import tqdm
+
+from psd_deflection.camera.answer import FrameAnswer, Status
+from psd_deflection.camera.intrinsics import calibrated
+from psd_deflection.camera.opencv import opencv
+from psd_deflection.camera.print_target import printed, sizes
+from psd_deflection.camera.reference import CameraReference
+from psd_deflection.camera.settings import TARGETS, CameraSettings
+from psd_deflection.camera.targets import target_of
+from psd_deflection.cli._options import FOREIGN, need_folder, picture_name, whole
+from psd_deflection.cli._report import print_json, show, warn
+from psd_deflection.errors import RecordingError, UsageError
+from psd_deflection.files import replace_file
+from psd_deflection.footage import Footage, Frame, read_image, read_settings, read_values
+from psd_deflection.recordings.csv_writer import CsvReferenceFile
+from psd_deflection.recordings.reference_sink import ReferenceSink
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('what', metavar='IN', nargs='*', help='a video, a folder of images, a device; or see above')
+    parser.add_argument(
+        '--target', choices=TARGETS, help='kind of target (default circles, or target.kind of the file)'
+    )
+    parser.add_argument('--params-file', metavar='CAMERA.yaml', help='target.spacing, target.radius, camera.matrix …')
+    parser.add_argument('--out', metavar='OUT', help='X.csv, X.mcap or a bag folder')
+    parser.add_argument('--frames', type=whole('--frames', 1), metavar='N', help='stop after so many frames')
+    parser.add_argument('--json', action='store_true', help='print the summary as JSON')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, print a target, or find the lens."""
+    if not args.what:
+        return _node(args)
+    if args.out is None:
+        raise UsageError('--out is missing: X.csv, X.mcap or a bag folder')
+    settings = read_settings(args.params_file)
+    if args.target is not None:
+        settings = settings.of_kind(args.target)
+    if args.what == ['target']:
+        return _print_target(args, settings)
+    if args.what[0] == 'intrinsics':
+        return _intrinsics(args, settings)
+    if len(args.what) > 1:
+        raise UsageError(f'{args.what[1]}: one IN at a time')
+    return _measure(args, settings)
+
+
+def _node(args: argparse.Namespace) -> int:
+    """The ROS node: it has no IN, but subscribes to images."""
+    if args.out is not None or importlib.util.find_spec('rclpy') is None:
+        raise UsageError('IN is missing: a video, a folder of images or a device; without IN it is a ROS node')
+    from psd_deflection.ros.camera import run_camera
+
+    values = {} if args.params_file is None else read_values(args.params_file)
+    if args.target is not None:
+        values['target.kind'] = args.target
+    run_camera(args.ros_arguments, values, show)
+    return 0
+
+
+def _print_target(args: argparse.Namespace, settings: CameraSettings) -> int:
+    out = Path(picture_name('.pdf', '.png', '.svg')(args.out))
+    need_folder(out)
+    with _saved(out):
+        replace_file(out, printed(settings, out.suffix[1:].lower()))
+    if args.json:
+        print_json({'out': args.out, 'parameters': sizes(settings)})
+        return 0
+    show(f'{out}: print it at 100 %, measure the line of 50 mm, and put this into CAMERA.yaml:')
+    show(*sizes(settings))
+    return 0
+
+
+def _intrinsics(args: argparse.Namespace, settings: CameraSettings) -> int:
+    out = Path(args.out)
+    if out.suffix.lower() not in {'.yaml', '.yml'}:
+        raise UsageError(f'--out {out}: the name must end in .yaml')
+    need_folder(out)
+    paths = args.what[1:]
+    if not paths:
+        raise UsageError('intrinsics: name the images of a ChArUco board, as in shots/*.png')
+    board = settings.of_kind(args.target or 'charuco')
+    bar = tqdm(paths, unit=' images', delay=1.0, leave=False, disable=True if args.json else None, ncols=80)
+    with contextlib.closing(bar):
+        found = calibrated(board, ((path, read_image(path)) for path in bar))
+    with _saved(out):
+        replace_file(out, found.as_yaml(out.stem).encode())
+    if args.json:
+        print_json({'out': args.out, **found.summary()})
+        return 0
+    show(f'{out}: {found.used} of {len(paths)} images used, rms {found.rms:.3f} px')
+    show(*found.lines())
+    for path, reason in found.left_out:
+        warn(f'{path}: not used: {reason}')
+    return 0
+
+
+@contextlib.contextmanager
+def _saved(out: Path) -> Iterator[None]:
+    """Turn what the disk refuses into a RecordingError."""
+    try:
+        yield
+    except OSError as error:
+        raise RecordingError(f'--out {out}: cannot be written ({error.strerror or error})') from None
+
+
+def _measure(args: argparse.Namespace, settings: CameraSettings) -> int:
+    out = Path(args.out)
+    if out.suffix.lower() in FOREIGN:
+        raise UsageError(f'--out {out}: {out.suffix} cannot be written; use X.csv, X.mcap or a bag folder (X)')
+    need_folder(out)
+    opencv()
+    footage = Footage(args.what[0], settings.exposure)
+    reference = CameraReference(settings, target_of)
+    reasons: collections.Counter[str] = collections.Counter()
+    found: list[FrameAnswer] = []
+    sink: CsvReferenceFile | ReferenceSink
+    sink = CsvReferenceFile(out) if out.suffix.lower() == '.csv' else ReferenceSink(out)
+    with contextlib.closing(sink):
+        for answer in _answers(args, footage, reference):
+            reasons[str(answer.status)] += 1
+            sink.put(answer.t_ns, answer.as_record(), str(answer.status))
+            found = [*found[-999:], answer] if answer.status is Status.OK else found
+    _tell(args, settings, reference, reasons, found)
+    return 0
+
+
+def _answers(args: argparse.Namespace, footage: Footage, reference: CameraReference) -> Iterator[FrameAnswer]:
+    frames: Iterator[Frame] = iter(footage)
+    hidden = True if args.json else None
+    bar = tqdm(
+        frames, total=args.frames or footage.total, unit=' frames', delay=1.0, leave=False, disable=hidden, ncols=80
+    )
+    # A live camera is ended by Ctrl-C: what was measured until then stays.
+    with contextlib.suppress(KeyboardInterrupt) if footage.live else contextlib.nullcontext():
+        for number, frame in enumerate(bar, 1):
+            yield from reference.take(frame.t_ns, frame.image)
+            if number == args.frames:
+                break
+    bar.close()
+    yield from reference.finish()
+
+
+def _tell(
+    args: argparse.Namespace,
+    settings: CameraSettings,
+    reference: CameraReference,
+    reasons: collections.Counter[str],
+    found: list[FrameAnswer],
+) -> None:
+    frames, good = sum(reasons.values()), reasons.pop(str(Status.OK), 0)
+    median = [
+        sorted(math.sqrt(float(a.covariance[i, i])) for a in found if a.covariance is not None)[len(found) // 2]
+        for i in range(3)
+        if found
+    ]
+    rest = reference.rest
+    if args.json:
+        print_json(
+            {
+                'out': args.out,
+                'frames': frames,
+                'answers': good,
+                'refused': dict(reasons.most_common()),
+                'sd': dict(zip(('dx', 'dy', 'theta'), median, strict=False)),
+                'turn': None if rest is None else reference.turn,
+                'radius_scale': None if rest is None else rest.scale,
+                'lens': bool(settings.matrix),
+            }
+        )
+        return
+    show(f'{args.out}: {good} of {frames} frames have an answer')
+    for reason, count in reasons.most_common():
+        show(f'  {count} refused: {reason}')
+    if rest is not None and median:
+        dx, dy, theta = median
+        sds = f'ΔX {dx * 1e6:.2f} µm, ΔY {dy * 1e6:.2f} µm, θ {math.degrees(theta):.5f}°'
+        show(f'one sd, median of the last frames: {sds}')
+        show(f'the camera is turned by {math.degrees(reference.turn):+.3f}° in its plane, which is taken off')
+        if settings.target == 'circles':
+            show(f'the discs look {100 * (rest.scale - 1):+.2f} % larger than target.spacing and target.radius say')
+    if not settings.matrix:
+        warn(
+            'camera.matrix is not given: the scale is that of target.spacing, lens distortion and perspective are not '
+            'corrected; `psd-deflection camera intrinsics` finds both'
+        )

@@ -1,0 +1,253 @@
+"""Where a camera's frames come from: a folder of images, a video file, a device; and the camera's parameter file.
+
+A folder has ``frames.csv`` with ``file,t,exposure`` (s; ``t`` is the start of the exposure). Of a video or a device the
+exposure is not known: ``camera.exposure`` says it.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from psd_deflection.camera.opencv import opencv
+from psd_deflection.camera.settings import CameraSettings, settings_from
+from psd_deflection.errors import ConfigError, DeviceError, RecordingError
+from psd_deflection.foreign_yaml import tree_of_text
+from psd_deflection.parameter_files import flattened, parameter_text
+
+FRAMES = 'frames.csv'
+SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.webp')
+MOST_PIXELS = 200_000_000
+_MOST_SECONDS = 9.2e9
+_SILENT_READS = 50
+
+
+class Frame(NamedTuple):
+    """One frame: ``t_ns`` is the middle of its exposure; ``image`` grey, uint8 or uint16, None if it cannot be read."""
+
+    name: str
+    t_ns: int
+    image: Any
+
+
+def read_values(path: str | Path) -> dict[str, object]:
+    """The values in ``CAMERA.yaml`` by their names: plain keys, dotted or nested, or a ROS 2 parameter file.
+
+    Raises ConfigError.
+    """
+    path = Path(path)
+    tree = tree_of_text(parameter_text(path), path)
+    if not isinstance(tree, dict):
+        raise ConfigError(f'{path}: has no parameters of a camera, as in "target.spacing: 0.025"')
+    if 'camera_matrix' in tree:
+        return _of_camera_info(tree, path)
+    values: dict[str, object] = {}
+    for name, body in tree.items():
+        if isinstance(body, dict) and isinstance(body.get('ros__parameters'), dict):
+            if name in {'/**', 'camera', '/camera', '/**/camera'}:
+                values |= flattened(body['ros__parameters'], str(path))
+        else:
+            values |= flattened({name: body}, str(path))
+    return values
+
+
+def _of_camera_info(tree: Mapping[str, Any], path: Path) -> dict[str, object]:
+    """Matrix and distortion of ROS's ``camera_info`` YAML, which may have our own keys beside its own."""
+    values: dict[str, object] = {}
+    for theirs, ours in (('camera_matrix', 'camera.matrix'), ('distortion_coefficients', 'camera.distortion')):
+        body = tree.get(theirs)
+        if not isinstance(body, dict) or 'data' not in body:
+            raise ConfigError(f'{path}: {theirs}.data is missing: not a camera_info file')
+        values[ours] = body['data']
+    own = {k: v for k, v in tree.items() if str(k).partition('.')[0] in {'target', 'camera', 'rest'}}
+    return values | flattened(own, str(path))
+
+
+def read_settings(path: str | Path | None) -> CameraSettings:
+    """The settings in ``CAMERA.yaml``; None: the defaults. Raises ConfigError."""
+    return CameraSettings() if path is None else settings_from(read_values(path), str(path))
+
+
+class Footage:
+    """The frames of ``source`` in order: iterate. ``total``: how many, or None if that is not known.
+
+    Raises RecordingError for a file or a folder that cannot be read, DeviceError for a device.
+    """
+
+    def __init__(self, source: str, exposure: float) -> None:
+        self._exposure_ns = round(exposure * 1e9)
+        path = Path(source)
+        self.total: int | None = None
+        self.live = False
+        if path.is_dir():
+            self._listed = _listed(path)
+            self.total = len(self._listed)
+            self._frames = self._of_folder()
+        elif path.is_file():
+            self._video = opencv().VideoCapture(str(path))
+            if not self._video.isOpened():
+                raise RecordingError(f'{path}: not a video that OpenCV can read; a single image goes into a folder')
+            count = int(self._video.get(opencv().CAP_PROP_FRAME_COUNT))
+            self.total = count if count > 0 else None
+            self._frames = self._of_video(path)
+        elif path.exists() or source.isdecimal():
+            self.live = True
+            self._video = opencv().VideoCapture(int(source) if source.isdecimal() else source)
+            if not self._video.isOpened():
+                raise DeviceError(f'{source}: no camera that OpenCV can open; `v4l2-ctl --list-devices` lists them')
+            self._frames = self._of_device(source)
+        else:
+            raise RecordingError(f'{source}: no such video, folder of images or device')
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self._frames
+
+    def _of_folder(self) -> Iterator[Frame]:
+        cv2 = opencv()
+        for path, t_ns, exposure_ns in self._listed:
+            content = np.frombuffer(path.read_bytes() if path.is_file() else b'', dtype=np.uint8)
+            yield Frame(path.name, t_ns + exposure_ns // 2, decoded(content, cv2))
+
+    def _of_video(self, path: Path) -> Iterator[Frame]:
+        cv2 = opencv()
+        number = 0
+        while True:
+            read, image = self._video.read()
+            if not read:
+                break
+            t_ms = float(self._video.get(cv2.CAP_PROP_POS_MSEC))
+            yield Frame(f'{path.name}:{number}', round(t_ms * 1e6) + self._exposure_ns // 2, grey(image))
+            number += 1
+        self._video.release()
+        if number == 0:
+            raise RecordingError(f'{path}: has no frame')
+
+    def _of_device(self, source: str) -> Iterator[Frame]:
+        number = silent = 0
+        try:
+            while silent < _SILENT_READS:
+                read, image = self._video.read()
+                # The driver's own stamps are not to be had; the frame was complete at this time at the latest.
+                t_ns = time.time_ns() - self._exposure_ns // 2
+                silent = 0 if read else silent + 1
+                if read:
+                    yield Frame(str(number), t_ns, grey(image))
+                    number += 1
+        finally:
+            self._video.release()
+        raise DeviceError(f'{source}: the camera gives no more frames; is it still connected?')
+
+
+def _listed(folder: Path) -> list[tuple[Path, int, int]]:
+    """File, start and length of the exposure (ns) of each frame of a folder. Raises RecordingError."""
+    path = folder / FRAMES
+    if not path.is_file():
+        raise RecordingError(f'{folder}: has no {FRAMES}; write one with the columns file,t,exposure (s)')
+    out: list[tuple[Path, int, int]] = []
+    try:
+        with path.open(encoding='utf-8', newline='') as stream:
+            rows = csv.DictReader(stream)
+            missing = {'file', 't', 'exposure'} - set(rows.fieldnames or ())
+            if missing:
+                raise RecordingError(f'{path}: has no column {", ".join(sorted(missing))}')
+            for row in rows:
+                where = f'{path}:{rows.line_num}'
+                name = row['file'] or ''
+                if not name or Path(name).name != name:
+                    raise RecordingError(f'{where}: file {name!r}: must be the name of an image in {folder}')
+                t, exposure = _seconds(row['t'], where, 't'), _seconds(row['exposure'], where, 'exposure')
+                if exposure < 0 or (out and t <= out[-1][1]):
+                    wrong = 'exposure is negative' if exposure < 0 else 't does not increase'
+                    raise RecordingError(f'{where}: {wrong}')
+                out.append((folder / name, t, exposure))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise RecordingError(f'{path}: cannot be read ({error})') from None
+    if not out:
+        raise RecordingError(f'{path}: lists no frame')
+    return out
+
+
+def _seconds(text: str | None, where: str, column: str) -> int:
+    """Seconds as ns, exactly for as many decimals as there are. Raises RecordingError."""
+    try:
+        value = float(text or '')
+    except ValueError:
+        value = math.nan
+    if not abs(value) < _MOST_SECONDS:
+        raise RecordingError(f'{where}: column {column} holds {text!r}, which is not a number of seconds')
+    whole, point, part = (text or '').strip().partition('.')
+    if point and whole.lstrip('-').isdecimal() and part.isdecimal():
+        sign = -1 if whole.startswith('-') else 1
+        return sign * (abs(int(whole)) * 1_000_000_000 + int(part[:9].ljust(9, '0')))
+    return round(value * 1e9)
+
+
+def read_image(path: str | Path) -> Any:
+    """The grey image in a file, None if it is none. Raises RecordingError if the file cannot be read."""
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
+    return decoded(np.frombuffer(content, dtype=np.uint8), opencv())
+
+
+def decoded(content: Any, cv2: Any) -> Any:
+    """A grey image of the bytes of a file (PNG, JPEG …), None if they are none."""
+    if not len(content):
+        return None
+    try:
+        image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+    return None if image is None else grey(image)
+
+
+def grey(image: Any) -> Any:
+    """An image as grey uint8 or uint16; None if it is of another kind."""
+    cv2 = opencv()
+    if image is None or image.dtype not in (np.uint8, np.uint16) or image.size > MOST_PIXELS:
+        return None
+    if image.ndim == 2:
+        return image
+    conversion = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}.get(image.shape[2])
+    return None if conversion is None else cv2.cvtColor(image, conversion)
+
+
+_ENCODINGS = {
+    'mono8': (np.uint8, 1, ''),
+    '8UC1': (np.uint8, 1, ''),
+    'mono16': (np.uint16, 1, ''),
+    '16UC1': (np.uint16, 1, ''),
+    'bgr8': (np.uint8, 3, 'COLOR_BGR2GRAY'),
+    '8UC3': (np.uint8, 3, 'COLOR_BGR2GRAY'),
+    'rgb8': (np.uint8, 3, 'COLOR_RGB2GRAY'),
+    'bgra8': (np.uint8, 4, 'COLOR_BGRA2GRAY'),
+    'rgba8': (np.uint8, 4, 'COLOR_RGBA2GRAY'),
+    # OpenCV names the pattern by its second row and column, ROS by its first.
+    'bayer_rggb8': (np.uint8, 1, 'COLOR_BayerBG2GRAY'),
+    'bayer_bggr8': (np.uint8, 1, 'COLOR_BayerRG2GRAY'),
+    'bayer_gbrg8': (np.uint8, 1, 'COLOR_BayerGR2GRAY'),
+    'bayer_grbg8': (np.uint8, 1, 'COLOR_BayerGB2GRAY'),
+}
+
+
+def of_ros_image(height: int, width: int, encoding: str, big_endian: bool, step: int, content: bytes) -> Any:
+    """The grey image of a sensor_msgs/Image; None if it is of an encoding without brightness, or damaged."""
+    found = _ENCODINGS.get(encoding)
+    if found is None:
+        return None
+    kind, channels, conversion = found
+    wide = width * channels * np.dtype(kind).itemsize
+    if not (0 < wide <= step and height > 0 and step * height <= len(content) <= MOST_PIXELS):
+        return None
+    rows = np.frombuffer(content, dtype=np.uint8, count=step * height).reshape(height, step)[:, :wide]
+    image = np.ascontiguousarray(rows).view(np.dtype(kind).newbyteorder('>' if big_endian else '<')).astype(kind)
+    image = image.reshape((height, width, channels) if channels > 1 else (height, width))
+    cv2 = opencv()
+    return cv2.cvtColor(image, getattr(cv2, conversion)) if conversion else image

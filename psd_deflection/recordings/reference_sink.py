@@ -1,0 +1,25 @@
+"""Writes a camera's poses as a recording: ``/reference/deflection`` and the same with covariance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from psd_deflection.recordings.bag_writer import BagWriter, McapFile
+from psd_deflection.records import ReferencePose, ReferenceWithCovariance
+
+
+class ReferenceSink:
+    """An ``.mcap``, else a bag folder. Raises RecordingError if it exists or the disk refuses to write."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = McapFile(path, rig_values={}) if path.suffix.lower() == '.mcap' else BagWriter(path, rig_values={})
+
+    def put(self, t_ns: int, reference: ReferenceWithCovariance | None, status: str) -> None:
+        """Write the pose of one frame; a frame without one has no message."""
+        if reference is not None:
+            self._file.put(ReferencePose(t_ns, reference.dx, reference.dy, reference.theta))
+            self._file.put(reference)
+
+    def close(self) -> None:
+        """Write index and summary and close."""
+        self._file.close()

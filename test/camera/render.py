@@ -1,0 +1,234 @@
+"""Draws what a camera sees of three discs: the judge of the detector, written apart from it.
+
+Coverage is anti-aliased by area: pixels on a rim are cut in 16 x 16 parts, each of which is followed back through the
+lens onto the plate. The exposure is a mean over instants of the real motion; then come the lens's blur, uneven light,
+noise of two kinds, and the converter. Nothing here is taken from the package.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import gaussian_filter
+
+Array = npt.NDArray[np.float64]
+PARTS = 16
+
+
+@dataclass(frozen=True)
+class Pose:
+    """The tip against its rest: m and rad; ``z`` is away from the base."""
+
+    dx: float = 0.0
+    dy: float = 0.0
+    theta: float = 0.0
+    phi: float = 0.0
+    omega: float = 0.0
+    z: float = 0.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Camera, target and light. ``turn``: of the camera about its axis; ``tilt``: of the camera about X and Y."""
+
+    width: int = 640
+    height: int = 480
+    focal: float = 2000.0
+    centre: tuple[float, float] = (330.0, 228.0)
+    distortion: Sequence[float] = ()
+    distance: float = 0.4
+    turn: float = 0.0
+    tilt: tuple[float, float] = (0.0, 0.0)
+    aim: tuple[float, float] = (0.0, 0.0)
+    view: str = 'outside'
+    spacing: float = 0.025
+    radius: float = 0.008
+    black: float = 20.0
+    white: float = 200.0
+    slope: tuple[float, float] = (0.0, 0.0)
+    blur: float = 0.7
+    read_noise: float = 2.0
+    shot_noise: float = 0.0
+    hide: Sequence[tuple[float, float, float, float]] = field(default=())
+    discs: int = 3
+
+    @property
+    def matrix(self) -> list[float]:
+        return [self.focal, 0.0, self.centre[0], 0.0, self.focal, self.centre[1], 0.0, 0.0, 1.0]
+
+
+def about(axis: int, angle: float) -> Array:
+    c, s = math.cos(angle), math.sin(angle)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    out = np.eye(3)
+    out[i, i] = out[j, j] = c
+    out[j, i], out[i, j] = s, -s
+    return out
+
+
+def camera_of(scene: Scene) -> tuple[Array, Array]:
+    """Rotation and origin of the rest frame in the camera's axes."""
+    facing = np.diag([1.0, -1.0, -1.0]) if scene.view == 'outside' else np.diag([-1.0, -1.0, 1.0])
+    rotation = about(2, scene.turn) @ about(0, scene.tilt[0]) @ about(1, scene.tilt[1]) @ facing
+    return rotation, np.array([scene.aim[0], scene.aim[1], scene.distance])
+
+
+def distort(x: Array, y: Array, distortion: Sequence[float]) -> tuple[Array, Array]:
+    k1, k2, p1, p2, k3 = [*distortion, *([0.0] * 5)][:5]
+    rr = x**2 + y**2
+    f = 1 + k1 * rr + k2 * rr**2 + k3 * rr**3
+    return (
+        x * f + 2 * p1 * x * y + p2 * (rr + 2 * x**2),
+        y * f + p1 * (rr + 2 * y**2) + 2 * p2 * x * y,
+    )
+
+
+def undistort(x: Array, y: Array, distortion: Sequence[float]) -> tuple[Array, Array]:
+    """Newton's method with a numeric derivative: not the detector's way."""
+    if not any(distortion):
+        return x, y
+    a, b, h = x.copy(), y.copy(), 1e-6
+    for _ in range(4):
+        fx, fy = distort(a, b, distortion)
+        xx, yx = distort(a + h, b, distortion)
+        xy, yy = distort(a, b + h, distortion)
+        j11, j12, j21, j22 = (xx - fx) / h, (xy - fx) / h, (yx - fy) / h, (yy - fy) / h
+        det = j11 * j22 - j12 * j21
+        ex, ey = x - fx, y - fy
+        a += (j22 * ex - j12 * ey) / det
+        b += (j11 * ey - j21 * ex) / det
+    return a, b
+
+
+@functools.lru_cache(maxsize=4)
+def rays(
+    width: int, height: int, focal: float, centre: tuple[float, float], distortion: tuple[float, ...]
+) -> tuple[Array, Array, Array]:
+    """Rays x and y (rows, columns) of all pixels, and d (x, y) / d (u, v) (4, rows, columns)."""
+    v, u = np.mgrid[:height, :width].astype(float)
+    x, y = undistort((u - centre[0]) / focal, (v - centre[1]) / focal, distortion)
+    return (
+        x,
+        y,
+        np.stack([np.gradient(x, axis=1), np.gradient(x, axis=0), np.gradient(y, axis=1), np.gradient(y, axis=0)]),
+    )
+
+
+def on_plate(scene: Scene, pose: Pose, x: Array, y: Array) -> tuple[Array, Array]:
+    """The point of the tip plate, in its own axes, that the ray (x, y) meets."""
+    rotation, origin = camera_of(scene)
+    tip = rotation @ about(1, pose.omega) @ about(0, pose.phi) @ about(2, pose.theta)
+    at = origin + rotation @ np.array([pose.dx, pose.dy, pose.z])
+    normal = tip[:, 2]
+    far = (normal @ at) / (normal[0] * x + normal[1] * y + normal[2])
+    px, py, pz = far * x - at[0], far * y - at[1], far - at[2]
+    return (
+        tip[0, 0] * px + tip[1, 0] * py + tip[2, 0] * pz,
+        tip[0, 1] * px + tip[1, 1] * py + tip[2, 1] * pz,
+    )
+
+
+def seen_at(scene: Scene, pose: Pose, x: float, y: float) -> tuple[float, float]:
+    """Pixel of a point (x, y) of the tip plate."""
+    rotation, origin = camera_of(scene)
+    tip = rotation @ about(1, pose.omega) @ about(0, pose.phi) @ about(2, pose.theta)
+    p = origin + rotation @ np.array([pose.dx, pose.dy, pose.z]) + tip @ np.array([x, y, 0.0])
+    a, b = distort(np.array([p[0] / p[2]]), np.array([p[1] / p[2]]), scene.distortion)
+    return scene.focal * float(a[0]) + scene.centre[0], scene.focal * float(b[0]) + scene.centre[1]
+
+
+def centres_of(scene: Scene) -> list[tuple[float, float]]:
+    half = (scene.discs - 1) / 2
+    return [(0.0, (half - i) * scene.spacing) for i in range(scene.discs)]
+
+
+def coverage(scene: Scene, pose: Pose, parts: int = PARTS) -> Array:
+    """The share (rows, columns) of each pixel that is white; rims are cut in ``parts`` x ``parts``."""
+    out = np.zeros((scene.height, scene.width))
+    everywhere = rays(scene.width, scene.height, scene.focal, tuple(scene.centre), tuple(scene.distortion))
+    offsets = (np.arange(parts) + 0.5) / parts - 0.5
+    du, dv = np.meshgrid(offsets, offsets)
+    for cx, cy in centres_of(scene):
+        turns = np.linspace(0, 2 * np.pi, 60)
+        rim = np.array(
+            [seen_at(scene, pose, cx + scene.radius * math.cos(t), cy + scene.radius * math.sin(t)) for t in turns]
+        )
+        u0, v0 = np.maximum(np.floor(rim.min(axis=0)).astype(int) - 2, 0)
+        u1, v1 = np.ceil(rim.max(axis=0)).astype(int) + 3
+        u1, v1 = min(u1, scene.width), min(v1, scene.height)
+        if u1 <= u0 or v1 <= v0:
+            continue
+        ray_x, ray_y, slope = (a[..., v0:v1, u0:u1] for a in everywhere)
+        x, y = on_plate(scene, pose, ray_x, ray_y)
+        away = np.hypot(x - cx, y - cy) - scene.radius
+        pixel = scene.radius * 2 * math.pi / float(np.sum(np.hypot(*np.diff(rim, axis=0).T)))
+        part = (away < 0).astype(float)
+        edge = np.abs(away) < 1.0 * pixel
+        # Within a pixel the lens is linear to a millionth of it.
+        k = slope[:, edge][..., None]
+        sub_x = ray_x[edge][:, None] + k[0] * du.ravel() + k[1] * dv.ravel()
+        sub_y = ray_y[edge][:, None] + k[2] * du.ravel() + k[3] * dv.ravel()
+        ex, ey = on_plate(scene, pose, sub_x, sub_y)
+        part[edge] = np.mean(np.hypot(ex - cx, ey - cy) < scene.radius, axis=1)
+        out[v0:v1, u0:u1] += part
+    for left, top, right, bottom in scene.hide:
+        out[int(top) : int(bottom), int(left) : int(right)] = 0.0
+    return out
+
+
+def clean(scene: Scene, poses: Sequence[Pose]) -> Array:
+    """Grey levels without noise: the mean over ``poses``, which are equal parts of the exposure."""
+    parts = max(PARTS // len(poses), 4)
+    part = np.mean([coverage(scene, p, parts) for p in poses], axis=0)
+    if scene.blur > 0:
+        part = gaussian_filter(part, scene.blur, mode='nearest', truncate=5.0)
+    v, u = np.mgrid[: scene.height, : scene.width]
+    light = 1 + scene.slope[0] * (u / scene.width - 0.5) + scene.slope[1] * (v / scene.height - 0.5)
+    return np.asarray(light * (scene.black + (scene.white - scene.black) * part))
+
+
+def photograph(scene: Scene, poses: Sequence[Pose], rng: np.random.Generator) -> npt.NDArray[np.uint8]:
+    """One frame as the camera gives it."""
+    grey = clean(scene, poses)
+    sd = np.sqrt(scene.read_noise**2 + scene.shot_noise**2 * np.maximum(grey, 0.0))
+    return np.clip(np.rint(grey + sd * rng.standard_normal(grey.shape)), 0, 255).astype(np.uint8)
+
+
+def board(scene: Scene, pose: Pose, texture: Array, size: tuple[float, float], parts: int = 4) -> Array:
+    """A flat picture on the tip plate in place of discs: the white share; ``size`` m, its middle at the origin."""
+    ray_x, ray_y, k = rays(scene.width, scene.height, scene.focal, tuple(scene.centre), tuple(scene.distortion))
+    out = np.zeros((scene.height, scene.width))
+    sign = 1.0 if scene.view == 'outside' else -1.0
+    high, wide = texture.shape
+    for i in range(parts * parts):
+        du, dv = (i // parts + 0.5) / parts - 0.5, (i % parts + 0.5) / parts - 0.5
+        x, y = on_plate(scene, pose, ray_x + k[0] * du + k[1] * dv, ray_y + k[2] * du + k[3] * dv)
+        column = np.floor((sign * x / size[0] + 0.5) * wide).astype(int)
+        row = np.floor((0.5 - y / size[1]) * high).astype(int)
+        on = (column >= 0) & (column < wide) & (row >= 0) & (row < high)
+        out += np.where(on, texture[np.clip(row, 0, high - 1), np.clip(column, 0, wide - 1)], 1.0)
+    return out / parts**2
+
+
+def photograph_of(scene: Scene, part: Array, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
+    """A frame of a white share: blur, light and noise as in :func:`photograph`."""
+    grey = scene.black + (scene.white - scene.black) * gaussian_filter(part, scene.blur, mode='nearest')
+    return np.clip(np.rint(grey + scene.read_noise * rng.standard_normal(grey.shape)), 0, 255).astype(np.uint8)
+
+
+def over_exposure(motion: Callable[[float], Pose], t: float, exposure: float, instants: int = 12) -> list[Pose]:
+    """The poses at the middles of equal parts of an exposure that begins at ``t``."""
+    return [motion(t + exposure * (i + 0.5) / instants) for i in range(instants)]
+
+
+def mean_of(poses: Sequence[Pose]) -> tuple[float, float, float]:
+    return (
+        float(np.mean([p.dx for p in poses])),
+        float(np.mean([p.dy for p in poses])),
+        float(np.mean([p.theta for p in poses])),
+    )

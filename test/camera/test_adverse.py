@@ -1,0 +1,15 @@
+"""Short form of ``make camera-campaign``: no answer is further off than five of its own standard deviations."""
+
+from __future__ import annotations
+
+import pytest
+
+from bench.campaign.camera import SIGMAS, off_by, runs
+from psd_deflection.camera.answer import Status
+
+
+@pytest.mark.statistics
+def test_a_bad_frame_is_refused_or_right() -> None:
+    found = [(hurt, off_by(answer, truth)) for hurt, answer, truth in runs(24, 3) if answer.status is Status.OK]
+    assert len(found) > 5
+    assert [f for f in found if f[1] > SIGMAS] == []

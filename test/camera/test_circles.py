@@ -1,0 +1,136 @@
+"""The thesis's three discs: what is rendered is found again, within what is claimed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from psd_deflection.camera.answer import FrameAnswer, Status
+from psd_deflection.camera.reference import CameraReference
+from psd_deflection.camera.settings import CameraSettings
+from psd_deflection.camera.targets import target_of
+from test.camera.render import Pose, Scene, mean_of, over_exposure, photograph
+
+STILL = [Pose()] * 2
+
+
+def settings_of(scene: Scene) -> CameraSettings:
+    return CameraSettings(
+        matrix=tuple(scene.matrix),
+        distortion=tuple(scene.distortion),
+        view=scene.view,
+        spacing=scene.spacing,
+        radius=scene.radius,
+    )
+
+
+def measured(scene: Scene, poses: Sequence[Pose], settings: CameraSettings | None = None) -> list[FrameAnswer]:
+    rng = np.random.default_rng(11)
+    reference = CameraReference(settings or settings_of(scene), target_of)
+    out = []
+    for number, pose in enumerate(poses):
+        out += reference.take(number, photograph(scene, [pose], rng))
+    return out + reference.finish()
+
+
+def assert_within(answers: Sequence[FrameAnswer], poses: Sequence[Pose], sigmas: float = 5.0) -> None:
+    """Each answer is right within its own covariance, and within what the project asks for."""
+    assert [a.status for a in answers] == [Status.OK] * len(poses)
+    for answer, pose in zip(answers, poses, strict=True):
+        assert answer.covariance is not None
+        off = np.array([answer.dx - pose.dx, answer.dy - pose.dy, answer.theta - pose.theta])
+        assert np.all(np.abs(off) < sigmas * np.sqrt(np.diag(answer.covariance))), (off, answer)
+        assert np.all(np.abs(off) < [10e-6, 10e-6, math.radians(0.03)])
+
+
+SCENES = {
+    'plain': Scene(),
+    'from the base': Scene(view='base', turn=0.4),
+    'turned': Scene(turn=-0.6),
+    'wide lens': Scene(distortion=(-0.25, 0.12, 0.001, -0.0015), aim=(0.02, -0.002)),
+    'oblique': Scene(tilt=(0.25, -0.3)),
+    'uneven light': Scene(slope=(0.8, -0.5), shot_noise=0.15),
+    'large': Scene(width=1920, height=1080, focal=5000.0, centre=(960.0, 520.0), blur=1.5),
+}
+
+
+@pytest.mark.parametrize('name', SCENES)
+def test_a_rendered_motion_is_found_again(name: str) -> None:
+    moved = [Pose(3e-3, -2e-3, 0.05, 0.01, -0.008), Pose(-4e-3, 3e-3, 0.3, -0.01, 0.01)]
+    assert_within(measured(SCENES[name], STILL + moved), STILL + moved)
+
+
+def test_theta_has_four_quadrants() -> None:
+    poses = STILL + [Pose(theta=math.radians(a)) for a in (50, 100, 150, 179)]
+    assert_within(measured(Scene(), poses), poses)
+
+
+def test_a_tilt_of_the_plate_is_seen_and_does_not_turn_theta() -> None:
+    poses = [*STILL, Pose(theta=0.1, phi=0.12, omega=-0.1)]
+    answer = measured(Scene(tilt=(0.2, 0.1)), poses)[-1]
+    assert answer.theta == pytest.approx(0.1, abs=5e-4)
+    assert [answer.phi, answer.omega] == pytest.approx([0.12, -0.1], abs=0.01)
+
+
+def test_without_a_lens_the_spacing_is_the_scale() -> None:
+    poses = [*STILL, Pose(2e-3, -1e-3, 0.1)]
+    settings = CameraSettings(spacing=0.025, radius=0.008)
+    answer = measured(Scene(turn=0.2), poses, settings)[-1]
+    assert [answer.dx, answer.dy, answer.theta] == pytest.approx([2e-3, -1e-3, 0.1], abs=20e-6)
+
+
+def test_the_mean_over_the_exposure_is_what_counts() -> None:
+    """A link at its turning point: the middle of the exposure is not the mean, the blur is not symmetric."""
+
+    def motion(t: float) -> Pose:
+        return Pose(4e-3 * math.cos(2 * math.pi * 14.0 * t))
+
+    scene, rng = Scene(), np.random.default_rng(5)
+    poses = over_exposure(motion, 0.0, 8e-3, 24)
+    reference = CameraReference(settings_of(scene), target_of)
+    for number in range(2):
+        reference.take(number, photograph(scene, [Pose()], rng))
+    (*_, answer) = reference.take(2, photograph(scene, poses, rng))
+    mean = mean_of(poses)[0]
+    assert abs(mean - poses[12].dx) > 50e-6
+    assert abs(answer.dx - mean) < 10e-6
+    assert answer.target is not None
+    assert answer.covariance is not None
+    still = 1e-6
+    assert math.sqrt(answer.covariance[0, 0]) > 2 * still
+
+
+@pytest.mark.parametrize(
+    ('status', 'scene'),
+    [
+        (Status.MISSING, Scene(discs=0)),
+        (Status.HIDDEN, Scene(discs=2)),
+        (Status.HIDDEN, Scene(hide=((280.0, 90.0, 300.0, 110.0),))),
+        (Status.OUTSIDE, Scene(aim=(0.0, 0.03))),
+        (Status.DOUBLED, Scene(discs=4, radius=0.006, spacing=0.018)),
+        (Status.SMALL, Scene(distance=5.0)),
+        (Status.DEFOCUSED, Scene(blur=9.0)),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_with_the_reason(status: Status, scene: Scene) -> None:
+    (answer,) = measured(scene, [Pose()])
+    assert (answer.status, answer.covariance) == (status, None)
+
+
+def test_an_overexposed_target_is_refused() -> None:
+    scene, rng = Scene(black=60.0, white=900.0), np.random.default_rng(1)
+    reference = CameraReference(settings_of(scene), target_of)
+    assert reference.take(0, photograph(scene, [Pose()], rng)) == []
+    (answer,) = reference.finish()
+    assert answer.status == Status.SATURATED
+
+
+def test_two_places_in_one_exposure_are_not_a_motion() -> None:
+    scene, rng = Scene(), np.random.default_rng(2)
+    reference = CameraReference(settings_of(scene), target_of)
+    reference.take(0, photograph(scene, [Pose(), Pose(dx=1.5e-3)], rng))
+    (answer,) = reference.finish()
+    assert answer.status == Status.GHOST
