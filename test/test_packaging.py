@@ -24,7 +24,18 @@ TESTED_ELSEWHERE = {'correction', 'errors', 'files', 'pages', 'parameters', 'rec
 """Rooms without a test file of their own: declarations; the correction, of which the effects' tests are; and the pages,
 which the tests of the reports open in a browser."""
 
-EXECUTABLES = ('estimator', 'replay', 'simulate', 'discover', 'check', 'effects', 'validate', 'identify')
+EXECUTABLES = (
+    'estimator',
+    'replay',
+    'simulate',
+    'discover',
+    'calibrate',
+    'camera',
+    'check',
+    'effects',
+    'validate',
+    'identify',
+)
 
 
 def installed_files() -> dict[str, Path]:
