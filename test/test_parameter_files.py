@@ -8,7 +8,7 @@ import pytest
 
 from psd_deflection.config import load_rig
 from psd_deflection.errors import ConfigError
-from psd_deflection.parameter_files import read_parameter_file, with_effects_section
+from psd_deflection.parameter_files import flat_parameters, read_parameter_file, with_effects_section, with_values
 
 
 @pytest.mark.parametrize(
@@ -95,3 +95,28 @@ def test_a_file_that_cannot_be_edited_is_refused(text: str, why: str, tmp_path: 
     with pytest.raises(ConfigError, match=why) as caught:
         with_effects_section(text, {'creep': {'amplitude': 0.1}}, tmp_path / 'rig.yaml')
     assert str(tmp_path / 'rig.yaml') in str(caught.value)
+
+
+def test_values_are_written_where_they_are() -> None:
+    """Nested, dotted and in a section of the node; numbers that YAML 1.1 takes for text."""
+    text = '/**:\n  ros__parameters:\n    psd_1.height: 0.0 # mm\n    psd_2:\n      center: [0.1, 0.2] # both\n'
+    out = with_values(
+        text,
+        {'psd_1.height': 1e-05, 'psd_2.center': [0.3, 0.4], 'psd_2.height': -3e-05},
+        'Calibrated by us',
+        Path('rig.yaml'),
+    )
+    assert flat_parameters(out, Path('rig.yaml')) == {
+        'psd_1.height': pytest.approx(1e-05, rel=1e-12),
+        'psd_2.center': [0.3, 0.4],
+        'psd_2.height': pytest.approx(-3e-05, rel=1e-12),
+    }
+    assert out.startswith('# Calibrated by us\n')
+    assert '[0.3, 0.4] # both' in out
+    assert '# mm' in out
+    assert (
+        with_values(out, {'psd_1.height': 0.25}, 'Calibrated by them', Path('rig.yaml')).count('# Calibrated by') == 1
+    )
+    # The name of a recording is a stranger's: a line end in it begins no line.
+    told = with_values(text, {}, 'Calibrated by x from a\nlink.length: 3', Path('rig.yaml'))
+    assert flat_parameters(told, Path('rig.yaml')) == flat_parameters(text, Path('rig.yaml'))

@@ -27,15 +27,15 @@ from psd_deflection.calibrating import check as checking
 from psd_deflection.calibrating.calibrate import Calibration, calibrate
 from psd_deflection.calibrating.report import report_html
 from psd_deflection.calibrating.result import result, sentence, source_of, values_of
-from psd_deflection.calibrating.rig_file import with_values
 from psd_deflection.cli._options import namespace_option
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save, show, warn
+from psd_deflection.cli._rig_file import rig_file
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.discovery.result import model_yaml
 from psd_deflection.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.misalignment.rig import is_calibrated
-from psd_deflection.parameter_files import parameter_text, with_effects_section
+from psd_deflection.parameter_files import with_effects_section, with_values
 from psd_deflection.recordings.calibration_runs import read_runs
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end
@@ -121,17 +121,15 @@ def _rig_of(args: argparse.Namespace) -> Rig:
 def _rig_yaml(params_file: str | None, rig: Rig, found: Calibration, date: str) -> str:
     """The user's parameter file with the calibration, comments kept; without one what describes the rig."""
     values, effects = values_of(found, date)
-    path = Path(params_file or 'rig.yaml')
-    if params_file is not None:
-        text = parameter_text(path)
-        try:
-            # Without a calibration the effects are those of the file.
-            plain = text if found.refused else with_effects_section(text, effects_to_values(effects), path)
-            return with_values(plain, values, source_of(found, date), path)
-        except ConfigError as error:
-            warn(f'{error}: rig.yaml has its values without its comments')
-    text = model_yaml(rig, effects_of_rig(rig) if found.refused else effects)
-    return with_values(text, values, source_of(found, date), path)
+
+    def edit(text: str, path: Path) -> str:
+        # Without a calibration the effects are those of the file.
+        plain = text if found.refused else with_effects_section(text, effects_to_values(effects), path)
+        return with_values(plain, values, f'Calibrated by {source_of(found, date)}', path)
+
+    return rig_file(
+        params_file, 'rig.yaml', lambda: model_yaml(rig, effects_of_rig(rig) if found.refused else effects), edit
+    )
 
 
 def _check(args: argparse.Namespace) -> int:

@@ -23,15 +23,17 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from psd_deflection import __version__
 from psd_deflection.cli._options import namespace_option, seed
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import save, show, warn
-from psd_deflection.config import Rig, load_rig, replace_values
+from psd_deflection.cli._rig_file import rig_file
+from psd_deflection.config import Rig, load_rig
 from psd_deflection.discovery.discover import Discovery, discover
 from psd_deflection.discovery.report import report_html
 from psd_deflection.discovery.result import model_yaml, result, sentence
-from psd_deflection.errors import ConfigError, RecordingError, UsageError
-from psd_deflection.parameter_files import parameter_text, with_effects_section
+from psd_deflection.errors import RecordingError, UsageError
+from psd_deflection.parameter_files import with_effects_section, with_values
 from psd_deflection.recordings.observations import read_observations
 from psd_deflection.simulation.catalogue import effect_names, effects_to_values
 
@@ -116,16 +118,15 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _model(params_file: str | None, rig: Rig, found: Discovery) -> str:
-    """The user's parameter file with the effects, comments kept; without one what describes the rig."""
-    if found.lines:
-        # What was wrong in the rig file is right in the model; the file itself is not changed.
-        rig = replace_values(rig, found.lines)
-        if params_file is not None:
-            warn('model.yaml has the lines that put the set-up right, without the comments of the rig file')
-    elif params_file is not None:
-        path = Path(params_file)
-        try:
-            return with_effects_section(parameter_text(path), effects_to_values(found.active_effects), path)
-        except ConfigError as error:
-            warn(f'{error}: model.yaml has its values without its comments')
-    return model_yaml(rig, found.active_effects)
+    """The user's parameter file with the effects, comments kept; without one what describes the rig.
+
+    What was wrong in the rig file is right in the model.
+    """
+
+    def edit(text: str, path: Path) -> str:
+        text = with_effects_section(text, effects_to_values(found.active_effects), path)
+        if not found.lines:
+            return text
+        return with_values(text, found.lines, f'Put right by psd-deflection {__version__}', path)
+
+    return rig_file(params_file, 'model.yaml', lambda: model_yaml(rig, found.active_effects), edit)

@@ -14,22 +14,30 @@ from __future__ import annotations
 
 import argparse
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
+from psd_deflection import __version__
 from psd_deflection.calibration import dot_noise_variances
 from psd_deflection.cli._options import namespace_option
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, save, show, warn
-from psd_deflection.config import load_rig
+from psd_deflection.cli._rig_file import rig_file
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.discovery.result import model_yaml
 from psd_deflection.errors import RecordingError
 from psd_deflection.identification.modes import modes_of
 from psd_deflection.identification.report import Identified, as_json, report_html, sentences
+from psd_deflection.parameter_files import with_values
 from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.grid import digest_of
 from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.references import read_run
 from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end
+from psd_deflection.simulation.catalogue import effects_of_rig
 from psd_deflection.solvers.registry import solver_from_rig
 
 
@@ -83,5 +91,18 @@ def run(args: argparse.Namespace) -> int:
             page = report_html(found, sources)
         save(page.encode(), out / 'report.html')
         save((json.dumps(answer, indent=1) + '\n').encode(), out / 'identify.json')
-        show(f'wrote {out / "report.html"}', aside=args.json)
+        save(_rig_yaml(args.params_file, rig, found, recording).encode(), out / 'rig.yaml')
+        show(f'wrote report.html, identify.json and rig.yaml into {out}', aside=args.json)
     return 0
+
+
+def _rig_yaml(params_file: str | None, rig: Rig, found: Identified, recording: Recording) -> str:
+    """The user's parameter file with the modes, comments kept; without one what describes the rig."""
+    date = datetime.now(UTC).date().isoformat()
+    name, digest = recording.path.name, digest_of(recording.path)
+    source = f'Identified by psd-deflection {__version__}, {date}, from {name} (sha256 {digest[:16]})'
+
+    def edit(text: str, path: Path) -> str:
+        return with_values(text, found.values, source, path)
+
+    return rig_file(params_file, 'rig.yaml', lambda: model_yaml(rig, effects_of_rig(rig)), edit)

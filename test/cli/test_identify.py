@@ -39,12 +39,18 @@ def test_a_person_reads_sentences_and_sees_pictures(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / 'out'
-    assert main(['identify', str(run), '--out', str(out)]) == 0
+    rig = tmp_path / 'mine.yaml'
+    rig.write_text('/**:\n  ros__parameters:\n    min_samples: 12 # mine\n')
+    assert main(['identify', str(run), '--params-file', str(rig), '--out', str(out)]) == 0
     said = capsys.readouterr().out
     assert 'Hz, damping ratio 0.0' in said
     assert 'from 2 ring-downs' in said
     assert 'input shaper' in said
     assert 'dynamics.bending_frequency: 1' in said
+    text = (out / 'rig.yaml').read_text()
+    assert text.startswith('# Identified by psd-deflection ')
+    assert 'min_samples: 12 # mine' in text
+    assert load_rig(out / 'rig.yaml').dynamics.bending_frequency == pytest.approx(11.0, rel=5e-4)
     page = (out / 'report.html').read_text()
     assert page.count('data:image/png') == 3
     assert json.loads((out / 'identify.json').read_text())['axes']['theta']['modes']
