@@ -7,9 +7,9 @@ holds what the calibration left open), report.html and calibration.json.
 --check RIG.yaml instead holds a calibrated rig file against a recording made since: what moved, by how much, how sure.
 --self takes recordings without reference and loads: the one redundant reading tells relative gains and turns.
 
-  psd-deflection calibrate sidebar.csv --params-file my_rig.yaml --out calibrated
-  psd-deflection calibrate today.csv --check calibrated/rig.yaml
-  psd-deflection calibrate run --self --params-file my_rig.yaml --out calibrated
+  psd-deflection calibrate run.csv --params-file my_rig.yaml --out new
+  psd-deflection calibrate today.csv --check new/rig.yaml
+  psd-deflection calibrate run --self --params-file my_rig.yaml --out new
 """
 
 from __future__ import annotations

@@ -70,19 +70,19 @@ def beginning(starts: Sequence[float]) -> Effect:
 
 
 def _sensitivity(physics: Physics, values: Values) -> None:
-    physics.sensitivity = physics.sensitivity * (1.0 + values['scale'])
+    physics.sensitivity = physics.sensitivity * (1.0 + values['error'])
 
 
 def _length(physics: Physics, values: Values) -> None:
-    physics.length *= 1.0 + values['scale']
+    physics.length *= 1.0 + values['error']
 
 
 def _rate(physics: Physics, values: Values) -> None:
-    physics.period /= 1.0 + values['scale']
+    physics.period /= 1.0 + values['error']
 
 
 def _delay(chunk: SimulatedSamples, values: Values, state: State) -> None:
-    at = np.arange(chunk.loads.shape[1]) + values['delay'] / chunk.physics.period
+    at = np.arange(chunk.loads.shape[1]) + values['late_by'] / chunk.physics.period
     whole = np.arange(chunk.loads.shape[1])
     for row in range(3):
         chunk.loads[row] = np.interp(at, whole, chunk.loads[row])
@@ -101,8 +101,8 @@ def _jump(chunk: SimulatedSamples, values: Values, state: State) -> None:
     i = 2 * (int(values['psd']) - 1)
     # Half a microsecond early: the sample's own time is rounded.
     after = chunk.t >= 1e-6 * values['time_us'] - 5e-7
-    chunk.dots[i] += values['x'] * after
-    chunk.dots[i + 1] += values['y'] * after
+    chunk.dots[i] += values['jump_x'] * after
+    chunk.dots[i + 1] += values['jump_y'] * after
 
 
 def _only(name: str, value: int) -> EffectParameter:
@@ -110,7 +110,7 @@ def _only(name: str, value: int) -> EffectParameter:
 
 
 def _factor(name: str, configure: Callable[[Physics, Values], None], stage: Stage, words: str) -> Effect:
-    scale = _amplitude('scale', '', -0.95, 20.0, 1e-3, words)
+    scale = _amplitude('error', '', -0.95, 20.0, 1e-3, words)
     return Effect(name, stage, words, '', '', '', (scale,), 'configure', configure=configure, order=98)
 
 
@@ -126,7 +126,7 @@ def mistakes(recordings: int, delays: Sequence[float], jumps: Sequence[tuple[int
         _factor('sample_rate', _rate, 'electronics', 'sample rate'),
     ]
     if delays:
-        late = EffectParameter('delay', 's', -2.0, 2.0, 1e-3, 'the loads are noted late by', grid=tuple(delays))
+        late = EffectParameter('late_by', 's', -2.0, 2.0, 1e-3, 'the loads are noted late by', grid=tuple(delays))
         out.append(
             Effect('load_delay', 'load', 'late loads', '', '', '', (late,), 'load', apply=_delay, order=-1, finite=True)
         )
@@ -141,8 +141,8 @@ def mistakes(recordings: int, delays: Sequence[float], jumps: Sequence[tuple[int
             _only('recording', recording),
             _only('psd', psd),
             _only('time_us', round(1e6 * time)),
-            _amplitude('x', 'm', -0.02, 0.02, 1e-6, 'jump of the reading'),
-            _amplitude('y', 'm', -0.02, 0.02, 1e-6, 'jump of the reading'),
+            _amplitude('jump_x', 'm', -0.02, 0.02, 1e-6, 'jump of the reading'),
+            _amplitude('jump_y', 'm', -0.02, 0.02, 1e-6, 'jump of the reading'),
         )
         out.append(Effect('jump', 'psd', 'jump', '', '', '', parameters, 'dots', apply=_jump, order=98))
     return out

@@ -250,7 +250,7 @@ class Search:
                 starts.append([s.candidate.from_coefficients(s.coefficients)])
             if s.candidate.effect.name == 'sample_rate' and far(null):
                 # A linear step does not reach another frequency of the ringing.
-                starts += [[ActiveEffect(s.candidate.effect, {'scale': v})] for v in OTHER_RATES]
+                starts += [[ActiveEffect(s.candidate.effect, {'error': v})] for v in OTHER_RATES]
         found = self._best_of(starts, 2, 12)
         size = self.workspace.size
         if found is None or not self._passes(null, found, null):

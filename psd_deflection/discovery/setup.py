@@ -292,21 +292,21 @@ def said(workspace: Workspace, fit: Fit, index: int, evidence: float) -> tuple[l
     if name == 'jump':
         o = workspace.observations[int(v['recording']) - 1]
         words = (
-            f'PSD {int(v["psd"])} of {o.name} jumps by {1e6 * v["x"]:.3g} µm along x and {1e6 * v["y"]:.3g} µm '
-            'along y: see its mount and its laser; split the recording there'
+            f'PSD {int(v["psd"])} of {o.name} jumps by {1e6 * v["jump_x"]:.3g} µm along x and '
+            f'{1e6 * v["jump_y"]:.3g} µm along y: see its mount and its laser; split the recording there'
         )
         return [Finding(name, f'psd_{int(v["psd"])}', 1e-6 * v['time_us'], words, evidence)], {}
     if name == 'load_delay':
-        late = 'late' if v['delay'] > 0.0 else 'early'
-        words = f'the loads are noted {abs(v["delay"]):.4g} s {late}: subtract {v["delay"]:.4g} s from their times'
-        return [Finding(name, ' '.join(LOADS), v['delay'], words, evidence)], {}
+        late = 'late' if v['late_by'] > 0.0 else 'early'
+        words = f'the loads are noted {abs(v["late_by"]):.4g} s {late}: subtract {v["late_by"]:.4g} s from their times'
+        return [Finding(name, ' '.join(LOADS), v['late_by'], words, evidence)], {}
     if name == 'zero':
         o = workspace.observations[int(v['recording']) - 1]
         moved = np.array([[v['x1'], v['y1']], [v['x2'], v['y2']]])
         zeros = [[float(f'{x:.7g}') for x in row] for row in (o.rig.zeros + moved).tolist()]
         words = f'overrides of {o.name}: ' + ', '.join(line(f'psd_{i}.zero', z) for i, z in enumerate(zeros, start=1))
         return [Finding(name, o.name, float(np.abs(moved).max()), words, evidence)], {}
-    factor = 1.0 + v['scale']
+    factor = 1.0 + v['error']
     key, old = {
         'sensitivity': ('amplifier.sensitivity', rig.amplifier.sensitivity),
         'link_length': ('link.length', rig.link.length),

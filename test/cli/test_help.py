@@ -29,6 +29,7 @@ ENDLESS = (
     'devices',
     'simulate --serve',
     'validate',
+    'calibrate',
     'identify',
     'compare-methods --out',
 )

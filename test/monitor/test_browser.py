@@ -159,8 +159,15 @@ def test_zero_and_record_work_on_this_machine(page: Page, start: Start, tmp_path
     page.live()
     dx = 'Number(document.getElementById("dx").textContent.replace("\\u2212", "-"))'
     page.until(f'{dx} > 400')
-    page.driver.find_element(By.ID, 'zero').click()
-    page.until('document.getElementById("notice").textContent.startsWith("unloaded dots (mm): psd_1 (")')
+    notice = 'document.getElementById("notice").textContent'
+    said = ''
+    # While the link rings under the simulated load the zero is refused: once more then.
+    while not said.startswith('unloaded dots (mm): psd_1 ('):
+        assert said == '' or 'move' in said
+        page.driver.execute_script(f'{notice} = ""')
+        page.driver.find_element(By.ID, 'zero').click()
+        page.until(f'{notice} !== ""')
+        said = page.driver.execute_script(f'return {notice}')
     page.until(f'Math.abs({dx}) < 20')
     record = page.driver.find_element(By.ID, 'record')
     record.click()
@@ -169,7 +176,8 @@ def test_zero_and_record_work_on_this_machine(page: Page, start: Start, tmp_path
     page.until('document.getElementById("record").getAttribute("aria-pressed") === "false"')
     assert program.end() == 0
     assert [p.name for p in (tmp_path / 'recordings').glob('psd_*/metadata.yaml')] == ['metadata.yaml']
-    assert page.complaints() == []
+    # The browser notes the refusals too.
+    assert [c for c in page.complaints() if '/api/zero' not in c or '409' not in c] == []
 
 
 def test_another_site_cannot_press_the_button_nor_look_on(page: Page, serve: Callable[..., Serving]) -> None:

@@ -235,8 +235,8 @@ def test_the_folder_by_default_is_in_the_users_configuration(tmp_path: Path, mon
 
 LINK = {'bending_stiffness', 'torsional_stiffness', 'damping'}
 """Effects that have the name of what they change; it is a word of mechanics and of the fit as well."""
-SEARCH = {'amplitude', 'gain'}
-"""Parameters that have the name of a kind of parameter, and of a column of the report."""
+SEARCH = {'amplitude', 'gain', 'psd'}
+"""Parameters that have the name of a kind of parameter, of a column of the report, and of a stage."""
 
 
 def words_of(path: Path) -> list[tuple[int, str]]:
