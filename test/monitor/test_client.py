@@ -57,6 +57,26 @@ def test_a_refusal_is_an_error_with_its_reason(serve: Serve, capsys: pytest.Capt
     assert capsys.readouterr().err == f'psd-deflection zero: {serving.url}: not zeroed: no data flows\n'
 
 
+def test_zero_waits_for_a_link_that_moves(
+    serve: Serve, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    serving = serve()
+    serving.shown.refusal = 'not zeroed: the link moves: y1 varied by 80.0 um rms'
+    assert main(['zero', '--wait', '0']) == 7
+    assert 'the link moves: y1 varied' in capsys.readouterr().err
+    waited: list[float] = []
+
+    def rests(seconds: float) -> None:
+        waited.append(seconds)
+        if len(waited) == 3:
+            serving.shown.refusal = ''
+
+    monkeypatch.setattr('psd_deflection.cli.zero.time.sleep', rests)
+    assert main(['zero']) == 0
+    assert len(waited) == 3
+    assert capsys.readouterr() == ('unloaded dots taken\n', '')
+
+
 def test_echo_prints_new_blocks(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:
     serving = serve()
     serving.give(0, 3)
