@@ -20,7 +20,7 @@ from psd_deflection.records import FloatArray
 CLEAR = 8.0
 """Least distance of another bright thing from the rim of a disc, px."""
 
-MIN_RADIUS = 4.0
+MIN_RADIUS = 6.0
 """Smallest half-width of a disc, px."""
 
 _MIN_AXIS_RATIO = 0.42
