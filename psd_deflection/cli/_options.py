@@ -166,6 +166,16 @@ def need_folder(out: Path) -> None:
         raise RecordingError(f'--out {out}: cannot be written (there is no folder {out.parent})')
 
 
+def make_folder(out: str) -> Path:
+    """The folder of --out, made if it is not there. Raises RecordingError."""
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordingError(f'--out {out}: cannot be made a folder ({error.strerror or error})') from None
+    return folder
+
+
 @contextlib.contextmanager
 def given_as_option(*parameters: str) -> Iterator[None]:
     """Turn a refused value inside into a UsageError: it came as an option (status 2), not from a file (3).

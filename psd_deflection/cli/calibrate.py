@@ -27,7 +27,7 @@ from psd_deflection.calibrating import check as checking
 from psd_deflection.calibrating.calibrate import Calibration, calibrate
 from psd_deflection.calibrating.report import report_html
 from psd_deflection.calibrating.result import result, sentence, source_of, values_of
-from psd_deflection.cli._options import namespace_option
+from psd_deflection.cli._options import make_folder, namespace_option
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save, show, warn
 from psd_deflection.cli._rig_file import rig_file
@@ -73,10 +73,7 @@ def run(args: argparse.Namespace) -> int:
     rig = _rig_of(args)
     with told('reading', quiet=args.quiet or args.json):
         runs = read_runs(args.recordings, rig, namespace=args.namespace)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RecordingError(f'--out {out}: cannot be made a folder ({error.strerror or error})') from None
+    make_folder(args.out)
     # Before the work, which takes its time.
     if not os.access(out, os.W_OK):
         raise RecordingError(f'--out {out}: cannot be written in; give another folder')

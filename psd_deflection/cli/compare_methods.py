@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from psd_deflection.cli._options import make_folder
 from psd_deflection.cli._report import print_json, save_figure, show
-from psd_deflection.errors import RecordingError
 from psd_deflection.geometry import Geometry
 from psd_deflection.geometry.linear import condition_number, design_matrix, error_bound
 from psd_deflection.solvers import make_solver
@@ -57,10 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the tables; draw the figures with --out."""
     if args.out is not None:
-        try:
-            Path(args.out).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise RecordingError(f'--out {args.out}: cannot be made a folder ({error.strerror or error})') from None
+        make_folder(args.out)
     if args.json:
         print_json(errors_json())
     else:

@@ -24,7 +24,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from psd_deflection import __version__
-from psd_deflection.cli._options import namespace_option, seed
+from psd_deflection.cli._options import make_folder, namespace_option, seed
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import save, show, warn
 from psd_deflection.cli._rig_file import rig_file
@@ -72,10 +72,7 @@ def run(args: argparse.Namespace) -> int:
     with told('reading', quiet=args.quiet or args.json):
         observations = read_observations(args.recordings, given, namespace=args.namespace, warn=warn, any_rate=True)
     out = Path(args.out)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RecordingError(f'--out {out}: cannot be made a folder ({error.strerror or error})') from None
+    make_folder(args.out)
     # Before the search, which takes its time.
     if not os.access(out, os.W_OK):
         raise RecordingError(f'--out {out}: cannot be written in; give another folder')

@@ -21,22 +21,18 @@ import numpy as np
 
 from psd_deflection import __version__
 from psd_deflection.calibration import dot_noise_variances
-from psd_deflection.cli._options import namespace_option
-from psd_deflection.cli._progress import progress_of, told
-from psd_deflection.cli._report import print_json, save, show, warn
+from psd_deflection.cli._options import make_folder, namespace_option
+from psd_deflection.cli._progress import told
+from psd_deflection.cli._report import print_json, save, show
 from psd_deflection.cli._rig_file import rig_file
-from psd_deflection.config import Rig, load_rig
+from psd_deflection.cli._seen import opened, seen_in
+from psd_deflection.config import Rig
 from psd_deflection.discovery.result import model_yaml
-from psd_deflection.errors import RecordingError
 from psd_deflection.identification.modes import modes_of
 from psd_deflection.identification.report import Identified, as_json, report_html, sentences
 from psd_deflection.parameter_files import with_values
-from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.grid import digest_of
-from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.references import read_run
-from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end
 from psd_deflection.simulation.catalogue import effects_of_rig
 from psd_deflection.solvers.registry import solver_from_rig
 
@@ -55,17 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Identify."""
     if args.out is not None:
-        try:
-            Path(args.out).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise RecordingError(f'--out {args.out}: cannot be made a folder ({error.strerror or error})') from None
-    recording = open_recording(args.recording, namespace=args.namespace)
-    rig = rig_at_end(recording) if args.params_file is None else load_rig(args.params_file)
-    for warning in nominal_rig(recording, args.params_file):
-        warn(warning)
-    recording = recording.with_block_size(rig.estimator.block_size)
-    with progress_of(recording.blocks(), quiet=args.json) as bar:
-        seen = read_run(recording, Pipeline(rig), bar)
+        make_folder(args.out)
+    recording, rig = opened(args)
+    seen = seen_in(recording, rig, quiet=args.json)
     with told('looking for modes', quiet=args.json):
         rate = rig.converter.sample_rate_hz
         solver = solver_from_rig(rig.estimator.solver, rig)

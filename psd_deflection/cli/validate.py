@@ -20,15 +20,13 @@ from pathlib import Path
 import numpy as np
 
 from psd_deflection.calibration import dot_noise_variances
-from psd_deflection.cli._options import namespace_option, number
-from psd_deflection.cli._progress import progress_of, told
-from psd_deflection.cli._report import columns, print_json, save, show, show_text, warn
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.errors import ConfigError, RecordingError, SolverError
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.references import read_references, read_run, references_of
-from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end
+from psd_deflection.cli._options import make_folder, namespace_option, number
+from psd_deflection.cli._progress import told
+from psd_deflection.cli._report import columns, print_json, save, show, show_text
+from psd_deflection.cli._seen import opened, seen_in
+from psd_deflection.config import Rig
+from psd_deflection.errors import ConfigError, SolverError
+from psd_deflection.recordings.references import read_references, references_of
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.solvers.registry import SOLVERS, solver_from_rig
 from psd_deflection.validation.agreement import validate
@@ -68,18 +66,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Compare."""
     if args.out is not None:
-        try:
-            Path(args.out).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise RecordingError(f'--out {args.out}: cannot be made a folder ({error.strerror or error})') from None
-    recording = open_recording(args.recording, namespace=args.namespace)
+        make_folder(args.out)
+    recording, rig = opened(args)
     references = references_of(recording) if args.reference is None else read_references(args.reference)
-    rig = rig_at_end(recording) if args.params_file is None else load_rig(args.params_file)
-    for warning in nominal_rig(recording, args.params_file):
-        warn(warning)
-    recording = recording.with_block_size(rig.estimator.block_size)
-    with progress_of(recording.blocks(), quiet=args.json) as bar:
-        seen = read_run(recording, Pipeline(rig), bar)
+    seen = seen_in(recording, rig, quiet=args.json)
     solvers = _solvers(rig)
     start = int(seen.t_ns[0])
     with told('comparing', quiet=args.json):
