@@ -42,7 +42,6 @@ from psd_deflection.records import (
 Input = AppliedLoad | ReferencePose | ReferenceWithCovariance | TemperatureReading
 
 SAMPLES = '/psd/samples'
-SPOTS = ('/psd_1/spot', '/psd_2/spot')
 DEFLECTION = '/link_tip/deflection'
 DEFLECTION_WITH_COVARIANCE = '/link_tip/deflection_with_covariance'
 DIAGNOSTICS = '/diagnostics'
@@ -51,6 +50,15 @@ LOAD = '/link_tip/load'
 REFERENCE = '/reference/deflection'
 REFERENCE_WITH_COVARIANCE = '/reference/deflection_with_covariance'
 TEMPERATURE = '/environment/temperature'
+
+
+def spot_topics(psds: int) -> tuple[str, ...]:
+    """The topic of each PSD's dot."""
+    return tuple(f'/psd_{n}/spot' for n in range(1, psds + 1))
+
+
+SPOTS = spot_topics(2)
+"""Of the PSDs that every rig has."""
 
 
 class Topic(NamedTuple):
@@ -93,7 +101,8 @@ TOPICS = (
     ),
     Topic(TEMPERATURE, temperature.MESSAGE, TemperatureReading, temperature.from_reading, temperature.to_reading),
 )
-"""Every fixed topic: a new message is one line here. Each solver adds :func:`solver_topic`, a PoseStamped."""
+"""Every fixed topic: a new message is one line here. Each solver adds :func:`solver_topic`, a PoseStamped,
+each PSD beyond the second one of :func:`spot_topics`, a PointStamped."""
 
 TOPIC_TYPES: Mapping[str, str] = {t.name: t.message.name for t in TOPICS}
 MESSAGE_TYPES: Mapping[str, MessageType] = {t.message.name: t.message for t in TOPICS}
@@ -169,13 +178,23 @@ def _of_topics(record: Record) -> tuple[Message, ...]:
         )
     if isinstance(record, ParameterChange):
         return ()
-    if isinstance(record, SpotMeans) and not (record.status in _MEASURED and all(map(math.isfinite, record.dots))):
-        return ()
+    if isinstance(record, SpotMeans):
+        return _of_spots(record)
     try:
         topics = _OF_RECORD[type(record)]
     except KeyError:
         raise TypeError(f'no message for a {type(record).__name__}') from None
     return tuple(Message(t.name, t.message.name, record.t_ns, t.fields(record)) for t in topics)
+
+
+def _of_spots(spots: SpotMeans) -> tuple[Message, ...]:
+    if not all(map(math.isfinite, spots.dots)) or not (spots.status in _MEASURED or spots.left_out):
+        return ()
+    # With a fault of one PSD the dots of the others are good if the estimate was made of them.
+    lost = () if spots.status in _MEASURED else spots.left_out
+    seen = [n for n in range(1, len(spots.sums) + 1) if n not in lost]
+    kind = point_stamped.MESSAGE.name
+    return tuple(Message(f'/psd_{n}/spot', kind, spots.t_ns, point_stamped.from_spot(spots, n)) for n in seen)
 
 
 def from_fields(topic: str, fields: Mapping[str, Any]) -> Input:

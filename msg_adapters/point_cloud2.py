@@ -1,14 +1,15 @@
 """sensor_msgs/PointCloud2: the raw samples of one block, one point per sample.
 
 Little-endian fields in this order: ``seq`` UINT32 (the sample number modulo 2^32), ``dt`` UINT32
-(ns after header.stamp, which is the time of the first sample), then the six channels in volts,
-FLOAT32. Two more follow only in blocks that need them, so replay has the same input as the live
-pipeline: ``flags`` UINT32 if a sample has a flag, and after it ``seq_high`` UINT32 (seq div 2^32)
-once the sample number has passed 32 bits, after 49 days at 1 kHz.
+(ns after header.stamp, which is the time of the first sample), then the channels in volts,
+FLOAT32: x1 y1 sum1 x2 y2 sum2, and three more of each further PSD. Two more follow only in blocks that need them, so
+replay has the same input as the live pipeline: ``flags`` UINT32 if a sample has a flag, and after it ``seq_high``
+UINT32 (seq div 2^32) once the sample number has passed 32 bits, after 49 days at 1 kHz.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy.typing as npt
 
 from msg_adapters.header import Fields, header, stamp_ns
 from msg_adapters.message_type import MessageType
-from psd_deflection.records import CHANNELS, SampleBlock
+from psd_deflection.records import CHANNELS, MOST_PSDS, SampleBlock, channel_names
 
 MESSAGE = MessageType(
     'sensor_msgs/msg/PointCloud2',
@@ -36,13 +37,21 @@ FRAME = 'link_tip'
 UINT32 = 6
 FLOAT32 = 7
 
-PLAIN = np.dtype([('seq', '<u4'), ('dt', '<u4'), *((c, '<f4') for c in CHANNELS)])
-"""One sample: 32 bytes."""
 
-FLAGGED = np.dtype([*PLAIN.descr, ('flags', '<u4')])
+@functools.cache
+def point_of(psds: int, more: int = 0) -> np.dtype[np.void]:
+    """One sample of so many PSDs: 32 bytes of two. ``more``: 1 with ``flags``, 2 with ``seq_high`` as well."""
+    kinds = [('seq', '<u4'), ('dt', '<u4'), *((c, '<f4') for c in channel_names(psds))]
+    return np.dtype([*kinds, *(('flags', '<u4'), ('seq_high', '<u4'))[:more]])
+
+
+PLAIN = point_of(2)
+"""One sample of two PSDs: 32 bytes."""
+
+FLAGGED = point_of(2, 1)
 """One sample of a block in which some sample carries a flag: 36 bytes."""
 
-LONG = np.dtype([*FLAGGED.descr, ('seq_high', '<u4')])
+LONG = point_of(2, 2)
 """One sample of a block in which some sample number has more than 32 bits: 40 bytes."""
 
 MAX_SPAN_NS = 2**32 - 1
@@ -54,34 +63,37 @@ MAX_STEP = 65_536
 _FORMATS = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 
 
-# Every field is four bytes wide.
-_ALL_FIELDS = [
-    {'name': name, 'offset': 4 * i, 'datatype': FLOAT32 if name in CHANNELS else UINT32, 'count': 1}
-    for i, name in enumerate(('seq', 'dt', *CHANNELS, 'flags', 'seq_high'))
-]
-_FIELDS = {dtype: _ALL_FIELDS[: dtype.itemsize // 4] for dtype in (PLAIN, FLAGGED, LONG)}
+@functools.cache
+def _fields(psds: int, more: int) -> list[dict[str, Any]]:
+    # Every field is four bytes wide.
+    channels = channel_names(psds)
+    return [
+        {'name': name, 'offset': 4 * i, 'datatype': FLOAT32 if name in channels else UINT32, 'count': 1}
+        for i, name in enumerate(point_of(psds, more).names or ())
+    ]
 
 
 def from_block(block: SampleBlock) -> Fields:
     """Fields of one block whose samples lie at most ``MAX_SPAN_NS`` apart (see :func:`parts`)."""
-    plain = FLAGGED if block.flags.any() else PLAIN
-    dtype = LONG if int(block.seq[-1]) >> 32 else plain
+    psds = block.volts.shape[1] // 3
+    more = 2 if int(block.seq[-1]) >> 32 else int(block.flags.any())
+    dtype = point_of(psds, more)
     width = len(block.seq)
     t_ns = int(block.t_ns[0])
     points = np.empty(width, dtype)
     points['seq'] = block.seq & 0xFFFFFFFF
     points['dt'] = block.t_ns - t_ns
-    for i, channel in enumerate(CHANNELS):
+    for i, channel in enumerate(channel_names(psds)):
         points[channel] = block.volts[:, i]
-    if dtype is not PLAIN:
+    if more:
         points['flags'] = block.flags
-    if dtype is LONG:
+    if more == 2:
         points['seq_high'] = block.seq >> 32
     return {
         'header': header(t_ns, FRAME),
         'height': 1,
         'width': width,
-        'fields': _FIELDS[dtype],
+        'fields': _fields(psds, more),
         'is_bigendian': False,
         'point_step': dtype.itemsize,
         'row_step': dtype.itemsize * width,
@@ -134,6 +146,12 @@ def layout(fields: Mapping[str, Any]) -> npt.DTypeLike:
         if name not in names:
             raise ValueError(f'has no field {name!r} (fields: {", ".join(names) or "none"})')
     return np.dtype({'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': step})
+
+
+def psds_of(points: npt.NDArray[np.void]) -> int:
+    """Of how many PSDs ``points`` have all three channels: 2 to ``MOST_PSDS``."""
+    names = points.dtype.names or ()
+    return next((n for n in range(MOST_PSDS, 2, -1) if set(channel_names(n)) <= set(names)), 2)
 
 
 def to_points(fields: Mapping[str, Any]) -> tuple[int, npt.NDArray[np.void]]:

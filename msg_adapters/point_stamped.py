@@ -14,6 +14,6 @@ MESSAGE = MessageType(
 
 
 def from_spot(spots: SpotMeans, psd: int) -> Fields:
-    """Fields of the dot on PSD ``psd`` (1 or 2), frame ``psd_1`` or ``psd_2``."""
+    """Fields of the dot on PSD ``psd`` (from 1), frame ``psd_1``, ``psd_2`` ..."""
     x, y = spots.dots[2 * psd - 2], spots.dots[2 * psd - 1]
     return {'header': header(spots.t_ns, f'psd_{psd}'), 'point': {'x': x, 'y': y, 'z': 0.0}}

@@ -16,7 +16,7 @@ MESSAGE = MessageType(
 
 
 def from_block(block: SampleBlock, psd: int, frame_prefix: str = '') -> Iterator[tuple[int, Fields]]:
-    """(stamp in ns, fields) of each sample of PSD ``psd`` (1 or 2), frame ``psd_1`` or ``psd_2``."""
+    """(stamp in ns, fields) of each sample of PSD ``psd`` (from 1), frame ``psd_1``, ``psd_2`` ..."""
     frame = f'{frame_prefix}psd_{psd}'
     volts = block.volts[:, 3 * psd - 3 : 3 * psd].tolist()
     for t_ns, (x, y, total) in zip(block.t_ns.tolist(), volts, strict=True):

@@ -23,7 +23,7 @@ import numpy as np
 from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.parameter_files import EFFECTS_PREFIX, read_parameter_file
 from psd_deflection.parameters import Parameter, Section, Value, check_value, parameter, shown
-from psd_deflection.records import FloatArray
+from psd_deflection.records import MOST_PSDS, FloatArray
 from psd_deflection.tables import html_table
 
 FRAME_PREFIX = 'frame_prefix'
@@ -205,7 +205,7 @@ class EstimatorConfig:
     consistency: str = parameter(
         'widen',
         '',
-        'when the four readings contradict each other: widen the covariance, refuse the block, or only report it',
+        'when the readings contradict each other: widen the covariance, refuse the block, or only report it',
         choices=('widen', 'refuse', 'report'),
         before='report',
     )
@@ -377,7 +377,7 @@ class MonitorConfig:
         True, '', 'publish the frames on /tf and /tf_static (needs tf2_msgs, which comes with a ROS installation)'
     )
     publish_volts: bool = parameter(
-        False, '', 'publish each raw sample as plain numbers too, for plots (/psd_1/volts, /psd_2/volts)'
+        False, '', 'publish each raw sample as plain numbers too, for plots (/psd_1/volts, /psd_2/volts ...)'
     )
     markers: bool = parameter(False, '', 'publish link, plate, beams and dots for RViz (/link_tip/markers)')
     markers_magnify: float = parameter(
@@ -408,6 +408,8 @@ PSDS = (
     Section(PsdConfig, 'psd_2.', center=(-0.100, 0.0)),
 )
 BEAMS = (Section(BeamConfig, 'beam_1.'), Section(BeamConfig, 'beam_2.'))
+MORE_PSDS = tuple((Section(PsdConfig, f'psd_{n}.'), Section(BeamConfig, f'beam_{n}.')) for n in range(3, MOST_PSDS + 1))
+"""PSDs that a rig may have, each with its beam: it has those whose ``center`` is given."""
 CALIBRATION = Section(CalibrationConfig, 'calibration.')
 AMPLIFIER = Section(AmplifierConfig, 'amplifier.')
 CONVERTER = Section(ConverterConfig, 'converter.')
@@ -429,8 +431,14 @@ SECTIONS: tuple[Section[Any], ...] = (
     MONITOR,
 )
 PARAMETERS: tuple[Parameter, ...] = tuple(p for section in SECTIONS for p in section.parameters.values())
-"""All parameters, in the order in which they are listed."""
-BY_NAME: Mapping[str, Parameter] = MappingProxyType({p.name: p for p in PARAMETERS})
+"""The parameters of every rig, in the order in which they are listed."""
+MORE_PARAMETERS: tuple[tuple[Parameter, ...], ...] = tuple(
+    tuple(p for section in pair for p in section.parameters.values()) for pair in MORE_PSDS
+)
+"""Those of PSD 3 and its beam, of PSD 4 and its beam ...: a rig has them if it has the PSD."""
+BY_NAME: Mapping[str, Parameter] = MappingProxyType(
+    {p.name: p for p in (*PARAMETERS, *(p for more in MORE_PARAMETERS for p in more))}
+)
 _DESCRIBED = tuple(
     p
     for section in (LINK, *PSDS, AMPLIFIER, CONVERTER, DYNAMICS)
@@ -447,8 +455,8 @@ DESCRIPTION = (
     *(ACQUISITION.parameters[name].name for name in ('psds_exchanged', 'latency_offset', 'thorlabs_x_sign')),
 )
 """Parameters that describe the rig and how it is evaluated; the others say how the node runs on one machine."""
-ZEROS = tuple(section.parameters['zero'].name for section in PSDS)
-"""The parameters that ``~/zero`` sets, one for each detector."""
+ZEROS = tuple(f'psd_{n}.zero' for n in range(1, MOST_PSDS + 1))
+"""The parameters that ``~/zero`` sets, one for each detector that a rig may have."""
 
 _ORDERED = (
     ('link.inner_radius', 'less than', 'link.outer_radius'),
@@ -479,7 +487,7 @@ class Rig:
     effects: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        changed = [p.with_value(self.values[p.name]) for p in PARAMETERS if self.values[p.name] != p.default]
+        changed = [p.with_value(self.values[p.name]) for p in self.parameters if self.values[p.name] != p.default]
         own = sorted({key.partition('.')[0] for key in self.effects})
         words = ', '.join([*changed, *(f'{EFFECTS_PREFIX}{name}' for name in own)])
         return f'<Rig {words}>' if words else '<Rig of the thesis>'
@@ -497,6 +505,16 @@ class Rig:
     def flat(self) -> dict[str, object]:
         """All values under their flat names, including simulated effects; :func:`rig_from_values` reads them."""
         return {**self.values, **{EFFECTS_PREFIX + key: value for key, value in self.effects.items()}}
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The parameters that it has, in the order in which they are listed."""
+        return (*PARAMETERS, *(p for more in MORE_PARAMETERS[: len(self.psds) - 2] for p in more))
+
+    @property
+    def zeros_by_name(self) -> dict[str, Value]:
+        """The unloaded dots, m, by parameter name."""
+        return {name: self.values[name] for name in ZEROS[: len(self.psds)]}
 
     @property
     def centers(self) -> FloatArray:
@@ -567,11 +585,12 @@ def _rig(values: Mapping[str, Value], effects: Mapping[str, Any], changes: Mappi
             raise ConfigError(
                 f'{source}: {key} = {shown(value)}: no parameter of that name{did_you_mean(key, BY_NAME)}'
             )
+    more = _more_psds(v, source)
     _check_together(v, source)
     return Rig(
         link=LINK.of(v),
-        psds=tuple(psd.of(v) for psd in PSDS),
-        beams=tuple(beam.of(v) for beam in BEAMS),
+        psds=tuple(psd.of(v) for psd in (*PSDS, *(psd for psd, _ in more))),
+        beams=tuple(beam.of(v) for beam in (*BEAMS, *(beam for _, beam in more))),
         amplifier=AMPLIFIER.of(v),
         converter=CONVERTER.of(v),
         dynamics=DYNAMICS.of(v),
@@ -582,6 +601,23 @@ def _rig(values: Mapping[str, Value], effects: Mapping[str, Any], changes: Mappi
         values=MappingProxyType(v),
         effects=MappingProxyType(effects),
     )
+
+
+def _more_psds(v: dict[str, Value], source: str) -> tuple[tuple[Section[PsdConfig], Section[BeamConfig]], ...]:
+    """The sections of the PSDs beyond the second that ``v`` describes; what it does not say of them is added.
+
+    Raises ConfigError if one has no centre, or the numbers have a gap.
+    """
+    given = [next((p.name for p in own if p.name in v), '') for own in MORE_PARAMETERS]
+    count = max((i for i, name in enumerate(given, start=1) if name), default=0)
+    for i, own in enumerate(MORE_PARAMETERS[:count]):
+        name = MORE_PSDS[i][0].parameters['center'].name
+        if name not in v:
+            of = given[i] or given[count - 1]
+            raise ConfigError(f'{source}: {of} is given without {name}: say where PSD {i + 3} is; PSDs have no gaps')
+        for p in own:
+            v.setdefault(p.name, p.default)
+    return MORE_PSDS[:count]
 
 
 def _check_together(v: dict[str, Any], source: str) -> None:
@@ -599,9 +635,15 @@ def _check_together(v: dict[str, Any], source: str) -> None:
 
 def _check_wiring(v: Mapping[str, Any], source: str) -> None:
     """Raise ConfigError if a channel is used twice."""
-    for p in (section.parameters['axes'] for section in PSDS):
-        if sorted(axis[-1] for axis in v[p.name]) != ['x', 'y']:
+    for p in (section.parameters['axes'] for section in (*PSDS, *(psd for psd, _ in MORE_PSDS))):
+        if p.name in v and sorted(axis[-1] for axis in v[p.name]) != ['x', 'y']:
             raise ConfigError(f'{source}: {p.with_value(v[p.name])}: must name x once and y once')
+
+
+def check_two_psds(rig: Rig, what: str) -> None:
+    """Raise ConfigError if ``rig`` has more than two PSDs, for ``what`` is made for two."""
+    if len(rig.psds) > 2:
+        raise ConfigError(f'psd_3.center is given: {what} takes rigs of two PSDs, this one has {len(rig.psds)}')
 
 
 def left_as_in_the_thesis(values: Mapping[str, object]) -> tuple[str, ...]:

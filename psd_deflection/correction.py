@@ -42,7 +42,8 @@ class Correction:
     def __init__(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
         self._nominal, self._true = Physics.of(rig), Physics.of(rig)
         # The solvers take every beam as parallel to Z.
-        self._nominal.slopes = np.zeros((2, 2))
+        self._nominal.slopes = np.zeros_like(self._nominal.slopes)
+        self._psds = len(rig.psds)
         self._sensors: list[tuple[Callable[[Reading, Values], None], Values]] = []
         self._beams: list[ActiveEffect] = []
         self._moves_optics = bool(self._true.slopes.any())
@@ -90,8 +91,8 @@ class Correction:
             self._wandered([active], t, warmer, 2)
             self._beams.append(active)
         if effect.correct is not None:
-            sums = np.full((2, 2), self._nominal.sum_nominal)
-            effect.correct(Reading(np.full((4, 2), 1e-3), sums, warmer, t), active.values)
+            sums = np.full((self._psds, 2), self._nominal.sum_nominal)
+            effect.correct(Reading(np.full((2 * self._psds, 2), 1e-3), sums, warmer, t), active.values)
             self._sensors.insert(0, (effect.correct, active.values))
         moves = effect.point == 'beam' or _optics(self._true) != before
         if moves and self._nominal.psds_at_base:
@@ -100,9 +101,9 @@ class Correction:
         return moves or effect.correct is not None
 
     def _wandered(self, effects: Sequence[ActiveEffect], t: FloatArray, warmer: FloatArray, n: int) -> FloatArray:
-        """The true beams (4, n), m."""
+        """The true beams (2P, n), m."""
         samples = SimulatedSamples(t, warmer, np.empty((3, n)), self._true)
-        samples.beams = np.repeat(self._true.beams.reshape(4, 1), n, axis=1)
+        samples.beams = np.repeat(self._true.beams.reshape(-1, 1), n, axis=1)
         for active in effects:
             if active.effect.apply is not None:
                 active.effect.apply(samples, active.values, {})
@@ -115,13 +116,15 @@ class Correction:
         warmer: FloatArray | float = 0.0,
         t: FloatArray | float = 0.0,
     ) -> FloatArray:
-        """Corrected dots (n, 4), m, of measured ``dots`` (n, 4), m.
+        """Corrected dots (n, 2P), m, of measured ``dots`` (n, 2P), m.
 
-        ``sums`` (n, 2) V, nominal if None; ``warmer`` (n,) K above the recording's first
+        ``sums`` (n, P) V, nominal if None; ``warmer`` (n,) K above the recording's first
         temperature; ``t`` (n,) s since its first sample.
         """
         n = len(dots)
-        given = np.full((2, n), self._nominal.sum_nominal) if sums is None else np.array(sums.T, dtype=np.float64)
+        given = (
+            np.full((self._psds, n), self._nominal.sum_nominal) if sums is None else np.array(sums.T, dtype=np.float64)
+        )
         reading = Reading(
             np.array(np.asarray(dots, dtype=np.float64).T, order='C'),
             given,
@@ -132,7 +135,7 @@ class Correction:
             correct(reading, values)
         if not self._moves_optics:
             return np.ascontiguousarray(reading.dots.T)
-        nominal_beams = np.repeat(self._nominal.beams.reshape(4, 1), n, axis=1)
+        nominal_beams = np.repeat(self._nominal.beams.reshape(-1, 1), n, axis=1)
         beams = self._wandered(self._beams, reading.t, reading.warmer, n)
         corrected = reading.dots.copy()
         for _ in range(PASSES):
@@ -148,6 +151,6 @@ def _optics(physics: Physics) -> list[object]:
 
 
 def _flat_pose(dots: FloatArray, beams: FloatArray, physics: Physics) -> FloatArray:
-    """Pose (3, n) of a flat plate from dots (4, n)."""
+    """Pose (3, n) of a flat plate from dots (2P, n)."""
     n = dots.shape[1]
-    return flat_poses(dots.T.reshape(n, 2, 2) + physics.centers, beams.T.reshape(n, 2, 2)).T
+    return flat_poses(dots.T.reshape(n, -1, 2) + physics.centers, beams.T.reshape(n, -1, 2)).T

@@ -12,7 +12,7 @@ recording starts, this state is written as a record (:meth:`Pipeline.memory`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import cos, expm1, nan, sin
 from typing import NamedTuple
@@ -25,6 +25,7 @@ from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_v
 from psd_deflection.calibration.health import OpticsHealth, Verdict
 from psd_deflection.config import ZEROS, Rig, replace_values
 from psd_deflection.correction import Correction
+from psd_deflection.errors import ConfigError
 from psd_deflection.geometry import Geometry
 from psd_deflection.misalignment.spread import ParameterSpread
 from psd_deflection.records import (
@@ -33,22 +34,25 @@ from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
     FloatArray,
+    IntArray,
     ParameterChange,
     RawChunk,
     Record,
     SampleBlock,
     SpotMeans,
     TipLoad,
+    dot_names,
 )
 from psd_deflection.simulation.catalogue import effects_of_rig
 from psd_deflection.simulation.tip_load import TipLoads
 from psd_deflection.solvers import solver_from_rig
-from psd_deflection.solvers.interface import Solution, SolverStatus
+from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 from psd_deflection.solvers.one_psd import OnePsd
-from psd_deflection.solvers.registry import psds_at_base
-from psd_deflection.uncertainty.consistency import NAMES, Checked, widened
-from psd_deflection.uncertainty.stamped import FIT, HELD_RESIDUAL, NOISE, StampedDots
+from psd_deflection.solvers.registry import psds_at_base, solver_class
+from psd_deflection.solvers.some_psds import solver_of_some
+from psd_deflection.uncertainty.consistency import Checked, widened
+from psd_deflection.uncertainty.stamped import FIT, HELD_RESIDUAL, NOISE, REDUNDANCY, SOME, SomePsds, StampedDots
 
 ZERO_BLOCKS = 25
 """Number of blocks that :meth:`Pipeline.zero` averages: half a second."""
@@ -60,17 +64,17 @@ MOVING, RINGS, STILL = 5.0, 10e-6, 2e-6
 START, FIRST_TEMPERATURE, TEMPERATURE = ENVIRONMENT
 HELD, FROZEN, TIP_LOADS = 'state.held_twist', 'state.frozen_blocks', 'state.tip_loads'
 ZERO_VARIANCES = 'state.zero_variances'
-REMEMBERED = (NOISE, FIT, HELD_RESIDUAL)
+REMEMBERED = (NOISE, FIT, HELD_RESIDUAL, REDUNDANCY)
 """Names of the values in the record of :meth:`Pipeline.memory`."""
 
-Dots = tuple[float, float, float, float]
+Dots = tuple[float, ...]
 
 
 @dataclass(slots=True)
 class PipelineCounters:
     """Counts of samples, blocks, estimates, and blocks without an estimate.
 
-    ``degraded``: those of ``estimates`` that come from one detector. ``findings``: number of blocks
+    ``degraded``: those of ``estimates`` that do not come from all detectors. ``findings``: number of blocks
     with each finding.
     """
 
@@ -88,6 +92,24 @@ class _Held(NamedTuple):
     t_ns: int
     theta: float
     variance: float
+
+
+class _Readings(NamedTuple):
+    """What a block is solved from.
+
+    ``dots`` (C,) m; ``variances`` (C,) m^2; ``spread`` (C, C) m^2 of the dots, None if ``variances`` are all of it.
+    ``kept``: the PSDs (from 0) that they are of, with their fit and check ``some``; None: all. ``checked``: the check of
+    the readings. ``factor``: what the calibration's uncertainty makes of the dots. ``wrong``: PSD (from 1) that contradicts them.
+    """
+
+    dots: Dots
+    variances: tuple[float, ...]
+    spread: FloatArray | None = None
+    kept: tuple[int, ...] | None = None
+    some: SomePsds | None = None
+    checked: Checked | None = None
+    factor: FloatArray | None = None
+    wrong: int = 0
 
 
 class Pipeline:
@@ -110,14 +132,13 @@ class Pipeline:
         self._environment: dict[str, float] = {}
         self._zero_variances: tuple[float, ...] = ()
         self.zero_refused = ''
-        self._factor: FloatArray | None = None
         self._held: _Held | None = None
-        self._frozen = (0, 0)
+        self._frozen: tuple[int, ...] = (0,) * len(rig.psds)
         variances = dot_noise_variances(rig)
         self._variances = [tuple(float(v) / n for v in variances) for n in range(1, config.block_size + 1)]
         self._build(rig)
         # After the solvers, which refuse a geometry that cannot be solved.
-        self.stamped = StampedDots(rig, flat=not psds_at_base(rig))
+        self.stamped = StampedDots(rig, flat=not psds_at_base(rig), tilts=solver_class(config.solver).tilts)
 
     def _build(self, rig: Rig) -> None:
         self.rig = rig
@@ -129,6 +150,7 @@ class Pipeline:
         self._spread = None if psds_at_base(rig) else ParameterSpread.from_rig(rig, self._zero_variances, self._effects)
         names = [config.solver, *(name for name in config.solvers if name != config.solver)]
         self._solvers = [(name, solver_from_rig(name, rig), name == config.solver) for name in names]
+        self._some_solvers: dict[tuple[int, tuple[int, ...]], Solver | None] = {}
 
     @property
     def repeated(self) -> int:
@@ -152,6 +174,10 @@ class Pipeline:
             volts = counts_to_volts(readings.astype(np.int32, copy=False), chunk.volts_per_count)
         else:
             volts = readings.astype(np.float32, copy=False)
+        if volts.shape[1] != 3 * len(self.rig.psds):
+            raise ConfigError(
+                f'the samples are of {volts.shape[1] // 3} PSDs, the rig file has {len(self.rig.psds)} (psd_N.center)'
+            )
         for block in self._cutter.add(chunk, volts):
             if self._correction.uses_time and START not in self._environment:
                 yield self._environment_change(block.index, {START: float(block.t_ns[0])})
@@ -176,10 +202,12 @@ class Pipeline:
         self.zero_refused = motion(recent, noise)
         if self.zero_refused:
             return None
-        x1, y1, x2, y2 = (sum(column) / len(self._recent) for column in zip(*self._recent, strict=True))
-        values: dict[str, float | str | tuple[float, ...]] = dict(zip(ZEROS, ((x1, y1), (x2, y2)), strict=True))
+        means = [sum(column) / len(self._recent) for column in zip(*self._recent, strict=True)]
+        values: dict[str, float | str | tuple[float, ...]] = dict(
+            zip(ZEROS, zip(means[0::2], means[1::2], strict=True), strict=False)
+        )
         if self._spread is not None:
-            scatter = recent.var(axis=0, ddof=1) if len(recent) > 1 else np.zeros(4)
+            scatter = recent.var(axis=0, ddof=1) if len(recent) > 1 else np.zeros(len(means))
             values[ZERO_VARIANCES] = tuple((np.maximum(scatter, noise) / len(recent)).tolist())
         return self.change(values)
 
@@ -205,13 +233,14 @@ class Pipeline:
         # It says which numbers belong to no sample; no estimate depends on it.
         values.pop(RESTART, None)
         held, frozen, loads = values.pop(HELD, None), values.pop(FROZEN, None), values.pop(TIP_LOADS, None)
-        told = {name: tuple(v) for name in REMEMBERED if isinstance(v := values.pop(name, None), list)}
+        names = [name for name in values if name in REMEMBERED or name.startswith(SOME)]
+        told = {name: tuple(v) for name in names if isinstance(v := values.pop(name), list)}
         if isinstance(held, list) and len(held) == 3:
             self._held = _Held(int(held[0]), held[1], held[2])
-        if isinstance(frozen, list) and len(frozen) == 2:
-            self._frozen = (int(frozen[0]), int(frozen[1]))
+        if isinstance(frozen, list) and len(frozen) == len(self._frozen):
+            self._frozen = tuple(map(int, frozen))
         variances = values.pop(ZERO_VARIANCES, None)
-        if isinstance(variances, list) and len(variances) == 4:
+        if isinstance(variances, list) and len(variances) == 2 * len(self.rig.psds):
             self._zero_variances = tuple(variances)
         if any(name in ZEROS for name in values):
             self.tip_loads.zeroed = True
@@ -242,7 +271,7 @@ class Pipeline:
             values.append((ZERO_VARIANCES, self._zero_variances))
         if self._held is not None and self.rig.estimator.degraded == 'hold':
             values.append((HELD, tuple(self._held)))
-        if self._frozen != (0, 0):
+        if any(self._frozen):
             values.append((FROZEN, self._frozen))
         if loads := self.tip_loads.memory():
             values.append((TIP_LOADS, loads))
@@ -274,7 +303,7 @@ class Pipeline:
         return self._correction.apply(samples, sums, warmer, t)
 
     def dots(self, block: SampleBlock) -> FloatArray:
-        """Dots (n, 4), m, of the samples of ``block``, calibrated and corrected as for the estimate."""
+        """Dots (n, 2P), m, of the samples of ``block``, calibrated and corrected as for the estimate."""
         volts = self._calibration.seen(block.volts)
         samples = self._calibration.dots(volts)
         if not self._correction.active:
@@ -289,171 +318,253 @@ class Pipeline:
         volts = self._calibration.seen(block.volts)
         sums = volts[:, 2::3].astype(np.float64)
         samples = self.dots(block)
-        x1, y1, x2, y2 = (samples.sum(axis=0) / present).tolist()
-        dots: Dots = (x1, y1, x2, y2)
+        means: Dots = tuple((samples.sum(axis=0) / present).tolist())
         if self._optics.refuses_frozen:
             self._count_still(volts)
-        verdict = self._optics.judge(block, volts, dots, sums, self._frozen)
-        status, reason = verdict.status, verdict.reason
+        verdict = self._optics.judge(block, volts, means, sums, self._frozen)
+        status, reason, findings = verdict.status, verdict.reason, verdict.findings
         t_ns = block_middle_ns(block, size, self._period_ns)
         slots = block.seq - block.index * size
-        variances = self._variances_of(verdict, sums, present)
-        spread: FloatArray | None = None
-        checked: Checked | None = None
+        whole = _Readings(means, self._variances_of(verdict, sums, present))
+        used: _Readings | None = None
         best: DeflectionEstimate | None = None
+        failure: tuple[BlockStatus, str] | None = None
         degraded = False
+
+        def take(kept: tuple[int, ...]) -> _Readings | None:
+            return self._some(kept, verdict, sums, whole, slots, samples)
+
         if status is BlockStatus.OK:
             if self.stamped.active:
                 fitted = self.stamped.fit(slots, samples)
-                x1, y1, x2, y2 = fitted.dots
-                dots = (x1, y1, x2, y2)
-                spread = self._spread_of(verdict, sums, fitted.covariance)
-            best, checked, failure = self._primary(t_ns, block.index, dots, variances, spread)
+                whole = whole._replace(dots=fitted.dots, spread=self._spread_of(verdict, sums, fitted.covariance))
+            used, best, failure = self._agreed(t_ns, block.index, whole, take)
             if failure is not None:
                 status, reason = failure
             elif best is not None:
                 self._held = _Held(t_ns, best.theta, best.variances[2])
-        elif verdict.faulty:
+        elif verdict.sound:
             if self.rig.estimator.covariance != 'file' and self.stamped.flat:
-                variances = self.stamped.mean_variances(present)
-            best = self._from_the_other(verdict.faulty, t_ns, block.index, dots, variances)
+                whole = whole._replace(variances=self.stamped.mean_variances(present))
+            others = None
+            if len(verdict.sound) > 1:
+                others = take(verdict.sound)
+            if others is not None:
+                used, best, failure = self._agreed(t_ns, block.index, others, take)
+                if failure is not None:
+                    status, reason = failure
+                elif best is not None:
+                    self._held = _Held(t_ns, best.theta, best.variances[2])
+            elif len(verdict.sound) == 1:
+                best = self._from_the_other(verdict.sound[0], t_ns, block.index, whole)
             degraded = best is not None
+        if used is not None and used.wrong:
+            findings = (*findings, f'psd_{used.wrong} contradicts the others and is left out')
         self.last_estimate = best
+        complete = used is not None and used.kept is None
+        left_out = self._left_out(used)
+        self.stamped.left_out = left_out
         if best is not None:
             self.counters.estimates += 1
-            self.counters.degraded += degraded
+            self.counters.degraded += degraded or not complete
             yield best
-        if best is not None and not degraded:
+        if best is not None and used is not None:
             yield TipLoad(t_ns, *self.tip_loads.tip_load(block.index, best.dx, best.dy, best.theta))
-            # The zero must not be a mean across an outage.
-            last = self.last_spots
-            if last is not None and t_ns - last.t_ns > ZERO_BLOCKS * size * self._period_ns:
+            if complete:
+                # The zero must not be a mean across an outage.
+                last = self.last_spots
+                if last is not None and t_ns - last.t_ns > ZERO_BLOCKS * size * self._period_ns:
+                    self._recent = []
+                self._recent = [*self._recent[1 - ZERO_BLOCKS :], used.dots]
+            else:
                 self._recent = []
-            self._recent = [*self._recent[1 - ZERO_BLOCKS :], dots]
             for number in range(1, len(self._solvers)):
-                solution, _ = self._solve(number, dots, variances)
+                solution, _ = self._solve(number, used)
                 if solution is not None:
-                    yield self._estimate(number, t_ns, block.index, solution, dots, variances, spread, checked)
+                    yield self._estimate(number, t_ns, block.index, solution, used)
         else:
             self._recent = []
         if best is None:
             name = status.name.lower()
             self.counters.refused[name] = self.counters.refused.get(name, 0) + 1
         # The estimates are out: the rest is not urgent.
-        if status is BlockStatus.OK and not verdict.findings:
+        if status is BlockStatus.OK and not findings:
             self.stamped.learn(block.index, slots, samples)
-        if checked is not None:
-            self.stamped.suspect(block.index, dots, checked)
+        if complete and used is not None and used.checked is not None:
+            self.stamped.suspect(block.index, used.dots, used.checked)
         if not self._optics.refuses_frozen:
             self._count_still(volts)
-        findings = verdict.findings + self._optics.late_findings(volts, verdict, self._frozen)
+        findings += self._optics.late_findings(volts, verdict, self._frozen)
         for finding in findings:
             name = finding.split(':')[0]
             self.counters.findings[name] = self.counters.findings.get(name, 0) + 1
-        sum1, sum2 = (sums.sum(axis=0) / present).tolist()
         spots = SpotMeans(
             t_ns,
             block.index,
-            dots,
-            (sum1, sum2),
+            whole.dots,
+            tuple((sums.sum(axis=0) / present).tolist()),
             covariance(samples),
             present,
             size - present,
             status,
             reason,
             findings,
+            left_out,
         )
         self.last_spots = spots
         yield spots
         yield block
 
     def _count_still(self, volts: npt.NDArray[np.float32]) -> None:
-        first, second = self._optics.still(volts)
-        self._frozen = (self._frozen[0] + 1 if first else 0, self._frozen[1] + 1 if second else 0)
+        still = self._optics.still(volts)
+        self._frozen = tuple(n + 1 if same else 0 for n, same in zip(self._frozen, still, strict=True))
+
+    def _agreed(
+        self,
+        t_ns: int,
+        block: int,
+        readings: _Readings,
+        take: Callable[[tuple[int, ...]], _Readings | None],
+    ) -> tuple[_Readings, DeflectionEstimate | None, tuple[BlockStatus, str] | None]:
+        """:meth:`_primary`, without the PSD that contradicts the others if it can be told; ``take``: :meth:`_some`."""
+        found = self._primary(t_ns, block, readings)
+        checked = found[0].checked
+        if checked is None or not checked.wrong or self.rig.estimator.consistency == 'report':
+            return found
+        before = range(len(self.rig.psds)) if readings.kept is None else readings.kept
+        kept = tuple(psd for i, psd in enumerate(before, start=1) if i != checked.wrong)
+        others = take(kept)
+        if others is None:
+            return found
+        return self._primary(t_ns, block, others._replace(wrong=before[checked.wrong - 1] + 1), checked)
+
+    def _some(
+        self,
+        kept: tuple[int, ...],
+        verdict: Verdict,
+        sums: FloatArray,
+        whole: _Readings,
+        slots: IntArray,
+        samples: FloatArray,
+    ) -> _Readings | None:
+        """The readings of the PSDs ``kept`` (from 0) alone; None if the primary method cannot do with them."""
+        solver = self._solver(0, kept)
+        if solver is None:
+            return None
+        some = self.stamped.some(kept, solver.tilts)
+        at = some.columns
+        dots = tuple(whole.dots[i] for i in at)
+        readings = _Readings(dots, tuple(whole.variances[i] for i in at), kept=kept, some=some)
+        if not self.stamped.active:
+            return readings
+        fitted = self.stamped.fit_some(some, slots, samples)
+        spread = self._spread_of(verdict, sums, fitted.covariance, at)
+        return readings._replace(dots=fitted.dots, spread=spread)
+
+    def _left_out(self, used: _Readings | None) -> tuple[int, ...]:
+        """The PSDs (from 1) without which a block was solved."""
+        if used is None or used.kept is None:
+            return ()
+        return tuple(n for n in range(1, len(self.rig.psds) + 1) if n - 1 not in used.kept)
+
+    def _solver(self, number: int, kept: tuple[int, ...] | None) -> Solver | None:
+        """Solver ``number`` for all PSDs, or for those ``kept`` (from 0); None if it cannot do with them."""
+        name, solver, _ = self._solvers[number]
+        if kept is None:
+            return solver
+        key = (number, kept)
+        if key not in self._some_solvers:
+            self._some_solvers[key] = solver_of_some(name, self.rig, kept)
+        return self._some_solvers[key]
 
     def _primary(
-        self, t_ns: int, block: int, dots: Dots, variances: tuple[float, ...], spread: FloatArray | None
-    ) -> tuple[DeflectionEstimate | None, Checked | None, tuple[BlockStatus, str] | None]:
-        """The primary solver's estimate, the check of its readings, and why there is no estimate."""
-        solution, failure = self._solve(0, dots, variances)
-        if solution is None:
-            return None, None, (BlockStatus.NOT_SOLVED, failure)
-        checked: Checked | None = None
-        self._factor = None if self._spread is None else self._spread.factor(solution.dx, solution.dy, solution.theta)
-        if self.stamped.flat:
-            allowed = np.diag(variances) if spread is None else spread
-            if self._factor is not None:
-                allowed = allowed + np.einsum('ik,jk->ij', self._factor, self._factor)
-            checked = self.stamped.check(dots, solution.residual, allowed)
-        if checked is not None and checked.contradict and self.rig.estimator.consistency == 'refuse':
-            reason = f'the four readings contradict each other: chi-square {checked.chi_square:.0f} of 1'
-            return None, checked, (BlockStatus.INCONSISTENT, reason)
-        return self._estimate(0, t_ns, block, solution, dots, variances, spread, checked), checked, None
+        self, t_ns: int, block: int, readings: _Readings, checked: Checked | None = None
+    ) -> tuple[_Readings, DeflectionEstimate | None, tuple[BlockStatus, str] | None]:
+        """The readings with their check, the primary solver's estimate, and why there is none.
 
-    def _solve(self, number: int, dots: Dots, variances: tuple[float, ...]) -> tuple[Solution | None, str]:
+        ``checked``: the check, if it was made.
+        """
+        solution, failure = self._solve(0, readings)
+        if solution is None:
+            return readings, None, (BlockStatus.NOT_SOLVED, failure)
+        factor = None if self._spread is None else self._spread.factor(solution.dx, solution.dy, solution.theta)
+        if self.stamped.flat and checked is None:
+            allowed = np.diag(readings.variances) if readings.spread is None else readings.spread
+            if factor is not None:
+                allowed = allowed + np.einsum('ik,jk->ij', factor, factor)
+            pose = solution[:5]
+            checked = self.stamped.check(readings.dots, solution.residual, allowed, pose, readings.some)
+        readings = readings._replace(checked=checked, factor=factor)
+        told = checked is not None and checked.contradict and not checked.wrong
+        if checked is not None and told and self.rig.estimator.consistency == 'refuse':
+            words = 'four readings' if len(self.rig.psds) == 2 else 'readings'
+            reason = f'the {words} contradict each other: chi-square {checked.chi_square:.0f} of {checked.freedom}'
+            return readings, None, (BlockStatus.INCONSISTENT, reason)
+        return readings, self._estimate(0, t_ns, block, solution, readings), None
+
+    def _solve(self, number: int, readings: _Readings) -> tuple[Solution | None, str]:
         """The answer of solver ``number``, or None and the reason."""
-        name, solver, _ = self._solvers[number]
-        s = solver.solve(dots, variances)
+        name = self._solvers[number][0]
+        solver = self._solver(number, readings.kept)
+        if solver is None:
+            return None, f'{name}: takes all PSDs'
+        s = solver.solve(readings.dots, readings.variances)
         if s.status is not SolverStatus.OK:
             return None, f'{name}: {s.status.name.lower().replace("_", " ")}'
         return s, ''
 
-    def _estimate(
-        self,
-        number: int,
-        t_ns: int,
-        block: int,
-        s: Solution,
-        dots: Dots,
-        variances: tuple[float, ...],
-        spread: FloatArray | None,
-        checked: Checked | None,
-    ) -> DeflectionEstimate:
-        """An answer with its covariance; ``spread`` (4, 4) m^2 of the dots, None if ``variances`` are all of it."""
-        name, solver, primary = self._solvers[number]
+    def _estimate(self, number: int, t_ns: int, block: int, s: Solution, readings: _Readings) -> DeflectionEstimate:
+        """An answer with its covariance."""
+        name, _, primary = self._solvers[number]
+        solver = self._solver(number, readings.kept)
+        dots, variances, spread, checked = readings.dots, readings.variances, readings.spread, readings.checked
         rms = (sum(r * r for r in s.residual) / len(s.residual)) ** 0.5
         covariance: tuple[float, ...] = s.covariance
-        widen = checked is not None and any(checked.possible) and self.rig.estimator.consistency == 'widen'
+        possible = () if checked is None or self.rig.estimator.consistency != 'widen' else checked.possible
+        factor = readings.factor
         # A printed threshold method has no covariance, and no slope either.
-        factor = self._factor
-        if (spread is not None or widen or factor is not None) and covariance[0] == covariance[0]:
+        known = solver is not None and covariance[0] == covariance[0]
+        if solver is not None and known and (spread is not None or any(possible) or factor is not None):
             gain = solver.gain(dots, variances, s)
             if spread is not None:
                 own = np.einsum('ic,ck,jk->ij', gain, spread, gain)
+                allowance = solver.allowance(dots, variances)
+                own = own if allowance is None else own + allowance
             else:
                 own = np.array(covariance).reshape(3, 3)
             if factor is not None:
                 own = own + _through(gain, factor)
-            if widen and checked is not None:
-                own = widened(own, gain, checked.possible)
+            if any(possible):
+                # A check that was made with all PSDs tells nothing of some of them.
+                own = widened(own, gain, possible) if len(possible) == gain.shape[1] else own
             covariance = tuple(own.ravel().tolist())
         chi_square = checked.chi_square if primary and checked is not None else nan
         return DeflectionEstimate(
             t_ns, block, name, s.dx, s.dy, s.theta, s.phi, s.omega, covariance, rms, primary, chi_square
         )
 
-    def _spread_of(self, verdict: Verdict, sums: FloatArray, covariance: FloatArray) -> FloatArray:
-        """:meth:`_variances_of` for the fit's own covariance (4, 4)."""
+    def _spread_of(
+        self, verdict: Verdict, sums: FloatArray, covariance: FloatArray, columns: Sequence[int] | None = None
+    ) -> FloatArray:
+        """:meth:`_variances_of` for the fit's own covariance (C, C), of the readings ``columns`` or of all."""
         if not verdict.findings:
             return covariance
-        first, second = self._optics.background_variance(sums)
+        background = np.repeat(self._optics.background_variance(sums), 2)
         more = 4.0 if verdict.half_light else 1.0
-        return more * covariance + np.diag([first, first, second, second])
+        return more * covariance + np.diag(background if columns is None else background[list(columns)])
 
     def _variances_of(self, verdict: Verdict, sums: FloatArray, present: int) -> tuple[float, ...]:
         """Variances of the dots' means, m^2: from the noise, and from missing or foreign light."""
         variances = self._variances[present - 1]
         if not verdict.findings:
             return variances
-        first, second = self._optics.background_variance(sums)
+        background = np.repeat(self._optics.background_variance(sums), 2).tolist()
         # The noise behind the divider grows as the inverse of the light.
         more = 4.0 if verdict.half_light else 1.0
-        return tuple(more * v + b for v, b in zip(variances, (first, first, second, second), strict=True))
+        return tuple(more * v + b for v, b in zip(variances, background, strict=True))
 
-    def _from_the_other(
-        self, faulty: int, t_ns: int, block: int, dots: Dots, variances: tuple[float, ...]
-    ) -> DeflectionEstimate | None:
-        """The translation from the remaining detector, by the rule that ``degraded`` names."""
+    def _from_the_other(self, psd: int, t_ns: int, block: int, readings: _Readings) -> DeflectionEstimate | None:
+        """The translation from the remaining detector ``psd`` (from 0), by the rule that ``degraded`` names."""
         config = self.rig.estimator
         theta, variance = 0.0, config.twist_sd**2
         if config.degraded == 'none':
@@ -465,9 +576,8 @@ class Pipeline:
             age = max(t_ns - held.t_ns, 0) / 1e9
             theta = held.theta
             variance = held.variance + config.twist_sd**2 * -expm1(-age / config.twist_hold)
-        psd = 2 - faulty
-        x, y = dots[2 * psd], dots[2 * psd + 1]
-        vx, vy = variances[2 * psd], variances[2 * psd + 1]
+        x, y = readings.dots[2 * psd : 2 * psd + 2]
+        vx, vy = readings.variances[2 * psd : 2 * psd + 2]
         dx, dy, cov = self._one_psd.solve(psd, (x, y), (vx, vy), theta, variance)
         if self._spread is not None:
             gain = np.zeros((3, 4))
@@ -479,15 +589,15 @@ class Pipeline:
 
 
 def _through(gain: FloatArray, factor: FloatArray) -> FloatArray:
-    """(3, 3): what dots that spread by ``factor`` (4, k) m do to an answer with ``gain`` (3, 4)."""
+    """(3, 3): what dots that spread by ``factor`` (C, k) m do to an answer with ``gain`` (3, C)."""
     moved = np.einsum('ij,jk->ik', gain, factor)
     return np.asarray(np.einsum('ik,jk->ij', moved, moved))
 
 
 def motion(dots: FloatArray, noise: tuple[float, ...]) -> str:
-    """Why ``dots`` (n, 4), m, of the last blocks are not those of a link at rest; '' if they may be.
+    """Why ``dots`` (n, C), m, of the last blocks are not those of a link at rest; '' if they may be.
 
-    ``noise`` (4,): variance of a block's dots, m^2. Moving is what scatters ``MOVING`` times as much as the noise says
+    ``noise`` (C,): variance of a block's dots, m^2. Moving is what scatters ``MOVING`` times as much as the noise says
     and by more than ``RINGS``, or what drifts by as much and by more than ``STILL`` from the first half to the second.
     A mean over whole periods leaves little of what rings, and all of what drifts.
     """
@@ -502,6 +612,6 @@ def motion(dots: FloatArray, noise: tuple[float, ...]) -> str:
     if beyond[worst] <= 1.0:
         return ''
     return (
-        f'the link moves: {NAMES[worst]} varied by {scatter[worst] * 1e6:.1f} um rms in the last '
+        f'the link moves: {dot_names(len(noise) // 2)[worst]} varied by {scatter[worst] * 1e6:.1f} um rms in the last '
         f'{len(dots)} blocks, noise explains {noise[worst] ** 0.5 * 1e6:.1f} um; wait until it is at rest'
     )

@@ -8,6 +8,7 @@ Times are integer nanoseconds of ROS time; everything else SI.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,10 +22,32 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 Counts = npt.NDArray[np.int16] | npt.NDArray[np.int32]
 
-CHANNELS = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
-"""The order of the six channels everywhere: on the wire, in recordings, in arrays."""
+MOST_PSDS = 6
+"""A rig has two to this many PSDs."""
 
-DOT_CHANNELS = (0, 1, 3, 4)
+
+@functools.cache
+def channel_names(psds: int) -> tuple[str, ...]:
+    """The order of the channels everywhere (on the wire, in recordings, in arrays): x1 y1 sum1 x2 y2 sum2 ..."""
+    return tuple(f'{quantity}{n}' for n in range(1, psds + 1) for quantity in ('x', 'y', 'sum'))
+
+
+@functools.cache
+def dot_names(psds: int) -> tuple[str, ...]:
+    """The channels that are coordinates of the dots: x1 y1 x2 y2 ..."""
+    return tuple(f'{axis}{n}' for n in range(1, psds + 1) for axis in 'xy')
+
+
+@functools.cache
+def dot_channels(psds: int) -> tuple[int, ...]:
+    """Places of :func:`dot_names` among :func:`channel_names`."""
+    return tuple(3 * n + axis for n in range(psds) for axis in (0, 1))
+
+
+CHANNELS = channel_names(2)
+"""The channels of two PSDs."""
+
+DOT_CHANNELS = dot_channels(2)
 """Which of ``CHANNELS`` are coordinates of the dots: x1, y1, x2, y2."""
 
 FLAG_OVER_RANGE = 1
@@ -52,8 +75,8 @@ class RawChunk:
     """Samples as they arrived, in order; not necessarily a whole block.
 
     ``seq`` int64 (n,): the sample number, extended beyond the 32 bits of the protocol. ``t_ns``
-    int64 (n,): when each sample was taken, ROS time, ns. ``readings`` (n, 6): int16 or int32 converter
-    counts, or float32 volts, in the order of ``CHANNELS``. ``flags`` uint8 (n,): as in the
+    int64 (n,): when each sample was taken, ROS time, ns. ``readings`` (n, 3P) of P PSDs: int16 or int32 converter
+    counts, or float32 volts, in the order of :func:`channel_names`. ``flags`` uint8 (n,): as in the
     protocol. ``volts_per_count``: V per count; None if ``readings`` are already volts.
     """
 
@@ -69,7 +92,7 @@ class SampleBlock:
     """The samples of one block that arrived; lost samples are left out, never filled in.
 
     ``index``: seq // block_size. ``seq`` int64 (n,), ``t_ns`` int64 (n,) ROS time in ns,
-    ``volts`` float32 (n, 6), ``flags`` uint8 (n,), n >= 1.
+    ``volts`` float32 (n, 3P), ``flags`` uint8 (n,), n >= 1.
     """
 
     index: int
@@ -81,24 +104,26 @@ class SampleBlock:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpotMeans:
-    """The two dots averaged over one block.
+    """The dots averaged over one block.
 
-    ``t_ns``: middle of the block. ``dots``: (x1, y1, x2, y2), m, from each PSD's centre.
-    ``sums``: (sum1, sum2), V. ``covariance`` (4, 4): sample covariance of the dots, m^2 (zeros if
+    ``t_ns``: middle of the block. ``dots``: (x1, y1, x2, y2, ...), m, from each PSD's centre.
+    ``sums``: (sum1, sum2, ...), V. ``covariance`` (2P, 2P): sample covariance of the dots, m^2 (zeros if
     fewer than two samples are present). ``present`` + ``lost`` = block size. ``reason`` is empty
-    when ``status`` is OK. ``findings``: warnings that do not prevent an estimate.
+    when ``status`` is OK. ``findings``: warnings that do not prevent an estimate. ``left_out``: PSDs (from 1) that
+    the estimate was made without, if the others were enough for it.
     """
 
     t_ns: int
     index: int
-    dots: tuple[float, float, float, float]
-    sums: tuple[float, float]
+    dots: tuple[float, ...]
+    sums: tuple[float, ...]
     covariance: FloatArray
     present: int
     lost: int
     status: BlockStatus
     reason: str
     findings: tuple[str, ...] = ()
+    left_out: tuple[int, ...] = ()
 
 
 class DeflectionEstimate(NamedTuple):
@@ -106,9 +131,9 @@ class DeflectionEstimate(NamedTuple):
 
     ``dx``, ``dy`` m; ``theta``, ``phi``, ``omega`` rad, right-hand positive about Z, X, Y.
     ``covariance``: 3 x 3 of (dx, dy, theta), row by row, m^2, m rad, rad^2.
-    ``residual_rms``: rms of the four dot residuals, m. ``primary``: True for the estimate that is
-    published as ``/link_tip/deflection``. ``chi_square``: of the one redundant reading, 1 degree of
-    freedom; NaN if it was not checked.
+    ``residual_rms``: rms of the dot residuals, m. ``primary``: True for the estimate that is
+    published as ``/link_tip/deflection``. ``chi_square``: of the redundant readings, one degree of
+    freedom each (one with two PSDs); NaN if they were not checked.
     """
 
     t_ns: int

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.config import Rig
-from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, FloatArray, SampleBlock
+from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, FloatArray, SampleBlock, channel_names, dot_names
 
 FROZEN_BLOCKS = 5
 """Blocks in a row in which x, y and sum do not change by one bit, which noise would prevent."""
@@ -22,17 +22,18 @@ NOISY = 5.0
 """Times the noise of the rig file."""
 
 HALF_LIGHT = (0.35, 0.65)
-"""Fraction of ``sum_nominal`` on both detectors if one of the splitter's two lasers fails."""
+"""Fraction of ``sum_nominal`` on all detectors if one of the splitter's two lasers fails."""
 
-_NAMES = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
 _THIRD_DIFFERENCE = 20.0
 """Variance of the third difference of white noise of variance 1: 1 + 9 + 9 + 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """``faulty``: the faulty detector (1 or 2), 0 if it is neither or both. ``faults``: all faulty
-    detectors. ``half_light``: the splitter works with one of its two lasers.
+    """``faulty``: the faulty detector (from 1), 0 if it is none or several. ``faults``: all faulty detectors.
+
+    ``sound``: the others (from 0), if there are faulty ones and samples enough to go on without them.
+    ``half_light``: the splitter works with one of its two lasers.
     """
 
     status: BlockStatus
@@ -41,9 +42,10 @@ class Verdict:
     findings: tuple[str, ...] = ()
     half_light: bool = False
     faults: frozenset[int] = frozenset()
+    sound: tuple[int, ...] = ()
 
 
-def _long(frozen: tuple[int, int]) -> list[tuple[int, str]]:
+def _long(frozen: tuple[int, ...]) -> list[tuple[int, str]]:
     """(PSD, message) for each PSD whose values have not changed for too long."""
     return [
         (psd, f'psd_{psd} stands still: no bit has moved for {blocks} blocks')
@@ -57,11 +59,12 @@ class OpticsHealth:
 
     def __init__(self, rig: Rig) -> None:
         config = rig.estimator
+        self._psds = len(rig.psds)
         self._size = config.block_size
         self._min_samples = config.min_samples
         self._splitter = config.splitter
         self._nominal = rig.amplifier.sum_nominal
-        # If two lasers share both detectors, half the light does not mean a lost laser.
+        # If two lasers share all detectors, half the light does not mean a lost laser.
         self._sum_min = config.sum_min * (0.5 if self._splitter else 1.0)
         self._sum_max = config.sum_max
         self.refuses_frozen = config.frozen == 'refuse'
@@ -75,12 +78,12 @@ class OpticsHealth:
         self._moves = [bool((own > step).any()) for own in rig.noises]
         self._noise = NOISY * np.sqrt(rig.noises**2 + step**2 / 12.0)
 
-    def still(self, volts: npt.NDArray[np.float32]) -> tuple[bool, bool]:
-        """For PSD 1 and PSD 2: whether x, y and sum are identical in all samples."""
+    def still(self, volts: npt.NDArray[np.float32]) -> tuple[bool, ...]:
+        """For each PSD: whether x, y and sum are identical in all samples."""
         if len(volts) < max(self._min_samples, 2):
-            return (False, False)
+            return (False,) * self._psds
         same = (volts == volts[0]).all(axis=0)
-        return (self._moves[0] and bool(same[:3].all()), self._moves[1] and bool(same[3:].all()))
+        return tuple(m and bool(same[3 * i : 3 * i + 3].all()) for i, m in enumerate(self._moves))
 
     def judge(
         self,
@@ -88,9 +91,9 @@ class OpticsHealth:
         volts: npt.NDArray[np.float32],
         dots: tuple[float, ...],
         sums: FloatArray,
-        frozen: tuple[int, int],
+        frozen: tuple[int, ...],
     ) -> Verdict:
-        """The block's verdict, causes before consequences. ``volts`` (n, 6): of the PSDs, x y sum of each.
+        """The block's verdict, causes before consequences. ``volts`` (n, 3P): of the PSDs, x y sum of each.
 
         ``frozen``: blocks in a row without change, per PSD. ``x1`` in a reason is PSD 1's x, whatever channel it is on.
         """
@@ -106,7 +109,7 @@ class OpticsHealth:
                 fault(psd, BlockStatus.LASER_LOST, f'laser {psd} lost: sum {least:.3f} V, below {self._sum_min:g} V')
         extremes = np.abs(volts).max(axis=0)
         if float(extremes.max()) >= self._rail:
-            for column, name in enumerate(_NAMES):
+            for column, name in enumerate(channel_names(self._psds)):
                 if extremes[column] >= self._rail:
                     at = float(extremes[column])
                     reason = f'{name} saturated: {at:.3f} V, converter.full_scale is {self._full_scale:g} V'
@@ -119,7 +122,7 @@ class OpticsHealth:
         if present < self._min_samples and not faults:
             reason = f'{present} of {self._size} samples, at least {self._min_samples} are needed'
             return Verdict(BlockStatus.TOO_FEW_SAMPLES, reason, 0)
-        for column, (name, dot, half) in enumerate(zip(('x1', 'y1', 'x2', 'y2'), dots, self._half, strict=True)):
+        for column, (name, dot, half) in enumerate(zip(dot_names(self._psds), dots, self._half, strict=True)):
             if abs(dot) > half:
                 reason = f'{name} at {dot * 1e3:.3f} mm, outside the active area'
                 fault(1 + column // 2, BlockStatus.OUTSIDE_ACTIVE_AREA, reason)
@@ -130,8 +133,10 @@ class OpticsHealth:
         # The worst cause first: a lost laser explains a saturated or outside reading.
         psd = min(faults, key=lambda p: (_ORDER.index(faults[p][0]), p))
         status, reason = faults[psd]
-        lone = len(faults) == 1 and present >= self._min_samples
-        return Verdict(status, reason, psd if lone else 0, findings, half_light, frozenset(faults))
+        enough = present >= self._min_samples
+        lone = len(faults) == 1 and enough
+        sound = tuple(i for i in range(self._psds) if i + 1 not in faults) if enough else ()
+        return Verdict(status, reason, psd if lone else 0, findings, half_light, frozenset(faults), sound)
 
     def _half_light(self, low: list[float]) -> bool:
         return all(HALF_LIGHT[0] * self._nominal < s < HALF_LIGHT[1] * self._nominal for s in low)
@@ -143,7 +148,7 @@ class OpticsHealth:
         if half_light:
             out.append('one of the two lasers is out: half the light on both detectors')
         high = sums.max(axis=0)
-        for psd in (1, 2):
+        for psd in range(1, self._psds + 1):
             if psd in faulty:
                 continue
             if high[psd - 1] > self._sum_max:
@@ -155,7 +160,7 @@ class OpticsHealth:
         return tuple(out)
 
     def late_findings(
-        self, volts: npt.NDArray[np.float32], verdict: Verdict, frozen: tuple[int, int]
+        self, volts: npt.NDArray[np.float32], verdict: Verdict, frozen: tuple[int, ...]
     ) -> tuple[str, ...]:
         """Findings computed after the estimate: a noisy detector, a detector whose values do not change."""
         faulty = verdict.faults
@@ -164,7 +169,7 @@ class OpticsHealth:
             # Third differences almost remove the link's own motion.
             rough = np.diff(volts, n=3, axis=0)
             level = np.sqrt(np.einsum('ij,ij->j', rough, rough) / (len(rough) * _THIRD_DIFFERENCE))
-            for psd in (1, 2):
+            for psd in range(1, self._psds + 1):
                 own = level[3 * psd - 3 : 3 * psd]
                 noisy = own[own > self._noise[psd - 1]]
                 if psd not in faulty and noisy.size:
@@ -173,18 +178,18 @@ class OpticsHealth:
             out += [reason for psd, reason in _long(frozen) if psd not in faulty]
         return tuple(out)
 
-    def background_variance(self, sums: FloatArray) -> tuple[float, float]:
+    def background_variance(self, sums: FloatArray) -> tuple[float, ...]:
         """Variance (m^2) that other light may have added to a dot of each PSD; 0 if there is none.
 
         Background light of fraction b shifts a reading by b (x_b - x). Its centre x_b is unknown. If
         x_b is uniform over the active area, the shift has a variance of (b L/2)^2 / 3.
         """
         out = []
-        for psd in (0, 1):
+        for psd in range(self._psds):
             total = float(sums[:, psd].mean())
             share = max(total - self._nominal, 0.0) / total if total > self._sum_max else 0.0
             out.append((share * max(self._half[2 * psd : 2 * psd + 2])) ** 2 / 3.0)
-        return (out[0], out[1])
+        return tuple(out)
 
 
 _ORDER = (

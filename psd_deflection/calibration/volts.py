@@ -10,11 +10,11 @@ import numpy.typing as npt
 from psd_deflection.calibration.sensors import Quadrant, Sensor, make_sensor
 from psd_deflection.calibration.wiring import Wiring
 from psd_deflection.config import Rig
-from psd_deflection.records import DOT_CHANNELS, Counts, FloatArray
+from psd_deflection.records import Counts, FloatArray, dot_channels
 
 
 def counts_to_volts(counts: Counts, volts_per_count: float) -> npt.NDArray[np.float32]:
-    """Volts (n, 6) of converter counts (n, 6); ``volts_per_count`` V.
+    """Volts (n, 3P) of converter counts (n, 3P) of P PSDs; ``volts_per_count`` V.
 
     The product is computed in double precision and rounded once to float32, as in a recording. So a
     replay from volts starts from exactly the same numbers.
@@ -26,12 +26,12 @@ def counts_to_volts(counts: Counts, volts_per_count: float) -> npt.NDArray[np.fl
 class Calibration:
     """Readings to the places of the dots.
 
-    ``sensitivities``: m/V on x1, y1, x2, y2, at the centre. ``sensors``: one for each PSD. ``wiring``: which channel
-    of the device is which axis of which PSD.
+    ``sensitivities``: m/V on x1, y1, x2, y2 ..., at the centre. ``sensors``: one for each PSD. ``wiring``: which
+    channel of the device is which axis of which PSD.
     """
 
     sensitivities: tuple[float, ...]
-    sensors: tuple[Sensor, Sensor]
+    sensors: tuple[Sensor, ...]
     wiring: Wiring = field(default_factory=Wiring)
 
     @classmethod
@@ -39,33 +39,33 @@ class Calibration:
         """The calibration of the rig's parameters."""
         return cls(
             sensitivities=tuple(rig.sensitivities.ravel().tolist()),
-            sensors=(make_sensor(rig.psds[0]), make_sensor(rig.psds[1])),
+            sensors=tuple(make_sensor(psd) for psd in rig.psds),
             wiring=Wiring.from_rig(rig),
         )
 
     def seen(self, volts: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Volts (n, 6) of the PSDs, x y sum of each, from those of the device's channels."""
+        """Volts (n, 3P) of the PSDs, x y sum of each, from those of the device's channels."""
         return self.wiring.to_psds(volts)
 
     def dots(self, volts: npt.NDArray[np.float32]) -> FloatArray:
-        """Places (n, 4), m: x1, y1, x2, y2, each from its PSD's centre; ``volts`` (n, 6) float32 as :meth:`seen`.
+        """Places (n, 2P), m: x1, y1, x2, y2 ..., each from its PSD's centre; ``volts`` (n, 3P) float32 as :meth:`seen`.
 
         The amplifier divides by the sum, so a voltage is the place over the sensitivity. The
         nonlinear curve of a segmented sensor is inverted.
         """
-        dots = np.multiply(volts[:, DOT_CHANNELS], self.sensitivities, dtype=np.float64)
+        dots = np.multiply(volts[:, dot_channels(len(self.sensors))], self.sensitivities, dtype=np.float64)
         for i, sensor in enumerate(self.sensors):
             if isinstance(sensor, Quadrant):
                 dots[:, 2 * i : 2 * i + 2] = sensor.from_linear(dots[:, 2 * i : 2 * i + 2])
         return dots
 
     def volts_of_electrodes(self, electrodes: FloatArray) -> FloatArray:
-        """Volts (n, 6) on the device's channels, as an amplifier that divides would give them.
+        """Volts (n, 3P) on the device's channels, as an amplifier that divides would give them.
 
-        ``electrodes`` (n, 8): of PSD 1 in the order of its ``electrodes``, then of PSD 2, each a current or what a
+        ``electrodes`` (n, 4P): of PSD 1 in the order of its ``electrodes``, then of PSD 2 ..., each a current or what a
         transimpedance amplifier makes of it, V. The sums are in their unit. A PSD without light reads 0, its sum too.
         """
-        own = np.empty((len(electrodes), 6))
+        own = np.empty((len(electrodes), 3 * len(self.sensors)))
         for psd, sensor in enumerate(self.sensors, start=1):
             first = self.wiring.input_of(psd) - 1
             four = electrodes[:, 4 * first : 4 * first + 4]
@@ -81,7 +81,7 @@ class Calibration:
 
 
 def dot_noise_variances(rig: Rig) -> FloatArray:
-    """Variance (4,), m^2, of one sample of x1, y1, x2, y2.
+    """Variance (2P,), m^2, of one sample of x1, y1, x2, y2 ...
 
     Amplifier noise, and the converter's rounding to steps: step^2/12 (Widrow & Kollar, Quantization
     Noise, 2008; good while the noise spans a step or more, as here). For a segmented sensor it holds

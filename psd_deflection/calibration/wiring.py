@@ -38,8 +38,8 @@ class Wiring:
         return not self.exchanged and all(axes == ('x', 'y') for axes in self.axes)
 
     def input_of(self, psd: int) -> int:
-        """Of PSD 1 or 2, the input of the device that it is wired to: 1 is x1 y1 sum1, 2 is x2 y2 sum2."""
-        return 3 - psd if self.exchanged else psd
+        """Of a PSD (from 1), the input of the device that it is wired to: 1 is x1 y1 sum1, 2 is x2 y2 sum2 ..."""
+        return 3 - psd if self.exchanged and psd <= 2 else psd
 
     @property
     def columns(self) -> tuple[int, ...]:
@@ -59,13 +59,13 @@ class Wiring:
         return tuple(out)
 
     def to_psds(self, volts: npt.NDArray[Number]) -> npt.NDArray[Number]:
-        """Volts of the PSDs (n, 6), x y sum of each, from those of the device's channels (n, 6)."""
+        """Volts of the PSDs (n, 3P), x y sum of each, from those of the device's channels (n, 3P)."""
         if self.nominal:
             return volts
         return volts[:, self.columns] * np.array(self.signs, volts.dtype)
 
     def to_device(self, volts: npt.NDArray[Number]) -> npt.NDArray[Number]:
-        """Volts on the device's channels (n, 6) from those of the PSDs (n, 6), x y sum of each."""
+        """Volts on the device's channels (n, 3P) from those of the PSDs (n, 3P), x y sum of each."""
         if self.nominal:
             return volts
         out = np.empty_like(volts)

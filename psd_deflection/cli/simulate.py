@@ -107,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
     kinds += [TemperatureReading] * (temperature is not None) + [ReferencePose] * reference
     simulated = SimulatedRun(rig, known, history.loads, temperature, args.seed, reference, noise or (0.0, 0.0, 0.0))
     count = len(history)
-    sink = open_sink(args.out, known.flat(), samples_with=kinds)
+    sink = open_sink(args.out, known.flat(), samples_with=kinds, psds=len(rig.psds))
     bar = tqdm(total=count, unit=' samples', delay=1.0, leave=False, disable=args.json or None, ncols=80)
     with contextlib.closing(sink), bar:
         for record in simulated.records(0 if is_csv(args.out) else BAG_START_NS):

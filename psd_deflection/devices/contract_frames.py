@@ -20,7 +20,8 @@ from psd_deflection.devices.device import (
     PowerUp,
     Probe,
     converter_parameters,
-    described_bits,
+    described,
+    psds_of,
 )
 from psd_deflection.devices.port_search import candidate_ports, is_pattern, matching
 from psd_deflection.devices.port_source import PortSource
@@ -41,7 +42,7 @@ from psd_deflection.protocol.frames import (
     StopFrame,
     encode,
 )
-from psd_deflection.records import CHANNELS, FLAG_DEVICE_DROPPED, FLAG_OVER_RANGE
+from psd_deflection.records import FLAG_DEVICE_DROPPED, FLAG_OVER_RANGE, MOST_PSDS, channel_names
 
 if TYPE_CHECKING:
     from psd_deflection.devices.rig_feed import RigFeed
@@ -62,7 +63,8 @@ class ContractFrames(PortSource):
         self._wanted = rig.acquisition.serial_number
         self._given = rig.acquisition.port
         self._baud = rig.acquisition.baud
-        self._decoder = FrameDecoder()
+        self._psds = len(rig.psds)
+        self._decoder = FrameDecoder(self._psds)
         self._early: list[Event] = []
         self._next_candidate = 0
 
@@ -90,7 +92,7 @@ class ContractFrames(PortSource):
         self._early = []
         try:
             port.write(_WAKE)
-            decoder = self._decoder = FrameDecoder()
+            decoder = self._decoder = FrameDecoder(self._psds)
             received = frames = 0
             deadline = time.monotonic() + timeout
             while (left := deadline - time.monotonic()) > 0:
@@ -128,7 +130,7 @@ class ContractFrames(PortSource):
 
     def start(self) -> None:
         """Discard the samples that came before the HELLO: they are older than their time of reading."""
-        self._decoder = FrameDecoder()
+        self._decoder = FrameDecoder(self._psds)
         self._early = []
         if self._port is not None:
             self._port.discard_input()
@@ -215,9 +217,9 @@ class SimulatedFrames:
                 'serial': serial,
                 'firmware': f'psd_deflection simulated rig {__version__}',
                 'sample_rate_hz': self._rate,
-                'channels': list(CHANNELS),
+                'channels': list(channel_names(len(feed.rig.psds))),
                 'volts_per_count': feed.rig.converter.volts_per_count,
-                **described_bits(self._bits),
+                **described(feed.rig),
             },
         )
 
@@ -262,7 +264,7 @@ class SimulatedFrames:
         top, wide = 2 ** (self._bits - 1) - 1, self._bits > WIRE_BITS
         while self.due_in_ns(since_power_up_ns) <= 0:
             number = self._feed.taken
-            x1, y1, sum1, x2, y2, sum2 = row = self._feed.next()
+            row = self._feed.next()
             seq = (self._first_seq + number) % (1 << 32)
             if len(out) >= room:
                 self._overruns += 1
@@ -272,7 +274,7 @@ class SimulatedFrames:
                 flags = (FLAG_OVER_RANGE if over else 0) | (FLAG_DEVICE_DROPPED if self._dropped else 0)
                 self._dropped = False
                 t_us = round((self._first_seq + number) * self._period_device_us)
-                out += encode(SampleFrame(flags, seq, t_us, (x1, y1, sum1, x2, y2, sum2)), wide=wide)
+                out += encode(SampleFrame(flags, seq, t_us, tuple(row)), wide=wide)
             if number % round(self._rate) == 0 and len(out) < room:
                 out += encode(self.hello) + encode(StatusFrame(self._overruns, 2150))
         return bytes(out)
@@ -292,6 +294,8 @@ class FramesEar:
             if isinstance(frame, HelloFrame):
                 info = frame.info
                 who = f'PSD device {info.get("serial", "?")}, firmware {info.get("firmware", "?")}'
+                psds = psds_of(info)
+                who += '' if psds == 2 else f', {psds} PSDs'
                 return Answer(f'{who}, protocol {frame.version}', {'baud': self._baud, **converter_parameters(info)})
             self.promising = self.promising or isinstance(frame, SampleFrame)
         return None
@@ -307,4 +311,5 @@ DEVICE = Device(
     ContractFrames,
     _simulate,
     Probe(FramesEar, _QUESTION, baud=921_600),
+    MOST_PSDS,
 )

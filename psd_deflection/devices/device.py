@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from psd_deflection.devices.rig_feed import RigFeed
     from psd_deflection.devices.source import Source
 
+PSDS = 'psds'
+"""Key of a HELLO: the number of PSDs, 2 if it is absent."""
+
 WIRE_BITS = 16
 """Bits of a count unless the device says otherwise."""
 
@@ -98,7 +101,7 @@ class Device:
 
     ``make``: makes its source, not yet opened, from a rig; raises ConfigError if the rig does not suit it.
     ``simulate``: makes its twins, one per port, that measure the rig of the feed; None if it cannot be simulated.
-    ``probe``: None if it cannot be recognised on a port.
+    ``probe``: None if it cannot be recognised on a port. ``most_psds``: it has inputs for so many.
     """
 
     name: str
@@ -106,11 +109,23 @@ class Device:
     make: Callable[[Rig], Source]
     simulate: Callable[[RigFeed, PowerUp], Sequence[LineDevice]] | None = None
     probe: Probe | None = None
+    most_psds: int = 2
 
 
-def described_bits(bits: int) -> dict[str, object]:
-    """What a simulated device says of its converter beside ``volts_per_count``."""
-    return {'bits': bits} if bits != WIRE_BITS else {}
+def described(rig: Rig) -> dict[str, object]:
+    """What a simulated device says beside ``volts_per_count``: bits and PSDs if they are not the usual ones."""
+    bits, psds = rig.converter.bits, len(rig.psds)
+    return ({'bits': bits} if bits != WIRE_BITS else {}) | described_psds(psds)
+
+
+def described_psds(psds: int) -> dict[str, object]:
+    """What a HELLO says of the number of PSDs: nothing if there are two."""
+    return {PSDS: psds} if psds != 2 else {}
+
+
+def psds_of(info: Mapping[str, object]) -> object:
+    """The number of PSDs that a HELLO says; whatever a stranger put there."""
+    return info.get(PSDS, 2)
 
 
 def converter_parameters(info: Mapping[str, object]) -> dict[str, object]:

@@ -68,7 +68,13 @@ def make_source(rig: Rig) -> Source:
 
     Raises ConfigError as :func:`find_device`, and if the rig does not suit that source.
     """
-    return find_device(rig.acquisition.source).make(rig)
+    device = find_device(rig.acquisition.source)
+    if len(rig.psds) > device.most_psds:
+        raise ConfigError(
+            f'source = {device.name!r}: has inputs for {device.most_psds} PSDs, the rig file has {len(rig.psds)} '
+            '(psd_N.center)'
+        )
+    return device.make(rig)
 
 
 def source_names() -> list[str]:

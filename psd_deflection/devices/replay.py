@@ -13,13 +13,13 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from psd_deflection.config import Rig
-from psd_deflection.devices.device import Device
+from psd_deflection.devices.device import PSDS, Device, described_psds
 from psd_deflection.devices.source import Clock, Event, Received, Sample, Source, SourceEndedError
 from psd_deflection.errors import ConfigError, DeviceError, RecordingError
 from psd_deflection.protocol.frames import PROTOCOL_VERSION, HelloFrame
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.records import CHANNELS, SampleBlock
+from psd_deflection.records import MOST_PSDS, SampleBlock, channel_names
 
 RATE_TOLERANCE = 2e-3
 """A recorded rate comes from stamps and is not round. If it differs by less than this, the rig's rate is used."""
@@ -81,9 +81,11 @@ class Replay(Source):
             'serial': str(info.get('serial', '')),
             'firmware': f'replay of {Path(self.name).name}',
             'sample_rate_hz': rate,
-            'channels': list(CHANNELS),
+            'channels': list(channel_names(recording.psds)),
             'volts_per_count': None,
         }
+        info.pop(PSDS, None)
+        info |= described_psds(recording.psds)
         return HelloFrame(PROTOCOL_VERSION, info)
 
     def start(self) -> None:
@@ -141,4 +143,4 @@ class Replay(Source):
         }
 
 
-DEVICE = Device('replay', 'a recording, in real time', Replay)
+DEVICE = Device('replay', 'a recording, in real time', Replay, most_psds=MOST_PSDS)

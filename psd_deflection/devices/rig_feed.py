@@ -20,7 +20,7 @@ LoadSource = Callable[[int, int], FloatArray]
 class RigFeed:
     """Gives one row of counts per sample period; computed in batches, which is faster.
 
-    ``taken``: rows given so far. ``dark``: (PSD 1 or 2, first, end) of the samples without laser light,
+    ``taken``: rows given so far. ``dark``: (PSD, from 1, first, end) of the samples without laser light,
     for demonstrations and golden recordings. ``poses``: a list that gets the true poses (n, 3) of each
     batch, or None.
     """
@@ -39,7 +39,7 @@ class RigFeed:
         self._row: list[int] = []
 
     def next(self) -> list[int]:
-        """The next sample: x1 y1 sum1 x2 y2 sum2, counts."""
+        """The next sample: x1 y1 sum1 x2 y2 sum2 ..., counts."""
         row = next(self._batch, None)
         if row is None:
             self._batch = self._make()

@@ -45,7 +45,7 @@ class Sample(NamedTuple):
     """One sample of a source that does not speak the frames of ``docs/protocol.md``.
 
     ``flags``, ``seq``: as in ``protocol.frames.SampleFrame``. ``t``: in the unit of the source's
-    :class:`Clock`. ``readings``: x1 y1 sum1 x2 y2 sum2; volts if :attr:`Source.volts` is True, else
+    :class:`Clock`. ``readings``: x1 y1 sum1 x2 y2 sum2 ...; volts if :attr:`Source.volts` is True, else
     converter counts (whole, of at most 32 bits).
     """
 
@@ -98,8 +98,8 @@ class Source(abc.ABC):
     def open(self, timeout: float) -> HelloFrame:
         """Open the device, wait for its description at most ``timeout`` s, and return it as a HELLO.
 
-        The HELLO has ``serial``, ``firmware``, ``sample_rate_hz``, ``channels`` and
-        ``volts_per_count`` (a number, or None if :attr:`volts`). The reader compares it with the rig,
+        The HELLO has ``serial``, ``firmware``, ``sample_rate_hz``, ``channels``,
+        ``volts_per_count`` (a number, or None if :attr:`volts`) and, if there are more than two, ``psds``. The reader compares it with the rig,
         and it is recorded. Raises DeviceError that says what to do; then nothing is left open.
         """
 

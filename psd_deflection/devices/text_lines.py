@@ -24,7 +24,8 @@ from psd_deflection.devices.device import (
     PowerUp,
     Probe,
     converter_parameters,
-    described_bits,
+    described,
+    psds_of,
 )
 from psd_deflection.devices.port_source import PortSource
 from psd_deflection.devices.serial_port import SerialPort
@@ -42,7 +43,7 @@ from psd_deflection.protocol.text_lines import (
     positive,
     with_check,
 )
-from psd_deflection.records import CHANNELS, FLAG_OVER_RANGE
+from psd_deflection.records import FLAG_OVER_RANGE, MOST_PSDS, channel_names
 
 if TYPE_CHECKING:
     from psd_deflection.devices.rig_feed import RigFeed
@@ -65,6 +66,7 @@ class TextLines(PortSource):
         self.volts = True
         self._top = 2 ** (rig.converter.bits - 1) - 1
         self._bits = rig.converter.bits
+        self._psds = len(rig.psds)
 
     def open(self, timeout: float) -> HelloFrame:
         """Open the port and wait for the line that describes the device."""
@@ -116,14 +118,15 @@ class TextLines(PortSource):
 
     def _hello(self, info: Mapping[str, object]) -> HelloFrame:
         """What the line that describes the device says."""
+        psds = psds_of(info)
         own: dict[str, object] = {
             'serial': str(info.get('serial', ''))[:64],
             'firmware': 'text lines',
-            'channels': list(CHANNELS),
+            'channels': list(channel_names(self._psds if psds == self._psds else 2)),
             'volts_per_count': None,
         }
         # Only what is known is kept: the line is a stranger's and goes into recordings.
-        known = ['firmware', 'sample_rate_hz', 'channels', 'bits']
+        known = ['firmware', 'sample_rate_hz', 'channels', 'bits', 'psds']
         if self._electrodes is None:
             # Otherwise what we hand on is volts.
             known.append('volts_per_count')
@@ -138,7 +141,7 @@ class TextLines(PortSource):
 
     def _sample(self, line: Line) -> Event:
         readings = line.readings
-        wanted = READINGS if self._electrodes is None else ELECTRODES
+        wanted = self._psds * (READINGS if self._electrodes is None else ELECTRODES)
         if len(readings) != wanted:
             return BadFrame(f'{len(readings)} readings where the description says {wanted}', 0)
         if self._electrodes is not None:
@@ -185,7 +188,7 @@ class SimulatedLines:
             'firmware': f'psd_deflection simulated lines {__version__}',
             'sample_rate_hz': self._rate,
             'volts_per_count': feed.rig.converter.volts_per_count,
-            **described_bits(feed.rig.converter.bits),
+            **described(feed.rig),
         }
 
     def greeting(self) -> bytes:
@@ -227,8 +230,10 @@ class LinesEar:
         """The device's answer from its description."""
         for item in self._decoder.feed(piece):
             if isinstance(item, Description) and 'sample_rate_hz' in item.info:
+                psds = psds_of(item.info)
+                who = f'text lines, {item.info.get("serial", "no serial number")}'
                 return Answer(
-                    f'text lines, {item.info.get("serial", "no serial number")}',
+                    who if psds == 2 else f'{who}, {psds} PSDs',
                     {'baud': self._baud, **converter_parameters(item.info)},
                 )
             self.promising = self.promising or isinstance(item, Line)
@@ -239,4 +244,6 @@ def _simulate(feed: RigFeed, power_up: PowerUp) -> Sequence[SimulatedLines]:
     return [SimulatedLines(feed, power_up)]
 
 
-DEVICE = Device('lines', 'a line of text a sample, as an Arduino sends it', TextLines, _simulate, Probe(LinesEar))
+DEVICE = Device(
+    'lines', 'a line of text a sample, as an Arduino sends it', TextLines, _simulate, Probe(LinesEar), MOST_PSDS
+)

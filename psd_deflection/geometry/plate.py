@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import atan2, cos, sin
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -207,3 +207,19 @@ def tie_matrix(slope_ratio: float, link_length: float) -> FloatArray:
     out[3, 1] = -slope_ratio / link_length
     out[4, 0] = slope_ratio / link_length
     return out
+
+
+Tilts = Literal['none', 'tied', 'free']
+"""What a method says of the plate's tilts: it has none, they follow from the deflection, they are unknowns."""
+
+
+def reading_slopes(
+    beams: FloatArray, heights: FloatArray, pose: FloatArray, tilts: Tilts, slope_ratio: float, link_length: float
+) -> FloatArray:
+    """How the dots (2P,) go with the unknowns at ``pose`` (5,): (2P, 3), or (2P, 5) if the tilts are free; m/m, m/rad."""
+    if tilts == 'none':
+        heights, pose = np.zeros(len(beams)), np.array([*pose[:3], 0.0, 0.0])
+    jacobian = crossings(pose, beams, heights)[1].reshape(-1, 5)
+    if tilts == 'free':
+        return jacobian
+    return jacobian @ tie_matrix(slope_ratio if tilts == 'tied' else 0.0, link_length)

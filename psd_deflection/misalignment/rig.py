@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.config import Rig
+from psd_deflection.config import Rig, check_two_psds
 from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.misalignment.model import ALL, INDEX, SLOPE, TOLERANCES, ZERO, place_of_reading, reading_of_place
 from psd_deflection.records import FloatArray
@@ -56,6 +56,7 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
 
     Raises ConfigError if an effect is listed twice.
     """
+    check_two_psds(rig, 'a calibration')
     v = np.zeros(len(ALL))
     clamp = dict.fromkeys(CLAMP.values(), 0.0)
     others: list[ActiveEffect] = []

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from psd_deflection.config import Rig
+from psd_deflection.config import Rig, check_two_psds
 from psd_deflection.misalignment.model import ZERO, by_parameters, by_place, place_of_reading, readings
 from psd_deflection.misalignment.rig import is_calibrated, known_of_rig, vector_of_rig
 from psd_deflection.records import FloatArray
@@ -55,6 +55,7 @@ class ParameterSpread:
         """
         if rig.estimator.covariance != 'total' or not is_calibrated(rig):
             return None
+        check_two_psds(rig, 'a calibration (calibration.names)')
         covariance = known_of_rig(rig).covariance
         if zero_variances:
             covariance[ZERO:] = covariance[:, ZERO:] = 0.0

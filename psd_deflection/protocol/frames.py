@@ -19,6 +19,7 @@ from typing import NamedTuple
 from cobs import cobs
 
 from psd_deflection.protocol.words import device_words
+from psd_deflection.records import MOST_PSDS
 
 PROTOCOL_VERSION = 1
 MAX_ENCODED = 512
@@ -55,12 +56,12 @@ class BadReason(StrEnum):
 
 
 class SampleFrame(NamedTuple):
-    """SAMPLE and WIDE SAMPLE: ``counts`` are x1 y1 sum1 x2 y2 sum2; ``t_device_us`` microseconds of device time."""
+    """SAMPLE and WIDE SAMPLE: ``counts`` are x1 y1 sum1 x2 y2 sum2 ...; ``t_device_us`` microseconds of device time."""
 
     flags: int
     seq: int
     t_device_us: int
-    counts: tuple[int, int, int, int, int, int]
+    counts: tuple[int, ...]
 
 
 class StatusFrame(NamedTuple):
@@ -126,9 +127,11 @@ _EMPTY: dict[int, GoodFrame] = {
 MAX_DEVICE_US = 1 << 53
 """285 years: a later device time is not plausible and would overflow the host's nanoseconds."""
 
-_SAMPLE = struct.Struct('<BBIQ6h')
-_WIDE_SAMPLE = struct.Struct('<BBIQ6i')
-_SAMPLES = {FrameType.SAMPLE: _SAMPLE, FrameType.WIDE_SAMPLE: _WIDE_SAMPLE}
+_SAMPLES = {
+    kind: {n: struct.Struct(f'<BBIQ{3 * n}{of}') for n in range(2, MOST_PSDS + 1)}
+    for kind, of in ((FrameType.SAMPLE, 'h'), (FrameType.WIDE_SAMPLE, 'i'))
+}
+"""By the number of PSDs."""
 _STATUS = struct.Struct('<BIh')
 _PING = struct.Struct('<BQ')
 _PONG = struct.Struct('<BQQ')
@@ -149,7 +152,10 @@ def encode(frame: GoodFrame, *, wide: bool = False) -> bytes:
         match frame:
             case SampleFrame(flags, seq, t_device_us, counts):
                 kind = FrameType.WIDE_SAMPLE if wide else FrameType.SAMPLE
-                return _seal(_SAMPLES[kind].pack(kind, flags, seq, t_device_us, *counts))
+                layout = _SAMPLES[kind].get(len(counts) // 3)
+                if layout is None:
+                    raise ValueError(f'{len(counts)} counts: a sample has three of each of 2 to {MOST_PSDS} PSDs')
+                return _seal(layout.pack(kind, flags, seq, t_device_us, *counts))
             case StatusFrame(overruns, temperature):
                 value = NO_TEMPERATURE if temperature is None else temperature
                 return _seal(_STATUS.pack(FrameType.STATUS, overruns, value))
@@ -173,8 +179,8 @@ def encode(frame: GoodFrame, *, wide: bool = False) -> bytes:
         raise ValueError(f'{frame!r}: {error}') from None
 
 
-def _parse(payload: bytes, size: int) -> Frame:
-    """``payload``: type, body and CRC, COBS decoded; ``size``: encoded size, for the report."""
+def _parse(payload: bytes, size: int, psds: int) -> Frame:
+    """``payload``: type, body and CRC, COBS decoded; ``size``: encoded size, for the report; ``psds``: of a sample."""
     if len(payload) < 5:
         return BadFrame(BadReason.TOO_SHORT, size)
     body = payload[:-4]
@@ -182,7 +188,7 @@ def _parse(payload: bytes, size: int) -> Frame:
         return BadFrame(BadReason.CRC, size)
     kind = body[0]
     if kind == FrameType.SAMPLE or kind == FrameType.WIDE_SAMPLE:
-        layout = _SAMPLE if kind == FrameType.SAMPLE else _WIDE_SAMPLE
+        layout = _SAMPLES[FrameType(kind)][psds]
         if len(body) != layout.size:
             return BadFrame(BadReason.LENGTH, size)
         _, flags, seq, t_device_us, *counts = layout.unpack(body)
@@ -227,10 +233,11 @@ class FrameDecoder:
 
     The result does not depend on how the stream was split. The bytes before the first zero may be
     the end of a frame that began before the port was opened. If they are not a valid frame, they
-    are ignored without a :class:`BadFrame`.
+    are ignored without a :class:`BadFrame`. ``psds``: PSDs that a sample has; one with others is a BadFrame.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, psds: int = 2) -> None:
+        self._psds = psds
         self._rest = b''
         self._dropped = 0
         self._in_step = False
@@ -270,7 +277,7 @@ class FrameDecoder:
             return
         else:
             try:
-                frame = _parse(cobs.decode(encoded), len(encoded))
+                frame = _parse(cobs.decode(encoded), len(encoded), self._psds)
             except cobs.DecodeError:
                 frame = BadFrame(BadReason.COBS, len(encoded))
         if in_step or not isinstance(frame, BadFrame):

@@ -1,9 +1,9 @@
 """One sample per line of text, simple to send from an Arduino and readable; no I/O.
 
 Theory of operation. A line is ``seq,t_us,x1,y1,sum1,x2,y2,sum2`` and a newline (a carriage return
-before it is ignored): ``seq`` and ``t_us`` whole numbers modulo 2^32, the six readings decimal. Where
-the electrodes themselves are converted, eight readings take their place: four of PSD 1, four of PSD 2. A
-line that begins with ``#`` describes the device: a JSON object with ``sample_rate_hz`` and, if the
+before it is ignored): ``seq`` and ``t_us`` whole numbers modulo 2^32, the six readings decimal. A device with more
+PSDs sends three readings of each further one. Where the electrodes themselves are converted, four readings of each
+PSD take their place. A line that begins with ``#`` describes the device: a JSON object with ``sample_rate_hz`` and, if the
 readings are converter counts, ``volts_per_count``. Without ``volts_per_count`` the readings are
 volts. The device sends this line at power-up and once a second.
 
@@ -22,12 +22,15 @@ from typing import NamedTuple
 from psd_deflection.protocol.frames import BadFrame
 from psd_deflection.protocol.sequence import WRAP
 from psd_deflection.protocol.words import device_words, finite
+from psd_deflection.records import MOST_PSDS
 
 MAX_LINE = 400
 """Bytes. Longer lines are malformed."""
 
-READINGS = 6
-ELECTRODES = 8
+READINGS = 3
+ELECTRODES = 4
+"""Readings of one PSD."""
+_COUNTS = frozenset(of * n for n in range(2, MOST_PSDS + 1) for of in (READINGS, ELECTRODES))
 _WHOLE = re.compile(rb'\d{1,10}')
 _DECIMAL = re.compile(rb'[+-]?(\d{1,9}(\.\d{0,9})?|\.\d{1,9})')
 MAX_VOLTS = 1e3
@@ -74,8 +77,8 @@ def parse(line: bytes) -> Item | None:
     if line.startswith(b'#'):
         return _description(line[1:], size)
     fields = [f.strip() for f in line.split(b',')]
-    if len(fields) - 2 not in (READINGS, ELECTRODES):
-        return BadFrame('not eight fields, nor ten', size)
+    if len(fields) - 2 not in _COUNTS:
+        return BadFrame('no number of fields that a sample has', size)
     if not (_WHOLE.fullmatch(fields[0]) and _WHOLE.fullmatch(fields[1])):
         return BadFrame('seq or t_us is no whole number', size)
     seq, t_us = int(fields[0]), int(fields[1])

@@ -258,6 +258,7 @@ class BagRecording(Recording):
 
     def _chunks(self) -> Iterator[RawChunk]:
         count = RecordedSequence(self.block_size, self._warn, self._note_restart)
+        psds = 0
         for log_time, messages in self._clouds():
             together = joined_points(messages)
             parts = (
@@ -271,6 +272,12 @@ class BagRecording(Recording):
                 except ValueError as error:
                     raise RecordingError(f'{self.path}: {SAMPLES} at log time {log_time} ns: {error}') from None
                 _, _, t_ns, volts, flags = part
+                psds = psds or volts.shape[1] // 3
+                if volts.shape[1] != 3 * psds:
+                    raise RecordingError(
+                        f'{self.path}: {SAMPLES} at log time {log_time} ns: has {volts.shape[1] // 3} PSDs, '
+                        f'the samples before have {psds}'
+                    )
                 finite = np.isfinite(volts).all(axis=1)
                 if finite.all():
                     yield RawChunk(seq, t_ns, volts, flags)

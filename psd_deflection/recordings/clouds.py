@@ -16,7 +16,7 @@ import numpy.typing as npt
 from msg_adapters import point_cloud2
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.allowance import MAX_FIELDS
-from psd_deflection.records import CHANNELS, IntArray
+from psd_deflection.records import IntArray, channel_names
 
 
 class _Layout(NamedTuple):
@@ -76,7 +76,7 @@ def _learn(message: bytes, dtype: np.dtype[np.void]) -> _Layout:
 
 
 class Samples(NamedTuple):
-    """Samples in order: ``seq`` int64 (n,), ``t_ns`` (n,), ``volts`` (n, 6), ``flags`` (n,).
+    """Samples in order: ``seq`` int64 (n,), ``t_ns`` (n,), ``volts`` (n, 3P), ``flags`` (n,).
 
     ``whole``: False if ``seq`` is modulo 2^32.
     """
@@ -102,6 +102,6 @@ def joined_points(messages: Sequence[tuple[int, npt.NDArray[np.void]]]) -> Sampl
         whole,
         seq,
         stamps + points['dt'].astype(np.int64),
-        np.stack([points[c] for c in CHANNELS], axis=1).astype(np.float32),
+        np.stack([points[c] for c in channel_names(point_cloud2.psds_of(points))], axis=1).astype(np.float32),
         points['flags'].astype(np.uint8) if 'flags' in names else np.zeros(len(points), np.uint8),
     )

@@ -46,7 +46,7 @@ def convert(
         # A row takes what is waiting, and a block's last row what came during the block.
         records = itertools.chain(loads, references, temperatures, blocks)
     kinds: list[type[Record]] = [type(found[0]) for found in beside if found]
-    sink = open_sink(out, parameters, device_hello=recording.hello, samples_with=kinds)
+    sink = open_sink(out, parameters, device_hello=recording.hello, samples_with=kinds, psds=recording.psds)
     samples = 0
     with contextlib.closing(sink):
         for record in records:

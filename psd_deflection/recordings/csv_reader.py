@@ -22,10 +22,17 @@ from psd_deflection.errors import RecordingError
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.mcap_reader import RawMessage
 from psd_deflection.recordings.recording import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN, Recording
-from psd_deflection.records import CHANNELS, AppliedLoad, RawChunk, ReferencePose, TemperatureReading
+from psd_deflection.records import (
+    MOST_PSDS,
+    AppliedLoad,
+    RawChunk,
+    ReferencePose,
+    TemperatureReading,
+    channel_names,
+)
 
-REQUIRED = ('t', *CHANNELS)
-KNOWN = (*REQUIRED, *LOAD_COLUMNS, TEMPERATURE_COLUMN, *REFERENCE_COLUMNS)
+REQUIRED = ('t', *channel_names(2))
+KNOWN = ('t', *channel_names(MOST_PSDS), *LOAD_COLUMNS, TEMPERATURE_COLUMN, *REFERENCE_COLUMNS)
 
 MAX_LINE = 10_000
 """Maximum characters of a line; a longer line is not a row of samples."""
@@ -61,6 +68,7 @@ class CsvRecording(Recording):
         super().__init__(path, block_size)
         self._warnings: list[str] = []
         self._header, self._columns = self._read_header()
+        self._channels = channel_names(self.psds)
         self._step_ns = 1e9 / sample_rate_hz if sample_rate_hz else self._find_step()
         self.sample_rate_hz = 1e9 / self._step_ns
 
@@ -119,11 +127,21 @@ class CsvRecording(Recording):
                 if there and len(there) < len(group):
                     lacking = ', '.join(n for n in group if n not in columns)
                     raise self._refuse(f'has {", ".join(there)} without {lacking}', number)
+            self.psds = self._count_psds(columns, number)
             unknown = [n for n in names if n not in KNOWN]
             if unknown:
                 self._warnings.append(f'{self.path}:{number}: columns that are not read: {", ".join(unknown)}')
             return names, columns
         raise self._refuse('is empty')
+
+    def _count_psds(self, columns: Collection[str], line: int) -> int:
+        """PSDs of which there are columns, 2 or more; none may be left out, and none in part."""
+        further = [name for name in channel_names(MOST_PSDS)[6:] if name in columns]
+        psds = int(further[-1].lstrip('xysum')) if further else 2
+        lacking = [name for name in channel_names(psds) if name not in columns]
+        if lacking:
+            raise self._refuse(f'has {", ".join(further)} without {", ".join(lacking)}', line)
+        return psds
 
     def _rows(self) -> Iterator[_Row]:
         at = self._columns['t']
@@ -187,7 +205,7 @@ class CsvRecording(Recording):
         remainder is carried to the next row and decays slowly, so that neither jitter of less than half a
         step nor a clock that runs slightly fast looks like a loss.
         """
-        take = itemgetter(*(self._columns[c] for c in CHANNELS))
+        take = itemgetter(*(self._columns[c] for c in self._channels))
         seqs: list[int] = []
         times: list[int] = []
         volts: list[list[float]] = []
@@ -213,7 +231,7 @@ class CsvRecording(Recording):
                     values = [math.nan]
                 # NaN and values beyond the bound show in the sum; only then the cell is searched.
                 if not sum(map(abs, values)) <= MAX_VOLTS:
-                    values = [self._number(row, c, MAX_VOLTS) for c in CHANNELS]
+                    values = [self._number(row, c, MAX_VOLTS) for c in self._channels]
                 seqs.append(seq)
                 times.append(row.t_ns)
                 volts.append(values)

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TextIO
 
 from psd_deflection.errors import RecordingError, creating
-from psd_deflection.recordings.csv_reader import REQUIRED
 from psd_deflection.recordings.recording import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN
 from psd_deflection.records import (
     AppliedLoad,
@@ -24,6 +23,7 @@ from psd_deflection.records import (
     ReferenceWithCovariance,
     SampleBlock,
     TemperatureReading,
+    channel_names,
 )
 
 
@@ -85,13 +85,13 @@ class CsvSampleSink(_CsvFile):
 
     ``kinds``: the kinds of records that have columns beside the samples: AppliedLoad, ReferencePose,
     TemperatureReading. Such a record goes into the first row at or after its time and must come before
-    that row's block. Loads and temperatures are held; a reference is written once.
+    that row's block. Loads and temperatures are held; a reference is written once. ``psds``: of a sample.
     """
 
-    def __init__(self, path: str | Path, kinds: Collection[type[Record]] = ()) -> None:
+    def __init__(self, path: str | Path, kinds: Collection[type[Record]] = (), psds: int = 2) -> None:
         self._waiting: dict[type[Record], deque[AppliedLoad | ReferencePose | TemperatureReading]] = {}
         self._held: dict[type[Record], str] = {}
-        header = list(REQUIRED)
+        header = ['t', *channel_names(psds)]
         for kind, columns in _BESIDE.items():
             if kind in kinds:
                 header += columns

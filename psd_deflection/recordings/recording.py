@@ -18,7 +18,6 @@ from psd_deflection.errors import RecordingError, printable
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.mcap_reader import RawMessage
 from psd_deflection.records import (
-    CHANNELS,
     RESTART,
     AppliedLoad,
     FloatArray,
@@ -28,6 +27,7 @@ from psd_deflection.records import (
     ReferencePose,
     SampleBlock,
     TemperatureReading,
+    channel_names,
 )
 from psd_deflection.tables import Column, Table, columns_of, html_table
 
@@ -42,10 +42,11 @@ LOAD_COLUMNS = ('load_fx', 'load_fy', 'load_tz')
 TEMPERATURE_COLUMN = 'temperature'
 REFERENCE_COLUMNS = ('ref_dx', 'ref_dy', 'ref_theta')
 
-SAMPLE_DTYPE = np.dtype(
-    [('t', '<f8'), ('t_ns', '<i8'), ('seq', '<i8'), *((c, '<f4') for c in CHANNELS), ('flags', 'u1')]
-)
-"""``t``: s from the first sample. ``t_ns``: ns since the epoch, or since the CSV's zero."""
+
+def sample_dtype(psds: int) -> np.dtype[np.void]:
+    """A sample. ``t``: s from the first sample. ``t_ns``: ns since the epoch, or since the CSV's zero."""
+    volts = [(c, '<f4') for c in channel_names(psds)]
+    return np.dtype([('t', '<f8'), ('t_ns', '<i8'), ('seq', '<i8'), *volts, ('flags', 'u1')])
 
 
 class Recording(abc.ABC):
@@ -120,6 +121,12 @@ class Recording(abc.ABC):
             yield from cutter.add(chunk, chunk.readings.astype(np.float32, copy=False))
         yield from cutter.flush()
 
+    @functools.cached_property
+    def psds(self) -> int:
+        """PSDs of which it holds samples. Raises RecordingError if it holds none."""
+        first = next(self.blocks(), None)
+        return 2 if first is None else first.volts.shape[1] // 3
+
     def lost(self, first: int, last: int, present: int) -> int:
         """Samples lost from number ``first`` to ``last``, of which ``present`` are there."""
         missing = last - first + 1 - present
@@ -176,14 +183,14 @@ class Recording(abc.ABC):
 
     @functools.cached_property
     def samples(self) -> npt.NDArray[np.void]:
-        """Every sample as a structured array (n,) of ``SAMPLE_DTYPE``, read at first use."""
+        """Every sample as a structured array (n,) of :func:`sample_dtype`, read at first use."""
         blocks = list(self.blocks())
-        out = np.empty(sum(len(b.seq) for b in blocks), SAMPLE_DTYPE)
+        out = np.empty(sum(len(b.seq) for b in blocks), sample_dtype(blocks[0].volts.shape[1] // 3))
         out['seq'] = np.concatenate([b.seq for b in blocks])
         out['t_ns'] = np.concatenate([b.t_ns for b in blocks])
         out['t'] = (out['t_ns'] - out['t_ns'][0]) * 1e-9
         volts = np.concatenate([b.volts for b in blocks])
-        for i, channel in enumerate(CHANNELS):
+        for i, channel in enumerate(channel_names(volts.shape[1] // 3)):
             out[channel] = volts[:, i]
         out['flags'] = np.concatenate([b.flags for b in blocks])
         return out
@@ -194,7 +201,7 @@ class Recording(abc.ABC):
         columns = [
             Column('seq', samples['seq'], '', 'number of the sample'),
             Column('t_ns', t_ns, 'ns', 'time, since the epoch if the recording has it'),
-            *(Column(name, samples[name], 'V', f'channel {name}') for name in CHANNELS),
+            *(Column(name, samples[name], 'V', f'channel {name}') for name in channel_names(self.psds)),
             Column('flags', samples['flags'], '', 'bit 0: over range, bit 1: samples were dropped before this one'),
         ]
         if loads := self.loads():

@@ -13,6 +13,7 @@ import numpy as np
 
 from msg_adapters import DEFLECTION
 from psd_deflection.config import BY_NAME, Rig, load_rig, replace_values, rig_as_recorded
+from psd_deflection.errors import ConfigError
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.readers import open_recording
@@ -64,9 +65,18 @@ def open_for_replay(
     """
     recording = open_recording(path, namespace=namespace)
     rig = rig_at_start(recording) if params_file is None else load_rig(params_file)
+    check_psds(recording, rig)
     if recording.block_size != rig.estimator.block_size:
         recording = recording.with_block_size(rig.estimator.block_size)
     return recording, rig
+
+
+def check_psds(recording: Recording, rig: Rig) -> None:
+    """Raise ConfigError if ``recording`` has samples of another number of PSDs than ``rig``."""
+    if recording.psds != len(rig.psds):
+        raise ConfigError(
+            f'{recording.path}: has samples of {recording.psds} PSDs, the rig file has {len(rig.psds)} (psd_N.center)'
+        )
 
 
 def replayed(

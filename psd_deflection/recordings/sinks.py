@@ -40,17 +40,18 @@ def open_sink(
     device_hello: Mapping[str, object] | None = None,
     samples_with: Collection[type[Record]] | None = None,
     title: str = '',
+    psds: int = 2,
 ) -> Sink:
     """The sink for ``path``: a ``.csv``, an ``.rrd`` (for Rerun), an ``.mcap`` (a single file), else a bag folder.
 
     ``rig_values``: the flat parameter set. ``samples_with``: a CSV holds the samples, with columns for these
-    kinds of records; None: it holds the estimates. ``title``: title of an ``.rrd``.
+    kinds of records; None: it holds the estimates. ``title``: title of an ``.rrd``. ``psds``: of the samples of a CSV.
     Raises RecordingError if ``path`` exists or cannot be made, ConfigError if rerun is not installed.
     """
     path = Path(path)
     if is_csv(path):
         if samples_with is not None:
-            return CsvSampleSink(path, samples_with)
+            return CsvSampleSink(path, samples_with, psds)
         return CsvEstimateSink(path, rig_from_values(rig_values, str(path)).estimator.solvers)
     if is_for_viewing(path):
         return RerunFile(path, rig_from_values(rig_values, str(path)), title)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from psd_deflection.config import Rig
+from psd_deflection.devices.device import psds_of
 from psd_deflection.errors import DeviceError
 from psd_deflection.protocol.frames import PROTOCOL_VERSION, HelloFrame
 from psd_deflection.protocol.words import device_words, finite
-from psd_deflection.records import CHANNELS
+from psd_deflection.records import channel_names
 
 
 class AnotherDeviceError(DeviceError):
@@ -64,9 +65,15 @@ class HelloGate:
                 raise DeviceError(f'{port}: HELLO has {key} {info.get(key)!r}, needed is a text')
 
     def _check_converter(self, info: dict[str, object], port: str) -> None:
-        channels = info.get('channels')
-        if channels != list(CHANNELS):
-            raise DeviceError(f'{port}: HELLO has channels {channels!r}, needed are {list(CHANNELS)!r}')
+        psds, wanted_psds = psds_of(info), len(self._rig.psds)
+        if type(psds) is not int or psds != wanted_psds:
+            raise DeviceError(
+                f'{port}: HELLO has psds {psds!r}, the rig file has {wanted_psds} PSDs; describe each PSD of the device '
+                '(psd_N.center)'
+            )
+        channels, needed = info.get('channels'), list(channel_names(wanted_psds))
+        if channels != needed:
+            raise DeviceError(f'{port}: HELLO has channels {channels!r}, needed are {needed!r}')
         rate = finite(info.get('sample_rate_hz'))
         wanted = self._rig.converter.sample_rate_hz
         if rate is None or abs(rate - wanted) > 1e-3 * wanted:

@@ -49,8 +49,8 @@ LONGEST_LINE = 2000
 
 def zero_text(rig: Rig) -> str:
     """The unloaded dots of ``rig``, as one line of text."""
-    (x1, y1), (x2, y2) = (psd.zero for psd in rig.psds)
-    return f'unloaded dots (mm): psd_1 ({x1 * 1e3:z.4f}, {y1 * 1e3:z.4f}), psd_2 ({x2 * 1e3:z.4f}, {y2 * 1e3:z.4f})'
+    zeros = enumerate((psd.zero for psd in rig.psds), start=1)
+    return 'unloaded dots (mm): ' + ', '.join(f'psd_{n} ({x * 1e3:z.4f}, {y * 1e3:z.4f})' for n, (x, y) in zeros)
 
 
 def load_text(load: AppliedLoad) -> str:

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.config import BY_NAME, ZEROS, Rig, replace_values
+from psd_deflection.config import BY_NAME, Rig, replace_values
 from psd_deflection.errors import ConfigError, Failed, Warned
 from psd_deflection.files import replace_file
 from psd_deflection.parameters import check_value
@@ -38,7 +38,7 @@ class ZeroStore:
     """
 
     def __init__(self, configured: Rig, serial: object) -> None:
-        self._configured = {name: configured.values[name] for name in ZEROS}
+        self._configured = configured.zeros_by_name
         named = configured.acquisition.zero_file
         # The device chooses its serial number: it must not lead out of the folder.
         self._serial = str(serial)
@@ -62,7 +62,7 @@ class ZeroStore:
             kept: Any = json.loads(content)
             if not isinstance(kept, dict) or not isinstance(kept.get('configured'), dict):
                 raise ValueError('not what ~/zero writes')
-            zeros = {name: check_value(BY_NAME[name], kept.get(name), str(self.path)) for name in ZEROS}
+            zeros = {name: check_value(BY_NAME[name], kept.get(name), str(self.path)) for name in rig.zeros_by_name}
         except FileNotFoundError:
             return rig, ''
         except (OSError, ValueError, RecursionError, ConfigError) as error:
@@ -78,7 +78,7 @@ class ZeroStore:
 
     def save(self, rig: Rig) -> str:
         """Save the zero of ``rig``; return '' or why it failed."""
-        kept = {'serial': self._serial, **{name: rig.values[name] for name in ZEROS}, 'configured': self._configured}
+        kept = {'serial': self._serial, **rig.zeros_by_name, 'configured': self._configured}
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             replace_file(self.path, json.dumps(kept, indent=1).encode())

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.simulation import effects as ours
-from psd_deflection.simulation.declaration import ActiveEffect, Effect
+from psd_deflection.simulation.declaration import PSD, ActiveEffect, Effect
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -165,7 +165,12 @@ def effects_of_rig(rig: Rig) -> list[ActiveEffect]:
     places = _places() if groups else {}
     for group, body in groups.items():
         name = str(body.pop('name', group))
-        found.append(_made(name, body, f'effects.{group}', places))
+        active = _made(name, body, f'effects.{group}', places)
+        if PSD in active.effect.parameters and active.values[PSD.name] > len(rig.psds):
+            raise ConfigError(
+                f'effects.{group}: psd = {active.values[PSD.name]:g}: the rig has {len(rig.psds)} PSDs (psd_N.center)'
+            )
+        found.append(active)
     return sort_effects(found)
 
 

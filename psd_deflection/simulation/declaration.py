@@ -14,7 +14,7 @@ from typing import Any, Literal, cast
 
 from psd_deflection.errors import ConfigError
 from psd_deflection.parameters import Parameter, check_value, shown
-from psd_deflection.records import FloatArray
+from psd_deflection.records import MOST_PSDS, FloatArray
 from psd_deflection.simulation.physics import Physics
 from psd_deflection.simulation.samples import SimulatedSamples
 
@@ -101,7 +101,17 @@ class EffectParameter:
 
 
 PSD = EffectParameter(
-    'psd', '', 1, 2, 1, 'which PSD', nominal=1, kind='choice', choices=(1, 2), required=True, each=True
+    'psd',
+    '',
+    1,
+    MOST_PSDS,
+    1,
+    'which PSD',
+    nominal=1,
+    kind='choice',
+    choices=tuple(range(1, MOST_PSDS + 1)),
+    required=True,
+    each=True,
 )
 """A parameter of every effect of one detector."""
 MOVES_FREQUENCY = EffectParameter(
@@ -119,7 +129,7 @@ MOVES_FREQUENCY = EffectParameter(
 
 @dataclass(slots=True, eq=False)
 class Reading:
-    """n readings during the correction: ``dots`` (4, n) m, ``sums`` (2, n) V, ``warmer`` (n,) K,
+    """n readings during the correction: ``dots`` (2P, n) m, ``sums`` (P, n) V, ``warmer`` (n,) K,
     ``t`` (n,) s. Changed in place.
     """
 
@@ -216,9 +226,9 @@ class Effect:
         raise KeyError(name)
 
     def variants(self) -> Iterator[dict[str, float]]:
-        """Each combination of the choices, by parameter name."""
+        """Each combination of the choices, by parameter name; of two PSDs."""
         discrete = [p for p in self.parameters if p.kind == 'choice']
-        for combination in itertools.product(*(p.choices for p in discrete)):
+        for combination in itertools.product(*(p.choices[:2] if p is PSD else p.choices for p in discrete)):
             yield {p.name: float(c) for p, c in zip(discrete, combination, strict=True)}
 
     def off_values(self, physics: Physics, choice: Values) -> dict[str, float]:

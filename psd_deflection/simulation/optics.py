@@ -11,7 +11,7 @@ from psd_deflection.simulation.physics import Physics
 
 
 def dots_on_plate(pose: FloatArray, beams: FloatArray, physics: Physics) -> FloatArray:
-    """Dots x1 y1 x2 y2 (4, n), m, from the PSD centres; ``pose`` (3, n), ``beams`` (4, n).
+    """Dots x1 y1 x2 y2 ... (2P, n), m, from the PSD centres; ``pose`` (3, n), ``beams`` (2P, n).
 
     The tilts are those of a cantilever, phi = -k dY/L and omega = k dX/L; k = 0 is a plate that stays parallel.
     """

@@ -14,13 +14,13 @@ from psd_deflection.solvers.registry import psds_at_base
 
 @dataclass(slots=True)
 class Physics:
-    """SI throughout; arrays are (2,) per axis or (2, 2) per PSD and axis.
+    """SI throughout; arrays are (2,) per axis or (P, 2) per PSD and axis.
 
     ``bending_stiffness`` EI, ``torsional_stiffness`` GJ, N m^2. ``clamp_bending`` and
     ``clamp_torsion``: clamp rotation per moment, rad/(N m). ``static_offset``: (dX, dY) of the
     link without load, m. ``slope_ratio``: k of phi = -k dY/L; 0 is the nominal, parallel planes.
     ``beams``: l_i, on the plate if ``psds_at_base``; ``slopes``: how much each goes sideways along Z.
-    ``half_area``: half width and height of the active areas. ``noise`` (6,), V rms of each channel.
+    ``half_area``: half width and height of the active areas. ``noise`` (3P,), V rms of each channel.
     ``phase``: how long after each sample the quantities are taken, below ``period``, s.
     """
 

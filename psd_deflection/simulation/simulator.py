@@ -32,8 +32,8 @@ from psd_deflection.solvers.registry import check_arrangement
 class SimulatedStep:
     """The result of :meth:`RigSimulator.step` for n samples.
 
-    ``counts`` int32 (n, 6): converter counts in the order of ``CHANNELS``. ``pose`` (n, 3): true
-    dX m, dY m, theta rad. ``dots`` (n, 4): true x1 y1 x2 y2 on the plate, m.
+    ``counts`` int32 (n, 3P): converter counts in the order of ``channel_names``. ``pose`` (n, 3): true
+    dX m, dY m, theta rad. ``dots`` (n, 2P): true x1 y1 x2 y2 ... on the plate, m.
     """
 
     counts: npt.NDArray[np.int32]
@@ -99,14 +99,16 @@ class ForwardModel:
             held = samples.static[axis] + p.static_offset[axis] if axis < 2 else samples.static[axis]
             samples.pose[axis] = mode(held)
         self._at('pose', samples)
-        samples.beams = np.repeat(p.beams.reshape(4, 1), n, axis=1)
+        samples.beams = np.repeat(p.beams.reshape(-1, 1), n, axis=1)
         self._at('beam', samples)
         samples.true_dots = dots_on_plate(samples.pose, samples.beams, p)
         samples.dots = samples.true_dots.copy()
-        samples.sums = np.full((2, n), p.sum_nominal)
+        psds = len(p.centers)
+        samples.sums = np.full((psds, n), p.sum_nominal)
         self._at('dots', samples)
-        samples.volts = np.empty((6, n))
-        for psd in range(2):
+        samples.volts = np.empty((3 * psds, n))
+        samples.noise = np.zeros(3 * psds)
+        for psd in range(psds):
             samples.volts[3 * psd : 3 * psd + 2] = samples.dots[2 * psd : 2 * psd + 2] / p.sensitivity[psd, :, None]
             samples.volts[3 * psd + 2] = samples.sums[psd]
         for i, active in enumerate(self.effects):
@@ -118,7 +120,7 @@ class ForwardModel:
     def _volts_between(
         self, before: int, samples: SimulatedSamples, loads: FloatArray, temperature: FloatArray | None, phase: float
     ) -> FloatArray:
-        """The volts (6, n) ``phase`` s after each sample, by the effects before effect number ``before``."""
+        """The volts (3P, n) ``phase`` s after each sample, by the effects before effect number ``before``."""
         if phase == self.physics.phase:
             return samples.volts.copy()
         key = (before, phase)
@@ -176,7 +178,7 @@ class RigSimulator:
         """
         samples = self._model.run(loads, temperature)
         p = self._model.physics
-        samples.volts += (p.noise * self._noise.standard_normal((len(loads), 6))).T
+        samples.volts += (p.noise * self._noise.standard_normal((len(loads), len(p.noise)))).T
         self._model.finish(samples)
         limit = round(p.full_scale / p.volts_per_count)
         volts = self._wiring.to_device(samples.volts.T)

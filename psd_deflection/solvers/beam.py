@@ -16,7 +16,7 @@ import numpy as np
 
 from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
-from psd_deflection.geometry.plate import crossing, flat_pose
+from psd_deflection.geometry.plate import Tilts, crossing, flat_pose
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers.gauss_newton import answer, fit
 from psd_deflection.solvers.interface import Solution, Solver, flat_gain
@@ -27,6 +27,7 @@ class BeamSolver(Solver):
 
     name: ClassVar[str] = 'beam'
     budgeted_as: ClassVar[str] = 'beam'
+    tilts: ClassVar[Tilts] = 'tied'
 
     def __init__(self, geometry: Geometry) -> None:
         """Bind to ``geometry``.

@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from psd_deflection.config import Rig
 from psd_deflection.geometry.layout import Geometry
+from psd_deflection.geometry.plate import Tilts
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers.plane import checked_variances
 
@@ -81,12 +82,13 @@ class Solver(abc.ABC):
 
     ``name``: as in the registry. ``budgeted_as``: the model of the error budget (``budget.estimate.METHODS``)
     whose errors the method has; '' if there is none. ``psds_at``: ``tip`` (on the plate, lasers at the base) or
-    ``base`` (lasers on the plate).
+    ``base`` (lasers on the plate). ``tilts``: what it says of the plate's tilts.
     """
 
     name: ClassVar[str]
     budgeted_as: ClassVar[str]
     psds_at: ClassVar[Literal['tip', 'base']] = 'tip'
+    tilts: ClassVar[Tilts] = 'none'
 
     @abc.abstractmethod
     def __init__(self, geometry: Geometry) -> None:
@@ -134,6 +136,11 @@ class Solver(abc.ABC):
             out[1, i] = (moved.dy - solution.dy) / _STEP
             out[2, i] = (moved.theta - solution.theta) / _STEP
         return out
+
+    def allowance(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> FloatArray | None:
+        """(3, 3): what the covariance of :meth:`solve` holds besides the dots' noise; None if there is nothing."""
+        del dots, variances
+        return None
 
 
 def flat_gain(

@@ -16,7 +16,8 @@ import numpy as np
 
 from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import SMALLEST_BASE_LINE, Geometry, check_twist
-from psd_deflection.geometry.plate import crossing, flat_poses
+from psd_deflection.geometry.plate import Tilts, crossing, crossings, flat_poses
+from psd_deflection.records import FloatArray
 from psd_deflection.solvers.gauss_newton import answer, fit
 from psd_deflection.solvers.interface import Solution, Solver
 
@@ -26,6 +27,7 @@ class PoseSolver(Solver):
 
     name: ClassVar[str] = 'pose'
     budgeted_as: ClassVar[str] = ''
+    tilts: ClassVar[Tilts] = 'free'
 
     def __init__(self, geometry: Geometry) -> None:
         """Bind to ``geometry``.
@@ -53,6 +55,7 @@ class PoseSolver(Solver):
             )
         self._centers = np.asarray(geometry.centers, dtype=np.float64)
         self._beams = np.asarray(geometry.beams, dtype=np.float64)
+        self._heights = heights
         self._rows = tuple(map(tuple, places.tolist()))
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
@@ -61,6 +64,12 @@ class PoseSolver(Solver):
         start = flat_poses(points, self._beams).tolist()
         found = fit(self._model, [*start, 0.0, 0.0], points.ravel().tolist(), variances)
         return answer(found, found.parameters, found.covariance)
+
+    def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
+        """(J^T W J)^-1 J^T W at the answer. See :class:`Solver`."""
+        slopes = crossings(np.array(solution[:5]), self._beams, self._heights)[1].reshape(-1, 5)
+        weighted = slopes.T / np.array(variances)
+        return np.asarray(np.linalg.solve(weighted @ slopes, weighted)[:3])
 
     def _model(self, x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
         dx, dy, theta, phi, omega = x

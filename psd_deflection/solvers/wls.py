@@ -60,7 +60,11 @@ class WlsSolver(Solver):
 
     @classmethod
     def options_from_rig(cls, rig: Rig) -> dict[str, Any]:
-        """``wls.weights`` and ``wls.row_scaling``."""
+        """``wls.weights`` and ``wls.row_scaling``. Raises ConfigError for the thesis's weights of more than two PSDs."""
+        if len(rig.psds) > 2 and rig.estimator.wls_weights == 'thesis':
+            raise ConfigError(
+                f'wls.weights = thesis: its weights are of two PSDs, the rig has {len(rig.psds)}; set inverse_variance'
+            )
         return {'weights': rig.estimator.wls_weights, 'row_scaling': rig.estimator.wls_row_scaling}
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:

@@ -90,7 +90,7 @@ class AppendixDSolver(Solver):
     def __init__(self, geometry: Geometry) -> None:
         """Bind to ``geometry``. Raises SolverError if the code's arctangents have no meaning."""
         if check_twist(geometry) != 2:
-            raise SolverError(f'{self.name} takes two PSDs')
+            raise SolverError(f'{self.name} takes two PSDs; of more take exact, or pose if their heights differ')
         self._centers = np.asarray(geometry.centers, dtype=np.float64)
         self._beams = np.asarray(geometry.beams, dtype=np.float64)
         (_, c1y), (c2x, _) = self._centers.tolist()

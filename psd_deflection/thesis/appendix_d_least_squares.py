@@ -39,7 +39,7 @@ class AppendixDOlsSolver(FixedGain):
     def __init__(self, geometry: Geometry, row_scaling: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)) -> None:
         """Bind to ``geometry``; ``row_scaling`` (4,): Po. Raises SolverError unless there are two PSDs."""
         if check_twist(geometry) != 2:
-            raise SolverError(f'{self.name} takes two PSDs')
+            raise SolverError(f'{self.name} takes two PSDs; of more take exact, or pose if their heights differ')
         design = printed_design_matrix(geometry) * np.array([1.0, 1.0, -1.0])
         super().__init__(design, np.zeros((2, 2)), np.array(row_scaling, dtype=np.float64))
 

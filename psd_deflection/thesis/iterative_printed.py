@@ -56,7 +56,7 @@ class IterativePrintedSolver(Solver):
     def __init__(self, geometry: Geometry, criterion: Criterion = 'printed') -> None:
         """Bind to ``geometry``. Raises SolverError if the beams coincide or there are not two."""
         if check_twist(geometry) != 2:
-            raise SolverError(f'{self.name} takes two PSDs')
+            raise SolverError(f'{self.name} takes two PSDs; of more take exact, or pose if their heights differ')
         if criterion not in get_args(Criterion):
             raise ConfigError(f'criterion = {criterion!r}: must be one of {", ".join(get_args(Criterion))}')
         self._criterion = criterion

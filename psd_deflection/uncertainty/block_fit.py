@@ -15,9 +15,8 @@ autocovariance Gamma, plus sum_k (q_k(middle) - w^T q_k)^2 tau_k^2 for the motio
 leave out. A motion that order 4 cannot follow (a load that is switched inside the block) shows in
 what is left of the samples: then their rms is added as an error that does not average out.
 
-The four readings are turned into four combinations first: x and y of the plate's middle, its twist,
-and the length of the base line, exactly, which does not move
-while the plate stays flat.
+The readings are turned into orthogonal combinations first (:mod:`psd_deflection.uncertainty.combinations`), so that
+motion is sought where the link moves the dots.
 """
 
 from __future__ import annotations
@@ -27,6 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.uncertainty.combinations import combinations_of
 
 ORDER = 4
 """Highest order: it follows a quarter period inside a block to 1e-4 of the amplitude."""
@@ -46,14 +46,12 @@ _MISFIT = 5.0
 LARGEST = 64
 """Samples a block up to which the colour of the noise makes the weights; of larger ones it makes the variance alone."""
 
-_DIAGONAL = np.arange(4)
-
 _WIDEN = 1.0
 """Times what is left of the samples: the standard deviation of a misfit's error in the middle."""
 
 
 class Fitted(NamedTuple):
-    """``dots`` (4,) m at the stamp, their ``covariance`` (4, 4) m^2, ``misfit``: the polynomial does not fit."""
+    """``dots`` (C,) m at the stamp, their ``covariance`` (C, C) m^2, ``misfit``: the polynomial does not fit."""
 
     dots: tuple[float, ...]
     covariance: FloatArray
@@ -76,21 +74,13 @@ def basis(size: int) -> FloatArray:
     return np.stack(columns, axis=1)
 
 
-def combinations(beams: FloatArray) -> FloatArray:
-    """Orthogonal (4, 4): x and y of the middle, twist, base line, each of (x1, y1, x2, y2). ``beams`` (2, 2), m."""
-    along = (beams[0] - beams[1]) / np.hypot(*(beams[0] - beams[1]))
-    x, y = float(along[0]), float(along[1])
-    rows = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0], [-y, x, y, -x], [x, y, -x, -y]])
-    return np.asarray(rows * 0.5**0.5)
-
-
 class _Terms(NamedTuple):
     """What the samples that are present say of the coefficients, for K orders of which ``told`` can be told.
 
-    ``q`` (n, K). ``u`` (4, n, K): precision times q. ``information`` (4, K, K): of the coefficients. ``v`` (4, told):
-    variances of the first ones. ``all`` (4, n, K + told + n): u, u times the covariance of the first ones, precision.
+    ``q`` (n, K). ``u`` (C, n, K): precision times q. ``information`` (C, K, K): of the coefficients. ``v`` (C, told):
+    variances of the first ones. ``all`` (C, n, K + told + n): u, u times the covariance of the first ones, precision.
     ``used``: orders above 0 that the middle needs. Once order 0, of which nothing is known beforehand, is taken out:
-    ``rest`` (4, k, k) and ``right`` (4, k) are the equations of those; ``first`` (4,) and ``share`` (4, k) give its
+    ``rest`` (C, k, k) and ``right`` (C, k) are the equations of those; ``first`` (C,) and ``share`` (C, k) give its
     weight from theirs.
     """
 
@@ -127,40 +117,42 @@ def _terms(q: FloatArray, precision: FloatArray, middle: FloatArray, whole: bool
 class BlockFit:
     """Fits block after block; see the module's text. It remembers how much motion there was."""
 
-    def __init__(self, size: int, centers: FloatArray, beams: FloatArray, poly: bool = True) -> None:
-        """``size``: N samples of a whole block. ``centers``, ``beams`` (2, 2) m. ``poly``: False gives the mean."""
+    def __init__(
+        self, size: int, centers: FloatArray, beams: FloatArray, poly: bool = True, slopes: FloatArray | None = None
+    ) -> None:
+        """``size``: N samples of a whole block. ``centers``, ``beams`` (P, 2) m, C = 2P. ``poly``: False gives the mean.
+
+        ``slopes``: as :func:`combinations_of` takes them.
+        """
         self._size = size
         self._poly = poly
         self._q = basis(size) if poly else basis(size)[:, :1]
         self._orders = self._q.shape[1]
         self._fft = 1 << (2 * size - 1).bit_length()
         self._middle = _at_middle(self._q)
-        self._squares = np.zeros((4, self._orders))
+        self._count = 2 * len(centers)
+        self._diagonal = np.arange(self._count)
+        self._squares = np.zeros((self._count, self._orders))
         # Until motion is seen there was none.
-        self._weight = np.ones((4, self._orders))
+        self._weight = np.ones((self._count, self._orders))
         self._folds = np.full(self._fft // 2 + 1, 2.0 / self._fft)
         self._folds[[0, -1]] = 1.0 / self._fft
-        self.set_geometry(centers, beams)
+        self.set_geometry(centers, beams, slopes)
 
-    def set_geometry(self, centers: FloatArray, beams: FloatArray) -> None:
-        """Use these places (2, 2), m, from now on; :meth:`set_noise` must follow."""
-        self._turn = combinations(beams)
-        self._columns = [tuple(column) for column in self._turn.T.tolist()]
-        apart = centers[0] - centers[1]
-        self._across, self._along = (
-            float(np.einsum('i,i->', row[:2], apart)) for row in (self._turn[2], self._turn[3])
-        )
-        self._base_line = float(np.hypot(*(beams[0] - beams[1]))) * 0.5**0.5
+    def set_geometry(self, centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None) -> None:
+        """Use these places (P, 2), m, from now on; :meth:`set_noise` must follow."""
+        self._combinations = combinations_of(centers, beams, slopes)
 
     def set_noise(self, gamma: FloatArray) -> None:
-        """Use the autocovariance ``gamma`` (4, 4, N) m^2 of the readings."""
-        turned = np.einsum('ac,cdl,bd->abl', self._turn, gamma, self._turn)
-        whole = np.zeros((4, 4, self._fft))
+        """Use the autocovariance ``gamma`` (C, C, N) m^2 of the readings."""
+        turn, count = self._combinations.turn, self._count
+        turned = np.einsum('ac,cdl,bd->abl', turn, gamma, turn)
+        whole = np.zeros((count, count, self._fft))
         whole[:, :, : self._size] = turned
         # The covariance with an earlier sample is the transposed one with a later.
         whole[:, :, self._fft - self._size + 1 :] = turned.transpose(1, 0, 2)[:, :, :0:-1]
         self._spectrum = np.fft.fft(whole)[:, :, : self._fft // 2 + 1] * self._folds
-        own = turned[range(4), range(4)]
+        own = turned[self._diagonal, self._diagonal]
         self._precision = _precision(own, white=not self._poly or self._size > LARGEST)
         self._whole = _terms(self._q, self._precision, self._middle, whole=True)
         self._bias, self._least = _BIAS * self._whole.v, 1e-9 * self._whole.v
@@ -168,10 +160,8 @@ class BlockFit:
         self._of_whole = np.einsum('afk,abf,bfj->akbj', f, self._spectrum, np.conj(f)).real
 
     def fit(self, slots: IntArray, dots: FloatArray) -> Fitted:
-        """The dots at the middle of the block. ``slots`` (n,): which samples are present. ``dots`` (n, 4), m."""
-        z = np.einsum('ac,sc->as', self._turn, dots)
-        # The length itself, not its first order: a twist by 1 degree would move that by 13 um.
-        z[3] = np.hypot(z[3] + self._along, z[2] + self._across) - self._base_line
+        """The dots at the middle of the block. ``slots`` (n,): which samples are present. ``dots`` (n, C), m."""
+        z = self._combinations.of(dots)
         # Of numbers about their mean: motion of millimetres leaves no rounding in what is left of it.
         offset = z.sum(axis=1) / len(slots)
         z -= offset[:, None]
@@ -193,7 +183,7 @@ class BlockFit:
         if whole:
             covariance = np.einsum('ak,akbj,bj->ab', x, self._of_whole, x)
         else:
-            weights = np.zeros((4, self._size))
+            weights = np.zeros((self._count, self._size))
             weights[:, slots] = np.einsum('ask,ak->as', terms.u, x)
             covariance = self._spread(weights)
         misfit = False
@@ -203,21 +193,8 @@ class BlockFit:
             if misfit:
                 rest = z - np.einsum('sk,ak->as', terms.q[:, :told], c)
                 more += np.where(squares > limit, _WIDEN**2 * (rest * rest).sum(axis=1) / left, 0.0)
-            covariance[_DIAGONAL, _DIAGONAL] += more
-        return Fitted(*self._back(value.tolist(), covariance), misfit)
-
-    def _back(self, value: list[float], covariance: FloatArray) -> tuple[tuple[float, ...], FloatArray]:
-        """Dots (4,) m and their covariance (4, 4) m^2 from those of the combinations."""
-        # From the length to the part along the base line at rest.
-        x, y, twist, length = value[0], value[1], value[2], value[3] + self._base_line
-        across = twist + self._across
-        along = max(length * length - across * across, 1e-4 * length * length) ** 0.5
-        back = self._turn.copy()
-        back[2] -= (across / along) * back[3]
-        back[3] *= length / along
-        longer = along - self._along
-        dots = tuple([x * p + y * q + twist * r + longer * s for p, q, r, s in self._columns])
-        return dots, np.einsum('ac,ab,bd->cd', back, covariance, back)
+            covariance[self._diagonal, self._diagonal] += more
+        return Fitted(*self._combinations.back(value.tolist(), covariance), misfit)
 
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""
@@ -228,11 +205,11 @@ class BlockFit:
         size = self._squares.size
         if len(values) != 2 * size:
             raise ValueError(f'a fit of {self._size} samples a block has {2 * size} values, not {len(values)}')
-        self._squares = np.array(values[:size]).reshape(4, -1)
-        self._weight = np.array(values[size:]).reshape(4, -1)
+        self._squares = np.array(values[:size]).reshape(self._count, -1)
+        self._weight = np.array(values[size:]).reshape(self._count, -1)
 
     def _without(self, slots: IntArray) -> FloatArray:
-        """The precision (4, n, n) of the samples that are present: a block of a matrix's inverse, inverted."""
+        """The precision (C, n, n) of the samples that are present: a block of a matrix's inverse, inverted."""
         lost = np.ones(self._size, dtype=bool)
         lost[slots] = False
         gone = np.flatnonzero(lost)
@@ -244,9 +221,9 @@ class BlockFit:
         )
 
     def _motion(self, c: FloatArray, v: FloatArray) -> FloatArray:
-        """tau^2 (4, K) after this block; order 0, of which nothing is known beforehand, is not meant.
+        """tau^2 (C, K) after this block; order 0, of which nothing is known beforehand, is not meant.
 
-        ``c``, ``v`` (4, told): coefficients and their variances of the orders that this block tells of.
+        ``c``, ``v`` (C, told): coefficients and their variances of the orders that this block tells of.
         """
         told = v.shape[1]
         square = c * c
@@ -268,7 +245,7 @@ class BlockFit:
         return tau
 
     def _spread(self, weights: FloatArray) -> FloatArray:
-        """Covariance (4, 4) of the weighted sums; ``weights`` (4, N)."""
+        """Covariance (C, C) of the weighted sums; ``weights`` (C, N)."""
         f = np.fft.rfft(weights, self._fft)
         return np.asarray(np.einsum('af,abf,bf->ab', f, self._spectrum, np.conj(f)).real)
 
@@ -292,7 +269,7 @@ def inverse(matrices: FloatArray) -> FloatArray:
 
 
 def _weights(terms: _Terms, motion: FloatArray, middle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Weights (4, K) of the sums h in the middle, and the variance (4,), m^2, of the motion that they leave out.
+    """Weights (C, K) of the sums h in the middle, and the variance (C,), m^2, of the motion that they leave out.
 
     A few numbers: floats, of which numpy's calls would cost a multiple.
     """
@@ -342,7 +319,7 @@ def _solved(matrix: list[list[float]], right: list[float]) -> list[float]:
 
 
 def _precision(gamma: FloatArray, white: bool) -> FloatArray:
-    """Inverse (4, N, N) of the covariance that ``gamma`` (4, N) stands for; of white noise as strong if ``white``."""
+    """Inverse (C, N, N) of the covariance that ``gamma`` (C, N) stands for; of white noise as strong if ``white``."""
     size = gamma.shape[1]
     lags = np.abs(np.arange(size)[:, None] - np.arange(size))
     if not white:

@@ -59,13 +59,16 @@ class Checked(NamedTuple):
 
     ``chi_square`` of this block. ``contradict``: this block or one shortly before is beyond ``LIMIT``.
     ``errors`` (4,): of each reading if it alone is wrong, m. ``possible`` (4,): what the covariance is to
-    allow for, m: the same from ``WIDEN`` on, or with the r that is held.
+    allow for, m: the same from ``WIDEN`` on, or with the r that is held. Of more than two PSDs ``errors`` and ``possible``
+    are (2P,), ``freedom`` counts the redundant readings, and ``wrong`` is the PSD (from 1) to leave out, 0: none.
     """
 
     chi_square: float
     contradict: bool
     errors: tuple[float, ...]
     possible: tuple[float, ...]
+    wrong: int = 0
+    freedom: int = 1
 
 
 class Consistency:
@@ -105,7 +108,7 @@ class Consistency:
 
 
 def widened(covariance: FloatArray, gain: FloatArray, errors: tuple[float, ...]) -> FloatArray:
-    """``covariance`` (3, 3) and what each of ``errors`` (4,) alone would cause through ``gain`` (3, 4)."""
+    """``covariance`` (3, 3) and what each of ``errors`` (2P,) alone would cause through ``gain`` (3, 2P)."""
     caused = gain * np.array(errors)
     return np.asarray(covariance + np.einsum('ik,jk->ij', caused, caused))
 

@@ -1,12 +1,12 @@
-"""The noise of the four readings, measured in the stream: how they vary about a link at rest.
+"""The noise of the readings, measured in the stream: how they vary about a link at rest.
 
 What an estimate's covariance needs is the variance of a weighted mean over one block, so colour
 counts as much as size: gamma_cd(l), the covariance of reading c with reading d l samples later, for
 l from 0 to N - 1. It is measured in segments of 50 blocks; each segment's mean and slope are taken
 off, which costs 2 of 50 degrees of freedom and is put back.
 
-Motion is no noise. Four readings see three unknowns, and the fourth combination, how much longer the
-base line between the dots is than that between the beams, holds still whatever a flat plate does. A
+Motion is no noise. The readings are more than the unknowns, and one combination of them (of two PSDs: how much longer
+the base line between the dots is than that between the beams) holds still whatever the plate does. A
 segment is at rest where no combination that moves with the link has a block mean that varies much
 more, against its roughness inside the blocks, than the one that does not move. During motion the
 values of the last rest hold. Before there was any rest, the roughness inside the blocks gives each
@@ -25,7 +25,8 @@ from math import exp, pi
 import numpy as np
 
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.uncertainty.block_fit import LARGEST, basis, combinations, inverse
+from psd_deflection.uncertainty.block_fit import LARGEST, basis, inverse
+from psd_deflection.uncertainty.combinations import combinations_of
 
 SEGMENT_BLOCKS = 50
 """Blocks of one segment: a second at 50 blocks a second."""
@@ -66,9 +67,9 @@ _PATIENCE = 3
 
 
 class StreamNoise:
-    """Autocovariance of the readings x1, y1, x2, y2, m; see the module's text.
+    """Autocovariance of the C readings x1, y1, x2, y2 ..., m; see the module's text.
 
-    ``gamma`` (4, 4, N): what to compute with, the converter's share included, m^2. ``measured``: whether
+    ``gamma`` (C, C, N): what to compute with, the converter's share included, m^2. ``measured``: whether
     it comes from the stream; until then it is the rig file's. ``at_rest``: whether the stream was ever
     seen at rest.
     """
@@ -80,17 +81,19 @@ class StreamNoise:
         beams: FloatArray,
         variances: FloatArray | float,
         steps: FloatArray | float,
+        slopes: FloatArray | None = None,
     ) -> None:
-        """``size``: N. ``centers``, ``beams`` (2, 2) m. Of each reading (4,), or of all: ``variances`` m^2 of a sample
-        by the rig file, ``steps`` m of the converter.
+        """``size``: N. ``centers``, ``beams`` (P, 2) m. Of each reading (C,), or of all: ``variances`` m^2 of a sample
+        by the rig file, ``steps`` m of the converter. ``slopes``: as :func:`combinations_of` takes them.
         """
         self._size = size
-        self._wanted = 4 + 16 * size
-        self._stated = np.broadcast_to(variances, (4,))
-        self._steps = np.broadcast_to(steps, (4,))
+        count = self._readings = 2 * len(centers)
+        self._wanted = 4 + count * count * size
+        self._stated = np.broadcast_to(variances, (count,))
+        self._steps = np.broadcast_to(steps, (count,))
         # Motion is judged with the largest.
         self._step = float(self._steps.max())
-        self.set_geometry(centers, beams)
+        self.set_geometry(centers, beams, slopes)
         self._mean_of = _mean_weights(size)
         self._q = basis(size)
         self._average: FloatArray | None = None
@@ -102,11 +105,10 @@ class StreamNoise:
         self._blocks: list[tuple[int, IntArray, FloatArray]] = []
         self.gamma = self._from_file()
 
-    def set_geometry(self, centers: FloatArray, beams: FloatArray) -> None:
+    def set_geometry(self, centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None) -> None:
         """Use these places, m, from now on."""
-        self._turn = combinations(beams)
-        self._apart = centers[0] - centers[1]
-        self._base_line = float(np.hypot(*(beams[0] - beams[1])))
+        self._combinations = combinations_of(centers, beams, slopes)
+        self._moving = self._combinations.turn[: self._combinations.moving]
 
     @property
     def measured(self) -> bool:
@@ -114,17 +116,17 @@ class StreamNoise:
         return self._seen >= STATED_SEGMENTS
 
     def sample_sd(self) -> FloatArray:
-        """Standard deviation (4,), m, of one sample."""
-        return np.asarray(np.sqrt(self.gamma[range(4), range(4), 0]))
+        """Standard deviation (C,), m, of one sample."""
+        return np.asarray(np.sqrt(self.gamma[range(self._readings), range(self._readings), 0]))
 
     def mean_sd(self) -> FloatArray:
-        """Standard deviation (4,), m, of the mean of a whole block."""
+        """Standard deviation (C,), m, of the mean of a whole block."""
         return np.asarray(np.sqrt(np.einsum('ccl,l->c', self.gamma, self._mean_of)))
 
     def add(self, index: int, slots: IntArray, dots: FloatArray) -> bool:
         """A block's samples; True where they ended a segment that changed ``gamma``.
 
-        ``index``: the block's number. ``slots`` (n,): which of its N samples are present. ``dots`` (n, 4), m.
+        ``index``: the block's number. ``slots`` (n,): which of its N samples are present. ``dots`` (n, C), m.
         """
         changed = False
         segment = index // SEGMENT_BLOCKS
@@ -151,12 +153,13 @@ class StreamNoise:
             raise ValueError(f'noise of {self._size} samples a block has {self._wanted} values, not {len(values)}')
         self._seen, self._count, self._louder = (int(v) for v in values[:3])
         self.at_rest = bool(values[3])
-        self._average = np.array(values[4:]).reshape(4, 4, self._size) if len(values) > 4 else None
+        self._average = np.array(values[4:]).reshape(self._readings, self._readings, -1) if len(values) > 4 else None
         self.gamma = self._in_use()
 
     def _from_file(self) -> FloatArray:
-        gamma = np.zeros((4, 4, self._size))
-        gamma[range(4), range(4), 0] = self._stated
+        count = self._readings
+        gamma = np.zeros((count, count, self._size))
+        gamma[range(count), range(count), 0] = self._stated
         return self._with_steps(gamma)
 
     def _in_use(self) -> FloatArray:
@@ -184,36 +187,36 @@ class StreamNoise:
         start = self._segment * SEGMENT_BLOCKS
         places = np.concatenate([(index - start) * size + slots for index, slots, _ in blocks])
         dots = np.concatenate([d for _, _, d in blocks])
-        apart = dots[:, :2] - dots[:, 2:] + self._apart
-        fixed = (np.hypot(apart[:, 0], apart[:, 1]) - self._base_line) * 0.5**0.5
-        series = np.column_stack((dots, fixed))
+        series = np.column_stack((dots, self._combinations.fixed(dots)))
         lags = _autocovariance(places, series, SEGMENT_BLOCKS * size, size)
         # Mean and slope of the segment were taken off, and with them 2 of its 50 blocks' variance.
         taken = np.einsum('cdl,l->cd', lags, self._mean_of)
         lags += (taken + taken.T)[:, :, None] / (SEGMENT_BLOCKS - 2)
         self._seen += 1
-        rough = _roughness(places, np.column_stack((np.einsum('sc,ac->sa', dots, self._turn[:3]), series)), self._q)
-        self._judge(lags[:4, :4], lags[4, 4], rough + (self._step**2 / 12.0 + _LEAST))
+        rough = _roughness(places, np.column_stack((np.einsum('sc,ac->sa', dots, self._moving), series)), self._q)
+        count = self._readings
+        self._judge(lags[:count, :count], lags[count, count], rough + (self._step**2 / 12.0 + _LEAST))
         self.gamma = self._in_use()
         return True
 
     def _judge(self, gamma: FloatArray, fixed: FloatArray, rough: FloatArray) -> None:
-        """``rough`` (8,): of three combinations, four readings and the one that does not move, m^2."""
-        turned = np.einsum('ac,cdl,ad->al', self._turn[:3], gamma, self._turn[:3])
+        """``rough``: of the combinations that move, the readings and the combination that does not, m^2."""
+        moving = self._moving
+        turned = np.einsum('ac,cdl,ad->al', moving, gamma, moving)
         least = self._step**2 / 12.0 + _LEAST
         means = turned @ self._mean_of + least / self._size
         fixed_mean = float(fixed @ self._mean_of) + least / self._size
-        fixed_rough = float(rough[7])
-        still = bool((means * fixed_rough <= _MOTION * rough[:3] * fixed_mean).all())
+        fixed_rough = float(rough[-1])
+        still = bool((means * fixed_rough <= _MOTION * rough[: len(moving)] * fixed_mean).all())
         if not self.at_rest:
             if still:
                 self._restart(gamma)
                 self.at_rest = True
             else:
-                self._into_average(_guess(fixed, rough[3:7] / fixed_rough))
+                self._into_average(_guess(fixed, rough[len(moving) : -1] / fixed_rough))
             return
         before = self._average if self._average is not None else gamma
-        known = np.einsum('ac,cdl,ad,l->a', self._turn[:3], before, self._turn[:3], self._mean_of) + least / self._size
+        known = np.einsum('ac,cdl,ad,l->a', moving, before, moving, self._mean_of) + least / self._size
         ratio = means / known
         if (ratio > _RISEN).any():
             self._louder = self._louder + 1 if still else 0
@@ -235,9 +238,10 @@ class StreamNoise:
 
 
 def _guess(fixed: FloatArray, size: FloatArray) -> FloatArray:
-    """In motion: each reading ``size`` (4,) times the combination that does not move, coloured like it."""
-    out = np.zeros((4, 4, len(fixed)))
-    out[range(4), range(4)] = fixed * size[:, None]
+    """In motion: each reading ``size`` (C,) times the combination that does not move, coloured like it."""
+    count = len(size)
+    out = np.zeros((count, count, len(fixed)))
+    out[range(count), range(count)] = fixed * size[:, None]
     return out
 
 

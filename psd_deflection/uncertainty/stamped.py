@@ -1,25 +1,100 @@
 """The dots of one block at its stamp and how sure they are: by the rule that the rig asks for.
 
 Joins what is measured of the noise (:mod:`psd_deflection.uncertainty.noise`), the fit through the block
-(:mod:`psd_deflection.uncertainty.block_fit`) and the check of the four readings against each other
-(:mod:`psd_deflection.uncertainty.consistency`), and tells what they remember.
+(:mod:`psd_deflection.uncertainty.block_fit`) and the check of the readings against each other
+(:mod:`psd_deflection.uncertainty.consistency`, of more than two PSDs :mod:`psd_deflection.uncertainty.redundancy`), and
+tells what they remember.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from psd_deflection.calibration import dot_noise_variances
 from psd_deflection.config import Rig
-from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.geometry.plate import Tilts, flat_points, flat_poses, reading_slopes
+from psd_deflection.records import FloatArray, IntArray, dot_names
 from psd_deflection.uncertainty.block_fit import BlockFit, Fitted
-from psd_deflection.uncertainty.consistency import LIMIT, NAMES, UNMEASURED, Checked, Consistency, Suspect
+from psd_deflection.uncertainty.consistency import LIMIT, UNMEASURED, Checked, Consistency, Suspect
 from psd_deflection.uncertainty.noise import StreamNoise
+from psd_deflection.uncertainty.redundancy import Redundancy
 
 NOISE, FIT, HELD_RESIDUAL = 'state.noise', 'state.block_fit', 'state.residual'
-"""Names under which :meth:`StampedDots.memory` tells what is remembered."""
+REDUNDANCY, SOME = 'state.redundancy', 'state.psds.'
+"""Names under which :meth:`StampedDots.memory` tells what is remembered; ``SOME`` goes on with the
+PSDs (from 0) that are kept."""
+
+
+class PlateModel:
+    """Where the beams of some PSDs meet the plate, as far as a method knows. ``beams`` (P, 2), m."""
+
+    def __init__(self, rig: Rig, kept: Sequence[int], tilts: Tilts) -> None:
+        """``kept``: PSDs (from 0). ``tilts``: what the method says of the plate's tilts."""
+        at = list(kept)
+        self._centers, self._heights = rig.centers[at], rig.heights[at]
+        self.beams = self._centers + rig.zeros[at]
+        self._tilts: Tilts = tilts
+        self._link = rig.link.slope_ratio, rig.link.length
+
+    def slopes_at(self, pose: Sequence[float]) -> FloatArray:
+        """How the readings go with what is solved for (C, unknowns) at ``pose``: dX, dY m, theta, phi, omega rad."""
+        return reading_slopes(self.beams, self._heights, np.array(pose), self._tilts, *self._link)
+
+    def residual(self, dots: tuple[float, ...], residual: tuple[float, ...]) -> tuple[float, ...]:
+        """What a pose near the best leaves of ``dots`` (C,), m; ``residual``: what the method leaves.
+
+        A method for small angles leaves its own error besides: of a flat plate it is computed anew.
+        """
+        if self._tilts != 'none':
+            return residual
+        points = self._centers + np.reshape(dots, (-1, 2))
+        left = points - flat_points(flat_poses(points, self.beams), self.beams)
+        return tuple(left.ravel().tolist())
+
+
+class SomePsds:
+    """The fit and the check of some of a rig's PSDs, while the others cannot be believed.
+
+    ``columns``: of their readings among all.
+    """
+
+    def __init__(self, rig: Rig, kept: Sequence[int], tilts: Tilts, poly: bool) -> None:
+        """``kept``: PSDs (from 0), two or more. ``tilts``: what the method says that solves them."""
+        at = list(kept)
+        self.columns = [2 * psd + axis for psd in at for axis in (0, 1)]
+        self._model = PlateModel(rig, at, tilts)
+        rest = self._model.slopes_at((0.0,) * 5)
+        self.fit = BlockFit(rig.estimator.block_size, rig.centers[at], self._model.beams, poly, rest)
+        self._redundancy = Redundancy(len(at), rest.shape[1])
+
+    def set_noise(self, gamma: FloatArray) -> None:
+        """Use their part of the autocovariance of all readings."""
+        self.fit.set_noise(gamma[np.ix_(self.columns, self.columns)])
+
+    def check(
+        self,
+        dots: tuple[float, ...],
+        residual: tuple[float, ...],
+        covariance: FloatArray,
+        pose: Sequence[float],
+        times: float,
+    ) -> Checked:
+        """As :meth:`StampedDots.check`; ``times``: as :meth:`Redundancy.check`."""
+        slopes = self._model.slopes_at(pose)
+        return self._redundancy.check(self._model.residual(dots, residual), slopes, covariance, times)
+
+    def state(self) -> tuple[float, ...]:
+        """What :meth:`set_state` needs to go on from here."""
+        check = self._redundancy.state()
+        return (float(len(check)), *check, *self.fit.state())
+
+    def set_state(self, values: tuple[float, ...]) -> None:
+        """Go on from :meth:`state` of another one. Raises ValueError if it was of other PSDs or another block size."""
+        head = 1 + int(values[0])
+        self._redundancy.set_state(values[1:head])
+        self.fit.set_state(values[head:])
 
 
 class StampedDots:
@@ -27,11 +102,15 @@ class StampedDots:
 
     ``active``: whether it says more than the mean of the samples and the rig file's noise. ``contradictions``: blocks
     whose readings contradict each other. ``misfits``: blocks with motion that the fit cannot follow. ``chi_square``:
-    of the last block's readings.
+    of the last block's readings, of ``freedom`` degrees. ``left_out``: PSDs (from 1) without which the last block was
+    solved.
     """
 
-    def __init__(self, rig: Rig, flat: bool = True) -> None:
-        """``flat``: the PSDs are on the plate, and the base line between the dots keeps its length."""
+    def __init__(self, rig: Rig, flat: bool = True, tilts: Tilts = 'none') -> None:
+        """``flat``: the PSDs are on the plate, and the base line between the dots keeps its length.
+
+        ``tilts``: what the rig's solver says of the plate's tilts; it counts for more than two PSDs.
+        """
         config = rig.estimator
         self.flat = flat
         poly = config.block_fit == 'poly'
@@ -41,63 +120,122 @@ class StampedDots:
         self._beams = rig.centers + rig.zeros
         variances = dot_noise_variances(rig)
         steps = rig.converter.volts_per_count * rig.sensitivities.ravel()
-        self.noise = StreamNoise(config.block_size, rig.centers, self._beams, variances, steps)
+        self._tilts: Tilts = tilts
+        self._poly = poly
+        self._all: PlateModel | None = None
+        slopes = self._rest_slopes(rig)
+        self.noise = StreamNoise(config.block_size, rig.centers, self._beams, variances, steps, slopes)
         self._stated_sd = np.sqrt(variances)
-        self._fit = BlockFit(config.block_size, rig.centers, self._beams, poly)
+        self._fit = BlockFit(config.block_size, rig.centers, self._beams, poly, slopes)
         self._fit.set_noise(self.noise.gamma)
         self._consistency = Consistency()
         self._suspect = Suspect(rig.centers, self._beams)
+        self._redundancy = None if slopes is None else Redundancy(len(rig.psds), slopes.shape[1])
+        self._some: dict[tuple[int, ...], SomePsds] = {}
+        self._told: dict[tuple[int, ...], tuple[float, ...]] = {}
+        self.left_out: tuple[int, ...] = ()
+        self.freedom = 1
+        self._rig = rig
         self._size = config.block_size
         self.contradictions = 0
         self.chi_square = 0.0
         self.misfits = 0
-        (x1, y1), (x2, y2) = rig.centers.tolist()
+        (x1, y1), (x2, y2) = rig.centers[:2].tolist()
         self._apart = (x1 - x2, y1 - y2)
 
     def set_zeros(self, rig: Rig) -> None:
         """Take the rig's zeros from now on."""
+        self._rig = rig
         self._beams = rig.centers + rig.zeros
-        self.noise.set_geometry(rig.centers, self._beams)
-        self._fit.set_geometry(rig.centers, self._beams)
+        slopes = self._rest_slopes(rig)
+        self.noise.set_geometry(rig.centers, self._beams, slopes)
+        self._fit.set_geometry(rig.centers, self._beams, slopes)
         self._fit.set_noise(self.noise.gamma)
         self._suspect = Suspect(rig.centers, self._beams)
         self._consistency = Consistency()
+        if slopes is not None:
+            self._redundancy = Redundancy(len(rig.psds), slopes.shape[1])
+            self._some, self._told = {}, {}
+
+    def _rest_slopes(self, rig: Rig) -> FloatArray | None:
+        """Of more than two PSDs how the readings go with what is solved for, at rest."""
+        if len(rig.psds) == 2:
+            return None
+        self._all = PlateModel(rig, range(len(rig.psds)), self._tilts)
+        return self._all.slopes_at((0.0,) * 5)
+
+    def some(self, kept: tuple[int, ...], tilts: Tilts) -> SomePsds:
+        """The fit and the check of the PSDs ``kept`` (from 0), two or more; ``tilts``: as of :class:`SomePsds`."""
+        found = self._some.get(kept)
+        if found is None:
+            found = self._some[kept] = SomePsds(self._rig, kept, tilts, self._poly)
+            found.set_noise(self.noise.gamma)
+            if kept in self._told:
+                found.set_state(self._told.pop(kept))
+        return found
+
+    def fit_some(self, some: SomePsds, slots: IntArray, samples: FloatArray) -> Fitted:
+        """The dots of some PSDs at the middle of a block; ``samples`` (n, C) m of all."""
+        fitted = some.fit.fit(slots, samples[:, some.columns])
+        self.misfits += fitted.misfit
+        return fitted
 
     def fit(self, slots: IntArray, samples: FloatArray) -> Fitted:
-        """The dots at the middle of a block. ``slots`` (n,): which samples are present; ``samples`` (n, 4), m."""
+        """The dots at the middle of a block. ``slots`` (n,): which samples are present; ``samples`` (n, C), m."""
         fitted = self._fit.fit(slots, samples)
         self.misfits += fitted.misfit
         return fitted
 
     def mean_variances(self, present: int) -> tuple[float, ...]:
-        """Variance (4,), m^2, of the mean of that many samples of each reading."""
+        """Variance (C,), m^2, of the mean of that many samples of each reading."""
         more = self._size / present
         return tuple(more * sd * sd for sd in self.noise.mean_sd().tolist())
 
-    def check(self, dots: tuple[float, ...], residual: tuple[float, ...], covariance: FloatArray) -> Checked:
-        """Hold the four readings of a block against each other."""
-        x1, y1, x2, y2 = dots
-        ax, ay = self._apart
+    def check(
+        self,
+        dots: tuple[float, ...],
+        residual: tuple[float, ...],
+        covariance: FloatArray,
+        pose: Sequence[float] = (),
+        some: SomePsds | None = None,
+    ) -> Checked:
+        """Hold the readings of a block against each other; ``pose``: dX, dY m, theta, phi, omega rad.
+
+        ``some``: it is theirs. :attr:`Checked.wrong` counts among those that are checked.
+        """
         sure = self.noise.measured or not self._measures
-        limit = LIMIT if sure else UNMEASURED * LIMIT
-        checked = self._consistency.check((ax + x1 - x2, ay + y1 - y2), residual, covariance, limit=limit)
+        times = 1.0 if sure else UNMEASURED
+        if some is not None:
+            checked = some.check(dots, residual, covariance, pose, times)
+        elif self._redundancy is not None and self._all is not None:
+            slopes = self._all.slopes_at(pose)
+            checked = self._redundancy.check(self._all.residual(dots, residual), slopes, covariance, times)
+        else:
+            x1, y1, x2, y2 = dots
+            ax, ay = self._apart
+            checked = self._consistency.check((ax + x1 - x2, ay + y1 - y2), residual, covariance, limit=times * LIMIT)
         self.contradictions += checked.contradict
-        self.chi_square = checked.chi_square
+        self.chi_square, self.freedom = checked.chi_square, checked.freedom
         return checked
 
     def learn(self, index: int, slots: IntArray, samples: FloatArray) -> None:
         """Take a good block into what is known of the noise. Nothing of this block's estimate waits for it."""
         if self._measures and self.noise.add(index, slots, samples):
             self._fit.set_noise(self.noise.gamma)
+            for some in self._some.values():
+                some.set_noise(self.noise.gamma)
 
     def suspect(self, index: int, dots: tuple[float, ...], checked: Checked) -> None:
         """Take a block into the search for a wrong reading: each that contradicts itself, of the others some."""
-        if checked.contradict or index % 10 == 0:
+        if len(dots) == 4 and (checked.contradict or index % 10 == 0):
             self._suspect.add(dots, checked.errors)
 
     def most_likely_wrong(self) -> str:
         """The reading that is most likely wrong and what is wrong with it, or '' if it cannot be told."""
-        return self._suspect.most_likely(float(self.noise.mean_sd().max()))
+        if self._redundancy is None:
+            return self._suspect.most_likely(float(self.noise.mean_sd().max()))
+        names = ' and '.join(f'psd_{psd}' for psd in self.left_out)
+        return f'{names} does not fit the others and is left out' if names else ''
 
     def noise_source(self) -> str:
         """Where the noise that covariances use comes from, in words."""
@@ -108,17 +246,22 @@ class StampedDots:
     def words(self) -> tuple[tuple[str, str], ...]:
         """For /diagnostics: the check of the readings, and the noise against the rig file's."""
         return (
-            ('chi-square of the readings', f'{self.chi_square:.2f}'),
+            ('chi-square of the readings', f'{self.chi_square:.2f}' + self._of_freedom()),
             ('blocks whose readings contradict each other', str(self.contradictions)),
             ('blocks with motion that the fit cannot follow', str(self.misfits)),
             ('covariance from', f'noise {self.noise_source()}' if self._measures else 'noise of the rig file'),
             *(self.noise_words() if self._measures else ()),
         )
 
+    def _of_freedom(self) -> str:
+        """With two PSDs it is always one degree."""
+        return '' if self._redundancy is None else f' of {self.freedom} degrees of freedom'
+
     def noise_words(self) -> tuple[tuple[str, str], ...]:
         """Of each reading, the noise of a sample and of a block's mean against the rig file's, um."""
         stated = self._stated_sd * 1e6
-        rows = zip(NAMES, self.noise.sample_sd(), self.noise.mean_sd(), stated, stated / self._size**0.5, strict=True)
+        names = dot_names(len(stated) // 2)
+        rows = zip(names, self.noise.sample_sd(), self.noise.mean_sd(), stated, stated / self._size**0.5, strict=True)
         return tuple(
             (
                 f'noise of {name} (um)',
@@ -137,6 +280,10 @@ class StampedDots:
             out[FIT] = self._fit.state()
         if self._consistency.held > 0.0:
             out[HELD_RESIDUAL] = (self._consistency.held,)
+        if self._redundancy is not None and any(state := self._redundancy.state()):
+            out[REDUNDANCY] = state
+        for kept, state in {**self._told, **{kept: some.state() for kept, some in self._some.items()}}.items():
+            out[SOME + '_'.join(map(str, kept))] = state
         return out
 
     def restore(self, values: Mapping[str, tuple[float, ...]]) -> None:
@@ -148,3 +295,10 @@ class StampedDots:
             self._fit.set_state(values[FIT])
         if HELD_RESIDUAL in values:
             (self._consistency.held,) = values[HELD_RESIDUAL]
+        if REDUNDANCY in values and self._redundancy is not None:
+            self._redundancy.set_state(values[REDUNDANCY])
+        for name, state in values.items():
+            if name.startswith(SOME):
+                kept = tuple(map(int, name.removeprefix(SOME).split('_')))
+                self._told[kept] = state
+                self._some.pop(kept, None)

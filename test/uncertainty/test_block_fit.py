@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.uncertainty.block_fit import BlockFit, basis, combinations, inverse
+from psd_deflection.uncertainty.block_fit import BlockFit, basis, inverse
+from psd_deflection.uncertainty.combinations import combinations
 
 PLACES = np.array([[0.0, 0.070], [-0.100, 0.0]])
 SIGMA = 1e-6

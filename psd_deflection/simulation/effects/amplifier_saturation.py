@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtr
 
-from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.records import FloatArray, dot_channels
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
 from psd_deflection.simulation.samples import SimulatedSamples
 
@@ -23,7 +23,7 @@ def _excess(v: FloatArray, sigma: float) -> FloatArray:
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
-    rows = range(6) if values['sums'] else DOT_CHANNELS
+    rows = range(len(samples.volts)) if values['sums'] else dot_channels(len(samples.volts) // 3)
     for row in rows:
         v, noise = samples.volts[row], float(samples.noise[row])
         samples.volts[row] = v - _excess(v - values['limit'], noise) + _excess(-v - values['limit'], noise)

@@ -1,0 +1,82 @@
+"""Methods for some of a rig's PSDs, while the others cannot be believed.
+
+A method takes what is left as it would take a rig that has no more. ``pose`` needs three PSDs at different heights to
+see the tilts; from fewer it cannot. Then the tilts are taken from the deflection, phi = -k dY/L and omega = +k dX/L as in
+``beam``, but how much the plate tilts is not known: k is somewhere between 0 (a plate that stays parallel) and
+``link.slope_ratio``. The answer is that of the middle, and its covariance allows for either end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from psd_deflection.config import Rig
+from psd_deflection.errors import SolverError
+from psd_deflection.geometry.layout import Geometry
+from psd_deflection.geometry.plate import Tilts
+from psd_deflection.records import FloatArray
+from psd_deflection.solvers.beam import BeamSolver
+from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.solvers.registry import make_solver, solver_class
+
+
+class PoseOfFew(Solver):
+    """``pose`` from PSDs that do not see the tilts; see the module's text."""
+
+    name: ClassVar[str] = 'pose'
+    budgeted_as: ClassVar[str] = ''
+    tilts: ClassVar[Tilts] = 'tied'
+
+    def __init__(self, geometry: Geometry) -> None:
+        """Bind to ``geometry``. Raises SolverError as :class:`BeamSolver`."""
+        half = geometry.slope_ratio / 2.0
+        self._middle = BeamSolver(replace(geometry, slope_ratio=half))
+        self._end = BeamSolver(geometry)
+
+    def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
+        """One block. See :class:`Solver`."""
+        found, end = self._middle.solve(dots, variances), self._end.solve(dots, variances)
+        if end.status is not SolverStatus.OK:
+            return end
+        unknown = self.unknown(found, end)
+        covariance = np.array(found.covariance).reshape(3, 3) + np.einsum('i,j->ij', unknown, unknown)
+        return found._replace(covariance=tuple(covariance.ravel().tolist()))
+
+    @staticmethod
+    def unknown(middle: Solution, end: Solution) -> FloatArray:
+        """(3,): m, m, rad, by which the answer goes from the middle to an end of what k may be."""
+        return np.array([b - a for a, b in zip(middle[:3], end[:3], strict=True)])
+
+    def allowance(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> FloatArray:
+        """That of the unknown tilt. See :class:`Solver`."""
+        unknown = self.unknown(self._middle.solve(dots, variances), self._end.solve(dots, variances))
+        return np.asarray(np.einsum('i,j->ij', unknown, unknown))
+
+    def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
+        """That of the middle. See :class:`Solver`."""
+        return self._middle.gain(dots, variances, self._middle.solve(dots, variances))
+
+
+def geometry_of(rig: Rig, kept: Sequence[int]) -> Geometry:
+    """The geometry of the PSDs ``kept`` (from 0)."""
+    whole = Geometry.from_rig(rig)
+    at = list(kept)
+    return replace(whole, centers=whole.centers[at], zeros=whole.zeros[at], heights=whole.heights[at])
+
+
+def solver_of_some(name: str, rig: Rig, kept: Sequence[int]) -> Solver | None:
+    """The method ``name`` for the PSDs ``kept`` (from 0) of the rig, with the rig's options; None if it takes no such."""
+    geometry = geometry_of(rig, kept)
+    try:
+        return make_solver(name, geometry, **solver_class(name).options_from_rig(rig))
+    except SolverError:
+        if solver_class(name).tilts != 'free':
+            return None
+    try:
+        return PoseOfFew(geometry)
+    except SolverError:
+        return None

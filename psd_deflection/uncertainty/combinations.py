@@ -1,0 +1,136 @@
+"""Orthogonal combinations of the readings: those that move with the link first, then those that do not.
+
+Of two PSDs: x and y of the plate's middle, its twist, and the length of the base line, exactly, which does not move
+while the plate stays flat. Of more PSDs: the directions in which the solver's unknowns move the dots at rest, and those
+across them, of which the link moves the dots only to second order.
+"""
+
+from __future__ import annotations
+
+import abc
+
+import numpy as np
+
+from psd_deflection.geometry.linear import design_matrix
+from psd_deflection.records import FloatArray
+
+
+class Combinations(abc.ABC):
+    """``turn`` (C, C): one combination of the C readings a row. ``moving``: how many of them move with the link."""
+
+    turn: FloatArray
+    moving: int
+
+    @abc.abstractmethod
+    def of(self, dots: FloatArray) -> FloatArray:
+        """The combinations (C, n) of ``dots`` (n, C), m."""
+
+    @abc.abstractmethod
+    def back(self, value: list[float], covariance: FloatArray) -> tuple[tuple[float, ...], FloatArray]:
+        """Dots (C,) m and their covariance (C, C) m^2 from those of the combinations."""
+
+    @abc.abstractmethod
+    def fixed(self, dots: FloatArray) -> FloatArray:
+        """One combination (n,) of ``dots`` (n, C), m, that does not move."""
+
+
+class _BaseLine(Combinations):
+    """Of two PSDs."""
+
+    moving = 3
+
+    def __init__(self, centers: FloatArray, beams: FloatArray) -> None:
+        self.turn = combinations(beams)
+        self._columns = [tuple(column) for column in self.turn.T.tolist()]
+        apart = self._apart = centers[0] - centers[1]
+        self._across, self._along = (float(np.einsum('i,i->', row[:2], apart)) for row in (self.turn[2], self.turn[3]))
+        self._beams_apart = float(np.hypot(*(beams[0] - beams[1])))
+        self._base_line = self._beams_apart * 0.5**0.5
+
+    def of(self, dots: FloatArray) -> FloatArray:
+        """See :class:`Combinations`."""
+        z = np.einsum('ac,sc->as', self.turn, dots)
+        # The length itself, not its first order: a twist by 1 degree would move that by 13 um.
+        z[3] = np.hypot(z[3] + self._along, z[2] + self._across) - self._base_line
+        return np.asarray(z)
+
+    def back(self, value: list[float], covariance: FloatArray) -> tuple[tuple[float, ...], FloatArray]:
+        """See :class:`Combinations`."""
+        # From the length to the part along the base line at rest.
+        x, y, twist, length = value[0], value[1], value[2], value[3] + self._base_line
+        across = twist + self._across
+        along = max(length * length - across * across, 1e-4 * length * length) ** 0.5
+        back = self.turn.copy()
+        back[2] -= (across / along) * back[3]
+        back[3] *= length / along
+        longer = along - self._along
+        dots = tuple([x * p + y * q + twist * r + longer * s for p, q, r, s in self._columns])
+        return dots, np.einsum('ac,ab,bd->cd', back, covariance, back)
+
+    def fixed(self, dots: FloatArray) -> FloatArray:
+        """See :class:`Combinations`."""
+        apart = dots[:, :2] - dots[:, 2:] + self._apart
+        return np.asarray((np.hypot(apart[:, 0], apart[:, 1]) - self._beams_apart) * 0.5**0.5)
+
+
+class _Several(Combinations):
+    """Of more PSDs."""
+
+    def __init__(self, slopes: FloatArray) -> None:
+        """``slopes`` (C, unknowns): how each reading goes with each unknown at rest."""
+        self.turn = _completed(slopes)
+        self.moving = slopes.shape[1]
+
+    def of(self, dots: FloatArray) -> FloatArray:
+        """See :class:`Combinations`."""
+        return np.asarray(np.einsum('ac,sc->as', self.turn, dots))
+
+    def back(self, value: list[float], covariance: FloatArray) -> tuple[tuple[float, ...], FloatArray]:
+        """See :class:`Combinations`."""
+        dots = np.einsum('ac,a->c', self.turn, np.array(value))
+        return tuple(dots.tolist()), np.einsum('ac,ab,bd->cd', self.turn, covariance, self.turn)
+
+    def fixed(self, dots: FloatArray) -> FloatArray:
+        """See :class:`Combinations`."""
+        return np.asarray(np.einsum('c,sc->s', self.turn[self.moving], dots))
+
+
+def combinations_of(centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None) -> Combinations:
+    """Of the PSDs at ``centers`` (P, 2) m under ``beams`` (P, 2) m.
+
+    ``slopes`` (2P, unknowns): how the readings of more than two PSDs go with what is solved for, at rest; None: with
+    the motion of a flat plate.
+    """
+    if len(centers) == 2:
+        return _BaseLine(centers, beams)
+    return _Several(design_matrix(beams) if slopes is None else slopes)
+
+
+def combinations(beams: FloatArray) -> FloatArray:
+    """Orthogonal (4, 4): x and y of the middle, twist, base line, each of (x1, y1, x2, y2). ``beams`` (2, 2), m."""
+    along = (beams[0] - beams[1]) / np.hypot(*(beams[0] - beams[1]))
+    x, y = float(along[0]), float(along[1])
+    rows = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0], [-y, x, y, -x], [x, y, -x, -y]])
+    return np.asarray(rows * 0.5**0.5)
+
+
+def _completed(slopes: FloatArray) -> FloatArray:
+    """Orthogonal (C, C) whose first rows span the columns of ``slopes`` (C, k), of full rank."""
+    count = len(slopes)
+    rows: list[FloatArray] = []
+    for candidate in (*slopes.T, *np.eye(count)):
+        row = candidate / np.sqrt((candidate * candidate).sum())
+        # Twice: once leaves rounding that shows.
+        for _ in range(2):
+            for before in rows:
+                row = row - (before * row).sum() * before
+        left = float((row * row).sum()) ** 0.5
+        # Of the unit vectors, those that the rows so far span are left out.
+        if len(rows) < slopes.shape[1] or left > _SPANNED:
+            rows.append(row / left)
+        if len(rows) == count:
+            break
+    return np.stack(rows)
+
+
+_SPANNED = 1e-6

@@ -1,0 +1,148 @@
+"""The readings too many of three and more PSDs: whether all belong to one pose, and which PSD does not.
+
+With residual r of the readings, their covariance C and slopes J by the p unknowns, what no pose explains has
+
+    chi-square = r^T Q r,     Q = W - W J (J^T W J)^-1 J^T W,     W = C^-1,
+
+of 2P - p degrees of freedom (generalised least squares; Q J = 0, so r may come from any solver). If PSD i alone is
+wrong, it is wrong by e_i = Q_ii^-1 (Q r)_i, and without it chi-square falls by e_i^T (Q r)_i and loses two degrees of
+freedom (Baarda's data snooping, by pairs). A PSD is wrong if the readings contradict each other with it and agree
+without it, and no other PSD could be blamed. It is then left out for a second: while the link rings, its readings may be
+right for a block. If several PSDs could be blamed, or none alone, the covariance is widened by what each would cause.
+One degree of freedom (``pose`` with three PSDs) tells no PSD from another: then each reading could be blamed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from psd_deflection.records import FloatArray
+from psd_deflection.uncertainty.block_fit import inverse
+from psd_deflection.uncertainty.consistency import Checked
+
+CONTRADICTS, DOUBTFUL = 7.7442e-6, 0.01
+"""Shares of sound blocks that are taken for contradictory, and for doubtful: those of two PSDs (``consistency``)."""
+
+HOLD = 50
+"""Blocks for which a wrong PSD is left out after its last contradiction: a second at 50 blocks a second."""
+
+_MORE = 1.5
+"""Times the error of one PSD alone, as for two PSDs."""
+
+_FADE = 0.98
+"""What is left of a held square after a block."""
+
+_UNSEEN = 4e-4
+"""A reading of which a smaller share shows in what is redundant cannot be checked."""
+
+
+class Redundancy:
+    """Checks the readings of block after block. It remembers who was wrong lately, and by how much."""
+
+    def __init__(self, psds: int, unknowns: int) -> None:
+        """``psds``: P. ``unknowns``: p; with as many readings or fewer nothing is redundant."""
+        self._psds = psds
+        self.freedom = max(2 * psds - unknowns, 0)
+        # Imported here: it takes a fifth of a second, and few rigs have more than two PSDs.
+        from scipy.special import chdtri
+
+        self._limit, self._less_limit = (
+            float(chdtri(f, CONTRADICTS)) if f > 0 else 0.0 for f in (self.freedom, self.freedom - 2)
+        )
+        self._doubtful, self._less_doubtful = (
+            float(chdtri(f, DOUBTFUL)) if f > 0 else 0.0 for f in (self.freedom, self.freedom - 2)
+        )
+        self._wrong = 0
+        self._left = 0
+        self._held = np.zeros(2 * psds)
+
+    def check(self, residual: tuple[float, ...], slopes: FloatArray, covariance: FloatArray, times: float) -> Checked:
+        """Check one block: ``residual`` (2P,) m, ``slopes`` (2P, p), ``covariance`` (2P, 2P) m^2.
+
+        ``times``: by how much more chi-square may be, while the noise is not known. :attr:`Checked.wrong` is the PSD
+        to leave out; ``chi_square`` and ``freedom`` are then those of the others.
+        """
+        none = (0.0,) * len(residual)
+        if not self.freedom:
+            return Checked(0.0, False, none, none, 0, 0)
+        q = _unexplained(slopes, covariance)
+        r = np.array(residual)
+        pull = np.einsum('ij,j->i', q, r)
+        chi_square = max(float((r * pull).sum()), 0.0)
+        errors, rest = self._blamed(q, pull, chi_square)
+        contradict = chi_square > times * self._limit
+        if contradict:
+            suspects = [psd for psd, left in enumerate(rest, start=1) if left <= times * self._less_limit]
+            if self._wrong not in suspects:
+                self._wrong = suspects[0] if len(suspects) == 1 else 0
+            self._left = HOLD if self._wrong else 0
+        elif self._wrong:
+            self._left -= 1
+            agree = rest[self._wrong - 1] <= times * self._less_limit
+            self._wrong = self._wrong if self._left > 0 and agree else 0
+        possible = self._possible(q, errors, rest, chi_square, contradict and not self._wrong, times)
+        if self._wrong:
+            one = self._wrong
+            return Checked(max(rest[one - 1], 0.0), True, tuple(errors), none, one, self.freedom - 2)
+        held = bool(self._held.any())
+        return Checked(chi_square, contradict or held, tuple(errors), tuple(possible.tolist()), 0, self.freedom)
+
+    def _blamed(self, q: FloatArray, pull: FloatArray, chi_square: float) -> tuple[list[float], list[float]]:
+        """The error (2P,) m of each PSD if it alone is wrong, or of each reading; chi-square without each PSD."""
+        errors = [0.0] * len(pull)
+        rest = [np.inf] * self._psds
+        if self.freedom < 3:
+            for i, (own, p) in enumerate(zip(np.diag(q).tolist(), pull.tolist(), strict=True)):
+                errors[i] = p / own if own > _UNSEEN * float(q.max()) else 0.0
+            return errors, rest
+        for psd in range(self._psds):
+            (a, b), (_, d) = q[2 * psd : 2 * psd + 2, 2 * psd : 2 * psd + 2].tolist()
+            u, v = pull[2 * psd], pull[2 * psd + 1]
+            determinant = a * d - b * b
+            if determinant > _UNSEEN * a * d:
+                x, y = (d * u - b * v) / determinant, (a * v - b * u) / determinant
+            else:
+                # It is seen in one direction only.
+                x, y = u / (a + d), v / (a + d)
+            errors[2 * psd : 2 * psd + 2] = [float(x), float(y)]
+            rest[psd] = chi_square - float(x * u + y * v)
+        return errors, rest
+
+    def _possible(
+        self, q: FloatArray, errors: list[float], rest: list[float], chi_square: float, hold: bool, times: float
+    ) -> FloatArray:
+        """What the covariance is to allow for, (2P,) m: errors of this block or held ones; ``hold``: keep them."""
+        squares = np.zeros(len(errors))
+        if hold or chi_square > times * self._doubtful:
+            limit = times * (self._less_limit if hold else self._less_doubtful)
+            blamed = [left <= limit for left in rest]
+            if not any(blamed):
+                blamed = [True] * self._psds
+            squares = np.repeat(blamed, 2) * np.square(errors)
+        self._held = np.maximum(_FADE * self._held, squares if hold else 0.0)
+        if self._wrong or not (self._held * np.diag(q) > times * self._limit).any():
+            self._held = np.zeros(len(errors))
+        # Both readings of a PSD may be wrong together: the sum of two outer products is at least half of theirs.
+        together = 2.0 if self.freedom >= 3 else 1.0
+        return np.asarray(_MORE * np.sqrt(together * np.maximum(squares, self._held)))
+
+    def state(self) -> tuple[float, ...]:
+        """What :meth:`set_state` needs to go on from here."""
+        return (float(self._wrong), float(self._left), *self._held.tolist())
+
+    def set_state(self, values: tuple[float, ...]) -> None:
+        """Go on from :meth:`state` of another one. Raises ValueError if it is of another number of PSDs."""
+        wrong, left, *held = values
+        if len(held) != 2 * self._psds or not 0 <= wrong <= self._psds:
+            raise ValueError(f'the check of {self._psds} PSDs has {2 + 2 * self._psds} values, not {len(values)}')
+        self._wrong, self._left, self._held = int(wrong), int(left), np.array(held)
+
+
+def _unexplained(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Q (2P, 2P) of the module's text, 1/m^2."""
+    weights = inverse(covariance[None])[0]
+    # Each unknown in its own unit, so that the elimination sees numbers of one size.
+    scaled = slopes / np.sqrt((slopes * slopes).sum(axis=0))
+    seen = np.einsum('ij,jk->ik', weights, scaled)
+    normal = inverse(np.einsum('ji,jk->ik', scaled, seen)[None])[0]
+    return np.asarray(weights - np.einsum('ia,ab,jb->ij', seen, normal, seen))
