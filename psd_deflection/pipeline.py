@@ -98,8 +98,9 @@ class _Readings(NamedTuple):
     """What a block is solved from.
 
     ``dots`` (C,) m; ``variances`` (C,) m^2; ``spread`` (C, C) m^2 of the dots, None if ``variances`` are all of it.
-    ``kept``: the PSDs (from 0) that they are of, with their fit and check ``some``; None: all. ``checked``: the check of
-    the readings. ``factor``: what the calibration's uncertainty makes of the dots. ``wrong``: PSD (from 1) that contradicts them.
+    ``kept``: the PSDs (from 0) that they are of, with their fit and check ``some``; None: all. ``checked``: the check
+    of the readings. ``factor``: what the calibration's uncertainty makes of the dots. ``wrong``: the PSD (from 1) that
+    contradicts them.
     """
 
     dots: Dots

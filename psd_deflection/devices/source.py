@@ -99,8 +99,8 @@ class Source(abc.ABC):
         """Open the device, wait for its description at most ``timeout`` s, and return it as a HELLO.
 
         The HELLO has ``serial``, ``firmware``, ``sample_rate_hz``, ``channels``,
-        ``volts_per_count`` (a number, or None if :attr:`volts`) and, if there are more than two, ``psds``. The reader compares it with the rig,
-        and it is recorded. Raises DeviceError that says what to do; then nothing is left open.
+        ``volts_per_count`` (a number, or None if :attr:`volts`) and, if there are more than two, ``psds``.
+        The reader compares it with the rig, and it is recorded. Raises DeviceError that says what to do; then nothing is left open.
         """
 
     @abc.abstractmethod

@@ -216,7 +216,7 @@ Tilts = Literal['none', 'tied', 'free']
 def reading_slopes(
     beams: FloatArray, heights: FloatArray, pose: FloatArray, tilts: Tilts, slope_ratio: float, link_length: float
 ) -> FloatArray:
-    """How the dots (2P,) go with the unknowns at ``pose`` (5,): (2P, 3), or (2P, 5) if the tilts are free; m/m, m/rad."""
+    """How the dots go with the unknowns at ``pose`` (5,): (2P, 3), (2P, 5) if the tilts are free; m/m and m/rad."""
     if tilts == 'none':
         heights, pose = np.zeros(len(beams)), np.array([*pose[:3], 0.0, 0.0])
     jacobian = crossings(pose, beams, heights)[1].reshape(-1, 5)

@@ -3,7 +3,8 @@
 Theory of operation. A line is ``seq,t_us,x1,y1,sum1,x2,y2,sum2`` and a newline (a carriage return
 before it is ignored): ``seq`` and ``t_us`` whole numbers modulo 2^32, the six readings decimal. A device with more
 PSDs sends three readings of each further one. Where the electrodes themselves are converted, four readings of each
-PSD take their place. A line that begins with ``#`` describes the device: a JSON object with ``sample_rate_hz`` and, if the
+PSD take their place. A line that begins with ``#`` describes the device: a JSON object with ``sample_rate_hz``,
+``psds`` if there are more than two, and, if the
 readings are converter counts, ``volts_per_count``. Without ``volts_per_count`` the readings are
 volts. The device sends this line at power-up and once a second.
 

@@ -68,8 +68,8 @@ class HelloGate:
         psds, wanted_psds = psds_of(info), len(self._rig.psds)
         if type(psds) is not int or psds != wanted_psds:
             raise DeviceError(
-                f'{port}: HELLO has psds {psds!r}, the rig file has {wanted_psds} PSDs; describe each PSD of the device '
-                '(psd_N.center)'
+                f'{port}: HELLO has psds {psds!r}, the rig file has {wanted_psds} PSDs; describe each PSD of the '
+                'device (psd_N.center)'
             )
         channels, needed = info.get('channels'), list(channel_names(wanted_psds))
         if channels != needed:

@@ -1,8 +1,8 @@
 """Methods for some of a rig's PSDs, while the others cannot be believed.
 
 A method takes what is left as it would take a rig that has no more. ``pose`` needs three PSDs at different heights to
-see the tilts; from fewer it cannot. Then the tilts are taken from the deflection, phi = -k dY/L and omega = +k dX/L as in
-``beam``, but how much the plate tilts is not known: k is somewhere between 0 (a plate that stays parallel) and
+see the tilts; from fewer it cannot. Then the tilts are taken from the deflection, phi = -k dY/L and omega = +k dX/L as
+in ``beam``, but how much the plate tilts is not known: k is somewhere between 0 (a plate that stays parallel) and
 ``link.slope_ratio``. The answer is that of the middle, and its covariance allows for either end.
 """
 
@@ -69,7 +69,7 @@ def geometry_of(rig: Rig, kept: Sequence[int]) -> Geometry:
 
 
 def solver_of_some(name: str, rig: Rig, kept: Sequence[int]) -> Solver | None:
-    """The method ``name`` for the PSDs ``kept`` (from 0) of the rig, with the rig's options; None if it takes no such."""
+    """The method ``name`` for the PSDs ``kept`` (from 0), with the rig's options; None if it cannot do with them."""
     geometry = geometry_of(rig, kept)
     try:
         return make_solver(name, geometry, **solver_class(name).options_from_rig(rig))

@@ -60,7 +60,10 @@ class WlsSolver(Solver):
 
     @classmethod
     def options_from_rig(cls, rig: Rig) -> dict[str, Any]:
-        """``wls.weights`` and ``wls.row_scaling``. Raises ConfigError for the thesis's weights of more than two PSDs."""
+        """``wls.weights`` and ``wls.row_scaling``. Raises ConfigError for the thesis's weights with more than two PSDs.
+
+        They are of two.
+        """
         if len(rig.psds) > 2 and rig.estimator.wls_weights == 'thesis':
             raise ConfigError(
                 f'wls.weights = thesis: its weights are of two PSDs, the rig has {len(rig.psds)}; set inverse_variance'

@@ -120,9 +120,9 @@ class BlockFit:
     def __init__(
         self, size: int, centers: FloatArray, beams: FloatArray, poly: bool = True, slopes: FloatArray | None = None
     ) -> None:
-        """``size``: N samples of a whole block. ``centers``, ``beams`` (P, 2) m, C = 2P. ``poly``: False gives the mean.
+        """``size``: N samples of a whole block. ``centers``, ``beams`` (P, 2) m, C = 2P.
 
-        ``slopes``: as :func:`combinations_of` takes them.
+        ``poly``: False gives the mean. ``slopes``: as :func:`combinations_of` takes them.
         """
         self._size = size
         self._poly = poly

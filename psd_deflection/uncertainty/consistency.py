@@ -59,8 +59,9 @@ class Checked(NamedTuple):
 
     ``chi_square`` of this block. ``contradict``: this block or one shortly before is beyond ``LIMIT``.
     ``errors`` (4,): of each reading if it alone is wrong, m. ``possible`` (4,): what the covariance is to
-    allow for, m: the same from ``WIDEN`` on, or with the r that is held. Of more than two PSDs ``errors`` and ``possible``
-    are (2P,), ``freedom`` counts the redundant readings, and ``wrong`` is the PSD (from 1) to leave out, 0: none.
+    allow for, m: the same from ``WIDEN`` on, or with the r that is held. Of more than two PSDs ``errors`` and
+    ``possible`` are (2P,), ``freedom`` counts the redundant readings, and ``wrong`` is the PSD (from 1) to leave out,
+    0: none.
     """
 
     chi_square: float
