@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from psd_deflection.averaging import BlockCutter, block_middle_ns, covariance
 from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_variances
-from psd_deflection.calibration.health import OpticsHealth, Verdict
+from psd_deflection.calibration.health import FROZEN_BLOCKS, OpticsHealth, Verdict
 from psd_deflection.config import ZEROS, Rig, replace_values
 from psd_deflection.correction import Correction
 from psd_deflection.errors import ConfigError
@@ -430,14 +430,18 @@ class Pipeline:
         """:meth:`_primary`, without the PSD that contradicts the others if it can be told; ``take``: :meth:`_some`."""
         found = self._primary(t_ns, block, readings)
         checked = found[0].checked
-        if checked is None or not checked.wrong or self.rig.estimator.consistency == 'report':
-            return found
         before = range(len(self.rig.psds)) if readings.kept is None else readings.kept
-        kept = tuple(psd for i, psd in enumerate(before, start=1) if i != checked.wrong)
-        others = take(kept)
+        if checked is None or len(before) < 3 or self.rig.estimator.consistency == 'report':
+            return found
+        wrong = before[checked.wrong - 1] if checked.wrong else -1
+        still = [psd for psd in before if self._frozen[psd] >= FROZEN_BLOCKS]
+        if not checked.wrong and checked.contradict and len(still) == 1:
+            # The check cannot tell, but a detector whose values do not change by one bit tells on itself.
+            wrong, checked = still[0], None
+        others = take(tuple(psd for psd in before if psd != wrong)) if wrong >= 0 else None
         if others is None:
             return found
-        return self._primary(t_ns, block, others._replace(wrong=before[checked.wrong - 1] + 1), checked)
+        return self._primary(t_ns, block, others._replace(wrong=wrong + 1), checked)
 
     def _some(
         self,
@@ -539,7 +543,7 @@ class Pipeline:
                 # A check that was made with all PSDs tells nothing of some of them.
                 own = widened(own, gain, possible) if len(possible) == gain.shape[1] else own
             covariance = tuple(own.ravel().tolist())
-        chi_square = checked.chi_square if primary and checked is not None else nan
+        chi_square = checked.chi_square if primary and checked is not None and checked.freedom else nan
         return DeflectionEstimate(
             t_ns, block, name, s.dx, s.dy, s.theta, s.phi, s.omega, covariance, rms, primary, chi_square
         )

@@ -100,7 +100,8 @@ class Source(abc.ABC):
 
         The HELLO has ``serial``, ``firmware``, ``sample_rate_hz``, ``channels``,
         ``volts_per_count`` (a number, or None if :attr:`volts`) and, if there are more than two, ``psds``.
-        The reader compares it with the rig, and it is recorded. Raises DeviceError that says what to do; then nothing is left open.
+        The reader compares it with the rig, and it is recorded. Raises DeviceError that says what to do; then nothing
+        is left open.
         """
 
     @abc.abstractmethod

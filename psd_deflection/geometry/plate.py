@@ -209,8 +209,9 @@ def tie_matrix(slope_ratio: float, link_length: float) -> FloatArray:
     return out
 
 
-Tilts = Literal['none', 'tied', 'free']
-"""What a method says of the plate's tilts: it has none, they follow from the deflection, they are unknowns."""
+Tilts = Literal['none', 'tied', 'bounded', 'free']
+"""What a method says of the plate's tilts: it has none; they follow from the deflection, by a k that is given or only
+bounded; they are unknowns."""
 
 
 def reading_slopes(
@@ -222,4 +223,4 @@ def reading_slopes(
     jacobian = crossings(pose, beams, heights)[1].reshape(-1, 5)
     if tilts == 'free':
         return jacobian
-    return jacobian @ tie_matrix(slope_ratio if tilts == 'tied' else 0.0, link_length)
+    return jacobian @ tie_matrix(0.0 if tilts == 'none' else slope_ratio, link_length)

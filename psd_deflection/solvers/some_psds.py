@@ -29,7 +29,7 @@ class PoseOfFew(Solver):
 
     name: ClassVar[str] = 'pose'
     budgeted_as: ClassVar[str] = ''
-    tilts: ClassVar[Tilts] = 'tied'
+    tilts: ClassVar[Tilts] = 'bounded'
 
     def __init__(self, geometry: Geometry) -> None:
         """Bind to ``geometry``. Raises SolverError as :class:`BeamSolver`."""

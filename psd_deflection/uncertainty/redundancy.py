@@ -8,7 +8,8 @@ of 2P - p degrees of freedom (generalised least squares; Q J = 0, so r may come 
 wrong, it is wrong by e_i = Q_ii^-1 (Q r)_i, and without it chi-square falls by e_i^T (Q r)_i and loses two degrees of
 freedom (Baarda's data snooping, by pairs). A PSD is wrong if the readings contradict each other with it and agree
 without it, and no other PSD could be blamed. It is then left out for a second: while the link rings, its readings may
-be right for a block. If several PSDs could be blamed, or none alone, the covariance is widened by what each would cause.
+be right for a block. If several PSDs could be blamed, or none alone, the covariance is widened by what each would
+cause.
 One degree of freedom (``pose`` with three PSDs) tells no PSD from another: then each reading could be blamed.
 """
 

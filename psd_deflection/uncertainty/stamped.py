@@ -67,7 +67,8 @@ class SomePsds:
         self._model = PlateModel(rig, at, tilts)
         rest = self._model.slopes_at((0.0,) * 5)
         self.fit = BlockFit(rig.estimator.block_size, rig.centers[at], self._model.beams, poly, rest)
-        self._redundancy = Redundancy(len(at), rest.shape[1])
+        # Of a plate whose tilt is not known, dots may contradict each other.
+        self._redundancy = Redundancy(len(at), 2 * len(at) if tilts == 'bounded' else rest.shape[1])
 
     def set_noise(self, gamma: FloatArray) -> None:
         """Use their part of the autocovariance of all readings."""
