@@ -66,7 +66,7 @@ def open(path: str | Path) -> Recording:
 def solve(dots: npt.ArrayLike, rig: Rig | str | Path | None = None, solver: str | None = None) -> Solutions:
     """The pose of the tip from the dots, without any correction of effects.
 
-    ``dots``: (4,) or (n, 4): x1, y1, x2, y2 from each PSD's centre, m. ``rig``: the rig or its parameter file; by
+    ``dots``: (2P,) or (n, 2P) of P PSDs: x1, y1, x2, y2 ... from each PSD's centre, m. ``rig``: the rig or its parameter file; by
     default the thesis rig. ``solver``: by default that of the rig; :mod:`psd_deflection.solvers` has their names.
 
     The result has ``pose`` (dX m, dY m, theta rad), ``tilt`` (phi, omega, rad), ``covariance`` of the pose (for means
@@ -80,15 +80,18 @@ def solve(dots: npt.ArrayLike, rig: Rig | str | Path | None = None, solver: str 
 
     from psd_deflection.calibration import dot_noise_variances
     from psd_deflection.errors import ConfigError
+    from psd_deflection.records import dot_names
     from psd_deflection.solvers import solver_from_rig
 
     known = _rig(rig)
+    count = 2 * len(known.psds)
     try:
         rows = np.asarray(dots, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ConfigError('dots: must be numbers, (4,) or (n, 4)') from None
-    if rows.ndim not in (1, 2) or rows.shape[-1] != 4:
-        raise ConfigError(f'dots: has the shape {rows.shape}: must be (4,) or (n, 4): x1, y1, x2, y2 in m')
+        raise ConfigError(f'dots: must be numbers, ({count},) or (n, {count})') from None
+    if rows.ndim not in (1, 2) or rows.shape[-1] != count:
+        names = ', '.join(dot_names(len(known.psds)))
+        raise ConfigError(f'dots: has the shape {rows.shape}: must be ({count},) or (n, {count}): {names} in m')
     bad = np.argwhere(~np.isfinite(rows))
     if len(bad):
         raise ConfigError(f'dots{bad[0].tolist()} = {rows[tuple(bad[0])]} m: must be finite')

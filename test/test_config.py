@@ -10,6 +10,7 @@ import pytest
 
 from psd_deflection.config import (
     BY_NAME,
+    PARAMETERS,
     LINK,
     LinkConfig,
     Rig,
@@ -130,7 +131,7 @@ def another(p: Parameter) -> Value:
     return 'wls'
 
 
-@pytest.mark.parametrize('name', BY_NAME)
+@pytest.mark.parametrize('name', [p.name for p in PARAMETERS])
 def test_every_parameter_reaches_its_field_and_nothing_else(name: str) -> None:
     nominal, value = load_rig(), another(BY_NAME[name])
     rig = replace_values(nominal, {name: value})
@@ -138,7 +139,7 @@ def test_every_parameter_reaches_its_field_and_nothing_else(name: str) -> None:
     before, after = flattened(nominal), flattened(rig)
     (changed,) = (i for i, (a, b) in enumerate(zip(before, after, strict=True)) if a != b)
     assert after[changed] == (tuple(value) if isinstance(value, list) else value)
-    assert name == list(BY_NAME)[changed]
+    assert name == PARAMETERS[changed].name
     # The ways lead to the same rig.
     assert rig_from_values(rig.flat()) == rig == load_rig(overrides={name: value})
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import psd_deflection.monitor
 from psd_deflection import __version__
 from psd_deflection.config import Rig
-from psd_deflection.records import AppliedLoad, FloatArray, ReferencePose
+from psd_deflection.records import AppliedLoad, FloatArray, ReferencePose, dot_names
 
 PAGE = Path(psd_deflection.monitor.__file__).parent / 'page'
 
@@ -24,10 +24,17 @@ KEYS = {
     'shift': (('ΔX', 'dx', 1, True), ('ΔY', 'dy', 4, True)),
     'theta': (('θ', 'theta', 1, True),),
     'load': (('Fx', 'dx', 1, False), ('Fy', 'dy', 2, False), ('Tz', 'theta', 3, False)),
-    'sums': (('sum 1', 'dx', 1, False), ('sum 2', 'dy', 2, False)),
-    'spectrum': (('x1', 'x1', 1, False), ('y1', 'y1', 2, False), ('x2', 'x2', 3, False), ('y2', 'y2', 4, False)),
 }
 """Of each plot: words, colour, series and whether it has a band."""
+
+
+def _keys(psds: int) -> dict[str, tuple[tuple[str, str, int, bool], ...]]:
+    """``KEYS`` and those of so many PSDs."""
+    colors = ('dx', 'dy', *(f'x{n}' for n in range(3, psds + 1)))
+    sums = tuple((f'sum {n}', color, n, False) for n, color in enumerate(colors, start=1))
+    dots = tuple((name, name, i, False) for i, name in enumerate(dot_names(psds), start=1))
+    return {**KEYS, 'sums': sums, 'spectrum': dots}
+
 
 CAPTIONS = {
     'shift': 'µm, band ±2 sd',
@@ -51,7 +58,7 @@ def plot_page(
 ) -> str:
     """The page as text.
 
-    ``table``: as ``Drawn.table`` makes it. ``spectrum``: frequencies (k,) Hz and densities (4, k) m/sqrt(Hz).
+    ``table``: as ``Drawn.table`` makes it. ``spectrum``: frequencies (k,) Hz and densities (2P, k) m/sqrt(Hz).
     ``zeros``: when the zero was taken, ns. Times are shown from ``start_ns`` on.
     """
     end = float(table['t'][-1])
@@ -80,12 +87,13 @@ def plot_page(
         'active_areas': [psd.active_area for psd in rig.psds],
         'sum_nominal': rig.amplifier.sum_nominal,
     }
-    shown = [name for name in KEYS if (name != 'load' or loads) and (name != 'spectrum' or spectrum is not None)]
+    keys = _keys(len(rig.psds))
+    shown = [name for name in keys if (name != 'load' or loads) and (name != 'spectrum' or spectrum is not None)]
     rows = ''.join(f'<tr><th scope="row">{html.escape(k)}</th><td>{html.escape(v)}</td></tr>' for k, v in summary)
     detectors = ''.join(
         f'<figure class="detector"><figcaption>PSD {n}</figcaption>'
         f'<canvas role="img" aria-label="dots on the active area of PSD {n}"></canvas></figure>'
-        for n in (1, 2)
+        for n in range(1, len(rig.psds) + 1)
     )
     name = html.escape(title)
     return (
@@ -95,7 +103,7 @@ def plot_page(
         f'<header><div class="title"><h1>{name}</h1> <span id="range" class="quiet"></span></div><div class="tools">'
         '<span class="quiet">drag over a trace to look closer</span>'
         '<button id="whole" type="button" aria-disabled="true">All of it</button></div></header>'
-        f'<main class="drawn"><section class="traces" aria-label="traces">{"".join(map(_figure, shown))}</section>'
+        f'<main class="drawn"><section class="traces" aria-label="traces">{"".join(_figure(name, keys[name]) for name in shown)}</section>'
         f'<section class="side" aria-label="summary"><div class="detectors">{detectors}</div>'
         f'<div class="card"><h2>Summary</h2><table>{rows}</table><p class="quiet">psd_deflection {__version__}; '
         f'<code>psd-deflection plot {name}</code></p></div></section></main>'
@@ -106,11 +114,11 @@ def plot_page(
     )
 
 
-def _figure(name: str) -> str:
+def _figure(name: str, shown: Sequence[tuple[str, str, int, bool]]) -> str:
     keys = ' '.join(
         f'<button type="button" class="key c-{color}" data-plot="{name}" data-series="{series}"'
         f'{" data-band" if band else ""} aria-pressed="true">{words} <output></output></button>'
-        for words, color, series, band in KEYS[name]
+        for words, color, series, band in shown
     )
     more = '<span class="quiet references" hidden>○ reference</span>' if name in ('shift', 'theta') else ''
     lost = '<span class="key c-bad">lost samples</span>' if name == 'theta' else ''

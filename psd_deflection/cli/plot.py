@@ -41,6 +41,7 @@ from psd_deflection.records import (
     ReferencePose,
     SampleBlock,
     SpotMeans,
+    dot_names,
 )
 
 SPECTRUM_OF_S = 600.0
@@ -153,15 +154,17 @@ class Drawn:
                 step = ((s.t_ns - start) / 1e9 - rows[-1][0]) / (s.index - index)
                 before = rows[-1][0]
                 for k in (1, s.index - index - 1):
-                    rows.append((before + k * step, *nothing, *(np.nan,) * 7, 0.0))
+                    rows.append((before + k * step, *nothing, *(np.nan,) * (3 * len(s.sums) + 1), 0.0))
             index = s.index
             e = self.estimates.get(s.index)
             pose = nothing if e is None else (*e.pose, *(max(v, 0.0) ** 0.5 for v in e.variances))
             lost = self._lost(s)
             unfinished = s.status is BlockStatus.TOO_FEW_SAMPLES and lost == 0
             rows.append(((s.t_ns - start) / 1e9, *pose, *s.dots, *s.sums, float(lost), float(unfinished)))
-        pose_names, dot_names = ('dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta'), ('x1', 'y1', 'x2', 'y2')
-        names = ('t', *pose_names, *dot_names, 'sum1', 'sum2', 'lost', 'unfinished')
+        psds = len(self.spots[0].sums) if self.spots else 2
+        pose_names = ('dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta')
+        sums = (f'sum{n}' for n in range(1, psds + 1))
+        names = ('t', *pose_names, *dot_names(psds), *sums, 'lost', 'unfinished')
         columns = np.array(rows, np.float64).T
         return dict(zip(names, columns, strict=True))
 
@@ -296,9 +299,10 @@ def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any
         figure = Figure(figsize=(13, 8), layout='constrained')
         figure.suptitle(f'{name} · {len(drawn.estimates)} estimates, {drawn.gone()} samples lost')
         heights = (3, 3, 3, 1.6, *([1.6] if inputs.loads else []))
-        grid = figure.add_gridspec(len(heights), 4, height_ratios=heights)
-        left = [figure.add_subplot(grid[0, :2])]
-        left += [figure.add_subplot(grid[i, :2], sharex=left[0]) for i in range(1, len(heights))]
+        # In twelfths, so that the detectors share one half of the width.
+        grid = figure.add_gridspec(len(heights), 12, height_ratios=heights)
+        left = [figure.add_subplot(grid[0, :6])]
+        left += [figure.add_subplot(grid[i, :6], sharex=left[0]) for i in range(1, len(heights))]
         for axes, (key, label, scale, unit) in zip(left, _POSE, strict=False):
             value, sd = table[key] * scale, table[f'sd_{key}'] * scale
             axes.fill_between(
@@ -312,21 +316,38 @@ def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any
             _mark_inputs(axes, inputs, key, scale, drawn.start_ns or 0)
         if left[0].get_legend_handles_labels()[0]:
             left[0].legend(loc='upper right', fontsize=8)
-        for key, color in (('sum1', COLORS['dx']), ('sum2', COLORS['dy'])):
+        sums = [f'sum{n}' for n in range(1, len(rig.psds) + 1)]
+        for key, color in zip(sums, _SUMS, strict=False):
             left[3].plot(t, table[key], color=color, linewidth=0.9, label=key, rasterized=raster)
         left[3].axhline(rig.estimator.sum_min, color=COLORS['quiet'], linestyle=':', linewidth=1)
         left[3].set(
             ylabel='sum (V)',
-            ylim=(0.0, 1.2 * max(rig.amplifier.sum_nominal, np.nanmax(table['sum1']), np.nanmax(table['sum2']))),
+            ylim=(0.0, 1.2 * max(rig.amplifier.sum_nominal, *(np.nanmax(table[key]) for key in sums))),
         )
-        left[3].legend(loc='center right', fontsize=8, ncols=2)
+        left[3].legend(loc='center right', fontsize=8, ncols=len(sums))
         if inputs.loads:
             _loads(left[4], inputs.loads, drawn.start_ns or 0, float(t[-1]))
         left[-1].set_xlabel('t (s)')
-        for number in (1, 2):
-            _detector(figure.add_subplot(grid[:2, 1 + number]), table, rig, number, raster)
-        _spectrum(figure.add_subplot(grid[2:, 2:]), spectrum, rig)
+        for number in range(1, len(rig.psds) + 1):
+            _detector(figure.add_subplot(grid[_place(number, len(rig.psds))]), table, rig, number, raster)
+        _spectrum(figure.add_subplot(grid[2:, 6:]), spectrum, rig)
     return figure
+
+
+_SUMS = (COLORS['dx'], COLORS['dy'], '#0f7b4f', '#8b3fa8', '#a52a4a', '#5a6472')
+_DOTS = (
+    *('#0b6bcb', '#5aa2e6', '#c2570c', '#e8a15f', '#0f7b4f', '#66b594'),
+    *('#8b3fa8', '#b98bca', '#a52a4a', '#cf8599', '#5a6472', '#9aa3ae'),
+)
+
+
+def _place(number: int, psds: int) -> tuple[slice, slice]:
+    """Rows and twelfths of detector ``number`` in the figure: up to three side by side, more in two rows."""
+    if psds <= 3:
+        wide = 6 // psds
+        return slice(0, 2), slice(6 + wide * (number - 1), 6 + wide * number)
+    row, column = divmod(number - 1, 3)
+    return slice(row, row + 1), slice(6 + 2 * column, 8 + 2 * column)
 
 
 def _mark_losses(axes: Any, table: dict[str, FloatArray]) -> None:
@@ -412,9 +433,7 @@ def _spectrum(axes: Any, spectrum: Spectrum, rig: Rig) -> None:
             0.5, 0.5, 'no stretch with light and without a loss is long enough', transform=axes.transAxes, ha='center'
         )
         return
-    for channel, color, values in zip(
-        ('x1', 'y1', 'x2', 'y2'), ('#0b6bcb', '#5aa2e6', '#c2570c', '#e8a15f'), density, strict=True
-    ):
+    for channel, color, values in zip(dot_names(len(rig.psds)), _DOTS, density, strict=False):
         if (values > 0.0).any():
             axes.plot(spectrum.frequencies, values * 1e6, color=color, linewidth=0.9, label=channel)
     for hertz, label in ((rig.dynamics.bending_frequency, 'bending'), (rig.dynamics.torsion_frequency, 'torsion')):

@@ -12,7 +12,7 @@ from enum import Enum
 import numpy as np
 
 from psd_deflection.commissioning.wirings import DOTS, Response, pattern, scales_of
-from psd_deflection.config import Rig
+from psd_deflection.config import Rig, check_two_psds
 from psd_deflection.records import DOT_CHANNELS, FloatArray
 
 REST_S = 2.0
@@ -71,6 +71,7 @@ class Guide:
     """
 
     def __init__(self, rig: Rig) -> None:
+        check_two_psds(rig, 'check')
         self._rig = rig
         self._sensitivity = rig.amplifier.sensitivity
         self._rail = rig.converter.full_scale - 2.0 * rig.converter.volts_per_count

@@ -18,20 +18,13 @@ from psd_deflection.records import (
     ReferencePose,
     SampleBlock,
     SpotMeans,
+    dot_names,
 )
 
 QUEUE_ITEMS = 2000
 """Ten seconds at 100 blocks/s and two items per block."""
 
-COLUMNS = (
-    't',
-    'block',
-    'x1',
-    'y1',
-    'x2',
-    'y2',
-    'sum1',
-    'sum2',
+_BEHIND = (
     'dx',
     'dy',
     'theta',
@@ -43,7 +36,15 @@ COLUMNS = (
     'status',
     'chi_square',
 )
-"""Columns of a row on the page: s, -, m, V, m, rad, their standard deviations, samples, BlockStatus, chi-square."""
+
+
+def row_columns(psds: int) -> tuple[str, ...]:
+    """Columns of a row on the page: s, -, m, V, m, rad, their standard deviations, samples, BlockStatus, chi-square."""
+    return ('t', 'block', *dot_names(psds), *(f'sum{n}' for n in range(1, psds + 1)), *_BEHIND)
+
+
+COLUMNS = row_columns(2)
+"""Those of two PSDs."""
 
 
 class BlockResult(NamedTuple):
@@ -118,13 +119,13 @@ def _seconds(t_ns: int) -> str:
 
 
 def row_json(result: BlockResult) -> str:
-    """One row in the order of ``COLUMNS``, as JSON; null for missing numbers."""
+    """One row in the order of :func:`row_columns`, as JSON; null for missing numbers."""
     spots, estimate = result
     values: list[float] = [*spots.dots, *spots.sums]
     if estimate is not None:
         values += [*estimate.pose, *(math.sqrt(max(v, 0.0)) for v in estimate.variances)]
     numbers = [f'{v:.7g}' if math.isfinite(v) else 'null' for v in values]
-    numbers += ['null'] * (12 - len(numbers))
+    numbers += ['null'] * (3 * len(spots.sums) + 6 - len(numbers))
     seconds = _seconds(spots.t_ns)
     chi_square = estimate.chi_square if estimate is not None else math.nan
     last = f'{chi_square:.4g}' if math.isfinite(chi_square) else 'null'

@@ -31,7 +31,7 @@ from psd_deflection import __version__
 from psd_deflection.config import MonitorConfig
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor import access
-from psd_deflection.monitor.feed import COLUMNS, BlockResult, Feed, mark_json, reference_json, row_json
+from psd_deflection.monitor.feed import BlockResult, Feed, mark_json, reference_json, row_columns, row_json
 from psd_deflection.monitor.served import Served, announce, withdraw
 from psd_deflection.monitor.shown import RefusedError, Shown
 from psd_deflection.monitor.spectrum import Spectrum, density_json
@@ -369,7 +369,7 @@ class MonitorServer:
         return {
             'instance': self._instance,
             'version': __version__,
-            'columns': COLUMNS,
+            'columns': row_columns(len(rig.psds)),
             'statuses': [s.name.lower().replace('_', ' ') for s in BlockStatus],
             'history_s': HISTORY_S,
             'rows': self._rows.maxlen,

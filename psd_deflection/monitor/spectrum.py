@@ -48,7 +48,7 @@ class Spectrum:
         return np.arange(1, SEGMENT // 2 + 1, dtype=np.float64) * (self.rate_hz / SEGMENT)
 
     def density(self) -> FloatArray | None:
-        """(4, k) of x1 y1 x2 y2, m/sqrt(Hz), one-sided; NaN for a PSD, None for both, without a long enough stretch.
+        """(2P, k) of x1 y1 x2 y2 ..., m/sqrt(Hz), one-sided; NaN for a PSD, None for all, if no stretch is long enough.
 
         Such a stretch has no loss and, on that PSD, light throughout.
         """
@@ -57,14 +57,15 @@ class Spectrum:
         seq = np.concatenate([b.seq for b in self._blocks])
         volts = self._calibration.seen(np.concatenate([b.volts for b in self._blocks]))
         dots = self._calibration.dots(volts).astype(np.float64)
-        for psd in (0, 1):
+        psds = volts.shape[1] // 3
+        for psd in range(psds):
             dots[~(volts[:, 3 * psd + 2] >= self._sum_min), 2 * psd : 2 * psd + 2] = np.nan
-        total = np.zeros((SEGMENT // 2 + 1, 4))
-        count = np.zeros(4)
+        total = np.zeros((SEGMENT // 2 + 1, 2 * psds))
+        count = np.zeros(2 * psds)
         for run in np.split(dots, np.flatnonzero(np.diff(seq) != 1) + 1):
             for start in range(0, len(run) - SEGMENT + 1, SEGMENT // 2):
                 part = run[start : start + SEGMENT]
-                seen = np.repeat(np.isfinite(part).all(axis=0).reshape(2, 2).all(axis=1), 2)
+                seen = np.repeat(np.isfinite(part).all(axis=0).reshape(-1, 2).all(axis=1), 2)
                 if not seen.any():
                     continue
                 part = part[:, seen]

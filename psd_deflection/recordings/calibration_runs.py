@@ -9,11 +9,12 @@ import numpy as np
 
 from psd_deflection.calibrating.observation import Run
 from psd_deflection.calibration import Wiring
-from psd_deflection.config import Rig
+from psd_deflection.config import Rig, check_two_psds
 from psd_deflection.errors import RecordingError
 from psd_deflection.recordings.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.replay_engine import check_psds
 from psd_deflection.records import CHANNELS, FloatArray
 
 
@@ -21,6 +22,8 @@ def read_run(source: Recording | str | Path, rig: Rig, *, namespace: str | None 
     """One recording: the recording or its path. Raises RecordingError if it cannot be read."""
     recording = source if isinstance(source, Recording) else open_recording(source, namespace=namespace)
     path = recording.path
+    check_two_psds(rig, 'a calibration')
+    check_psds(recording, rig)
     samples = recording.samples
     first = int(samples['seq'][0])
     n = int(samples['seq'][-1]) - first + 1

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from psd_deflection.calibration import Wiring
-from psd_deflection.config import Rig, replace_values
+from psd_deflection.config import Rig, check_two_psds, replace_values
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.errors import ConfigError, RecordingError
 from psd_deflection.foreign_yaml import tree_of_file
@@ -16,7 +16,7 @@ from psd_deflection.recordings.csv_reader import CsvRecording
 from psd_deflection.recordings.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end
+from psd_deflection.recordings.replay_engine import check_psds, nominal_rig, rig_at_end
 from psd_deflection.recordings.simulated_recording import SimulatedRecording
 from psd_deflection.records import CHANNELS, FloatArray
 
@@ -51,6 +51,8 @@ def read_observation(
                 warn(warning)
     if overrides:
         rig = replace_values(rig, overrides, where)
+    check_two_psds(rig, 'a comparison with the simulation')
+    check_psds(recording, rig)
     recording = recording.with_block_size(rig.estimator.block_size)
     samples = recording.samples
     rate = recording.sample_rate_hz

@@ -212,7 +212,8 @@ class RerunFile:
         self._static('rig/link', rr.LineStrips3D.from_fields(radii=rig.link.outer_radius, colors=_METAL))
         rest = rr.LineStrips3D([[(0, 0, 0), (0, 0, length)]], radii=rr.Radius.ui_points(1.0), colors=_METAL)
         self._static('rig/link_at_rest', rest)
-        self._static('rig/tip/plate', rr.Boxes3D.from_fields(colors=[_METAL, _SENSOR, _SENSOR], fill_mode='solid'))
+        colors = [_METAL, *[_SENSOR] * len(rig.psds)]
+        self._static('rig/tip/plate', rr.Boxes3D.from_fields(colors=colors, fill_mode='solid'))
         for i, psd in enumerate(rig.psds):
             n = i + 1
             width, height = (1e3 * side for side in psd.active_area)
@@ -225,7 +226,7 @@ class RerunFile:
             self._static(f'psd_{n}/plane/dot', rr.Points2D.from_fields(colors=_LIGHT, radii=rr.Radius.ui_points(5.0)))
             trail = rr.Points2D.from_fields(colors=(*_LIGHT, 110), radii=rr.Radius.ui_points(1.5))
             self._static(f'psd_{n}/plane/trail', trail)
-            self._static(f'sums/psd_{n}', rr.SeriesLines(names=f'sum{n} (V)', colors=POSE[i][4]))
+            self._static(f'sums/psd_{n}', rr.SeriesLines(names=f'sum{n} (V)', colors=POSE[i % len(POSE)][4]))
             x, y = psd.center[0] + psd.zero[0], psd.center[1] + psd.zero[1]
             beam = rr.LineStrips3D(
                 [[(x, y, 0.0), (x, y, length + psd.height)]], radii=rr.Radius.ui_points(0.8), colors=_LIGHT
@@ -280,8 +281,9 @@ def blueprint(rig: Rig, speed: float = 1.0) -> Any:
     left = rrb.Vertical(
         *(traces(f'tip/{name}', f'{label} ({unit}), ± 2 sd') for name, label, unit, _, _ in POSE), row_shares=[5, 5, 6]
     )
+    detectors = [detector(n) for n in range(1, len(rig.psds) + 1)]
     right = rrb.Vertical(
-        rrb.Horizontal(detector(1), detector(2), space, column_shares=[3, 3, 4]),
+        rrb.Horizontal(*detectors, space, column_shares=[*[3] * len(detectors), 4]),
         traces('load', 'Load at the tip (N, N m)', True),
         traces('sums', 'Sums (V)', True, 1.1 * rig.amplifier.sum_nominal),
         traces('lost', 'Samples lost a block', most=1.05 * rig.estimator.block_size),

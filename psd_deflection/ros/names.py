@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from msg_adapters import INPUTS, LATCHED, SAMPLES
+from psd_deflection.records import MOST_PSDS
 
 
 class Delivery(NamedTuple):
@@ -17,7 +18,7 @@ class Delivery(NamedTuple):
 
 
 TF, TF_STATIC = '/tf', '/tf_static'
-VOLTS = ('/psd_1/volts', '/psd_2/volts')
+VOLTS = tuple(f'/psd_{n}/volts' for n in range(1, MOST_PSDS + 1))
 MARKERS = '/link_tip/markers'
 MARKERS_AT_REST = '/link_tip/markers_at_rest'
 _LATCHED = Delivery(depth=1, latched=True)
@@ -47,5 +48,5 @@ SERVICES = (ZERO, RECORD)
 """Services of the node; ``~`` stands for the node's name."""
 
 BASE, REST, TIP = 'link_base', 'link_tip_rest', 'link_tip'
-PSDS = ('psd_1', 'psd_2')
-"""Frames: the clamp, the unloaded tip, the tip, the PSDs."""
+PSDS = tuple(f'psd_{n}' for n in range(1, MOST_PSDS + 1))
+"""Frames: the clamp, the unloaded tip, the tip, the PSDs that a rig may have."""

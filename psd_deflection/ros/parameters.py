@@ -21,12 +21,9 @@ from rclpy.parameter import Parameter as RosParameter
 
 from psd_deflection.config import (
     BY_NAME,
-    PARAMETERS,
-    PSDS,
     QOS_OVERRIDES_PREFIX,
     ROS_OWN,
     SIMULATED,
-    ZEROS,
     Rig,
     replace_values,
     rig_from_values,
@@ -38,7 +35,6 @@ from psd_deflection.runner.session import Session
 from psd_deflection.solvers.registry import SOLVERS, check_live, solver_class
 
 SOURCE = 'ROS parameters'
-_AXES = [section.parameters['axes'] for section in PSDS]
 
 _READ = 'read when the node is configured'
 _AT_START = {'autostart': 'read at the start of the process'}
@@ -59,7 +55,7 @@ def rig_of_node(node: Node) -> tuple[Rig, set[str]]:
     given = {name: _plain(parameter) for name, parameter in node.get_parameters_by_prefix('').items()}
     rig = rig_from_values(given, SOURCE)
     shown = _ros_values(rig)
-    values = {p.name: (shown[p.name], _descriptor(p)) for p in PARAMETERS}
+    values = {p.name: (shown[p.name], _descriptor(p)) for p in rig.parameters}
     for name, (value, descriptor) in {**values, SIMULATED: (False, _SIMULATED)}.items():
         # rclpy tells of overrides that nobody declares (a mistyped name) only by declaring them, and then without
         # descriptor and with the type as it was typed.
@@ -72,7 +68,8 @@ def rig_of_node(node: Node) -> tuple[Rig, set[str]]:
 def _ros_values(rig: Rig) -> dict[str, Any]:
     """The values by name. Signs are written out, because rcl does not read the bare y that `ros2 param dump` writes."""
     signed = {
-        p.name: [a if a.startswith('-') else f'+{a}' for a in psd.axes] for p, psd in zip(_AXES, rig.psds, strict=True)
+        f'psd_{n}.axes': [a if a.startswith('-') else f'+{a}' for a in psd.axes]
+        for n, psd in enumerate(rig.psds, start=1)
     }
     return {**rig.values, **signed}
 
@@ -134,7 +131,7 @@ class LiveParameters:
         self._node = node
         self._showing = False
         self.rig, self.given = rig_of_node(node)
-        self._zeros = {name: self.rig.values[name] for name in ZEROS}
+        self._zeros = self.rig.zeros_by_name
         self.session: Session | None = None
         node.add_pre_set_parameters_callback(self._known)
         node.add_on_set_parameters_callback(self._change)
@@ -148,7 +145,7 @@ class LiveParameters:
         """Set the node's parameters to the present values of the rig, so that a new zero can be read there."""
         session = self.session
         if session is not None:
-            live = {p.name: session.rig.values[p.name] for p in PARAMETERS if p.live}
+            live = {p.name: session.rig.values[p.name] for p in session.rig.parameters if p.live}
             self.rig = replace_values(self.rig, live, SOURCE)
         simulated = session is not None and session.simulated
         changed = [
@@ -201,7 +198,7 @@ class LiveParameters:
             _check_solvers(rig)
             self.rig = rig
             self.given |= set(new)
-            self._zeros |= {name: rig.values[name] for name in ZEROS if name in new}
+            self._zeros |= {name: rig.values[name] for name in rig.zeros_by_name if name in new}
             return
         fixed = [name for name in new if name not in BY_NAME or not BY_NAME[name].live]
         if fixed:

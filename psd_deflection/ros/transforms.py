@@ -1,4 +1,4 @@
-"""The frames of the messages as a tree for tf2: ``link_base``, ``link_tip_rest``, ``link_tip``, ``psd_1``, ``psd_2``.
+"""The frames of the messages as a tree for tf2: ``link_base``, ``link_tip_rest``, ``link_tip``, ``psd_1`` ...
 
 What the rig file fixes is static and latched. The tip moves with each estimate of the primary solver; it is sent
 by the pipeline thread, with the estimate's own stamp.
@@ -40,14 +40,14 @@ def _transform(prefix: str, parent: str, child: str, t_ns: int, at: Vector, rota
 
 
 def static_transforms(rig: Rig, t_ns: int) -> list[Any]:
-    """The TransformStamped of the unloaded tip and of both PSDs, which are on the plate or, ``base_pair``, fixed."""
+    """The TransformStamped of the unloaded tip and of the PSDs, which are on the plate or, ``base_pair``, fixed."""
     prefix = rig.monitor.frame_prefix
     holder = REST if psds_at_base(rig) else TIP
     return [
         _transform(prefix, BASE, REST, t_ns, (0.0, 0.0, rig.link.length), _UPRIGHT),
         *(
             _transform(prefix, holder, name, t_ns, (*psd.center, psd.height), _UPRIGHT)
-            for name, psd in zip(PSDS, rig.psds, strict=True)
+            for name, psd in zip(PSDS, rig.psds, strict=False)
         ),
     ]
 

@@ -16,8 +16,10 @@ from msg_adapters import (
     DEFLECTION,
     DIAGNOSTICS,
     INPUTS,
+    SPOTS,
     TOPIC_TYPES,
     solver_topic,
+    spot_topics,
     to_messages,
     vector3_stamped,
 )
@@ -61,7 +63,9 @@ def topics_of(rig: Rig) -> dict[str, str]:
     """The topics that a node of ``rig`` publishes encoded messages on, with their types."""
     outputs = {topic: kind for topic, kind in TOPIC_TYPES.items() if topic not in INPUTS}
     outputs |= {solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in (*rig.estimator.solvers, ONE_PSD)}
-    return outputs | (dict.fromkeys(VOLTS, vector3_stamped.MESSAGE.name) if rig.monitor.publish_volts else {})
+    outputs |= dict.fromkeys(spot_topics(len(rig.psds)), TOPIC_TYPES[SPOTS[0]])
+    volts = VOLTS[: len(rig.psds)] if rig.monitor.publish_volts else ()
+    return outputs | dict.fromkeys(volts, vector3_stamped.MESSAGE.name)
 
 
 class PublisherWire:
@@ -104,7 +108,7 @@ class VoltsPublisher:
     def put(self, record: Record) -> None:
         """Publish the samples of a block."""
         if isinstance(record, SampleBlock) and self._wire.active:
-            for psd, topic in enumerate(VOLTS, 1):
+            for psd, topic in enumerate(VOLTS[: record.volts.shape[1] // 3], 1):
                 for t_ns, fields in vector3_stamped.from_block(record, psd, self._frame_prefix):
                     self._wire.put(topic, vector3_stamped.MESSAGE.name, self._encode(fields), t_ns)
 

@@ -70,8 +70,7 @@ class HealthReporter:
                 self._acquisition(new, rate(new.samples)),
                 self._clock(new),
                 self._estimates(new, rate(new.estimates)),
-                self._laser(1, new),
-                self._laser(2, new),
+                *(self._laser(psd, new) for psd in range(1, len(self._session.rig.psds) + 1)),
                 self._recording(),
             ),
             str(hello.info.get('serial', '')) if hello is not None else '',
@@ -152,15 +151,17 @@ class HealthReporter:
             level, message = WARN, f'{new.blocks - new.estimates} of {new.blocks} blocks have no estimate'
         elif new.degraded and spots is not None:
             rule = self._session.rig.estimator.degraded
-            twist = 'held' if rule == 'hold' else 'assumed 0'
             level = WARN
-            message = (
-                f'degraded: {new.degraded} of {new.blocks} blocks from one detector, twist {twist}; {spots.reason}'
-            )
+            how = f'from one detector, twist {"held" if rule == "hold" else "assumed 0"}'
+            if spots.left_out:
+                how = f'without {" and ".join(f"psd_{psd}" for psd in spots.left_out)}'
+            why = spots.reason or next((f for f in spots.findings if 'left out' in f), '')
+            message = f'degraded: {new.degraded} of {new.blocks} blocks {how}; {why}'
         elif new.contradictions:
             level = WARN
             wrong = self._session.pipeline.stamped.most_likely_wrong() or 'which one is wrong cannot be told'
-            message = f'the four readings contradict each other in {new.contradictions} blocks: {wrong}'
+            readings = 'four readings' if len(self._session.rig.psds) == 2 else 'readings'
+            message = f'the {readings} contradict each other in {new.contradictions} blocks: {wrong}'
         values = [
             ('rate (estimates/s)', rate),
             ('blocks', str(pipeline.blocks)),

@@ -210,5 +210,7 @@ class Processing:
         text = f'no estimate: {spots.reason}'
         if cause and estimate is not None:
             cause += ' degraded'
-            text = f'degraded, translation from one detector alone: {spots.reason}'
+            without = ' and '.join(f'psd_{psd}' for psd in spots.left_out)
+            how = f'without {without}' if without else 'translation from one detector alone'
+            text = f'degraded, {how}: {spots.reason}'
         self._spokesman.block(cause, text, time.monotonic())

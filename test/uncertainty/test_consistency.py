@@ -93,7 +93,7 @@ def test_what_has_next_to_no_part_in_the_base_line_is_not_accused() -> None:
         got = Consistency().check((0.14, y), (1e-5, 0.0, -1e-5, 0.0), COVARIANCE)
         assert [e != 0.0 for e in got.errors] == [True, seen, True, seen]
     nothing = Consistency().check((0.0, 0.0), (1e-5,) * 4, COVARIANCE)
-    assert nothing == (0.0, False, (0.0,) * 4, (0.0,) * 4)
+    assert nothing == (0.0, False, (0.0,) * 4, (0.0,) * 4, 0, 1)
     assert Consistency().check(REST, (1e-5, 0.0, 0.0, 0.0), np.zeros((4, 4))).chi_square == 0.0
 
 

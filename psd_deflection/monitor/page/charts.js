@@ -202,6 +202,10 @@ export class Legend {
   constructor(plotOf) {
     this.plotOf = plotOf;
     this.hidden = new Set();
+    this.find();
+  }
+
+  find() {
     this.keys = [...document.querySelectorAll('button.key')];
     this.times = [...document.querySelectorAll('output.at')];
     for (const key of this.keys) key.onclick = () => this.toggle(key);

@@ -20,8 +20,9 @@ const body = document.body;
 const styles = getComputedStyle(document.documentElement);
 const color = (name) => styles.getPropertyValue(name).trim();
 
-const KEEP = ['t', 'x1', 'y1', 'x2', 'y2', 'sum1', 'sum2', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta', 'lost', 'status',
-  'dx_low', 'dx_high', 'dy_low', 'dy_high', 'theta_low', 'theta_high'];
+const BANDS = ['dx_low', 'dx_high', 'dy_low', 'dy_high', 'theta_low', 'theta_high'];
+// What is kept of a row; its columns depend on the number of PSDs.
+let KEEP = [];
 const MICRO = 1e6;
 const MDEG = (180 / Math.PI) * 1e3;
 const SCALES = { dx: MICRO, dy: MICRO, theta: MDEG };
@@ -90,9 +91,15 @@ function greet(found) {
   hello = found;
   hello.at = Object.fromEntries(found.columns.map((name, i) => [name, i]));
   if (other) {
+    const psds = found.active_areas.map((_, i) => i + 1);
+    KEEP = ['t', ...psds.flatMap((n) => [`x${n}`, `y${n}`]), ...psds.map((n) => `sum${n}`),
+      'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta', 'lost', 'status', ...BANDS];
+    blank = KEEP.map((name) => (name === 'lost' ? 1 : null));
+    row = new Array(KEEP.length).fill(null);
     rows = new Rows(KEEP, found.rows);
+    further(psds.length);
     references = new Rows(['t', 'dx', 'dy', 'theta'], found.rows);
-    detectors = [1, 2].map((n) => new Detector($(`detector_${n}`), n, found.active_areas[n - 1], color));
+    detectors = psds.map((n) => new Detector($(`detector_${n}`), n, found.active_areas[n - 1], color));
     if (plots) {
       plots.hello = found;
       plots.references = references;
@@ -105,6 +112,37 @@ function greet(found) {
   body.dataset.instance = found.instance;
   $('messages').replaceChildren();
   buttons();
+}
+
+// The figures and the keys of the PSDs beyond the second, made like those that every rig has.
+function further(psds) {
+  for (const element of document.querySelectorAll('.further')) element.remove();
+  const after = (last, like, id) => {
+    const made = like.cloneNode(true);
+    made.classList.add('further');
+    if (id) made.id = id;
+    last.after(' ', made);
+    return made;
+  };
+  let figure = $('detector_2');
+  let sum = document.querySelector('.key[data-plot="sums"][data-series="2"]');
+  let key = document.querySelector('.key[data-plot="spectrum"][data-series="4"]');
+  const name = (button, series, text, name) => {
+    button.className = `key further ${name}`;
+    button.dataset.series = String(series);
+    button.firstChild.textContent = `${text} `;
+  };
+  for (let n = 3; n <= psds; n++) {
+    figure = after(figure, $('detector_2'), `detector_${n}`);
+    figure.querySelector('figcaption').firstChild.textContent = `PSD ${n} `;
+    figure.querySelector('canvas').setAttribute('aria-label', `dot on PSD ${n}`);
+    sum = after(sum, sum);
+    name(sum, n, `sum ${n}`, `c-x${n}`);
+    for (const [i, axis] of ['x', 'y'].entries()) {
+      key = after(key, key);
+      name(key, 2 * n - 1 + i, `${axis}${n}`, `c-${axis}${n}`);
+    }
+  }
 }
 
 function startOver() {
@@ -134,8 +172,8 @@ function showReferences() {
 }
 
 // Breaks the traces where blocks are gone altogether, and is marked as lost.
-const blank = KEEP.map((name) => (name === 'lost' ? 1 : null));
-const row = new Array(KEEP.length).fill(null);
+let blank = [];
+let row = [];
 
 function takeRow(values) {
   const at = hello.at;
@@ -146,8 +184,8 @@ function takeRow(values) {
     blank[0] = last + hello.block_s;
     rows.push(blank);
   }
-  for (let i = 0; i < 15; i++) row[i] = values[at[KEEP[i]]];
-  let i = 15;
+  let i = KEEP.length - BANDS.length;
+  for (let k = 0; k < i; k++) row[k] = values[at[KEEP[k]]];
   for (const name of ['dx', 'dy', 'theta']) {
     const [k, s] = [at[name], at[`sd_${name}`]];
     const scale = SCALES[name];

@@ -26,6 +26,10 @@ export class Plots {
 
   build() {
     const { color, elements, hello, legend } = this;
+    legend.find();
+    this.psds = hello.active_areas.map((_, i) => i + 1);
+    this.sums = this.psds.map((n) => `sum${n}`);
+    const dots = this.psds.flatMap((n) => [`--x${n}`, `--y${n}`]);
     for (const plot of Object.values(this.plots || {})) plot.destroy();
     const fade = (name) => color(name) + '33';
     const time = { time: false, range: () => [this.state.from, this.state.to] };
@@ -52,18 +56,18 @@ export class Plots {
         cursor: cursor(this.zoom, 'traces'),
         hooks: seen('theta', [...marked, of(['--theta', 3, 1])]),
       }), this.empty(4), elements.theta),
-      sums: new uPlot(options(color, elements.sums, [line(color('--dx')), line(color('--dy'))], {
+      sums: new uPlot(options(color, elements.sums, this.psds.map((n) => line(color(['--dx', '--dy'][n - 1] ?? `--x${n}`))), {
         scales: { x: time, y: { range: () => [0, 1.5 * hello.sum_nominal] } },
         cursor: cursor(this.zoom, 'traces'),
         hooks: seen('sums', []),
-      }), this.empty(3), elements.sums),
-      spectrum: new uPlot(options(color, elements.spectrum, ['--x1', '--y1', '--x2', '--y2'].map((n) => line(color(n), 1)), {
+      }), this.empty(1 + this.psds.length), elements.sums),
+      spectrum: new uPlot(options(color, elements.spectrum, dots.map((n) => line(color(n), 1)), {
         scales: { x: { time: false, distr: 3, range: () => this.band ?? [f0, f0 * bins] }, y: { distr: 3 } },
         cursor: cursor(spectral),
         hooks: { drawAxes: [modeMarks(color, hello.modes, this.frequencies.at(-1))], setCursor: [legend.follow('spectrum', 3)], setSelect: [dragged(spectral)] },
         x: { splits: decades, values: (u, ticks) => ticks.map((v) => number(v)) },
         y: { splits: decades, values: (u, ticks) => ticks.map(power) },
-      }), [this.frequencies, ...[1, 2, 3, 4].map(() => this.frequencies.map(() => null))], elements.spectrum),
+      }), [this.frequencies, ...dots.map(() => this.frequencies.map(() => null))], elements.spectrum),
     };
     for (const name of Object.keys(this.plots)) legend.apply(name);
   }
@@ -96,11 +100,11 @@ export class Plots {
     const of = (...names) => [t, ...rows.slices(names, first)];
     this.plots.shift.setData(of('dx', 'dx_low', 'dx_high', 'dy', 'dy_low', 'dy_high'));
     this.plots.theta.setData(of('theta', 'theta_low', 'theta_high'));
-    this.plots.sums.setData(of('sum1', 'sum2'));
+    this.plots.sums.setData(of(...this.sums));
   }
 
   spectrum(density) {
-    const channels = density || [1, 2, 3, 4].map(() => this.frequencies.map(() => null));
+    const channels = density || this.psds.flatMap((n) => [n, n]).map(() => this.frequencies.map(() => null));
     this.plots.spectrum.setData([this.frequencies, ...channels.map((c) => c.map((v) => (v > 0 ? v * 1e6 : null)))]);
   }
 }

@@ -38,6 +38,7 @@ function band(name, scale) {
 }
 
 let plots = {};
+const psds = read.active_areas.map((_, i) => i + 1);
 const element = (name) => document.getElementById(`plot_${name}`);
 const legend = new Legend((name) => plots[name]);
 const timed = () => Object.entries(plots).filter(([name]) => name !== 'spectrum').map(([, plot]) => plot);
@@ -55,7 +56,7 @@ const of = (...names) => referenceMarks(color, () => [referenceTimes, ...names.m
 const data = {
   shift: [t, ...band('dx', MICRO), ...band('dy', MICRO)],
   theta: [t, ...band('theta', MDEG)],
-  sums: [t, column(read.columns.sum1), column(read.columns.sum2)],
+  sums: [t, ...psds.map((n) => column(read.columns[`sum${n}`]))],
 };
 if (read.loads.t) data.load = [column(read.loads.t, 1, Float64Array), ...['fx', 'fy', 'tz'].map((name) => column(read.loads[name]))];
 if (read.spectrum) data.spectrum = [column(read.spectrum.f), ...read.spectrum.density.map((text) => column(text, MICRO).map((v) => (v > 0 ? v : null)))];
@@ -83,10 +84,10 @@ function build() {
     load: () => options(color, element('load'), ['--dx', '--dy', '--theta'].map((name) => ({ ...line(color(name)), paths: steps })), {
       scales: { x: time, y: { range: calm(1) } }, cursor: cursor(zoom, 'traces'), hooks: seen('load', []),
     }),
-    sums: () => options(color, element('sums'), [line(color('--dx')), line(color('--dy'))], {
+    sums: () => options(color, element('sums'), psds.map((n) => line(color(['--dx', '--dy'][n - 1] ?? `--x${n}`))), {
       scales: { x: time, y: { range: () => [0, 1.5 * read.sum_nominal] } }, cursor: cursor(zoom, 'traces'), hooks: seen('sums', []),
     }),
-    spectrum: () => options(color, element('spectrum'), ['--x1', '--y1', '--x2', '--y2'].map((name) => line(color(name), 1)), {
+    spectrum: () => options(color, element('spectrum'), psds.flatMap((n) => [`--x${n}`, `--y${n}`]).map((name) => line(color(name), 1)), {
       scales: { x: { time: false, distr: 3, range: () => limits.frequencies ?? [data.spectrum[0][0], data.spectrum[0].at(-1)] }, y: { distr: 3 } },
       cursor: cursor(spectral),
       hooks: { drawAxes: [modeMarks(color, read.modes, data.spectrum[0].at(-1))], setCursor: [legend.follow('spectrum', 3)], setSelect: [dragged(spectral)] },
@@ -99,7 +100,7 @@ function build() {
   drawDots();
 }
 
-const dots = [1, 2].map((psd) => ['x', 'y'].map((axis) => column(read.columns[`${axis}${psd}`])));
+const dots = psds.map((psd) => ['x', 'y'].map((axis) => column(read.columns[`${axis}${psd}`])));
 
 // The dots of the time that is shown, on the active areas.
 function drawDots() {
