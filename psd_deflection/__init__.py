@@ -66,8 +66,9 @@ def open(path: str | Path) -> Recording:
 def solve(dots: npt.ArrayLike, rig: Rig | str | Path | None = None, solver: str | None = None) -> Solutions:
     """The pose of the tip from the dots, without any correction of effects.
 
-    ``dots``: (2P,) or (n, 2P) of P PSDs: x1, y1, x2, y2 ... from each PSD's centre, m. ``rig``: the rig or its parameter file; by
-    default the thesis rig. ``solver``: by default that of the rig; :mod:`psd_deflection.solvers` has their names.
+    ``dots``: (2P,) or (n, 2P) of P PSDs: x1, y1, x2, y2 ... from each PSD's centre, m. ``rig``: the rig or its
+    parameter file; by default the thesis rig. ``solver``: by default that of the rig;
+    :mod:`psd_deflection.solvers` has their names.
 
     The result has ``pose`` (dX m, dY m, theta rad), ``tilt`` (phi, omega, rad), ``covariance`` of the pose (for means
     of one block, with the rig's noise), ``residual`` (m) and ``status`` (0: solved), each for one block or for n.

@@ -428,20 +428,38 @@ class Pipeline:
         take: Callable[[tuple[int, ...]], _Readings | None],
     ) -> tuple[_Readings, DeflectionEstimate | None, tuple[BlockStatus, str] | None]:
         """:meth:`_primary`, without the PSD that contradicts the others if it can be told; ``take``: :meth:`_some`."""
-        found = self._primary(t_ns, block, readings)
+        before = tuple(range(len(self.rig.psds))) if readings.kept is None else readings.kept
+        taken: dict[int, _Readings | None] = {}
+
+        def without(psd: int) -> _Readings | None:
+            # Once a block: a fit remembers the motion that it saw.
+            if psd not in taken:
+                taken[psd] = take(tuple(p for p in before if p != psd))
+            return taken[psd]
+
+        def agree_without(number: int) -> bool:
+            others = without(before[number - 1])
+            return others is not None and self._agree(others)
+
+        if len(before) < 3 or self.rig.estimator.consistency == 'report':
+            return self._primary(t_ns, block, readings)
+        found = self._primary(t_ns, block, readings, agree_without)
         checked = found[0].checked
-        before = range(len(self.rig.psds)) if readings.kept is None else readings.kept
-        if checked is None or len(before) < 3 or self.rig.estimator.consistency == 'report':
-            return found
-        wrong = before[checked.wrong - 1] if checked.wrong else -1
+        wrong = before[checked.wrong - 1] if checked is not None and checked.wrong else -1
         still = [psd for psd in before if self._frozen[psd] >= FROZEN_BLOCKS]
-        if not checked.wrong and checked.contradict and len(still) == 1:
+        if wrong < 0 and checked is not None and checked.contradict and len(still) == 1:
             # The check cannot tell, but a detector whose values do not change by one bit tells on itself.
-            wrong, checked = still[0], None
-        others = take(tuple(psd for psd in before if psd != wrong)) if wrong >= 0 else None
-        if others is None:
-            return found
-        return self._primary(t_ns, block, others._replace(wrong=wrong + 1), checked)
+            wrong = still[0]
+        others = without(wrong) if wrong >= 0 else None
+        return found if others is None else self._primary(t_ns, block, others._replace(wrong=wrong + 1))
+
+    def _agree(self, readings: _Readings) -> bool:
+        """Whether the readings of some PSDs agree with each other."""
+        solution, _ = self._solve(0, readings)
+        if solution is None or readings.some is None:
+            return False
+        spread = np.diag(readings.variances) if readings.spread is None else readings.spread
+        return self.stamped.agree(readings.some, readings.dots, solution.residual, spread, solution[:5])
 
     def _some(
         self,
@@ -483,22 +501,23 @@ class Pipeline:
         return self._some_solvers[key]
 
     def _primary(
-        self, t_ns: int, block: int, readings: _Readings, checked: Checked | None = None
+        self, t_ns: int, block: int, readings: _Readings, agree_without: Callable[[int], bool] | None = None
     ) -> tuple[_Readings, DeflectionEstimate | None, tuple[BlockStatus, str] | None]:
         """The readings with their check, the primary solver's estimate, and why there is none.
 
-        ``checked``: the check, if it was made.
+        ``agree_without``: as :meth:`StampedDots.check` has it.
         """
         solution, failure = self._solve(0, readings)
         if solution is None:
             return readings, None, (BlockStatus.NOT_SOLVED, failure)
         factor = None if self._spread is None else self._spread.factor(solution.dx, solution.dy, solution.theta)
-        if self.stamped.flat and checked is None:
+        checked: Checked | None = None
+        if self.stamped.flat:
             allowed = np.diag(readings.variances) if readings.spread is None else readings.spread
             if factor is not None:
                 allowed = allowed + np.einsum('ik,jk->ij', factor, factor)
             pose = solution[:5]
-            checked = self.stamped.check(readings.dots, solution.residual, allowed, pose, readings.some)
+            checked = self.stamped.check(readings.dots, solution.residual, allowed, pose, readings.some, agree_without)
         readings = readings._replace(checked=checked, factor=factor)
         told = checked is not None and checked.contradict and not checked.wrong
         if checked is not None and told and self.rig.estimator.consistency == 'refuse':

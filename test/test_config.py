@@ -10,8 +10,8 @@ import pytest
 
 from psd_deflection.config import (
     BY_NAME,
-    PARAMETERS,
     LINK,
+    PARAMETERS,
     LinkConfig,
     Rig,
     left_as_in_the_thesis,

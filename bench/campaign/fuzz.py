@@ -385,7 +385,7 @@ def corrupted(count: int) -> int:
     originals = []
     for i in range(256):
         counts = tuple(chance.randrange(-32768, 32768) for _ in range(6))
-        frame = SampleFrame(i & 3, chance.getrandbits(32), chance.getrandbits(40), counts)  # type: ignore[arg-type]
+        frame = SampleFrame(i & 3, chance.getrandbits(32), chance.getrandbits(40), counts)
         originals.append((frame, encode(frame)))
     decoder = FrameDecoder()
     decoder.feed(b'\x00')

@@ -245,7 +245,7 @@ class Line:
         if self.freeze:
             counts[3:] = [high - DIGIT // 2, 0, 16384]
         flags, self.flags = self.flags, 0
-        frame = encode(SampleFrame(flags, seq % 2**32, max(t_us, 0), tuple(counts)))  # type: ignore[arg-type]
+        frame = encode(SampleFrame(flags, seq % 2**32, max(t_us, 0), tuple(counts)))
         changed = self.wire(identity, frame) if self.wire is not None else None
         if changed is not None:
             self.taken_by_fault.add(identity)

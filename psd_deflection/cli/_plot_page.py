@@ -96,6 +96,7 @@ def plot_page(
         for n in range(1, len(rig.psds) + 1)
     )
     name = html.escape(title)
+    figures = ''.join(_figure(plot, keys[plot]) for plot in shown)
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -103,7 +104,7 @@ def plot_page(
         f'<header><div class="title"><h1>{name}</h1> <span id="range" class="quiet"></span></div><div class="tools">'
         '<span class="quiet">drag over a trace to look closer</span>'
         '<button id="whole" type="button" aria-disabled="true">All of it</button></div></header>'
-        f'<main class="drawn"><section class="traces" aria-label="traces">{"".join(_figure(name, keys[name]) for name in shown)}</section>'
+        f'<main class="drawn"><section class="traces" aria-label="traces">{figures}</section>'
         f'<section class="side" aria-label="summary"><div class="detectors">{detectors}</div>'
         f'<div class="card"><h2>Summary</h2><table>{rows}</table><p class="quiet">psd_deflection {__version__}; '
         f'<code>psd-deflection plot {name}</code></p></div></section></main>'

@@ -5,15 +5,16 @@ With residual r of the readings, their covariance C and slopes J by the p unknow
     chi-square = r^T Q r,     Q = W - W J (J^T W J)^-1 J^T W,     W = C^-1,
 
 of 2P - p degrees of freedom (generalised least squares; Q J = 0, so r may come from any solver). If PSD i alone is
-wrong, it is wrong by e_i = Q_ii^-1 (Q r)_i, and without it chi-square falls by e_i^T (Q r)_i and loses two degrees of
-freedom (Baarda's data snooping, by pairs). A PSD is wrong if the readings contradict each other with it and agree
-without it, and no other PSD could be blamed. It is then left out for a second: while the link rings, its readings may
-be right for a block. If several PSDs could be blamed, or none alone, the covariance is widened by what each would
-cause.
-One degree of freedom (``pose`` with three PSDs) tells no PSD from another: then each reading could be blamed.
+wrong, it is wrong by e_i = Q_ii^-1 (Q r)_i (Baarda's data snooping, by pairs). A PSD is wrong if the readings
+contradict each other with it and agree without it, and no other PSD could be blamed. It is then left out for a second:
+while the link rings, its readings may be right for a block. If several PSDs could be blamed, or none alone, the
+covariance is widened by what each would cause. One degree of freedom (``pose`` with three PSDs) tells no PSD from
+another: then each reading could be blamed.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -47,21 +48,34 @@ class Redundancy:
         # Imported here: it takes a fifth of a second, and few rigs have more than two PSDs.
         from scipy.special import chdtri
 
-        self._limit, self._less_limit = (
-            float(chdtri(f, CONTRADICTS)) if f > 0 else 0.0 for f in (self.freedom, self.freedom - 2)
-        )
-        self._doubtful, self._less_doubtful = (
-            float(chdtri(f, DOUBTFUL)) if f > 0 else 0.0 for f in (self.freedom, self.freedom - 2)
+        self._limit, self._doubtful = (
+            float(chdtri(self.freedom, share)) if self.freedom else 0.0 for share in (CONTRADICTS, DOUBTFUL)
         )
         self._wrong = 0
         self._left = 0
         self._held = np.zeros(2 * psds)
 
-    def check(self, residual: tuple[float, ...], slopes: FloatArray, covariance: FloatArray, times: float) -> Checked:
+    def agrees(self, residual: tuple[float, ...], slopes: FloatArray, covariance: FloatArray, times: float) -> bool:
+        """Whether these readings agree with each other, and there are enough of them to tell; as :meth:`check`."""
+        if not self.freedom:
+            return False
+        r = np.array(residual)
+        chi_square = float(np.einsum('i,ij,j->', r, _unexplained(slopes, covariance), r))
+        return chi_square <= times * self._limit
+
+    def check(
+        self,
+        residual: tuple[float, ...],
+        slopes: FloatArray,
+        covariance: FloatArray,
+        times: float,
+        agree_without: Callable[[int], bool] | None = None,
+    ) -> Checked:
         """Check one block: ``residual`` (2P,) m, ``slopes`` (2P, p), ``covariance`` (2P, 2P) m^2.
 
-        ``times``: by how much more chi-square may be, while the noise is not known. :attr:`Checked.wrong` is the PSD
-        to leave out; ``chi_square`` and ``freedom`` are then those of the others.
+        ``times``: by how much more chi-square may be, while the noise is not known. ``agree_without``: whether the
+        readings of this block agree without a PSD (from 1), by a fit of their own: that of all readings mixes a wrong
+        one into the others. None: none may be left out. :attr:`Checked.wrong` is the PSD to leave out.
         """
         none = (0.0,) * len(residual)
         if not self.freedom:
@@ -70,56 +84,53 @@ class Redundancy:
         r = np.array(residual)
         pull = np.einsum('ij,j->i', q, r)
         chi_square = max(float((r * pull).sum()), 0.0)
-        errors, rest = self._blamed(q, pull, chi_square)
+        errors = self._errors(q, pull)
         contradict = chi_square > times * self._limit
-        if contradict:
-            suspects = [psd for psd, left in enumerate(rest, start=1) if left <= times * self._less_limit]
+        suspects: list[int] = []
+        if agree_without is None:
+            self._wrong = 0
+        elif contradict:
+            suspects = [psd for psd in range(1, self._psds + 1) if agree_without(psd)]
             if self._wrong not in suspects:
                 self._wrong = suspects[0] if len(suspects) == 1 else 0
             self._left = HOLD if self._wrong else 0
         elif self._wrong:
             self._left -= 1
-            agree = rest[self._wrong - 1] <= times * self._less_limit
-            self._wrong = self._wrong if self._left > 0 and agree else 0
-        possible = self._possible(q, errors, rest, chi_square, contradict and not self._wrong, times)
+            self._wrong = self._wrong if self._left > 0 and agree_without(self._wrong) else 0
+        possible = self._possible(q, errors, suspects, chi_square, contradict and not self._wrong, times)
         if self._wrong:
-            one = self._wrong
-            return Checked(max(rest[one - 1], 0.0), True, tuple(errors), none, one, self.freedom - 2)
+            return Checked(chi_square, True, tuple(errors), none, self._wrong, self.freedom)
         held = bool(self._held.any())
         return Checked(chi_square, contradict or held, tuple(errors), tuple(possible.tolist()), 0, self.freedom)
 
-    def _blamed(self, q: FloatArray, pull: FloatArray, chi_square: float) -> tuple[list[float], list[float]]:
-        """The error (2P,) m of each PSD if it alone is wrong, or of each reading; chi-square without each PSD."""
+    def _errors(self, q: FloatArray, pull: FloatArray) -> list[float]:
+        """The error (2P,) m of each PSD if it alone is wrong; with one degree of freedom of each reading."""
         errors = [0.0] * len(pull)
-        rest = [np.inf] * self._psds
         if self.freedom < 3:
             for i, (own, p) in enumerate(zip(np.diag(q).tolist(), pull.tolist(), strict=True)):
                 errors[i] = p / own if own > _UNSEEN * float(q.max()) else 0.0
-            return errors, rest
+            return errors
         for psd in range(self._psds):
             (a, b), (_, d) = q[2 * psd : 2 * psd + 2, 2 * psd : 2 * psd + 2].tolist()
-            u, v = pull[2 * psd], pull[2 * psd + 1]
+            u, v = pull[2 * psd : 2 * psd + 2].tolist()
             determinant = a * d - b * b
             if determinant > _UNSEEN * a * d:
                 x, y = (d * u - b * v) / determinant, (a * v - b * u) / determinant
             else:
                 # It is seen in one direction only.
                 x, y = u / (a + d), v / (a + d)
-            errors[2 * psd : 2 * psd + 2] = [float(x), float(y)]
-            rest[psd] = chi_square - float(x * u + y * v)
-        return errors, rest
+            errors[2 * psd : 2 * psd + 2] = [x, y]
+        return errors
 
     def _possible(
-        self, q: FloatArray, errors: list[float], rest: list[float], chi_square: float, hold: bool, times: float
+        self, q: FloatArray, errors: list[float], suspects: list[int], chi_square: float, hold: bool, times: float
     ) -> FloatArray:
         """What the covariance is to allow for, (2P,) m: errors of this block or held ones; ``hold``: keep them."""
         squares = np.zeros(len(errors))
         if hold or chi_square > times * self._doubtful:
-            limit = times * (self._less_limit if hold else self._less_doubtful)
-            blamed = [left <= limit for left in rest]
-            if not any(blamed):
-                blamed = [True] * self._psds
-            squares = np.repeat(blamed, 2) * np.square(errors)
+            squares = np.square(errors)
+            if suspects:
+                squares *= np.repeat([psd in suspects for psd in range(1, self._psds + 1)], 2)
         self._held = np.maximum(_FADE * self._held, squares if hold else 0.0)
         if self._wrong or not (self._held * np.diag(q) > times * self._limit).any():
             self._held = np.zeros(len(errors))

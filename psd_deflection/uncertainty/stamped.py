@@ -8,7 +8,7 @@ tells what they remember.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -81,10 +81,23 @@ class SomePsds:
         covariance: FloatArray,
         pose: Sequence[float],
         times: float,
+        agree_without: Callable[[int], bool] | None,
     ) -> Checked:
         """As :meth:`StampedDots.check`; ``times``: as :meth:`Redundancy.check`."""
         slopes = self._model.slopes_at(pose)
-        return self._redundancy.check(self._model.residual(dots, residual), slopes, covariance, times)
+        return self._redundancy.check(self._model.residual(dots, residual), slopes, covariance, times, agree_without)
+
+    def agree(
+        self,
+        dots: tuple[float, ...],
+        residual: tuple[float, ...],
+        covariance: FloatArray,
+        pose: Sequence[float],
+        times: float,
+    ) -> bool:
+        """Whether these readings agree with each other, and are enough to tell."""
+        slopes = self._model.slopes_at(pose)
+        return self._redundancy.agrees(self._model.residual(dots, residual), slopes, covariance, times)
 
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""
@@ -199,18 +212,20 @@ class StampedDots:
         covariance: FloatArray,
         pose: Sequence[float] = (),
         some: SomePsds | None = None,
+        agree_without: Callable[[int], bool] | None = None,
     ) -> Checked:
         """Hold the readings of a block against each other; ``pose``: dX, dY m, theta, phi, omega rad.
 
-        ``some``: it is theirs. :attr:`Checked.wrong` counts among those that are checked.
+        ``some``: it is theirs. ``agree_without``: as :meth:`Redundancy.check` has it. :attr:`Checked.wrong` counts
+        among those that are checked.
         """
-        sure = self.noise.measured or not self._measures
-        times = 1.0 if sure else UNMEASURED
+        times = self._times
         if some is not None:
-            checked = some.check(dots, residual, covariance, pose, times)
+            checked = some.check(dots, residual, covariance, pose, times, agree_without)
         elif self._redundancy is not None and self._all is not None:
             slopes = self._all.slopes_at(pose)
-            checked = self._redundancy.check(self._all.residual(dots, residual), slopes, covariance, times)
+            left = self._all.residual(dots, residual)
+            checked = self._redundancy.check(left, slopes, covariance, times, agree_without)
         else:
             x1, y1, x2, y2 = dots
             ax, ay = self._apart
@@ -218,6 +233,22 @@ class StampedDots:
         self.contradictions += checked.contradict
         self.chi_square, self.freedom = checked.chi_square, checked.freedom
         return checked
+
+    @property
+    def _times(self) -> float:
+        """By how much more a chi-square may be than with known noise."""
+        return 1.0 if self.noise.measured or not self._measures else UNMEASURED
+
+    def agree(
+        self,
+        some: SomePsds,
+        dots: tuple[float, ...],
+        residual: tuple[float, ...],
+        covariance: FloatArray,
+        pose: Sequence[float],
+    ) -> bool:
+        """Whether the readings of some PSDs agree with each other, and are enough to tell."""
+        return some.agree(dots, residual, covariance, pose, self._times)
 
     def learn(self, index: int, slots: IntArray, samples: FloatArray) -> None:
         """Take a good block into what is known of the noise. Nothing of this block's estimate waits for it."""

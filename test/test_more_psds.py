@@ -1,0 +1,461 @@
+"""Rigs of three and more PSDs from the rig file to the estimate: by truth, with one PSD failing, bit for bit again."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.stats import chi2
+
+from msg_adapters import point_cloud2, to_messages
+from psd_deflection.cli.main import main
+from psd_deflection.config import Rig, load_rig, replace_values
+from psd_deflection.errors import ConfigError, PsdDeflectionError, RecordingError
+from psd_deflection.geometry import Geometry
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.sinks import open_sink
+from psd_deflection.records import (
+    MOST_PSDS,
+    AppliedLoad,
+    BlockStatus,
+    DeflectionEstimate,
+    FloatArray,
+    RawChunk,
+    Record,
+    SampleBlock,
+    SpotMeans,
+    TipLoad,
+    channel_names,
+)
+from psd_deflection.runner.session import zero_text
+from psd_deflection.simulation import loads
+from psd_deflection.simulation.simulator import RigSimulator
+from psd_deflection.solvers import Solver, solver_from_rig
+from test.judges import RayPlane
+
+Counts = npt.NDArray[np.int32]
+Spoil = Callable[[Counts], None]
+
+STEP = 10.0 / 32768
+THREE = Path(__file__).parents[1] / 'config' / 'three_psds.yaml'
+LEVEL = {'psd_1.height': 0.0, 'psd_2.height': 0.0}
+FOURTH = {'psd_4.center': [-0.06, -0.06], 'psd_4.height': -0.04}
+
+
+@pytest.fixture(scope='module')
+def three() -> Rig:
+    return load_rig(THREE)
+
+
+def with_solver(rig: Rig, solver: str, **more: object) -> Rig:
+    return replace_values(rig, {'solver': solver, 'solvers': [solver], **more})
+
+
+def chunk_of(counts: Counts, first: int = 0) -> RawChunk:
+    seq = np.arange(first, first + len(counts))
+    return RawChunk(seq, seq * 1_000_000, counts, np.zeros(len(counts), np.uint8), STEP)
+
+
+def primaries(records: Sequence[Record]) -> list[DeflectionEstimate]:
+    return [r for r in records if isinstance(r, DeflectionEstimate) and r.primary]
+
+
+def spots_of(records: Sequence[Record]) -> list[SpotMeans]:
+    return [r for r in records if isinstance(r, SpotMeans)]
+
+
+def at_rest(rig: Rig, dots: FloatArray, n: int, seed: int) -> Counts:
+    """Counts of ``n`` samples of the dots (2P,), m, with 2 mV of noise on every channel."""
+    volts = np.full(3 * len(rig.psds), 5.0)
+    for i in range(len(rig.psds)):
+        volts[3 * i : 3 * i + 2] = dots[2 * i : 2 * i + 2] / 5e-4
+    noisy = volts + np.random.default_rng(seed).normal(0.0, 2e-3, (n, len(volts)))
+    return np.rint(noisy / STEP).astype(np.int32)
+
+
+# The rig file.
+
+
+def test_a_rig_of_two_has_no_parameter_of_a_third() -> None:
+    rig = load_rig()
+    assert len(rig.psds) == len(rig.beams) == 2
+    assert not [name for name in rig.flat() if name.startswith(('psd_3', 'beam_3'))]
+
+
+def test_what_a_third_psd_leaves_out_has_its_default_and_goes_round(three: Rig) -> None:
+    assert three.psds[2].center == (0.08, -0.06)
+    assert (three.psds[2].height, three.beams[2].angle, three.psds[2].axes) == (0.0, (0.0, 0.0), ('x', 'y'))
+    assert load_rig(overrides=three.flat()) == three
+    assert f'psd_3.zero {[0.0, 0.0]}' in ' '.join(f'{p.name} {three.values[p.name]}' for p in three.parameters)
+    assert zero_text(three).endswith('psd_3 (0.0000, 0.0000)')
+
+
+@pytest.mark.parametrize(
+    ('values', 'words'),
+    [
+        ({'psd_4.center': [0.0, -0.07]}, 'psd_4.center is given without psd_3.center'),
+        ({'psd_3.height': 0.01}, 'psd_3.height is given without psd_3.center'),
+        ({'beam_3.angle': [0.0, 0.001]}, 'beam_3.angle is given without psd_3.center'),
+        ({f'psd_{MOST_PSDS + 1}.center': [0.0, 0.0]}, f'psd_{MOST_PSDS + 1}.center'),
+        ({'psd_3.center': [0.08, 0.0], 'psd_3.axes': ['x', '-x']}, 'must name x once and y once'),
+    ],
+)
+def test_a_gap_and_a_psd_without_a_place_are_refused_by_name(values: dict[str, object], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        load_rig(overrides=values)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'words'),
+    [
+        ({'solvers': ['pose', 'minimum_tilt']}, 'minimum_tilt takes two PSDs.*pose'),
+        ({'solvers': ['pose', 'appendix_d']}, 'appendix_d takes two PSDs.*pose'),
+        ({'solvers': ['pose', 'wls'], 'wls.weights': 'thesis'}, 'wls.weights = thesis.*inverse_variance'),
+        ({'effects.sensor_gain.psd': 4, 'effects.sensor_gain.x': 0.01}, 'psd = 4: the rig has 3 PSDs'),
+        ({'calibration.names': ['psd_1.rotation'], 'calibration.sds': [0.001]}, 'psd_3.center is given: a calibration'),
+    ],
+)
+def test_what_is_made_for_two_is_refused(three: Rig, changes: dict[str, object], words: str) -> None:
+    with pytest.raises(PsdDeflectionError, match=words):
+        Pipeline(replace_values(three, changes))
+
+
+def test_samples_of_another_number_of_psds_are_refused(three: Rig) -> None:
+    two = RigSimulator(load_rig()).step(np.zeros((20, 3)))
+    with pytest.raises(ConfigError, match='samples are of 2 PSDs, the rig file has 3'):
+        list(Pipeline(three).process(chunk_of(two.counts)))
+
+
+# By truth.
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize(
+    ('solver', 'more', 'pose', 'unknowns'),
+    [
+        ('pose', {}, (1.2e-3, -1.8e-3, 0.01, 4e-3, 3e-3), 5),
+        ('pose', FOURTH, (-0.5e-3, 1.0e-3, -0.01, -2e-3, 1e-3), 5),
+        ('exact', LEVEL, (1.2e-3, -1.8e-3, 0.02, 0.0, 0.0), 3),
+        ('exact', {**LEVEL, 'psd_4.center': [0.05, 0.06]}, (1.2e-3, -1.8e-3, 0.02, 0.0, 0.0), 3),
+        ('beam', {}, (0.9e-3, -1.5e-3, 0.01, 1.5 * 1.5e-3 / 0.585, 1.5 * 0.9e-3 / 0.585), 3),
+        ('iterative', LEVEL, (1.2e-3, -1.8e-3, 0.02, 0.0, 0.0), 3),
+    ],
+)
+def test_errors_are_those_of_the_covariance(
+    three: Rig, rays: RayPlane, solver: str, more: dict[str, object], pose: tuple[float, ...], unknowns: int
+) -> None:
+    rig = with_solver(three, solver, **more)
+    dots = rays.tip_dots(Geometry.from_rig(rig), pose)
+    found = primaries(list(Pipeline(rig).process(chunk_of(at_rest(rig, dots, 20 * 500, 11)))))[100:]
+    errors = np.array([e.pose for e in found]) - pose[:3]
+    covariances = np.array([e.covariance for e in found]).reshape(-1, 3, 3)
+    squares = np.einsum('ni,nij,nj->n', errors, np.linalg.inv(covariances), errors)
+    # 400 blocks: a mean of 3 within four of its standard deviations, and the tail of a chi-square.
+    assert len(found) == 400
+    assert squares.mean() == pytest.approx(3.0, abs=4.0 * (6.0 / 400) ** 0.5)
+    assert np.mean(squares < chi2.isf(0.05, 3)) > 0.95 - 4.0 * (0.05 * 0.95 / 400) ** 0.5
+    freedom = 2 * len(rig.psds) - unknowns
+    redundant = np.array([e.chi_square for e in found])
+    assert redundant.mean() == pytest.approx(freedom, abs=4.0 * (2.0 * freedom / 400) ** 0.5)
+    if unknowns == 5:
+        # The tilts have the sign that was given.
+        tilts = np.array([(e.phi, e.omega) for e in found]).mean(axis=0)
+        assert tilts == pytest.approx(pose[3:], abs=2e-5)
+
+
+def test_an_answer_goes_with_each_dot_as_its_gain_says(three: Rig, rays: RayPlane) -> None:
+    pose = solver_from_rig('pose', three)
+    dots = tuple(rays.tip_dots(Geometry.from_rig(three), (1e-3, -1e-3, 0.01, 2e-3, 1e-3)).tolist())
+    variances = (1e-12, 2e-12, 3e-12, 1e-12, 2e-12, 3e-12)
+    found = pose.solve(dots, variances)
+    by_differences = Solver.gain(pose, dots, variances, found)
+    assert pose.gain(dots, variances, found) == pytest.approx(by_differences, rel=1e-4, abs=1e-5)
+
+
+# One PSD fails in the middle of a stream.
+
+FAILS = 1800
+
+
+def dark(psd: int) -> Spoil:
+    def spoil(counts: Counts) -> None:
+        counts[FAILS:, 3 * psd : 3 * psd + 3] %= 13
+
+    return spoil
+
+
+def saturated(psd: int) -> Spoil:
+    def spoil(counts: Counts) -> None:
+        counts[FAILS:, 3 * psd] = 32767
+
+    return spoil
+
+
+def stuck(psd: int) -> Spoil:
+    def spoil(counts: Counts) -> None:
+        counts[FAILS:, 3 * psd : 3 * psd + 3] = counts[FAILS - 1, 3 * psd : 3 * psd + 3]
+
+    return spoil
+
+
+def inverted(psd: int) -> Spoil:
+    def spoil(counts: Counts) -> None:
+        counts[FAILS:, 3 * psd + 1] *= -1
+
+    return spoil
+
+
+PUSHED = loads.steps([(0.0, 0.0, 0.0), (0.0, -30.0, -5.0), (10.0, 10.0, 5.0)], 1.2)
+
+
+def run(rig: Rig, spoil: Spoil | None = None) -> tuple[list[Record], FloatArray, Pipeline]:
+    """The records of a link that is pushed and rings, and its true poses in the middle of the blocks."""
+    simulated = RigSimulator(rig, 3).step(PUSHED.loads)
+    counts = simulated.counts.copy()
+    if spoil is not None:
+        spoil(counts)
+    pipeline = Pipeline(rig)
+    records = list(pipeline.process(chunk_of(counts)))
+    middle = np.arange(9, len(counts), 20)
+    p = simulated.pose
+    return records, (9.0 * (p[middle] + p[middle + 1]) - p[middle - 1] - p[middle + 2]) / 16.0, pipeline
+
+
+def deviations(records: Sequence[Record], truth: FloatArray) -> FloatArray:
+    """|error| over its own standard deviation, (n, 3), of the primary estimates."""
+    found = primaries(records)
+    errors = np.array([e.pose for e in found]) - truth[[e.block for e in found]]
+    return np.asarray(np.abs(errors) / np.sqrt([e.variances for e in found]))
+
+
+@pytest.mark.parametrize(('solver', 'more'), [('exact', LEVEL), ('pose', {})])
+@pytest.mark.parametrize('fault', [dark, saturated])
+@pytest.mark.parametrize('psd', [0, 2])
+def test_without_one_psd_the_estimate_goes_on_from_the_others(
+    three: Rig, solver: str, more: dict[str, object], fault: Callable[[int], Spoil], psd: int
+) -> None:
+    rig = with_solver(three, solver, **more)
+    records, truth, pipeline = run(rig, fault(psd))
+    found, spots = primaries(records), spots_of(records)
+    assert len(found) == len(spots) == 180
+    assert deviations(records, truth).max() < 5.0
+    after = [s for s in spots if s.index * 20 >= FAILS]
+    assert {s.left_out for s in after} == {(psd + 1,)}
+    assert {s.status for s in after} == {BlockStatus.LASER_LOST if fault is dark else BlockStatus.SATURATED}
+    assert pipeline.counters.degraded == len(after) == 90
+    assert sum(isinstance(r, TipLoad) for r in records) == 180
+    # What is left says less, and its own check has two degrees of freedom less: one, or none.
+    before = np.mean([e.variances for e in found[50:90]], axis=0)
+    assert (np.mean([e.variances for e in found[-50:]], axis=0) > 1.1 * before).all()
+    squares = np.array([e.chi_square for e in found[-80:]])
+    assert np.isnan(squares).all() if solver == 'pose' else 0.5 < squares.mean() < 1.6
+    # The dots of the others are published, and no others.
+    topics = {m.topic for m in to_messages(after[-1])}
+    assert topics == {f'/psd_{n}/spot' for n in (1, 2, 3) if n != psd + 1}
+
+
+@pytest.mark.parametrize('fault', [stuck, inverted])
+@pytest.mark.parametrize('psd', [0, 1, 2])
+def test_a_psd_that_contradicts_the_others_is_named_and_left_out(
+    three: Rig, fault: Callable[[int], Spoil], psd: int
+) -> None:
+    rig = with_solver(three, 'exact', **LEVEL)
+    records, truth, pipeline = run(rig, fault(psd))
+    found, spots = primaries(records), spots_of(records)
+    assert len(found) == 180
+    assert deviations(records, truth).max() < 5.0
+    left_out = [s.left_out for s in spots if s.index * 20 >= FAILS]
+    assert left_out.count((psd + 1,)) > 30
+    assert left_out.count((psd + 1,)) + left_out.count(()) == 90
+    assert not any(s.left_out for s in spots if s.index * 20 < FAILS)
+    assert pipeline.stamped.most_likely_wrong() == f'psd_{psd + 1} does not fit the others and is left out'
+    assert f'psd_{psd + 1} contradicts the others and is left out' in pipeline.counters.findings
+    # What is left agrees.
+    good = [e.chi_square for e, s in zip(found, spots, strict=True) if s.left_out]
+    assert np.mean(good) < 2.0
+
+
+@pytest.mark.parametrize('psd', [0, 1, 2])
+def test_one_degree_of_freedom_names_none_but_the_truth_stays_inside(three: Rig, psd: int) -> None:
+    records, truth, pipeline = run(three, inverted(psd))
+    assert len(primaries(records)) == 180
+    assert deviations(records, truth).max() < 5.0
+    assert pipeline.stamped.contradictions > 60
+    assert pipeline.stamped.most_likely_wrong() == ''
+
+
+def test_a_stuck_psd_tells_on_itself_where_the_check_cannot(three: Rig) -> None:
+    records, truth, _ = run(three, stuck(1))
+    assert deviations(records, truth).max() < 5.0
+    assert [s.left_out for s in spots_of(records)].count((2,)) > 70
+
+
+def test_refuse_refuses_only_what_cannot_be_told(three: Rig) -> None:
+    told, _, _ = run(with_solver(three, 'exact', consistency='refuse', **LEVEL), inverted(2))
+    assert len(primaries(told)) > 110
+    not_told, _, pipeline = run(replace_values(three, {'consistency': 'refuse'}), inverted(2))
+    assert pipeline.counters.refused['inconsistent'] > 60
+    assert spots_of(not_told)[-1].status is BlockStatus.INCONSISTENT
+    assert spots_of(not_told)[-1].reason.startswith('the readings contradict each other')
+    reported, _, pipeline = run(with_solver(three, 'exact', consistency='report', **LEVEL), inverted(2))
+    assert len(primaries(reported)) == 180
+    assert not any(s.left_out for s in spots_of(reported))
+    assert pipeline.stamped.contradictions > 60
+
+
+def test_with_one_psd_left_the_rule_for_one_holds(three: Rig) -> None:
+    def two_dark(counts: Counts) -> None:
+        dark(0)(counts)
+        dark(1)(counts)
+
+    records, _, pipeline = run(with_solver(three, 'exact', **LEVEL), two_dark)
+    assert len(primaries(records)) == 90
+    assert pipeline.counters.refused == {'laser_lost': 90}
+    records, truth, _ = run(with_solver(three, 'exact', degraded='hold', **LEVEL), two_dark)
+    assert {e.solver for e in primaries(records)[90:]} == {'one_psd'}
+    assert deviations(records, truth).max() < 5.0
+
+
+def test_two_of_four_may_fail_one_after_the_other(three: Rig) -> None:
+    def spoil(counts: Counts) -> None:
+        dark(3)(counts)
+        counts[2400:, 1] *= -1
+
+    rig = with_solver(three, 'exact', **LEVEL, **{**FOURTH, 'psd_4.height': 0.0})
+    records, truth, pipeline = run(rig, spoil)
+    assert deviations(records, truth).max() < 5.0
+    assert spots_of(records)[100].left_out == (4,)
+    assert spots_of(records)[-1].left_out == (1, 4)
+    assert pipeline.stamped.most_likely_wrong() == 'psd_1 and psd_4 does not fit the others and is left out'
+
+
+# Bit for bit again.
+
+
+@pytest.mark.parametrize('fault', [None, dark(2), inverted(1)])
+@pytest.mark.parametrize('solver', ['pose', 'exact'])
+def test_from_the_memory_at_any_block_the_same_bits_follow(three: Rig, solver: str, fault: Spoil | None) -> None:
+    rig = with_solver(three, solver, **({} if solver == 'pose' else LEVEL))
+    counts = RigSimulator(rig, 5).step(PUSHED.loads).counts
+    if fault is not None:
+        fault(counts)
+    cut = FAILS + 400
+    first, second = Pipeline(rig), Pipeline(rig)
+    list(first.process(chunk_of(counts[:cut])))
+    memory = first.memory(rig)
+    assert memory is not None
+    second.apply(memory)
+    again = list(second.process(chunk_of(counts[cut:], cut)))
+    assert primaries(again) == primaries(list(first.process(chunk_of(counts[cut:], cut))))
+    assert len(primaries(again)) == (len(counts) - cut) // 20
+
+
+def test_a_recording_of_three_is_replayed_without_a_differing_bit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ['--params-file', str(THREE), '--loads', 'steps:0,0,0;0,-20,-4:1.5']
+    assert main(['simulate', *words, '--out', str(tmp_path / 'a')]) == 0
+    assert main(['replay', str(tmp_path / 'a'), '--out', str(tmp_path / 'b.mcap')]) == 0
+    assert main(['replay', str(tmp_path / 'b.mcap'), '--compare']) == 0
+    assert 'no bit differs' in capsys.readouterr().out
+    bag = open_recording(tmp_path / 'b.mcap')
+    assert bag.psds == 3
+    assert bag.samples.dtype.names is not None
+    assert bag.samples.dtype.names[3:12] == channel_names(3)
+    assert '/psd_3/spot' in bag.topics()
+    # The same samples as a CSV, which names no rig.
+    assert main(['convert', str(tmp_path / 'b.mcap'), '--out', str(tmp_path / 'c.csv')]) == 0
+    csv = open_recording(tmp_path / 'c.csv')
+    assert csv.psds == 3
+    assert all((csv.samples[c] == bag.samples[c]).all() for c in channel_names(3))
+    assert main(['replay', str(tmp_path / 'c.csv')]) == 3
+    assert 'samples of 3 PSDs, the rig file has 2' in capsys.readouterr().err
+    assert main(['replay', str(tmp_path / 'c.csv'), '--params-file', str(THREE)]) == 0
+
+
+@pytest.mark.parametrize('command', ['check', 'discover', 'calibrate'])
+def test_commands_for_two_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
+    words = ['--params-file', str(THREE), '--loads', 'constant:0,0,0:1']
+    assert main(['simulate', *words, '--out', str(tmp_path / 'a.csv')]) == 0
+    more = [] if command == 'check' else ['--out', str(tmp_path / 'out')]
+    assert main([command, str(tmp_path / 'a.csv'), '--params-file', str(THREE), *more]) == 3
+    assert 'takes rigs of two PSDs, this one has 3' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('header', 'words'),
+    [
+        ('t,x1,y1,sum1,x2,y2,sum2,x3,sum3', 'has x3, sum3 without y3'),
+        ('t,x1,y1,sum1,x2,y2,sum2,x4,y4,sum4', 'without x3, y3, sum3'),
+        ('t,x1,y1,sum1', 'the header lacks x2, y2, sum2'),
+    ],
+)
+def test_a_csv_with_part_of_a_psd_is_refused(tmp_path: Path, header: str, words: str) -> None:
+    path = tmp_path / 'a.csv'
+    path.write_text('\n'.join([header, '0,' + '0,' * (header.count(',') - 1) + '0']))
+    with pytest.raises(RecordingError, match=words):
+        open_recording(path)
+
+
+def test_a_bag_whose_number_of_psds_changes_is_refused(tmp_path: Path, three: Rig) -> None:
+    blocks = []
+    for index, rig in enumerate((three, load_rig())):
+        counts = RigSimulator(rig).step(np.zeros((20, 3))).counts
+        seq = np.arange(20) + 20 * index
+        flags = np.zeros(20, np.uint8)
+        blocks.append(SampleBlock(index, seq, seq * 1_000_000 + 1, (counts * STEP).astype(np.float32), flags))
+    with contextlib.closing(open_sink(tmp_path / 'a.mcap', three.flat())) as sink:
+        for block in blocks:
+            sink.put(block)
+    with pytest.raises(RecordingError, match='has 2 PSDs, the samples before have 3'):
+        list(open_recording(tmp_path / 'a.mcap').blocks())
+
+
+def test_the_cloud_of_two_is_as_it_was() -> None:
+    names = ('seq', 'dt', 'x1', 'y1', 'sum1', 'x2', 'y2', 'sum2', 'flags', 'seq_high')
+    for more, dtype in enumerate((point_cloud2.PLAIN, point_cloud2.FLAGGED, point_cloud2.LONG)):
+        assert dtype.names == names[: 8 + more]
+        assert dtype.itemsize == 32 + 4 * more
+    assert [point_cloud2.point_of(n).itemsize for n in (3, MOST_PSDS)] == [44, 8 + 12 * MOST_PSDS]
+
+
+def test_a_csv_of_samples_keeps_loads_beside_many_channels(tmp_path: Path, three: Rig) -> None:
+    counts = RigSimulator(three).step(np.zeros((20, 3))).counts
+    seq = np.arange(20)
+    volts = (counts * STEP).astype(np.float32)
+    sink = open_sink(tmp_path / 'a.csv', three.flat(), samples_with=[AppliedLoad], psds=3)
+    with contextlib.closing(sink):
+        sink.put(AppliedLoad(0, 1.0, 2.0, 3.0))
+        sink.put(SampleBlock(0, seq, seq * 1_000_000, volts, np.zeros(20, np.uint8)))
+    read = open_recording(tmp_path / 'a.csv')
+    assert read.loads() == [AppliedLoad(0, 1.0, 2.0, 3.0)]
+    assert all((read.samples[c] == volts[:, i]).all() for i, c in enumerate(channel_names(3)))
+
+
+def test_a_zero_is_of_all_psds(three: Rig) -> None:
+    zeros = {'psd_1.zero': [1e-4, -1e-4], 'psd_2.zero': [0.0, 2e-4], 'psd_3.zero': [-3e-4, 1e-4]}
+    counts = RigSimulator(replace_values(three, zeros), 2).step(np.zeros((600, 3))).counts
+    pipeline = Pipeline(three)
+    list(pipeline.process(chunk_of(counts)))
+    taken = pipeline.zero()
+    assert taken is not None
+    found = dict(taken.values)
+    for name, wanted in zeros.items():
+        assert found[name] == pytest.approx(wanted, abs=1e-6)
+    assert [e.pose for e in primaries(list(pipeline.process(chunk_of(counts, 600))))][-1] == pytest.approx(
+        (0.0, 0.0, 0.0), abs=5e-6
+    )
+
+
+def test_exchanged_inputs_are_those_of_the_first_two(three: Rig) -> None:
+    counts = RigSimulator(three, 2).step(PUSHED.loads[:2500]).counts
+    swapped = counts[:, list(itertools.chain(range(3, 6), range(3), range(6, 9)))]
+    straight = primaries(list(Pipeline(three).process(chunk_of(counts))))
+    exchanged = replace_values(three, {'psds_exchanged': True})
+    assert primaries(list(Pipeline(exchanged).process(chunk_of(swapped)))) == straight
