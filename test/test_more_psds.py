@@ -234,6 +234,13 @@ def deviations(records: Sequence[Record], truth: FloatArray) -> FloatArray:
     return np.asarray(np.abs(errors) / np.sqrt([e.variances for e in found]))
 
 
+def assert_inside(records: Sequence[Record], truth: FloatArray) -> None:
+    """As good as two PSDs while the link rings: 99 % within three standard deviations, none far out."""
+    found = deviations(records, truth)
+    assert (found < 3.0).mean() > 0.99
+    assert found.max() < 6.0
+
+
 @pytest.mark.parametrize(('solver', 'more'), [('exact', LEVEL), ('pose', {})])
 @pytest.mark.parametrize('fault', [dark, saturated])
 @pytest.mark.parametrize('psd', [0, 2])
@@ -244,7 +251,7 @@ def test_without_one_psd_the_estimate_goes_on_from_the_others(
     records, truth, pipeline = run(rig, fault(psd))
     found, spots = primaries(records), spots_of(records)
     assert len(found) == len(spots) == 180
-    assert deviations(records, truth).max() < 5.0
+    assert_inside(records, truth)
     after = [s for s in spots if s.index * 20 >= FAILS]
     assert {s.left_out for s in after} == {(psd + 1,)}
     assert {s.status for s in after} == {BlockStatus.LASER_LOST if fault is dark else BlockStatus.SATURATED}
@@ -269,7 +276,7 @@ def test_a_psd_that_contradicts_the_others_is_named_and_left_out(
     records, truth, pipeline = run(rig, fault(psd))
     found, spots = primaries(records), spots_of(records)
     assert len(found) == 180
-    assert deviations(records, truth).max() < 5.0
+    assert_inside(records, truth)
     left_out = [s.left_out for s in spots if s.index * 20 >= FAILS]
     assert left_out.count((psd + 1,)) > 30
     assert left_out.count((psd + 1,)) + left_out.count(()) == 90
@@ -285,14 +292,14 @@ def test_a_psd_that_contradicts_the_others_is_named_and_left_out(
 def test_one_degree_of_freedom_names_none_but_the_truth_stays_inside(three: Rig, psd: int) -> None:
     records, truth, pipeline = run(three, inverted(psd))
     assert len(primaries(records)) == 180
-    assert deviations(records, truth).max() < 5.0
+    assert_inside(records, truth)
     assert pipeline.stamped.contradictions > 60
     assert pipeline.stamped.most_likely_wrong() == ''
 
 
 def test_a_stuck_psd_tells_on_itself_where_the_check_cannot(three: Rig) -> None:
     records, truth, _ = run(three, stuck(1))
-    assert deviations(records, truth).max() < 5.0
+    assert_inside(records, truth)
     assert [s.left_out for s in spots_of(records)].count((2,)) > 70
 
 
@@ -319,7 +326,7 @@ def test_with_one_psd_left_the_rule_for_one_holds(three: Rig) -> None:
     assert pipeline.counters.refused == {'laser_lost': 90}
     records, truth, _ = run(with_solver(three, 'exact', degraded='hold', **LEVEL), two_dark)
     assert {e.solver for e in primaries(records)[90:]} == {'one_psd'}
-    assert deviations(records, truth).max() < 5.0
+    assert_inside(records, truth)
 
 
 def test_two_of_four_may_fail_one_after_the_other(three: Rig) -> None:
@@ -329,7 +336,7 @@ def test_two_of_four_may_fail_one_after_the_other(three: Rig) -> None:
 
     rig = with_solver(three, 'exact', **LEVEL, **{**FOURTH, 'psd_4.height': 0.0})
     records, truth, pipeline = run(rig, spoil)
-    assert deviations(records, truth).max() < 5.0
+    assert_inside(records, truth)
     assert spots_of(records)[100].left_out == (4,)
     assert spots_of(records)[-1].left_out == (1, 4)
     assert pipeline.stamped.most_likely_wrong() == 'psd_1 and psd_4 does not fit the others and is left out'

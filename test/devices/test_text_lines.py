@@ -35,7 +35,7 @@ LINE = Line(7, 7000, VALUES)
         (b'# {"sample_rate_hz": 200}', Description({'sample_rate_hz': 200})),
         (b'# a remark', BadFrame('comment without a description', 10)),
         (b'#[1]', BadFrame('comment without a description', 4)),
-        (b'7,7000,0.1,-0.2,5,0,1.5', BadFrame('not eight fields, nor ten', 23)),
+        (b'7,7000,0.1,-0.2,5,0,1.5', BadFrame('no number of fields that a sample has', 23)),
         (b'7,7000,0.1,-0.2,5,0,1.5,x', BadFrame('a reading is no number', 25)),
         (b'7,7000,0.1,-0.2,5,0,1.5,nan', BadFrame('a reading is no number', 27)),
         (b'7,7000,0.1,-0.2,5,0,1.5,1e9', BadFrame('a reading is no number', 27)),
@@ -62,7 +62,7 @@ STREAM = b'tail\n7,7000,0.1,-0.2,5,0,1.5,4.75\r\n\n#{"a":1}\nrubbish\n' + b'x' *
 ITEMS = [
     LINE,
     Description({'a': 1}),
-    BadFrame('not eight fields, nor ten', 7),
+    BadFrame('no number of fields that a sample has', 7),
     BadFrame('longer than a line', 1000),
     Line(1, 2, (0, 0, 5, 0, 0, 5)),
 ]

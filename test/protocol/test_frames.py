@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import zlib
 
 import pytest
+from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -25,6 +27,7 @@ from psd_deflection.protocol.frames import (
     StopFrame,
     encode,
 )
+from psd_deflection.records import MOST_PSDS
 
 SAMPLE = SampleFrame(0, 1, 1000, (1, -1, 16384, 0, 0, 16384))
 SAMPLE_BYTES = bytes.fromhex('020102010101 03e803 01010101 01 0201 03ffff 0240 01010101 0640713ed6b200')
@@ -167,3 +170,43 @@ def test_every_single_flipped_bit_of_one_sample_is_noticed() -> None:
         wire = bytearray(SAMPLE_BYTES)
         wire[bit // 8] ^= 1 << (bit % 8)
         assert not any(isinstance(f, SampleFrame) for f in decode(bytes(wire) + b'\x00')), bit
+
+
+@st.composite
+def samples_of_some(draw: st.DrawFn) -> tuple[SampleFrame, bool]:
+    """A sample of any number of PSDs, and whether it goes as a wide one."""
+    wide = draw(st.booleans())
+    most = (1 << 31 if wide else 1 << 15) - 1
+    count = 3 * draw(st.integers(2, MOST_PSDS))
+    counts = draw(st.lists(st.integers(-most - 1, most), min_size=count, max_size=count))
+    flags, seq, t_us = draw(st.integers(0, 255)), draw(st.integers(0, 2**32 - 1)), draw(st.integers(0, 2**53))
+    return SampleFrame(flags, seq, t_us, tuple(counts)), wide
+
+
+@given(samples_of_some(), st.integers(2, MOST_PSDS))
+def test_a_sample_of_any_number_of_psds_comes_back_and_no_other_is_taken(
+    sample: tuple[SampleFrame, bool], psds: int
+) -> None:
+    frame, wide = sample
+    stream = b'\x00' + encode(frame, wide=wide)
+    assert len(stream) - 2 <= MAX_ENCODED
+    (found,) = FrameDecoder(psds).feed(stream)
+    if 3 * psds == len(frame.counts):
+        assert found == frame
+    else:
+        assert isinstance(found, BadFrame)
+        assert found.reason == BadReason.LENGTH
+
+
+@pytest.mark.parametrize('count', [0, 3, 5, 7, 3 * MOST_PSDS + 3])
+def test_counts_that_are_not_three_of_each_psd_cannot_be_sent(count: int) -> None:
+    with pytest.raises(ValueError, match='counts|expected'):
+        encode(SampleFrame(0, 0, 0, (0,) * count))
+
+
+@given(st.binary(max_size=200), st.integers(2, MOST_PSDS))
+def test_whatever_comes_a_sample_has_the_number_of_psds_that_was_asked_for(junk: bytes, psds: int) -> None:
+    body = bytes((1,)) + junk
+    sealed = cobs.encode(body + zlib.crc32(body).to_bytes(4, 'little'))
+    for frame in FrameDecoder(psds).feed(b'\x00' + sealed + b'\x00' + junk + b'\x00'):
+        assert isinstance(frame, BadFrame) or (isinstance(frame, SampleFrame) and len(frame.counts) == 3 * psds)
