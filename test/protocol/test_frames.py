@@ -200,7 +200,7 @@ def test_a_sample_of_any_number_of_psds_comes_back_and_no_other_is_taken(
 
 @pytest.mark.parametrize('count', [0, 3, 5, 7, 3 * MOST_PSDS + 3])
 def test_counts_that_are_not_three_of_each_psd_cannot_be_sent(count: int) -> None:
-    with pytest.raises(ValueError, match='counts|expected'):
+    with pytest.raises(ValueError, match=r'counts|expected'):
         encode(SampleFrame(0, 0, 0, (0,) * count))
 
 
