@@ -466,3 +466,16 @@ def test_exchanged_inputs_are_those_of_the_first_two(three: Rig) -> None:
     straight = primaries(list(Pipeline(three).process(chunk_of(counts))))
     exchanged = replace_values(three, {'psds_exchanged': True})
     assert primaries(list(Pipeline(exchanged).process(chunk_of(swapped)))) == straight
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize(('solver', 'more'), [('pose', {}), ('exact', LEVEL)])
+def test_the_noise_is_that_of_the_samples_without_any_rest(three: Rig, solver: str, more: dict[str, object]) -> None:
+    """A twist by a degree moves every combination of the dots; what the model leaves of them stays noise."""
+    rig = with_solver(three, solver, **more)
+    ringing = loads.steps([(0.0, -30.0, -10.0), (10.0, 10.0, 5.0), (0.0, 0.0, 0.0)], 1.0)
+    pipeline = Pipeline(rig)
+    list(pipeline.process(chunk_of(RigSimulator(rig, 4).step(ringing.loads).counts)))
+    assert pipeline.stamped.noise_source() == 'measured in motion'
+    assert pipeline.stamped.noise.sample_sd() == pytest.approx(1e-6, rel=0.1)
+    assert pipeline.stamped.noise.mean_sd() == pytest.approx(1e-6 / 20**0.5, rel=0.15)

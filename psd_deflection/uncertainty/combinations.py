@@ -2,17 +2,22 @@
 
 Of two PSDs: x and y of the plate's middle, its twist, and the length of the base line, exactly, which does not move
 while the plate stays flat. Of more PSDs: the directions in which the solver's unknowns move the dots at rest, and those
-across them, of which the link moves the dots only to second order.
+across them, of which the link moves the dots only to second order. The one that does not move is of what the solver's
+model leaves of the dots: a twist by 1 degree would move the dots' own by 15 um.
 """
 
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 
 import numpy as np
 
 from psd_deflection.geometry.linear import design_matrix
 from psd_deflection.records import FloatArray
+
+Left = Callable[[FloatArray], FloatArray]
+"""What a model of the plate leaves of dots (n, C), m."""
 
 
 class Combinations(abc.ABC):
@@ -76,8 +81,9 @@ class _BaseLine(Combinations):
 class _Several(Combinations):
     """Of more PSDs."""
 
-    def __init__(self, slopes: FloatArray) -> None:
+    def __init__(self, slopes: FloatArray, left: Left | None) -> None:
         """``slopes`` (C, unknowns): how each reading goes with each unknown at rest."""
+        self._left = left
         self.turn = _completed(slopes)
         self.moving = slopes.shape[1]
 
@@ -92,18 +98,21 @@ class _Several(Combinations):
 
     def fixed(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""
-        return np.asarray(np.einsum('c,sc->s', self.turn[self.moving], dots))
+        left = dots if self._left is None else self._left(dots)
+        return np.asarray(np.einsum('c,sc->s', self.turn[self.moving], left))
 
 
-def combinations_of(centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None) -> Combinations:
+def combinations_of(
+    centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None, left: Left | None = None
+) -> Combinations:
     """Of the PSDs at ``centers`` (P, 2) m under ``beams`` (P, 2) m.
 
     ``slopes`` (2P, unknowns): how the readings of more than two PSDs go with what is solved for, at rest; None: with
-    the motion of a flat plate.
+    the motion of a flat plate. ``left``: what the solver's model leaves of the dots; None: to first order.
     """
     if len(centers) == 2:
         return _BaseLine(centers, beams)
-    return _Several(design_matrix(beams) if slopes is None else slopes)
+    return _Several(design_matrix(beams) if slopes is None else slopes, left)
 
 
 def combinations(beams: FloatArray) -> FloatArray:

@@ -26,7 +26,7 @@ import numpy as np
 
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.uncertainty.block_fit import LARGEST, basis, inverse
-from psd_deflection.uncertainty.combinations import combinations_of
+from psd_deflection.uncertainty.combinations import Left, combinations_of
 
 SEGMENT_BLOCKS = 50
 """Blocks of one segment: a second at 50 blocks a second."""
@@ -82,9 +82,10 @@ class StreamNoise:
         variances: FloatArray | float,
         steps: FloatArray | float,
         slopes: FloatArray | None = None,
+        left: Left | None = None,
     ) -> None:
         """``size``: N. ``centers``, ``beams`` (P, 2) m. Of each reading (C,), or of all: ``variances`` m^2 of a sample
-        by the rig file, ``steps`` m of the converter. ``slopes``: as :func:`combinations_of` takes them.
+        by the rig file, ``steps`` m of the converter. ``slopes``, ``left``: as :func:`combinations_of` takes them.
         """
         self._size = size
         count = self._readings = 2 * len(centers)
@@ -93,7 +94,7 @@ class StreamNoise:
         self._steps = np.broadcast_to(steps, (count,))
         # Motion is judged with the largest.
         self._step = float(self._steps.max())
-        self.set_geometry(centers, beams, slopes)
+        self.set_geometry(centers, beams, slopes, left)
         self._mean_of = _mean_weights(size)
         self._q = basis(size)
         self._average: FloatArray | None = None
@@ -105,9 +106,11 @@ class StreamNoise:
         self._blocks: list[tuple[int, IntArray, FloatArray]] = []
         self.gamma = self._from_file()
 
-    def set_geometry(self, centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None) -> None:
+    def set_geometry(
+        self, centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None, left: Left | None = None
+    ) -> None:
         """Use these places, m, from now on."""
-        self._combinations = combinations_of(centers, beams, slopes)
+        self._combinations = combinations_of(centers, beams, slopes, left)
         self._moving = self._combinations.turn[: self._combinations.moving]
 
     @property

@@ -14,9 +14,10 @@ import numpy as np
 
 from psd_deflection.calibration import dot_noise_variances
 from psd_deflection.config import Rig
-from psd_deflection.geometry.plate import Tilts, flat_points, flat_poses, reading_slopes
+from psd_deflection.geometry.plate import Tilts, flat_points, flat_poses, plate_points, reading_slopes, tied_pose
 from psd_deflection.records import FloatArray, IntArray, dot_names
 from psd_deflection.uncertainty.block_fit import BlockFit, Fitted
+from psd_deflection.uncertainty.combinations import Left
 from psd_deflection.uncertainty.consistency import LIMIT, UNMEASURED, Checked, Consistency, Suspect
 from psd_deflection.uncertainty.noise import StreamNoise
 from psd_deflection.uncertainty.redundancy import Redundancy
@@ -25,6 +26,10 @@ NOISE, FIT, HELD_RESIDUAL = 'state.noise', 'state.block_fit', 'state.residual'
 REDUNDANCY, SOME = 'state.redundancy', 'state.psds.'
 """Names under which :meth:`StampedDots.memory` tells what is remembered; ``SOME`` goes on with the
 PSDs (from 0) that are kept."""
+
+
+_STEPS = 7
+"""Steps from rest that leave less than the last digit of a nanometre, at the largest poses."""
 
 
 class PlateModel:
@@ -37,10 +42,24 @@ class PlateModel:
         self.beams = self._centers + rig.zeros[at]
         self._tilts: Tilts = tilts
         self._link = rig.link.slope_ratio, rig.link.length
+        self._tie = 0.0 if tilts == 'none' else rig.link.slope_ratio
+        self._gain = np.linalg.pinv(self.slopes_at((0.0,) * 5))
 
     def slopes_at(self, pose: Sequence[float]) -> FloatArray:
         """How the readings go with what is solved for (C, unknowns) at ``pose``: dX, dY m, theta, phi, omega rad."""
         return reading_slopes(self.beams, self._heights, np.array(pose), self._tilts, *self._link)
+
+    def left(self, dots: FloatArray) -> FloatArray:
+        """What the best pose leaves of ``dots`` (n, C), m, all readings of one weight."""
+        points = self._centers + dots.reshape(len(dots), -1, 2)
+        heights = self._heights if self._tilts != 'none' else np.zeros(len(self._heights))
+        unknowns = np.zeros((len(dots), self._gain.shape[0]))
+        # The slopes at rest are right to some per cent, so each step leaves some per cent of the error before it.
+        for _ in range(_STEPS):
+            pose = unknowns if self._tilts == 'free' else tied_pose(unknowns, self._tie, self._link[1])
+            left: FloatArray = (points - plate_points(pose, self.beams, heights)).reshape(len(dots), -1)
+            unknowns = unknowns + np.einsum('us,ns->nu', self._gain, left)
+        return left
 
     def residual(self, dots: tuple[float, ...], residual: tuple[float, ...]) -> tuple[float, ...]:
         """What a pose near the best leaves of ``dots`` (C,), m; ``residual``: what the method leaves.
@@ -138,7 +157,7 @@ class StampedDots:
         self._poly = poly
         self._all: PlateModel | None = None
         slopes = self._rest_slopes(rig)
-        self.noise = StreamNoise(config.block_size, rig.centers, self._beams, variances, steps, slopes)
+        self.noise = StreamNoise(config.block_size, rig.centers, self._beams, variances, steps, slopes, self._left)
         self._stated_sd = np.sqrt(variances)
         self._fit = BlockFit(config.block_size, rig.centers, self._beams, poly, slopes)
         self._fit.set_noise(self.noise.gamma)
@@ -162,7 +181,7 @@ class StampedDots:
         self._rig = rig
         self._beams = rig.centers + rig.zeros
         slopes = self._rest_slopes(rig)
-        self.noise.set_geometry(rig.centers, self._beams, slopes)
+        self.noise.set_geometry(rig.centers, self._beams, slopes, self._left)
         self._fit.set_geometry(rig.centers, self._beams, slopes)
         self._fit.set_noise(self.noise.gamma)
         self._suspect = Suspect(rig.centers, self._beams)
@@ -170,6 +189,10 @@ class StampedDots:
         if slopes is not None:
             self._redundancy = Redundancy(len(rig.psds), slopes.shape[1])
             self._some, self._told = {}, {}
+
+    @property
+    def _left(self) -> Left | None:
+        return None if self._all is None else self._all.left
 
     def _rest_slopes(self, rig: Rig) -> FloatArray | None:
         """Of more than two PSDs how the readings go with what is solved for, at rest."""

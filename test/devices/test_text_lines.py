@@ -18,7 +18,7 @@ from psd_deflection.devices.text_lines import SimulatedLines
 from psd_deflection.errors import DeviceError
 from psd_deflection.protocol.frames import BadFrame
 from psd_deflection.protocol.text_lines import Description, Line, LineDecoder, TimeExtender, parse, with_check
-from psd_deflection.records import FLAG_OVER_RANGE
+from psd_deflection.records import FLAG_OVER_RANGE, channel_names
 
 VALUES = (0.1, -0.2, 5.0, 0.0, 1.5, 4.75)
 LINE = Line(7, 7000, VALUES)
@@ -238,3 +238,37 @@ def test_electrodes_in_counts_are_scaled_and_their_end_is_told(wired: Any) -> No
 def test_a_line_must_have_as_many_readings_as_the_description_says(wired: Any, info: bytes, line: bytes) -> None:
     _, event = sent(wired, info, line)
     assert 'readings where the description says' in event.reason
+
+
+def test_three_psds(wired: Any, run: Any, unloaded: Any, volts: Any) -> None:
+    more = {'psd_3.center': [0.08, 0.0]}
+    port = wired(SimulatedLines(unloaded(load_rig(overrides=more))))
+    running = run(load_rig(overrides={'source': 'lines', 'port': str(port.link), **more}))
+    np.testing.assert_allclose(volts(running.take(100)).mean(axis=0), [0, 0, 5] * 3, atol=1e-2)
+    assert running.acquisition.counters.bad == 0
+
+
+@pytest.mark.parametrize(
+    ('info', 'line', 'found'),
+    [
+        (b'"psds": 3', b'1,1000,0,0,5,0,0,5,0,1,5', (0, 0, 5, 0, 0, 5, 0, 1, 5)),
+        (b'"psds": 3', b'1,1000,0,0,5,0,0,5', '6 readings where the description says 9'),
+        (b'"psds": 3, "electrodes": true', b'1,1000' + b',1,1,1,1' * 3, (0, 0, 2, 0, 0, 2, 0, 0, 2)),
+        (b'"psds": 3', b'1,1000,0,0,5,0,0,5,0', 'no number of fields that a sample has'),
+    ],
+)
+def test_a_line_of_three_psds(wired: Any, info: bytes, line: bytes, found: object) -> None:
+    hello, event = sent(wired, info, line, **{'psd_3.center': [0.08, 0.0]})
+    assert hello.info['psds'] == 3
+    assert hello.info['channels'] == list(channel_names(3))
+    assert (event.reason if isinstance(event, BadFrame) else event.readings) == found
+
+
+@given(st.integers(1, 60), st.floats(-900.0, 900.0))
+def test_a_line_has_readings_or_electrodes_of_two_to_six_psds(count: int, value: float) -> None:
+    item = parse(with_check('7,7000,' + ','.join([f'{value:.4f}'] * count)).strip())
+    if count in {6, 8, 9, 12, 15, 16, 18, 20, 24}:
+        assert isinstance(item, Line)
+        assert len(item.readings) == count
+    else:
+        assert isinstance(item, BadFrame)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from psd_deflection.monitor.feed import COLUMNS, BlockResult, Feed, row_json
+from psd_deflection.monitor.feed import COLUMNS, BlockResult, Feed, row_columns, row_json
 from psd_deflection.records import BlockStatus, SampleBlock, TipLoad
 
 from .serving import START_NS, estimate_of, spots_of
@@ -60,3 +60,10 @@ def test_items_beyond_the_queue_are_dropped_and_counted() -> None:
     assert [r.spots.index for r in feed.take() if isinstance(r, BlockResult)] == [0, 1, 2, 3, 4]
     feed.put(spots_of(99))
     assert feed.waiting == 1
+
+
+def test_a_row_of_three_psds_has_their_columns() -> None:
+    spots = dataclasses.replace(spots_of(0), dots=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0), sums=(7.0, 8.0, 9.0))
+    row = dict(zip(row_columns(3), json.loads(row_json(BlockResult(spots, None))), strict=True))
+    assert [row[k] for k in ('x3', 'y3', 'sum1', 'sum3', 'dx')] == [5.0, 6.0, 7.0, 9.0, None]
+    assert row['present'] == spots.present

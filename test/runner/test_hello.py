@@ -20,7 +20,7 @@ from psd_deflection.devices.source import Received, Source
 from psd_deflection.errors import DeviceError
 from psd_deflection.protocol.frames import HelloFrame, SampleFrame
 from psd_deflection.protocol.words import MAX_TEXT
-from psd_deflection.records import CHANNELS
+from psd_deflection.records import CHANNELS, channel_names
 from psd_deflection.runner import acquisition as module
 from psd_deflection.runner.acquisition import Acquisition, Arrival
 from psd_deflection.runner.hello import AnotherDeviceError, HelloGate
@@ -257,3 +257,31 @@ def test_no_rate_on_the_wire_ends_the_reader(device: Any, rig: Rig, rate: str) -
     device.answer = sealed(b'\x10\x01' + text.encode())
     with pytest.raises(DeviceError, match='sample_rate_hz'):
         Acquisition(rig, lambda _: None).open()
+
+
+THREE = {**GOOD, 'psds': 3, 'channels': list(channel_names(3))}
+
+
+@pytest.mark.parametrize(
+    ('third', 'hello', 'said'),
+    [
+        (True, GOOD, 'HELLO has psds 2, the rig file has 3 PSDs'),
+        (False, THREE, 'HELLO has psds 3, the rig file has 2 PSDs'),
+        (True, {**THREE, 'psds': True}, 'HELLO has psds True'),
+        (True, {**THREE, 'psds': 3.0}, 'HELLO has psds 3.0'),
+        (True, {**THREE, 'psds': 'three'}, "HELLO has psds 'three'"),
+        (True, {**THREE, 'channels': list(CHANNELS)}, 'HELLO has channels'),
+    ],
+)
+def test_a_device_with_other_psds_than_the_rig_file_is_refused(
+    third: bool, hello: dict[str, object], said: str
+) -> None:
+    rig = load_rig(overrides={'psd_3.center': [0.08, 0.0]} if third else {})
+    with pytest.raises(DeviceError, match=said):
+        HelloGate(rig).take(HelloFrame(1, hello), 'port', volts=False)
+
+
+def test_a_device_with_as_many_psds_is_taken() -> None:
+    taken = HelloGate(load_rig(overrides={'psd_3.center': [0.08, 0.0]}))
+    taken.take(HelloFrame(1, THREE), 'port', volts=False)
+    assert taken.hello == HelloFrame(1, THREE)
