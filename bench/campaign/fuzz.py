@@ -66,12 +66,15 @@ def frames_target() -> tuple[Target, list[bytes]]:
         StatusFrame,
         encode,
     )
+    from psd_deflection.records import MOST_PSDS
 
     @timed()
     def target(stream: bytes) -> list[str]:
         stream = stream[:4096]
-        whole = FrameDecoder().feed(b'\x00' + stream)
-        pieces = FrameDecoder()
+        # The first byte chooses of how many PSDs a sample is.
+        psds = 2 + (stream[0] if stream else 0) % (MOST_PSDS - 1)
+        whole = FrameDecoder(psds).feed(b'\x00' + stream)
+        pieces = FrameDecoder(psds)
         apart = pieces.feed(b'\x00')
         for i in range(len(stream)):
             apart += pieces.feed(stream[i : i + 1])
@@ -81,7 +84,7 @@ def frames_target() -> tuple[Target, list[bytes]]:
         return [f.reason for f in whole if isinstance(f, BadFrame)]
 
     seeds = [
-        encode(SampleFrame(0, 1, 1000, (1, 2, 3, 4, 5, 6))),
+        *(bytes((n - 2,)) + encode(SampleFrame(0, 1, 1000, tuple(range(3 * n)))) for n in range(2, MOST_PSDS + 1)),
         encode(StatusFrame(3, None)),
         encode(HelloFrame(1, {'serial': 'A'})),
         encode(PingFrame(7)),
@@ -322,11 +325,11 @@ def records_target() -> tuple[Target, list[bytes]]:
 
 def yaml_target() -> tuple[Target, list[bytes]]:
     """A parameter file and a ``metadata.yaml`` that are YAML, with anchors, aliases, merge keys and tags."""
-    from psd_deflection.config import PARAMETERS, load_rig
+    from psd_deflection.config import BY_NAME, load_rig
     from psd_deflection.errors import PsdDeflectionError
     from psd_deflection.recordings.bag_reader import read_information
 
-    names = [p.name for p in PARAMETERS]
+    names = [*BY_NAME]
     tags = ('', '!!int ', '!!float ', '!!bool ', '!!timestamp ', '!!binary ', '!!set ', '!!python/name:os.system ')
 
     def said(choices: Choices, depth: int, anchors: list[str]) -> str:
