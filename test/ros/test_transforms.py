@@ -19,6 +19,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from psd_deflection.config import Rig, load_rig  # noqa: E402
 from psd_deflection.records import DeflectionEstimate  # noqa: E402
 from psd_deflection.ros.transforms import TransformPublisher, static_transforms, tip_transform  # noqa: E402
+from psd_deflection.ros.wires import topics_of  # noqa: E402
 from psd_deflection.runner.processing import RecordSink  # noqa: E402
 
 AT_NS = 5_000_000_007
@@ -52,6 +53,16 @@ def test_a_prefix_keeps_two_rigs_apart() -> None:
     assert not left.keys() & right.keys()
     assert left['left_psd_1'][0] == 'left_link_tip'
     assert {parent for parent, _ in right.values()} == {'right_link_base', 'right_link_tip_rest', 'right_link_tip'}
+
+
+def test_a_third_psd_has_its_frame_and_its_topics() -> None:
+    third = {'psd_3.center': [0.08, -0.06], 'psd_3.height': 0.01}
+    rig = load_rig(overrides={**third, 'publish_volts': True})
+    assert tree(rig)['psd_3'] == ('link_tip', (0.08, -0.06, 0.01))
+    two, three = topics_of(load_rig(overrides={'publish_volts': True})), topics_of(rig)
+    assert three.keys() - two.keys() == {'/psd_3/spot', '/psd_3/volts'}
+    assert three['/psd_3/spot'] == two['/psd_1/spot']
+    assert not [topic for topic in two if 'psd_3' in topic]
 
 
 def test_psds_at_the_base_do_not_move_with_the_tip() -> None:
