@@ -27,13 +27,32 @@ OF_STAGE: Mapping[str, tuple[str, ...]] = {
     'load': ('square', 'cube', 'stop', 'dead_band', 'saturation', 'product', 'hop', 'events', 'fading_square'),
     'link': ('square', 'cube', 'stop', 'dead_band', 'hop', 'events', 'fading_square', 'resonance'),
     'optics': ('square', 'stop', 'hop', 'events', 'product'),
-    'psd': ('square', 'cube', 'stop', 'dead_band', 'saturation', 'product', 'hop', 'magnitude', 'rate', 'drag', 'stick'),
+    'psd': (
+        'square',
+        'cube',
+        'stop',
+        'dead_band',
+        'saturation',
+        'product',
+        'hop',
+        'magnitude',
+        'rate',
+        'drag',
+        'stick',
+    ),
     'electronics': ('dead_band', 'saturation', 'events', 'gain_events', 'rate', 'fading_square', 'jitter'),
 }
 KIND_OF = {
     **dict.fromkeys(STATIC, 'static'),
-    **{'hop': 'switched', 'events': 'switched', 'gain_events': 'switched', 'rate': 'rate', 'drag': 'rate'},
-    **{'fading_square': 'history', 'stick': 'history', 'resonance': 'resonance', 'jitter': 'variance'},
+    'hop': 'switched',
+    'events': 'switched',
+    'gain_events': 'switched',
+    'rate': 'rate',
+    'drag': 'rate',
+    'fading_square': 'history',
+    'stick': 'history',
+    'resonance': 'resonance',
+    'jitter': 'variance',
 }
 
 

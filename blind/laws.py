@@ -132,7 +132,9 @@ def summary(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
     )
     lines.append(f'{"ok  " if alarms == 0 else "MISS"} laws where nothing is missing: {alarms}/{len(nulls)} (wanted 0)')
     if laws:
-        lines.append(f'     right kind: {sum(r["kind"] for r in laws)}/{n}; mean set: {np.mean([r["set"] for r in laws]):.1f}')
+        lines.append(
+            f'     right kind: {sum(r["kind"] for r in laws)}/{n}; mean set: {np.mean([r["set"] for r in laws]):.1f}'
+        )
         lines.append(f'     seconds a law: median {np.median([r["seconds"] for r in laws]):.0f}')
     return '\n'.join(lines), passed
 

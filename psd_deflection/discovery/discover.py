@@ -369,15 +369,13 @@ def _answer(
         null = refit(ws, ())
         ws.base = (*ws.base, lattice)
     law = None
-    if _unknown(left, 1.0) or ws.gap(fit.difference) > UNSAID * ws.floor() or coincidences(fit, ws.physics):
+    # Coarse steps cause noise that varies with the signal, which is no law.
+    if lattice is None and (
+        _unknown(left, 1.0) or ws.gap(fit.difference) > UNSAID * ws.floor() or coincidences(fit, ws.physics)
+    ):
         law = find_law(ws, null, fit, search.penalty, left.excess, rng, progress)
     if law is not None:
-        kept = {(a.effect.name, a.choices) for a in law.fit.effects}
-        for i in reversed(range(len(fit.effects))):
-            if (fit.effects[i].effect.name, fit.effects[i].choices) not in kept:
-                search.trace.append(f'{fit.effects[i].label} only stood in for the law')
-                fit = _without(ws, result, fit, i)
-                heldout = [h for j, h in enumerate(heldout) if j != i]
+        fit, heldout = _beside(law, search, result, fit, heldout)
         explains = null.residual - fit.residual if fit.free else None
         left = localise(ws, fit.residual, fit.jacobian if fit.free else None, rng, explained=explains)
     progress('alternatives')
@@ -430,6 +428,20 @@ def _answer(
         checked.known,
         law if verdict == 'unknown_effect' else None,
     )
+
+
+def _beside(
+    law: FoundLaw, search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut]
+) -> tuple[Fit, list[HeldOut]]:
+    """``fit`` without the effects that only stood in for the law."""
+    kept = {(a.effect.name, a.choices) for a in law.beside}
+    for i in reversed(range(len(fit.effects))):
+        active = fit.effects[i]
+        if (active.effect.name, active.choices) not in kept:
+            search.trace.append(f'{active.label} only stood in for the law')
+            fit = _without(search.workspace, result, fit, i)
+            heldout = [h for j, h in enumerate(heldout) if j != i]
+    return fit, heldout
 
 
 def _named(search: Search, result: SearchResult, fit: Fit, heldout: Sequence[HeldOut]) -> list[NamedEffect]:

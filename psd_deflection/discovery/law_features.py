@@ -18,11 +18,13 @@ from scipy.signal import lfilter
 from psd_deflection.discovery.fit import Fit
 from psd_deflection.discovery.hidden import only_in
 from psd_deflection.discovery.workspace import Workspace, fine_means
-from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
 from psd_deflection.simulation.catalogue import sort_effects
-from psd_deflection.simulation.laws import TARGETS, VARIABLES, Term
+from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.simulation.laws import TARGETS, VARIABLES, Term, known
 from psd_deflection.simulation.modes import mode_coefficients
 from psd_deflection.simulation.optics import dots_on_plate
+from psd_deflection.simulation.samples import SimulatedSamples
 from psd_deflection.simulation.simulator import ForwardModel
 
 LOADS, POSE, DOTS = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta'), ('x1', 'y1', 'x2', 'y2')
@@ -36,7 +38,8 @@ class Response:
     """One recording beside the effects of a fit. ``known``: every variable (n,); ``weight`` (nf, targets (1 + p)):
     what a term on fine blocks is multiplied with for its product with the residual and p fitted columns;
     ``length`` (nf, targets): likewise for its squared length. ``error`` and ``power`` (targets, nf): the residual as
-    an estimate of what the target lacks, and the inverse of its variance.
+    an estimate of what the target lacks, and the inverse of its variance. ``modes``: of bending and torsion;
+    ``rings``: the period of each in fine blocks.
     """
 
     known: Mapping[str, FloatArray]
@@ -47,6 +50,7 @@ class Response:
     error: FloatArray
     power: FloatArray
     modes: tuple[tuple[FloatArray, FloatArray], ...]
+    rings: tuple[int, int]
 
 
 def _jacobian(pose: FloatArray, beams: FloatArray, model: ForwardModel) -> FloatArray:
@@ -56,9 +60,7 @@ def _jacobian(pose: FloatArray, beams: FloatArray, model: ForwardModel) -> Float
         plus, minus = pose.copy(), pose.copy()
         plus[k] += h
         minus[k] -= h
-        out[k] = (
-            dots_on_plate(plus, beams, model.physics) - dots_on_plate(minus, beams, model.physics)
-        ) / (2.0 * h)
+        out[k] = (dots_on_plate(plus, beams, model.physics) - dots_on_plate(minus, beams, model.physics)) / (2.0 * h)
     return out
 
 
@@ -77,29 +79,19 @@ def responses(ws: Workspace, fit: Fit) -> list[Response]:
         q, _ = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))
     columns = [ws.split(c) for c in np.ascontiguousarray(q.T)]
     out = []
-    effects = sort_effects([*ws.base, *fit.effects])
     ws.simulations += 1
-    for i, (o, size) in enumerate(zip(ws.observations, ws.fine, strict=True)):
-        model = ForwardModel(o.rig, only_in(effects, i))
-        s = model.run(o.loads, o.temperature)
+    for i, size in enumerate(ws.fine):
+        model, s = _variables(ws, fit.effects, i)
         p = model.physics
         nf = ws.measured[i].shape[1]
-        known = {
-            **dict(zip(LOADS, s.loads, strict=True)),
-            **dict(zip(POSE, s.pose, strict=True)),
-            **dict(zip(DOTS, s.dots, strict=True)),
-            'temperature': s.warmer,
-            'time': s.t,
-        }
+        values = {name: known(s, name) for name in VARIABLES}
         jacobian = _jacobian(fine_means(s.pose, size), fine_means(s.beams, size), model)
         jacobian = jacobian / p.sensitivity.reshape(1, 4, 1)
         noise = ws.noise[i]
         scale = np.sqrt(ws.count[i]) / noise.innovation[:, None]
         vectors = [ws.split(fit.residual)[i], *(c[i] for c in columns)]
         # Each vector, as it multiplies unwhitened fine blocks: (6, 1 + p, nf).
-        back = np.stack(
-            [_unwhiten(np.stack([v[c] * scale[c] for v in vectors]), noise.ar[c]) for c in range(6)]
-        )
+        back = np.stack([_unwhiten(np.stack([v[c] * scale[c] for v in vectors]), noise.ar[c]) for c in range(6)])
         gain = (scale * (1.0 - noise.ar.sum(axis=1))[:, None]) ** 2
         mixing = np.zeros((len(SOUGHT), 6, nf))
         for t, name in enumerate(SOUGHT):
@@ -115,13 +107,45 @@ def responses(ws: Workspace, fit: Fit) -> list[Response]:
         direct = np.einsum('tcn,cn->tn', mixing, back[:, 0])
         bending = mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period)
         torsion = mode_coefficients(p.torsion_frequency, p.torsion_damping_ratio, p.period)
+        fine = p.period * size
         out.append(
             Response(
-                known, p.period, size, weight, np.ascontiguousarray(power.T),
-                direct / np.maximum(power, 1e-300), power, (bending, torsion),
+                values,
+                p.period,
+                size,
+                weight,
+                np.ascontiguousarray(power.T),
+                direct / np.maximum(power, 1e-300),
+                power,
+                (bending, torsion),
+                (
+                    round(1.0 / (p.bending_frequency * p.period * size)),
+                    round(1.0 / (p.torsion_frequency * p.period * size)),
+                ),
             )
         )
     return out
+
+
+def _variables(ws: Workspace, effects: Sequence[ActiveEffect], i: int) -> tuple[ForwardModel, SimulatedSamples]:
+    """Recording number ``i``, simulated with ``effects`` besides those of the rig file."""
+    o = ws.observations[i]
+    model = ForwardModel(o.rig, only_in(sort_effects([*ws.base, *effects]), i))
+    return model, model.run(o.loads, o.temperature)
+
+
+def known_values(ws: Workspace, effects: Sequence[ActiveEffect], name: str) -> list[FloatArray]:
+    """Block means of a variable of each recording, simulated with ``effects``."""
+    out = []
+    for i, o in enumerate(ws.observations):
+        _, samples = _variables(ws, effects, i)
+        out.append(fine_means(known(samples, name)[None, :], o.rig.estimator.block_size)[0])
+    return out
+
+
+def known_fine(ws: Workspace, effects: Sequence[ActiveEffect], name: str) -> list[FloatArray]:
+    """Likewise as means over fine blocks."""
+    return [fine_means(known(_variables(ws, effects, i)[1], name)[None, :], size)[0] for i, size in enumerate(ws.fine)]
 
 
 def _spread(parts: Sequence[FloatArray]) -> float:
@@ -199,7 +223,7 @@ def allowed(target: str, term: Term) -> bool:
 
 
 def _blocks(r: Response, values: FloatArray) -> FloatArray:
-    return fine_means(values[None, :], r.fine)[0]
+    return np.asarray(fine_means(values[None, :], r.fine)[0])
 
 
 def _way(target: str) -> int:
@@ -245,28 +269,59 @@ def score(found: Sequence[Response], listed: Sequence[Term], targets: Sequence[s
     return out
 
 
+MOST_TIMES = 12
 TOGGLE_COST = 24.0
 """Chi-square that each switching must gain: twice the logarithm of the blocks of a recording, and some more."""
 
 
 def switchings(found: Sequence[Response], targets: Sequence[str] = SOUGHT) -> list[Term]:
-    """Terms that are on between times which the residual shows, for recordings one by one (the first that has any).
+    """Terms that are on between times which the residual of the only recording shows.
 
-    The states are the likeliest of two levels, 0 and A (Viterbi's algorithm), with A fitted in turn.
+    The states are the likeliest of two levels, 0 and A (Viterbi's algorithm), with A fitted in turn. What the link
+    rings after a switching is averaged over its period first, and the times are improved with the modes in the model.
     """
-    out: list[Term] = []
-    r = found[0]
+    out: dict[tuple[tuple[str, ...], tuple[float, ...]], Term] = {}
+    (r,) = found
     for t, name in enumerate(SOUGHT):
         if name not in targets or TARGETS[name].point == 'static':
             continue
-        own = [n for n in DOTS if name in DOTS and n[1] == name[1]]
+        own = [n for n in DOTS if name in DOTS and (n[1] == name[1])]
+        on_link = TARGETS[name].point == 'pose'
         for of in ((), *((n,) for n in own)):
             v = _blocks(r, r.known[of[0]]) if of else np.ones(r.error.shape[1])
-            times = _two_levels(r.error[t], r.power[t] * v * v, v)
-            if 0 < len(times) <= 12:
-                at = tuple(float(k * r.fine * r.period) for k in times)
-                out.append(Term('switched', of, times=at))
-    return list({(x.of, x.times): x for x in out}.values())
+            error = _averaged(r.error[t], r.rings[int(name == 'theta')]) if on_link else r.error[t]
+            times = _two_levels(error, r.power[t] * v * v, v)
+            if 0 < len(times) <= MOST_TIMES:
+                term = Term('switched', of, times=tuple(float(k * r.fine * r.period) for k in times))
+                places = (name, f'static_{name}') if on_link else (name,)
+                for place in places:
+                    better = _with_better_times(found, place, term)
+                    out[better.of, better.times] = better
+    return list(out.values())
+
+
+def _averaged(values: FloatArray, blocks: int) -> FloatArray:
+    """Means over ``blocks`` neighbours."""
+    if blocks < 2:
+        return values
+    return np.asarray(np.convolve(values, np.ones(blocks) / blocks, mode='same'))
+
+
+def _with_better_times(found: Sequence[Response], target: str, term: Term) -> Term:
+    """Each time moved to where the term explains most on ``target``: by up to 0.08 s, then to a sample."""
+    step = found[0].period
+    for reach, pitch in ((0.08, 8.0 * step), (8.0 * step, step)):
+        for k in range(len(term.times)):
+            tries = []
+            for shift in np.arange(-reach, reach + 0.5 * pitch, pitch).tolist():
+                times = [*term.times]
+                times[k] = round(times[k] + shift, 9)
+                if times == sorted(set(times)):
+                    tries.append(Term(term.form, term.of, times=tuple(times)))
+            best = score(found, tries, (target,))
+            if best:
+                term = Term(term.form, term.of, times=best[0].term.times)
+    return term
 
 
 def _two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[int]:
@@ -282,7 +337,6 @@ def _two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[in
     if below[a, b] <= 0.0 or gain[a, b] < TOGGLE_COST:
         return []
     level = float(top[a, b] / below[a, b])
-    state = np.zeros(len(own), dtype=np.int64)
     for _ in range(4):
         state = _likeliest(weight * level * (2.0 * own - level))
         on = state == 1
@@ -292,7 +346,7 @@ def _two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[in
     return [int(k) for k in np.flatnonzero(np.diff(state, prepend=0))]
 
 
-def _likeliest(gain: FloatArray) -> FloatArray:
+def _likeliest(gain: FloatArray) -> IntArray:
     """States (n,) 0 or 1 that gain most, each change for ``TOGGLE_COST``; 0 before the first."""
     off, on = 0.0, -TOGGLE_COST
     came = np.empty((len(gain), 2), dtype=np.int64)

@@ -23,23 +23,26 @@ from psd_deflection.discovery.law_features import (
     POSE,
     SOUGHT,
     Scored,
+    known_fine,
     responses,
     score,
     switchings,
     terms,
 )
 from psd_deflection.discovery.search import BIC_ACCEPT, P_ACCEPT
-from psd_deflection.discovery.validate import HeldOut, heldout_gain, heldout_gap
+from psd_deflection.discovery.validate import HeldOut, fold_of_case, heldout_gain, heldout_gap
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.laws import FORMS, TARGETS, Law, Term, effect_of, values_of
+from psd_deflection.simulation.laws import FORMS, TARGETS, VARIABLES, Law, Term, effect_of, values_of
 
-TRIED = 14
+TRIED = 12
 """Terms that are refitted in the simulation for the first place."""
-FOLLOWED = 4
+FOLLOWED = 3
 """Of these, the best are refitted in full and get further terms."""
 MAX_TERMS = 4
+BUDGET = 600
+"""Forward simulations beside one set of effects after which no term is added."""
 TIED = 21.6
 """Loss in chi-square below which another law counts as equivalent, as for effects."""
 EXPLAINS = 0.5
@@ -70,6 +73,11 @@ class FoundLaw:
         """All of it."""
         return (self.law, *self.further)
 
+    def adopted(self, name: str) -> list[Law]:
+        """The laws as effects of that name; those on further quantities get it with a number."""
+        names = [name, *(f'{name}_{i}' for i in range(2, len(self.laws) + 1))]
+        return [dataclasses.replace(law, name=n) for law, n in zip(self.laws, names, strict=True)]
+
     @property
     def beside(self) -> tuple[ActiveEffect, ...]:
         """The effects of the catalogue in the same model."""
@@ -99,6 +107,17 @@ def _on(target: str, *listed: Term) -> Law:
     return Law(f'law_{target}', TARGETS[target].stage, target, listed)
 
 
+def _covariance(fit: Fit) -> FloatArray:
+    """(p, p) of the parameters of ``fit``; those that the recording does not determine get large values.
+
+    A threshold below which only one level of a load lies is such a one.
+    """
+    lengths = np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-150)
+    unit = fit.jacobian / lengths
+    values, vectors = np.linalg.eigh(unit.T @ unit)
+    return np.asarray((vectors / np.maximum(values, 1e-9)) @ vectors.T / np.outer(lengths, lengths))
+
+
 def _fitted(law: Law, fit: Fit, covariance: FloatArray, index: int) -> Law:
     """The law with the values and standard deviations of effect ``index`` of ``fit``."""
     values = fit.effects[index].values
@@ -117,6 +136,7 @@ class _Seeker:
 
     def __init__(self, ws: Workspace, start: Fit, penalty: float) -> None:
         self.ws, self.start, self.penalty = ws, start, penalty
+        self.last = ws.simulations + BUDGET
         self.found = responses(ws, start)
         self.listed = list(terms(self.found))
         if len(ws.observations) == 1:
@@ -132,9 +152,14 @@ class _Seeker:
     def trial(self, laws: Sequence[Law], beside: Sequence[ActiveEffect], iterations: int) -> _Trial:
         """The laws refitted in the simulation."""
         fit = refit(self.ws, [*beside, *(ActiveEffect(effect_of(law), values_of(law)) for law in laws)], iterations)
-        covariance = fit.covariance()
+        covariance = _covariance(fit)
         better = tuple(_fitted(law, fit, covariance, len(beside) + i) for i, law in enumerate(laws))
         return _Trial(better, fit, self.cost(better, fit))
+
+    def done(self, trial: _Trial) -> bool:
+        """Whether no more than noise is left, or enough has been tried."""
+        size = float(self.ws.size)
+        return trial.fit.chi2 < size + 4.0 * math.sqrt(2.0 * size) or self.ws.simulations > self.last
 
     def first(self) -> list[_Trial]:
         """Laws of one term, the best first."""
@@ -155,10 +180,10 @@ class _Seeker:
 
     def grown(self, trial: _Trial) -> _Trial:
         """Further terms while BIC improves by enough; then terms that it does not miss go."""
-        while trial.terms < MAX_TERMS:
+        while trial.terms < MAX_TERMS and not self.done(trial):
             more = responses(self.ws, trial.fit)
             scored = score(more, [t for t in self.listed if t.form != 'switched'])
-            tries = [self.trial(_with(trial.laws, s), trial.beside, 4) for s in scored[:3]]
+            tries = [self.trial(_with(trial.laws, s), trial.beside, 4) for s in scored[:2]]
             best = min(tries, key=lambda t: t.cost, default=trial)
             if best.cost > trial.cost - BIC_ACCEPT:
                 break
@@ -174,9 +199,7 @@ class _Seeker:
     def lean(self, trial: _Trial) -> _Trial:
         """Without the effects that only stood in for the law."""
         while trial.beside:
-            fewer = [
-                self.trial(trial.laws, [a for a in trial.beside if a is not gone], 5) for gone in trial.beside
-            ]
+            fewer = [self.trial(trial.laws, [a for a in trial.beside if a is not gone], 5) for gone in trial.beside]
             best = min(fewer, key=lambda t: t.cost)
             if best.cost > trial.cost + BIC_ACCEPT:
                 break
@@ -235,6 +258,13 @@ def find_law(
     ``excess``: chi-square beyond noise that ``fit`` leaves; ``penalty``: of BIC, for each parameter.
     """
     progress('a law for what remains')
+    found = _law_of_the_mean(ws, null, fit, penalty, excess, rng)
+    return found or find_jitter(ws, fit, penalty)
+
+
+def _law_of_the_mean(
+    ws: Workspace, null: Fit, fit: Fit, penalty: float, excess: float, rng: np.random.Generator
+) -> FoundLaw | None:
     starts = [fit, null] if fit.effects else [null]
     trials: list[tuple[_Trial, _Seeker]] = []
     for start in starts:
@@ -243,7 +273,12 @@ def find_law(
     if not trials:
         return None
     trials.sort(key=lambda t: t[0].cost)
-    followed = [(s.grown(t), s) for t, s in trials[:FOLLOWED]]
+    # Where one law leaves nothing but noise, others get no further terms.
+    followed: list[tuple[_Trial, _Seeker]] = []
+    for t, s in trials[:FOLLOWED]:
+        followed.append((t if s.done(t) else s.grown(t), s))
+        if s.done(followed[-1][0]):
+            break
     best, seeker = min(followed, key=lambda t: t[0].cost)
     best = seeker.lean(best)
     others = [t for t, _ in (*followed, *trials)]
@@ -276,6 +311,85 @@ def find_law(
         ws.gap(found.difference),
         heldout_gap(ws, found),
     )
+
+
+def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
+    """The channel and the variable that its noise grows with, or None: variance = a + b v^2."""
+    known = {name: known_fine(ws, fit.effects, name) for name in VARIABLES}
+    folds = [fold_of_case(ws)[case] for case in ws.case]
+    fold = np.concatenate(folds)
+    best: tuple[float, str, str, float, float] | None = None
+    tried = 0
+    for c, channel in enumerate(CHANNELS):
+        squares = np.concatenate([part[c] for part in ws.split(fit.residual)]) ** 2
+        there = squares > 0.0
+        for name, values in known.items():
+            v2 = np.concatenate(values) ** 2
+            full = float(v2.max())
+            if full <= 0.0:
+                continue
+            tried += 1
+            a, b = _variance(squares[there], v2[there] / full)
+            gain = _likelihood(squares[there], a + b * v2[there] / full) - _likelihood(
+                squares[there], squares[there].mean()
+            )
+            if best is None or gain > best[0]:
+                best = gain, channel, name, b / full, full
+    if best is None:
+        return None
+    gain, channel, name, slope, full = best
+    c = CHANNELS.index(channel)
+    squares = np.concatenate([part[c] for part in ws.split(fit.residual)]) ** 2
+    v2 = np.concatenate(known[name]) ** 2 / full
+    held = []
+    for k in np.unique(fold):
+        other, own = (fold != k) & (squares > 0.0), (fold == k) & (squares > 0.0)
+        a, b = _variance(squares[other], v2[other])
+        flat = float(squares[other].mean())
+        held.append(_likelihood(squares[own], a + b * v2[own]) - _likelihood(squares[own], flat))
+    heldout = HeldOut(0.5 * float(sum(held)), math.sqrt(max(gain, 1.0)))
+    p = min(1.0, tried * float(chi2_law.sf(max(gain, 0.0), 1)))
+    if p > P_ACCEPT or gain - penalty <= BIC_ACCEPT or not heldout.holds or slope <= 0.0:
+        return None
+    scale = float(np.mean([n.innovation[c] * math.sqrt(s) for n, s in zip(ws.noise, ws.fine, strict=True)]))
+    if not channel.startswith('sum'):
+        scale *= float(ws.physics.sensitivity.ravel()[DOTS.index(channel)])
+    coefficient = math.sqrt(slope) * scale
+    # The curvature of the likelihood of a single parameter, to first order.
+    term = Term('jitter', (name,), coefficient, sd={'coefficient': coefficient / math.sqrt(max(gain, 1.0))})
+    law = Law(f'law_{channel}', 'electronics', channel, (term,))
+    whole = dataclasses.replace(fit, effects=(*fit.effects, ActiveEffect(effect_of(law), values_of(law))))
+    others = [dataclasses.replace(law, stage='psd')]
+    return FoundLaw(
+        law,
+        (),
+        whole,
+        fit,
+        (channel,),
+        tuple(others),
+        p,
+        gain - penalty,
+        heldout,
+        ws.gap(fit.difference),
+        heldout_gap(ws, fit),
+    )
+
+
+def _likelihood(squares: FloatArray, variance: FloatArray | float) -> float:
+    """Twice the log-likelihood of whitened values, up to a constant."""
+    v = np.broadcast_to(np.asarray(variance), squares.shape)
+    return float(-np.sum(np.log(v) + squares / v))
+
+
+def _variance(squares: FloatArray, v2: FloatArray) -> tuple[float, float]:
+    """a and b of variance = a + b v2, the likeliest: weighted least squares on the squares, in turn."""
+    a, b = float(squares.mean()), 0.0
+    columns = np.stack([np.ones_like(v2), v2], axis=1)
+    for _ in range(8):
+        weight = 1.0 / (a + b * v2)
+        found = np.linalg.lstsq(columns * weight[:, None], squares * weight, rcond=None)[0]
+        a, b = max(float(found[0]), 0.05), max(float(found[1]), 0.0)
+    return a, b
 
 
 def _simplest(best: _Trial, others: Sequence[_Trial]) -> _Trial:

@@ -217,12 +217,13 @@ def _law(discovery: Discovery) -> str:
     if discovery.law is None:
         return ''
     found = discovery.law
-    words = f' What remains follows a law ({found.law.stage}, {found.law.kind}): {"; ".join(e.expression for e in found.laws)}'
+    expressions = '; '.join(e.expression for e in found.laws)
+    words = f' What remains follows a law ({found.law.stage}, {found.law.kind}): {expressions}'
     beside = [a.effect.name for a in found.beside]
     named = {e.active.effect.name for e in discovery.effects}
     with_law = f'; on unseen load cases it leaves {1e6 * found.heldout_gap:.3f} µm'
     also = f', beside {", ".join(beside)}' if beside and set(beside) != named else ''
-    return f'{words}{also}{with_law}. It is not in the model unless you adopt it.'
+    return f'{words}{also}{with_law}.'
 
 
 def _missing(discovery: Discovery) -> str:

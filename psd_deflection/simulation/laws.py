@@ -50,10 +50,18 @@ Kind = str
 KINDS: tuple[Kind, ...] = ('static', 'switched', 'rate', 'history', 'resonance', 'variance')
 
 VARIABLES: Mapping[str, str] = {
-    **{'load_fx': 'N', 'load_fy': 'N', 'load_tz': 'N m'},
-    **{'dx': 'm', 'dy': 'm', 'theta': 'rad'},
-    **{'x1': 'm', 'y1': 'm', 'x2': 'm', 'y2': 'm'},
-    **{'temperature': 'K', 'time': 's'},
+    'load_fx': 'N',
+    'load_fy': 'N',
+    'load_tz': 'N m',
+    'dx': 'm',
+    'dy': 'm',
+    'theta': 'rad',
+    'x1': 'm',
+    'y1': 'm',
+    'x2': 'm',
+    'y2': 'm',
+    'temperature': 'K',
+    'time': 's',
 }
 """What a law may depend on, with its unit. ``temperature``: above the first one; ``time``: since the first sample."""
 
@@ -74,9 +82,7 @@ class Target:
 _ALWAYS = ('temperature', 'time')
 TARGETS: Mapping[str, Target] = {
     **{n: Target('load', 'load', i, VARIABLES[n], (*_LOADS, *_ALWAYS)) for i, n in enumerate(_LOADS)},
-    **{
-        f'static_{n}': Target('link', 'static', i, VARIABLES[n], (*_LOADS, *_ALWAYS)) for i, n in enumerate(_POSE)
-    },
+    **{f'static_{n}': Target('link', 'static', i, VARIABLES[n], (*_LOADS, *_ALWAYS)) for i, n in enumerate(_POSE)},
     **{n: Target('link', 'pose', i, VARIABLES[n], (*_LOADS, *_POSE, *_ALWAYS)) for i, n in enumerate(_POSE)},
     **{f'beam_{n}': Target('optics', 'dots', i, 'm', tuple(VARIABLES)) for i, n in enumerate(_DOTS)},
     **{n: Target('psd', 'dots', i, 'm', tuple(VARIABLES)) for i, n in enumerate(_DOTS)},
@@ -203,9 +209,7 @@ FORMS: Mapping[str, Form] = {
         following=_relaxed,
         fitted={'time_constant': ('s', 1e-4, 1e5)},
     ),
-    'play': Form(
-        'history', 'play({v}, {half_width}) - {v}', following=_play, fitted={'half_width': ('v', *_POSITIVE)}
-    ),
+    'play': Form('history', 'play({v}, {half_width}) - {v}', following=_play, fitted={'half_width': ('v', *_POSITIVE)}),
     'resonance': Form(
         'resonance',
         '{v} through a mode of {frequency} and damping ratio {damping_ratio}',
@@ -246,15 +250,16 @@ class Term:
         """One of ``KINDS``; a wave in time is a line, which is a resonance."""
         return 'resonance' if self.form == 'wave' and self.of == ('time',) else FORMS[self.form].kind
 
-    def evaluate(self, known: Callable[[str], FloatArray], n: int, period: float, state: State) -> FloatArray:
-        """The form (n,), without its coefficient; ``known`` gives a variable's next samples."""
+    def evaluate(self, given: Callable[[str], FloatArray], n: int, period: float, state: State) -> FloatArray:
+        """The form (n,), without its coefficient; ``given`` gives a variable's next samples."""
         if n == 0:
             return np.empty(0)
         v = np.ones(n)
         for name in self.of:
-            v = v * known(name)
+            v = v * given(name)
         if self.form == 'switched':
-            return v * (np.searchsorted(np.asarray(self.times) - 1e-9, known('time'), side='right') % 2)
+            on = np.searchsorted(np.asarray(self.times) - 1e-9, given('time'), side='right') % 2
+            return np.asarray(v * on)
         form = FORMS[self.form]
         if form.apart is not None:
             return form.apart(v, self.shapes)
@@ -327,14 +332,16 @@ class Law:
         return f'{self.acts_on} += ' + ' + '.join(parts)
 
 
-def _known(samples: SimulatedSamples, name: str) -> FloatArray:
+def known(samples: SimulatedSamples, name: str) -> FloatArray:
+    """A variable of ``VARIABLES`` (n,) of samples that have passed the stage where it is made."""
     if name == 'time':
         return samples.t
     if name == 'temperature':
         return samples.warmer
     if name in _LOADS:
-        return samples.loads[_LOADS.index(name)]
-    return samples.pose[_POSE.index(name)] if name in _POSE else samples.dots[_DOTS.index(name)]
+        return np.asarray(samples.loads[_LOADS.index(name)])
+    rows = samples.pose[_POSE.index(name)] if name in _POSE else samples.dots[_DOTS.index(name)]
+    return np.asarray(rows)
 
 
 def _with_values(terms: Sequence[Term], values: Values) -> list[Term]:
@@ -350,9 +357,7 @@ def _apply(law: Law, samples: SimulatedSamples, values: Values, state: State) ->
     added = np.zeros(n)
     for i, term in enumerate(_with_values(law.terms, values)):
         own = state.setdefault(str(i), {})
-        grown = term.coefficient * term.evaluate(
-            partial(_known, samples), n, samples.physics.period, own
-        )
+        grown = term.coefficient * term.evaluate(partial(known, samples), n, samples.physics.period, own)
         added += grown
     if law.acts_on.startswith('beam_'):
         # A beam that moves sideways moves the dot in the plate's own axes.
@@ -374,8 +379,8 @@ def _jitter(law: Law, samples: SimulatedSamples, values: Values, state: State) -
         return
     target, n = TARGETS[law.acts_on], len(samples.t)
     rms = np.zeros(n)
-    for i, term in enumerate(_with_values(law.terms, values)):
-        rms += np.abs(term.coefficient * term.evaluate(partial(_known, samples), n, samples.physics.period, {}))
+    for term in _with_values(law.terms, values):
+        rms += np.abs(term.coefficient * term.evaluate(partial(known, samples), n, samples.physics.period, {}))
     rng = state.setdefault('noise', np.random.default_rng(zlib.crc32(law.name.encode())))
     hiss = rms * rng.standard_normal(n)
     if target.row < 4:
@@ -394,13 +399,13 @@ def _correct(law: Law, reading: Reading, values: Values) -> None:
     place = reading.dots[row] if row < 4 else reading.sums[row - 4]
     read, n = place.copy(), len(place)
 
-    def known(name: str) -> FloatArray:
+    def read_as(name: str) -> FloatArray:
         if name == 'time':
             return reading.t
         return reading.warmer if name == 'temperature' else reading.dots[_DOTS.index(name)]
 
     for _ in range(_PASSES):
-        place[:] = read - sum(t.coefficient * t.evaluate(known, n, 0.0, {}) for t in terms)
+        place[:] = read - sum(t.coefficient * t.evaluate(read_as, n, 0.0, {}) for t in terms)
 
 
 def _correctable(law: Law) -> bool:
@@ -415,9 +420,7 @@ def _parameters(law: Law) -> list[EffectParameter]:
         size = abs(t.coefficient) or 1.0
         unit = t.unit(law.acts_on)
         unit = '' if unit == '1' else unit
-        out.append(
-            EffectParameter(f'c{i}', unit, -1e30, 1e30, 0.1 * size, f'coefficient of {t.words()}')
-        )
+        out.append(EffectParameter(f'c{i}', unit, -1e30, 1e30, 0.1 * size, f'coefficient of {t.words()}'))
         for name, value in t.shapes.items():
             _, low, high = FORMS[t.form].fitted.get(name, ('v', *_ANY))
             if name not in FORMS[t.form].fitted:
@@ -425,7 +428,14 @@ def _parameters(law: Law) -> list[EffectParameter]:
             scale = 0.05 * (abs(value) or 1.0) if name != 'phase' else 0.1
             out.append(
                 EffectParameter(
-                    f'{name}{i}', t.shape_unit(name), low, high, scale, f'{name} of term {i}', value, 'shape',
+                    f'{name}{i}',
+                    t.shape_unit(name),
+                    low,
+                    high,
+                    scale,
+                    f'{name} of term {i}',
+                    value,
+                    'shape',
                     grid=(value,),
                 )
             )
