@@ -118,10 +118,7 @@ def responses(ws: Workspace, fit: Fit) -> list[Response]:
                 direct / np.maximum(power, 1e-300),
                 power,
                 (bending, torsion),
-                (
-                    round(1.0 / (p.bending_frequency * p.period * size)),
-                    round(1.0 / (p.torsion_frequency * p.period * size)),
-                ),
+                (round(1.0 / (p.bending_frequency * fine)), round(1.0 / (p.torsion_frequency * fine))),
             )
         )
     return out
