@@ -267,6 +267,8 @@ def score(found: Sequence[Response], listed: Sequence[Term], targets: Sequence[s
 
 
 MOST_TIMES = 12
+REFINED = 4
+"""Of the terms with times, so many get better times."""
 TOGGLE_COST = 24.0
 """Chi-square that each switching must gain: twice the logarithm of the blocks of a recording, and some more."""
 
@@ -277,7 +279,7 @@ def switchings(found: Sequence[Response], targets: Sequence[str] = SOUGHT) -> li
     The states are the likeliest of two levels, 0 and A (Viterbi's algorithm), with A fitted in turn. What the link
     rings after a switching is averaged over its period first, and the times are improved with the modes in the model.
     """
-    out: dict[tuple[tuple[str, ...], tuple[float, ...]], Term] = {}
+    seen: list[Scored] = []
     (r,) = found
     for t, name in enumerate(SOUGHT):
         if name not in targets or TARGETS[name].point == 'static':
@@ -291,10 +293,10 @@ def switchings(found: Sequence[Response], targets: Sequence[str] = SOUGHT) -> li
             if 0 < len(times) <= MOST_TIMES:
                 term = Term('switched', of, times=tuple(float(k * r.fine * r.period) for k in times))
                 places = (name, f'static_{name}') if on_link else (name,)
-                for place in places:
-                    better = _with_better_times(found, place, term)
-                    out[better.of, better.times] = better
-    return list(out.values())
+                seen += score(found, [term], places)
+    seen.sort(key=lambda s: -s.gain)
+    better = [_with_better_times(found, s.target, s.term) for s in seen[:REFINED]]
+    return list({(t.of, t.times): t for t in better}.values())
 
 
 def _averaged(values: FloatArray, blocks: int) -> FloatArray:
@@ -307,7 +309,7 @@ def _averaged(values: FloatArray, blocks: int) -> FloatArray:
 def _with_better_times(found: Sequence[Response], target: str, term: Term) -> Term:
     """Each time moved to where the term explains most on ``target``: by up to 0.08 s, then to a sample."""
     step = found[0].period
-    for reach, pitch in ((0.08, 8.0 * step), (8.0 * step, step)):
+    for reach, pitch in ((0.08, 8.0 * step), (0.08, 8.0 * step), (8.0 * step, step)):
         for k in range(len(term.times)):
             tries = []
             for shift in np.arange(-reach, reach + 0.5 * pitch, pitch).tolist():

@@ -45,6 +45,8 @@ BUDGET = 600
 """Forward simulations beside one set of effects after which no term is added."""
 TIED = 21.6
 """Loss in chi-square below which another law counts as equivalent, as for effects."""
+UNDETERMINED = 100.0
+"""Standard deviation, over its value, from which on a number counts as not determined."""
 EXPLAINS = 0.5
 """Share of what is left, in chi-square, that a law must explain."""
 
@@ -112,7 +114,7 @@ def _covariance(fit: Fit) -> FloatArray:
 
     A threshold below which only one level of a load lies is such a one.
     """
-    lengths = np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-150)
+    lengths = np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-60)
     unit = fit.jacobian / lengths
     values, vectors = np.linalg.eigh(unit.T @ unit)
     return np.asarray((vectors / np.maximum(values, 1e-9)) @ vectors.T / np.outer(lengths, lengths))
@@ -127,6 +129,9 @@ def _fitted(law: Law, fit: Fit, covariance: FloatArray, index: int) -> Law:
         own = {'coefficient': sd.get(f'c{i}', 0.0)}
         own.update({k: sd[f'{k}{i}'] for k in t.shapes if k in FORMS[t.form].fitted and f'{k}{i}' in sd})
         shapes = {k: values[f'{k}{i}'] for k in t.shapes}
+        sizes = {'coefficient': values[f'c{i}'], **shapes}
+        # What the recording does not determine has no standard deviation.
+        own = {k: v for k, v in own.items() if v < UNDETERMINED * abs(sizes[k])}
         out.append(dataclasses.replace(t, coefficient=values[f'c{i}'], shapes=shapes, sd=own))
     return dataclasses.replace(law, terms=tuple(out))
 
@@ -358,6 +363,10 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     # The curvature of the likelihood of a single parameter, to first order.
     term = Term('jitter', (name,), coefficient, sd={'coefficient': coefficient / math.sqrt(max(gain, 1.0))})
     law = Law(f'law_{channel}', 'electronics', channel, (term,))
+    # What this noise adds to block means is no gap any more.
+    added = sum(float(np.sum((coefficient * v) ** 2)) for v in known[name]) / sum(len(v) for v in known[name])
+    added /= 4.0 * ws.observations[0].rig.estimator.block_size
+    added = 0.0 if channel.startswith('sum') else added
     whole = dataclasses.replace(fit, effects=(*fit.effects, ActiveEffect(effect_of(law), values_of(law))))
     others = [dataclasses.replace(law, stage='psd')]
     return FoundLaw(
@@ -370,8 +379,8 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
         p,
         gain - penalty,
         heldout,
-        ws.gap(fit.difference),
-        heldout_gap(ws, fit),
+        math.sqrt(max(ws.gap(fit.difference) ** 2 - added, 0.0)),
+        math.sqrt(max(heldout_gap(ws, fit) ** 2 - added, 0.0)),
     )
 
 
