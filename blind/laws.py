@@ -28,7 +28,9 @@ from psd_deflection.config import load_rig
 from psd_deflection.discovery.discover import Discovery, discover
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.result import result
+from psd_deflection.discovery.signatures import SignatureBank
 
+_BANK = SignatureBank()
 STAGES = tuple(law_forms.OF_STAGE)
 WANTED = {'stage': 0.90, 'variables': 0.90, 'gap': 0.80, 'alarm': 0.0}
 MOST_FLOORS = 1.2
@@ -73,7 +75,7 @@ def observe(law: dict[str, Any] | None, seed: int) -> list[Observation]:
 
 def answer(law: dict[str, Any] | None, seed: int) -> tuple[dict[str, Any], Discovery]:
     """discover's result.json."""
-    found = discover(observe(law, seed), load_rig(), seed=0)
+    found = discover(observe(law, seed), load_rig(), seed=0, bank=_BANK)
     return result(found), found
 
 

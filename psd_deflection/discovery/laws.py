@@ -22,6 +22,7 @@ from psd_deflection.discovery.law_features import (
     LOADS,
     POSE,
     SOUGHT,
+    Response,
     Scored,
     known_fine,
     responses,
@@ -159,7 +160,9 @@ class _Seeker:
         fit = refit(self.ws, [*beside, *(ActiveEffect(effect_of(law), values_of(law)) for law in laws)], iterations)
         covariance = _covariance(fit)
         better = tuple(_fitted(law, fit, covariance, len(beside) + i) for i, law in enumerate(laws))
-        return _Trial(better, fit, self.cost(better, fit))
+        # A shape at its bound means that the form is not the right one.
+        bound = any(i >= len(beside) for i, _ in fit.at_bound)
+        return _Trial(better, fit, math.inf if bound else self.cost(better, fit))
 
     def done(self, trial: _Trial) -> bool:
         """Whether no more than noise is left, or enough has been tried."""
@@ -187,6 +190,11 @@ class _Seeker:
         """Further terms while BIC improves by enough; then terms that it does not miss go."""
         while trial.terms < MAX_TERMS and not self.done(trial):
             more = responses(self.ws, trial.fit)
+            if trial.laws[0].terms[0].times and len(trial.laws) == 1:
+                again = self._switched_again(trial, more)
+                if again.cost < trial.cost - BIC_ACCEPT:
+                    trial = again
+                    continue
             scored = score(more, [t for t in self.listed if t.form != 'switched'])
             tries = [self.trial(_with(trial.laws, s), trial.beside, 4) for s in scored[:2]]
             best = min(tries, key=lambda t: t.cost, default=trial)
@@ -200,6 +208,17 @@ class _Seeker:
                 break
             trial = best
         return trial
+
+    def _switched_again(self, trial: _Trial, left: Sequence[Response]) -> _Trial:
+        """With the further times of switching that show once the law is in the model."""
+        (law,), best = trial.laws, trial
+        term = law.terms[0]
+        for more in switchings(left, (law.acts_on.removeprefix('static_'),)):
+            times = tuple(sorted({*term.times} ^ {*more.times}))
+            if more.of == term.of and times:
+                now = dataclasses.replace(law, terms=(dataclasses.replace(term, times=times), *law.terms[1:]))
+                best = min(best, self.trial([now], trial.beside, 4), key=lambda t: t.cost)
+        return best
 
     def lean(self, trial: _Trial) -> _Trial:
         """Without the effects that only stood in for the law."""
@@ -275,6 +294,7 @@ def _law_of_the_mean(
     for start in starts:
         seeker = _Seeker(ws, start, penalty)
         trials += [(t, seeker) for t in seeker.first()]
+    trials = [(t, s) for t, s in trials if t.cost < math.inf]
     if not trials:
         return None
     trials.sort(key=lambda t: t[0].cost)
@@ -298,10 +318,9 @@ def _law_of_the_mean(
     p = math.exp(min(chances + float(chi2_law.logsf(max(gain, 0.0), max(parameters, 1))), 0.0))
     bic = gain - (best.cost - found.chi2 - penalty * without.parameters)
     held = heldout_gain(ws, without, found, rng)
-    bound = any(i >= len(best.beside) for i, _ in found.at_bound)
     enough = fit.chi2 - found.chi2 > EXPLAINS * excess
     enough &= best.cost < fit.chi2 + penalty * fit.parameters - BIC_ACCEPT
-    if p > P_ACCEPT or bic <= BIC_ACCEPT or not held.holds or bound or not enough:
+    if p > P_ACCEPT or bic <= BIC_ACCEPT or not held.holds or not enough:
         return None
     return FoundLaw(
         best.laws[0],
