@@ -9,6 +9,7 @@ nothing. Develop on one range of seeds and judge once on another.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import sys
@@ -156,8 +157,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     jobs: list[tuple[dict[str, Any] | None, int]] = [(law, law['number']) for law in listed]
     jobs += [(None, 100_000 + args.first + i) for i in range(args.nulls)]
     rows = []
-    with ProcessPoolExecutor(args.jobs) as pool, (folder / f'answers-{args.first}.jsonl').open('w') as stream:
-        for row in tqdm(pool.map(_one, jobs), total=len(jobs), desc='answers', file=sys.stderr):
+    with contextlib.ExitStack() as open_until_done:
+        stream = open_until_done.enter_context((folder / f'answers-{args.first}.jsonl').open('w'))
+        pool = open_until_done.enter_context(ProcessPoolExecutor(args.jobs)) if args.jobs > 1 else None
+        answers = map(_one, jobs) if pool is None else pool.map(_one, jobs)
+        for row in tqdm(answers, total=len(jobs), desc='answers', file=sys.stderr):
             rows.append(row)
             stream.write(json.dumps(row) + '\n')
             stream.flush()

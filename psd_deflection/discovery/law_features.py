@@ -295,7 +295,7 @@ def switchings(found: Sequence[Response], targets: Sequence[str] = SOUGHT) -> li
                 places = (name, f'static_{name}') if on_link else (name,)
                 seen += score(found, [term], places)
     seen.sort(key=lambda s: -s.gain)
-    better = [_with_better_times(found, s.target, s.term) for s in seen[:REFINED]]
+    better = [with_better_times(found, s.target, s.term) for s in seen[:REFINED]]
     return list({(t.of, t.times): t for t in better}.values())
 
 
@@ -306,7 +306,7 @@ def _averaged(values: FloatArray, blocks: int) -> FloatArray:
     return np.asarray(np.convolve(values, np.ones(blocks) / blocks, mode='same'))
 
 
-def _with_better_times(found: Sequence[Response], target: str, term: Term) -> Term:
+def with_better_times(found: Sequence[Response], target: str, term: Term) -> Term:
     """Each time moved to where the term explains most on ``target``: by up to 0.08 s, then to a sample."""
     step = found[0].period
     for reach, pitch in ((0.08, 8.0 * step), (0.08, 8.0 * step), (8.0 * step, step)):

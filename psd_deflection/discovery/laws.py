@@ -29,6 +29,7 @@ from psd_deflection.discovery.law_features import (
     score,
     switchings,
     terms,
+    with_better_times,
 )
 from psd_deflection.discovery.search import BIC_ACCEPT, P_ACCEPT
 from psd_deflection.discovery.validate import HeldOut, fold_of_case, heldout_gain, heldout_gap
@@ -216,7 +217,9 @@ class _Seeker:
         for more in switchings(left, (law.acts_on.removeprefix('static_'),)):
             times = tuple(sorted({*term.times} ^ {*more.times}))
             if more.of == term.of and times:
-                now = dataclasses.replace(law, terms=(dataclasses.replace(term, times=times), *law.terms[1:]))
+                better = with_better_times(self.found, law.acts_on, Term(term.form, term.of, times=times))
+                both = dataclasses.replace(term, times=better.times)
+                now = dataclasses.replace(law, terms=(both, *law.terms[1:]))
                 best = min(best, self.trial([now], trial.beside, 4), key=lambda t: t.cost)
         return best
 
