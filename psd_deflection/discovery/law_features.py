@@ -178,6 +178,7 @@ def terms(found: Sequence[Response]) -> Iterator[Term]:
             yield Term('below', (name,), shapes={'threshold': level})
         for share in (0.05, 0.15, 0.3, 0.5, 0.7):
             yield Term('beyond', (name,), shapes={'threshold': share * size[name]})
+            yield Term('within', (name,), shapes={'threshold': share * size[name]})
         # Held loads take few values, and any threshold between two of them is the same.
         distinct = np.unique(np.concatenate(parts[name]))
         few = [0.5 * (a + b) for a, b in itertools.pairwise(distinct.tolist())] if len(distinct) <= 24 else []

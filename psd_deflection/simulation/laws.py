@@ -104,6 +104,10 @@ def _beyond(v: FloatArray, shapes: Values) -> FloatArray:
     return np.sign(v) * np.maximum(np.abs(v) - shapes['threshold'], 0.0)
 
 
+def _within(v: FloatArray, shapes: Values) -> FloatArray:
+    return np.clip(v, -shapes['threshold'], shapes['threshold'])
+
+
 def _over(v: FloatArray, shapes: Values) -> FloatArray:
     return (v > shapes['threshold']).astype(np.float64)
 
@@ -190,6 +194,7 @@ FORMS: Mapping[str, Form] = {
     'beyond': Form(
         'static', 'sign({v}) max(|{v}| - {threshold}, 0)', apart=_beyond, fitted={'threshold': ('v', *_POSITIVE)}
     ),
+    'within': Form('static', '{v} within ±{threshold}', apart=_within, fitted={'threshold': ('v', *_POSITIVE)}),
     'wave': Form(
         'static',
         'sin(2 pi {v} / {period} + {phase})',
