@@ -216,7 +216,7 @@ class Scored:
 
 
 def allowed(target: str, term: Term) -> bool:
-    """Whether the term's variables are known where it acts, and it is not one that a dot cannot have."""
+    """Whether the term's variables are known where it acts."""
     return all(v in TARGETS[target].variables for v in term.depends_on)
 
 

@@ -57,7 +57,7 @@ EXPLAINS = 0.5
 class FoundLaw:
     """``fit``: the model with the law as its last effects: ``law``, then ``further`` on other quantities that belong to
     it. ``channels``: where it shows. ``equivalent``: laws in place of the first that this recording cannot tell from
-    it. ``without``: the model without it.
+    it. ``without``: the model without it. ``heldout_gap``: m, on unseen load cases.
     """
 
     law: Law
@@ -69,7 +69,6 @@ class FoundLaw:
     p: float
     delta_bic: float
     heldout: HeldOut
-    gap: float
     heldout_gap: float
 
     @property
@@ -335,7 +334,6 @@ def _law_of_the_mean(
         p,
         bic,
         held,
-        ws.gap(found.difference),
         heldout_gap(ws, found),
     )
 
@@ -401,7 +399,6 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
         p,
         gain - penalty,
         heldout,
-        math.sqrt(max(ws.gap(fit.difference) ** 2 - added, 0.0)),
         math.sqrt(max(heldout_gap(ws, fit) ** 2 - added, 0.0)),
     )
 

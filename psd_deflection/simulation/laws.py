@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import yaml
@@ -46,8 +46,7 @@ from psd_deflection.simulation.declaration import (
 from psd_deflection.simulation.modes import mode_coefficients
 from psd_deflection.simulation.samples import SimulatedSamples
 
-Kind = str
-KINDS: tuple[Kind, ...] = ('static', 'switched', 'rate', 'history', 'resonance', 'variance')
+Kind = Literal['static', 'switched', 'rate', 'history', 'resonance', 'variance']
 
 VARIABLES: Mapping[str, str] = {
     'load_fx': 'N',
@@ -252,7 +251,7 @@ class Term:
 
     @property
     def kind(self) -> Kind:
-        """One of ``KINDS``; a wave in time is a line, which is a resonance."""
+        """A wave in time is a line, which is a resonance."""
         return 'resonance' if self.form == 'wave' and self.of == ('time',) else FORMS[self.form].kind
 
     def evaluate(self, given: Callable[[str], FloatArray], n: int, period: float, state: State) -> FloatArray:
