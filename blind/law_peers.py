@@ -98,14 +98,16 @@ def adcd(path: Path) -> tuple[list[str], str, Array]:
     package, sympy = importlib.import_module('adcd'), importlib.import_module('sympy')
     known, y, _, _, fitted = _data(path)
     best: tuple[float, str, dict[str, float]] | None = None
+    # As many points as its own scenarios have: it takes minutes with all of them.
+    some = np.flatnonzero(fitted)[:: max(1, int(fitted.sum()) // 200)]
     for name in known:
         found = package.fit(
-            {k: v[fitted] for k, v in known.items()},
-            y[fitted],
-            np.zeros(int(fitted.sum())),
+            {k: v[some] for k, v in known.items()},
+            y[some],
+            np.zeros(len(some)),
             limit_variable=name,
             correction_mode='additive',
-            max_iterations=2,
+            max_iterations=1,
             verbose=False,
         )
         if found.best_expr and (best is None or found.best_nmse_residual < best[0]):
