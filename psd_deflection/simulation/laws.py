@@ -43,6 +43,7 @@ from psd_deflection.simulation.declaration import (
     Use,
     Values,
 )
+from psd_deflection.simulation.hysteresis import play
 from psd_deflection.simulation.modes import mode_coefficients
 from psd_deflection.simulation.samples import SimulatedSamples
 
@@ -158,8 +159,6 @@ def _resonance(v: FloatArray, shapes: Values, period: float, state: State) -> Fl
 
 
 def _play(v: FloatArray, shapes: Values, period: float, state: State) -> FloatArray:
-    from psd_deflection.simulation.effects.clamp_friction import play
-
     held = play(v, shapes['half_width'], state.get('held', v[0]))
     state['held'] = float(held[-1])
     return held - v
