@@ -15,6 +15,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from msg_adapters import (
     DEFLECTION,
     DIAGNOSTICS,
+    FILTER_TOPICS,
     INPUTS,
     TOPIC_TYPES,
     solver_topic,
@@ -24,7 +25,15 @@ from msg_adapters import (
 from psd_deflection import __version__
 from psd_deflection.config import Rig
 from psd_deflection.recordings import cdr
-from psd_deflection.records import ENVIRONMENT, ParameterChange, Record, RigState, SampleBlock, TemperatureReading
+from psd_deflection.records import (
+    ENVIRONMENT,
+    KNOWN_LOAD,
+    ParameterChange,
+    Record,
+    RigState,
+    SampleBlock,
+    TemperatureReading,
+)
 from psd_deflection.ros.names import VOLTS, delivery
 from psd_deflection.runner.session import Session
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
@@ -60,6 +69,8 @@ def qos(topic: str) -> QoSProfile:
 def topics_of(rig: Rig) -> dict[str, str]:
     """The topics that a node of ``rig`` publishes encoded messages on, with their types."""
     outputs = {topic: kind for topic, kind in TOPIC_TYPES.items() if topic not in INPUTS}
+    if rig.estimator.filter == 'none':
+        outputs = {topic: kind for topic, kind in outputs.items() if topic not in FILTER_TOPICS}
     outputs |= {solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in (*rig.estimator.solvers, ONE_PSD)}
     return outputs | (dict.fromkeys(VOLTS, vector3_stamped.MESSAGE.name) if rig.monitor.publish_volts else {})
 
@@ -124,6 +135,9 @@ class RigPublisher:
 
     def put_change(self, change: ParameterChange) -> None:
         """Publish the rig after ``change``."""
+        if all(name == KNOWN_LOAD for name, _ in change.values):
+            # A reader has the load from its own topic.
+            return
         self._last = change
         self._environment |= {name: value for name, value in change.values if name in ENVIRONMENT}
         self._publish(dict(change.values))
