@@ -11,6 +11,7 @@ the seconds in which they are in their 95 % band; rms error of the pose between 
 
 from __future__ import annotations
 
+import argparse
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 from scipy.signal import savgol_filter
+from scipy.stats import chi2
+from tqdm import tqdm
 
 from blind.generator import EI, GJ, PLACES, RATE, SIGMA, Array, output
 from psd_deflection.config import Rig, load_rig
@@ -32,7 +35,6 @@ BLOCK = 20
 AXES = ('dX', 'dY', 'theta')
 KINDS = ('steps', 'chirp', 'operation')
 LATER = np.arange(1, BLOCK + 1) / RATE
-BLOCKS_A_SECOND = int(RATE) // BLOCK
 
 
 @dataclass(frozen=True)
@@ -201,3 +203,71 @@ def judge(run: Run, rig: Rig) -> Result:
         pose[part],
         pose_own[part],
     )
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of one axis; rms values in m, rad, m/s, rad/s.
+
+    ``velocity``: error, ``own``: what the filter says of it, ``smoothed``: that of Savitzky and Golay. ``nis`` a
+    sample; ``inside``: share of the blocks whose NIS is in its 95 % band. ``foretold``, ``held``: errors of the pose.
+    """
+
+    velocity: float
+    own: float
+    smoothed: float
+    nis: float
+    inside: float
+    foretold: float
+    held: float
+
+
+def figures(results: Iterable[Result]) -> list[Figures]:
+    """Of dX, dY and theta, over all ``results``."""
+    results = list(results)
+    low, high = (float(chi2.ppf(p, BLOCK)) for p in (0.025, 0.975))
+    out = []
+    for axis in range(3):
+        velocity, own, smoothed, squares, foretold, held = (
+            np.concatenate([getattr(result, name)[:, axis] for result in results])
+            for name in ('velocity', 'own', 'smoothed', 'squares', 'foretold', 'held')
+        )
+        inside = float(np.mean((squares > low) & (squares < high)))
+        nis = float(squares.mean()) / BLOCK
+        out.append(Figures(rms(velocity), rms(own), rms(smoothed), nis, inside, rms(foretold), rms(held)))
+    return out
+
+
+def table(found: Mapping[str, list[Figures]]) -> str:
+    """A Markdown table."""
+    rows = [
+        '| motion | axis | velocity | own | / own | / Savitzky-Golay | NIS | inside | foretold | held |',
+        '|---' * 10 + '|',
+    ]
+    for kind, axes in found.items():
+        for name, f in zip(AXES, axes, strict=True):
+            unit, micro = ('mm/s', 'µm') if name != 'theta' else ('mrad/s', 'µrad')
+            rows.append(
+                f'| {kind} | {name} | {f.velocity * 1e3:.3f} {unit} | {f.own * 1e3:.3f} | {f.velocity / f.own:.2f} '
+                f'| {f.velocity / f.smoothed:.3f} | {f.nis:.3f} | {f.inside:.1%} '
+                f'| {f.foretold * 1e6:.1f} {micro} | {f.held * 1e6:.1f} |'
+            )
+    return '\n'.join(rows)
+
+
+def main() -> None:
+    """The table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--runs', type=int, default=20, help='of each kind of motion')
+    parser.add_argument('--seconds', type=float, default=23.0, help='of a run, the first three at rest')
+    parser.add_argument('--seed', type=int, default=0)
+    args = parser.parse_args()
+    found: dict[str, list[Figures]] = {}
+    for kind in KINDS:
+        seeds = range(args.seed, args.seed + args.runs)
+        found[kind] = figures([judge(make(kind, args.seconds, seed), rig_of()) for seed in tqdm(seeds, kind)])
+    print(table(found))
+
+
+if __name__ == '__main__':
+    main()

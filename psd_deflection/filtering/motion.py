@@ -237,7 +237,7 @@ class ModalFilter:
         levels = self.levels
         # Of x0, one sample before the block: what the block says, then with what was known.
         scaled = np.einsum('aknm,am->akn', says.precision, miss)
-        score = np.einsum('ani,akn->aki', says.observed, scaled)
+        score = np.einsum('akin,an->aki', says.pulled, miss)
         known = inverse(p)
         posterior = inverse((known[:, None] + says.information).reshape(-1, 3, 3)).reshape(3, levels, 3, 3)
         squares = np.einsum('an,akn->ak', miss, scaled) - np.einsum('aki,akij,akj->ak', score, posterior, score)
@@ -247,15 +247,16 @@ class ModalFilter:
         weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
         weights /= weights.sum(axis=1, keepdims=True)
         carried = np.einsum('akij,akjl->akil', says.kept, posterior)
-        gain = says.smoothed + np.einsum('akij,akjn->akin', carried, says.pulled)
-        found = after[:, None] + np.einsum('akin,an->aki', gain, miss)
+        found = after[:, None] + np.einsum('akin,an->aki', says.smoothed, miss)
+        found += np.einsum('akij,akj->aki', carried, score)
         covariance = np.einsum('akij,aklj->akil', carried, says.kept) + says.left
         self._x = np.einsum('ak,aki->ai', weights, found)
         apart = found - self._x[:, None]
         spread = covariance + apart[..., :, None] * apart[..., None, :]
         self._p = np.einsum('ak,akij->aij', weights, spread)
         self._p = 0.5 * (self._p + self._p.transpose(0, 2, 1))
-        mean = np.einsum('ak,akin->ain', weights, gain)
+        mean = np.einsum('ak,akin->ain', weights, says.smoothed)
+        mean += np.einsum('akij,akjn->ain', weights[..., None, None] * carried, says.pulled)
         own = self._tables.phi - np.einsum('ain,anj->aij', mean, says.observed)
         noise = self._noise[:, slots[:, None], slots]
         both = np.einsum('pin,pnm->pim', mean[_FIRST], noise)
