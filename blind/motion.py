@@ -22,7 +22,7 @@ from scipy.signal import savgol_filter
 from scipy.stats import chi2
 from tqdm import tqdm
 
-from blind.generator import EI, GJ, PLACES, RATE, SIGMA, Array, output
+from blind.generator import EI, GJ, MM_PER_V, PLACES, RATE, SIGMA, Array, output
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import RawChunk, TipMotion
@@ -75,10 +75,10 @@ def loads_of(kind: str, seconds: float, rng: np.random.Generator) -> Array:
     return out
 
 
-def moved(loads: Array, modes: Iterable[tuple[float, float]] = MODES) -> tuple[Array, Array]:
+def moved(loads: Array) -> tuple[Array, Array]:
     """Pose and velocity (n, 3) at each sample; the sample sees the loads before it."""
     pose, velocity = np.empty_like(loads), np.empty_like(loads)
-    for axis, (hertz, zeta) in enumerate(modes):
+    for axis, (hertz, zeta) in enumerate(MODES):
         w = 2.0 * math.pi * hertz
         step = expm(np.array([[0.0, 1.0, 0.0], [-w * w, -2.0 * zeta * w, w * w], [0.0, 0.0, 0.0]]) / RATE)
         (a, b, c), (d, e, f), _ = step.tolist()
@@ -89,18 +89,22 @@ def moved(loads: Array, modes: Iterable[tuple[float, float]] = MODES) -> tuple[A
     return pose, velocity
 
 
-def make(kind: str, seconds: float, seed: int, modes: Iterable[tuple[float, float]] = MODES) -> Run:
+def make(kind: str, seconds: float, seed: int) -> Run:
     """A run of ``kind``."""
-    rng = np.random.default_rng(seed)
-    loads = loads_of(kind, seconds, rng)
-    pose, velocity = moved(loads, modes)
+    return run_of(loads_of(kind, seconds, np.random.default_rng(seed)), seed)
+
+
+def run_of(loads: Array, seed: int) -> Run:
+    """The run under ``loads`` (n, 3)."""
+    pose, velocity = moved(loads)
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     volts = np.full((len(pose), 6), 5.0)
     for psd, (lx, ly) in enumerate(PLACES):
         x, y = lx - pose[:, 0], ly - pose[:, 1]
-        volts[:, 3 * psd] = (c * x + s * y - lx) / 0.5e-3
-        volts[:, 3 * psd + 1] = (c * y - s * x - ly) / 0.5e-3
-    return Run(loads, pose, velocity, output(volts + SIGMA * rng.normal(size=volts.shape), []))
+        volts[:, 3 * psd] = (c * x + s * y - lx) / MM_PER_V
+        volts[:, 3 * psd + 1] = (c * y - s * x - ly) / MM_PER_V
+    noise = np.random.default_rng([seed, 1]).normal(0.0, SIGMA, volts.shape)
+    return Run(loads, pose, velocity, output(volts + noise, []))
 
 
 @dataclass(frozen=True)
@@ -135,7 +139,7 @@ def rig_of(changes: Mapping[str, object] | None = None) -> Rig:
 
 def pose_of(volts: Array) -> Array:
     """Pose (n, 3) of readings (n, 6): the base line between the dots gives the twist."""
-    (l1, l2), dots = (complex(*place) for place in PLACES), 0.5e-3 * volts
+    (l1, l2), dots = (complex(*place) for place in PLACES), MM_PER_V * volts
     q1, q2 = l1 + dots[:, 0] + 1j * dots[:, 1], l2 + dots[:, 3] + 1j * dots[:, 4]
     turn = (l1 - l2) / (q1 - q2)
     turn /= np.abs(turn)

@@ -39,16 +39,30 @@ def operation() -> motion.Run:
     return motion.make('operation', 8.0, 5)
 
 
+@pytest.fixture(scope='module')
+def judged() -> dict[str, motion.Result]:
+    return {kind: motion.judge(motion.make(kind, 9.0, 2), RIG) for kind in motion.KINDS}
+
+
+@pytest.mark.statistics
 @pytest.mark.parametrize('kind', motion.KINDS)
-def test_velocity_prediction_and_innovations(kind: str) -> None:
-    figures = motion.figures([motion.judge(motion.make(kind, 9.0, 2), RIG)])
-    for axis in figures:
+def test_velocity_prediction_and_innovations(kind: str, judged: dict[str, motion.Result]) -> None:
+    for axis in motion.figures([judged[kind]]):
         assert axis.velocity < 0.2 * axis.smoothed
         assert axis.velocity < 1.1 * axis.own
         assert 0.92 < axis.inside < 0.98
         assert axis.foretold < 0.25 * axis.held
 
 
+@pytest.mark.statistics
+def test_the_prediction_is_better_than_the_held_estimate_at_every_frequency(judged: dict[str, motion.Result]) -> None:
+    swept = judged['chirp']
+    # The frequency rises with time, from 0.5 Hz to 1.2 times that of the mode.
+    for foretold, held in zip(np.array_split(swept.foretold, 12), np.array_split(swept.held, 12), strict=True):
+        assert np.all(np.square(foretold).mean(axis=0) < 0.25 * np.square(held).mean(axis=0))
+
+
+@pytest.mark.statistics
 def test_the_covariance_of_the_pose_is_that_of_its_errors() -> None:
     run = motion.make('operation', 10.0, 6)
     moved = through(Pipeline(RIG), run, range(500))[150:]
