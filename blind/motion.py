@@ -62,7 +62,7 @@ def loads_of(kind: str, seconds: float, rng: np.random.Generator) -> Array:
         t = np.arange(n - rest) / RATE
         for axis in range(3):
             low, high = 0.5, 1.2 * MODES[axis][0]
-            phase = 2.0 * math.pi * (low * t + 0.5 * (high - low) / (seconds - REST) * t * t) + rng.uniform(0.0, 6.0)
+            phase = 2.0 * math.pi * (low * t + 0.5 * (high - low) / (seconds - REST) * t * t)
             out[rest:, axis] = 0.1 * most[axis] * np.sin(phase)
     else:
         for axis in range(3):
@@ -178,6 +178,7 @@ def judge(run: Run, rig: Rig) -> Result:
     velocity, own, squares = np.zeros((blocks, 3)), np.zeros((blocks, 3)), np.zeros((blocks, 3))
     pose, pose_own = np.zeros((blocks, 3)), np.zeros((blocks, 3))
     foretold, held = np.zeros((blocks * BLOCK, 3)), np.zeros((blocks * BLOCK, 3))
+    first = int(REST * RATE) // BLOCK
     for block in range(blocks):
         before = motion.innovations
         for record in pipeline.process(chunk(run, block)):
@@ -191,11 +192,10 @@ def judge(run: Run, rig: Rig) -> Result:
         estimate = pipeline.last_estimate
         if estimate is None:
             raise RuntimeError(f'block {block} has no estimate')
-        if block + 1 < blocks:
+        if first - 1 <= block < blocks - 1:
             ahead = slice(BLOCK * (block + 1), BLOCK * (block + 2))
             foretold[ahead] = motion.predicted(LATER).pose - run.pose[ahead]
             held[ahead] = np.array(estimate.pose) - run.pose[ahead]
-    first = int(REST * RATE) // BLOCK
     part, samples = slice(first, blocks), slice(first * BLOCK, blocks * BLOCK)
     return Result(
         velocity[part],

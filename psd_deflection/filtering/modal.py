@@ -1,12 +1,13 @@
 """How a mode moves from sample to sample, and what a block of samples says about it.
 
-Each of dX, dY and theta is a damped oscillator about the static deflection u of the load, and the load wanders
-(a random walk of rate Q):
+Each of dX, dY and theta is a damped oscillator about the static deflection u of the load. The load wanders by steps, or
+smoothly, if its rate of change r does:
 
-    q'' + 2 zeta w q' + w^2 (q - u) = 0,    u' = white noise of density Q (m^2/s or rad^2/s).
+    q'' + 2 zeta w q' + w^2 (q - u) = 0,
+    u' = r + noise of density Q_u (m^2/s),    r' = noise of density Q_r (m^2/s^3).
 
-The state is x = (q, q'/w, u), all in m (or rad). The samples of one block are y = O x0 + process noise + noise of the
-readings, with x0 the state one sample before the block. So a whole block is one update of three unknowns, and
+The state is x = (q, q'/w, u, r/w), all in m (or rad). The samples of one block are y = O x0 + process noise + noise of
+the readings, with x0 the state one sample before the block. So a whole block is one update of four unknowns, and
 :class:`BlockTables` holds what does not depend on x0: the answer is that of a Kalman filter that runs sample by sample
 (Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, 5.2), also if the noise of
 the readings is coloured within the block.
@@ -37,44 +38,50 @@ class Oscillator:
         return 2.0 * math.pi * self.frequency
 
     def step(self, seconds: float) -> FloatArray:
-        """Phi (3, 3): the state after ``seconds`` of its own motion."""
+        """Phi (4, 4): the state after ``seconds`` of its own motion."""
         w, zeta = self.w, self.damping_ratio
         root = math.sqrt(1.0 - zeta**2)
         decay = math.exp(-zeta * w * seconds)
         c, s = math.cos(root * w * seconds), math.sin(root * w * seconds) / root
         kept, turned = decay * (c + zeta * s), decay * s
-        return np.array([[kept, turned, 1.0 - kept], [-turned, decay * (c - zeta * s), turned], [0.0, 0.0, 1.0]])
+        out = np.zeros((4, 4))
+        out[:2, :2] = [[kept, turned], [-turned, decay * (c - zeta * s)]]
+        out[:, 2:] = self.pushed(np.array([seconds]))[0].T
+        return out
 
     def pushed(self, seconds: FloatArray) -> FloatArray:
-        """(n, 3): the state ``seconds`` (n,) after u went from 0 to 1, the last column of Phi; 0 before that."""
+        """(n, 2, 4): the state ``seconds`` (n,) after u, or r/w, went from 0 to 1: columns of Phi; 0 before that."""
         w, zeta = self.w, self.damping_ratio
         root = math.sqrt(1.0 - zeta**2)
         since = np.maximum(seconds, 0.0)
         decay = np.exp(-zeta * w * since)
         c, s = np.cos(root * w * since), np.sin(root * w * since) / root
-        out = np.stack((1.0 - decay * (c + zeta * s), decay * s, np.ones(len(since))), axis=1)
-        return np.asarray(np.where(seconds[:, None] >= 0.0, out, 0.0))
+        zero, one = np.zeros(len(since)), np.ones(len(since))
+        rest = 1.0 - decay * (c + zeta * s)
+        lag = 2.0 * zeta - decay * (2.0 * zeta * c + (2.0 * zeta**2 - 1.0) * s)
+        out = np.array([[rest, decay * s, one, zero], [w * since - lag, rest, w * since, one]]).transpose(2, 0, 1)
+        return np.asarray(np.where(seconds[:, None, None] >= 0.0, out, 0.0))
 
     def spreads(self, seconds: FloatArray) -> FloatArray:
-        """D (n, 3, 3): covariance that a load of rate Q = 1 adds in ``seconds`` (n,).
+        """D (n, 2, 4, 4): covariance that Q_u = 1, or Q_r = w^2, adds in ``seconds`` (n,).
 
-        It is the integral of the last column of Phi times itself, by Gauss-Legendre in pieces of an eighth of a
+        It is the integral of the column of Phi times itself, by Gauss-Legendre in pieces of an eighth of a
         period at most.
         """
         nodes, weights = np.polynomial.legendre.leggauss(8)
         pieces = max(1, math.ceil(8.0 * float(seconds.max()) * self.frequency))
         shares = ((np.arange(pieces)[:, None] + 0.5 * (nodes + 1.0)) / pieces).ravel()
-        pushed = self.pushed((seconds[:, None] * shares).ravel()).reshape(len(seconds), len(shares), 3)
+        pushed = self.pushed((seconds[:, None] * shares).ravel()).reshape(len(seconds), len(shares), 2, 4)
         parts = np.tile(0.5 * weights / pieces, pieces) * seconds[:, None]
-        return np.asarray(np.einsum('np,npi,npj->nij', parts, pushed, pushed))
+        return np.asarray(np.einsum('np,npci,npcj->ncij', parts, pushed, pushed))
 
 
 class Says(NamedTuple):
     """What n samples of a block say; A axes, K rates. S: their covariance if x0 is known, X: that of x_end with them.
 
-    ``observed`` (A, n, 3): O. ``precision`` (A, K, n, n): S^-1. ``pulled`` (A, K, 3, n): O^T S^-1. ``smoothed``
-    (A, K, 3, n): X S^-1. ``information`` (A, K, 3, 3): O^T S^-1 O, of x0. ``kept`` (A, K, 3, 3): x_end for x0, with the
-    samples given. ``left`` (A, K, 3, 3): covariance of x_end if x0 and the samples are known. ``log_size`` (A, K):
+    ``observed`` (A, n, 4): O. ``precision`` (A, K, n, n): S^-1. ``pulled`` (A, K, 4, n): O^T S^-1. ``smoothed``
+    (A, K, 4, n): X S^-1. ``information`` (A, K, 4, 4): O^T S^-1 O, of x0. ``kept`` (A, K, 4, 4): x_end for x0, with the
+    samples given. ``left`` (A, K, 4, 4): covariance of x_end if x0 and the samples are known. ``log_size`` (A, K):
     log det S.
     """
 
@@ -91,16 +98,16 @@ class Says(NamedTuple):
 class BlockTables:
     """What a block of N samples says about A axes for each of K rates of their loads.
 
-    ``phi`` (A, 3, 3): over the whole block. ``added`` (A, K, 3, 3): what the load adds to the covariance over it.
+    ``phi`` (A, 4, 4): over the whole block. ``added`` (A, K, 4, 4): what the load adds to the covariance over it.
     """
 
     def __init__(self, modes: tuple[Oscillator, ...], size: int, period: float) -> None:
         """``size``: N. ``period``: of a sample, s."""
         self.size = size
-        self._observed = np.empty((len(modes), size, 3))
-        self._walk = np.empty((len(modes), size, size))
-        self._to_end = np.empty((len(modes), 3, size))
-        self._spread = np.empty((len(modes), 3, 3))
+        self._observed = np.empty((len(modes), size, 4))
+        self._walk = np.empty((len(modes), 2, size, size))
+        self._to_end = np.empty((len(modes), 2, 4, size))
+        self._spread = np.empty((len(modes), 2, 4, 4))
         self.phi = np.stack([mode.step(size * period) for mode in modes])
         for a, mode in enumerate(modes):
             steps = [mode.step(n * period) for n in range(size + 1)]
@@ -110,17 +117,18 @@ class BlockTables:
             for s in range(size):
                 # Covariance of the state at sample s with itself, carried on to later samples.
                 for t in range(s, size):
-                    self._walk[a, s, t] = self._walk[a, t, s] = steps[t - s][0] @ spreads[s + 1][:, 0]
-                self._to_end[a, :, s] = steps[size - 1 - s] @ spreads[s + 1][:, 0]
+                    self._walk[a, :, s, t] = self._walk[a, :, t, s] = spreads[s + 1][:, :, 0] @ steps[t - s][0]
+                self._to_end[a, :, :, s] = spreads[s + 1][:, :, 0] @ steps[size - 1 - s].T
 
     def fill(self, noise: FloatArray, rates: FloatArray) -> None:
         """Use this noise and these rates.
 
-        ``noise`` (A, N, N): covariance of the readings in one block. ``rates`` (A, K): Q.
+        ``noise`` (A, N, N): covariance of the readings in one block. ``rates`` (A, K, 2): Q_u
+        and Q_r/w^2.
         """
-        self._covariance = noise[:, None] + rates[:, :, None, None] * self._walk[:, None]
-        self._reach = rates[:, :, None, None] * self._to_end[:, None]
-        self.added = rates[:, :, None, None] * self._spread[:, None]
+        self._covariance = noise[:, None] + np.einsum('akc,acnm->aknm', rates, self._walk)
+        self._reach = np.einsum('akc,acin->akin', rates, self._to_end)
+        self.added = np.einsum('akc,acij->akij', rates, self._spread)
         self._whole = self._of(np.arange(self.size))
 
     def says(self, slots: IntArray) -> Says:

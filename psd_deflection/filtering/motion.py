@@ -23,15 +23,17 @@ from psd_deflection.filtering.modal import BlockTables, Oscillator
 from psd_deflection.records import AppliedLoad, FloatArray, IntArray
 from psd_deflection.uncertainty.block_fit import LARGEST, inverse
 
-LEVELS = 13
-"""K: rates of the load that are tried."""
+STEPPED, SMOOTH = 13, 10
+"""Rates that are tried of a load that wanders by steps, and of one whose rate of change wanders; K together."""
 SMALLEST, STEP = 1e-2, 10.0**0.5
-"""The static deflection wanders in one block by so many times the noise of a sample, at the lowest rate; from each rate
+"""The static deflection wanders in one block by so many times the noise of a sample at the lowest rate; from each rate
 to the next the factor."""
 DOWN, UP, JUMPS = 0.03, 0.01, 0.01
 """Probability that the rate of the next block is the next one down, the next one up, any one at all."""
 UNKNOWN = 1.0
 """Standard deviation of each state at the start, m or rad: nothing is known."""
+STEADY = 1e-9
+"""The same of r/w, if the rig file states how the load wanders: it has no rate of change."""
 KNOWN_LOAD = 0.05
 """Share by which the deflection of a known load may differ from the rig file's link, one standard deviation."""
 AXES = ('dX', 'dY', 'theta')
@@ -115,9 +117,11 @@ class ModalFilter:
         self._compliance = np.array(compliance)
         self._gain = gain
         stated = np.array(config.filter_load_walk) * self._compliance
-        self._stated = np.square(stated)[:, None] if any(config.filter_load_walk) else None
-        self.levels = 1 if self._stated is not None else LEVELS
-        self._changes = _transitions(self.levels)
+        self._stated = (
+            np.stack((np.square(stated), np.zeros(3)), axis=1)[:, None] if any(config.filter_load_walk) else None
+        )
+        self.levels = 1 if self._stated is not None else STEPPED + SMOOTH
+        self._changes = _transitions((1,) if self._stated is not None else (STEPPED, SMOOTH))
         self.innovations = Innovations()
         self.coasts = 0
         self._loads: list[AppliedLoad] = []
@@ -127,9 +131,11 @@ class ModalFilter:
 
     def forget(self) -> None:
         """Know nothing: the next block starts anew."""
-        self._x = np.zeros((3, 3))
-        self._p = np.tile(UNKNOWN**2 * np.eye(3), (3, 1, 1))
-        self._shared = np.zeros((3, 3, 3))
+        self._x = np.zeros((3, 4))
+        self._p = np.tile(UNKNOWN**2 * np.eye(4), (3, 1, 1))
+        if self._stated is not None:
+            self._p[:, 3, 3] = STEADY**2
+        self._shared = np.zeros((3, 4, 4))
         self._weights = np.full((3, self.levels), 1.0 / self.levels)
         self._index: int | None = None
         self._t_ns = 0
@@ -144,8 +150,12 @@ class ModalFilter:
         self._noise = behind[_FIRST, _SECOND]
         rates = self._stated
         if rates is None:
-            steps = SMALLEST * STEP ** np.arange(LEVELS)
-            rates = own[:, 0, 0, None] * np.square(steps) / (self._size * self._period)
+            seconds = self._size * self._period
+            rates = np.zeros((3, self.levels, 2))
+            steps = own[:, 0, 0, None] / seconds * np.square(SMALLEST * STEP ** np.arange(STEPPED))
+            smooth = own[:, 0, 0, None] / seconds * np.square(SMALLEST * STEP ** np.arange(SMOOTH))
+            rates[:, :STEPPED, 0] = steps
+            rates[:, STEPPED:, 1] = smooth / (self._w[:, None] * seconds) ** 2
         self._rates = rates
         self._tables.fill(own, rates)
 
@@ -200,12 +210,12 @@ class ModalFilter:
         self._shared = np.einsum('pij,pjl,pml->pim', phi[_FIRST], self._shared, phi[_SECOND])
 
     def _known_loads(self, t_ns: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """What the known loads of this block do: to each sample (3, N), to the end (3, 3), and to u, (3,)."""
+        """What the known loads of this block do: to each sample (3, N), to the end (3, 4), and to u, (3,)."""
         if not self._loads:
             return None
         period_ns = 1e9 * self._period
         end_ns = t_ns + round(0.5 * (self._size - 1) * period_ns)
-        samples, end, size = np.zeros((3, self._size)), np.zeros((3, 3)), np.zeros(3)
+        samples, end, size = np.zeros((3, self._size)), np.zeros((3, 4)), np.zeros(3)
         while self._loads and self._loads[0].t_ns <= end_ns:
             load = self._loads.pop(0)
             before, self._held = self._held, np.array(load[1:])
@@ -216,7 +226,7 @@ class ModalFilter:
             step = self._compliance * (self._held - before)
             size = size + np.square(KNOWN_LOAD * step)
             for a, mode in enumerate(self._modes):
-                pushed = step[a] * mode.pushed(self._period * np.arange(1.0, self._size + 1.0) - since)
+                pushed = step[a] * mode.pushed(self._period * np.arange(1.0, self._size + 1.0) - since)[:, 0]
                 samples[a] += pushed[:, 0]
                 end[a] += pushed[-1]
         return samples, end, size
@@ -239,7 +249,7 @@ class ModalFilter:
         scaled = np.einsum('aknm,am->akn', says.precision, miss)
         score = np.einsum('akin,an->aki', says.pulled, miss)
         known = inverse(p)
-        posterior = inverse((known[:, None] + says.information).reshape(-1, 3, 3)).reshape(3, levels, 3, 3)
+        posterior = inverse((known[:, None] + says.information).reshape(-1, 4, 4)).reshape(3, levels, 4, 4)
         squares = np.einsum('an,akn->ak', miss, scaled) - np.einsum('aki,akij,akj->ak', score, posterior, score)
         size = says.log_size - _log_det(posterior) + _log_det(p)[:, None]
         prior = np.einsum('ak,kl->al', self._weights, self._changes)
@@ -271,9 +281,9 @@ class ModalFilter:
     def _moved(self) -> Moved:
         """Of the end of the block, ``filter_ahead`` later."""
         x = np.einsum('aij,aj->ai', self._later, self._x)
-        rate = np.einsum('ak,ak->a', self._weights, self._rates)
+        rate = np.einsum('ak,akc->ac', self._weights, self._rates)
         p = np.einsum('aij,ajl,aml->aim', self._later, self._p, self._later)
-        p += rate[:, None, None] * self._later_spread
+        p += np.einsum('ac,acij->aij', rate, self._later_spread)
         shared = np.einsum('pij,pjl,pml->pim', self._later[_FIRST], self._shared, self._later[_SECOND])
         t_ns = self._t_ns + round(1e9 * (0.5 * (self._size - 1) * self._period + self._ahead))
         pose, velocity = np.diag(p[:, 0, 0]), np.diag(self._w**2 * p[:, 1, 1])
@@ -284,17 +294,17 @@ class ModalFilter:
 
     def predicted(self, seconds: FloatArray) -> Predicted:
         """The motion so long (n,) after the last block's last sample."""
-        rate = np.einsum('ak,ak->a', self._weights, self._rates)
+        rate = np.einsum('ak,akc->ac', self._weights, self._rates)
         steps = np.stack([[mode.step(s) for s in seconds.tolist()] for mode in self._modes])
         added = np.stack([mode.spreads(seconds) for mode in self._modes])
         x = np.einsum('anij,aj->nai', steps, self._x)
-        p = np.einsum('anij,ajl,anml->naim', steps, self._p, steps) + (rate[:, None, None, None] * added).swapaxes(0, 1)
+        p = np.einsum('anij,ajl,anml->naim', steps, self._p, steps) + np.einsum('ac,ancij->naij', rate, added)
         return Predicted(x[..., 0], self._w * x[..., 1], p[..., 0, 0], self._w**2 * p[..., 1, 1])
 
     def load_walk(self) -> tuple[float, ...]:
-        """How the load wanders by what was seen last: N, N, N m in the root of a second."""
-        rate = np.einsum('ak,ak->a', self._weights, self._rates)
-        return tuple((np.sqrt(rate) / self._compliance).tolist())
+        """How far the load wanders in a second by what was seen last, by its steps alone: N, N, N m."""
+        rate = np.einsum('ak,akc->ac', self._weights, self._rates)
+        return tuple((np.sqrt(rate[:, 0]) / self._compliance).tolist())
 
     def memory(self) -> tuple[float, ...]:
         """What the next block depends on, besides the noise; () if nothing is known."""
@@ -308,15 +318,15 @@ class ModalFilter:
 
     def restore(self, values: tuple[float, ...]) -> None:
         """Go on from another one's :meth:`memory`. Raises ValueError if it had another number of rates."""
-        numbers = 8 + 9 + 27 + 27 + 3 * self.levels
+        numbers = 8 + 12 + 48 + 48 + 3 * self.levels
         if len(values) < numbers or (len(values) - numbers) % 5:
             raise ValueError(f'{STATE}: {len(values)} numbers do not tell a filter with {self.levels} rates')
         self._index = int(values[0])
         self._t_ns = joined_ns(*values[1:3])
         self.coasted = values[3]
         self._held = np.array(values[5:8]) if values[4] else None
-        x, p, shared, weights = np.split(np.array(values[8:numbers]), (9, 36, 63))
-        self._x, self._p, self._shared = x.reshape(3, 3), p.reshape(3, 3, 3), shared.reshape(3, 3, 3)
+        x, p, shared, weights = np.split(np.array(values[8:numbers]), (12, 60, 108))
+        self._x, self._p, self._shared = x.reshape(3, 4), p.reshape(3, 4, 4), shared.reshape(3, 4, 4)
         self._weights = weights.reshape(3, self.levels)
         waiting = np.reshape(values[numbers:], (-1, 5)).tolist()
         self._loads = [AppliedLoad(joined_ns(s, ns), fx, fy, tz) for s, ns, fx, fy, tz in waiting]
@@ -333,24 +343,29 @@ def joined_ns(seconds: float, ns: float) -> int:
 
 
 def _log_det(matrices: FloatArray) -> FloatArray:
-    """log det of positive definite ``matrices`` (..., 3, 3)."""
-    a, b, c = (matrices[..., 0, i] for i in range(3))
-    e, f = matrices[..., 1, 1], matrices[..., 1, 2]
-    g = matrices[..., 2, 2]
-    # By elimination: the expansion loses its digits where the states are strongly correlated.
-    e1, f1 = e - b * b / a, f - b * c / a
-    g1 = g - c * c / a - f1 * f1 / e1
-    return np.asarray(np.log(a) + np.log(e1) + np.log(g1))
+    """log det of positive definite ``matrices`` (..., 4, 4), by elimination."""
+    rest, out = matrices, np.zeros(matrices.shape[:-2])
+    for _ in range(matrices.shape[-1]):
+        pivot, row = rest[..., 0, 0], rest[..., 0, 1:]
+        out = out + np.log(pivot)
+        rest = rest[..., 1:, 1:] - row[..., :, None] * (row / pivot[..., None])[..., None, :]
+    return np.asarray(out)
 
 
-def _transitions(levels: int) -> FloatArray:
-    """(K, K): probability of rate l in the next block if it is k in this one; rows sum to 1."""
+def _transitions(families: tuple[int, ...]) -> FloatArray:
+    """(K, K): probability of rate l in the next block if it is k in this one; rows sum to 1.
+
+    ``families``: numbers of rates of each kind, K together.
+    """
+    levels = sum(families)
     if levels == 1:
         return np.ones((1, 1))
     out = np.full((levels, levels), JUMPS / levels)
-    for k in range(levels):
-        down, up = max(k - 1, 0), min(k + 1, levels - 1)
-        out[k, down] += DOWN
-        out[k, up] += UP
-        out[k, k] += 1.0 - DOWN - UP - JUMPS
+    first = 0
+    for count in families:
+        for k in range(first, first + count):
+            out[k, max(k - 1, first)] += DOWN
+            out[k, min(k + 1, first + count - 1)] += UP
+            out[k, k] += 1.0 - DOWN - UP - JUMPS
+        first += count
     return out

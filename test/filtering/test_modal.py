@@ -17,9 +17,9 @@ PERIOD = 1e-3
 
 
 def system(mode: Oscillator) -> FloatArray:
-    """dx/dt of (q, q'/w, u)."""
+    """dx/dt of (q, q'/w, u, r/w)."""
     w = 2.0 * math.pi * mode.frequency
-    return np.array([[0.0, w, 0.0], [-w, -2.0 * mode.damping_ratio * w, w], [0.0, 0.0, 0.0]])
+    return np.array([[0.0, w, 0.0, 0.0], [-w, -2.0 * mode.damping_ratio * w, w, 0.0], [0.0, 0.0, 0.0, w], [0.0] * 4])
 
 
 @pytest.mark.parametrize('mode', [MODE, Oscillator(21.0, 0.0), Oscillator(3.0, 0.7)])
@@ -27,27 +27,32 @@ def system(mode: Oscillator) -> FloatArray:
 def test_a_step_is_the_matrix_exponential(mode: Oscillator, seconds: float) -> None:
     expected = expm(system(mode) * seconds)
     np.testing.assert_allclose(mode.step(seconds), expected, atol=1e-12)
-    np.testing.assert_allclose(mode.pushed(np.array([seconds, -1.0])), [expected[:, 2], np.zeros(3)], atol=1e-12)
+    np.testing.assert_allclose(
+        mode.pushed(np.array([seconds, -1.0])), [expected[:, 2:].T, np.zeros((2, 4))], atol=1e-12
+    )
 
 
-def test_what_a_load_adds_is_the_integral_of_the_covariance() -> None:
+@pytest.mark.parametrize('kind', [0, 1])
+def test_what_a_load_adds_is_the_integral_of_the_covariance(kind: int) -> None:
     a = system(MODE)
-    rate = np.diag([0.0, 0.0, 1.0])
+    rate = np.zeros((4, 4))
+    rate[2 + kind, 2 + kind] = 1.0
 
     def grows(_: float, p: FloatArray) -> FloatArray:
-        p = p.reshape(3, 3)
+        p = p.reshape(4, 4)
         return np.asarray(a @ p + p @ a.T + rate).ravel()
 
     times = np.array([0.001, 0.02, 0.3])
-    expected = solve_ivp(grows, (0.0, 0.3), np.zeros(9), t_eval=times, rtol=1e-11, atol=1e-16).y.T.reshape(-1, 3, 3)
-    np.testing.assert_allclose(MODE.spreads(times), expected, rtol=1e-7, atol=1e-12)
+    expected = solve_ivp(grows, (0.0, 0.3), np.zeros(16), t_eval=times, rtol=1e-10, atol=1e-15).y.T.reshape(-1, 4, 4)
+    np.testing.assert_allclose(MODE.spreads(times)[:, kind], expected, rtol=1e-7, atol=1e-12)
 
 
 def by_samples(
-    y: FloatArray, here: list[int], x: FloatArray, p: FloatArray, rate: float, r: float
+    y: FloatArray, here: list[int], x: FloatArray, p: FloatArray, rate: FloatArray, r: float
 ) -> tuple[FloatArray, FloatArray, float, float]:
     """A Kalman filter, one sample after the other: state, covariance, NIS and log det of the innovations."""
-    phi, added = expm(system(MODE) * PERIOD), rate * MODE.spreads(np.array([PERIOD]))[0]
+    phi = expm(system(MODE) * PERIOD)
+    added = np.einsum('c,cij->ij', rate, MODE.spreads(np.array([PERIOD]))[0])
     squares = size = 0.0
     for n in range(20):
         x, p = phi @ x, phi @ p @ phi.T + added
@@ -64,17 +69,17 @@ def by_samples(
 @pytest.mark.parametrize('lost', [(), (0, 7, 8), tuple(range(1, 20))])
 def test_a_block_says_what_a_filter_of_samples_says(lost: tuple[int, ...]) -> None:
     rng = np.random.default_rng(1)
-    rates, r = np.array([[1e-9, 1e-5]]), 1e-12
+    rates, r = np.array([[[1e-9, 0.0], [1e-5, 0.0], [0.0, 1e-5]]]), 1e-12
     tables = BlockTables((MODE,), 20, PERIOD)
     tables.fill(r * np.eye(20)[None], rates)
     here = [n for n in range(20) if n not in lost]
     says = tables.says(np.array(here))
-    x = np.array([1e-3, -2e-3, 5e-4])
-    root = rng.normal(0.0, 1e-5, (3, 3))
+    x = np.array([1e-3, -2e-3, 5e-4, 1e-4])
+    root = rng.normal(0.0, 1e-5, (4, 4))
     p = root @ root.T
     y = 1e-3 * rng.normal(1.0, 1e-2, 20)
     for k, rate in enumerate(rates[0]):
-        expected = by_samples(y, here, x, p, float(rate), r)
+        expected = by_samples(y, here, x, p, rate, r)
         miss = y[here] - says.observed[0] @ x
         posterior = np.linalg.inv(np.linalg.inv(p) + says.information[0, k])
         score = says.pulled[0, k] @ miss
