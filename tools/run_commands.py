@@ -88,6 +88,7 @@ SHORTER = {
     r'^python -m blind\.coverage$': '--rows 1 --losses 1',
     r'^python -m blind\.clock$': '--runs 5',
     r'^python -m blind\.modes$': '--rigs 3',
+    r'^python -m blind\.motion\b': '--runs 1 --seconds 4',
     r'^python -m bench\.campaign\.hellos$': '1000',
     r'^ros2 topic echo\b': '--once',
 }
