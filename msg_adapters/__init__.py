@@ -19,6 +19,7 @@ from msg_adapters import (
     pose_with_covariance_stamped,
     string,
     temperature,
+    twist_stamped,
     wrench_stamped,
 )
 from msg_adapters.header import Fields
@@ -37,6 +38,7 @@ from psd_deflection.records import (
     SpotMeans,
     TemperatureReading,
     TipLoad,
+    TipMotion,
 )
 
 Input = AppliedLoad | ReferencePose | ReferenceWithCovariance | TemperatureReading
@@ -44,6 +46,8 @@ Input = AppliedLoad | ReferencePose | ReferenceWithCovariance | TemperatureReadi
 SAMPLES = '/psd/samples'
 DEFLECTION = '/link_tip/deflection'
 DEFLECTION_WITH_COVARIANCE = '/link_tip/deflection_with_covariance'
+VELOCITY = '/link_tip/velocity'
+FILTERED = '/link_tip/filtered/deflection'
 DIAGNOSTICS = '/diagnostics'
 RIG = '/link_tip/rig'
 LOAD = '/link_tip/load'
@@ -88,6 +92,8 @@ TOPICS = (
         pose_with_covariance_stamped.from_estimate,
     ),
     Topic('/link_tip/wrench', wrench_stamped.MESSAGE, TipLoad, wrench_stamped.from_load),
+    Topic(VELOCITY, twist_stamped.MESSAGE, TipMotion, twist_stamped.from_motion),
+    Topic(FILTERED, pose_with_covariance_stamped.MESSAGE, TipMotion, pose_with_covariance_stamped.from_estimate),
     Topic(DIAGNOSTICS, diagnostic_array.MESSAGE, DiagnosticReport, diagnostic_array.from_report),
     Topic(RIG, string.MESSAGE, RigState, string.from_rig, latched=True),
     Topic(LOAD, wrench_stamped.MESSAGE, AppliedLoad, wrench_stamped.from_load, wrench_stamped.to_applied_load),
@@ -108,6 +114,9 @@ TOPIC_TYPES: Mapping[str, str] = {t.name: t.message.name for t in TOPICS}
 MESSAGE_TYPES: Mapping[str, MessageType] = {t.message.name: t.message for t in TOPICS}
 INPUTS = tuple(t.name for t in TOPICS if t.to_record is not None)
 """The topics that the node subscribes to."""
+
+FILTER_TOPICS = (VELOCITY, FILTERED)
+"""Published if the rig asks for the filter."""
 
 LATCHED = tuple(t.name for t in TOPICS if t.latched)
 

@@ -1,4 +1,4 @@
-"""geometry_msgs/PoseWithCovarianceStamped: the primary estimate or a reference, with its covariance."""
+"""geometry_msgs/PoseWithCovarianceStamped: the primary estimate, the filter's pose or a reference, with covariance."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from msg_adapters.header import Fields, header, stamp_ns
 from msg_adapters.message_type import MessageType
 from msg_adapters.orientation import angles
 from msg_adapters.pose_stamped import FRAME, pose
-from psd_deflection.records import DeflectionEstimate, FloatArray, ReferenceWithCovariance
+from psd_deflection.records import DeflectionEstimate, FloatArray, ReferenceWithCovariance, TipMotion
 
 MESSAGE = MessageType(
     'geometry_msgs/msg/PoseWithCovarianceStamped',
@@ -27,8 +27,8 @@ _OBSERVED = (0, 1, 5)
 """x, y and yaw in ROS order (x, y, z, roll, pitch, yaw)."""
 
 
-def from_estimate(e: DeflectionEstimate | ReferenceWithCovariance) -> Fields:
-    """Fields of an estimate or a reference: covariance 6 x 6, row by row, in ROS order."""
+def from_estimate(e: DeflectionEstimate | TipMotion | ReferenceWithCovariance) -> Fields:
+    """Fields of an estimate, a motion or a reference: covariance 6 x 6, row by row, in ROS order."""
     covariance = [0.0] * 36
     for axis in (2, 3, 4):
         covariance[7 * axis] = UNOBSERVED_VARIANCE

@@ -277,6 +277,32 @@ class EstimatorConfig:
         choices=('rotation', 'azimuth'),
         before='azimuth',
     )
+    filter: str = parameter(
+        'none',
+        '',
+        'filter of the motion, /link_tip/velocity and /link_tip/filtered/deflection: none, or modal (Kalman filter on '
+        'dynamics.*)',
+        choices=('none', 'modal'),
+        # YAML, and so ROS, reads off as false.
+        synonyms=(('off', 'none'), (False, 'none')),
+    )
+    filter_ahead: float = parameter(
+        0.0,
+        's',
+        'the filter foretells the motion so long after the last sample: the transport delay of who uses it',
+        minimum=0.0,
+        maximum=1.0,
+    )
+    filter_coast: float = parameter(
+        0.5, 's', 'the filter goes on without samples for at most so long', minimum=0.0, maximum=60.0
+    )
+    filter_load_walk: tuple[float, float, float] = parameter(
+        (0.0, 0.0, 0.0),
+        '',
+        'process noise of the filter: how far fx, fy (N) and tz (N m) wander in the root of a second; 0 0 0: estimated',
+        minimum=0.0,
+        maximum=1e6,
+    )
     wls_row_scaling: tuple[float, float, float, float] = parameter(
         (0.03, 0.5, 10.0, 0.1),
         '',

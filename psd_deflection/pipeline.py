@@ -26,11 +26,14 @@ from psd_deflection.calibration.health import FROZEN_BLOCKS, OpticsHealth, Verdi
 from psd_deflection.config import ZEROS, Rig, replace_values
 from psd_deflection.correction import Correction
 from psd_deflection.errors import ConfigError
+from psd_deflection.filtering.motion import STATE, ModalFilter, joined_ns, split_ns
 from psd_deflection.geometry import Geometry
 from psd_deflection.misalignment.spread import ParameterSpread
 from psd_deflection.records import (
     ENVIRONMENT,
+    KNOWN_LOAD,
     RESTART,
+    AppliedLoad,
     BlockStatus,
     DeflectionEstimate,
     FloatArray,
@@ -41,6 +44,7 @@ from psd_deflection.records import (
     SampleBlock,
     SpotMeans,
     TipLoad,
+    TipMotion,
     dot_names,
 )
 from psd_deflection.simulation.catalogue import effects_of_rig
@@ -63,6 +67,7 @@ MOVING, RINGS, STILL = 5.0, 10e-6, 2e-6
 
 START, FIRST_TEMPERATURE, TEMPERATURE = ENVIRONMENT
 HELD, FROZEN, TIP_LOADS = 'state.held_twist', 'state.frozen_blocks', 'state.tip_loads'
+SYSTEMATIC = 'state.systematic'
 ZERO_VARIANCES = 'state.zero_variances'
 REMEMBERED = (NOISE, FIT, HELD_RESIDUAL, REDUNDANCY)
 """Names of the values in the record of :meth:`Pipeline.memory`."""
@@ -140,6 +145,19 @@ class Pipeline:
         self._build(rig)
         # After the solvers, which refuse a geometry that cannot be solved.
         self.stamped = StampedDots(rig, flat=not psds_at_base(rig), tilts=solver_class(config.solver).tilts)
+        # What the covariance of the last estimate holds besides noise.
+        self._systematic: FloatArray | None = None
+        self.motion_filter = self._new_filter()
+
+    def _new_filter(self) -> ModalFilter | None:
+        """The filter of the motion at the rig's present zero; None if the rig asks for none."""
+        if self.rig.estimator.filter == 'none':
+            return None
+        _, solver, _ = self._solvers[0]
+        at_rest = tuple(self.rig.zeros.ravel().tolist())
+        gain = solver.gain(at_rest, self._variances[0], solver.solve(at_rest, self._variances[0]))
+        compliance = self.tip_loads.compliance
+        return ModalFilter(self.rig, compliance, gain, self.stamped.noise.gamma)
 
     def _build(self, rig: Rig) -> None:
         self.rig = rig
@@ -234,6 +252,8 @@ class Pipeline:
         # It says which numbers belong to no sample; no estimate depends on it.
         values.pop(RESTART, None)
         held, frozen, loads = values.pop(HELD, None), values.pop(FROZEN, None), values.pop(TIP_LOADS, None)
+        motion, load = values.pop(STATE, None), values.pop(KNOWN_LOAD, None)
+        systematic = values.pop(SYSTEMATIC, None)
         names = [name for name in values if name in REMEMBERED or name.startswith(SOME)]
         told = {name: tuple(v) for name in names if isinstance(v := values.pop(name), list)}
         if isinstance(held, list) and len(held) == 3:
@@ -256,7 +276,18 @@ class Pipeline:
                 self._effects = effects_of_rig(rig)
             self._build(rig)
             self.stamped.set_zeros(self.rig)
+            if any(name in ZEROS for name in values):
+                # The tip did not move with its zero.
+                self.motion_filter = self._new_filter()
         self.stamped.restore(told)
+        if self.motion_filter is not None:
+            self.motion_filter.set_noise(self.stamped.noise.gamma)
+            if isinstance(motion, list):
+                self.motion_filter.restore(tuple(motion))
+            if isinstance(systematic, list):
+                self._systematic = np.reshape(systematic, (3, 3))
+            if isinstance(load, list) and len(load) == 5:
+                self.motion_filter.load(AppliedLoad(joined_ns(load[0], load[1]), load[2], load[3], load[4]))
 
     def memory(self, rig: Rig) -> ParameterChange | None:
         """The state that the next block depends on besides its samples and ``rig``; None if there is none.
@@ -278,11 +309,24 @@ class Pipeline:
             values.append((TIP_LOADS, loads))
         if self.last_spots is not None:
             values += self.stamped.memory().items()
+        if self.motion_filter is not None and (motion := self.motion_filter.memory()):
+            values.append((STATE, motion))
+            if self._systematic is not None:
+                values.append((SYSTEMATIC, tuple(self._systematic.ravel().tolist())))
         if not values:
             return None
         last = self.last_spots
         t_ns, block = (last.t_ns, last.index + 1) if last is not None else (0, 0)
         return ParameterChange(t_ns, block, tuple(values))
+
+    def load(self, load: AppliedLoad) -> ParameterChange | None:
+        """Tell the filter of the motion a known load; None if there is no filter, or if it holds already.
+
+        What the load does before the next block is not foretold.
+        """
+        if self.motion_filter is None or not self.motion_filter.is_new(load):
+            return None
+        return self.change({KNOWN_LOAD: (*split_ns(load.t_ns), load.fx, load.fy, load.tz)})
 
     def temperature(self, celsius: float) -> ParameterChange | None:
         """Set the ambient temperature from the next block on; None if no correction needs it."""
@@ -371,6 +415,13 @@ class Pipeline:
             yield best
         if best is not None and used is not None:
             yield TipLoad(t_ns, *self.tip_loads.tip_load(block.index, best.dx, best.dy, best.theta))
+        if self.motion_filter is not None:
+            # Poses of some PSDs have another noise than the filter knows: it coasts.
+            usable = status is BlockStatus.TOO_FEW_SAMPLES or (status is BlockStatus.OK and complete)
+            moved = self._moved(self.motion_filter, block.index, t_ns, slots, samples if usable else None)
+            if moved is not None:
+                yield moved
+        if best is not None and used is not None:
             if complete:
                 # The zero must not be a mean across an outage.
                 last = self.last_spots
@@ -389,8 +440,9 @@ class Pipeline:
             name = status.name.lower()
             self.counters.refused[name] = self.counters.refused.get(name, 0) + 1
         # The estimates are out: the rest is not urgent.
-        if status is BlockStatus.OK and not findings:
-            self.stamped.learn(block.index, slots, samples)
+        sound = status is BlockStatus.OK and not findings
+        if sound and self.stamped.learn(block.index, slots, samples) and self.motion_filter is not None:
+            self.motion_filter.set_noise(self.stamped.noise.gamma)
         if complete and used is not None and used.checked is not None:
             self.stamped.suspect(block.index, used.dots, used.checked)
         if not self._optics.refuses_frozen:
@@ -415,6 +467,38 @@ class Pipeline:
         self.last_spots = spots
         yield spots
         yield block
+
+    def _moved(
+        self, motion: ModalFilter, block: int, t_ns: int, slots: IntArray, samples: FloatArray | None
+    ) -> TipMotion | None:
+        """The motion by the filter; ``samples`` (n, 4) m, None if none of the block can be used."""
+        poses: FloatArray | None = None
+        if samples is not None:
+            solved = self._solvers[0][1].solve_many(samples, np.array(self._variances[0]))
+            sound = solved.status == SolverStatus.OK
+            if sound.any():
+                slots, poses = slots[sound], solved.pose[sound]
+        moved = motion.block(block, t_ns, slots if poses is not None else None, poses)
+        if moved is None:
+            return None
+        covariance = moved.covariance if self._systematic is None else moved.covariance + self._systematic
+        dx, dy, theta = moved.pose.tolist()
+        vx, vy, vtheta = moved.velocity.tolist()
+        return TipMotion(
+            moved.t_ns,
+            block,
+            dx,
+            dy,
+            theta,
+            0.0,
+            0.0,
+            tuple(covariance.ravel().tolist()),
+            vx,
+            vy,
+            vtheta,
+            tuple(moved.velocity_covariance.ravel().tolist()),
+            moved.coasted,
+        )
 
     def _count_still(self, volts: npt.NDArray[np.float32]) -> None:
         still = self._optics.still(volts)
@@ -546,6 +630,8 @@ class Pipeline:
         covariance: tuple[float, ...] = s.covariance
         possible = () if checked is None or self.rig.estimator.consistency != 'widen' else checked.possible
         factor = readings.factor
+        if primary:
+            self._systematic = None
         # A printed threshold method has no covariance, and no slope either.
         known = solver is not None and covariance[0] == covariance[0]
         if solver is not None and known and (spread is not None or any(possible) or factor is not None):
@@ -556,11 +642,14 @@ class Pipeline:
                 own = own if allowance is None else own + allowance
             else:
                 own = np.array(covariance).reshape(3, 3)
+            noise = own
             if factor is not None:
                 own = own + _through(gain, factor)
             if any(possible):
                 # A check that was made with all PSDs tells nothing of some of them.
                 own = widened(own, gain, possible) if len(possible) == gain.shape[1] else own
+            if primary and own is not noise:
+                self._systematic = own - noise
             covariance = tuple(own.ravel().tolist())
         chi_square = checked.chi_square if primary and checked is not None and checked.freedom else nan
         return DeflectionEstimate(

@@ -169,6 +169,29 @@ class TipLoad(NamedTuple):
     tz: float
 
 
+class TipMotion(NamedTuple):
+    """The tip's pose and velocity by the filter, at the end of a block or a stated time later.
+
+    ``dx``, ``dy`` m; ``theta``, ``phi``, ``omega`` rad (the filter has no tilts: 0); ``vx``, ``vy`` m/s, ``vtheta``
+    rad/s. ``covariance``, ``velocity_covariance``: 3 x 3 of (x, y, theta), row by row. ``coasted``: time since the
+    last sample that was used, s.
+    """
+
+    t_ns: int
+    block: int
+    dx: float
+    dy: float
+    theta: float
+    phi: float
+    omega: float
+    covariance: tuple[float, ...]
+    vx: float
+    vy: float
+    vtheta: float
+    velocity_covariance: tuple[float, ...]
+    coasted: float = 0.0
+
+
 class AppliedLoad(NamedTuple):
     """A known load at the tip centroid in ``link_tip_rest``, held until the next one: N, N, N m."""
 
@@ -218,10 +241,15 @@ The numbers between belong to no sample.
 """
 
 
+KNOWN_LOAD = 'input.load'
+"""Recorded with the block from which on the filter knows of a load: seconds and nanoseconds of its stamp, N, N, N m."""
+
+
 class ParameterChange(NamedTuple):
     """A value that affects the estimates and was changed during the run.
 
-    These are parameters (set by ``~/zero`` or live), the names in :data:`ENVIRONMENT`, and :data:`RESTART`.
+    These are parameters (set by ``~/zero`` or live), the names in :data:`ENVIRONMENT`, :data:`RESTART` and
+    :data:`KNOWN_LOAD`.
     ``values``: names and checked values; they apply from block ``block`` on. The change is
     recorded, and replay applies it at the same block.
     """
@@ -271,6 +299,7 @@ Record = (
     | SpotMeans
     | DeflectionEstimate
     | TipLoad
+    | TipMotion
     | AppliedLoad
     | ReferencePose
     | ReferenceWithCovariance

@@ -78,6 +78,7 @@ SHORTEST = {
     'camera-campaign': 'CAMERA_FRAMES=20',
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
     'blind-calibration': 'RIGS=1',
+    'blind-laws': 'LAWS="--laws 1 --nulls 0"',
     'shots': 'SHOT_SECONDS=2',
 }
 """Variables with which a ``make`` target takes only seconds."""
@@ -87,6 +88,7 @@ SHORTER = {
     r'^python -m blind\.coverage$': '--rows 1 --losses 1',
     r'^python -m blind\.clock$': '--runs 5',
     r'^python -m blind\.modes$': '--rigs 3',
+    r'^python -m blind\.motion\b': '--runs 1 --seconds 4',
     r'^python -m bench\.campaign\.hellos$': '1000',
     r'^ros2 topic echo\b': '--once',
 }
@@ -97,6 +99,7 @@ VERDICTS = {
     'crash': r'\d+ kills: ',
     'soak': r'real time: \d+ samples lost',
     'camera-campaign': r'adverse frames: ',
+    'blind-laws': r'right variables',
     'blind': r'failures \(\d+\)',
 }
 """What a campaign says at its end: cut short, on a busy machine, it may come to another verdict than in full."""

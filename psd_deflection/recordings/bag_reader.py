@@ -19,6 +19,7 @@ import numpy.typing as npt
 from msg_adapters import (
     DEFLECTION_WITH_COVARIANCE,
     DIAGNOSTICS,
+    FILTERED,
     LOAD,
     REFERENCE,
     RIG,
@@ -343,7 +344,7 @@ class BagRecording(Recording):
             topic = channel.topic
             if topic == DEFLECTION_WITH_COVARIANCE:
                 wanted = pose_with_covariance_stamped.MESSAGE.name
-            elif topic.startswith('/link_tip/') and topic.endswith('/deflection'):
+            elif topic != FILTERED and topic.startswith('/link_tip/') and topic.endswith('/deflection'):
                 wanted = pose_stamped.MESSAGE.name
             else:
                 continue

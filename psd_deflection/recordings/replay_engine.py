@@ -21,6 +21,7 @@ from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.summary import NO_PARAMETERS
 from psd_deflection.records import (
     ENVIRONMENT,
+    KNOWN_LOAD,
     DeflectionEstimate,
     RawChunk,
     Record,
@@ -90,6 +91,9 @@ def replayed(
     # Our recorder notes when a temperature took effect; for other recordings the stamps decide.
     noted = any(name in ENVIRONMENT for change in changes for name, _ in change.values)
     temperatures = [] if noted or not pipeline.needs_temperature else recording.temperatures()
+    noted = any(name == KNOWN_LOAD for change in changes for name, _ in change.values)
+    loads = [] if noted or pipeline.motion_filter is None else recording.loads()
+    loads.reverse()
     for block in recording.blocks() if blocks is None else blocks:
         while temperatures and temperatures[0].t_ns <= block.t_ns[0]:
             warmer = pipeline.temperature(temperatures.pop(0).celsius)
@@ -101,6 +105,8 @@ def replayed(
             change = changes.pop(0)
             pipeline.apply(change)
             yield [change]
+        while loads and loads[-1].t_ns <= block.t_ns[-1]:
+            pipeline.load(loads.pop())
         yield list(pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags)))
     yield list(pipeline.flush())
 

@@ -61,7 +61,10 @@ class SimulatedRun:
                 load = (float(loads[i, 0]), float(loads[i, 1]), float(loads[i, 2]))
                 if load != last:
                     last = load
-                    yield AppliedLoad(int(t_ns[i - start]), *load)
+                    applied = AppliedLoad(int(t_ns[i - start]), *load)
+                    yield applied
+                    # It acts from its stamp on: what replays the recording needs no note of the block.
+                    pipeline.load(applied)
                 # One temperature reading per estimate is enough: air temperature changes slowly.
                 if temperature is not None and i % block == 0 and float(temperature[i]) != last_temperature:
                     last_temperature = float(temperature[i])

@@ -14,6 +14,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from msg_adapters import (
     DEFLECTION,
     DIAGNOSTICS,
+    FILTER_TOPICS,
     INPUTS,
     SPOTS,
     TOPIC_TYPES,
@@ -59,6 +60,8 @@ def qos(topic: str) -> QoSProfile:
 def topics_of(rig: Rig) -> dict[str, str]:
     """The topics that a node of ``rig`` publishes encoded messages on, with their types."""
     outputs = {topic: kind for topic, kind in TOPIC_TYPES.items() if topic not in INPUTS}
+    if rig.estimator.filter == 'none':
+        outputs = {topic: kind for topic, kind in outputs.items() if topic not in FILTER_TOPICS}
     outputs |= {solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in (*rig.estimator.solvers, ONE_PSD)}
     outputs |= dict.fromkeys(spot_topics(len(rig.psds)), TOPIC_TYPES[SPOTS[0]])
     volts = VOLTS[: len(rig.psds)] if rig.monitor.publish_volts else ()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from psd_deflection.filtering.motion import AXES, Innovations
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.runner.session import Session
 
@@ -15,6 +16,12 @@ CLOCK_STEP_NS = 20_000_000
 
 OFF_NS = 1_000_000
 """If the map of the device's clock is this far from its fit, the stamps are wrong by as much."""
+
+
+BEYOND = 6.0
+"""Standard deviations that the mean NIS of a second may be above 1: chance and a switched load explain that."""
+
+LOAD_WALK = ('load wanders, fx (N in 1 s)', 'load wanders, fy (N in 1 s)', 'load wanders, tz (N m in 1 s)')
 
 
 class _Seen(NamedTuple):
@@ -36,6 +43,7 @@ class HealthReporter:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._seen: _Seen | None = None
+        self._foretold = Innovations()
 
     def report(self, t_ns: int) -> DiagnosticReport:
         """The report for the time since the last one. ``t_ns``: now, ROS time."""
@@ -70,6 +78,7 @@ class HealthReporter:
                 self._acquisition(new, rate(new.samples)),
                 self._clock(new),
                 self._estimates(new, rate(new.estimates)),
+                *self._motion(),
                 *(self._laser(psd, new) for psd in range(1, len(self._session.rig.psds) + 1)),
                 self._recording(),
             ),
@@ -176,6 +185,35 @@ class HealthReporter:
             values.append(('latency, median (ms)', f'{latency.median * 1e3:.3f}'))
             values.append(('latency, worst of a second (ms)', f'{latency.worst * 1e3:.3f}'))
         return DiagnosticEntry('psd_deflection: estimates', level, message, tuple(values))
+
+    def _motion(self) -> tuple[DiagnosticEntry, ...]:
+        motion = self._session.pipeline.motion_filter
+        if motion is None:
+            return ()
+        name = 'psd_deflection: motion'
+        before, self._foretold = self._foretold, motion.innovations
+        new = self._foretold.since(before)
+        values = [
+            *((f'NIS a sample, {axis}', f'{nis:.3f}') for axis, nis in zip(AXES, new.means(), strict=True)),
+            ('NIS, 95 % band', '{:.3f} to {:.3f}'.format(*new.band(1.96))),
+            ('coasting (s)', f'{motion.coasted:.3f}'),
+            ('times that it coasted', str(motion.coasts)),
+            *zip(LOAD_WALK, (f'{walk:.3g}' for walk in motion.load_walk()), strict=True),
+        ]
+        level, message = OK, 'the modes foretell the samples'
+        worst = max(new.means())
+        if motion.coasted > 0.0:
+            level, message = WARN, f'coasting for {motion.coasted:.2f} s: no samples that can be used'
+        elif not new.samples:
+            level, message = STALE, 'no samples that can be used'
+        elif worst > new.band(BEYOND)[1]:
+            axis = AXES[new.means().index(worst)]
+            level = WARN
+            message = (
+                f'the modes of the rig file do not foretell {axis}: NIS {worst:.2f} a sample; '
+                '`psd-deflection identify` measures them'
+            )
+        return (DiagnosticEntry(name, level, message, tuple(values)),)
 
     def _laser(self, psd: int, new: _Seen) -> DiagnosticEntry:
         name = f'psd_deflection: psd_{psd}'

@@ -145,6 +145,10 @@ class Processing:
                 raise TimeoutError('it was begun and has not ended: something holds up the pipeline')
         return asked.result()
 
+    def later(self, action: Callable[[], object]) -> None:
+        """Run ``action`` between two blocks and do not wait for it."""
+        self._requests.put((Future(), action))
+
     def give(self, records: Iterable[Record]) -> int:
         """Hand each record to every sink as it comes; return the number of records."""
         count = 0

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from msg_adapters import to_messages
 from psd_deflection import __version__
 from psd_deflection.recordings import cdr
-from psd_deflection.records import ENVIRONMENT, ParameterChange, RigState
+from psd_deflection.records import ENVIRONMENT, KNOWN_LOAD, ParameterChange, RigState
 from psd_deflection.runner.fanout import Wire
 from psd_deflection.runner.session import Session
 
@@ -28,6 +28,9 @@ class RigPublisher:
 
     def put_change(self, change: ParameterChange) -> None:
         """Publish the rig after ``change``."""
+        if all(name == KNOWN_LOAD for name, _ in change.values):
+            # A reader has the load from its own topic.
+            return
         self._last = change
         self._environment |= {name: value for name, value in change.values if name in ENVIRONMENT}
         self._publish(dict(change.values))

@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, wait
+from functools import partial
 from pathlib import Path
 
 from msg_adapters import LOAD, TOPIC_TYPES, from_fields, to_messages
@@ -226,9 +227,16 @@ class Session:
             record = record._replace(t_ns=self.acquisition.now_ns())
         if isinstance(record, AppliedLoad):
             self.load = record
+            if self.pipeline.motion_filter is not None:
+                self.processing.later(partial(self._tell_filter, record))
         for sink in self.input_sinks:
             sink.put(record)
         return record
+
+    def _tell_filter(self, load: AppliedLoad) -> None:
+        told = self.pipeline.load(load)
+        if told is not None:
+            self.processing.give([told])
 
     def note_load(self, fx: float, fy: float, tz: float, *, add: bool = False) -> AppliedLoad:
         """Take down that this load (N, N, N m) acts at the tip from now on, as if it had come on ``/link_tip/load``.

@@ -70,6 +70,11 @@ class TipLoads:
         fx, fy, tz = traced.loads
         return fx, fy, tz
 
+    @property
+    def compliance(self) -> tuple[float, float, float]:
+        """Deflection for a load of 1 N, 1 N, 1 N m at the tip: m/N, m/N, rad/(N m)."""
+        return self._statics.deflection(1.0, 1.0, 1.0)
+
     def memory(self) -> tuple[float, ...]:
         """What :meth:`restore` needs to go on from here; empty if the next load depends on the pose alone."""
         moved = self.zeroed and any(self._offset)

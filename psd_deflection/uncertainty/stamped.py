@@ -273,12 +273,17 @@ class StampedDots:
         """Whether the readings of some PSDs agree with each other, and are enough to tell."""
         return some.agree(dots, residual, covariance, pose, self._times)
 
-    def learn(self, index: int, slots: IntArray, samples: FloatArray) -> None:
-        """Take a good block into what is known of the noise. Nothing of this block's estimate waits for it."""
-        if self._measures and self.noise.add(index, slots, samples):
-            self._fit.set_noise(self.noise.gamma)
-            for some in self._some.values():
-                some.set_noise(self.noise.gamma)
+    def learn(self, index: int, slots: IntArray, samples: FloatArray) -> bool:
+        """Take a good block into what is known of the noise; True if that changed.
+
+        Nothing of this block's estimate waits for it.
+        """
+        if not (self._measures and self.noise.add(index, slots, samples)):
+            return False
+        self._fit.set_noise(self.noise.gamma)
+        for some in self._some.values():
+            some.set_noise(self.noise.gamma)
+        return True
 
     def suspect(self, index: int, dots: tuple[float, ...], checked: Checked) -> None:
         """Take a block into the search for a wrong reading: each that contradicts itself, of the others some."""

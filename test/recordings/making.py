@@ -23,6 +23,7 @@ from psd_deflection.records import (
     SpotMeans,
     TemperatureReading,
     TipLoad,
+    TipMotion,
 )
 
 T0 = 1_760_000_000_123_456_789
@@ -52,6 +53,12 @@ def estimate(index: int, solver: str = 'exact', primary: bool = True) -> Deflect
     return DeflectionEstimate(t_ns, index, solver, 1e-3 * index, -5e-4, 0.01, 1e-4, -2e-3, covariance, 1e-7, primary)
 
 
+def motion(index: int) -> TipMotion:
+    covariance = (1e-12, 1e-13, 2e-13, 1e-13, 3e-12, 1e-14, 2e-13, 1e-14, 1e-11)
+    t_ns = T0 + 20 * STEP * index + 19_000_000
+    return TipMotion(t_ns, index, 1e-3, -5e-4, 0.01, 0.0, 0.0, covariance, 0.1 * index, -0.2, 0.3, (1e-8,) * 9, 0.02)
+
+
 def run(blocks: int) -> Iterator[Record]:
     """What a live run hands to its recorder, one record of every kind at least."""
     yield TemperatureReading(T0, 21.5)
@@ -62,6 +69,7 @@ def run(blocks: int) -> Iterator[Record]:
         yield estimate(i)
         yield estimate(i, 'wls', primary=False)
         yield TipLoad(T0 + 20 * STEP * i + 9_500_000, 0.5 * i, -0.25, 0.01)
+        yield motion(i)
         if i % 10 == 0:
             yield AppliedLoad(T0 + 20 * STEP * i, 0.5 * i, 0.0, 0.1)
             yield ReferencePose(T0 + 20 * STEP * i, 1e-3, 2e-3, 3e-3)

@@ -1,0 +1,277 @@
+"""How well the filter of the motion does: ``python -m blind.motion --runs 20``.
+
+A link with the thesis's dimensions is at rest for three seconds. Then its load is switched at random times (steps),
+swept (chirp) or wanders (operation). Truth and samples are computed here, by matrix exponentials and the exact plate,
+with the rig's noise and converter, without the product's simulator. The samples go through the whole pipeline.
+
+Columns: rms error of the velocity by the filter (``own``: what its covariance says), and by the Savitzky-Golay filter
+of block means that does best, which knows the future; normalised innovations squared a sample, ``inside``: share of
+the seconds in which they are in their 95 % band; rms error of the pose between the blocks, foretold and held.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.signal import savgol_filter
+from scipy.stats import chi2
+from tqdm import tqdm
+
+from blind.generator import EI, GJ, MM_PER_V, PLACES, RATE, SIGMA, Array, output
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import RawChunk, TipMotion
+
+LENGTH = 0.585
+GIVES = (LENGTH**3 / (3.0 * EI), LENGTH**3 / (3.0 * EI), LENGTH / GJ)
+MODES = ((14.0, 0.02), (14.0, 0.02), (21.0, 0.02))
+REST = 3.0
+BLOCK = 20
+AXES = ('dX', 'dY', 'theta')
+KINDS = ('steps', 'chirp', 'operation')
+LATER = np.arange(1, BLOCK + 1) / RATE
+
+
+@dataclass(frozen=True)
+class Run:
+    """One link in motion at 1 kHz. ``loads`` (n, 3), ``pose`` (n, 3), ``velocity`` (n, 3): truth; ``volts`` (n, 6)."""
+
+    loads: Array
+    pose: Array
+    velocity: Array
+    volts: Array
+
+
+def loads_of(kind: str, seconds: float, rng: np.random.Generator) -> Array:
+    """Loads (n, 3), N, N, N m; each is held for a sample."""
+    n, rest = int(seconds * RATE), int(REST * RATE)
+    out = np.zeros((n, 3))
+    most = np.array([20.0, 20.0, 2.0])
+    if kind == 'steps':
+        for axis in range(3):
+            at = rest
+            while at < n:
+                out[at:, axis] = most[axis] * rng.uniform(-1.0, 1.0)
+                at += int(RATE * rng.exponential(1.5)) + 1
+    elif kind == 'chirp':
+        t = np.arange(n - rest) / RATE
+        for axis in range(3):
+            low, high = 0.5, 1.2 * MODES[axis][0]
+            phase = 2.0 * math.pi * (low * t + 0.5 * (high - low) / (seconds - REST) * t * t)
+            out[rest:, axis] = 0.1 * most[axis] * np.sin(phase)
+    else:
+        for axis in range(3):
+            # A force that forgets in 0.2 s.
+            kept = math.exp(-1.0 / (RATE * 0.2))
+            held = 0.0
+            for i, new in enumerate(rng.normal(0.0, 0.2 * most[axis] * math.sqrt(1.0 - kept * kept), n - rest), rest):
+                held = kept * held + new
+                out[i, axis] = held
+    return out
+
+
+def moved(loads: Array) -> tuple[Array, Array]:
+    """Pose and velocity (n, 3) at each sample; the sample sees the loads before it."""
+    pose, velocity = np.empty_like(loads), np.empty_like(loads)
+    for axis, (hertz, zeta) in enumerate(MODES):
+        w = 2.0 * math.pi * hertz
+        step = expm(np.array([[0.0, 1.0, 0.0], [-w * w, -2.0 * zeta * w, w * w], [0.0, 0.0, 0.0]]) / RATE)
+        (a, b, c), (d, e, f), _ = step.tolist()
+        q = v = 0.0
+        for i, u in enumerate((GIVES[axis] * loads[:, axis]).tolist()):
+            pose[i, axis], velocity[i, axis] = q, v
+            q, v = a * q + b * v + c * u, d * q + e * v + f * u
+    return pose, velocity
+
+
+def make(kind: str, seconds: float, seed: int) -> Run:
+    """A run of ``kind``."""
+    return run_of(loads_of(kind, seconds, np.random.default_rng(seed)), seed)
+
+
+def run_of(loads: Array, seed: int) -> Run:
+    """The run under ``loads`` (n, 3)."""
+    pose, velocity = moved(loads)
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    volts = np.full((len(pose), 6), 5.0)
+    for psd, (lx, ly) in enumerate(PLACES):
+        x, y = lx - pose[:, 0], ly - pose[:, 1]
+        volts[:, 3 * psd] = (c * x + s * y - lx) / MM_PER_V
+        volts[:, 3 * psd + 1] = (c * y - s * x - ly) / MM_PER_V
+    noise = np.random.default_rng([seed, 1]).normal(0.0, SIGMA, volts.shape)
+    return Run(loads, pose, velocity, output(volts + noise, []))
+
+
+@dataclass(frozen=True)
+class Result:
+    """Of B blocks in motion; (B, 3) unless said otherwise.
+
+    ``velocity``, ``own``: error of the velocity at the end of a block, and the standard deviation that it is given.
+    ``smoothed``: error of the best Savitzky-Golay filter in the middle. ``squares``: NIS of a block. ``foretold``,
+    ``held`` (20 B, 3): error of the pose at each sample until the next block is there. ``pose``, ``pose_own``.
+    """
+
+    velocity: Array
+    own: Array
+    smoothed: Array
+    squares: Array
+    foretold: Array
+    held: Array
+    pose: Array
+    pose_own: Array
+
+
+def chunk(run: Run, block: int) -> RawChunk:
+    """Block number ``block`` of the run."""
+    seq = np.arange(block * BLOCK, (block + 1) * BLOCK)
+    return RawChunk(seq, seq * 1_000_000, run.volts[seq].astype(np.float32), np.zeros(BLOCK, np.uint8))
+
+
+def rig_of(changes: Mapping[str, object] | None = None) -> Rig:
+    """The thesis rig with its filter."""
+    return load_rig(None, {'filter': 'modal', 'solvers': ['exact'], **(changes or {})})
+
+
+def pose_of(volts: Array) -> Array:
+    """Pose (n, 3) of readings (n, 6): the base line between the dots gives the twist."""
+    (l1, l2), dots = (complex(*place) for place in PLACES), MM_PER_V * volts
+    q1, q2 = l1 + dots[:, 0] + 1j * dots[:, 1], l2 + dots[:, 3] + 1j * dots[:, 4]
+    turn = (l1 - l2) / (q1 - q2)
+    turn /= np.abs(turn)
+    moved_by = 0.5 * (l1 + l2) - turn * 0.5 * (q1 + q2)
+    return np.column_stack((moved_by.real, moved_by.imag, np.angle(turn)))
+
+
+def _smoothed(run: Run, part: slice) -> Array:
+    """Error of the velocity (B, 3) in the middle of the blocks, by the Savitzky-Golay filter that does best."""
+    means = pose_of(run.volts).reshape(-1, BLOCK, 3).mean(axis=1)
+    inside = run.velocity.reshape(-1, BLOCK, 3)
+    truth = 0.5 * (inside[:, BLOCK // 2 - 1] + inside[:, BLOCK // 2])
+    out = np.empty_like(truth[part])
+    for axis in range(3):
+        tried = [
+            savgol_filter(means[:, axis], window, order, deriv=1, delta=BLOCK / RATE)[part] - truth[part, axis]
+            for window in (3, 5, 7, 9, 11)
+            for order in range(1, min(window, 7))
+        ]
+        out[:, axis] = min(tried, key=rms)
+    return out
+
+
+def rms(errors: Array) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def judge(run: Run, rig: Rig) -> Result:
+    """The run through the pipeline, against the truth."""
+    pipeline = Pipeline(rig)
+    motion = pipeline.motion_filter
+    if motion is None:
+        raise ValueError('the rig asks for no filter')
+    blocks = len(run.volts) // BLOCK
+    velocity, own, squares = np.zeros((blocks, 3)), np.zeros((blocks, 3)), np.zeros((blocks, 3))
+    pose, pose_own = np.zeros((blocks, 3)), np.zeros((blocks, 3))
+    foretold, held = np.zeros((blocks * BLOCK, 3)), np.zeros((blocks * BLOCK, 3))
+    first = int(REST * RATE) // BLOCK
+    for block in range(blocks):
+        before = motion.innovations
+        for record in pipeline.process(chunk(run, block)):
+            if isinstance(record, TipMotion):
+                at = BLOCK * (block + 1) - 1
+                velocity[block] = np.array([record.vx, record.vy, record.vtheta]) - run.velocity[at]
+                own[block] = np.sqrt(record.velocity_covariance[::4])
+                pose[block] = np.array([record.dx, record.dy, record.theta]) - run.pose[at]
+                pose_own[block] = np.sqrt(record.covariance[::4])
+        squares[block] = motion.innovations.since(before).squares
+        estimate = pipeline.last_estimate
+        if estimate is None:
+            raise RuntimeError(f'block {block} has no estimate')
+        if first - 1 <= block < blocks - 1:
+            ahead = slice(BLOCK * (block + 1), BLOCK * (block + 2))
+            foretold[ahead] = motion.predicted(LATER).pose - run.pose[ahead]
+            held[ahead] = np.array(estimate.pose) - run.pose[ahead]
+    part, samples = slice(first, blocks), slice(first * BLOCK, blocks * BLOCK)
+    return Result(
+        velocity[part],
+        own[part],
+        _smoothed(run, part),
+        squares[part],
+        foretold[samples],
+        held[samples],
+        pose[part],
+        pose_own[part],
+    )
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of one axis; rms values in m, rad, m/s, rad/s.
+
+    ``velocity``: error, ``own``: what the filter says of it, ``smoothed``: that of Savitzky and Golay. ``nis`` a
+    sample; ``inside``: share of the blocks whose NIS is in its 95 % band. ``foretold``, ``held``: errors of the pose.
+    """
+
+    velocity: float
+    own: float
+    smoothed: float
+    nis: float
+    inside: float
+    foretold: float
+    held: float
+
+
+def figures(results: Iterable[Result]) -> list[Figures]:
+    """Of dX, dY and theta, over all ``results``."""
+    results = list(results)
+    low, high = (float(chi2.ppf(p, BLOCK)) for p in (0.025, 0.975))
+    out = []
+    for axis in range(3):
+        velocity, own, smoothed, squares, foretold, held = (
+            np.concatenate([getattr(result, name)[:, axis] for result in results])
+            for name in ('velocity', 'own', 'smoothed', 'squares', 'foretold', 'held')
+        )
+        inside = float(np.mean((squares > low) & (squares < high)))
+        nis = float(squares.mean()) / BLOCK
+        out.append(Figures(rms(velocity), rms(own), rms(smoothed), nis, inside, rms(foretold), rms(held)))
+    return out
+
+
+def table(found: Mapping[str, list[Figures]]) -> str:
+    """A Markdown table."""
+    rows = [
+        '| motion | axis | velocity | own | / own | / Savitzky-Golay | NIS | inside | foretold | held |',
+        '|---' * 10 + '|',
+    ]
+    for kind, axes in found.items():
+        for name, f in zip(AXES, axes, strict=True):
+            unit, micro = ('mm/s', 'µm') if name != 'theta' else ('mrad/s', 'µrad')
+            rows.append(
+                f'| {kind} | {name} | {f.velocity * 1e3:.3f} {unit} | {f.own * 1e3:.3f} | {f.velocity / f.own:.2f} '
+                f'| {f.velocity / f.smoothed:.3f} | {f.nis:.3f} | {f.inside:.1%} '
+                f'| {f.foretold * 1e6:.1f} {micro} | {f.held * 1e6:.1f} |'
+            )
+    return '\n'.join(rows)
+
+
+def main() -> None:
+    """The table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--runs', type=int, default=20, help='of each kind of motion')
+    parser.add_argument('--seconds', type=float, default=23.0, help='of a run, the first three at rest')
+    parser.add_argument('--seed', type=int, default=0)
+    args = parser.parse_args()
+    found: dict[str, list[Figures]] = {}
+    for kind in KINDS:
+        seeds = range(args.seed, args.seed + args.runs)
+        found[kind] = figures([judge(make(kind, args.seconds, seed), rig_of()) for seed in tqdm(seeds, kind)])
+    print(table(found))
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,156 @@
+"""How a mode moves from sample to sample, and what a block of samples says about it.
+
+Each of dX, dY and theta is a damped oscillator about the static deflection u of the load. The load wanders by steps, or
+smoothly, if its rate of change r does:
+
+    q'' + 2 zeta w q' + w^2 (q - u) = 0,
+    u' = r + noise of density Q_u (m^2/s),    r' = noise of density Q_r (m^2/s^3).
+
+The state is x = (q, q'/w, u, r/w), all in m (or rad). The samples of one block are y = O x0 + process noise + noise of
+the readings, with x0 the state one sample before the block. So a whole block is one update of four unknowns, and
+:class:`BlockTables` holds what does not depend on x0: the answer is that of a Kalman filter that runs sample by sample
+(Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, 5.2), also if the noise of
+the readings is coloured within the block.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.uncertainty.block_fit import inverse
+
+
+@dataclass(frozen=True, slots=True)
+class Oscillator:
+    """One mode. ``frequency`` Hz, undamped, above 0; ``damping_ratio`` 0 or more, below 1."""
+
+    frequency: float
+    damping_ratio: float
+
+    @property
+    def w(self) -> float:
+        """Angular frequency, rad/s."""
+        return 2.0 * math.pi * self.frequency
+
+    def step(self, seconds: float) -> FloatArray:
+        """Phi (4, 4): the state after ``seconds`` of its own motion."""
+        w, zeta = self.w, self.damping_ratio
+        root = math.sqrt(1.0 - zeta**2)
+        decay = math.exp(-zeta * w * seconds)
+        c, s = math.cos(root * w * seconds), math.sin(root * w * seconds) / root
+        kept, turned = decay * (c + zeta * s), decay * s
+        out = np.zeros((4, 4))
+        out[:2, :2] = [[kept, turned], [-turned, decay * (c - zeta * s)]]
+        out[:, 2:] = self.pushed(np.array([seconds]))[0].T
+        return out
+
+    def pushed(self, seconds: FloatArray) -> FloatArray:
+        """(n, 2, 4): the state ``seconds`` (n,) after u, or r/w, went from 0 to 1: columns of Phi; 0 before that."""
+        w, zeta = self.w, self.damping_ratio
+        root = math.sqrt(1.0 - zeta**2)
+        since = np.maximum(seconds, 0.0)
+        decay = np.exp(-zeta * w * since)
+        c, s = np.cos(root * w * since), np.sin(root * w * since) / root
+        zero, one = np.zeros(len(since)), np.ones(len(since))
+        rest = 1.0 - decay * (c + zeta * s)
+        lag = 2.0 * zeta - decay * (2.0 * zeta * c + (2.0 * zeta**2 - 1.0) * s)
+        out = np.array([[rest, decay * s, one, zero], [w * since - lag, rest, w * since, one]]).transpose(2, 0, 1)
+        return np.asarray(np.where(seconds[:, None, None] >= 0.0, out, 0.0))
+
+    def spreads(self, seconds: FloatArray) -> FloatArray:
+        """D (n, 2, 4, 4): covariance that Q_u = 1, or Q_r = w^2, adds in ``seconds`` (n,).
+
+        It is the integral of the column of Phi times itself, by Gauss-Legendre in pieces of an eighth of a
+        period at most.
+        """
+        nodes, weights = np.polynomial.legendre.leggauss(8)
+        pieces = max(1, math.ceil(8.0 * float(seconds.max()) * self.frequency))
+        shares = ((np.arange(pieces)[:, None] + 0.5 * (nodes + 1.0)) / pieces).ravel()
+        pushed = self.pushed((seconds[:, None] * shares).ravel()).reshape(len(seconds), len(shares), 2, 4)
+        parts = np.tile(0.5 * weights / pieces, pieces) * seconds[:, None]
+        return np.asarray(np.einsum('np,npci,npcj->ncij', parts, pushed, pushed))
+
+
+class Says(NamedTuple):
+    """What n samples of a block say; A axes, K rates. S: their covariance if x0 is known, X: that of x_end with them.
+
+    ``observed`` (A, n, 4): O. ``precision`` (A, K, n, n): S^-1. ``pulled`` (A, K, 4, n): O^T S^-1. ``smoothed``
+    (A, K, 4, n): X S^-1. ``information`` (A, K, 4, 4): O^T S^-1 O, of x0. ``kept`` (A, K, 4, 4): x_end for x0, with the
+    samples given. ``left`` (A, K, 4, 4): covariance of x_end if x0 and the samples are known. ``log_size`` (A, K):
+    log det S.
+    """
+
+    observed: FloatArray
+    precision: FloatArray
+    pulled: FloatArray
+    smoothed: FloatArray
+    information: FloatArray
+    kept: FloatArray
+    left: FloatArray
+    log_size: FloatArray
+
+
+class BlockTables:
+    """What a block of N samples says about A axes for each of K rates of their loads.
+
+    ``phi`` (A, 4, 4): over the whole block. ``added`` (A, K, 4, 4): what the load adds to the covariance over it.
+    """
+
+    def __init__(self, modes: tuple[Oscillator, ...], size: int, period: float) -> None:
+        """``size``: N. ``period``: of a sample, s."""
+        self.size = size
+        self._observed = np.empty((len(modes), size, 4))
+        self._walk = np.empty((len(modes), 2, size, size))
+        self._to_end = np.empty((len(modes), 2, 4, size))
+        self._spread = np.empty((len(modes), 2, 4, 4))
+        self.phi = np.stack([mode.step(size * period) for mode in modes])
+        for a, mode in enumerate(modes):
+            steps = [mode.step(n * period) for n in range(size + 1)]
+            spreads = mode.spreads(period * np.arange(size + 1, dtype=np.float64))
+            self._observed[a] = [steps[n + 1][0] for n in range(size)]
+            self._spread[a] = spreads[size]
+            for s in range(size):
+                # Covariance of the state at sample s with itself, carried on to later samples.
+                for t in range(s, size):
+                    self._walk[a, :, s, t] = self._walk[a, :, t, s] = spreads[s + 1][:, :, 0] @ steps[t - s][0]
+                self._to_end[a, :, :, s] = spreads[s + 1][:, :, 0] @ steps[size - 1 - s].T
+
+    def fill(self, noise: FloatArray, rates: FloatArray) -> None:
+        """Use this noise and these rates.
+
+        ``noise`` (A, N, N): covariance of the readings in one block. ``rates`` (A, K, 2): Q_u
+        and Q_r/w^2.
+        """
+        self._covariance = noise[:, None] + np.einsum('akc,acnm->aknm', rates, self._walk)
+        self._reach = np.einsum('akc,acin->akin', rates, self._to_end)
+        self.added = np.einsum('akc,acij->akij', rates, self._spread)
+        self._whole = self._of(np.arange(self.size))
+
+    def says(self, slots: IntArray) -> Says:
+        """What the samples at ``slots`` (n,) of the block say. A whole block is at hand, others are computed."""
+        return self._whole if len(slots) == self.size else self._of(slots)
+
+    def _of(self, slots: IntArray) -> Says:
+        covariance = self._covariance[:, :, slots[:, None], slots]
+        count = len(slots)
+        precision = inverse(covariance.reshape(-1, count, count)).reshape(covariance.shape)
+        observed = self._observed[:, slots]
+        reach = self._reach[..., slots]
+        pulled = np.einsum('ani,aknm->akim', observed, precision)
+        smoothed = np.einsum('akin,aknm->akim', reach, precision)
+        _, size = np.linalg.slogdet(covariance)
+        return Says(
+            observed,
+            precision,
+            pulled,
+            smoothed,
+            np.einsum('akin,anj->akij', pulled, observed),
+            self.phi[:, None] - np.einsum('akin,anj->akij', smoothed, observed),
+            self.added - np.einsum('akin,akjn->akij', smoothed, reach),
+            size,
+        )

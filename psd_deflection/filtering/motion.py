@@ -1,0 +1,371 @@
+"""The filter: block after block of poses in, pose and velocity of the tip out.
+
+How fast the load wanders is not known and changes: a link at rest, in operation, and one whose load has just been
+switched differ by six orders of magnitude. So each axis has K rates. In every block the filter runs with all of them,
+and Bayes' rule weighs them by how well they foretold the samples (a Markov chain says how likely a change is); the
+next block starts from mean and covariance of them all (generalised pseudo-Bayes of first order, Bar-Shalom, Li &
+Kirubarajan 2001, 11.6.4). With rates that the rig file states, K is 1.
+
+The axes are filtered one by one. The noise that they share, because each pose is solved from the same four readings,
+is followed through the gains, so that the covariance of the pose is that of the errors.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from psd_deflection.config import Rig
+from psd_deflection.errors import ConfigError
+from psd_deflection.filtering.modal import BlockTables, Oscillator
+from psd_deflection.records import AppliedLoad, FloatArray, IntArray
+from psd_deflection.uncertainty.block_fit import LARGEST, inverse
+
+STEPPED, SMOOTH = 13, 10
+"""Rates that are tried of a load that wanders by steps, and of one whose rate of change wanders; K together."""
+SMALLEST, STEP = 1e-2, 10.0**0.5
+"""The static deflection wanders in one block by so many times the noise of a sample at the lowest rate; from each rate
+to the next the factor."""
+DOWN, UP, JUMPS = 0.03, 0.01, 0.01
+"""Probability that the rate of the next block is the next one down, the next one up, any one at all."""
+UNKNOWN = 1.0
+"""Standard deviation of each state at the start, m or rad: nothing is known."""
+STEADY = 1e-9
+"""The same of r/w, if the rig file states how the load wanders: it has no rate of change."""
+KNOWN_LOAD = 0.05
+"""Share by which the deflection of a known load may differ from the rig file's link, one standard deviation."""
+AXES = ('dX', 'dY', 'theta')
+_PAIRS = ((0, 1), (0, 2), (1, 2))
+_FIRST, _SECOND = (np.array(side) for side in zip(*_PAIRS, strict=True))
+STATE = 'state.motion'
+"""Name under which :meth:`ModalFilter.memory` is recorded."""
+
+
+class Moved(NamedTuple):
+    """The tip at ``t_ns``: ``pose`` (3,) m, m, rad; ``velocity`` (3,) m/s, m/s, rad/s; their covariances (3, 3).
+
+    ``coasted``: time since the last sample that was used, s.
+    """
+
+    t_ns: int
+    pose: FloatArray
+    velocity: FloatArray
+    covariance: FloatArray
+    velocity_covariance: FloatArray
+    coasted: float
+
+
+class Predicted(NamedTuple):
+    """Motion at n times: ``pose`` m, m, rad, ``velocity`` m/s, m/s, rad/s, and their variances, (n, 3) each."""
+
+    pose: FloatArray
+    velocity: FloatArray
+    variance: FloatArray
+    velocity_variance: FloatArray
+
+
+class Innovations(NamedTuple):
+    """How well the filter foretold the samples so far.
+
+    ``squares``: sums of the normalised innovations squared (NIS) of dX, dY, theta; each has the mean 1 a sample.
+    """
+
+    squares: tuple[float, ...] = (0.0, 0.0, 0.0)
+    samples: int = 0
+
+    def since(self, before: Innovations) -> Innovations:
+        """Those that came after ``before``."""
+        squares = tuple(now - then for now, then in zip(self.squares, before.squares, strict=True))
+        return Innovations(squares, self.samples - before.samples)
+
+    def means(self) -> tuple[float, ...]:
+        """NIS a sample, of dX, dY, theta; 0 without samples."""
+        return tuple(square / max(self.samples, 1) for square in self.squares)
+
+    def band(self, deviations: float) -> tuple[float, float]:
+        """Where the mean NIS is, up to so many standard deviations: of a chi-square with a degree for each sample."""
+        half = deviations * math.sqrt(2.0 / max(self.samples, 1))
+        return max(1.0 - half, 0.0), 1.0 + half
+
+
+class ModalFilter:
+    """Holds pose, velocity and static deflection of the tip, at the last sample of the last block.
+
+    ``innovations``: of the run so far. ``coasted``: s since the last sample that was used. ``coasts``: times that the
+    filter went on without samples. Raises ConfigError if blocks are too long.
+    """
+
+    def __init__(self, rig: Rig, compliance: tuple[float, float, float], gain: FloatArray, noise: FloatArray) -> None:
+        """``compliance``: m/N, m/N, rad/(N m). ``gain`` (3, 4): of the solver at rest. ``noise``: :meth:`set_noise`."""
+        config, dynamics = rig.estimator, rig.dynamics
+        size = config.block_size
+        if size > LARGEST:
+            raise ConfigError(f'filter = {config.filter}: needs a block_size of {LARGEST} at most, not {size}')
+        self._size = size
+        self._period = 1.0 / rig.converter.sample_rate_hz
+        bending = Oscillator(dynamics.bending_frequency, dynamics.bending_damping_ratio)
+        torsion = Oscillator(dynamics.torsion_frequency, dynamics.torsion_damping_ratio)
+        self._modes = (bending, bending, torsion)
+        self._w = np.array([mode.w for mode in self._modes])
+        self._tables = BlockTables(self._modes, size, self._period)
+        self._ahead = config.filter_ahead
+        self._later = np.stack([mode.step(self._ahead) for mode in self._modes])
+        self._later_spread = np.stack([mode.spreads(np.array([self._ahead]))[0] for mode in self._modes])
+        self._longest = config.filter_coast
+        self._compliance = np.array(compliance)
+        self._gain = gain
+        stated = np.array(config.filter_load_walk) * self._compliance
+        self._stated = (
+            np.stack((np.square(stated), np.zeros(3)), axis=1)[:, None] if any(config.filter_load_walk) else None
+        )
+        self.levels = 1 if self._stated is not None else STEPPED + SMOOTH
+        self._changes = _transitions((1,) if self._stated is not None else (STEPPED, SMOOTH))
+        self.innovations = Innovations()
+        self.coasts = 0
+        self._loads: list[AppliedLoad] = []
+        self._held: FloatArray | None = None
+        self.set_noise(noise)
+        self.forget()
+
+    def forget(self) -> None:
+        """Know nothing: the next block starts anew."""
+        self._x = np.zeros((3, 4))
+        self._p = np.tile(UNKNOWN**2 * np.eye(4), (3, 1, 1))
+        if self._stated is not None:
+            self._p[:, 3, 3] = STEADY**2
+        self._shared = np.zeros((3, 4, 4))
+        self._weights = np.full((3, self.levels), 1.0 / self.levels)
+        self._index: int | None = None
+        self._t_ns = 0
+        self.coasted = 0.0
+
+    def set_noise(self, gamma: FloatArray) -> None:
+        """``gamma`` (4, 4, N), m^2: covariance of reading c with reading d, so many samples later."""
+        turned = np.einsum('ac,cdl,bd->abl', self._gain, gamma, self._gain)
+        lags = np.arange(self._size)[:, None] - np.arange(self._size)
+        behind = np.where(lags >= 0, turned.transpose(1, 0, 2)[..., np.abs(lags)], turned[..., np.abs(lags)])
+        own = behind[range(3), range(3)]
+        self._noise = behind[_FIRST, _SECOND]
+        rates = self._stated
+        if rates is None:
+            seconds = self._size * self._period
+            rates = np.zeros((3, self.levels, 2))
+            steps = own[:, 0, 0, None] / seconds * np.square(SMALLEST * STEP ** np.arange(STEPPED))
+            smooth = own[:, 0, 0, None] / seconds * np.square(SMALLEST * STEP ** np.arange(SMOOTH))
+            rates[:, :STEPPED, 0] = steps
+            rates[:, STEPPED:, 1] = smooth / (self._w[:, None] * seconds) ** 2
+        self._rates = rates
+        self._tables.fill(own, rates)
+
+    def is_new(self, load: AppliedLoad) -> bool:
+        """Whether ``load`` differs from the last one that was told."""
+        if self._loads:
+            return load[1:] != self._loads[-1][1:]
+        return self._held is None or load[1:] != tuple(self._held.tolist())
+
+    def load(self, load: AppliedLoad) -> None:
+        """A known load that acts from its stamp on. One from before the samples that were used is seen in them."""
+        self._loads.append(load)
+
+    def block(self, index: int, t_ns: int, slots: IntArray | None, poses: FloatArray | None) -> Moved | None:
+        """The motion at the end of block ``index``, or None if nothing is known.
+
+        ``t_ns``: time of the block's middle. ``slots`` (n,), ``poses`` (n, 3) m, m, rad: the samples that can be used,
+        and which of the N places each has; None if there is none: then the filter coasts.
+        """
+        seconds = self._size * self._period
+        if self._index is not None:
+            missed = index - self._index - 1
+            away = (t_ns - self._t_ns) / 1e9
+            # After a restart numbers and times do not agree.
+            if missed < 0 or away > self._longest + 2.0 * seconds or abs(away - (missed + 1) * seconds) > 0.5 * seconds:
+                self.forget()
+            for _ in range(missed if self._index is not None else 0):
+                self._coast(seconds)
+        if self._index is None and slots is None:
+            return None
+        pushed = self._known_loads(t_ns)
+        self._index, self._t_ns = index, t_ns
+        if slots is None or poses is None:
+            self._coast(seconds)
+            if pushed is not None:
+                self._x = self._x + pushed[1]
+            if self.coasted > self._longest:
+                self.forget()
+                return None
+        else:
+            self._update(slots, poses, pushed)
+        return self._moved()
+
+    def _coast(self, seconds: float) -> None:
+        if self.coasted == 0.0:
+            self.coasts += 1
+        self.coasted += seconds
+        phi = self._tables.phi
+        self._x = np.einsum('aij,aj->ai', phi, self._x)
+        added = np.einsum('ak,akij->aij', self._weights, self._tables.added)
+        self._p = np.einsum('aij,ajl,aml->aim', phi, self._p, phi) + added
+        self._shared = np.einsum('pij,pjl,pml->pim', phi[_FIRST], self._shared, phi[_SECOND])
+
+    def _known_loads(self, t_ns: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """What the known loads of this block do: to each sample (3, N), to the end (3, 4), and to u, (3,)."""
+        if not self._loads:
+            return None
+        period_ns = 1e9 * self._period
+        end_ns = t_ns + round(0.5 * (self._size - 1) * period_ns)
+        samples, end, size = np.zeros((3, self._size)), np.zeros((3, 4)), np.zeros(3)
+        while self._loads and self._loads[0].t_ns <= end_ns:
+            load = self._loads.pop(0)
+            before, self._held = self._held, np.array(load[1:])
+            since = self._period * self._size - (end_ns - load.t_ns) / 1e9
+            # The first one may have acted before the run.
+            if self._index is None or before is None or since < 0.0:
+                continue
+            step = self._compliance * (self._held - before)
+            size = size + np.square(KNOWN_LOAD * step)
+            for a, mode in enumerate(self._modes):
+                pushed = step[a] * mode.pushed(self._period * np.arange(1.0, self._size + 1.0) - since)[:, 0]
+                samples[a] += pushed[:, 0]
+                end[a] += pushed[-1]
+        return samples, end, size
+
+    def _update(
+        self, slots: IntArray, poses: FloatArray, pushed: tuple[FloatArray, FloatArray, FloatArray] | None
+    ) -> None:
+        says = self._tables.says(slots)
+        foretold = np.einsum('ani,ai->an', says.observed, self._x)
+        after = np.einsum('aij,aj->ai', self._tables.phi, self._x)
+        p = self._p
+        if pushed is not None:
+            foretold = foretold + pushed[0][:, slots]
+            after = after + pushed[1]
+            p = p.copy()
+            p[:, 2, 2] += pushed[2]
+        miss = poses.T - foretold
+        levels = self.levels
+        # Of x0, one sample before the block: what the block says, then with what was known.
+        scaled = np.einsum('aknm,am->akn', says.precision, miss)
+        score = np.einsum('akin,an->aki', says.pulled, miss)
+        known = inverse(p)
+        posterior = inverse((known[:, None] + says.information).reshape(-1, 4, 4)).reshape(3, levels, 4, 4)
+        squares = np.einsum('an,akn->ak', miss, scaled) - np.einsum('aki,akij,akj->ak', score, posterior, score)
+        size = says.log_size - _log_det(posterior) + _log_det(p)[:, None]
+        prior = np.einsum('ak,kl->al', self._weights, self._changes)
+        log_weights = np.log(prior) - 0.5 * (size + squares)
+        weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
+        weights /= weights.sum(axis=1, keepdims=True)
+        carried = np.einsum('akij,akjl->akil', says.kept, posterior)
+        found = after[:, None] + np.einsum('akin,an->aki', says.smoothed, miss)
+        found += np.einsum('akij,akj->aki', carried, score)
+        covariance = np.einsum('akij,aklj->akil', carried, says.kept) + says.left
+        self._x = np.einsum('ak,aki->ai', weights, found)
+        apart = found - self._x[:, None]
+        spread = covariance + apart[..., :, None] * apart[..., None, :]
+        self._p = np.einsum('ak,akij->aij', weights, spread)
+        self._p = 0.5 * (self._p + self._p.transpose(0, 2, 1))
+        mean = np.einsum('ak,akin->ain', weights, says.smoothed)
+        mean += np.einsum('akij,akjn->ain', weights[..., None, None] * carried, says.pulled)
+        own = self._tables.phi - np.einsum('ain,anj->aij', mean, says.observed)
+        noise = self._noise[:, slots[:, None], slots]
+        both = np.einsum('pin,pnm->pim', mean[_FIRST], noise)
+        self._shared = np.einsum('pij,pjl,pml->pim', own[_FIRST], self._shared, own[_SECOND])
+        self._shared += np.einsum('pim,pjm->pij', both, mean[_SECOND])
+        self._weights = weights
+        self.coasted = 0.0
+        taken = np.einsum('ak,ak->a', weights, squares).tolist()
+        so_far = zip(self.innovations.squares, taken, strict=True)
+        self.innovations = Innovations(tuple(a + b for a, b in so_far), self.innovations.samples + len(slots))
+
+    def _moved(self) -> Moved:
+        """Of the end of the block, ``filter_ahead`` later."""
+        x = np.einsum('aij,aj->ai', self._later, self._x)
+        rate = np.einsum('ak,akc->ac', self._weights, self._rates)
+        p = np.einsum('aij,ajl,aml->aim', self._later, self._p, self._later)
+        p += np.einsum('ac,acij->aij', rate, self._later_spread)
+        shared = np.einsum('pij,pjl,pml->pim', self._later[_FIRST], self._shared, self._later[_SECOND])
+        t_ns = self._t_ns + round(1e9 * (0.5 * (self._size - 1) * self._period + self._ahead))
+        pose, velocity = np.diag(p[:, 0, 0]), np.diag(self._w**2 * p[:, 1, 1])
+        for k, (a, b) in enumerate(_PAIRS):
+            pose[a, b] = pose[b, a] = shared[k, 0, 0]
+            velocity[a, b] = velocity[b, a] = self._w[a] * self._w[b] * shared[k, 1, 1]
+        return Moved(t_ns, x[:, 0], self._w * x[:, 1], pose, velocity, self.coasted)
+
+    def predicted(self, seconds: FloatArray) -> Predicted:
+        """The motion so long (n,) after the last block's last sample."""
+        rate = np.einsum('ak,akc->ac', self._weights, self._rates)
+        steps = np.stack([[mode.step(s) for s in seconds.tolist()] for mode in self._modes])
+        added = np.stack([mode.spreads(seconds) for mode in self._modes])
+        x = np.einsum('anij,aj->nai', steps, self._x)
+        p = np.einsum('anij,ajl,anml->naim', steps, self._p, steps) + np.einsum('ac,ancij->naij', rate, added)
+        return Predicted(x[..., 0], self._w * x[..., 1], p[..., 0, 0], self._w**2 * p[..., 1, 1])
+
+    def load_walk(self) -> tuple[float, ...]:
+        """How far the load wanders in a second by what was seen last, by its steps alone: N, N, N m."""
+        rate = np.einsum('ak,akc->ac', self._weights, self._rates)
+        return tuple((np.sqrt(rate[:, 0]) / self._compliance).tolist())
+
+    def memory(self) -> tuple[float, ...]:
+        """What the next block depends on, besides the noise; () if nothing is known."""
+        if self._index is None:
+            return ()
+        held = (1.0, *self._held.tolist()) if self._held is not None else (0.0,) * 4
+        times = (float(self._index), *split_ns(self._t_ns), self.coasted)
+        arrays = (self._x, self._p, self._shared, self._weights)
+        waiting = [v for load in self._loads for v in (*split_ns(load.t_ns), *load[1:])]
+        return (*times, *held, *(v for array in arrays for v in array.ravel().tolist()), *waiting)
+
+    def restore(self, values: tuple[float, ...]) -> None:
+        """Go on from another one's :meth:`memory`. Raises ValueError if it had another number of rates."""
+        numbers = 8 + 12 + 48 + 48 + 3 * self.levels
+        if len(values) < numbers or (len(values) - numbers) % 5:
+            raise ValueError(f'{STATE}: {len(values)} numbers do not tell a filter with {self.levels} rates')
+        self._index = int(values[0])
+        self._t_ns = joined_ns(*values[1:3])
+        self.coasted = values[3]
+        self._held = np.array(values[5:8]) if values[4] else None
+        x, p, shared, weights = np.split(np.array(values[8:numbers]), (12, 60, 108))
+        self._x, self._p, self._shared = x.reshape(3, 4), p.reshape(3, 4, 4), shared.reshape(3, 4, 4)
+        self._weights = weights.reshape(3, self.levels)
+        waiting = np.reshape(values[numbers:], (-1, 5)).tolist()
+        self._loads = [AppliedLoad(joined_ns(s, ns), fx, fy, tz) for s, ns, fx, fy, tz in waiting]
+
+
+def split_ns(t_ns: int) -> tuple[float, float]:
+    """Seconds and nanoseconds: one float does not hold a time to the nanosecond."""
+    return float(t_ns // 1_000_000_000), float(t_ns % 1_000_000_000)
+
+
+def joined_ns(seconds: float, ns: float) -> int:
+    """The time that :func:`split_ns` split."""
+    return 1_000_000_000 * int(seconds) + int(ns)
+
+
+def _log_det(matrices: FloatArray) -> FloatArray:
+    """log det of positive definite ``matrices`` (..., 4, 4), by elimination."""
+    rest, out = matrices, np.zeros(matrices.shape[:-2])
+    for _ in range(matrices.shape[-1]):
+        pivot, row = rest[..., 0, 0], rest[..., 0, 1:]
+        out = out + np.log(pivot)
+        rest = rest[..., 1:, 1:] - row[..., :, None] * (row / pivot[..., None])[..., None, :]
+    return np.asarray(out)
+
+
+def _transitions(families: tuple[int, ...]) -> FloatArray:
+    """(K, K): probability of rate l in the next block if it is k in this one; rows sum to 1.
+
+    ``families``: numbers of rates of each kind, K together.
+    """
+    levels = sum(families)
+    if levels == 1:
+        return np.ones((1, 1))
+    out = np.full((levels, levels), JUMPS / levels)
+    first = 0
+    for count in families:
+        for k in range(first, first + count):
+            out[k, max(k - 1, first)] += DOWN
+            out[k, min(k + 1, first + count - 1)] += UP
+            out[k, k] += 1.0 - DOWN - UP - JUMPS
+        first += count
+    return out

@@ -1,0 +1,220 @@
+"""The filter in the pipeline: against the truth of a generator of its own, without samples, and in a replay."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from blind import motion
+from psd_deflection.cli.main import main
+from psd_deflection.config import load_rig
+from psd_deflection.errors import ConfigError
+from psd_deflection.filtering.motion import STATE
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import KNOWN_LOAD, AppliedLoad, FloatArray, ParameterChange, RawChunk, TipMotion
+
+RIG = motion.rig_of()
+
+
+def through(pipeline: Pipeline, run: motion.Run, blocks: range) -> list[TipMotion]:
+    return [r for b in blocks for r in pipeline.process(motion.chunk(run, b)) if isinstance(r, TipMotion)]
+
+
+def truth(run: motion.Run, moved: TipMotion) -> FloatArray:
+    return np.asarray(run.pose[round(moved.t_ns / 1e6)])
+
+
+def pose(moved: TipMotion) -> FloatArray:
+    return np.array([moved.dx, moved.dy, moved.theta])
+
+
+def velocity(moved: TipMotion) -> FloatArray:
+    return np.array([moved.vx, moved.vy, moved.vtheta])
+
+
+@pytest.fixture(scope='module')
+def operation() -> motion.Run:
+    return motion.make('operation', 8.0, 5)
+
+
+@pytest.fixture(scope='module')
+def judged() -> dict[str, motion.Result]:
+    return {kind: motion.judge(motion.make(kind, 7.0, 2), RIG) for kind in motion.KINDS}
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize('kind', motion.KINDS)
+def test_velocity_prediction_and_innovations(kind: str, judged: dict[str, motion.Result]) -> None:
+    for axis in motion.figures([judged[kind]]):
+        assert axis.velocity < 0.2 * axis.smoothed
+        assert axis.velocity < 1.1 * axis.own
+        assert 0.92 < axis.inside < 0.98
+        assert axis.foretold < 0.5 * axis.held
+
+
+@pytest.mark.statistics
+def test_the_prediction_is_better_than_the_held_estimate_at_every_frequency(judged: dict[str, motion.Result]) -> None:
+    swept = judged['chirp']
+    # The frequency rises with time, from 0.5 Hz to 1.2 times that of the mode.
+    for foretold, held in zip(np.array_split(swept.foretold, 8), np.array_split(swept.held, 8), strict=True):
+        assert np.all(np.square(foretold).mean(axis=0) < 0.9 * np.square(held).mean(axis=0))
+
+
+@pytest.mark.statistics
+def test_the_covariance_of_the_pose_is_that_of_its_errors() -> None:
+    run = motion.make('operation', 10.0, 6)
+    moved = through(Pipeline(RIG), run, range(500))[150:]
+    errors = np.array([pose(m) - truth(run, m) for m in moved])
+    stated = np.mean([np.reshape(m.covariance, (3, 3)) for m in moved], axis=0)
+    found = errors.T @ errors / len(errors)
+    scale = np.sqrt(np.outer(np.diag(stated), np.diag(stated)))
+    # The readings are shared: x and twist err together.
+    assert abs(stated / scale)[0, 2] > 0.2
+    np.testing.assert_allclose(found / scale, stated / scale, atol=0.3)
+
+
+def test_without_samples_for_100_ms_the_truth_is_within_three_deviations(operation: motion.Run) -> None:
+    beyond = []
+    pipeline = Pipeline(RIG)
+    filtered = pipeline.motion_filter
+    assert filtered is not None
+    for first in range(160, 380, 20):
+        before = through(pipeline, operation, range(0 if first == 160 else first - 20, first))[-1]
+        foretold = filtered.predicted(np.arange(1.0, 101.0) / 1000.0)
+        ahead = slice(20 * first, 20 * first + 100)
+        beyond.append(np.abs(foretold.pose - operation.pose[ahead]) / np.sqrt(foretold.variance))
+        assert foretold.variance[-1, 0] > 4.0 * foretold.variance[0, 0]
+    assert np.mean(np.concatenate(beyond) < 3.0) > 0.99
+    # Samples come back: the filter goes on, and does not begin anew.
+    after = through(pipeline, operation, range(first + 5, first + 6))[-1]
+    assert filtered.coasts == 1
+    assert np.all(np.abs(pose(after) - truth(operation, after)) < 5.0 * np.sqrt(after.covariance[::4]))
+    assert after.covariance[0] < 100.0 * before.covariance[0]
+
+
+def test_a_lost_laser_is_coasted_through_and_said(operation: motion.Run) -> None:
+    dark = motion.Run(operation.loads, operation.pose, operation.velocity, operation.volts.copy())
+    dark.volts[4000:4100, 2] = 0.0
+    pipeline = Pipeline(RIG)
+    moved = {m.block: m for m in through(pipeline, dark, range(210))}
+    assert [moved[b].coasted for b in (199, 200, 204, 205)] == pytest.approx([0.0, 0.02, 0.10, 0.0])
+    errors = np.abs([pose(moved[b]) - truth(dark, moved[b]) for b in range(200, 205)])
+    deviations = np.sqrt([moved[b].covariance[::4] for b in range(200, 205)])
+    assert np.all(errors < 3.0 * deviations)
+    assert np.all(np.diff(deviations, axis=0) > 0.0)
+
+
+def test_coasting_ends(operation: motion.Run) -> None:
+    dark = motion.Run(operation.loads, operation.pose, operation.velocity, operation.volts.copy())
+    dark.volts[4000:, 2] = 0.0
+    pipeline = Pipeline(motion.rig_of({'filter_coast': 0.2}))
+    moved = through(pipeline, dark, range(300))
+    assert moved[-1].block == 209
+    memory = pipeline.memory(pipeline.rig)
+    assert memory is not None
+    assert STATE not in dict(memory.values)
+
+
+def test_ahead_is_the_prediction(operation: motion.Run) -> None:
+    now, later = Pipeline(RIG), Pipeline(motion.rig_of({'filter_ahead': 0.005}))
+    there = through(later, operation, range(250))[-1]
+    here = through(now, operation, range(250))[-1]
+    assert there.t_ns == here.t_ns + 5_000_000
+    assert now.motion_filter is not None
+    foretold = now.motion_filter.predicted(np.array([0.005]))
+    np.testing.assert_allclose(pose(there), foretold.pose[0], rtol=1e-9)
+    np.testing.assert_allclose(velocity(there), foretold.velocity[0], rtol=1e-9)
+    np.testing.assert_allclose(there.covariance[::4], foretold.variance[0], rtol=1e-9)
+    assert np.all(np.abs(pose(there) - truth(operation, there)) < 4.0 * np.sqrt(there.covariance[::4]))
+
+
+def test_a_known_load_is_foretold() -> None:
+    run = motion.make('steps', 6.0, 11)
+    told, untold = Pipeline(RIG), Pipeline(RIG)
+    changes = np.flatnonzero(np.any(np.diff(run.loads, axis=0), axis=1)) + 1
+    told.load(AppliedLoad(0, 0.0, 0.0, 0.0))
+    for i in changes.tolist():
+        assert told.load(AppliedLoad(i * 1_000_000, *run.loads[i].tolist())) is not None
+    with_load, without = (through(p, run, range(300))[150:] for p in (told, untold))
+    off, blind = (
+        motion.rms(np.array([velocity(m) - run.velocity[round(m.t_ns / 1e6)] for m in moved])[:, :2])
+        for moved in (with_load, without)
+    )
+    assert off < 0.5 * blind
+
+
+def test_the_process_noise_can_be_stated(operation: motion.Run) -> None:
+    pipeline = Pipeline(motion.rig_of({'filter_load_walk': [10.0, 10.0, 1.0]}))
+    through(pipeline, operation, range(200))
+    filtered = pipeline.motion_filter
+    assert filtered is not None
+    assert filtered.levels == 1
+    assert filtered.load_walk() == pytest.approx((10.0, 10.0, 1.0))
+
+
+@pytest.mark.parametrize('start', [151, 203, 260])
+def test_a_recording_begun_at_any_block_replays_to_the_bit(operation: motion.Run, start: int) -> None:
+    dark = motion.Run(operation.loads, operation.pose, operation.velocity, operation.volts.copy())
+    dark.volts[4000:4100, 2] = 0.0
+    live = Pipeline(RIG)
+    live.load(AppliedLoad(0, 0.0, 0.0, 0.0))
+    live.load(AppliedLoad(5_303_000_000, 3.0, 0.0, 0.0))
+    through(live, dark, range(start))
+    memory = live.memory(RIG)
+    assert memory is not None
+    expected = through(live, dark, range(start, 300))
+    replay = Pipeline(RIG)
+    replay.apply(memory)
+    assert through(replay, dark, range(start, 300)) == expected
+    # And it would not be the same without.
+    without = Pipeline(RIG)
+    without.apply(memory._replace(values=tuple(v for v in memory.values if v[0] != STATE)))
+    assert through(without, dark, range(start, 300)) != expected
+
+
+def test_a_zero_begins_anew() -> None:
+    run = motion.make('steps', 4.0, 1)
+    pipeline = Pipeline(RIG)
+    through(pipeline, run, range(100))
+    assert pipeline.zero() is not None
+    moved = through(pipeline, run, range(100, 140))
+    assert np.all(np.abs(pose(moved[-1])) < 5.0 * np.sqrt(moved[-1].covariance[::4]))
+
+
+def test_a_restart_begins_anew(operation: motion.Run) -> None:
+    pipeline = Pipeline(RIG)
+    through(pipeline, operation, range(200))
+    late = motion.chunk(operation, 200)
+    later = RawChunk(late.seq + 20, late.t_ns + 300_000_000, late.readings, late.flags)
+    found = [r for r in pipeline.process(later) if isinstance(r, TipMotion)][-1]
+    assert pipeline.motion_filter is not None
+    assert pipeline.motion_filter.coasts == 0
+    assert np.all(np.abs(pose(found) - operation.pose[4019]) < 5.0 * np.sqrt(found.covariance[::4]))
+
+
+def test_no_filter_no_motion_and_a_long_block_is_refused(operation: motion.Run) -> None:
+    pipeline = Pipeline(load_rig())
+    assert pipeline.motion_filter is None
+    assert pipeline.load(AppliedLoad(0, 1.0, 0.0, 0.0)) is None
+    assert not through(pipeline, operation, range(5))
+    with pytest.raises(ConfigError, match='block_size of 64 at most, not 100'):
+        Pipeline(motion.rig_of({'block_size': 100}))
+
+
+def test_a_load_is_noted_once() -> None:
+    pipeline = Pipeline(RIG)
+    first = pipeline.load(AppliedLoad(1_700_000_000_123_456_789, 1.0, 0.0, 0.0))
+    assert isinstance(first, ParameterChange)
+    assert dict(first.values)[KNOWN_LOAD] == (1_700_000_000.0, 123_456_789.0, 1.0, 0.0, 0.0)
+    assert pipeline.load(AppliedLoad(1_700_000_001_000_000_000, 1.0, 0.0, 0.0)) is None
+
+
+def test_a_simulated_recording_replays_to_the_bit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = tmp_path / 'rig.yaml'
+    rig.write_text('/**:\n  ros__parameters:\n    filter: modal\n')
+    arguments = ['--params-file', str(rig), '--loads', 'steps:0,0,0;0,-10,0.5:1', '--out', str(tmp_path / 'run')]
+    assert main(['simulate', *arguments]) == 0
+    assert main(['replay', str(tmp_path / 'run'), '--compare', '--strict']) == 0
+    assert 'no bit differs' in capsys.readouterr().out

@@ -1,0 +1,68 @@
+"""The filter's topics over real DDS, live, recorded and replayed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.ros
+pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped, WrenchStamped  # noqa: E402
+from std_srvs.srv import SetBool  # noqa: E402
+
+from psd_deflection.cli.main import main  # noqa: E402
+from psd_deflection.recordings.readers import open_recording  # noqa: E402
+from psd_deflection.records import KNOWN_LOAD  # noqa: E402
+from test.ros.conftest import BLOCK_NS, stamp  # noqa: E402
+
+
+def test_velocity_and_filtered_pose_are_published_and_replay_to_the_bit(
+    start: Callable[..., Any], peer: Any, tmp_path: Path, simulated_port: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start('--port', simulated_port, '--ros-args', '-p', 'filter:=modal', '-p', f'bag_dir:={tmp_path}')
+    speeds = peer.collect(TwistStamped, '/link_tip/velocity')
+    poses = peer.collect(PoseWithCovarianceStamped, '/link_tip/filtered/deflection')
+    health = peer.collect(DiagnosticArray, '/diagnostics')
+    load = peer.node.create_publisher(WrenchStamped, '/link_tip/load', 10)
+    peer.until(lambda: len(speeds) >= 30, 'velocities')
+    begun = peer.call(SetBool, '/estimator/record', SetBool.Request(data=True))
+    folder = Path(begun.message.removeprefix('recording to '))
+    for force in (0.0, -10.0):
+        message = WrenchStamped()
+        message.wrench.force.y = force
+        load.publish(message)
+        peer.until_of_now(speeds, 'velocities after the load')
+    now = len(speeds)
+    peer.until(lambda: len(speeds) >= now + 50, 'a second of velocities')
+    peer.until(lambda: len(health) >= 3, 'diagnostics')
+    peer.call(SetBool, '/estimator/record', SetBool.Request(data=False))
+    assert {m.header.frame_id for m in (*speeds, *poses)} == {'link_tip_rest'}
+    assert [stamp(m) for m in speeds[:30]] == [stamp(m) for m in poses[:30]]
+    assert np.median(np.diff([stamp(m) for m in speeds])) == pytest.approx(BLOCK_NS, abs=100_000)
+    covariance = np.reshape(poses[-1].pose.covariance, (6, 6))
+    assert 1e-9 < covariance[0, 0] ** 0.5 < 1e-5
+    status = next(s for s in health[-1].status if s.name == 'estimator: motion')
+    assert status.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
+    assert float({v.key: v.value for v in status.values}['NIS a sample, dX']) > 0.5
+    recording = open_recording(folder)
+    noted = [name for change in recording.changes for name, _ in change.values]
+    assert noted.count(KNOWN_LOAD) == 2
+    assert recording.topics()['/link_tip/velocity'] == recording.topics()['/link_tip/filtered/deflection'] > 60
+    assert main(['replay', str(folder), '--compare']) == 0
+    assert 'no bit differs' in capsys.readouterr().out
+
+
+def test_without_the_filter_there_is_no_topic_of_it(start: Callable[..., Any], peer: Any, simulated_port: str) -> None:
+    start('--port', simulated_port)
+    health = peer.collect(DiagnosticArray, '/diagnostics')
+    peer.until(lambda: len(health) >= 1, 'diagnostics')
+    graph = dict(peer.node.get_topic_names_and_types())
+    assert '/link_tip/velocity' not in graph
+    assert '/link_tip/filtered/deflection' not in graph
+    assert 'estimator: motion' not in {s.name for s in health[0].status}
