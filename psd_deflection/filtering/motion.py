@@ -98,7 +98,7 @@ class ModalFilter:
     """
 
     def __init__(self, rig: Rig, compliance: tuple[float, float, float], gain: FloatArray, noise: FloatArray) -> None:
-        """``compliance``: m/N, m/N, rad/(N m). ``gain`` (3, 4): of the solver at rest. ``noise``: :meth:`set_noise`."""
+        """``compliance``: m/N, m/N, rad/(N m). ``gain`` (3, C): of the solver at rest. ``noise``: :meth:`set_noise`."""
         config, dynamics = rig.estimator, rig.dynamics
         size = config.block_size
         if size > LARGEST:
@@ -142,7 +142,7 @@ class ModalFilter:
         self.coasted = 0.0
 
     def set_noise(self, gamma: FloatArray) -> None:
-        """``gamma`` (4, 4, N), m^2: covariance of reading c with reading d, so many samples later."""
+        """``gamma`` (C, C, N), m^2: covariance of reading c with reading d, so many samples later."""
         turned = np.einsum('ac,cdl,bd->abl', self._gain, gamma, self._gain)
         lags = np.arange(self._size)[:, None] - np.arange(self._size)
         behind = np.where(lags >= 0, turned.transpose(1, 0, 2)[..., np.abs(lags)], turned[..., np.abs(lags)])
