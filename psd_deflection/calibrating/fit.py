@@ -10,7 +10,8 @@ y_j would go with its errors and pull the gains towards zero (attenuation). J_y 
 does not reach, the one redundant reading, the reference's noise does not enter, and the weight is that of the
 detectors. Known loads take the place of y, with the link's compliance; without either S_ref is as good as infinite.
 
-tau is the offset of the reference's clock. S_ref (three variances) and a factor on S_dots are variance components:
+tau is the offset of the reference's clock. S_ref (three variances, in proportion to those that the reference states for
+each row, if it does) and a factor on S_dots are variance components:
 estimated from the residuals, in turn with p. Rows beyond ``FAR`` are outliers and count for nothing. A reference whose
 errors are correlated from row to row counts as the fewer rows that it is worth.
 """
@@ -80,7 +81,7 @@ def prior_of_rig(rig: Rig, vector: RigVector | None = None) -> Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """``reference`` (3,): standard deviations of the reference, m, m, rad. ``dots``: factor on the dots' noise.
+    """``reference`` (3,): median standard deviations of the reference, m, m, rad. ``dots``: factor on the dots' noise.
 
     ``fewer``: rows that are worth one, because the reference's errors are correlated.
     """
@@ -158,7 +159,7 @@ def pose_of_readings(dots: FloatArray, p: FloatArray, length: float) -> FloatArr
 
 def weight_matrices(linear: Linear, rows: Rows, noise: Noise) -> FloatArray:
     """C^-1 (n, 4, 4), 1/m^2."""
-    spread = linear.by_pose * noise.reference
+    spread = linear.by_pose * (noise.reference * rows.sd)[:, None, :]
     covariance = np.einsum('nij,nkj->nik', spread, spread)
     covariance[:, range(4), range(4)] += noise.dots**2 * rows.variances
     return np.asarray(np.linalg.inv(covariance)) / noise.fewer
@@ -312,7 +313,7 @@ def _components(
     """The variance components from the residuals."""
     good = robust > 0.0 if number else np.ones(len(rows), dtype=bool)
     inverse = np.linalg.pinv(linear.by_pose)
-    errors = np.einsum('nij,nj->ni', inverse, linear.residual)[good]
+    errors = (np.einsum('nij,nj->ni', inverse, linear.residual) / rows.sd)[good]
     # Two PSDs leave one direction that no pose reaches.
     across = np.linalg.svd(linear.by_pose)[0][:, :, 3]
     redundant = np.einsum('ni,ni->n', across, linear.residual)[good]
@@ -328,7 +329,7 @@ def _components(
     dots = _deviation(redundant / expected, robustly) / share**0.5
     if kind == 'self':
         return Noise(np.full(3, _FREE), max(dots, 0.3), 1.0)
-    own = np.einsum('nij,nj->ni', inverse**2, rows.variances)[good].mean(axis=0) * dots**2
+    own = (np.einsum('nij,nj->ni', inverse**2, rows.variances) / rows.sd**2)[good].mean(axis=0) * dots**2
     seen = np.array([_deviation(e, robustly) ** 2 for e in errors.T]) / share
     reference = np.sqrt(np.maximum(seen - own, 0.01 * own))
     return Noise(reference, max(dots, 0.3), _fewer(errors, rows.run[good]))

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+from blind.render import Pose, Scene, photograph
 from psd_deflection.cli.main import main
 from psd_deflection.recordings.readers import open_recording
-from test.camera.render import Pose, Scene, photograph
 
 POSES = [Pose(), Pose(), Pose(1e-3, -2e-3, 0.02), Pose(-2e-3, 1e-3, -0.01)]
 
