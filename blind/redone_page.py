@@ -73,7 +73,8 @@ def _body(
     yield (
         '<p>The rig is simulated and differs from its rig file in every gain, turn, centre, height and beam. '
         'Weights hang on the sidebar, 0.585 m from the link, on either side, and then on the link itself. '
-        'A camera with a clock of its own looks at three discs on the tip. <code>calibrate</code> sees the recordings of the sidebar only. The '
+        'A camera with a clock of its own looks at three discs on the tip. '
+        '<code>calibrate</code> sees the recordings of the sidebar only. The '
         'recordings on the link are judged by the true pose, which only the simulation knows.</p>'
     )
     yield from _camera_frame(folder, f'sidebar_right_{largest}N')
@@ -125,7 +126,8 @@ def verdict(summary: Mapping[str, Any]) -> str:
     holds = 'holds' if summary['holds'] else 'does not hold'
     return (
         f'Calibrated on the sidebar alone, the rig is at most {words} of the 50 N deflection off on the link: '
-        f'the bound of {100 * summary["limit"]:g} % {holds}. Weights tuned by hand on the sidebar, without calibration: {old}.'
+        f'the bound of {100 * summary["limit"]:g} % {holds}. '
+        f'Weights tuned by hand on the sidebar, without calibration: {old}.'
     )
 
 
