@@ -133,6 +133,21 @@ def test_the_beam_solver_takes_a_calibrated_file(nominal: Rig, pose: FloatArray)
     assert own == pytest.approx(small, rel=0.1, abs=1e-16)
 
 
+def test_every_recording_has_a_zero_of_its_own(nominal: Rig) -> None:
+    """The beams were aimed anew between two recordings, by 0.3 mm: a hundred times what the readings are good for."""
+    rng = np.random.default_rng([77, 1])
+    truth, runs = misaligned.draw(rng), []
+    for _ in range(2):
+        now = truth | {f'beam_{n}.{axis}': rng.normal(0.0, 3e-4) for n in (1, 2) for axis in 'xy'}
+        pose = misaligned.poses(misaligned.pushes(rng, 6, 1.2))
+        runs.append(campaign.run_of(misaligned.record(now, pose, rng)))
+    found = calibrate(runs, nominal)
+    assert found.fit.noise.dots == pytest.approx(1.0, abs=0.15)
+    errors = np.array([(found.values[AT[n]] - v) / found.sd[AT[n]] for n, v in truth.items() if n in AT])
+    assert np.abs(errors).max() < 4.0
+    assert np.mean(errors**2) < 2.0
+
+
 def test_a_late_reference_is_put_right(nominal: Rig, pose: FloatArray) -> None:
     recorded = misaligned.record(only(), pose, np.random.default_rng(2))
     run = campaign.run_of(recorded)
