@@ -150,7 +150,7 @@ wheel: $(VENV)/.installed
 	$(BIN)/python -m build --outdir dist . > build/wheel/log
 	$(PYTHON) -m venv build/wheel/use && build/wheel/use/bin/pip install --quiet --disable-pip-version-check dist/*.whl
 	cd build/wheel && use/bin/psd-deflection --help && use/bin/psd-deflection info ../../bags/clean
-	build/wheel/use/bin/pip install --quiet --disable-pip-version-check 'psd_deflection[monitor]' 'psd_deflection[ros]' 'psd_deflection[pandas]' 'psd_deflection[camera]'
+	build/wheel/use/bin/pip install --quiet --disable-pip-version-check 'psd_deflection[monitor]' 'psd_deflection[ros]' 'psd_deflection[pandas]' 'psd_deflection[camera]' 'psd_deflection[foxglove]'
 	build/wheel/use/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/*.tar.gz
 	cd build/wheel && use/bin/psd-deflection --version && use/lib/psd_deflection/replay --help > log
 

@@ -400,6 +400,11 @@ class MonitorConfig:
         synonyms=((True, 'on'), (False, 'off')),
         name='monitor_control',
     )
+    foxglove: bool = parameter(False, '', 'serve the messages to Foxglove, without ROS')
+    foxglove_address: str = parameter('127.0.0.1', '', 'address of that; 0.0.0.0 shows it to the network')
+    foxglove_port: int = parameter(
+        8765, '', 'port of that; 0, or one that is in use, takes any free one', minimum=0, maximum=65535
+    )
 
 
 LINK = Section(LinkConfig, 'link.')

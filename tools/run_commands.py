@@ -49,11 +49,11 @@ CI_RUNS = (
     (r'^make demo-thesis$', 'test/blind/test_redone.py', "main(['--short', "),
     (r'^colcon build$', 'Makefile', 'bin/colcon --log-base log build '),
     (
-        r"^pip install 'psd_deflection\[(ros|monitor|pandas|camera)\]'$",
+        r"^pip install 'psd_deflection\[(ros|monitor|pandas|camera|foxglove)\]'$",
         'Makefile',
         "pip install --quiet --disable-pip-version-check 'psd_deflection[",
     ),
-    (r'^make doc-commands$', '.ci/run', 'make doc-commands '),
+    (r'^make doc-commands\b', '.ci/run', 'make doc-commands '),
     (r'^make wheel$|^pip install dist/\*\.whl', '.ci/run', 'make wheel '),
     (r'^make rerun$', '.ci/run', 'make rerun '),
     (r"^pip install '\.\[rerun\]'$", 'Makefile', "'.[rerun]'"),
@@ -186,6 +186,10 @@ def run_by_ci(line: str) -> tuple[str, str] | None:
     return next(((file, text) for pattern, file, text in CI_RUNS if re.search(pattern, line)), None)
 
 
+JOURNEY = 'docs/first-day.md'
+"""One path, of which every line is typed, in its order, also what is run elsewhere."""
+
+
 def is_quick(line: str) -> bool:
     """Whether the tests run it within themselves."""
     return QUICK.search(line) is not None and '--serve' not in line and run_by_ci(line) is None
@@ -199,6 +203,9 @@ def blocks_to_run() -> list[list[Command]]:
         blocks.setdefault(command.block, []).append(command)
     out = []
     for block in blocks.values():
+        if block[0].page == JOURNEY:
+            out.append(block)
+            continue
         if all(is_quick(c.line) or run_by_ci(c.line) for c in block):
             continue
         left = [c for c in block if run_by_ci(c.line) is None and c.line not in seen]

@@ -80,8 +80,9 @@ def main() -> int:
     chance = random.Random(args.seed)
     with tempfile.TemporaryDirectory() as name:
         bags = Path(name) / 'bags'
-        rig_process = Program([*PSD_DEFLECTION, 'simulate', '--serve'])
-        port = rig_process.until('port: (.+)')[1]
+        port = str(Path(name) / 'port')
+        rig_process = Program([*PSD_DEFLECTION, 'simulate', '--serve', '--link', port])
+        rig_process.until('port: ')
         rotating = {'bag_max_duration': 0.7}
         lost = []
         try:

@@ -24,7 +24,7 @@ from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import given_as_option, given_parameters, over_file, parameter_option
 from psd_deflection.devices.registry import DEVICES, source_names
 from psd_deflection.errors import ConfigError, UsageError
-from psd_deflection.monitor.start import start_monitor
+from psd_deflection.monitor.start import start_views
 from psd_deflection.runner.headless import run_headless
 from psd_deflection.runner.simulated_rig import simulates, started_early
 from psd_deflection.solvers.registry import SOLVERS, check_live
@@ -51,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='solver whose answer is published as /link_tip/deflection (default exact)',
     )
     parser.add_argument('--monitor', action='store_true', help='serve the live page and print its address')
+    parser.add_argument('--foxglove', action='store_true', help='serve the messages to Foxglove and print the address')
     parser.add_argument('--no-ros', action='store_true', help='acquire and record without ROS')
     parser.add_argument(
         '--ros-args', action='store_true', help='arguments after this go to ROS (ros2 run, ros2 launch)'
@@ -88,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace, overrides: dict[str, object], display: Display) -> int:
     if args.no_ros:
-        return run_headless(overrides, display.say, display.watch, start_monitor)
+        return run_headless(overrides, display.say, display.watch, start_views)
     if importlib.util.find_spec('rclpy') is None:
         raise ConfigError(
             "rclpy is not installed: source your ROS 2, or `pip install 'psd_deflection[ros]'`, "

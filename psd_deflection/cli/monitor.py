@@ -27,8 +27,9 @@ from psd_deflection.cli._report import warn
 from psd_deflection.config import MONITOR, replace_values
 from psd_deflection.errors import UsageError
 from psd_deflection.monitor.feed import Feed
+from psd_deflection.monitor.foxglove import FeedBeside, FoxgloveServer
 from psd_deflection.monitor.shown import ShownRecording
-from psd_deflection.monitor.start import need_server, start_monitor
+from psd_deflection.monitor.start import need_server, start_views
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.replay_engine import nominal_rig, open_for_replay, replayed
@@ -55,6 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     control.add_argument(
         '--no-control', dest='monitor_control', action='store_const', const='off', help='switch the buttons off'
+    )
+    page.add_argument(
+        '--foxglove', action='store_true', help='serve the messages to Foxglove as well, and print the address'
     )
     live = parser.add_argument_group('the rig (without REC)')
     parameter_option(live, '--port', 'port')
@@ -88,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
     values = over_file(args.params_file, overrides)
     display = Display()
     with started_early(simulates(values)):
-        status = run_headless(values, display.say, display.watch, start_monitor)
+        status = run_headless(values, display.say, display.watch, start_views)
     display.tell_recorded()
     return status
 
@@ -113,7 +117,8 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     display = Display()
-    feed = Feed()
+    foxglove = FoxgloveServer(rig.monitor) if rig.monitor.foxglove else None
+    feed = Feed() if foxglove is None else FeedBeside(foxglove, rig)
     server: MonitorServer | None = None
 
     def say(text: str) -> None:
@@ -139,6 +144,8 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     )
     server = MonitorServer(shown, feed, rig.monitor, display.say)
     server.start()
+    if foxglove is not None:
+        display.say(foxglove.words())
     try:
         shown.start()
         while not stop.wait(0.1) and shown.failed is None:
@@ -146,6 +153,8 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     finally:
         shown.close()
         server.close()
+        if foxglove is not None:
+            foxglove.close()
     if shown.failed is not None:
         raise shown.failed
     return 0

@@ -1,14 +1,20 @@
-"""Starts the page of a session, for the node and the command line."""
+"""Starts the views of a session, for the node and the command line: the page, Foxglove."""
 
 from __future__ import annotations
 
 import importlib.util
+import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor.feed import Feed
+from psd_deflection.monitor.foxglove import FoxgloveServer
 from psd_deflection.monitor.shown import ShownSession
+from psd_deflection.runner.diagnostics import HealthReporter
+from psd_deflection.runner.fanout import Fanout
+from psd_deflection.runner.processing import RecordSink
+from psd_deflection.runner.rig_publisher import RigPublisher
 from psd_deflection.runner.session import Session
 
 if TYPE_CHECKING:
@@ -24,13 +30,37 @@ def need_server() -> None:
         )
 
 
-def start_monitor(session: Session, say: Callable[[str], None]) -> MonitorServer | None:
-    """Serve ``session`` if its rig has ``monitor`` set; else None. It adds a sink to the session.
+class Views:
+    """What shows a session: its page, its Foxglove server, both or neither."""
 
-    ``say`` gets the address as a line. Raises ConfigError if it cannot be served.
+    def __init__(self) -> None:
+        self.parts: list[MonitorServer | FoxgloveServer | Reports] = []
+
+    def close(self) -> None:
+        """End all of them."""
+        for part in reversed(self.parts):
+            part.close()
+
+
+def start_views(session: Session, say: Callable[[str], None], *, reports: bool = True) -> Views:
+    """Serve ``session`` as its parameters ``monitor`` and ``foxglove`` say. They add sinks and wires to the session.
+
+    ``say`` gets each address as a line. ``reports``: whether Foxglove needs reports of the run's health; False if
+    somebody puts them to the session's fan-out. Raises ConfigError if something cannot be served.
     """
-    if not session.rig.monitor.enabled:
-        return None
+    views = Views()
+    try:
+        if session.rig.monitor.enabled:
+            views.parts.append(_start_page(session, say))
+        if session.rig.monitor.foxglove:
+            _start_foxglove(session, say, views, reports)
+    except BaseException:
+        views.close()
+        raise
+    return views
+
+
+def _start_page(session: Session, say: Callable[[str], None]) -> MonitorServer:
     need_server()
     # Imported here: only the page needs aiohttp.
     from psd_deflection.monitor.server import MonitorServer
@@ -43,3 +73,39 @@ def start_monitor(session: Session, say: Callable[[str], None]) -> MonitorServer
     session.input_sinks.append(feed)
     session.listeners.append(server.tell)
     return server
+
+
+def _start_foxglove(session: Session, say: Callable[[str], None], views: Views, reports: bool) -> None:
+    server = FoxgloveServer(session.rig.monitor)
+    views.parts.append(server)
+    say(server.words())
+    fanout = Fanout(session.rig.monitor.frame_prefix)
+    fanout.wires.append(server)
+    rig_told = RigPublisher(server, session)
+    rig_told.tell()
+    session.fanout.wires.append(server)
+    session.fanout.change_wires.append(rig_told)
+    session.input_sinks.append(fanout)
+    if reports:
+        views.parts.append(Reports(session, fanout))
+
+
+class Reports:
+    """Puts the run's health to ``sink``, once a second, from a thread of its own."""
+
+    def __init__(self, session: Session, sink: RecordSink) -> None:
+        self._session = session
+        self._sink = sink
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name='reports', daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        health = HealthReporter(self._session)
+        while not self._stop.wait(1.0):
+            self._sink.put(health.report(self._session.acquisition.now_ns()))
+
+    def close(self) -> None:
+        """End the thread."""
+        self._stop.set()
+        self._thread.join()

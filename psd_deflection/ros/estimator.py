@@ -31,21 +31,21 @@ from std_srvs.srv import SetBool, Trigger
 from msg_adapters import DEFLECTION, DIAGNOSTICS, to_messages
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError, Failed, PsdDeflectionError, Warned
-from psd_deflection.monitor.start import start_monitor
+from psd_deflection.monitor.start import Views, start_views
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.log import NodeLog
 from psd_deflection.ros.names import RECORD, ZERO
 from psd_deflection.ros.parameters import LiveParameters
 from psd_deflection.ros.transforms import TransformPublisher, installed
-from psd_deflection.ros.wires import InputRecorder, PublisherWire, RigPublisher, VoltsPublisher, topics_of
+from psd_deflection.ros.wires import InputRecorder, PublisherWire, VoltsPublisher, topics_of
 from psd_deflection.runner.diagnostics import STALE, HealthReporter
 from psd_deflection.runner.realtime import Watchdog, settle
+from psd_deflection.runner.rig_publisher import RigPublisher
 from psd_deflection.runner.session import Session, why_no_zero, zero_text
 from psd_deflection.runner.signals import Signals, StopRequestedError
 
 if TYPE_CHECKING:
-    from psd_deflection.monitor.server import MonitorServer
     from psd_deflection.ros.markers import RigMarkers
 
 NODE_NAME = 'estimator'
@@ -92,7 +92,7 @@ class EstimatorNode:
         self._starting = False
         self._alone = True
         self._health: HealthReporter | None = None
-        self._monitor: MonitorServer | None = None
+        self._views: Views | None = None
         self._rig_told: RigPublisher | None = None
         self._markers: RigMarkers | None = None
         self._transforms: TransformPublisher | None = None
@@ -221,7 +221,8 @@ class EstimatorNode:
             self._make_views(session)
             self._inputs.session = session
             session.start()
-            self._monitor = start_monitor(session, self._say)
+            # Its health is put to the fan-out once a second.
+            self._views = start_views(session, self._say, reports=False)
         except BaseException:
             self.cleanup()
             raise
@@ -267,9 +268,9 @@ class EstimatorNode:
         self._live.session = None
         self._health = None
         self._rig_told = None
-        monitor, self._monitor = self._monitor, None
-        if monitor is not None:
-            monitor.close()
+        views, self._views = self._views, None
+        if views is not None:
+            views.close()
         session, self.session = self.session, None
         if session is not None:
             session.close()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import time
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -18,13 +17,11 @@ from msg_adapters import (
     INPUTS,
     TOPIC_TYPES,
     solver_topic,
-    to_messages,
     vector3_stamped,
 )
-from psd_deflection import __version__
 from psd_deflection.config import Rig
 from psd_deflection.recordings import cdr
-from psd_deflection.records import ENVIRONMENT, ParameterChange, Record, RigState, SampleBlock, TemperatureReading
+from psd_deflection.records import Record, SampleBlock, TemperatureReading
 from psd_deflection.ros.names import VOLTS, delivery
 from psd_deflection.runner.session import Session
 from psd_deflection.solvers.one_psd import NAME as ONE_PSD
@@ -107,41 +104,6 @@ class VoltsPublisher:
             for psd, topic in enumerate(VOLTS, 1):
                 for t_ns, fields in vector3_stamped.from_block(record, psd, self._frame_prefix):
                     self._wire.put(topic, vector3_stamped.MESSAGE.name, self._encode(fields), t_ns)
-
-
-class RigPublisher:
-    """Publishes rig, zero and hello of ``session``: on activation, at each change, and if the hello changes.
-
-    Changes come in the pipeline thread, between two blocks. Our own recordings hold the same without it.
-    """
-
-    def __init__(self, wire: PublisherWire, session: Session) -> None:
-        self._wire = wire
-        self._session = session
-        self._told: Mapping[str, object] | None = None
-        self._last = ParameterChange(0, 0, ())
-        self._environment: dict[str, object] = {}
-
-    def put_change(self, change: ParameterChange) -> None:
-        """Publish the rig after ``change``."""
-        self._last = change
-        self._environment |= {name: value for name, value in change.values if name in ENVIRONMENT}
-        self._publish(dict(change.values))
-
-    def tell(self, again: bool = True) -> None:
-        """Publish the present rig; with ``again`` False only if the hello is another than the one that was told."""
-        if again or self._hello() != self._told:
-            self._publish(self._environment)
-
-    def _hello(self) -> Mapping[str, object] | None:
-        hello = self._session.acquisition.hello
-        return None if hello is None else hello.info
-
-    def _publish(self, changed: Mapping[str, object]) -> None:
-        self._told = self._hello()
-        state = RigState(self._last.t_ns, self._last.block, self._session.rig.flat(), self._told, changed, __version__)
-        for message in to_messages(state):
-            self._wire.put(message.topic, message.type, cdr.encode(message.type, message.fields), time.time_ns())
 
 
 class InputRecorder:

@@ -150,7 +150,8 @@ def test_the_daemon_on_the_simulated_rig_shows_moving_dots_and_traces(
 
 def test_zero_and_record_work_on_this_machine(page: Page, start: Start, tmp_path: Path) -> None:
     # Taken as unloaded: dots 0.5 mm off those that the device has at rest. Its loads act along Y.
-    port = start('simulate', '--serve').until('port: (.+)')[1]
+    port = str(tmp_path / 'port')
+    start('simulate', '--serve', '--link', port).until('port: ')
     zeros = {'psd_1.zero': [5e-4, 0.0], 'psd_2.zero': [5e-4, 0.0]}
     # Neither takes over nor leaves behind a zero that a user of this machine has taken.
     rig = parameter_file(tmp_path, keep_zero=False, **zeros)

@@ -13,7 +13,7 @@ from typing import Any, cast
 import pytest
 
 from psd_deflection.cli._display import Display, live_line
-from psd_deflection.monitor.start import start_monitor
+from psd_deflection.monitor.start import start_views
 from psd_deflection.runner.headless import run_headless
 from psd_deflection.runner.session import Session
 from psd_deflection.runner.signals import Signals, StopRequestedError
@@ -32,7 +32,7 @@ def test_a_signal_ends_the_waiting_for_a_silent_device(
         os.kill(os.getpid(), number)
 
     threading.Thread(target=end, daemon=True).start()
-    assert run_headless({'port': str(device.link)}, Display().say, lambda session: None, start_monitor) == 0
+    assert run_headless({'port': str(device.link)}, Display().say, lambda session: None, start_views) == 0
     assert signal.getsignal(number) is before
 
 
@@ -60,7 +60,7 @@ def test_a_signal_ends_the_waiting_for_one_that_is_away(device: Any, sample: Any
     away: list[bool] = []
     shown: list[str] = []
     values: dict[str, object] = {'port': str(device.link), 'keep_zero': False, 'realtime': False}
-    assert run_headless(values, Display().say, look, start_monitor) == 0
+    assert run_headless(values, Display().say, look, start_views) == 0
     assert away
     assert 'no samples: the device is away' in shown[0]
 
