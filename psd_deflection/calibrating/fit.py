@@ -42,8 +42,8 @@ CLAMP_SHARE = 0.2
 FAR = 27.0
 """Squared distance of an outlier, of four residuals: one good row in 50 000."""
 STEPS, PASSES = 4, 4
-ZERO_PASSES = 4
-"""Fits after each of which the zeros of the recordings are taken anew."""
+ZERO_PASSES, SAME_ZERO = 4, 1e-8
+"""Fits after each of which the zeros of the recordings are taken anew, unless they change by less than that, m."""
 _FREE = 1.0
 """Standard deviation, m and rad, of a pose that nothing but the dots tells."""
 _HUBER = 3.0
@@ -320,9 +320,12 @@ def with_one_zero(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask) ->
     for _ in range(ZERO_PASSES if count > 1 else 0):
         inverse = weight_matrices(best.linear, rows, best.noise) * best.weights[:, None, None]
         weighted = np.einsum('nij,njk->nik', inverse, best.linear.slopes)
+        before = offsets.copy()
         for run in range(1, count):
             whole, _, pull = _of_zero(best.linear, weighted, rows.run == run)
             offsets[run] += np.linalg.solve(whole, pull)
+        if np.abs(offsets - before).max() < SAME_ZERO:
+            break
         rows = _moved(given, rig, best.values, offsets)
         best = fit(rows, rig, prior, kind, free=free, start=best)
     return rows, best

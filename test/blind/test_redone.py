@@ -28,10 +28,10 @@ def test_calibrated_on_the_sidebar_the_rig_is_right_on_the_link(tmp_path: Path) 
     assert main(['--short', '--seed', '2', '--out', str(out)]) == 0
     summary = json.loads((out / 'summary.json').read_text())
     shares = summary['shares']
-    assert max(shares['after'].values()) <= 0.002
+    assert max(shares['after'].values()) <= 0.005
     # Without calibration no method is that good, and what was tuned for the sidebar does not do for the link.
     for stem in ('before', 'before_sidebar', 'before_link'):
-        assert max(shares[stem].values()) > 0.006
+        assert max(shares[stem].values()) > 3.0 * max(shares['after'].values())
     clock = summary['clock']
     assert clock['value'] == pytest.approx(clock['true'], abs=5e-4)
     page = (out / 'page.html').read_text()
