@@ -1,6 +1,7 @@
 """Makes the pictures of the live page in docs/figures: ``make shots``; needs Chromium and its driver.
 
-The page shows the simulated rig; the pictures are taken after all load cases, with 50 N on the sidebar.
+The page shows the simulated rig after all load cases, with 50 N on the sidebar; then a recording in which a laser
+goes out, and a rig whose cable was pulled.
 """
 
 from __future__ import annotations
@@ -10,7 +11,9 @@ import base64
 import re
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from selenium.webdriver.support.ui import WebDriverWait
 
@@ -18,7 +21,9 @@ from tools.browser import open_browser
 from tools.program import PSD_DEFLECTION, WAIT_S, Program
 
 FIGURES = Path(__file__).resolve().parents[1] / 'docs' / 'figures'
-SHOTS = (('monitor', 1440, 900, 1.0, 'light', False),)
+MONITOR = ('monitor', 1440, 900, 1.0, 'light', False)
+LASER_OFF = ('monitor_laser_off', 1440, 900, 1.0, 'light', False)
+AWAY = ('monitor_away', 1440, 900, 1.0, 'light', False)
 THETA = 'return document.getElementById("theta").textContent'
 LOADED = r'\u22129[34]\d\.\d+'
 """The twist in mdeg when 50 N hang on the sidebar, which they do every ``LOAD_PERIOD_S``."""
@@ -28,9 +33,17 @@ PHONE = ('monitor_phone', 390, 844, 2.0, 'light', True)
 
 
 def take(
-    url: str, name: str, width: int, height: int, ratio: float, scheme: str, mobile: bool, seconds: float, loaded: bool
+    url: str,
+    name: str,
+    width: int,
+    height: int,
+    ratio: float,
+    scheme: str,
+    mobile: bool,
+    seconds: float,
+    ready: Callable[[Any], bool] = lambda driver: True,
 ) -> None:
-    """One picture."""
+    """One picture, once ``seconds`` of data were drawn and the page is ``ready``."""
     driver = open_browser(Path(tempfile.mkdtemp()))
     try:
         driver.execute_cdp_cmd(
@@ -44,12 +57,32 @@ def take(
         driver.execute_script("document.documentElement.style.scrollbarWidth = 'none'")
         wait = WebDriverWait(driver, seconds + LOAD_PERIOD_S + WAIT_S, poll_frequency=0.2)
         wait.until(lambda d: int(d.execute_script('return document.body.dataset.rows ?? 0')) >= BLOCKS_PER_S * seconds)
-        if loaded:
-            wait.until(lambda d: re.fullmatch(LOADED, d.execute_script(THETA)), 'no 50 N on the sidebar')
+        wait.until(ready)
         shot = driver.execute_cdp_cmd('Page.captureScreenshot', {})
         (FIGURES / f'{name}.png').write_bytes(base64.b64decode(shot['data']))
     finally:
         driver.quit()
+
+
+def loaded(driver: Any) -> bool:
+    """Whether 50 N hang on the sidebar."""
+    return re.fullmatch(LOADED, driver.execute_script(THETA)) is not None
+
+
+def says(*texts: str) -> Callable[[Any], bool]:
+    """Whether the page shows one of ``texts``."""
+    return lambda driver: any(text in driver.execute_script('return document.body.innerText') for text in texts)
+
+
+def away_without(device: Program) -> Callable[[Any], bool]:
+    """Pull the cable at the first question; then whether the page says so."""
+    away = says('no samples')
+
+    def ready(driver: Any) -> bool:
+        device.end()
+        return away(driver)
+
+    return ready
 
 
 def main() -> int:
@@ -57,13 +90,30 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seconds', type=float, default=40.0, help='before the first picture')
     seconds = parser.parse_args().seconds
-    program = Program([*PSD_DEFLECTION, 'monitor', '--http-port', '0'])
-    try:
-        url = program.until(r'monitor: (http\S+)')[1]
-        for i, shot in enumerate((*SHOTS, PHONE)):
-            take(url, *shot, seconds if i == 0 else 4.0, i == 0 and seconds > 10.0)
-    finally:
-        program.end()
+    monitor = [*PSD_DEFLECTION, 'monitor', '--http-port', '0']
+    with tempfile.TemporaryDirectory() as folder:
+        program = Program(monitor)
+        try:
+            url = program.until(r'monitor: (http\S+)')[1]
+            take(url, *MONITOR, seconds, loaded if seconds > 10.0 else lambda driver: True)
+            take(url, *PHONE, 4.0)
+        finally:
+            program.end()
+        program = Program([*monitor, 'bags/laser_off', '--loop'], FIGURES.parents[1])
+        try:
+            take(program.until(r'monitor: (http\S+)')[1], *LASER_OFF, 1.0, says('laser 1 lost', 'laser 2 lost'))
+        finally:
+            program.end()
+        port = f'{folder}/rig_port'
+        device = Program([*PSD_DEFLECTION, 'simulate', '--serve', '--link', port])
+        device.until('port: ')
+        program = Program([*monitor, '--port', port])
+        try:
+            url = program.until(r'monitor: (http\S+)')[1]
+            take(url, *AWAY, 3.0, away_without(device))
+        finally:
+            program.end()
+            device.end()
     return 0
 
 
