@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--out', metavar='OUT', help='X.csv, X.mcap or a bag folder')
     parser.add_argument('--frames', type=whole('--frames', 1), metavar='N', help='stop after so many frames')
     parser.add_argument(
-        '--show', metavar='PNG', help='once a second, write the frame with what was found in it to this picture'
+        '--show', metavar='FILE.png', help='once a second, write the frame with what was found in it to this picture'
     )
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')
 
