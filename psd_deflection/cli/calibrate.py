@@ -8,7 +8,7 @@ holds what the calibration left open), report.html and calibration.json.
 --self takes recordings without reference and loads: the one redundant reading tells relative gains and turns.
 
   psd-deflection calibrate run.csv --params-file my_rig.yaml --out new
-  psd-deflection calibrate run.csv --reference camera.csv --exposure 0.002 --params-file my_rig.yaml --out new
+  psd-deflection calibrate run.csv --reference camera.csv --out new
   psd-deflection calibrate today.csv --check new/rig.yaml
   psd-deflection calibrate run --self --params-file my_rig.yaml --out new
 """

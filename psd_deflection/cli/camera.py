@@ -10,7 +10,8 @@ bag folder have /reference/deflection and /reference/deflection_with_covariance.
 
   psd-deflection camera target --out target.pdf
   psd-deflection camera frames --params-file camera.yaml --out reference.csv
-  psd-deflection camera /dev/video0 --params-file camera.yaml --out run.mcap --show now.png
+  psd-deflection camera /dev/video0 --params-file camera.yaml --out run.mcap
+  psd-deflection camera /dev/video0 --out run.csv --show now.png
   psd-deflection camera intrinsics shots/*.png --out camera_info.yaml
   ros2 run psd_deflection camera --ros-args -r image:=/camera/image_raw
 """
