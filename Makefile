@@ -20,6 +20,7 @@
 # make shots    the pictures of the live page in docs/figures anew (needs Chromium)
 # make blind    hide effects with a second generator and see whether discover names them (an hour or two on two cores; JOBS=1 for one)
 # make blind-calibration  200 rigs of the second generator, misaligned by chance, calibrated and checked (half an hour on two idle cores; RIGS=20 for a look)
+# make blind-laws  laws that no catalogue has, drawn by chance: does discover find where they act and on what they depend (a quarter of an hour on an idle core; LAWS='--first 500' for fresh ones)
 # make camera-campaign  render 10,000 frames, most of them bad, and see whether the camera is right about each (two hours)
 # make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
 # make demo-thesis  the experiment of the thesis redone: camera, calibrate, validate on one page (some minutes; THESIS=--short: seconds)
@@ -36,7 +37,7 @@ PYTEST ?=
 WORKERS ?= 2
 BIN := $(VENV)/bin
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks axe shots blind blind-calibration camera-campaign demo-discover demo-thesis colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws camera-campaign demo-discover demo-thesis colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -169,6 +170,10 @@ blind: $(VENV)/.installed
 RIGS ?= 200
 blind-calibration: $(VENV)/.installed
 	OMP_NUM_THREADS=1 $(BIN)/python -m blind.calibration --rigs $(RIGS) --jobs $(JOBS)
+
+LAWS ?=
+blind-laws: $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m blind.laws --jobs $(JOBS) $(LAWS)
 
 # Rendered frames: errors, cost, and adverse frames, of which no answer may be wrong (two hours on an idle core).
 CAMERA_FRAMES ?= 10000

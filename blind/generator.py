@@ -18,6 +18,8 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.stats import norm
 
+from blind import law_forms
+
 Array = npt.NDArray[np.float64]
 Spec = Mapping[str, Any]
 
@@ -78,9 +80,14 @@ def _oscillator(frequency: float, ratio: float) -> tuple[Array, Array]:
     return np.array([[0.0, 1.0], [-w * w, -2.0 * ratio * w]]), np.array([[0.0], [w * w]])
 
 
-def motion(loads: Array, length: float, effects: Sequence[Spec]) -> Array:
-    """Tip pose (n * FINER, 3): dX, dY, theta on the fine grid."""
+def motion(loads: Array, length: float, effects: Sequence[Spec], warm: Array | None = None) -> Array:
+    """Tip pose (n * FINER, 3): dX, dY, theta on the fine grid. ``warm`` (n,), K, for laws of the temperature."""
     f = loads.copy()
+    known = dict(zip(law_forms.LOADS, loads.T, strict=True))
+    known['temperature'] = np.zeros(len(loads)) if warm is None else warm
+    at = np.arange(len(loads)) / RATE
+    for e in find(effects, 'law_load'):
+        f[:, law_forms.LOADS.index(e['where'])] += e['size'] * law_forms.added(e, known, at, 1.0 / RATE)
     for e in find(effects, 'load_direction'):
         c, s = math.cos(e['angle']), math.sin(e['angle'])
         f[:, :2] = f[:, :2] @ np.array([[c, s], [-s, c]])
@@ -115,6 +122,8 @@ def motion(loads: Array, length: float, effects: Sequence[Spec]) -> Array:
         static = static * (1.0 + e['size'] * (static / np.array([1e-3, 1e-3, 1e-2])) ** 2)
     for e in find(effects, 'alien_quadratic_load'):
         static[:, 1] += e['size'] * f[:, 1] ** 2
+    for e in find(effects, 'law_link'):
+        static[:, law_forms.LOADS.index(e['where'])] += e['size'] * law_forms.added(e, known, at, 1.0 / RATE)
     for e in find(effects, 'clamp_friction'):
         levers = (length, length, 1.0)
         axes = {1: (0, 1), 2: (2,), 3: (0, 1, 2)}[int(e['axis'])]
@@ -165,7 +174,9 @@ def motion(loads: Array, length: float, effects: Sequence[Spec]) -> Array:
     return pose
 
 
-def optics(pose: Array, t: Array, warm: Array, length: float, effects: Sequence[Spec]) -> Array:
+def optics(
+    pose: Array, t: Array, warm: Array, length: float, effects: Sequence[Spec], loads: Array | None = None
+) -> Array:
     """Dots (n, 4), m, by intersecting each beam with the plate in space."""
     n = len(pose)
     k = sum(e['slope_ratio'] for e in find(effects, 'plane_tilt'))
@@ -187,6 +198,11 @@ def optics(pose: Array, t: Array, warm: Array, length: float, effects: Sequence[
         for e in find(effects, 'laser_pointing_drift'):
             if int(e['psd']) == i + 1:
                 beam = beam + t[:, None] * np.array([e['rate_x'], e['rate_y']])
+        for e in find(effects, 'law_optics'):
+            column = law_forms.DOTS.index(e['where'])
+            if column // 2 == i and loads is not None:
+                known = {**dict(zip(law_forms.LOADS, loads.T, strict=True)), 'temperature': warm}
+                beam[:, column % 2] += e['size'] * law_forms.added(e, known, t, STEP)
         for e in find(effects, 'refraction'):
             beam = beam + warm[:, None] * np.array([e['x'], e['y']])
         # middle + a ex + b ey = (beam, s): three equations for a, b and the height s.
@@ -257,6 +273,10 @@ def sensors(dots: Array, t: Array, warm: Array, effects: Sequence[Spec]) -> tupl
             m[:, cols[0]] += e['x'] * warm
             m[:, cols[1]] += e['y'] * warm
     _alien_sensors(m, t, warm, effects)
+    for e in (*find(effects, 'law_psd'), *find(effects, 'law_electronics')):
+        if e['form'] != 'jitter':
+            known = {**dict(zip(law_forms.DOTS, m.T, strict=True)), 'temperature': warm}
+            m[:, law_forms.DOTS.index(e['where'])] += e['size'] * law_forms.added(e, known, t, STEP)
     return m, light
 
 
@@ -347,6 +367,17 @@ def noise(n: int, kind: str, seed: int) -> Array:
     return SIGMA * e
 
 
+def jitter(volts: Array, effects: Sequence[Spec], seed: int) -> Array:
+    """Noise (n, 6), V, whose rms follows the size of one channel's own voltage."""
+    out = np.zeros_like(volts)
+    for e in find(effects, 'law_electronics'):
+        if e['form'] == 'jitter':
+            c = (0, 1, 3, 4)[law_forms.DOTS.index(e['where'])]
+            hiss = np.random.default_rng(seed + 1).normal(size=len(volts))
+            out[:, c] = e['size'] / law_forms.FULL[e['where']] * np.abs(volts[:, c]) * hiss
+    return out
+
+
 def electronic_noise(
     n: int, seed: int, *, sigmas: Sequence[float] = (SIGMA,) * 6, memory: float = 0.0, heavy: bool = False
 ) -> Array:
@@ -385,20 +416,22 @@ class Generator:
         """Volts (n, 6) without noise, before clipping and steps."""
         moving = [e for e in effects if e['name'] in LINK]
         key = repr(moving)
+        warmer = self.temperature - self.temperature[0]
         if key not in self._poses:
             if len(self._poses) > 2:
                 self._poses = {k: v for k, v in self._poses.items() if k == '[]'}
-            self._poses[key] = motion(self.loads, self.length, moving)
+            self._poses[key] = motion(self.loads, self.length, moving, warmer)
         pose = self._poses[key]
         t = np.arange(len(pose), dtype=np.float64) * STEP
-        warm = np.repeat(self.temperature - self.temperature[0], FINER)
-        m, light = sensors(optics(pose, t, warm, self.length, effects), t, warm, effects)
+        warm = np.repeat(warmer, FINER)
+        dots = optics(pose, t, warm, self.length, effects, np.repeat(self.loads, FINER, axis=0))
+        m, light = sensors(dots, t, warm, effects)
         return electronics(m, light, t, effects)
 
     def record(self, effects: Sequence[Spec], kind: str, seed: int) -> Array:
         """Volts (n, 6) as read by a converter."""
         clean = self.clean(effects)
-        return output(clean + noise(len(clean), kind, seed), effects)
+        return output(clean + noise(len(clean), kind, seed) + jitter(clean, effects, seed), effects)
 
 
 LINK = frozenset(
@@ -406,6 +439,7 @@ LINK = frozenset(
         *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
         *('clamp_friction', 'creep', 'damping', 'tip_mass', 'second_bending_mode', 'self_weight', 'mount_tilt'),
         *('load_offset', 'load_direction', 'alien_cubic_spring', 'alien_quadratic_load', 'alien_soft_mode'),
+        *('law_load', 'law_link'),
     )
 )
 """Effects that change the motion, and with it the slow part of a run."""

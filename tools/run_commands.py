@@ -79,6 +79,7 @@ SHORTEST = {
     'camera-campaign': 'CAMERA_FRAMES=20',
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
     'blind-calibration': 'RIGS=1',
+    'blind-laws': 'LAWS="--laws 1 --nulls 0"',
     'shots': 'SHOT_SECONDS=2',
 }
 """Variables with which a ``make`` target takes only seconds."""
@@ -98,6 +99,7 @@ VERDICTS = {
     'crash': r'\d+ kills: ',
     'soak': r'real time: \d+ samples lost',
     'camera-campaign': r'adverse frames: ',
+    'blind-laws': r'right variables',
     'blind': r'failures \(\d+\)',
 }
 """What a campaign says at its end: cut short, on a busy machine, it may come to another verdict than in full."""

@@ -7,7 +7,8 @@ several, or a .yaml list of recordings with the parameters that differ in each:
     overrides: {link.length: 0.4}
 
 DIR gets model.yaml (the rig with the effects found; use it as --params-file), report.html and
-result.json. The exit status is 0 whatever was found.
+result.json. Where no effect fits, DIR also gets law.yaml: an empirical law for what remains. With --adopt NAME
+the law becomes an effect of yours, and model.yaml has it. The exit status is 0 whatever was found.
 
   psd-deflection discover odd.csv --out found
   psd-deflection discover a.csv b.csv --params-file my_rig.yaml --out found
@@ -19,6 +20,7 @@ import argparse
 import json
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from tqdm import tqdm
@@ -35,7 +37,9 @@ from psd_deflection.discovery.result import model_yaml, result, sentence
 from psd_deflection.errors import RecordingError, UsageError
 from psd_deflection.parameter_files import with_effects_section, with_values
 from psd_deflection.recordings.observations import read_observations
-from psd_deflection.simulation.catalogue import effect_names, effects_to_values
+from psd_deflection.simulation.catalogue import FOLDERS, effect_folders, effect_names, effects_to_values
+from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.simulation.laws import Law, effect_of, law_text, values_of
 
 STEPS = 8
 """Steps that the progress bar counts: described, signatures, adding, weighing, alternatives, where, report, done."""
@@ -58,6 +62,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help='do not consider this effect; repeatable',
     )
+    parser.add_argument(
+        '--adopt',
+        metavar='NAME',
+        help='if a law is found, write it as the effect NAME to the folder of your effects and into model.yaml',
+    )
     namespace_option(parser)
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     parser.add_argument('--json', action='store_true', help='print the content of result.json')
@@ -69,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
     for name in args.without:
         if name not in effect_names():
             raise UsageError(f'--without {name}: no effect of that name; there are: {", ".join(effect_names())}')
+    folder = None if args.adopt is None else _adopting(args.adopt)
     with told('reading', quiet=args.quiet or args.json):
         observations = read_observations(args.recordings, given, namespace=args.namespace, warn=warn, any_rate=True)
     out = Path(args.out)
@@ -92,10 +102,21 @@ def run(args: argparse.Namespace) -> int:
         bar.set_description_str('done')
         bar.update(STEPS - bar.n)
     in_json = json.dumps(result(found), indent=1, allow_nan=False)
+    laws = [] if found.law is None else found.law.adopted(args.adopt or 'law')
+    adopted: list[Path] = []
+    if folder is not None and laws:
+        make_folder(str(folder))
+        adopted = [folder / f'{law.name}.yaml' for law in laws]
+        for law, path in zip(laws, adopted, strict=True):
+            save(_law_file(law).encode(), path)
     files = {
-        'model.yaml': _model(args.params_file, rig, found),
+        'model.yaml': _model(args.params_file, rig, found, _with_law(found, laws) if adopted else found.active_effects),
         'result.json': in_json + '\n',
         'report.html': page,
+        **{
+            f'{law.name if args.adopt is None else law.name.replace(args.adopt, "law", 1)}.yaml': _law_file(law)
+            for law in laws
+        },
     }
     for name, text in files.items():
         save(text.encode(errors='replace'), out / name)
@@ -110,20 +131,54 @@ def run(args: argparse.Namespace) -> int:
             show(f'to tell {effect.active.effect.name} from {", ".join(effect.equivalent)}: {effect.suggestion.text}')
     for unknown in found.unknown:
         show(f'unknown: {unknown.signature}')
+    for path in adopted:
+        show(f'{path.stem} is an effect now: {path}')
+    if laws and args.adopt is None:
+        show(f'law: {out / "law.yaml"}; --adopt NAME makes it an effect')
+    elif args.adopt is not None and not laws:
+        show(f'--adopt {args.adopt}: there is no law to adopt')
     show(f'{found.simulations} forward simulations; see {out / "report.html"}')
     return 0
 
 
-def _model(params_file: str | None, rig: Rig, found: Discovery) -> str:
+def _adopting(name: str) -> Path:
+    """The folder for the effect ``name``; raises UsageError before a search that could not be adopted."""
+    if not name.isidentifier() or name.startswith('_'):
+        raise UsageError(f'--adopt {name}: must be a name of letters, digits and underscores, such as base_yields')
+    if name in effect_names():
+        raise UsageError(f'--adopt {name}: there is an effect of that name; give another')
+    folders = effect_folders()
+    if not folders:
+        raise UsageError(f'--adopt {name}: there is no folder for your effects; set {FOLDERS}')
+    return folders[0]
+
+
+def _law_file(law: Law) -> str:
+    return law_text(
+        law,
+        (
+            f'Found by psd-deflection discover {__version__}: no effect of the catalogue explains this.',
+            f'Edit it, and put it as NAME.yaml, with name: NAME, into a folder of effects ({FOLDERS}).',
+        ),
+    )
+
+
+def _with_law(found: Discovery, laws: Sequence[Law]) -> list[ActiveEffect]:
+    """The effects of the model that has the law."""
+    beside = [] if found.law is None else [a for a in found.law.beside if a.effect.name in effect_names()]
+    return [*found.known, *beside, *(ActiveEffect(effect_of(law), values_of(law)) for law in laws)]
+
+
+def _model(params_file: str | None, rig: Rig, found: Discovery, effects: Sequence[ActiveEffect]) -> str:
     """The user's parameter file with the effects, comments kept; without one what describes the rig.
 
     What was wrong in the rig file is right in the model.
     """
 
     def edit(text: str, path: Path) -> str:
-        text = with_effects_section(text, effects_to_values(found.active_effects), path)
+        text = with_effects_section(text, effects_to_values(effects), path)
         if not found.lines:
             return text
         return with_values(text, found.lines, f'Put right by psd-deflection {__version__}', path)
 
-    return rig_file(params_file, 'model.yaml', lambda: model_yaml(rig, found.active_effects), edit)
+    return rig_file(params_file, 'model.yaml', lambda: model_yaml(rig, effects), edit)

@@ -23,6 +23,7 @@ from psd_deflection.discovery.coincidence import Coincidence, coincidences
 from psd_deflection.discovery.experiment import Suggestion, suggest
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.hidden import FIRST, SETUP, beginning, mistakes
+from psd_deflection.discovery.laws import FoundLaw, find_law
 from psd_deflection.discovery.localise import Localisation, localise
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.screen import Screen
@@ -99,7 +100,7 @@ class Discovery:
     """The answer. Gaps in m (rms of block means over x1 y1 x2 y2).
 
     ``setup``: mistakes of the set-up and the recording, with ``lines`` that put the rig file right; ``known``: the
-    effects that the rig file has already.
+    effects that the rig file has already. ``law``: describes what is unknown; it is in no gap and no effect here.
     """
 
     verdict: str
@@ -122,6 +123,7 @@ class Discovery:
     setup: tuple[Finding, ...]
     lines: Mapping[str, object]
     known: tuple[ActiveEffect, ...]
+    law: FoundLaw | None = None
 
     @property
     def floors(self) -> float:
@@ -366,6 +368,16 @@ def _answer(
     if lattice is not None:
         null = refit(ws, ())
         ws.base = (*ws.base, lattice)
+    law = None
+    # Coarse steps cause noise that varies with the signal, which is no law.
+    if lattice is None and (
+        _unknown(left, 1.0) or ws.gap(fit.difference) > UNSAID * ws.floor() or coincidences(fit, ws.physics)
+    ):
+        law = find_law(ws, null, fit, search.penalty, left.excess, rng, progress)
+    if law is not None:
+        fit, heldout = _beside(law, search, result, fit, heldout)
+        explains = null.residual - fit.residual if fit.free else None
+        left = localise(ws, fit.residual, fit.jacobian if fit.free else None, rng, explained=explains)
     progress('alternatives')
     named = _named(search, result, fit, heldout)
     setup, lines = list(checked.findings), dict(checked.lines)
@@ -414,7 +426,22 @@ def _answer(
         tuple(setup),
         lines,
         checked.known,
+        law if verdict == 'unknown_effect' else None,
     )
+
+
+def _beside(
+    law: FoundLaw, search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut]
+) -> tuple[Fit, list[HeldOut]]:
+    """``fit`` without the effects that only stood in for the law."""
+    kept = {(a.effect.name, a.choices) for a in law.beside}
+    for i in reversed(range(len(fit.effects))):
+        active = fit.effects[i]
+        if (active.effect.name, active.choices) not in kept:
+            search.trace.append(f'{active.label} only stood in for the law')
+            fit = _without(search.workspace, result, fit, i)
+            heldout = [h for j, h in enumerate(heldout) if j != i]
+    return fit, heldout
 
 
 def _named(search: Search, result: SearchResult, fit: Fit, heldout: Sequence[HeldOut]) -> list[NamedEffect]:

@@ -11,11 +11,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from psd_deflection.discovery.discover import Discovery, NamedEffect
+from psd_deflection.discovery.law_features import known_values
+from psd_deflection.discovery.laws import FoundLaw
 from psd_deflection.discovery.result import parameters_of, provenance, sentence, size_of
 from psd_deflection.discovery.screen import Score
 from psd_deflection.discovery.trust import BANDS
 from psd_deflection.pages import page, picture, table
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
+from psd_deflection.simulation.laws import VARIABLES
 
 BEFORE, AFTER, HELD, FLOOR = '#c44e52', '#4c72b0', '#55a868', '#8c8c8c'
 DOTS = ('x1', 'y1', 'x2', 'y2')
@@ -148,6 +151,51 @@ def _effect_section(effect: NamedEffect) -> str:
     return ''.join(out)
 
 
+def _law_figure(discovery: Discovery, found: FoundLaw) -> Figure:
+    """What is missing and what the law leaves against its first variable, in the channel where it shows most."""
+    ws, name = discovery.workspace, found.law.variables[0]
+    _, alone = ws.residual([*ws.base, *found.beside])
+    missing, left = ws.block_dots(alone), ws.block_dots(found.fit.difference)
+    moved = np.concatenate([a - b for a, b in zip(missing, left, strict=True)], axis=1)
+    row = int(np.argmax(np.nansum(moved**2, axis=1)))
+    axis_values = known_values(ws, found.beside, name)
+    scale, unit = (1e3, f'm{VARIABLES[name]}') if VARIABLES[name] in ('m', 'rad') else (1.0, VARIABLES[name])
+    figure = Figure(figsize=(10, 3.4), layout='constrained')
+    axes = figure.subplots(1, 2, sharey=True)
+    at = np.concatenate(axis_values) * scale
+    before, after = (np.concatenate([b[row] for b in blocks]) * 1e6 for blocks in (missing, left))
+    axes[0].plot(at, before, '.', ms=2, color=BEFORE, label='missing')
+    axes[0].plot(at, moved[row] * 1e6, '.', ms=1.5, color='black', label='law')
+    axes[1].plot(at, after, '.', ms=2, color=AFTER, label='left with the law')
+    for axis in axes:
+        axis.set_xlabel(f'{name} / {unit}')
+        axis.grid(alpha=0.25)
+        axis.legend(frameon=False)
+    axes[0].set_ylabel(f'{DOTS[row]} / µm')
+    figure.suptitle(f'measured minus simulated {DOTS[row]} against {name}, block means')
+    return figure
+
+
+def _law_section(discovery: Discovery, found: FoundLaw) -> str:
+    law = found.law
+    out = [f'<h3>A law for it</h3><p>{"<br>".join(html.escape(e.expression) for e in found.laws)}</p>']
+    beside = ', '.join(a.label for a in found.beside)
+    out.append(
+        f'<p>Stage {law.stage}, {law.kind}; it shows on {", ".join(found.channels)}'
+        f'{f"; fitted beside {html.escape(beside)}" if beside else ""}. On unseen load cases '
+        f'{1e6 * found.heldout_gap:.3f} µm remain. BIC better by {found.delta_bic:.1f}; p over all terms that '
+        f'were tried {found.p:.2g}; log-likelihood on unseen load cases {found.heldout.gain:+.1f} ± '
+        f'{found.heldout.error:.1f}. It is an empirical law and not in model.yaml unless it is adopted.</p>'
+    )
+    if law.kind != 'variance':
+        out.append(picture(_law_figure(discovery, found), 'what is missing against its variable, with the law'))
+    if found.equivalent:
+        rows = [(e.stage, ', '.join(e.variables), e.expression) for e in found.equivalent]
+        out.append('<p>This recording cannot tell it from:</p>')
+        out.append(table(('stage', 'depends on', 'law'), rows))
+    return ''.join(out)
+
+
 def _where_table(discovery: Discovery) -> str:
     names = [o.name for o in discovery.workspace.observations]
     rows = [
@@ -185,6 +233,8 @@ def report_html(discovery: Discovery) -> str:
         body.append(
             f'<p>{html.escape(u.signature)}. It is {100 * u.explains:.0f} % of what was to be explained; {where}.</p>'
         )
+    if discovery.law is not None:
+        body.append(_law_section(discovery, discovery.law))
     body.append('<h2>Where</h2>')
     body.append(picture(_where_figure(discovery), 'where simulation and data part'))
     body.append(_where_table(discovery))

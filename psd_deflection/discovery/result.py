@@ -11,6 +11,7 @@ import yaml
 from psd_deflection import __version__
 from psd_deflection.config import DESCRIPTION, Rig
 from psd_deflection.discovery.discover import Discovery, NamedEffect, Rival
+from psd_deflection.discovery.laws import FoundLaw
 from psd_deflection.simulation.catalogue import effects_to_values
 from psd_deflection.simulation.declaration import ActiveEffect
 
@@ -80,9 +81,9 @@ def result(discovery: Discovery) -> dict[str, Any]:
             'depends_on': list(u.depends_on),
             'explains': u.explains,
             'rms': u.rms,
-            'law': None,
+            'law': None if i or discovery.law is None else law_of(discovery.law),
         }
-        for u in discovery.unknown
+        for i, u in enumerate(discovery.unknown)
     ]
     return {
         'verdict': discovery.verdict,
@@ -111,6 +112,32 @@ def result(discovery: Discovery) -> dict[str, Any]:
             'per_channel': {k: {'before': a, 'after': b} for k, (a, b) in discovery.per_channel.items()},
         },
         'provenance': provenance(discovery),
+    }
+
+
+def law_of(found: FoundLaw) -> dict[str, Any]:
+    """The tree of ``law``."""
+    law = found.law
+    return {
+        'stage': law.stage,
+        'acts_on': law.acts_on,
+        'channels': list(found.channels),
+        'variables': list(law.variables),
+        'kind': law.kind,
+        'expression': law.expression,
+        'further': [e.expression for e in found.further],
+        'heldout_after': found.heldout_gap,
+        'beside': [a.label for a in found.beside],
+        'equivalent': [
+            {'stage': e.stage, 'acts_on': e.acts_on, 'variables': list(e.variables), 'expression': e.expression}
+            for e in found.equivalent
+        ],
+        'evidence': {
+            'delta_bic': _number(found.delta_bic),
+            'p': _number(found.p),
+            'heldout_gain': _number(found.heldout.gain),
+            'heldout_gain_error': _number(found.heldout.error),
+        },
     }
 
 
@@ -182,7 +209,21 @@ def _setup(discovery: Discovery) -> str:
 
 def sentence(discovery: Discovery) -> str:
     """The verdict in one sentence, after one about the set-up if that is wrong."""
-    return _setup(discovery) + _missing(discovery)
+    return _setup(discovery) + _missing(discovery) + _law(discovery)
+
+
+def _law(discovery: Discovery) -> str:
+    """The law for what is unknown, in a sentence, or nothing."""
+    if discovery.law is None:
+        return ''
+    found = discovery.law
+    expressions = '; '.join(e.expression for e in found.laws)
+    words = f' What remains follows a law ({found.law.stage}, {found.law.kind}): {expressions}'
+    beside = [a.effect.name for a in found.beside]
+    named = {e.active.effect.name for e in discovery.effects}
+    with_law = f'; on unseen load cases it leaves {1e6 * found.heldout_gap:.3f} µm'
+    also = f', beside {", ".join(beside)}' if beside and set(beside) != named else ''
+    return f'{words}{also}{with_law}.'
 
 
 def _missing(discovery: Discovery) -> str:

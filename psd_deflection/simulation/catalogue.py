@@ -2,9 +2,9 @@
 
 An effect is one file with one :class:`~psd_deflection.simulation.declaration.Effect` called
 ``EFFECT``; the file has the effect's name. Adding a file to ``effects/`` or to a folder of
-``$PSD_DEFLECTION_EFFECTS`` adds an effect; so does an entry point of the group
-``psd_deflection.effects`` of another package. In a rig file the effects are listed below
-``effects:``, one map each, under any key::
+``$PSD_DEFLECTION_EFFECTS`` adds an effect; in such a folder it may also be a law in YAML (:mod:`.laws`).
+So does an entry point of the group ``psd_deflection.effects`` of another package. In a rig file the
+effects are listed below ``effects:``, one map each, under any key::
 
     effects:
       sensor_rotation_2: {name: sensor_rotation, psd: 2, angle: 0.01}
@@ -64,7 +64,7 @@ def _places() -> dict[str, Place]:
     others: list[tuple[str, Place]] = []
     for folder in dict.fromkeys(effect_folders()):
         try:
-            files = sorted(f for f in folder.iterdir() if f.suffix == '.py')
+            files = sorted(f for f in folder.iterdir() if f.suffix in ('.py', '.yaml'))
         except OSError as error:
             # The default folder is optional, and a service may not be allowed to read a home.
             if FOLDERS in os.environ:
@@ -90,6 +90,11 @@ def effect_names() -> list[str]:
 
 @functools.cache
 def _of_file(path: Path) -> object:
+    if path.suffix == '.yaml':
+        # Imported here: it needs the filters, which a rig without laws does not.
+        from psd_deflection.simulation.laws import effect_of, read_law
+
+        return effect_of(read_law(path))
     spec = importlib.util.spec_from_file_location(f'{__name__}.{path.stem}', path)
     if spec is None or spec.loader is None:
         raise ImportError(f'{path} is not a Python file')
@@ -103,6 +108,8 @@ def _of_file(path: Path) -> object:
 def _load(name: str, place: Place) -> Effect:
     try:
         found = _of_file(place) if isinstance(place, Path) else place.load()
+    except ConfigError:
+        raise
     except (Exception, SystemExit) as error:
         # A user's file may raise anything; the message names the file and the cause.
         raise ConfigError(f'{_words(place)}: holds no effect ({type(error).__name__}: {error})') from error

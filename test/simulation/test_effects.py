@@ -18,7 +18,7 @@ from psd_deflection.records import FloatArray, RawChunk, TipLoad
 from psd_deflection.simulation import loads
 from psd_deflection.simulation.catalogue import catalogue, effects_of_rig, effects_to_values, make_active
 from psd_deflection.simulation.declaration import ActiveEffect, Effect
-from psd_deflection.simulation.effects.clamp_friction import play
+from psd_deflection.simulation.hysteresis import play
 from psd_deflection.simulation.physics import Physics
 from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
 

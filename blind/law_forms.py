@@ -1,0 +1,187 @@
+"""Laws that no catalogue has, drawn by chance over stage, variable and form; formulas of their own.
+
+Everything is computed on the generator's fine grid, sample by sample where there is a memory. Nothing is taken from
+``psd_deflection``. A law that an effect of the catalogue makes as well (a cubic r² non-linearity, a lag, a loop of the
+clamp ...) is not drawn.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Spec = Mapping[str, Any]
+
+LOADS = ('load_fx', 'load_fy', 'load_tz')
+DOTS = ('x1', 'y1', 'x2', 'y2')
+FULL = {'load_fx': 30.0, 'load_fy': 50.0, 'load_tz': 29.0, 'temperature': 3.5, **dict.fromkeys(DOTS, 2e-3)}
+"""About the largest value of each variable in the experiment, in which the shapes are drawn."""
+
+STATIC = ('square', 'cube', 'stop', 'dead_band', 'saturation', 'product', 'hop', 'magnitude')
+OF_STAGE: Mapping[str, tuple[str, ...]] = {
+    'load': ('square', 'cube', 'stop', 'dead_band', 'saturation', 'product', 'hop', 'events', 'fading_square'),
+    'link': ('square', 'cube', 'stop', 'dead_band', 'hop', 'events', 'fading_square', 'resonance'),
+    'optics': ('square', 'stop', 'hop', 'events', 'product'),
+    'psd': (
+        'square',
+        'cube',
+        'stop',
+        'dead_band',
+        'saturation',
+        'product',
+        'hop',
+        'magnitude',
+        'rate',
+        'drag',
+        'stick',
+    ),
+    'electronics': ('dead_band', 'saturation', 'events', 'gain_events', 'rate', 'fading_square', 'jitter'),
+}
+KIND_OF = {
+    **dict.fromkeys(STATIC, 'static'),
+    'hop': 'switched',
+    'events': 'switched',
+    'gain_events': 'switched',
+    'rate': 'rate',
+    'drag': 'rate',
+    'fading_square': 'history',
+    'stick': 'history',
+    'resonance': 'resonance',
+    'jitter': 'variance',
+}
+
+
+def draw(seed: int, stage: str, form: str) -> dict[str, Any]:
+    """A law without its size: where it acts, on what it depends, its shapes."""
+    rng = np.random.default_rng((seed, len(stage), len(form)))
+    where = str(rng.choice(LOADS if stage in ('load', 'link') else DOTS))
+    if stage in ('load', 'link'):
+        of = [str(rng.choice(LOADS))]
+    elif stage == 'optics':
+        of = ['temperature'] if rng.random() < 0.5 else [str(rng.choice(LOADS))]
+    else:
+        # The other axis of the same PSD, or the same one.
+        of = [where if rng.random() < 0.5 else DOTS[DOTS.index(where) ^ 1]]
+    if form == 'resonance':
+        # The mode of a load's own direction is in the catalogue.
+        of = [str(rng.choice([n for n in LOADS if n != where]))]
+    if form in ('dead_band', 'saturation', 'jitter') and stage in ('psd', 'electronics'):
+        of = [where]
+    if form in ('rate', 'drag') and form == 'rate':
+        # A delay of one's own reading is in the catalogue.
+        of = [DOTS[DOTS.index(where) ^ 1]]
+    if form == 'product':
+        others = [n for n in ((*LOADS, 'temperature') if stage in ('load', 'optics') else DOTS) if n not in of]
+        of.append(str(rng.choice(others)))
+    if form == 'events':
+        of = []
+    times = np.sort(rng.uniform(2.0, 22.0, int(rng.integers(1, 5)))).tolist() if 'events' in form else []
+    return {
+        'name': f'law_{stage}',
+        'form': form,
+        'where': where,
+        'of': of,
+        'at': float(rng.uniform(0.15, 0.6)),
+        'sign': float(rng.choice((-1.0, 1.0))),
+        'time_constant': float(np.exp(rng.uniform(math.log(0.2), math.log(4.0)))),
+        'frequency': float(rng.uniform(30.0, 70.0)),
+        'times': [round(t, 3) for t in times],
+    }
+
+
+def truth_of(law: Spec) -> dict[str, Any]:
+    """What an answer must say: stage, what it acts on, variables, kind."""
+    variables = [*law['of'], *(['time'] if law['times'] else [])]
+    return {
+        'stage': law['name'].removeprefix('law_'),
+        'where': law['where'],
+        'variables': sorted(set(variables)),
+        'kind': KIND_OF[law['form']],
+        'form': law['form'],
+    }
+
+
+def _lag(u: Array, tau: float, step: float) -> Array:
+    out = np.empty_like(u)
+    y, decay = 0.0, math.exp(-step / tau)
+    for i, v in enumerate(u.tolist()):
+        out[i] = y
+        y = v + (y - v) * decay
+    return out
+
+
+def _mode(u: Array, frequency: float, step: float) -> Array:
+    """A resonance of damping ratio 0.02, by small steps of a rotation that fades."""
+    w, zeta = 2.0 * math.pi * frequency, 0.02
+    turn = np.exp(step * (-zeta * w + 1j * w * math.sqrt(1.0 - zeta**2)))
+    out = np.empty(len(u))
+    z, before = 0j, 0.0
+    lean = zeta / math.sqrt(1.0 - zeta**2)
+    for i, v in enumerate(u.tolist()):
+        # A step of the input starts a free vibration about the new place.
+        z -= (v - before) * (1.0 - 1j * lean)
+        before = v
+        out[i] = v + z.real
+        z *= turn
+    return out
+
+
+def _stuck(v: Array, half: float) -> Array:
+    """What a loop of friction adds to v: it is dragged behind."""
+    held, out = float(v[0]), np.empty_like(v)
+    for i, x in enumerate(v.tolist()):
+        held = x - half if x - held > half else x + half if held - x > half else held
+        out[i] = held - x
+    return out
+
+
+def _between(t: Array, times: Sequence[float]) -> Array:
+    on = np.zeros(len(t))
+    for k, at in enumerate(times):
+        on[t >= at - 1e-9] = (k + 1) % 2
+    return on
+
+
+def added(law: Spec, known: Mapping[str, Array], t: Array, step: float) -> Array:
+    """What the law adds (n,), in units of its size; ``known``: the variables on the grid ``t``."""
+    form = law['form']
+    scaled = [known[n] / FULL[n] for n in law['of']]
+    u = np.prod(scaled, axis=0) if scaled else np.ones(len(t))
+    b, sign = law['at'], law['sign']
+    if form == 'square':
+        out = u**2
+    elif form == 'cube':
+        out = u**3
+    elif form == 'stop':
+        out = np.clip(sign * u - b, 0.0, None)
+    elif form == 'dead_band':
+        out = -np.clip(u, -b, b)
+    elif form == 'saturation':
+        out = b * np.tanh(u / b) - u
+    elif form == 'magnitude':
+        out = np.sqrt(u**2)
+    elif form == 'hop':
+        out = np.where(sign * u > b, 1.0, 0.0)
+    elif form == 'events':
+        out = _between(t, law['times'])
+    elif form == 'gain_events':
+        out = u * _between(t, law['times'])
+    elif form in ('rate', 'drag'):
+        speed = np.gradient(u, step)
+        out = speed * np.abs(speed) if form == 'drag' else speed
+    elif form == 'fading_square':
+        out = _lag(u**2, law['time_constant'], step)
+    elif form == 'stick':
+        out = _stuck(u, 0.1 * b)
+    elif form == 'resonance':
+        out = _mode(u, law['frequency'], step)
+    elif form == 'product':
+        out = u
+    else:
+        raise ValueError(form)
+    return np.asarray(out)

@@ -1,0 +1,175 @@
+"""Laws beyond the catalogue: ``python -m blind.laws [--laws 12] [--nulls 12] [--first 0]``.
+
+Each law is drawn (:mod:`blind.law_forms`), scaled to a gap of 5 to 30 floors and recorded with noise; discover is given
+volts, loads and temperatures. Counted are: the right stage and the right variables, named or listed as what the
+recording cannot tell from it, each also alone; the gap that remains on unseen load cases; and laws where there is
+nothing. Develop on one range of seeds and judge once on another.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import sys
+import time
+import zlib
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from blind import generator, law_forms
+from blind.cases import designs, gap_of
+from psd_deflection.config import load_rig
+from psd_deflection.discovery.discover import Discovery, discover
+from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.result import result
+from psd_deflection.discovery.signatures import SignatureBank
+
+_BANK = SignatureBank()
+STAGES = tuple(law_forms.OF_STAGE)
+WANTED = {'stage': 0.90, 'variables': 0.90, 'gap': 0.80, 'alarm': 0.0}
+MOST_FLOORS = 1.2
+
+
+def drawn(first: int, count: int) -> list[dict[str, Any]]:
+    """Laws number ``first`` on: each stage in turn, a form by chance, no form twice in a dozen if that can be."""
+    out: list[dict[str, Any]] = []
+    used: set[str] = set()
+    for i in range(first, first + count):
+        stage = STAGES[i % len(STAGES)]
+        if i % 12 == 0:
+            used.clear()
+        rng = np.random.default_rng((20261122, i))
+        left = [f for f in law_forms.OF_STAGE[stage] if f not in used] or list(law_forms.OF_STAGE[stage])
+        form = str(rng.choice(left))
+        used.add(form)
+        law = law_forms.draw(zlib.crc32(f'law-{i}'.encode()), stage, form)
+        gap = float(np.exp(rng.uniform(math.log(5.0), math.log(30.0))))
+        out.append({**law, 'number': i, 'gap': gap})
+    return out
+
+
+def sized(law: dict[str, Any]) -> dict[str, Any]:
+    """The law with the size that gives its gap: the readings answer to it nearly in proportion."""
+    design = designs('one')
+    if law['form'] == 'jitter':
+        # The noise of the channel, at full deflection, is 1.5 to 4 times what it is at rest.
+        return {**law, 'size': generator.SIGMA * math.sqrt(law['gap'] / 2.0)}
+    size = {'law_load': 1.0, 'law_link': 1e-5}.get(law['name'], 1e-6)
+    for _ in range(3):
+        size *= law['gap'] / max(gap_of(design, {**law, 'size': size}), 1e-9)
+    return {**law, 'size': size}
+
+
+def observe(law: dict[str, Any] | None, seed: int) -> list[Observation]:
+    """The recording with the law, or one in which nothing is missing."""
+    (g,) = designs('one')
+    volts = g.record([] if law is None else [law], 'white', seed)
+    return [Observation('recording', load_rig(), volts, g.loads, g.temperature)]
+
+
+def answer(law: dict[str, Any] | None, seed: int) -> tuple[dict[str, Any], Discovery]:
+    """discover's result.json."""
+    found = discover(observe(law, seed), load_rig(), seed=0, bank=_BANK)
+    return result(found), found
+
+
+def judged(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:
+    """How the answer compares with the truth."""
+    said = next((u['law'] for u in got['unknown'] if u['law']), None)
+    row: dict[str, Any] = {'verdict': got['verdict'], 'law': None if said is None else said['expression']}
+    row['effects'] = [e['name'] for e in got['effects']]
+    if law is None:
+        return {**row, 'alarm': said is not None}
+    truth = law_forms.truth_of(law)
+    listed = [] if said is None else [said, *said['equivalent']]
+    floor = got['gap']['floor']
+    return {
+        **row,
+        'truth': truth,
+        'gap': law['gap'],
+        'stage': any(e['stage'] == truth['stage'] for e in listed),
+        'stage_alone': said is not None and said['stage'] == truth['stage'],
+        'variables': any(sorted(e['variables']) == truth['variables'] for e in listed),
+        'variables_alone': said is not None and sorted(said['variables']) == truth['variables'],
+        'kind': said is not None and said['kind'] == truth['kind'],
+        'set': len(listed),
+        'floors': (got['gap']['heldout_after'] if said is None else said['heldout_after']) / floor,
+    }
+
+
+def _one(job: tuple[dict[str, Any] | None, int]) -> dict[str, Any]:
+    law, seed = job
+    start = time.perf_counter()
+    got, _ = answer(None if law is None else sized(law), seed)
+    row = judged(law, got)
+    return {**row, 'number': seed, 'seconds': time.perf_counter() - start}
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
+    """The counts against what is wanted."""
+    laws, nulls = [r for r in rows if 'truth' in r], [r for r in rows if 'truth' not in r]
+    lines, passed = [], True
+    for name, words in (('stage', 'right stage'), ('variables', 'right variables')):
+        k, n = sum(r[name] for r in laws), len(laws)
+        alone = sum(r[f'{name}_alone'] for r in laws)
+        good = n == 0 or k >= WANTED[name] * n
+        passed &= good
+        lines.append(
+            f'{"ok  " if good else "MISS"} {words}, named or listed as equivalent: {k}/{n} '
+            f'(wanted {100 * WANTED[name]:.0f} %); named itself: {alone}/{n}'
+        )
+    near, n = sum(r['floors'] <= MOST_FLOORS for r in laws), len(laws)
+    good = n == 0 or near >= WANTED['gap'] * n
+    alarms = sum(r['alarm'] for r in nulls)
+    passed &= good and alarms == 0
+    lines.append(
+        f'{"ok  " if good else "MISS"} gap on unseen load cases at most {MOST_FLOORS} floors: {near}/{n} '
+        f'(wanted {100 * WANTED["gap"]:.0f} %)'
+    )
+    lines.append(f'{"ok  " if alarms == 0 else "MISS"} laws where nothing is missing: {alarms}/{len(nulls)} (wanted 0)')
+    if laws:
+        lines.append(
+            f'     right kind: {sum(r["kind"] for r in laws)}/{n}; mean set: {np.mean([r["set"] for r in laws]):.1f}'
+        )
+        lines.append(f'     seconds a law: median {np.median([r["seconds"] for r in laws]):.0f}')
+    return '\n'.join(lines), passed
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Draw, let discover answer, count; exit status 1 if a threshold is missed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--out', default='build/blind-laws', help='folder for the answers (default: build/blind-laws)')
+    parser.add_argument('--laws', type=int, default=12)
+    parser.add_argument('--nulls', type=int, default=12)
+    parser.add_argument('--first', type=int, default=0, help='number of the first law: fresh ones')
+    parser.add_argument('--jobs', type=int, default=1, help='processes at once')
+    args = parser.parse_args(argv)
+    folder = Path(args.out)
+    folder.mkdir(parents=True, exist_ok=True)
+    listed = drawn(args.first, args.laws)
+    jobs: list[tuple[dict[str, Any] | None, int]] = [(law, law['number']) for law in listed]
+    jobs += [(None, 100_000 + args.first + i) for i in range(args.nulls)]
+    rows = []
+    with contextlib.ExitStack() as open_until_done:
+        stream = open_until_done.enter_context((folder / f'answers-{args.first}.jsonl').open('w'))
+        pool = open_until_done.enter_context(ProcessPoolExecutor(args.jobs)) if args.jobs > 1 else None
+        answers = map(_one, jobs) if pool is None else pool.map(_one, jobs)
+        for row in tqdm(answers, total=len(jobs), desc='answers', file=sys.stderr):
+            rows.append(row)
+            stream.write(json.dumps(row) + '\n')
+            stream.flush()
+    text, passed = summary(rows)
+    print(text)
+    (folder / f'summary-{args.first}.txt').write_text(text + '\n')
+    return 0 if passed else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,362 @@
+"""What a law may be made of: terms, and how much of a residual each explains to first order.
+
+A law adds to one quantity of the chain. To first order the readings answer linearly: what is added to a pose moves the
+dots by the Jacobian of the optics, what is added to a static pose passes the link's modes first, and what is added to a
+dot shows in one channel. So thousands of terms are scored without a simulation.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+from psd_deflection.discovery.fit import Fit
+from psd_deflection.discovery.hidden import only_in
+from psd_deflection.discovery.workspace import Workspace, fine_means
+from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
+from psd_deflection.simulation.catalogue import sort_effects
+from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.simulation.laws import TARGETS, VARIABLES, Term, known
+from psd_deflection.simulation.modes import mode_coefficients
+from psd_deflection.simulation.optics import dots_on_plate
+from psd_deflection.simulation.samples import SimulatedSamples
+from psd_deflection.simulation.simulator import ForwardModel
+
+LOADS, POSE, DOTS = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta'), ('x1', 'y1', 'x2', 'y2')
+SOUGHT = (*(f'static_{n}' for n in POSE), *POSE, *DOTS, 'sum1', 'sum2')
+"""The targets that are looked at. A law on a load does what one on the static pose does."""
+_BATCH = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Response:
+    """One recording beside the effects of a fit. ``known``: every variable (n,); ``weight`` (nf, targets (1 + p)):
+    what a term on fine blocks is multiplied with for its product with the residual and p fitted columns;
+    ``length`` (nf, targets): likewise for its squared length. ``error`` and ``power`` (targets, nf): the residual as
+    an estimate of what the target lacks, and the inverse of its variance. ``modes``: of bending and torsion;
+    ``rings``: the period of each in fine blocks.
+    """
+
+    known: Mapping[str, FloatArray]
+    period: float
+    fine: int
+    weight: FloatArray
+    length: FloatArray
+    error: FloatArray
+    power: FloatArray
+    modes: tuple[tuple[FloatArray, FloatArray], ...]
+    rings: tuple[int, int]
+
+
+def _jacobian(pose: FloatArray, beams: FloatArray, model: ForwardModel) -> FloatArray:
+    """Change of the dots (3, 4, nf) with dX, dY, theta."""
+    out = np.empty((3, 4, pose.shape[1]))
+    for k, h in enumerate((1e-6, 1e-6, 1e-6)):
+        plus, minus = pose.copy(), pose.copy()
+        plus[k] += h
+        minus[k] -= h
+        out[k] = (dots_on_plate(plus, beams, model.physics) - dots_on_plate(minus, beams, model.physics)) / (2.0 * h)
+    return out
+
+
+def _unwhiten(rows: FloatArray, ar: FloatArray) -> FloatArray:
+    """The adjoint of whitening, without its scale, of one channel's rows (k, nf)."""
+    out = rows.copy()
+    for j in range(1, len(ar) + 1):
+        out[:, :-j] -= ar[j - 1] * rows[:, j:]
+    return out
+
+
+def responses(ws: Workspace, fit: Fit) -> list[Response]:
+    """How each recording answers to a term on each of ``SOUGHT``, beside the effects of ``fit``."""
+    q = np.empty((len(fit.residual), 0))
+    if fit.jacobian.shape[1]:
+        q, _ = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))
+    columns = [ws.split(c) for c in np.ascontiguousarray(q.T)]
+    out = []
+    ws.simulations += 1
+    for i, size in enumerate(ws.fine):
+        model, s = _variables(ws, fit.effects, i)
+        p = model.physics
+        nf = ws.measured[i].shape[1]
+        values = {name: known(s, name) for name in VARIABLES}
+        jacobian = _jacobian(fine_means(s.pose, size), fine_means(s.beams, size), model)
+        jacobian = jacobian / p.sensitivity.reshape(1, 4, 1)
+        noise = ws.noise[i]
+        scale = np.sqrt(ws.count[i]) / noise.innovation[:, None]
+        vectors = [ws.split(fit.residual)[i], *(c[i] for c in columns)]
+        # Each vector, as it multiplies unwhitened fine blocks: (6, 1 + p, nf).
+        back = np.stack([_unwhiten(np.stack([v[c] * scale[c] for v in vectors]), noise.ar[c]) for c in range(6)])
+        gain = (scale * (1.0 - noise.ar.sum(axis=1))[:, None]) ** 2
+        mixing = np.zeros((len(SOUGHT), 6, nf))
+        for t, name in enumerate(SOUGHT):
+            target = TARGETS[name]
+            if target.point in ('static', 'pose'):
+                mixing[t, list(DOT_CHANNELS)] = jacobian[target.row]
+            elif target.row < 4:
+                mixing[t, DOT_CHANNELS[target.row]] = 1.0 / p.sensitivity.ravel()[target.row]
+            else:
+                mixing[t, 3 * (target.row - 4) + 2] = 1.0
+        weight = np.einsum('tcn,ckn->ntk', mixing, back).reshape(nf, -1)
+        power = np.einsum('tcn,cn->tn', mixing**2, gain)
+        direct = np.einsum('tcn,cn->tn', mixing, back[:, 0])
+        bending = mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period)
+        torsion = mode_coefficients(p.torsion_frequency, p.torsion_damping_ratio, p.period)
+        fine = p.period * size
+        out.append(
+            Response(
+                values,
+                p.period,
+                size,
+                weight,
+                np.ascontiguousarray(power.T),
+                direct / np.maximum(power, 1e-300),
+                power,
+                (bending, torsion),
+                (round(1.0 / (p.bending_frequency * fine)), round(1.0 / (p.torsion_frequency * fine))),
+            )
+        )
+    return out
+
+
+def _variables(ws: Workspace, effects: Sequence[ActiveEffect], i: int) -> tuple[ForwardModel, SimulatedSamples]:
+    """Recording number ``i``, simulated with ``effects`` besides those of the rig file."""
+    o = ws.observations[i]
+    model = ForwardModel(o.rig, only_in(sort_effects([*ws.base, *effects]), i))
+    return model, model.run(o.loads, o.temperature)
+
+
+def known_values(ws: Workspace, effects: Sequence[ActiveEffect], name: str) -> list[FloatArray]:
+    """Block means of a variable of each recording, simulated with ``effects``."""
+    out = []
+    for i, o in enumerate(ws.observations):
+        _, samples = _variables(ws, effects, i)
+        out.append(fine_means(known(samples, name)[None, :], o.rig.estimator.block_size)[0])
+    return out
+
+
+def known_fine(ws: Workspace, effects: Sequence[ActiveEffect], name: str) -> list[FloatArray]:
+    """Likewise as means over fine blocks."""
+    return [fine_means(known(_variables(ws, effects, i)[1], name)[None, :], size)[0] for i, size in enumerate(ws.fine)]
+
+
+def _spread(parts: Sequence[FloatArray]) -> float:
+    whole = np.concatenate(parts)
+    return float(np.max(np.abs(whole))) if len(whole) else 0.0
+
+
+def _levels(parts: Sequence[FloatArray], count: int) -> list[float]:
+    """Between the values that a variable takes, evenly by rank of the distinct ones."""
+    whole = np.concatenate(parts)
+    low, high = float(whole.min()), float(whole.max())
+    if high <= low:
+        return []
+    return [low + (high - low) * (k + 0.5) / count for k in range(count)]
+
+
+def terms(found: Sequence[Response]) -> Iterator[Term]:
+    """Every term that is tried, with a grid for its shapes; variables that never change are left out."""
+    parts = {name: [r.known[name] for r in found] for name in VARIABLES}
+    size = {name: _spread(values) for name, values in parts.items()}
+    moving = [n for n in VARIABLES if size[n] > 0.0]
+    placed = [n for n in moving if n != 'time']
+    for k in (1, 2, 3):
+        for several in itertools.combinations_with_replacement(moving, k):
+            if k < 3 or len(set(several)) == 1:
+                yield Term('product', several)
+    for name in placed:
+        yield Term('absolute', (name,))
+        yield Term('signed_square', (name,))
+        levels = _levels(parts[name], 8)
+        for level in levels:
+            yield Term('above', (name,), shapes={'threshold': level})
+            yield Term('below', (name,), shapes={'threshold': level})
+        for share in (0.05, 0.15, 0.3, 0.5, 0.7):
+            yield Term('beyond', (name,), shapes={'threshold': share * size[name]})
+            yield Term('within', (name,), shapes={'threshold': share * size[name]})
+        # Held loads take few values, and any threshold between two of them is the same.
+        distinct = np.unique(np.concatenate(parts[name]))
+        few = [0.5 * (a + b) for a, b in itertools.pairwise(distinct.tolist())] if len(distinct) <= 24 else []
+        for level in few or _levels(parts[name], 24):
+            yield Term('over', (name,), shapes={'threshold': level})
+    for name in placed:
+        if name not in LOADS:
+            yield Term('rate', (name,))
+            yield Term('rate_absolute', (name,))
+            yield Term('drag', (name,))
+        if name in LOADS or name in POSE:
+            yield Term('direction', (name,))
+        for share in (0.02, 0.1, 0.3):
+            yield Term('play', (name,), shapes={'half_width': share * size[name]})
+        for tau in (0.02, 0.1, 0.3, 1.0, 3.0, 10.0):
+            yield Term('relaxed', (name,), shapes={'time_constant': tau})
+            yield Term('relaxed', (name, name), shapes={'time_constant': tau})
+        if name in DOTS or name in POSE:
+            for share in (0.2, 0.3, 0.45, 0.7, 1.0, 1.5):
+                for phase in (0.0, 0.5 * math.pi):
+                    yield Term('wave', (name,), shapes={'period': share * size[name], 'phase': phase})
+    for name in LOADS:
+        if name in moving:
+            for f in np.geomspace(2.0, 180.0, 48).tolist():
+                yield Term('resonance', (name,), shapes={'frequency': f, 'damping_ratio': 0.04})
+
+
+@dataclass(frozen=True, slots=True)
+class Scored:
+    """A term with its coefficient to first order, and its gain in chi-square."""
+
+    target: str
+    term: Term
+    gain: float
+
+
+def allowed(target: str, term: Term) -> bool:
+    """Whether the term's variables are known where it acts."""
+    return all(v in TARGETS[target].variables for v in term.depends_on)
+
+
+def _blocks(r: Response, values: FloatArray) -> FloatArray:
+    return np.asarray(fine_means(values[None, :], r.fine)[0])
+
+
+def _way(target: str) -> int:
+    """0: as it is; 1: through the mode of bending; 2: through that of torsion."""
+    return 0 if TARGETS[target].point != 'static' else 2 if target == 'static_theta' else 1
+
+
+def _through(r: Response, way: int, row: FloatArray) -> FloatArray:
+    return row if way == 0 else np.asarray(lfilter(*r.modes[way - 1], row))
+
+
+def score(found: Sequence[Response], listed: Sequence[Term], targets: Sequence[str] = SOUGHT) -> list[Scored]:
+    """Each term on each target, the best first."""
+    out: list[Scored] = []
+    count, k = len(SOUGHT), found[0].weight.shape[1] // len(SOUGHT)
+    listed = [t for t in listed if any(allowed(name, t) for name in targets)]
+    ways = sorted({_way(name) for name in targets})
+    for start in range(0, len(listed), _BATCH):
+        batch = listed[start : start + _BATCH]
+        # In place, and through the modes of bending and torsion.
+        totals = np.zeros((3, len(batch), count, k))
+        lengths = np.zeros((3, len(batch), count))
+        for r in found:
+            rows = [t.evaluate(r.known.__getitem__, len(r.known['time']), r.period, {}) for t in batch]
+            for way in ways:
+                # Only loads and what is like them drive a mode.
+                some = [i for i, t in enumerate(batch) if way == 0 or allowed('static_dx', t)]
+                if some:
+                    at = np.stack([_blocks(r, _through(r, way, rows[i])) for i in some])
+                    totals[way, some] += (at @ r.weight).reshape(len(some), count, k)
+                    lengths[way, some] += at**2 @ r.length
+        for i, term in enumerate(batch):
+            for t, name in enumerate(SOUGHT):
+                if name not in targets or not allowed(name, term):
+                    continue
+                way = _way(name)
+                g, across = totals[way, i, t, 0], totals[way, i, t, 1:]
+                f = lengths[way, i, t] - float(across @ across)
+                if f > 1e-6 * lengths[way, i, t] > 0.0:
+                    guess = Term(term.form, term.of, float(g / f), term.shapes, term.times)
+                    out.append(Scored(name, guess, float(g * g / f)))
+    out.sort(key=lambda s: -s.gain)
+    return out
+
+
+MOST_TIMES = 12
+REFINED = 4
+"""Of the terms with times, so many get better times."""
+TOGGLE_COST = 24.0
+"""Chi-square that each switching must gain: twice the logarithm of the blocks of a recording, and some more."""
+
+
+def switchings(found: Sequence[Response], targets: Sequence[str] = SOUGHT) -> list[Term]:
+    """Terms that are on between times which the residual of the only recording shows.
+
+    The states are the likeliest of two levels, 0 and A (Viterbi's algorithm), with A fitted in turn. What the link
+    rings after a switching is averaged over its period first, and the times are improved with the modes in the model.
+    """
+    seen: list[Scored] = []
+    (r,) = found
+    for t, name in enumerate(SOUGHT):
+        if name not in targets or TARGETS[name].point == 'static':
+            continue
+        own = [n for n in DOTS if name in DOTS and (n[1] == name[1])]
+        on_link = TARGETS[name].point == 'pose'
+        for of in ((), *((n,) for n in own)):
+            v = _blocks(r, r.known[of[0]]) if of else np.ones(r.error.shape[1])
+            error = _averaged(r.error[t], r.rings[int(name == 'theta')]) if on_link else r.error[t]
+            times = _two_levels(error, r.power[t] * v * v, v)
+            if 0 < len(times) <= MOST_TIMES:
+                term = Term('switched', of, times=tuple(float(k * r.fine * r.period) for k in times))
+                places = (name, f'static_{name}') if on_link else (name,)
+                seen += score(found, [term], places)
+    seen.sort(key=lambda s: -s.gain)
+    better = [with_better_times(found, s.target, s.term) for s in seen[:REFINED]]
+    return list({(t.of, t.times): t for t in better}.values())
+
+
+def _averaged(values: FloatArray, blocks: int) -> FloatArray:
+    """Means over ``blocks`` neighbours."""
+    if blocks < 2:
+        return values
+    return np.asarray(np.convolve(values, np.ones(blocks) / blocks, mode='same'))
+
+
+def with_better_times(found: Sequence[Response], target: str, term: Term) -> Term:
+    """Each time moved to where the term explains most on ``target``: by up to 0.08 s, then to a sample."""
+    step = found[0].period
+    for reach, pitch in ((0.08, 8.0 * step), (0.08, 8.0 * step), (8.0 * step, step)):
+        for k in range(len(term.times)):
+            tries = []
+            for shift in np.arange(-reach, reach + 0.5 * pitch, pitch).tolist():
+                times = [*term.times]
+                times[k] = round(times[k] + shift, 9)
+                if times == sorted(set(times)):
+                    tries.append(Term(term.form, term.of, times=tuple(times)))
+            best = score(found, tries, (target,))
+            if best:
+                term = Term(term.form, term.of, times=best[0].term.times)
+    return term
+
+
+def _two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[int]:
+    """Where the state changes: ``error`` (nf,) is A v s with s 0 or 1, each with ``weight`` in units of A."""
+    own = np.where(np.abs(v) > 1e-12, error / np.where(np.abs(v) > 1e-12, v, 1.0), 0.0)
+    # The best box, on a coarse grid, gives the first A.
+    step = max(1, len(own) // 240)
+    p = np.concatenate(([0.0], np.cumsum(own * weight)))[::step]
+    n = np.concatenate(([0.0], np.cumsum(weight)))[::step]
+    top, below = p[None, :] - p[:, None], n[None, :] - n[:, None]
+    gain = np.where(below > 1e-9 * n[-1], top**2 / np.maximum(below, 1e-9 * n[-1] + 1e-300), 0.0)
+    a, b = np.unravel_index(int(np.argmax(np.triu(gain, 1))), gain.shape)
+    if below[a, b] <= 0.0 or gain[a, b] < TOGGLE_COST:
+        return []
+    level = float(top[a, b] / below[a, b])
+    for _ in range(4):
+        state = _likeliest(weight * level * (2.0 * own - level))
+        on = state == 1
+        if not on.any():
+            return []
+        level = float((own * weight)[on].sum() / max(float(weight[on].sum()), 1e-300))
+    return [int(k) for k in np.flatnonzero(np.diff(state, prepend=0))]
+
+
+def _likeliest(gain: FloatArray) -> IntArray:
+    """States (n,) 0 or 1 that gain most, each change for ``TOGGLE_COST``; 0 before the first."""
+    off, on = 0.0, -TOGGLE_COST
+    came = np.empty((len(gain), 2), dtype=np.int64)
+    for k, g in enumerate(gain.tolist()):
+        from_on, from_off = on - TOGGLE_COST, off - TOGGLE_COST
+        came[k, 0], came[k, 1] = int(from_on > off), int(on >= from_off)
+        off, on = max(off, from_on), max(on, from_off) + g
+    state = np.empty(len(gain), dtype=np.int64)
+    now = int(on > off)
+    for k in range(len(gain) - 1, -1, -1):
+        state[k] = now
+        now = int(came[k, now])
+    return state

@@ -1,0 +1,462 @@
+"""A law for what no effect of the catalogue explains: where it acts, on what it depends, and how.
+
+Terms are scored on the residual to first order, the best are refitted as effects in the simulation together with the
+effects found so far, and further terms are added and dropped by BIC (sparse regression in the loop). A law is told only
+if it passes the rule for an effect and explains most of what is left; laws that the recording cannot tell from it are
+listed beside it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2 as chi2_law
+
+from psd_deflection.discovery.fit import Fit, refit
+from psd_deflection.discovery.law_features import (
+    DOTS,
+    LOADS,
+    POSE,
+    SOUGHT,
+    Response,
+    Scored,
+    known_fine,
+    responses,
+    score,
+    switchings,
+    terms,
+    with_better_times,
+)
+from psd_deflection.discovery.search import BIC_ACCEPT, P_ACCEPT
+from psd_deflection.discovery.validate import HeldOut, fold_of_case, heldout_gain, heldout_gap
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.simulation.laws import FORMS, TARGETS, VARIABLES, Law, Term, effect_of, values_of
+
+TRIED = 12
+"""Terms that are refitted in the simulation for the first place."""
+FOLLOWED = 3
+"""Of these, the best are refitted in full and get further terms."""
+MAX_TERMS = 4
+BUDGET = 600
+"""Forward simulations beside one set of effects after which no term is added."""
+TIED = 21.6
+"""Loss in chi-square below which another law counts as equivalent, as for effects."""
+UNDETERMINED = 100.0
+"""Standard deviation, over its value, from which on a number counts as not determined."""
+EXPLAINS = 0.5
+"""Share of what is left, in chi-square, that a law must explain."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundLaw:
+    """``fit``: the model with the law as its last effects: ``law``, then ``further`` on other quantities that belong to
+    it. ``channels``: where it shows. ``equivalent``: laws in place of the first that this recording cannot tell from
+    it. ``without``: the model without it. ``heldout_gap``: m, on unseen load cases.
+    """
+
+    law: Law
+    further: tuple[Law, ...]
+    fit: Fit
+    without: Fit
+    channels: tuple[str, ...]
+    equivalent: tuple[Law, ...]
+    p: float
+    delta_bic: float
+    heldout: HeldOut
+    heldout_gap: float
+
+    @property
+    def laws(self) -> tuple[Law, ...]:
+        """All of it."""
+        return (self.law, *self.further)
+
+    def adopted(self, name: str) -> list[Law]:
+        """The laws as effects of that name; those on further quantities get it with a number."""
+        names = [name, *(f'{name}_{i}' for i in range(2, len(self.laws) + 1))]
+        return [dataclasses.replace(law, name=n) for law, n in zip(self.laws, names, strict=True)]
+
+    @property
+    def beside(self) -> tuple[ActiveEffect, ...]:
+        """The effects of the catalogue in the same model."""
+        return self.fit.effects[: len(self.fit.effects) - len(self.laws)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trial:
+    laws: tuple[Law, ...]
+    fit: Fit
+    cost: float
+
+    @property
+    def beside(self) -> tuple[ActiveEffect, ...]:
+        return self.fit.effects[: len(self.fit.effects) - len(self.laws)]
+
+    @property
+    def terms(self) -> int:
+        return sum(len(law.terms) for law in self.laws)
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(v for law in self.laws for v in law.variables))
+
+
+def _on(target: str, *listed: Term) -> Law:
+    return Law(f'law_{target}', TARGETS[target].stage, target, listed)
+
+
+def _covariance(fit: Fit) -> FloatArray:
+    """(p, p) of the parameters of ``fit``; those that the recording does not determine get large values.
+
+    A threshold below which only one level of a load lies is such a one.
+    """
+    lengths = np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-60)
+    unit = fit.jacobian / lengths
+    values, vectors = np.linalg.eigh(unit.T @ unit)
+    return np.asarray((vectors / np.maximum(values, 1e-9)) @ vectors.T / np.outer(lengths, lengths))
+
+
+def _fitted(law: Law, fit: Fit, covariance: FloatArray, index: int) -> Law:
+    """The law with the values and standard deviations of effect ``index`` of ``fit``."""
+    values = fit.effects[index].values
+    sd = {fit.free[j][1]: math.sqrt(max(covariance[j, j], 0.0)) for j in fit.columns_of(index)}
+    out = []
+    for i, t in enumerate(law.terms, 1):
+        own = {'coefficient': sd.get(f'c{i}', 0.0)}
+        own.update({k: sd[f'{k}{i}'] for k in t.shapes if k in FORMS[t.form].fitted and f'{k}{i}' in sd})
+        shapes = {k: values[f'{k}{i}'] for k in t.shapes}
+        sizes = {'coefficient': values[f'c{i}'], **shapes}
+        # What the recording does not determine has no standard deviation.
+        own = {k: v for k, v in own.items() if v < UNDETERMINED * abs(sizes[k])}
+        out.append(dataclasses.replace(t, coefficient=values[f'c{i}'], shapes=shapes, sd=own))
+    return dataclasses.replace(law, terms=tuple(out))
+
+
+class _Seeker:
+    """The search beside one set of effects."""
+
+    def __init__(self, ws: Workspace, start: Fit, penalty: float) -> None:
+        self.ws, self.start, self.penalty = ws, start, penalty
+        self.last = ws.simulations + BUDGET
+        self.found = responses(ws, start)
+        self.listed = list(terms(self.found))
+        if len(ws.observations) == 1:
+            # In another recording the events have other times.
+            self.listed += switchings(self.found)
+        self.tried = len(self.listed) * len(SOUGHT)
+
+    def cost(self, laws: Sequence[Law], fit: Fit) -> float:
+        """BIC; whatever was looked for counts, also what a refit does not improve."""
+        more = sum(len(FORMS[t.form].fixed) + len(t.times) for law in laws for t in law.terms)
+        return fit.chi2 + self.penalty * (fit.parameters + more)
+
+    def trial(self, laws: Sequence[Law], beside: Sequence[ActiveEffect], iterations: int) -> _Trial:
+        """The laws refitted in the simulation."""
+        fit = refit(self.ws, [*beside, *(ActiveEffect(effect_of(law), values_of(law)) for law in laws)], iterations)
+        covariance = _covariance(fit)
+        better = tuple(_fitted(law, fit, covariance, len(beside) + i) for i, law in enumerate(laws))
+        # A shape at its bound means that the form is not the right one.
+        bound = any(i >= len(beside) for i, _ in fit.at_bound)
+        return _Trial(better, fit, math.inf if bound else self.cost(better, fit))
+
+    def done(self, trial: _Trial) -> bool:
+        """Whether no more than noise is left, or enough has been tried."""
+        size = float(self.ws.size)
+        return trial.fit.chi2 < size + 4.0 * math.sqrt(2.0 * size) or self.ws.simulations > self.last
+
+    def first(self) -> list[_Trial]:
+        """Laws of one term, the best first."""
+        scored = score(self.found, self.listed)
+        seen: set[tuple[str, str, tuple[str, ...]]] = set()
+        picked: list[Scored] = []
+        for s in scored:
+            key = (s.target, s.term.form, s.term.of)
+            if s.gain < 0.3 * scored[0].gain or len(picked) >= TRIED:
+                break
+            if key not in seen:
+                seen.add(key)
+                picked.append(s)
+        quick = [self.trial([_on(s.target, s.term)], self.start.effects, 3) for s in picked]
+        quick.sort(key=lambda t: t.cost)
+        full = [self.trial(t.laws, t.beside, 8) for t in quick[:FOLLOWED]]
+        return sorted([*full, *quick[FOLLOWED:]], key=lambda t: t.cost)
+
+    def grown(self, trial: _Trial) -> _Trial:
+        """Further terms while BIC improves by enough; then terms that it does not miss go."""
+        while trial.terms < MAX_TERMS and not self.done(trial):
+            more = responses(self.ws, trial.fit)
+            if trial.laws[0].terms[0].times and len(trial.laws) == 1:
+                again = self._switched_again(trial, more)
+                if again.cost < trial.cost - BIC_ACCEPT:
+                    trial = again
+                    continue
+            scored = score(more, [t for t in self.listed if t.form != 'switched'])
+            tries = [self.trial(_with(trial.laws, s), trial.beside, 4) for s in scored[:2]]
+            best = min(tries, key=lambda t: t.cost, default=trial)
+            if best.cost > trial.cost - BIC_ACCEPT:
+                break
+            trial = best
+        while trial.terms > 1:
+            fewer = [self.trial(laws, trial.beside, 5) for laws in _fewer(trial.laws)]
+            best = min(fewer, key=lambda t: t.cost)
+            if best.cost > trial.cost + BIC_ACCEPT:
+                break
+            trial = best
+        return trial
+
+    def _switched_again(self, trial: _Trial, left: Sequence[Response]) -> _Trial:
+        """With the further times of switching that show once the law is in the model."""
+        (law,), best = trial.laws, trial
+        term = law.terms[0]
+        for more in switchings(left, (law.acts_on.removeprefix('static_'),)):
+            times = tuple(sorted({*term.times} ^ {*more.times}))
+            if more.of == term.of and times:
+                better = with_better_times(self.found, law.acts_on, Term(term.form, term.of, times=times))
+                both = dataclasses.replace(term, times=better.times)
+                now = dataclasses.replace(law, terms=(both, *law.terms[1:]))
+                best = min(best, self.trial([now], trial.beside, 4), key=lambda t: t.cost)
+        return best
+
+    def lean(self, trial: _Trial) -> _Trial:
+        """Without the effects that only stood in for the law."""
+        while trial.beside:
+            fewer = [self.trial(trial.laws, [a for a in trial.beside if a is not gone], 5) for gone in trial.beside]
+            best = min(fewer, key=lambda t: t.cost)
+            if best.cost > trial.cost + BIC_ACCEPT:
+                break
+            trial = best
+        return trial
+
+    def same_elsewhere(self, trial: _Trial) -> list[_Trial]:
+        """The first law at the other stages that show alike: a beam for a dot, a load for a static pose."""
+        law, others = trial.laws[0], trial.laws[1:]
+        moved: list[Law] = []
+        if f'beam_{law.acts_on}' in TARGETS:
+            moved.append(dataclasses.replace(law, acts_on=f'beam_{law.acts_on}', stage='optics'))
+        if law.acts_on.startswith('static_'):
+            row = TARGETS[law.acts_on].row
+            p = self.ws.physics
+            per = p.torque_compliance if row == 2 else p.force_compliance
+            of_load = tuple(dataclasses.replace(t, coefficient=t.coefficient / per) for t in law.terms)
+            moved.append(dataclasses.replace(law, acts_on=LOADS[row], stage='load', terms=of_load))
+        out = [self.trial([m, *others], trial.beside, 4) for m in moved]
+        if law.acts_on in DOTS:
+            # A voltage is a dot over a constant: by no recording can the two be told apart.
+            out.append(_Trial((dataclasses.replace(law, stage='electronics'), *others), trial.fit, trial.cost))
+        return out
+
+
+def _with(laws: Sequence[Law], s: Scored) -> tuple[Law, ...]:
+    """The laws and one more term, in the law on its target if there is one."""
+    if any(law.acts_on == s.target for law in laws):
+        return tuple(
+            dataclasses.replace(law, terms=(*law.terms, s.term)) if law.acts_on == s.target else law for law in laws
+        )
+    return (*laws, _on(s.target, s.term))
+
+
+def _fewer(laws: Sequence[Law]) -> list[tuple[Law, ...]]:
+    """Each way to leave out one term."""
+    out = []
+    for gone in (t for law in laws for t in law.terms):
+        rest = [dataclasses.replace(law, terms=tuple(t for t in law.terms if t is not gone)) for law in laws]
+        out.append(tuple(law for law in rest if law.terms))
+    return out
+
+
+def find_law(
+    ws: Workspace,
+    null: Fit,
+    fit: Fit,
+    penalty: float,
+    excess: float,
+    rng: np.random.Generator,
+    progress: Callable[[str], None],
+) -> FoundLaw | None:
+    """The law that explains what ``fit`` leaves, or None.
+
+    ``null``: the rig file's own model, tried as well, because effects of the catalogue may stand in for the law.
+    ``excess``: chi-square beyond noise that ``fit`` leaves; ``penalty``: of BIC, for each parameter.
+    """
+    progress('a law for what remains')
+    found = _law_of_the_mean(ws, null, fit, penalty, excess, rng)
+    return found or find_jitter(ws, fit, penalty)
+
+
+def _law_of_the_mean(
+    ws: Workspace, null: Fit, fit: Fit, penalty: float, excess: float, rng: np.random.Generator
+) -> FoundLaw | None:
+    starts = [fit, null] if fit.effects else [null]
+    trials: list[tuple[_Trial, _Seeker]] = []
+    for start in starts:
+        seeker = _Seeker(ws, start, penalty)
+        trials += [(t, seeker) for t in seeker.first()]
+    trials = [(t, s) for t, s in trials if t.cost < math.inf]
+    if not trials:
+        return None
+    trials.sort(key=lambda t: t[0].cost)
+    # Where one law leaves nothing but noise, others get no further terms.
+    followed: list[tuple[_Trial, _Seeker]] = []
+    for t, s in trials[:FOLLOWED]:
+        followed.append((t if s.done(t) else s.grown(t), s))
+        if s.done(followed[-1][0]):
+            break
+    best, seeker = min(followed, key=lambda t: t[0].cost)
+    best = seeker.lean(best)
+    others = [t for t, _ in (*followed, *trials)]
+    best = _simplest(best, others)
+    found = best.fit
+    without = refit(ws, best.beside, 6) if best.beside else null
+    gain = without.chi2 - found.chi2
+    parameters = found.parameters - without.parameters
+    chosen = sum(len(t.times) for law in best.laws for t in law.terms)
+    # Every term on every target might have been taken, and every block as a time of a switching.
+    chances = best.terms * math.log(seeker.tried) + chosen * math.log(max(ws.size / 6.0, 2.0))
+    p = math.exp(min(chances + float(chi2_law.logsf(max(gain, 0.0), max(parameters, 1))), 0.0))
+    bic = gain - (best.cost - found.chi2 - penalty * without.parameters)
+    held = heldout_gain(ws, without, found, rng)
+    enough = fit.chi2 - found.chi2 > EXPLAINS * excess
+    enough &= best.cost < fit.chi2 + penalty * fit.parameters - BIC_ACCEPT
+    if p > P_ACCEPT or bic <= BIC_ACCEPT or not held.holds or not enough:
+        return None
+    return FoundLaw(
+        best.laws[0],
+        best.laws[1:],
+        found,
+        without,
+        _channels(ws, best),
+        _tied(best, [*others, *seeker.same_elsewhere(best)]),
+        p,
+        bic,
+        held,
+        heldout_gap(ws, found),
+    )
+
+
+def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
+    """The channel and the variable that its noise grows with, or None: variance = a + b v^2."""
+    known = {name: known_fine(ws, fit.effects, name) for name in VARIABLES}
+    folds = [fold_of_case(ws)[case] for case in ws.case]
+    fold = np.concatenate(folds)
+    best: tuple[float, str, str, float, float] | None = None
+    tried = 0
+    for c, channel in enumerate(CHANNELS):
+        squares = np.concatenate([part[c] for part in ws.split(fit.residual)]) ** 2
+        there = squares > 0.0
+        for name, values in known.items():
+            v2 = np.concatenate(values) ** 2
+            full = float(v2.max())
+            if full <= 0.0:
+                continue
+            tried += 1
+            a, b = _variance(squares[there], v2[there] / full)
+            gain = _likelihood(squares[there], a + b * v2[there] / full) - _likelihood(
+                squares[there], squares[there].mean()
+            )
+            if best is None or gain > best[0]:
+                best = gain, channel, name, b / full, full
+    if best is None:
+        return None
+    gain, channel, name, slope, full = best
+    c = CHANNELS.index(channel)
+    squares = np.concatenate([part[c] for part in ws.split(fit.residual)]) ** 2
+    v2 = np.concatenate(known[name]) ** 2 / full
+    held = []
+    for k in np.unique(fold):
+        other, own = (fold != k) & (squares > 0.0), (fold == k) & (squares > 0.0)
+        a, b = _variance(squares[other], v2[other])
+        flat = float(squares[other].mean())
+        held.append(_likelihood(squares[own], a + b * v2[own]) - _likelihood(squares[own], flat))
+    heldout = HeldOut(0.5 * float(sum(held)), math.sqrt(max(gain, 1.0)))
+    p = min(1.0, tried * float(chi2_law.sf(max(gain, 0.0), 1)))
+    if p > P_ACCEPT or gain - penalty <= BIC_ACCEPT or not heldout.holds or slope <= 0.0:
+        return None
+    scale = float(np.mean([n.innovation[c] * math.sqrt(s) for n, s in zip(ws.noise, ws.fine, strict=True)]))
+    if not channel.startswith('sum'):
+        scale *= float(ws.physics.sensitivity.ravel()[DOTS.index(channel)])
+    coefficient = math.sqrt(slope) * scale
+    # The curvature of the likelihood of a single parameter, to first order.
+    term = Term('jitter', (name,), coefficient, sd={'coefficient': coefficient / math.sqrt(max(gain, 1.0))})
+    law = Law(f'law_{channel}', 'electronics', channel, (term,))
+    # What this noise adds to block means is no gap any more.
+    added = sum(float(np.sum((coefficient * v) ** 2)) for v in known[name]) / sum(len(v) for v in known[name])
+    added /= 4.0 * ws.observations[0].rig.estimator.block_size
+    added = 0.0 if channel.startswith('sum') else added
+    whole = dataclasses.replace(fit, effects=(*fit.effects, ActiveEffect(effect_of(law), values_of(law))))
+    others = [dataclasses.replace(law, stage='psd')]
+    return FoundLaw(
+        law,
+        (),
+        whole,
+        fit,
+        (channel,),
+        tuple(others),
+        p,
+        gain - penalty,
+        heldout,
+        math.sqrt(max(heldout_gap(ws, fit) ** 2 - added, 0.0)),
+    )
+
+
+def _likelihood(squares: FloatArray, variance: FloatArray | float) -> float:
+    """Twice the log-likelihood of whitened values, up to a constant."""
+    v = np.broadcast_to(np.asarray(variance), squares.shape)
+    return float(-np.sum(np.log(v) + squares / v))
+
+
+def _variance(squares: FloatArray, v2: FloatArray) -> tuple[float, float]:
+    """a and b of variance = a + b v2, the likeliest: weighted least squares on the squares, in turn."""
+    a, b = float(squares.mean()), 0.0
+    columns = np.stack([np.ones_like(v2), v2], axis=1)
+    for _ in range(8):
+        weight = 1.0 / (a + b * v2)
+        found = np.linalg.lstsq(columns * weight[:, None], squares * weight, rcond=None)[0]
+        a, b = max(float(found[0]), 0.05), max(float(found[1]), 0.0)
+    return a, b
+
+
+def _simplest(best: _Trial, others: Sequence[_Trial]) -> _Trial:
+    """Of the laws beside the same effects that this recording cannot tell apart, the one with the fewest variables.
+
+    A sensor's own dot goes before the pose, on which its dot depends.
+    """
+    beside = [a.effect.name for a in best.beside]
+    near = [
+        t
+        for t in (best, *others)
+        if t.fit.chi2 - best.fit.chi2 < TIED
+        and t.cost - best.cost < BIC_ACCEPT
+        and [a.effect.name for a in t.beside] == beside
+    ]
+
+    def rank(t: _Trial) -> tuple[int, int, int, float]:
+        foreign = sum(v in POSE for law in t.laws if law.acts_on in DOTS for v in law.variables)
+        return t.terms, len(t.variables), foreign, t.cost
+
+    return min(near, key=rank)
+
+
+def _tied(best: _Trial, others: Sequence[_Trial]) -> tuple[Law, ...]:
+    """Each other first law, by stage, target and variables, that the recording cannot exclude."""
+
+    def key(law: Law) -> tuple[str, str, tuple[str, ...]]:
+        return law.stage, law.acts_on, law.variables
+
+    out = {key(best.laws[0]): best.laws[0]}
+    for t in sorted(others, key=lambda t: t.cost):
+        if t.fit.chi2 - best.fit.chi2 < TIED and t.cost - best.cost < TIED:
+            out.setdefault(key(t.laws[0]), t.laws[0])
+    return tuple(out.values())[1:]
+
+
+def _channels(ws: Workspace, best: _Trial) -> tuple[str, ...]:
+    """Where the law shows: the channels with more than a twentieth of its energy."""
+    _, alone = ws.residual([*ws.base, *best.beside])
+    moved = ws.whiten([a - b for a, b in zip(alone, best.fit.difference, strict=True)])
+    energy: FloatArray = np.sum([np.sum(part**2, axis=1) for part in ws.split(moved)], axis=0)
+    return tuple(c for c, e in zip(CHANNELS, energy, strict=True) if e > 0.05 * float(energy.sum()))

@@ -1,0 +1,114 @@
+"""discover describes what no effect explains as a law; nothing is adopted without the word."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from psd_deflection.cli.main import main
+from psd_deflection.config import load_rig
+from psd_deflection.discovery.fit import refit
+from psd_deflection.discovery.law_features import responses, score, switchings, terms
+from psd_deflection.discovery.laws import find_jitter, find_law
+from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.simulation import loads
+from psd_deflection.simulation.catalogue import FOLDERS, effect_names, effects_of_rig
+from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.simulation.laws import Law, Term, effect_of, law_text, read_law, values_of
+from psd_deflection.simulation.simulator import ForwardModel
+
+RIG = load_rig()
+HISTORY = loads.identification().loads
+WARM = 21.0 + 2.0 * np.sin(np.linspace(0.0, 5.0, len(HISTORY)))
+SCHEMA = json.loads((Path(__file__).parents[1] / 'data' / 'result.schema.json').read_text())
+
+
+def workspace(law: Law | None, seed: int = 0) -> Workspace:
+    active = [] if law is None else [ActiveEffect(effect_of(law), values_of(law))]
+    model = ForwardModel(RIG, active)
+    samples = model.run(HISTORY, WARM)
+    samples.volts += RIG.noises.ravel()[:, None] * np.random.default_rng(seed).standard_normal(samples.volts.shape)
+    model.finish(samples)
+    return Workspace([Observation('test', RIG, samples.volts.T.copy(), HISTORY, WARM)])
+
+
+def test_a_term_scores_to_first_order_what_it_explains() -> None:
+    law = Law('odd', 'link', 'static_dy', (Term('product', ('load_fy', 'load_fy'), 2e-9),))
+    ws = workspace(law)
+    null = refit(ws, ())
+    found = responses(ws, null)
+    listed = list(terms(found))
+    assert len({(t.form, t.of, tuple(t.shapes.values())) for t in listed}) == len(listed)
+    best = score(found, listed)[0]
+    assert (best.target, best.term.form, best.term.of) == ('static_dy', 'product', ('load_fy', 'load_fy'))
+    assert best.term.coefficient == pytest.approx(2e-9, rel=0.02)
+    assert null.chi2 - best.gain == pytest.approx(ws.size, rel=0.05)
+
+
+def test_times_of_switching_are_found_to_a_sample_or_two() -> None:
+    for target, size in (('x1', 3e-6), ('static_dx', 5e-6)):
+        law = Law('bump', 'psd', target, (Term('switched', (), size, times=(3.217, 7.5, 15.003)),))
+        ws = workspace(law)
+        found = responses(ws, refit(ws, ()))
+        best = score(found, switchings(found))[0]
+        assert best.target == target
+        assert best.term.coefficient == pytest.approx(size, rel=0.03)
+        np.testing.assert_allclose(best.term.times, (3.217, 7.5, 15.003), atol=0.004)
+
+
+def test_there_is_no_law_in_noise() -> None:
+    ws = workspace(None, seed=3)
+    null = refit(ws, ())
+    assert find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print) is None
+    assert find_jitter(ws, null, float(np.log(ws.effective_size()))) is None
+
+
+def test_noise_that_follows_a_variable_is_a_law_of_its_variance() -> None:
+    ws = workspace(Law('shaky', 'electronics', 'y2', (Term('jitter', ('load_fy',), 5e-8),)))
+    found = find_jitter(ws, refit(ws, ()), float(np.log(ws.effective_size())))
+    assert found is not None
+    assert (found.law.acts_on, found.law.variables, found.law.kind) == ('y2', ('load_fy',), 'variance')
+    assert found.law.terms[0].coefficient == pytest.approx(5e-8, rel=0.1)
+
+
+def test_a_law_is_told_adopted_and_then_explains_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    theirs, ours = tmp_path / 'theirs', tmp_path / 'ours'
+    theirs.mkdir()
+    ours.mkdir()
+    hidden = Law('base_moves', 'psd', 'y2', (Term('product', ('load_fx', 'load_fx'), 3e-9),))
+    (theirs / 'base_moves.yaml').write_text(law_text(hidden))
+    monkeypatch.setenv(FOLDERS, str(theirs))
+    run, out = str(tmp_path / 'run'), tmp_path / 'found'
+    steps = 'steps:0,0,0;10,0,5;-20,10,0;30,-20,-5;-10,-30,10;20,0,-10;0,0,0:1'
+    assert main(['simulate', '--out', run, '--loads', steps, '--effect', 'base_moves,c1=3e-9']) == 0
+    monkeypatch.setenv(FOLDERS, str(ours))
+    # The whole catalogue takes its time, and the blind suite has it.
+    few = [name for name in effect_names() if name not in ('sensor_gain', 'sensor_rotation', 'bending_stiffness')]
+    without = [word for name in few for word in ('--without', name)]
+    assert main(['discover', run, '--out', str(out), '--adopt', 'yielding', '--quiet', *without]) == 0
+    told = json.loads((out / 'result.json').read_text())
+    jsonschema.validate(told, SCHEMA)
+    law = told['unknown'][0]['law']
+    assert (told['verdict'], law['stage'], law['variables'], law['kind']) == (
+        'unknown_effect',
+        'psd',
+        ['load_fx'],
+        'static',
+    )
+    assert law['channels'] == ['y2']
+    assert law['heldout_after'] < 1.05 * told['gap']['floor']
+    assert 'A law for it' in (out / 'report.html').read_text()
+    # It is an effect of the user's now, and the model has it.
+    assert 'yielding' in effect_names()
+    adopted = read_law(ours / 'yielding.yaml')
+    assert adopted.terms[0].coefficient == pytest.approx(3e-9, rel=0.05)
+    (active,) = effects_of_rig(load_rig(out / 'model.yaml'))
+    assert active.effect.name == 'yielding'
+    # A name that is taken, and one that is none, are refused before the search.
+    assert main(['discover', run, '--out', str(out), '--adopt', 'yielding', '--quiet']) == 2
+    assert main(['discover', run, '--out', str(out), '--adopt', 'a b', '--quiet']) == 2

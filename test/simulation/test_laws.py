@@ -1,0 +1,184 @@
+"""Laws in YAML: read, written, simulated in pieces, corrected, refused with file and key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from psd_deflection.config import load_rig
+from psd_deflection.correction import Correction
+from psd_deflection.errors import ConfigError
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.catalogue import FOLDERS, catalogue, effects_of_rig
+from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.simulation.laws import (
+    FORMS,
+    TARGETS,
+    Law,
+    Term,
+    effect_of,
+    law_text,
+    read_law,
+    unit_of,
+    values_of,
+)
+from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
+
+RIG = load_rig()
+LOADS = np.repeat([[0.0, 0.0, 0.0], [20.0, -30.0, 10.0], [5.0, 10.0, -20.0], [0.0, 0.0, 0.0]], 150, axis=0)
+WARM = 20.0 + np.linspace(0.0, 3.0, len(LOADS))
+SHAPES = {
+    'threshold': 1.2e-4,
+    'period': 3e-4,
+    'phase': 0.3,
+    'half_width': 1e-5,
+    'time_constant': 0.1,
+    'frequency': 33.0,
+    'damping_ratio': 0.05,
+}
+
+
+def law_of(form: str, target: str = 'y2', variable: str = 'y1') -> Law:
+    shapes = {k: SHAPES[k] for k in (*FORMS[form].fitted, *FORMS[form].fixed)}
+    times = (0.1, 0.25) if form == 'switched' else ()
+    return Law('odd', TARGETS[target].stage, target, (Term(form, (variable,), 1e-6, shapes, times),))
+
+
+def active(law: Law) -> list[ActiveEffect]:
+    return [ActiveEffect(effect_of(law), values_of(law))]
+
+
+@pytest.mark.parametrize('form', [f for f in FORMS if f != 'jitter'])
+def test_a_law_is_simulated_alike_in_pieces_of_any_size(form: str) -> None:
+    law = law_of(form)
+    whole = ForwardModel(RIG, active(law)).run(LOADS, WARM)
+    nominal = ForwardModel(RIG, []).run(LOADS, WARM)
+    pieces, model = [], ForwardModel(RIG, active(law))
+    for a, b in ((0, 1), (1, 2), (2, 7), (7, 300), (300, 300), (300, len(LOADS))):
+        pieces.append(model.run(LOADS[a:b], WARM[a:b]).volts)
+    np.testing.assert_array_equal(np.concatenate(pieces, axis=1), whole.volts)
+    changed = np.any(whole.volts != nominal.volts, axis=1)
+    assert changed.tolist() == [False] * 4 + [True, False]
+
+
+@pytest.mark.parametrize('target', TARGETS)
+def test_a_law_acts_on_what_it_names(target: str) -> None:
+    law = law_of('product', target, 'load_fy')
+    samples = ForwardModel(RIG, active(law)).run(LOADS, WARM)
+    nominal = ForwardModel(RIG, []).run(LOADS, WARM)
+    moved = np.any(samples.volts != nominal.volts, axis=1)
+    psd = {'1': slice(0, 3), '2': slice(3, 6)}
+    if target[-1] in psd:
+        rest = np.ones(6, dtype=bool)
+        rest[psd[target[-1]]] = False
+        assert moved.any()
+        assert not moved[rest].any()
+    else:
+        # What moves the link shows on both PSDs.
+        assert moved[:2].any()
+        assert moved[3:5].any()
+
+
+def test_a_jitter_is_noise_that_grows_and_has_no_mean() -> None:
+    law = Law('shaky', 'electronics', 'x1', (Term('jitter', ('temperature',), 1e-5),))
+    samples = ForwardModel(RIG, active(law)).expect(LOADS, WARM)
+    np.testing.assert_array_equal(samples.volts, ForwardModel(RIG, []).expect(LOADS, WARM).volts)
+    model = ForwardModel(RIG, active(law))
+    run = model.run(LOADS, WARM)
+    before = run.volts.copy()
+    model.finish(run)
+    added = run.volts - before
+    early, late = added[0, :150].std(), added[0, -150:].std()
+    assert late == pytest.approx(2.6 / 0.4 * early, rel=0.4)
+    assert not added[1:].any()
+
+
+def test_a_lag_and_a_rate_are_those_of_their_equations() -> None:
+    t = np.arange(400) * 1e-3
+    u = np.sin(2.0 * np.pi * 5.0 * t)
+    lag = Term('relaxed', ('y1',), 1.0, {'time_constant': 0.05}).evaluate(lambda _: u, len(t), 1e-3, {})
+    want = solve_ivp(lambda s, y: (np.sin(10.0 * np.pi * s) - y) / 0.05, (0.0, t[-1]), [0.0], t_eval=t, rtol=1e-9)
+    np.testing.assert_allclose(lag, want.y[0], atol=3e-4)
+    rate = Term('rate', ('y1',)).evaluate(lambda _: u, len(t), 1e-3, {})
+    np.testing.assert_allclose(rate[3:], 10.0 * np.pi * np.cos(10.0 * np.pi * t[3:]), atol=0.02)
+
+
+def test_a_law_of_what_a_reading_knows_is_corrected() -> None:
+    terms = (Term('product', ('y1', 'temperature'), 2e-3), Term('beyond', ('y1',), 0.05, {'threshold': 5e-5}))
+    law = Law('odd', 'psd', 'y1', terms)
+    seen = ForwardModel(RIG, active(law)).run(LOADS, WARM)
+    true = ForwardModel(RIG, []).run(LOADS, WARM)
+    assert np.abs(seen.dots - true.dots).max() > 5e-6
+    fixed = Correction(RIG, active(law)).apply(seen.dots.T, seen.sums.T, WARM - WARM[0])
+    np.testing.assert_allclose(fixed, true.dots.T, atol=1e-11)
+
+
+def test_a_law_of_the_load_is_not_corrected_and_does_no_harm() -> None:
+    dots = np.full((3, 4), 1e-4)
+    np.testing.assert_array_equal(Correction(RIG, active(law_of('product', 'y2', 'load_fy'))).apply(dots), dots)
+
+
+def test_a_file_is_read_as_it_was_written_and_switched_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    terms = (
+        Term('above', ('load_fx',), 2.5e-7, {'threshold': 10.0}, sd={'coefficient': 1e-9, 'threshold': 0.1}),
+        Term('switched', (), 1e-6, times=(0.1, 0.3)),
+    )
+    law = Law('yielding', 'psd', 'y2', terms, 'the mount yields')
+    file = tmp_path / 'yielding.yaml'
+    file.write_text(law_text(law, ['found somewhere']))
+    assert read_law(file) == law
+    monkeypatch.setenv(FOLDERS, str(tmp_path))
+    effect = catalogue()['yielding']
+    assert [(p.name, p.unit) for p in effect.parameters] == [('c1', 'm/N'), ('threshold1', 'N'), ('c2', 'm')]
+    rig = load_rig(overrides={'effects.e.name': 'yielding', 'effects.e.c1': 2.5e-7})
+    volts = RigSimulator(rig, 1).step(LOADS).counts
+    assert effects_of_rig(rig)[0].values['threshold1'] == 10.0
+    assert np.any(volts != RigSimulator(RIG, 1).step(LOADS).counts)
+
+
+def test_units_and_words_are_those_of_the_variables() -> None:
+    term = Term('product', ('load_tz', 'load_tz', 'temperature'), 2.0)
+    assert unit_of(term.of) == '(N m)^2 K'
+    assert term.unit('y2') == 'm/((N m)^2 K)'
+    assert Law('a', 'psd', 'y2', (term,)).expression == 'y2 += 2 m/((N m)^2 K) · load_tz^2 temperature'
+    assert Term('rate', ('x1',)).unit('y1') == 'm s/m'
+
+
+@pytest.mark.parametrize(
+    ('change', 'said'),
+    [
+        ({'acts_on: y2': 'acts_on: y3'}, "acts_on = 'y3': unknown"),
+        ({'form: above': 'form: abov'}, "terms[0].form = 'abov': unknown; did you mean above?"),
+        ({'load_fx': 'load_fz'}, "terms[0].of = 'load_fz': unknown"),
+        ({'coefficient: 2.5e-07': 'coefficient: many'}, "terms[0].coefficient = 'many': must be a number"),
+        ({'  threshold: 10.0\n': ''}, 'terms[0].threshold = None: must be a number'),
+        ({'name: yielding\n': ''}, 'name is missing'),
+        ({'form: above': 'form: switched'}, 'terms[0].times = []: a switched term, and no other, has times'),
+        ({'acts_on: y2': 'acts_on: load_fx', '- load_fx': '- y1'}, "terms[0].of = 'y1': unknown"),
+    ],
+)
+def test_a_malformed_law_is_refused_with_file_and_key(tmp_path: Path, change: dict[str, str], said: str) -> None:
+    text = law_text(Law('yielding', 'psd', 'y2', (Term('above', ('load_fx',), 2.5e-7, {'threshold': 10.0}),)))
+    for old, new in change.items():
+        assert old in text
+        text = text.replace(old, new)
+    file = tmp_path / 'yielding.yaml'
+    file.write_text(text)
+    with pytest.raises(ConfigError) as error:
+        read_law(file)
+    assert str(error.value).startswith(f'{file}: {said}')
+
+
+def test_every_form_has_a_sound_unit() -> None:
+    # A coefficient times its form has the unit of what it acts on: doubled variables in halved units change nothing.
+    values: FloatArray = np.linspace(-1e-3, 1e-3, 50)
+    for form in set(FORMS) - {'jitter', 'switched'}:
+        term = law_of(form).terms[0]
+        shapes = {k: 1e3 * v if term.shape_unit(k) == 'm' else v for k, v in term.shapes.items()}
+        scaled = Term(form, term.of, 1.0, shapes)
+        a = term.evaluate(lambda _: values, 50, 1e-3, {})
+        b = scaled.evaluate(lambda _: 1e3 * values, 50, 1e-3, {})
+        np.testing.assert_allclose(b, 1e3 ** FORMS[form].unit_of_v * a, rtol=1e-9, atol=1e-15, err_msg=form)
