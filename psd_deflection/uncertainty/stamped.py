@@ -7,6 +7,7 @@ Joins what is measured of the noise (:mod:`psd_deflection.uncertainty.noise`), t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -114,6 +115,8 @@ class StampedDots:
         """For /diagnostics: the check of the readings, and the noise against the rig file's."""
         return (
             ('chi-square of the readings', f'{self.chi_square:.2f}'),
+            # The survival function for one degree of freedom.
+            ('p of that chi-square', f'{math.erfc(math.sqrt(0.5 * self.chi_square)):.2g}'),
             ('blocks whose readings contradict each other', str(self.contradictions)),
             ('blocks with motion that the fit cannot follow', str(self.misfits)),
             ('covariance from', f'noise {self.noise_source()}' if self._measures else 'noise of the rig file'),
