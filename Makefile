@@ -23,6 +23,7 @@
 # make blind-laws  laws that no catalogue has, drawn by chance: does discover find where they act and on what they depend (a quarter of an hour on an idle core; LAWS='--first 500' for fresh ones)
 # make camera-campaign  render 10,000 frames, most of them bad, and see whether the camera is right about each (two hours)
 # make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
+# make demo-thesis  the experiment of the thesis redone: camera, calibrate, validate on one page (some minutes; THESIS=--short: seconds)
 # make clean    remove what the above made
 PYTHON ?= python3
 VENV ?= .venv
@@ -36,7 +37,7 @@ PYTEST ?=
 WORKERS ?= 2
 BIN := $(VENV)/bin
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws camera-campaign demo-discover colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws camera-campaign demo-discover demo-thesis colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -185,6 +186,11 @@ demo-discover: $(VENV)/.installed
 	$(BIN)/psd-deflection discover build/demo/rig --out build/demo/found
 	$(BIN)/psd-deflection replay build/demo/rig --params-file build/demo/found/model.yaml --out build/demo/corrected.csv
 	@echo 'the report: build/demo/found/report.html'
+
+THESIS ?=
+demo-thesis: $(VENV)/.installed
+	rm -rf build/thesis
+	OMP_NUM_THREADS=1 $(BIN)/python -m blind.redone --out build/thesis $(THESIS)
 
 # colcon from PyPI wants an older setuptools than ours: a virtual environment of its own.
 colcon:

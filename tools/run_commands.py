@@ -46,6 +46,7 @@ CI_RUNS = (
     (r'^make docs$', '.ci/run', 'make docs '),
     (r'^make axe$', '.ci/run', 'make axe '),
     (r'^make colcon$', '.ci/run', 'make colcon '),
+    (r'^make demo-thesis$', 'test/blind/test_redone.py', "main(['--short', "),
     (r'^colcon build$', 'Makefile', 'bin/colcon --log-base log build '),
     (
         r"^pip install 'psd_deflection\[(ros|monitor|pandas|camera|foxglove)\]'$",

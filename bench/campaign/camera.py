@@ -11,19 +11,18 @@ further off than 5 sigma of its own covariance. It ends with status 1 if a bound
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import math
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from blind import render
 from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.boards import board_of, board_size
 from psd_deflection.camera.opencv import opencv
@@ -31,7 +30,6 @@ from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.camera.targets import target_of
 
-ROOT = Path(__file__).resolve().parents[2]
 REST = 4
 RUN = 20
 """Frames of one rendered rig, after those at rest."""
@@ -39,21 +37,7 @@ RUN = 20
 SIGMAS = 5.0
 
 
-def renderer() -> Any:
-    """The judge's renderer, which lies beside the tests; ``test`` is also the name of a package of Python."""
-    spec = importlib.util.spec_from_file_location('render', ROOT / 'test' / 'camera' / 'render.py')
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules['render'] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-render = renderer()
-
-
-def settings_of(scene: Any, rest: int = 0) -> CameraSettings:
+def settings_of(scene: render.Scene, rest: int = 0) -> CameraSettings:
     return CameraSettings(
         rest_frames=rest,
         matrix=tuple(scene.matrix),
@@ -102,6 +86,12 @@ def random_motion(rng: np.random.Generator) -> Any:
     return motion
 
 
+def moved(rng: np.random.Generator) -> render.Pose:
+    """A tip that is off by millimetres and degrees."""
+    dx, dy = rng.uniform(-3e-3, 3e-3, 2).tolist()
+    return render.Pose(dx, dy, rng.uniform(-0.05, 0.05))
+
+
 HURTS = (
     'none',
     'motion blur',
@@ -124,12 +114,15 @@ HURTS = (
 )
 
 
-def adverse(rng: np.random.Generator, scene: Any, motion: Any, hurt: str) -> tuple[Any, tuple[float, float, float]]:
+def adverse(
+    rng: np.random.Generator, scene: render.Scene, motion: Any, hurt: str
+) -> tuple[Any, tuple[float, float, float]]:
     """One frame with ``hurt`` done to it, and the truth: the mean over the exposure."""
     t = rng.uniform(0.0, 1.0)
     if hurt in {'far away', 'outside'}:
         # The plate is really there: the camera stays where it was.
-        away = render.Pose(*rng.choice([-1, 1], 2) * rng.uniform(0.02, 0.08, 2), z=rng.uniform(-0.02, 0.02))
+        dx, dy = rng.choice([-1, 1], 2) * rng.uniform(0.02, 0.08, 2)
+        away = render.Pose(float(dx), float(dy), z=rng.uniform(-0.02, 0.02))
         if hurt == 'far away':
             away = render.Pose(z=(-1.0 if scene.view == 'outside' else 1.0) * rng.uniform(0.3, 6.0))
         near = motion
@@ -170,8 +163,8 @@ def adverse(rng: np.random.Generator, scene: Any, motion: Any, hurt: str) -> tup
         grey = np.maximum(grey, np.roll(grey, shift, (0, 1)))
     if hurt == 'ghost':
         # Nearer than that, two pictures are a motion that was exposed twice, and their mean is right.
-        away = rng.uniform(4.0, 14.0)
-        shift = np.rint([away * math.sin(turn), away * math.cos(turn)]).astype(int)
+        apart = rng.uniform(4.0, 14.0)
+        shift = np.rint([apart * math.sin(turn), apart * math.cos(turn)]).astype(int)
         grey = grey + rng.uniform(0.1, 1.0) * (np.roll(grey, shift, (0, 1)) - scene.black)
     if hurt in {'over-exposed', 'blooming'}:
         grey = grey * rng.uniform(1.2, 6.0)
@@ -260,7 +253,7 @@ SCALES = {
 """The thesis's scale: a target of 66 mm fills most of the height."""
 
 
-def bound_of(scene: Any) -> float:
+def bound_of(scene: render.Scene) -> float:
     """Cramer-Rao bound of the place of the middle disc in the image, px a coordinate: noise over the summed slopes."""
     shift = 0.05 * scene.distance / scene.focal
     one = replace(scene, discs=1)
@@ -281,7 +274,7 @@ def accuracy_table(frames: int, seed: int) -> bool:
             reference.take(0, render.photograph(scene, [render.Pose()], rng))
         off, centres = [], []
         for _ in range(frames):
-            pose = render.Pose(*rng.uniform(-3e-3, 3e-3, 2), rng.uniform(-0.05, 0.05))
+            pose = moved(rng)
             (answer,) = reference.take(0, render.photograph(scene, [pose], rng))
             assert answer.target is not None
             off.append([answer.dx - pose.dx, answer.dy - pose.dy, answer.theta - pose.theta])
@@ -314,7 +307,7 @@ def charuco_row(frames: int, seed: int) -> bool:
         reference.take(0, shot(render.Pose()))
     off = []
     for _ in range(frames):
-        pose = render.Pose(*rng.uniform(-3e-3, 3e-3, 2), rng.uniform(-0.05, 0.05))
+        pose = moved(rng)
         (answer,) = reference.take(0, shot(pose))
         off.append([answer.dx - pose.dx, answer.dy - pose.dy, answer.theta - pose.theta])
     rms = np.sqrt(np.mean(np.square(off), axis=0)) * [1e6, 1e6, math.degrees(1.0)]

@@ -31,6 +31,7 @@ from psd_deflection.calibrating.fit import (
     refitted,
     residual_at,
     weight_matrices,
+    with_one_zero,
 )
 from psd_deflection.calibrating.observation import (
     LEAST_HOLD,
@@ -156,7 +157,7 @@ def calibrate(
         rows = settled(rows, rig, noise)
     progress('fitting')
     free = fitted_parameters(kind)
-    first = fit(rows, rig, prior, kind, free=free)
+    rows, first = with_one_zero(rows, rig, prior, kind, free)
     first, prior, widened = _believed(first, rows, rig, prior, kind, free)
     free = _determined(first, prior, free)
     whole = fit(rows, rig, prior, kind, free=free, start=first)

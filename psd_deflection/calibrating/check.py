@@ -20,7 +20,17 @@ import numpy as np
 from scipy.stats import chi2
 
 from psd_deflection.calibrating.calibrate import fitted_parameters, kind_of, roughly_late
-from psd_deflection.calibrating.fit import NAMES, Fit, Kind, Mask, Prior, explained, fit, prior_of_rig, score_at
+from psd_deflection.calibrating.fit import (
+    NAMES,
+    Fit,
+    Kind,
+    Mask,
+    Prior,
+    explained,
+    prior_of_rig,
+    score_at,
+    with_one_zero,
+)
 from psd_deflection.calibrating.observation import Rows, Run, joined, noise_of, rows_of, settled
 from psd_deflection.config import Rig
 from psd_deflection.misalignment.model import COUNT, PARAMETERS, TOLERANCES, ZERO
@@ -86,7 +96,7 @@ def check(
     wide = told.covariance.copy()
     wide[:COUNT, :COUNT] += np.diag((3.0 * TOLERANCES) ** 2)
     free = fitted_parameters(kind)
-    best = fit(rows, rig, Prior(told.mean, wide), kind, free=free)
+    rows, best = with_one_zero(rows, rig, Prior(told.mean, wide), kind, free)
     # Gradient and information at the file's values: from a rig that far off k and the heights would not be linear.
     z = told.mean.copy()
     z[ZERO:] = best.values[ZERO:]

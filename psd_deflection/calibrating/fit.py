@@ -10,14 +10,15 @@ y_j would go with its errors and pull the gains towards zero (attenuation). J_y 
 does not reach, the one redundant reading, the reference's noise does not enter, and the weight is that of the
 detectors. Known loads take the place of y, with the link's compliance; without either S_ref is as good as infinite.
 
-tau is the offset of the reference's clock. S_ref (three variances) and a factor on S_dots are variance components:
+tau is the offset of the reference's clock. S_ref (three variances, in proportion to those that the reference states for
+each row, if it does) and a factor on S_dots are variance components:
 estimated from the residuals, in turn with p. Rows beyond ``FAR`` are outliers and count for nothing. A reference whose
 errors are correlated from row to row counts as the fewer rows that it is worth.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -41,6 +42,8 @@ CLAMP_SHARE = 0.2
 FAR = 27.0
 """Squared distance of an outlier, of four residuals: one good row in 50 000."""
 STEPS, PASSES = 4, 4
+ZERO_PASSES, SAME_ZERO = 4, 1e-8
+"""Fits after each of which the zeros of the recordings are taken anew, unless they change by less than that, m."""
 _FREE = 1.0
 """Standard deviation, m and rad, of a pose that nothing but the dots tells."""
 _HUBER = 3.0
@@ -80,7 +83,7 @@ def prior_of_rig(rig: Rig, vector: RigVector | None = None) -> Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """``reference`` (3,): standard deviations of the reference, m, m, rad. ``dots``: factor on the dots' noise.
+    """``reference`` (3,): median standard deviations of the reference, m, m, rad. ``dots``: factor on the dots' noise.
 
     ``fewer``: rows that are worth one, because the reference's errors are correlated.
     """
@@ -158,7 +161,7 @@ def pose_of_readings(dots: FloatArray, p: FloatArray, length: float) -> FloatArr
 
 def weight_matrices(linear: Linear, rows: Rows, noise: Noise) -> FloatArray:
     """C^-1 (n, 4, 4), 1/m^2."""
-    spread = linear.by_pose * noise.reference
+    spread = linear.by_pose * (noise.reference * rows.sd)[:, None, :]
     covariance = np.einsum('nij,nkj->nik', spread, spread)
     covariance[:, range(4), range(4)] += noise.dots**2 * rows.variances
     return np.asarray(np.linalg.inv(covariance)) / noise.fewer
@@ -187,7 +190,7 @@ def fit(
         for _ in range(STEPS):
             inverse = weight_matrices(linear, rows, noise)
             robust = _robust(linear, inverse, noise, kind, number)
-            step, information = _step(linear, inverse, robust, z, prior, free)
+            step, information = _step(linear, inverse, robust, z, prior, free, rows)
             z = z + step
             linear = linearised(rows, z, rig, kind)
             if np.all(np.abs(step) <= 1e-2 * np.sqrt(np.diag(posterior(information, prior, free)))):
@@ -195,7 +198,7 @@ def fit(
         noise = _components(linear, rows, robust, kind, number, information, prior)
     inverse = weight_matrices(linear, rows, noise)
     robust = _robust(linear, inverse, noise, kind, PASSES)
-    _, information = _step(linear, inverse, robust, z, prior, free)
+    _, information = _step(linear, inverse, robust, z, prior, free, rows)
     return Fit(z, posterior(information, prior, free), information, linear, robust, noise, free)
 
 
@@ -212,9 +215,7 @@ def score_at(rows: Rows, z: FloatArray, rig: Rig, kind: Kind, best: Fit) -> tupl
     """J^T C^-1 r (SIZE,) and J^T C^-1 J (SIZE, SIZE) at ``z``, with the noise and the outliers of the fit ``best``."""
     linear = linearised(rows, z, rig, kind)
     inverse = weight_matrices(linear, rows, best.noise) * best.weights[:, None, None]
-    weighted = np.einsum('nij,njk->nik', inverse, linear.slopes).reshape(-1, SIZE)
-    information = linear.slopes.reshape(-1, SIZE).T @ weighted
-    return weighted.T @ linear.residual.ravel(), 0.5 * (information + information.T)
+    return _normal(linear, inverse, rows)
 
 
 def explained(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask, best: Fit) -> tuple[float, FloatArray]:
@@ -228,7 +229,7 @@ def explained(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask, best: 
     for _ in range(STEPS):
         linear = linearised(rows, z, rig, kind)
         inverse = weight_matrices(linear, rows, best.noise)
-        step, information = _step(linear, inverse, best.weights, z, prior, free)
+        step, information = _step(linear, inverse, best.weights, z, prior, free, rows)
         z = z + step
     residual = linearised(rows, z, rig, kind).residual
     misfit = float(np.einsum('ni,nij,nj,n->', residual, inverse, residual, best.weights))
@@ -246,7 +247,7 @@ def refitted(whole: Fit, rows: Rows, prior: Prior, kept: FloatArray, free: Mask)
     z = whole.values.copy()
     z[~free] = prior.mean[~free]
     shifted = Linear(residual_at(whole, z), whole.linear.slopes, whole.linear.by_pose)
-    return z + _step(shifted, inverse, whole.weights * kept, z, prior, free)[0]
+    return z + _step(shifted, inverse, whole.weights * kept, z, prior, free, rows)[0]
 
 
 def residual_at(whole: Fit, z: FloatArray) -> FloatArray:
@@ -261,12 +262,10 @@ def _step(
     z: FloatArray,
     prior: Prior,
     free: Mask,
+    rows: Rows,
 ) -> tuple[FloatArray, FloatArray]:
     """Gauss-Newton's step (SIZE,) and the information (SIZE, SIZE) of the rows."""
-    weighted = np.einsum('nij,njk->nik', inverse * robust[:, None, None], linear.slopes)
-    flat = linear.slopes.reshape(-1, SIZE)
-    information = flat.T @ weighted.reshape(-1, SIZE)
-    right = weighted.reshape(-1, SIZE).T @ linear.residual.ravel()
+    right, information = _normal(linear, inverse * robust[:, None, None], rows)
     at = np.flatnonzero(free)
     own = np.ix_(at, at)
     scale = prior.sd[at]
@@ -275,7 +274,75 @@ def _step(
     gradient = scale * right[at] - precision @ ((z - prior.mean)[at] / scale)
     step = np.zeros(SIZE)
     step[at] = scale * np.linalg.solve(normal, gradient)
-    return step, 0.5 * (information + information.T)
+    return step, information
+
+
+def _normal(linear: Linear, inverse: FloatArray, rows: Rows) -> tuple[FloatArray, FloatArray]:
+    """J^T C^-1 r (SIZE,) and J^T C^-1 J (SIZE, SIZE), ``inverse`` (n, 4, 4) being C^-1.
+
+    Every recording after the first has a zero of its own, which is eliminated: its readings tell the parameters only
+    what a constant offset of the four does not.
+    """
+    weighted = np.einsum('nij,njk->nik', inverse, linear.slopes)
+    information = linear.slopes.reshape(-1, SIZE).T @ weighted.reshape(-1, SIZE)
+    right = weighted.reshape(-1, SIZE).T @ linear.residual.ravel()
+    for run in range(1, int(rows.run.max()) + 1):
+        whole, shared, pull = _of_zero(linear, weighted, rows.run == run)
+        right -= shared.T @ np.linalg.solve(whole, pull)
+        information -= shared.T @ np.linalg.solve(whole, shared)
+    return right, 0.5 * (information + information.T)
+
+
+def _of_zero(linear: Linear, weighted: FloatArray, own: Mask) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The normal equations of one recording's own zero: (4, 4), with the parameters (4, SIZE), right side (4,)."""
+    zero = slice(ZERO, COUNT)
+    by_zero = linear.slopes[own][:, :, zero].reshape(-1, COUNT - ZERO).T
+    shared = by_zero @ weighted[own].reshape(-1, SIZE)
+    pull = weighted[own][:, :, zero].reshape(-1, COUNT - ZERO).T @ linear.residual[own].ravel()
+    return shared[:, zero] + np.diag(TOLERANCES[zero] ** -2), shared, pull
+
+
+def with_one_zero(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask) -> tuple[Rows, Fit]:
+    """The rows as if all recordings had the zero of the first one, and their fit.
+
+    The beams may have been aimed anew between two recordings, and a camera takes its rest anew. The offset is a
+    change of the unloaded readings; what it does to the others follows from the model.
+    """
+    given, count = rows, int(rows.run.max()) + 1
+    offsets = np.zeros((count, COUNT - ZERO))
+    if count > 1:
+        residual = linearised(rows, prior.mean, rig, kind).residual
+        offsets += [np.median(residual[rows.run == run], axis=0) for run in range(count)]
+        offsets -= offsets[0]
+        rows = _moved(given, rig, prior.mean, offsets)
+    best = fit(rows, rig, prior, kind, free=free)
+    # The medians are as good as the reference; the one redundant reading knows its part much better.
+    for _ in range(ZERO_PASSES if count > 1 else 0):
+        inverse = weight_matrices(best.linear, rows, best.noise) * best.weights[:, None, None]
+        weighted = np.einsum('nij,njk->nik', inverse, best.linear.slopes)
+        before = offsets.copy()
+        for run in range(1, count):
+            whole, _, pull = _of_zero(best.linear, weighted, rows.run == run)
+            offsets[run] += np.linalg.solve(whole, pull)
+        if np.abs(offsets - before).max() < SAME_ZERO:
+            break
+        rows = _moved(given, rig, best.values, offsets)
+        best = fit(rows, rig, prior, kind, free=free, start=best)
+    return rows, best
+
+
+def _moved(rows: Rows, rig: Rig, z: FloatArray, offsets: FloatArray) -> Rows:
+    """The rows without ``offsets`` (recordings, 4), m, of the unloaded readings, by the model with ``z`` (SIZE,)."""
+    length, dots = rig.link.length, rows.dots.copy()
+    for run, offset in enumerate(offsets):
+        if not offset.any():
+            continue
+        own = rows.run == run
+        moved = z[:COUNT].copy()
+        moved[ZERO:] += offset
+        pose = pose_of_readings(rows.dots[own], moved, length).T
+        dots[own] -= (readings(moved, pose, length) - readings(z[:COUNT], pose, length)).T
+    return replace(rows, dots=dots)
 
 
 def posterior(information: FloatArray, prior: Prior, free: Mask) -> FloatArray:
@@ -312,7 +379,7 @@ def _components(
     """The variance components from the residuals."""
     good = robust > 0.0 if number else np.ones(len(rows), dtype=bool)
     inverse = np.linalg.pinv(linear.by_pose)
-    errors = np.einsum('nij,nj->ni', inverse, linear.residual)[good]
+    errors = (np.einsum('nij,nj->ni', inverse, linear.residual) / rows.sd)[good]
     # Two PSDs leave one direction that no pose reaches.
     across = np.linalg.svd(linear.by_pose)[0][:, :, 3]
     redundant = np.einsum('ni,ni->n', across, linear.residual)[good]
@@ -328,7 +395,7 @@ def _components(
     dots = _deviation(redundant / expected, robustly) / share**0.5
     if kind == 'self':
         return Noise(np.full(3, _FREE), max(dots, 0.3), 1.0)
-    own = np.einsum('nij,nj->ni', inverse**2, rows.variances)[good].mean(axis=0) * dots**2
+    own = (np.einsum('nij,nj->ni', inverse**2, rows.variances) / rows.sd**2)[good].mean(axis=0) * dots**2
     seen = np.array([_deviation(e, robustly) ** 2 for e in errors.T]) / share
     reference = np.sqrt(np.maximum(seen - own, 0.01 * own))
     return Noise(reference, max(dots, 0.3), _fewer(errors, rows.run[good]))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -40,7 +40,8 @@ class Run:
     """One recording. ``t`` (n,) s of the whole grid; ``volts`` (n, 6) V of the PSDs, NaN if a sample is lost.
 
     ``reference_t`` (m,) s, ``reference`` (m, 3) m, m, rad; ``loads`` (n, 3) N, N, N m, held, or None. ``digest``: of
-    its source.
+    its source. ``reference_sd`` (m, 3): as the reference states them, None if it does not. ``exposure``: time over
+    which each reference is a mean, s.
     """
 
     name: str
@@ -50,6 +51,8 @@ class Run:
     reference: FloatArray
     loads: FloatArray | None = None
     digest: str = ''
+    reference_sd: FloatArray | None = None
+    exposure: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +61,7 @@ class Rows:
 
     ``dots`` (n, 4) m: as the detectors give them; ``variances`` (n, 4) of them by the noise alone. ``velocity``
     (n, 3): of the pose. ``loads`` (n, 3). ``rest`` (n,): whether the link has come to rest under its load.
+    ``sd`` (n, 3): of the reference as it states them, in proportion; ones if it does not.
     """
 
     t: FloatArray
@@ -68,14 +72,14 @@ class Rows:
     velocity: FloatArray
     loads: FloatArray
     rest: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    sd: FloatArray
 
     def __len__(self) -> int:
         return len(self.t)
 
     def at(self, which: np.ndarray[tuple[int], np.dtype[np.bool_]] | IntArray) -> Rows:
         """Some of the rows."""
-        names = ('t', 'run', 'pose', 'dots', 'variances', 'velocity', 'loads', 'rest')
-        return Rows(*(getattr(self, name)[which] for name in names))
+        return Rows(*(getattr(self, one.name)[which] for one in fields(self)))
 
 
 @dataclass(slots=True)
@@ -102,8 +106,11 @@ def usable_dots(run: Run, rig: Rig) -> FloatArray:
     return Calibration.from_rig(rig).dots(volts.astype(np.float32))
 
 
-def smoothed(dots: FloatArray, period: float, places: FloatArray) -> Smoothed:
-    """The polynomial through the samples about each of ``places`` (m,), in samples from the first."""
+def smoothed(dots: FloatArray, period: float, places: FloatArray, exposure: float = 0.0) -> Smoothed:
+    """The polynomial through the samples about each of ``places`` (m,), in samples from the first.
+
+    ``exposure``, s: the dots are the mean over so long about each place.
+    """
     middle = np.clip(np.rint(places).astype(np.int64), 0, len(dots) - 1)
     index = middle[:, None] + np.arange(-HALF, HALF + 1)
     inside = (index >= 0) & (index < len(dots))
@@ -120,7 +127,11 @@ def smoothed(dots: FloatArray, period: float, places: FloatArray) -> Smoothed:
     at = (places - middle) / HALF
     basis = np.vander(at, DEGREE + 1, increasing=True)
     slope = np.zeros_like(basis)
+    wide = 0.5 * exposure / (HALF * period)
     slope[:, 1:] = basis[:, :-1] * np.arange(1, DEGREE + 1)
+    if wide > 0.0:
+        power = np.arange(1, DEGREE + 2)
+        basis = ((at[:, None] + wide) ** power - (at[:, None] - wide) ** power) / (2.0 * wide * power)
     fitted = np.einsum('wi,nic->nwc', _BASIS, coefficients)
     freedom = np.maximum(mask.sum(axis=1) - DEGREE - 1, 1.0)
     squares = (mask[:, :, None] * (window - fitted) ** 2).sum(axis=1) / freedom[:, None]
@@ -175,8 +186,10 @@ def rows_of(run: Run, rig: Rig, noise: FloatArray, *, late: float = 0.0, blocks:
     places = np.interp(times, run.t, np.arange(len(run.t)), left=-np.inf, right=np.inf)
     inside = np.isfinite(places)
     places, times = places[inside], times[inside]
+    stated = None if poses is None else run.reference_sd
+    sd = np.full((len(places), 3), np.nan) if stated is None else stated[inside]
+    s = smoothed(dots, period, places, 0.0 if poses is None else run.exposure)
     poses = np.zeros((len(places), 3)) if poses is None else poses[inside]
-    s = smoothed(dots, period, places)
     loads = np.zeros((len(run.t), 3)) if run.loads is None else run.loads
     middle = np.clip(np.rint(places).astype(np.int64), 0, len(run.t) - 1)
     sample = rig.sensitivities.ravel() ** 2 * (noise**2 + rig.converter.volts_per_count**2 / 12.0)
@@ -190,6 +203,7 @@ def rows_of(run: Run, rig: Rig, noise: FloatArray, *, late: float = 0.0, blocks:
         speed,
         loads[middle],
         at_rest(run.loads, run.t)[middle],
+        sd,
     ).at(s.good)
     if len(rows) > 1 and float(np.median(np.diff(rows.t))) < (size - 0.5) * period:
         rows = _by_block(rows, rig, size * period, sample / size)
@@ -240,16 +254,18 @@ def _by_block(rows: Rows, rig: Rig, seconds: float, variances: FloatArray) -> Ro
         mean(rows.velocity),
         rows.loads[first],
         rows.rest[first],
+        np.sqrt(mean(rows.sd**2)),
     )
 
 
 def joined(parts: Sequence[Rows]) -> Rows:
     """All rows, each with the number of its recording."""
-    run = np.concatenate([np.full(len(p), i) for i, p in enumerate(parts)])
-    names = ('pose', 'dots', 'variances', 'velocity', 'loads', 'rest')
-    return Rows(
-        np.concatenate([p.t for p in parts]), run, *(np.concatenate([getattr(p, n) for p in parts]) for n in names)
-    )
+    every = {one.name: np.concatenate([getattr(p, one.name) for p in parts]) for one in fields(Rows)}
+    every['run'] = np.concatenate([np.full(len(p), i) for i, p in enumerate(parts)])
+    sd = every['sd']
+    # Only their proportions are believed: the fit finds their size. Recordings that do not state them have no part.
+    every['sd'] = np.ones_like(sd) if np.isnan(sd).any() else sd / np.median(sd, axis=0)
+    return Rows(**every)
 
 
 CHANNEL_NAMES = tuple(CHANNELS[i] for i in DOT_CHANNELS)

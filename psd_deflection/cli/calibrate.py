@@ -8,6 +8,7 @@ holds what the calibration left open), report.html and calibration.json.
 --self takes recordings without reference and loads: the one redundant reading tells relative gains and turns.
 
   psd-deflection calibrate run.csv --params-file my_rig.yaml --out new
+  psd-deflection calibrate run.csv --reference camera.csv --out new
   psd-deflection calibrate today.csv --check new/rig.yaml
   psd-deflection calibrate run --self --params-file my_rig.yaml --out new
 """
@@ -25,9 +26,10 @@ from tqdm import tqdm
 
 from psd_deflection.calibrating import check as checking
 from psd_deflection.calibrating.calibrate import Calibration, calibrate
+from psd_deflection.calibrating.observation import Run
 from psd_deflection.calibrating.report import report_html
 from psd_deflection.calibrating.result import result, sentence, source_of, values_of
-from psd_deflection.cli._options import make_folder, namespace_option
+from psd_deflection.cli._options import make_folder, namespace_option, number
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save, show, warn
 from psd_deflection.cli._rig_file import rig_file
@@ -41,6 +43,8 @@ from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end
 from psd_deflection.simulation.catalogue import effects_of_rig, effects_to_values
 
+MOST_EXPOSURE = 0.02
+"""s. The polynomial that is fitted to the samples about a reference is 21 samples long."""
 STEPS = 5
 """Steps that the progress bar counts: noise, rows, fitting, held-out motion, report."""
 
@@ -50,6 +54,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('recordings', metavar='REC', nargs='+', help='recordings with a reference or with known loads')
     parser.add_argument(
         '--params-file', metavar='RIG.yaml', help='the rig as it is known (default: the parameters in the recording)'
+    )
+    parser.add_argument(
+        '--reference',
+        metavar='FILE',
+        action='append',
+        default=[],
+        help='a table t,dx,dy,theta or another recording, one for each REC in order (default: in REC)',
+    )
+    parser.add_argument(
+        '--exposure',
+        type=number('--exposure', 0.0, MOST_EXPOSURE),
+        default=0.0,
+        metavar='S',
+        help='time over which each reference is a mean, s: the exposure of a camera (default 0)',
     )
     parser.add_argument('--out', metavar='DIR', help='folder for rig.yaml, report.html, calibration.json')
     parser.add_argument('--check', metavar='RIG.yaml', help='instead: does this calibrated rig file still hold?')
@@ -63,6 +81,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, calibrate or check, write, and say it in a sentence."""
+    if args.reference and len(args.reference) != len(args.recordings):
+        raise UsageError(
+            f'--reference is given {len(args.reference)} times for {len(args.recordings)} recordings: '
+            f'give one for each, in the same order'
+        )
     if args.check is not None:
         if args.params_file is not None or args.out is not None:
             raise UsageError('--check RIG.yaml is for itself: give neither --params-file nor --out')
@@ -72,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     out = Path(args.out)
     rig = _rig_of(args)
     with told('reading', quiet=args.quiet or args.json):
-        runs = read_runs(args.recordings, rig, namespace=args.namespace)
+        runs = _runs_of(args, rig)
     make_folder(args.out)
     # Before the work, which takes its time.
     if not os.access(out, os.W_OK):
@@ -106,6 +129,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _runs_of(args: argparse.Namespace, rig: Rig) -> list[Run]:
+    return read_runs(args.recordings, rig, references=args.reference, exposure=args.exposure, namespace=args.namespace)
+
+
 def _rig_of(args: argparse.Namespace) -> Rig:
     if args.params_file is not None:
         return load_rig(args.params_file)
@@ -134,7 +161,7 @@ def _check(args: argparse.Namespace) -> int:
     if not is_calibrated(rig):
         raise ConfigError(f'{args.check}: calibration.names: not there; --check takes the rig.yaml of a calibration')
     with told('checking', quiet=args.quiet or args.json):
-        found = checking.check(read_runs(args.recordings, rig, namespace=args.namespace), rig, alone=args.alone)
+        found = checking.check(_runs_of(args, rig), rig, alone=args.alone)
     if args.json:
         print_json(checking.result(found), indent=1)
         return 0

@@ -11,6 +11,7 @@ bag folder have /reference/deflection and /reference/deflection_with_covariance.
   psd-deflection camera target --out target.pdf
   psd-deflection camera frames --params-file camera.yaml --out reference.csv
   psd-deflection camera /dev/video0 --params-file camera.yaml --out run.mcap
+  psd-deflection camera /dev/video0 --out run.csv --show now.png
   psd-deflection camera intrinsics shots/*.png --out camera_info.yaml
   ros2 run psd_deflection camera --ros-args -r image:=/camera/image_raw
 """
@@ -22,14 +23,17 @@ import collections
 import contextlib
 import importlib.util
 import math
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.intrinsics import calibrated
 from psd_deflection.camera.opencv import opencv
+from psd_deflection.camera.preview import preview
 from psd_deflection.camera.print_target import printed, sizes
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import TARGETS, CameraSettings
@@ -42,6 +46,8 @@ from psd_deflection.footage import Footage, Frame, read_image, read_settings, re
 from psd_deflection.recordings.csv_writer import CsvReferenceFile
 from psd_deflection.recordings.reference_sink import ReferenceSink
 
+PREVIEW_S = 1.0
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
@@ -52,6 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--params-file', metavar='CAMERA.yaml', help='target.spacing, target.radius, camera.matrix …')
     parser.add_argument('--out', metavar='OUT', help='X.csv, X.mcap or a bag folder')
     parser.add_argument('--frames', type=whole('--frames', 1), metavar='N', help='stop after so many frames')
+    parser.add_argument(
+        '--show', metavar='FILE.png', help='once a second, write the frame with what was found in it to this picture'
+    )
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')
 
 
@@ -124,12 +133,12 @@ def _intrinsics(args: argparse.Namespace, settings: CameraSettings) -> int:
 
 
 @contextlib.contextmanager
-def _saved(out: Path) -> Iterator[None]:
+def _saved(out: Path, option: str = '--out') -> Iterator[None]:
     """Turn what the disk refuses into a RecordingError."""
     try:
         yield
     except OSError as error:
-        raise RecordingError(f'--out {out}: cannot be written ({error.strerror or error})') from None
+        raise RecordingError(f'{option} {out}: cannot be written ({error.strerror or error})') from None
 
 
 def _measure(args: argparse.Namespace, settings: CameraSettings) -> int:
@@ -145,7 +154,7 @@ def _measure(args: argparse.Namespace, settings: CameraSettings) -> int:
     sink: CsvReferenceFile | ReferenceSink
     sink = CsvReferenceFile(out) if out.suffix.lower() == '.csv' else ReferenceSink(out)
     with contextlib.closing(sink):
-        for answer in _answers(args, footage, reference):
+        for answer in _answers(args, footage, reference, _Preview(args.show)):
             reasons[str(answer.status)] += 1
             sink.put(answer.t_ns, answer.as_record(), str(answer.status))
             found = [*found[-999:], answer] if answer.status is Status.OK else found
@@ -153,7 +162,40 @@ def _measure(args: argparse.Namespace, settings: CameraSettings) -> int:
     return 0
 
 
-def _answers(args: argparse.Namespace, footage: Footage, reference: CameraReference) -> Iterator[FrameAnswer]:
+class _Preview:
+    """Writes the newest answered frame to ``path``, at most once in ``PREVIEW_S``, and the last; None: nothing."""
+
+    def __init__(self, path: str | None) -> None:
+        if path is not None and not path.lower().endswith('.png'):
+            raise UsageError(f'--show {path}: the name must end in .png')
+        self._path = None if path is None else Path(path)
+        self._due = 0.0
+        self._last: tuple[Any, FrameAnswer] | None = None
+        if self._path is not None:
+            need_folder(self._path)
+
+    def take(self, frame: Frame, answers: list[FrameAnswer]) -> None:
+        """The answer of this frame, if it is among ``answers``."""
+        own = [answer for answer in answers if answer.t_ns == frame.t_ns]
+        if self._path is None or not own:
+            return
+        self._last = frame.image, own[-1]
+        if time.monotonic() >= self._due:
+            self._due = time.monotonic() + PREVIEW_S
+            self.write()
+
+    def write(self) -> None:
+        """Write what is not written yet."""
+        if self._path is not None and self._last is not None:
+            with _saved(self._path, '--show'):
+                replace_file(self._path, preview(*self._last))
+            self._last = None
+
+
+def _answers(
+    args: argparse.Namespace, footage: Footage, reference: CameraReference, shown: _Preview
+) -> Iterator[FrameAnswer]:
+    frame: Frame | None = None
     frames: Iterator[Frame] = iter(footage)
     hidden = True if args.json else None
     bar = tqdm(
@@ -162,11 +204,17 @@ def _answers(args: argparse.Namespace, footage: Footage, reference: CameraRefere
     # A live camera is ended by Ctrl-C: what was measured until then stays.
     with contextlib.suppress(KeyboardInterrupt) if footage.live else contextlib.nullcontext():
         for number, frame in enumerate(bar, 1):
-            yield from reference.take(frame.t_ns, frame.image)
+            answers = reference.take(frame.t_ns, frame.image)
+            shown.take(frame, answers)
+            yield from answers
             if number == args.frames:
                 break
     bar.close()
-    yield from reference.finish()
+    answers = reference.finish()
+    if frame is not None:
+        shown.take(frame, answers)
+    shown.write()
+    yield from answers
 
 
 def _tell(

@@ -18,7 +18,19 @@ from psd_deflection.errors import ConfigError
 
 SHELLS = ('bash', 'zsh', 'tcsh')
 
-FILES = ('REC', 'IN', 'FILE', 'OUT', 'RIG.yaml', 'CAMERA.yaml', 'FILE.yaml', 'FILE.png|svg|pdf', 'PORT', 'PATH')
+FILES = (
+    'REC',
+    'IN',
+    'FILE',
+    'OUT',
+    'RIG.yaml',
+    'CAMERA.yaml',
+    'FILE.yaml',
+    'FILE.png',
+    'FILE.png|svg|pdf',
+    'PORT',
+    'PATH',
+)
 FOLDERS = ('DIR', 'FOLDER')
 """Names of values in the help that are to be completed as paths; a bag is a folder, and completed as a file is."""
 

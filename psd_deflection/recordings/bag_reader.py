@@ -22,6 +22,7 @@ from msg_adapters import (
     FILTERED,
     LOAD,
     REFERENCE,
+    REFERENCE_WITH_COVARIANCE,
     RIG,
     SAMPLES,
     TEMPERATURE,
@@ -48,6 +49,7 @@ from psd_deflection.records import (
     ParameterChange,
     RawChunk,
     ReferencePose,
+    ReferenceWithCovariance,
     SampleBlock,
     TemperatureReading,
 )
@@ -332,6 +334,10 @@ class BagRecording(Recording):
     def references(self) -> list[ReferencePose]:
         """Independent measurements of the tip."""
         return self._decoded(REFERENCE, pose_stamped.to_reference)
+
+    def references_with_covariance(self) -> list[ReferenceWithCovariance]:
+        """The same with their covariances, if they were recorded."""
+        return self._decoded(REFERENCE_WITH_COVARIANCE, pose_with_covariance_stamped.to_reference)
 
     def temperatures(self) -> list[TemperatureReading]:
         """Ambient temperatures."""

@@ -14,12 +14,24 @@ from psd_deflection.errors import RecordingError
 from psd_deflection.recordings.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.references import References, read_references, references_in
 from psd_deflection.recordings.replay_engine import check_psds
 from psd_deflection.records import CHANNELS, FloatArray
 
 
-def read_run(source: Recording | str | Path, rig: Rig, *, namespace: str | None = None) -> Run:
-    """One recording: the recording or its path. Raises RecordingError if it cannot be read."""
+def read_run(
+    source: Recording | str | Path,
+    rig: Rig,
+    *,
+    reference: str | Path | None = None,
+    exposure: float = 0.0,
+    namespace: str | None = None,
+) -> Run:
+    """One recording: the recording or its path. Raises RecordingError if it cannot be read.
+
+    ``reference``: a table of it, or another recording; None: in the recording. ``exposure``: time over which each
+    reference is a mean, s.
+    """
     recording = source if isinstance(source, Recording) else open_recording(source, namespace=namespace)
     path = recording.path
     check_two_psds(rig, 'a calibration')
@@ -37,7 +49,8 @@ def read_run(source: Recording | str | Path, rig: Rig, *, namespace: str | None 
         volts[place, i] = samples[channel]
     start = int(samples['t_ns'][0])
     t = np.interp(np.arange(n), place, (samples['t_ns'] - start).astype(np.float64)) * 1e-9
-    references = recording.references()
+    found = references_in(recording) if reference is None else read_references(reference)
+    references = References(np.zeros(0, np.int64), np.zeros((0, 3))) if found is None else found
     applied = recording.loads()
     loads: FloatArray | None = None
     if applied:
@@ -48,13 +61,26 @@ def read_run(source: Recording | str | Path, rig: Rig, *, namespace: str | None 
         path.name,
         t,
         Wiring.from_rig(rig).to_psds(volts),
-        np.array([(r.t_ns - start) * 1e-9 for r in references]),
-        np.array([(r.dx, r.dy, r.theta) for r in references], dtype=np.float64).reshape(-1, 3),
+        (references.t_ns - start).astype(np.float64) * 1e-9,
+        references.poses,
         loads,
         digest_of(path) if path.exists() else '',
+        references.sd,
+        exposure,
     )
 
 
-def read_runs(sources: Sequence[Recording | str | Path], rig: Rig, *, namespace: str | None = None) -> list[Run]:
-    """All of ``sources``."""
-    return [read_run(source, rig, namespace=namespace) for source in sources]
+def read_runs(
+    sources: Sequence[Recording | str | Path],
+    rig: Rig,
+    *,
+    references: Sequence[str | Path] = (),
+    exposure: float = 0.0,
+    namespace: str | None = None,
+) -> list[Run]:
+    """All of ``sources``; ``references``: none, or the reference of each."""
+    tables: Sequence[str | Path | None] = references or [None] * len(sources)
+    return [
+        read_run(source, rig, reference=table, exposure=exposure, namespace=namespace)
+        for source, table in zip(sources, tables, strict=True)
+    ]

@@ -25,6 +25,7 @@ from psd_deflection.records import (
     ParameterChange,
     RawChunk,
     ReferencePose,
+    ReferenceWithCovariance,
     SampleBlock,
     TemperatureReading,
     channel_names,
@@ -154,6 +155,10 @@ class Recording(abc.ABC):
     @abc.abstractmethod
     def references(self) -> list[ReferencePose]:
         """Independent measurements of the tip."""
+
+    def references_with_covariance(self) -> list[ReferenceWithCovariance]:
+        """The same with their covariances, if they were recorded."""
+        return []
 
     @abc.abstractmethod
     def temperatures(self) -> list[TemperatureReading]:

@@ -21,7 +21,15 @@ from psd_deflection.recordings.csv_reader import MAX_LINE, MAX_SECONDS
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay_engine import replayed
-from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, IntArray, SampleBlock, SpotMeans
+from psd_deflection.records import (
+    BlockStatus,
+    DeflectionEstimate,
+    FloatArray,
+    IntArray,
+    ReferencePose,
+    SampleBlock,
+    SpotMeans,
+)
 
 POSE = ('dx', 'dy', 'theta')
 DEVIATIONS = ('sd_dx', 'sd_dy', 'sd_theta')
@@ -58,13 +66,27 @@ class Run:
 
 def references_of(recording: Recording) -> References:
     """The references in the recording; raises RecordingError if it has none."""
-    found = recording.references()
-    if not found:
+    found = references_in(recording)
+    if found is None:
         raise RecordingError(
             f'{recording.path}: holds no reference (CSV columns ref_dx, ref_dy, ref_theta, or the topic '
             f'/reference/deflection); give one with --reference FILE'
         )
-    return _in_order(np.array([r.t_ns for r in found], dtype=np.int64), np.array([r[1:] for r in found]), None, {})
+    return found
+
+
+def references_in(recording: Recording) -> References | None:
+    """The references in the recording, with the standard deviations that came with each; None if it has none."""
+    stated = recording.references_with_covariance()
+    found = recording.references() or [ReferencePose(r.t_ns, r.dx, r.dy, r.theta) for r in stated]
+    if not found:
+        return None
+    variances = {r.t_ns: (r.covariance[0], r.covariance[4], r.covariance[8]) for r in stated}
+    own = np.array([variances.get(r.t_ns, (0.0, 0.0, 0.0)) for r in found])
+    # ROS states an unknown covariance as zeros.
+    sd = np.sqrt(own) if np.all(own > 0.0) else None
+    t_ns = np.array([r.t_ns for r in found], dtype=np.int64)
+    return _in_order(t_ns, np.array([r[1:] for r in found]), sd, {})
 
 
 def read_references(path: str | Path) -> References:

@@ -10,10 +10,11 @@ reference section: at a height of 20 mm, a flat model's dY is wrong by 115 um un
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
+from psd_deflection.config import Rig
 from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.geometry.plate import Tilts, crossing, flat_pose
@@ -23,20 +24,25 @@ from psd_deflection.solvers.interface import Solution, Solver, flat_gain
 
 
 class BeamSolver(Solver):
-    """Tilts tied to the deflection by ``Geometry.slope_ratio``; heights in the model; P >= 2 PSDs."""
+    """Tilts tied to the deflection by ``Geometry.slope_ratio``; heights in the model; P >= 2 PSDs.
+
+    If the rig file lists the effect ``plane_tilt``, as a calibrated one does, what tilts and heights did to the dots is
+    taken off before any solver sees them: the model is then the flat plate, and only the tilts are told.
+    """
 
     name: ClassVar[str] = 'beam'
     budgeted_as: ClassVar[str] = 'beam'
     tilts: ClassVar[Tilts] = 'tied'
 
-    def __init__(self, geometry: Geometry) -> None:
-        """Bind to ``geometry``.
+    def __init__(self, geometry: Geometry, tilt_in_dots: bool = True) -> None:
+        """Bind to ``geometry``. ``tilt_in_dots``: the dots are as the tilted plate has them.
 
         Raises SolverError if the beams coincide, or if 1 + k h/L = 0 for a surface: there the
         rotation cancels the displacement.
         """
         check_twist(geometry)
-        self._tie = slope_per_metre(geometry)
+        self._slope = slope_per_metre(geometry)
+        self._tie = self._slope if tilt_in_dots else 0.0
         for i, height in enumerate(np.asarray(geometry.heights).tolist()):
             if abs(1.0 + self._tie * height) < 1e-3:
                 raise SolverError(
@@ -48,12 +54,19 @@ class BeamSolver(Solver):
         self._beams = [(lx, ly) for lx, ly in np.asarray(geometry.beams).tolist()]
         self._heights = np.asarray(geometry.heights).tolist()
 
+    @classmethod
+    def options_from_rig(cls, rig: Rig) -> dict[str, Any]:
+        """Whether the rig file's effects leave the tilts in the dots."""
+        # The name of an effect is that of its group unless it has one of its own.
+        names = {rig.effects.get(f'{group}.name', group) for group in {key.partition('.')[0] for key in rig.effects}}
+        return {'tilt_in_dots': 'plane_tilt' not in names}
+
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
         q = [c + m for c, m in zip(self._centers, dots, strict=True)]
         found = fit(self._model, flat_pose(q, self._beams), q, variances)
         dx, dy, theta = found.parameters
-        return answer(found, (dx, dy, theta, -self._tie * dy, self._tie * dx), found.covariance)
+        return answer(found, (dx, dy, theta, -self._slope * dy, self._slope * dx), found.covariance)
 
     def _model(self, x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
         dx, dy, theta = x

@@ -150,6 +150,13 @@ class Redundancy:
         self._wrong, self._left, self._held = int(wrong), int(left), np.array(held)
 
 
+def survival(chi_square: float, freedom: int) -> float:
+    """Probability that a chi-square of ``freedom`` degrees is larger; 1 of none."""
+    from scipy.special import chdtrc
+
+    return float(chdtrc(freedom, chi_square)) if freedom else 1.0
+
+
 def _unexplained(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
     """Q (2P, 2P) of the module's text, 1/m^2."""
     weights = inverse(covariance[None])[0]

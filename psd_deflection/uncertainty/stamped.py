@@ -8,6 +8,7 @@ tells what they remember.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -20,7 +21,7 @@ from psd_deflection.uncertainty.block_fit import BlockFit, Fitted
 from psd_deflection.uncertainty.combinations import Left
 from psd_deflection.uncertainty.consistency import LIMIT, UNMEASURED, Checked, Consistency, Suspect
 from psd_deflection.uncertainty.noise import StreamNoise
-from psd_deflection.uncertainty.redundancy import Redundancy
+from psd_deflection.uncertainty.redundancy import Redundancy, survival
 
 NOISE, FIT, HELD_RESIDUAL = 'state.noise', 'state.block_fit', 'state.residual'
 REDUNDANCY, SOME = 'state.redundancy', 'state.psds.'
@@ -307,11 +308,19 @@ class StampedDots:
         """For /diagnostics: the check of the readings, and the noise against the rig file's."""
         return (
             ('chi-square of the readings', f'{self.chi_square:.2f}' + self._of_freedom()),
+            ('p of that chi-square', f'{self._p_value():.2g}'),
             ('blocks whose readings contradict each other', str(self.contradictions)),
             ('blocks with motion that the fit cannot follow', str(self.misfits)),
             ('covariance from', f'noise {self.noise_source()}' if self._measures else 'noise of the rig file'),
             *(self.noise_words() if self._measures else ()),
         )
+
+    def _p_value(self) -> float:
+        """Share of sound blocks with a larger chi-square."""
+        if self._redundancy is not None:
+            return survival(self.chi_square, self.freedom)
+        # The survival function for one degree of freedom.
+        return math.erfc(math.sqrt(0.5 * self.chi_square))
 
     def _of_freedom(self) -> str:
         """With two PSDs it is always one degree."""

@@ -12,9 +12,9 @@ from blind import misaligned
 from psd_deflection.calibrating.calibrate import Calibration, calibrate
 from psd_deflection.calibrating.check import check
 from psd_deflection.calibrating.fit import NAMES
-from psd_deflection.calibrating.observation import Run
+from psd_deflection.calibrating.observation import Run, smoothed
 from psd_deflection.calibrating.result import values_of
-from psd_deflection.config import Rig, rig_from_values
+from psd_deflection.config import Rig, replace_values, rig_from_values
 from psd_deflection.errors import RecordingError
 from psd_deflection.records import FloatArray
 
@@ -88,6 +88,64 @@ def test_what_the_recording_cannot_show_keeps_value_and_tolerance(nominal: Rig) 
         assert found.values[AT[name]] == found.prior.mean[AT[name]]
         assert found.sd[AT[name]] == pytest.approx(found.prior.sd[AT[name]])
     assert 'psd_1.gain_y' not in alone
+
+
+def test_frames_count_as_much_as_they_say(nominal: Rig, pose: FloatArray) -> None:
+    """Every second frame is three times as noisy, and says so: too little for an outlier."""
+    pose = pose[:8000]
+    recorded = misaligned.record(only(), pose, np.random.default_rng(2))
+    run = campaign.run_of(recorded)
+    share = np.where(np.arange(len(run.reference)) % 2, 3.0, 1.0)[:, None] * np.ones(3)
+    noisy = pose[recorded.frames] + (run.reference - pose[recorded.frames]) * share
+    # In its own units: only the proportions are believed.
+    stated = Run(run.name, run.t, run.volts, run.reference_t, noisy, reference_sd=7.0 * share * misaligned.CAMERA)
+    unstated = Run(run.name, run.t, run.volts, run.reference_t, noisy)
+    known, guessed = calibrate([stated], nominal), calibrate([unstated], nominal)
+    clock = AT['reference.clock']
+    assert known.sd[clock] < guessed.sd[clock] / 1.4
+    assert abs(known.clock + known.values[clock]) < 4.0 * known.sd[clock]
+
+
+def test_a_reference_may_be_a_mean_over_an_exposure(nominal: Rig) -> None:
+    """The mean of a motion of 14 Hz over 12 ms is 4.5 % less than its middle."""
+    t = np.arange(2000) / 1000.0
+    wave = np.column_stack([np.sin(2 * np.pi * 14.0 * t + phase) for phase in range(4)])
+    at = np.linspace(100.3, 1900.8, 50)
+    less = np.sin(np.pi * 14.0 * 0.012) / (np.pi * 14.0 * 0.012)
+    true = np.column_stack([np.sin(2 * np.pi * 14.0 * at / 1000.0 + phase) for phase in range(4)])
+    assert smoothed(wave, 1e-3, at).dots == pytest.approx(true, abs=3e-5)
+    assert smoothed(wave, 1e-3, at, 0.012).dots == pytest.approx(less * true, abs=3e-5)
+    assert less < 0.956
+
+
+def test_the_beam_solver_takes_a_calibrated_file(nominal: Rig, pose: FloatArray) -> None:
+    """What tilts and heights did is taken off the dots: it must not be taken off twice."""
+    truth = misaligned.draw(np.random.default_rng(8))
+    rig, _ = campaign.calibrated_rig(nominal, campaign.run_of(misaligned.record(truth, pose, np.random.default_rng(1))))
+    rng = np.random.default_rng(6)
+    later = misaligned.poses(misaligned.pushes(rng, 3, 1.0))
+    volts = misaligned.record(truth, later, rng).volts
+    (_, exact, small), (_, beam, own) = (
+        campaign.measured(replace_values(rig, {'solver': name}), volts) for name in ('exact', 'beam')
+    )
+    assert np.abs(exact).max(axis=0).min() > 1e-3
+    assert beam == pytest.approx(exact, abs=1e-8)
+    assert own == pytest.approx(small, rel=0.1, abs=1e-16)
+
+
+def test_every_recording_has_a_zero_of_its_own(nominal: Rig) -> None:
+    """The beams were aimed anew between two recordings, by 0.3 mm: a hundred times what the readings are good for."""
+    rng = np.random.default_rng([77, 1])
+    truth, runs = misaligned.draw(rng), []
+    for _ in range(2):
+        now = truth | {f'beam_{n}.{axis}': rng.normal(0.0, 3e-4) for n in (1, 2) for axis in 'xy'}
+        pose = misaligned.poses(misaligned.pushes(rng, 6, 1.2))
+        runs.append(campaign.run_of(misaligned.record(now, pose, rng)))
+    found = calibrate(runs, nominal)
+    assert found.fit.noise.dots == pytest.approx(1.0, abs=0.15)
+    errors = np.array([(found.values[AT[n]] - v) / found.sd[AT[n]] for n, v in truth.items() if n in AT])
+    assert np.abs(errors).max() < 4.0
+    assert np.mean(errors**2) < 2.0
 
 
 def test_a_late_reference_is_put_right(nominal: Rig, pose: FloatArray) -> None:

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from blind.render import Pose, Scene, mean_of, over_exposure, photograph
 from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.camera.targets import target_of
-from test.camera.render import Pose, Scene, mean_of, over_exposure, photograph
 
 STILL = [Pose()] * 2
 

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+from blind.render import Pose, Scene, photograph, seen_at
 from psd_deflection.cli.main import main
 from psd_deflection.recordings.readers import open_recording
-from test.camera.render import Pose, Scene, photograph
 
 POSES = [Pose(), Pose(), Pose(1e-3, -2e-3, 0.02), Pose(-2e-3, 1e-3, -0.01)]
 
@@ -50,6 +50,19 @@ def test_the_table_has_each_frame_with_its_answer_or_reason(
     for row, pose in zip((r for r in rows if r['status'] == 'ok'), POSES, strict=True):
         for name in ('dx', 'dy', 'theta'):
             assert abs(float(row[name]) - getattr(pose, name)) < 5 * float(row[f'sd_{name}'])
+
+
+def test_the_preview_shows_where_the_discs_were_found(filmed: Path, tmp_path: Path) -> None:
+    """Crosses at the discs of the last frame, and nowhere in a frame without an answer."""
+    words = ['camera', str(filmed / 'frames'), '--params-file', str(filmed / 'camera.yaml')]
+    for frames, crosses in (('5', True), ('4', False)):
+        out = ['--out', str(tmp_path / f'{frames}.csv'), '--show', str(tmp_path / 'now.png')]
+        assert main([*words, *out, '--frames', frames]) == 0
+        shown = cv2.imread(str(tmp_path / 'now.png'))
+        assert shown is not None
+        green = (shown[..., 1].astype(int) - shown[..., 2]) > 100
+        seen = [seen_at(Scene(turn=0.1), POSES[-1], 0.0, 0.025 * i) for i in (1, 0, -1)]
+        assert [bool(green[round(v), round(u)]) for u, v in seen] == [crosses] * 3
 
 
 @pytest.mark.parametrize('name', ['reference.mcap', 'reference'])

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from psd_deflection.errors import RecordingError
-from psd_deflection.recordings.references import read_references
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.references import read_references, references_in
+from test.recordings.making import write_bag
 
 
 def written(folder: Path, text: str) -> Path:
@@ -77,3 +79,12 @@ def test_a_table_that_is_no_text_is_refused(tmp_path: Path) -> None:
 def test_no_file(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match='cannot be read'):
         read_references(tmp_path / 'none.csv')
+
+
+def test_a_bag_states_the_deviations_of_each_reference(tmp_path: Path) -> None:
+    write_bag(tmp_path / 'bag', {})
+    found = references_in(open_recording(tmp_path / 'bag'))
+    assert found is not None
+    assert len(found.t_ns) == len(found.poses) >= 2
+    assert found.sd is not None
+    assert found.sd == pytest.approx(np.full((len(found.t_ns), 3), 1e-6))

@@ -16,7 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # noqa: E402
 from sensor_msgs.msg import Image  # noqa: E402
 
-from test.camera.render import Pose, Scene, photograph  # noqa: E402
+from blind.render import Pose, Scene, photograph  # noqa: E402
 from tools.program import PSD_DEFLECTION, Program  # noqa: E402
 
 

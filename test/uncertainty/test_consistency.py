@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from psd_deflection.config import rig_from_values
 from psd_deflection.records import FloatArray
 from psd_deflection.uncertainty.consistency import Consistency, Suspect, widened
+from psd_deflection.uncertainty.stamped import StampedDots
 
 CENTERS = np.array([[0.0, 0.070], [-0.100, 0.0]])
 COVARIANCE = np.diag([4e-12, 1e-12, 9e-12, 2e-12]) + 0.5e-12
@@ -161,3 +163,11 @@ def test_exchanged_axes_are_named(psd: int, order: list[int]) -> None:
 
 def test_sound_readings_are_not_accused() -> None:
     assert seen(lambda r: r) == ''
+
+
+def test_the_p_is_that_of_the_chi_square() -> None:
+    """One degree of freedom: 3.84 is the 5 % point, 6.63 the 1 % point."""
+    stamped = StampedDots(rig_from_values({}), flat=True)
+    for chi_square, p in ((0.0, '1'), (3.8415, '0.05'), (6.6349, '0.01')):
+        stamped.chi_square = chi_square
+        assert dict(stamped.words())['p of that chi-square'] == p

@@ -1,4 +1,4 @@
-"""Draws what a camera sees of three discs: the judge of the detector, written apart from it.
+"""Draws what a camera sees of the target on the tip plate: the judge of the detector, written apart from it.
 
 Coverage is anti-aliased by area: pixels on a rim are cut in 16 x 16 parts, each of which is followed back through the
 lens onto the plate. The exposure is a mean over instants of the real motion; then come the lens's blur, uneven light,
@@ -59,10 +59,12 @@ class Scene:
 
     @property
     def matrix(self) -> list[float]:
+        """Camera matrix, row by row."""
         return [self.focal, 0.0, self.centre[0], 0.0, self.focal, self.centre[1], 0.0, 0.0, 1.0]
 
 
 def about(axis: int, angle: float) -> Array:
+    """A turn about one axis."""
     c, s = math.cos(angle), math.sin(angle)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     out = np.eye(3)
@@ -79,6 +81,7 @@ def camera_of(scene: Scene) -> tuple[Array, Array]:
 
 
 def distort(x: Array, y: Array, distortion: Sequence[float]) -> tuple[Array, Array]:
+    """Where the lens puts a ray."""
     k1, k2, p1, p2, k3 = [*distortion, *([0.0] * 5)][:5]
     rr = x**2 + y**2
     f = 1 + k1 * rr + k2 * rr**2 + k3 * rr**3
@@ -133,16 +136,23 @@ def on_plate(scene: Scene, pose: Pose, x: Array, y: Array) -> tuple[Array, Array
     )
 
 
-def seen_at(scene: Scene, pose: Pose, x: float, y: float) -> tuple[float, float]:
-    """Pixel of a point (x, y) of the tip plate."""
+def seen(scene: Scene, pose: Pose, points: Array) -> Array:
+    """Pixels (n, 2) of points (n, 2) of the tip plate."""
     rotation, origin = camera_of(scene)
     tip = rotation @ about(1, pose.omega) @ about(0, pose.phi) @ about(2, pose.theta)
-    p = origin + rotation @ np.array([pose.dx, pose.dy, pose.z]) + tip @ np.array([x, y, 0.0])
-    a, b = distort(np.array([p[0] / p[2]]), np.array([p[1] / p[2]]), scene.distortion)
-    return scene.focal * float(a[0]) + scene.centre[0], scene.focal * float(b[0]) + scene.centre[1]
+    at = origin + rotation @ np.array([pose.dx, pose.dy, pose.z]) + points @ tip[:, :2].T
+    a, b = distort(at[:, 0] / at[:, 2], at[:, 1] / at[:, 2], scene.distortion)
+    return scene.focal * np.column_stack((a, b)) + scene.centre
+
+
+def seen_at(scene: Scene, pose: Pose, x: float, y: float) -> tuple[float, float]:
+    """Pixel of a point (x, y) of the tip plate."""
+    u, v = seen(scene, pose, np.array([[x, y]]))[0]
+    return float(u), float(v)
 
 
 def centres_of(scene: Scene) -> list[tuple[float, float]]:
+    """Of the discs, on the plate, from the top, m."""
     half = (scene.discs - 1) / 2
     return [(0.0, (half - i) * scene.spacing) for i in range(scene.discs)]
 
@@ -155,9 +165,7 @@ def coverage(scene: Scene, pose: Pose, parts: int = PARTS) -> Array:
     du, dv = np.meshgrid(offsets, offsets)
     for cx, cy in centres_of(scene):
         turns = np.linspace(0, 2 * np.pi, 60)
-        rim = np.array(
-            [seen_at(scene, pose, cx + scene.radius * math.cos(t), cy + scene.radius * math.sin(t)) for t in turns]
-        )
+        rim = seen(scene, pose, (cx, cy) + scene.radius * np.column_stack((np.cos(turns), np.sin(turns))))
         u0, v0 = np.maximum(np.floor(rim.min(axis=0)).astype(int) - 2, 0)
         u1, v1 = np.ceil(rim.max(axis=0)).astype(int) + 3
         u1, v1 = min(u1, scene.width), min(v1, scene.height)
@@ -194,7 +202,11 @@ def clean(scene: Scene, poses: Sequence[Pose]) -> Array:
 
 def photograph(scene: Scene, poses: Sequence[Pose], rng: np.random.Generator) -> npt.NDArray[np.uint8]:
     """One frame as the camera gives it."""
-    grey = clean(scene, poses)
+    return developed(scene, clean(scene, poses), rng)
+
+
+def developed(scene: Scene, grey: Array, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
+    """Clean grey levels with noise, as whole numbers."""
     sd = np.sqrt(scene.read_noise**2 + scene.shot_noise**2 * np.maximum(grey, 0.0))
     return np.clip(np.rint(grey + sd * rng.standard_normal(grey.shape)), 0, 255).astype(np.uint8)
 
@@ -227,6 +239,7 @@ def over_exposure(motion: Callable[[float], Pose], t: float, exposure: float, in
 
 
 def mean_of(poses: Sequence[Pose]) -> tuple[float, float, float]:
+    """The mean of dX, dY, theta."""
     return (
         float(np.mean([p.dx for p in poses])),
         float(np.mean([p.dy for p in poses])),
