@@ -194,8 +194,8 @@ def terms(found: Sequence[Response]) -> Iterator[Term]:
         for share in (0.02, 0.1, 0.3):
             yield Term('play', (name,), shapes={'half_width': share * size[name]})
         for tau in (0.02, 0.1, 0.3, 1.0, 3.0, 10.0):
-            yield Term('relaxed', (name,), shapes={'time_constant': tau})
-            yield Term('relaxed', (name, name), shapes={'time_constant': tau})
+            yield Term('relaxed', (name,), shapes={'tau': tau})
+            yield Term('relaxed', (name, name), shapes={'tau': tau})
         if name in DOTS or name in POSE:
             for share in (0.2, 0.3, 0.45, 0.7, 1.0, 1.5):
                 for phase in (0.0, 0.5 * math.pi):
@@ -203,7 +203,7 @@ def terms(found: Sequence[Response]) -> Iterator[Term]:
     for name in LOADS:
         if name in moving:
             for f in np.geomspace(2.0, 180.0, 48).tolist():
-                yield Term('resonance', (name,), shapes={'frequency': f, 'damping_ratio': 0.04})
+                yield Term('resonance', (name,), shapes={'natural_frequency': f, 'zeta': 0.04})
 
 
 @dataclass(frozen=True, slots=True)

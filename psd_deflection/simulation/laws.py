@@ -143,7 +143,7 @@ def _direction(v: FloatArray, shapes: Values, period: float, state: State) -> Fl
 
 def _relaxed(v: FloatArray, shapes: Values, period: float, state: State) -> FloatArray:
     # The input counts from one sample to the next as a straight line.
-    a = period / shapes['time_constant']
+    a = period / shapes['tau']
     kept = math.exp(-a)
     ahead = 1.0 - (1.0 - kept) / a
     b = np.array([ahead, 1.0 - kept - ahead])
@@ -153,7 +153,7 @@ def _relaxed(v: FloatArray, shapes: Values, period: float, state: State) -> Floa
 
 
 def _resonance(v: FloatArray, shapes: Values, period: float, state: State) -> FloatArray:
-    b, a = mode_coefficients(shapes['frequency'], shapes['damping_ratio'], period)
+    b, a = mode_coefficients(shapes['natural_frequency'], shapes['zeta'], period)
     y, state['y'] = lfilter(b, a, v, zi=state.get('y', np.zeros(2)))
     return np.asarray(y)
 
@@ -208,16 +208,16 @@ FORMS: Mapping[str, Form] = {
     'direction': Form('history', 'sign of the last change of {v}', following=_direction, unit_of_v=0),
     'relaxed': Form(
         'history',
-        '{v} through a lag of {time_constant}',
+        '{v} through a lag of {tau}',
         following=_relaxed,
-        fitted={'time_constant': ('s', 1e-4, 1e5)},
+        fitted={'tau': ('s', 1e-4, 1e5)},
     ),
     'play': Form('history', 'play({v}, {half_width}) - {v}', following=_play, fitted={'half_width': ('v', *_POSITIVE)}),
     'resonance': Form(
         'resonance',
-        '{v} through a mode of {frequency} and damping ratio {damping_ratio}',
+        '{v} through a mode of {natural_frequency} and damping ratio {zeta}',
         following=_resonance,
-        fitted={'frequency': ('Hz', 0.01, 1e4), 'damping_ratio': ('', 1e-4, 0.99)},
+        fitted={'natural_frequency': ('Hz', 0.01, 1e4), 'zeta': ('', 1e-4, 0.99)},
     ),
     'jitter': Form('variance', 'noise of rms {v}'),
 }

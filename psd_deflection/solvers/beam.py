@@ -57,9 +57,8 @@ class BeamSolver(Solver):
     @classmethod
     def options_from_rig(cls, rig: Rig) -> dict[str, Any]:
         """Whether the rig file's effects leave the tilts in the dots."""
-        # The name of an effect is that of its group unless it has one of its own.
-        names = {rig.effects.get(f'{group}.name', group) for group in {key.partition('.')[0] for key in rig.effects}}
-        return {'tilt_in_dots': 'plane_tilt' not in names}
+        # An effect that says how the plate leans: its correction takes the tilts off.
+        return {'tilt_in_dots': not any(k.endswith('.slope_ratio') and v for k, v in rig.effects.items())}
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""

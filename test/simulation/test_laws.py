@@ -35,9 +35,9 @@ SHAPES = {
     'period': 3e-4,
     'phase': 0.3,
     'half_width': 1e-5,
-    'time_constant': 0.1,
-    'frequency': 33.0,
-    'damping_ratio': 0.05,
+    'tau': 0.1,
+    'natural_frequency': 33.0,
+    'zeta': 0.05,
 }
 
 
@@ -99,7 +99,7 @@ def test_a_jitter_is_noise_that_grows_and_has_no_mean() -> None:
 def test_a_lag_and_a_rate_are_those_of_their_equations() -> None:
     t = np.arange(400) * 1e-3
     u = np.sin(2.0 * np.pi * 5.0 * t)
-    lag = Term('relaxed', ('y1',), 1.0, {'time_constant': 0.05}).evaluate(lambda _: u, len(t), 1e-3, {})
+    lag = Term('relaxed', ('y1',), 1.0, {'tau': 0.05}).evaluate(lambda _: u, len(t), 1e-3, {})
     want = solve_ivp(lambda s, y: (np.sin(10.0 * np.pi * s) - y) / 0.05, (0.0, t[-1]), [0.0], t_eval=t, rtol=1e-9)
     np.testing.assert_allclose(lag, want.y[0], atol=3e-4)
     rate = Term('rate', ('y1',)).evaluate(lambda _: u, len(t), 1e-3, {})
