@@ -8,7 +8,9 @@ Viewers can only look: the server offers neither publishing nor services nor par
 from __future__ import annotations
 
 import logging
+import math
 import threading
+import time
 from typing import TYPE_CHECKING
 
 from msg_adapters import MESSAGE_TYPES, RIG
@@ -24,6 +26,10 @@ if TYPE_CHECKING:
     from foxglove.websocket import ChannelView, Client, WebSocketServer
 
 VIEWER = 'in Foxglove: Open connection'
+
+
+SETTLED_S = 0.2
+"""So long after a viewer has asked for a topic it gets what is sent."""
 
 
 class FoxgloveServer:
@@ -48,18 +54,20 @@ class FoxgloveServer:
         self._lock = threading.Lock()
         self._channels: dict[str, foxglove.Channel] = {}
         self._rig: tuple[bytes, int] | None = None
+        self._repeat_at = math.inf
         self._server = self._serve(config)
         self.address = f'ws://{config.foxglove_address}:{self._server.port}'
 
     def _serve(self, config: MonitorConfig) -> WebSocketServer:
-        repeat_rig = self._repeat_rig
+        server = self
 
         class Listener(self._sdk.ServerListener):  # type: ignore[misc, name-defined]
             """The server's thread tells it of each viewer that looks at a topic."""
 
             def on_subscribe(self, client: Client, channel: ChannelView) -> None:
                 if channel.topic == RIG:
-                    repeat_rig()
+                    # What is sent now would not reach it: it is told before its subscription holds.
+                    server._repeat_at = time.monotonic() + SETTLED_S
 
         ports = [config.foxglove_port] + [0] * (config.foxglove_port != 0)
         for port in ports:
@@ -91,15 +99,14 @@ class FoxgloveServer:
             # Sent again to who comes later, as a latched topic is.
             self._rig = cdr, t_ns
         self._channels[topic].log(cdr, log_time=t_ns)
+        if time.monotonic() >= self._repeat_at and self._rig is not None:
+            self._repeat_at = math.inf
+            message, t_ns = self._rig
+            self._channels[RIG].log(message, log_time=t_ns)
 
     def words(self) -> str:
         """The address, and where to open it, as a line."""
         return f'foxglove: {self.address} ({VIEWER})'
-
-    def _repeat_rig(self) -> None:
-        if self._rig is not None:
-            message, t_ns = self._rig
-            self._channels[RIG].log(message, log_time=t_ns)
 
     def close(self) -> None:
         """End the connections."""

@@ -42,7 +42,7 @@ def test_programs_get_the_declaration(capsys: pytest.CaptureFixture[str]) -> Non
     found = json.loads(capsys.readouterr().out)['sensor_rotation']
     assert found['corrected'] == 'reading'
     assert found['parameters']['angle']['unit'] == 'rad'
-    assert found['parameters']['psd']['choices'] == [1, 2]
+    assert found['parameters']['psd']['choices'] == [1, 2, 3, 4, 5, 6]
 
 
 def test_what_is_corrected_is_said() -> None:
