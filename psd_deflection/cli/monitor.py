@@ -117,7 +117,7 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     display = Display()
-    foxglove = FoxgloveServer(rig.monitor) if rig.monitor.foxglove else None
+    foxglove = FoxgloveServer(rig) if rig.monitor.foxglove else None
     feed = Feed() if foxglove is None else FeedBeside(foxglove, rig)
     server: MonitorServer | None = None
 

@@ -13,13 +13,13 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from msg_adapters import MESSAGE_TYPES, RIG
+from msg_adapters import INPUTS, MESSAGE_TYPES, RIG, TOPIC_TYPES
 from psd_deflection import __version__
 from psd_deflection.config import MonitorConfig, Rig
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.records import ParameterChange, Record, RigState, SpotMeans
-from psd_deflection.runner.fanout import Fanout
+from psd_deflection.runner.fanout import Fanout, published
 
 if TYPE_CHECKING:
     import foxglove
@@ -38,7 +38,7 @@ class FoxgloveServer:
     Raises ConfigError if foxglove-sdk is not installed or the address cannot be served on.
     """
 
-    def __init__(self, config: MonitorConfig) -> None:
+    def __init__(self, rig: Rig) -> None:
         # Imported here: only this view needs it.
         try:
             import foxglove
@@ -55,8 +55,11 @@ class FoxgloveServer:
         self._channels: dict[str, foxglove.Channel] = {}
         self._rig: tuple[bytes, int] | None = None
         self._repeat_at = math.inf
-        self._server = self._serve(config)
-        self.address = f'ws://{config.foxglove_address}:{self._server.port}'
+        # Before anybody looks: foxglove-sdk offers a new channel to a viewer that it does not let subscribe to it yet.
+        for topic, type_name in (published(rig) | {name: TOPIC_TYPES[name] for name in INPUTS}).items():
+            self._offer(topic, type_name)
+        self._server = self._serve(rig.monitor)
+        self.address = f'ws://{rig.monitor.foxglove_address}:{self._server.port}'
 
     def _serve(self, config: MonitorConfig) -> WebSocketServer:
         server = self
@@ -83,8 +86,7 @@ class FoxgloveServer:
                 reason = str(error)
         raise ConfigError(f'foxglove_address {config.foxglove_address}: {reason}')
 
-    def put(self, topic: str, type_name: str, cdr: bytes, t_ns: int) -> None:
-        """Send a message to those who look at its topic."""
+    def _offer(self, topic: str, type_name: str) -> None:
         with self._lock:
             if topic not in self._channels:
                 self._channels[topic] = self._sdk.Channel(
@@ -95,6 +97,11 @@ class FoxgloveServer:
                     message_encoding='cdr',
                     context=self._context,
                 )
+
+    def put(self, topic: str, type_name: str, cdr: bytes, t_ns: int) -> None:
+        """Send a message to those who look at its topic."""
+        if topic not in self._channels:
+            self._offer(topic, type_name)
         if topic == RIG:
             # Sent again to who comes later, as a latched topic is.
             self._rig = cdr, t_ns

@@ -76,7 +76,7 @@ def _start_page(session: Session, say: Callable[[str], None]) -> MonitorServer:
 
 
 def _start_foxglove(session: Session, say: Callable[[str], None], views: Views, reports: bool) -> None:
-    server = FoxgloveServer(session.rig.monitor)
+    server = FoxgloveServer(session.rig)
     views.parts.append(server)
     say(server.words())
     fanout = Fanout(session.rig.monitor.frame_prefix)

@@ -12,22 +12,17 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters import (
-    DEFLECTION,
     DIAGNOSTICS,
-    FILTER_TOPICS,
     INPUTS,
-    SPOTS,
     TOPIC_TYPES,
-    solver_topic,
-    spot_topics,
     vector3_stamped,
 )
 from psd_deflection.config import Rig
 from psd_deflection.recordings import cdr
 from psd_deflection.records import Record, SampleBlock, TemperatureReading
 from psd_deflection.ros.names import VOLTS, delivery
+from psd_deflection.runner.fanout import published
 from psd_deflection.runner.session import Session
-from psd_deflection.solvers.one_psd import NAME as ONE_PSD
 
 MAX_INPUT_BYTES = 4096
 """Maximum size of a message of another node that we record, bytes; valid ones have some hundred bytes."""
@@ -59,13 +54,8 @@ def qos(topic: str) -> QoSProfile:
 
 def topics_of(rig: Rig) -> dict[str, str]:
     """The topics that a node of ``rig`` publishes encoded messages on, with their types."""
-    outputs = {topic: kind for topic, kind in TOPIC_TYPES.items() if topic not in INPUTS}
-    if rig.estimator.filter == 'none':
-        outputs = {topic: kind for topic, kind in outputs.items() if topic not in FILTER_TOPICS}
-    outputs |= {solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in (*rig.estimator.solvers, ONE_PSD)}
-    outputs |= dict.fromkeys(spot_topics(len(rig.psds)), TOPIC_TYPES[SPOTS[0]])
     volts = VOLTS[: len(rig.psds)] if rig.monitor.publish_volts else ()
-    return outputs | dict.fromkeys(volts, vector3_stamped.MESSAGE.name)
+    return published(rig) | dict.fromkeys(volts, vector3_stamped.MESSAGE.name)
 
 
 class PublisherWire:

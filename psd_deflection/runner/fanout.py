@@ -4,9 +4,20 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from msg_adapters import messages
+from msg_adapters import DEFLECTION, FILTER_TOPICS, INPUTS, SPOTS, TOPIC_TYPES, messages, solver_topic, spot_topics
+from psd_deflection.config import Rig
 from psd_deflection.recordings import cdr
 from psd_deflection.records import ParameterChange, Record
+from psd_deflection.solvers.one_psd import NAME as ONE_PSD
+
+
+def published(rig: Rig) -> dict[str, str]:
+    """The topics of what a run of ``rig`` puts out, with their types."""
+    outputs = {topic: kind for topic, kind in TOPIC_TYPES.items() if topic not in INPUTS}
+    if rig.estimator.filter == 'none':
+        outputs = {topic: kind for topic, kind in outputs.items() if topic not in FILTER_TOPICS}
+    outputs |= {solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in (*rig.estimator.solvers, ONE_PSD)}
+    return outputs | dict.fromkeys(spot_topics(len(rig.psds)), TOPIC_TYPES[SPOTS[0]])
 
 
 class Wire(Protocol):

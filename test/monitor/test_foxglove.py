@@ -119,7 +119,7 @@ def test_a_recording_is_played_bit_for_bit(start: Callable[..., Program]) -> Non
 def test_a_port_in_use_gives_way_to_a_free_one() -> None:
     with socket.create_server(('127.0.0.1', 0)) as taken:
         port = taken.getsockname()[1]
-        server = FoxgloveServer(load_rig(overrides={'foxglove_port': port}).monitor)
+        server = FoxgloveServer(load_rig(overrides={'foxglove_port': port}))
         assert server.address.startswith('ws://127.0.0.1:')
         assert not server.address.endswith(f':{port}')
         server.close()
@@ -127,7 +127,7 @@ def test_a_port_in_use_gives_way_to_a_free_one() -> None:
 
 def test_an_address_that_is_not_ours_is_named() -> None:
     with pytest.raises(ConfigError, match=r'foxglove_address 192\.0\.2\.1: .*assign'):
-        FoxgloveServer(load_rig(overrides={'foxglove_address': '192.0.2.1'}).monitor)
+        FoxgloveServer(load_rig(overrides={'foxglove_address': '192.0.2.1'}))
 
 
 def test_without_the_sdk_the_error_says_how_to_install_it(
