@@ -232,10 +232,10 @@ FAULTS = tuple(
 )
 
 
-def faults() -> int:
-    """Print :func:`fault` for every wrong reading at 10, 30 and 50 N."""
+def faults(rows: int | None = None) -> int:
+    """Print :func:`fault` for every wrong reading (or the first ``rows``) at 10, 30 and 50 N."""
     print('| wrong | load | largest error, own sd | named |\n|---|---|---|---|')
-    for kind, channel in FAULTS:
+    for kind, channel in FAULTS[:rows]:
         for force in (10.0, 30.0, 50.0):
             for name, load in (('sidebar', (0.0, -force, -0.585 * force)), ('link', (0.0, -force, 0.0))):
                 worst, named = fault(kind, channel, load)
@@ -286,18 +286,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Print the table of docs/accuracy.md."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--jobs', type=int, default=2, help='processes at once')
-    parser.add_argument('--rows', type=int, default=len(ROWS), help='only the first kinds of noise, and only the table')
+    parser.add_argument(
+        '--rows', type=int, help='only the first kinds of noise (of wrong readings with --faults), and only the table'
+    )
     parser.add_argument('--losses', type=int, default=len(LOSSES), help='only the first kinds of loss')
     parser.add_argument('--faults', action='store_true', help='instead: each reading wrong in turn')
     args = parser.parse_args(argv)
     if args.faults:
-        return faults()
+        return faults(args.rows)
     print(HEAD)
     print('|---' * (HEAD.count('|') - 1) + '|')
     cost: Array | None = None
     motion(100, 16)
     pairs = [(row, loss) for row in ROWS[: args.rows] for loss in list(LOSSES)[: args.losses]]
-    whole = args.rows >= len(ROWS)
+    whole = args.rows is None
     with ProcessPoolExecutor(args.jobs) as pool:
         rough = pool.submit(coarse) if whole else None
         for row, loss, s in pool.map(_job, pairs):

@@ -8,6 +8,7 @@ there is one within its bounds, and prints the other figures at that size.
 
 from __future__ import annotations
 
+import argparse
 import math
 import sys
 from collections.abc import Callable, Iterator
@@ -198,8 +199,10 @@ def table_51() -> list[str]:
 
 
 def main() -> int:
-    """Print all of it."""
-    for part in (table_b1, named_b1, table_51):
+    """Print all of it, or the first ``--parts``."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
+    parser.add_argument('--parts', type=int, help='only the first of the three')
+    for part in (table_b1, named_b1, table_51)[: parser.parse_args().parts]:
         print('\n'.join(part()), flush=True)
         print()
     return 0

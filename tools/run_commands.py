@@ -87,6 +87,8 @@ SHORTEST = {
 SHORTER = {
     r'^python -m blind\.run\b': '--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation',
     r'^python -m blind\.coverage$': '--rows 1 --losses 1',
+    r'^python -m blind\.coverage --faults$': '--rows 1',
+    r'^python -m blind\.thesis$': '--parts 1',
     r'^python -m blind\.clock$': '--runs 5',
     r'^python -m blind\.modes$': '--rigs 3',
     r'^python -m blind\.motion\b': '--runs 1 --seconds 4',

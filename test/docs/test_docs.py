@@ -230,6 +230,12 @@ def hooks() -> Any:
     return module
 
 
+@pytest.fixture(scope='module')
+def page_of_messages(hooks: Any) -> str:
+    """Made once: it reads every source."""
+    return str(hooks.on_page_markdown((ROOT / 'docs' / 'messages.md').read_text()))
+
+
 def pattern(row: str) -> re.Pattern[str]:
     """What a message of the page stands for: … is anything."""
     return re.compile('.+'.join(re.escape(part) for part in row.split('…')))
@@ -253,9 +259,14 @@ def pattern(row: str) -> re.Pattern[str]:
     ids=lambda v: ' '.join(v) if isinstance(v, list) else str(v),
 )
 def test_every_user_message_is_on_the_page_of_messages(
-    status: int, argv: list[str], hooks: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+    status: int,
+    argv: list[str],
+    hooks: Any,
+    page_of_messages: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: Any,
 ) -> None:
-    page = hooks.on_page_markdown((ROOT / 'docs' / 'messages.md').read_text())
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
     for name, line in {
         'unknown': 'link: {lenght: 1.0}',
@@ -273,7 +284,7 @@ def test_every_user_message_is_on_the_page_of_messages(
         ended = stop.code if isinstance(stop.code, int) else 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert ended == status, said
-    table = page.partition(f'## Exit status {status}: ')[2].partition('\n## ')[0]
+    table = page_of_messages.partition(f'## Exit status {status}: ')[2].partition('\n## ')[0]
     rows = re.findall(r'^\| `(.+)` \| `', table, re.M)
     assert len(rows) > 5
     # A row of few words would fit whatever is said.
