@@ -89,6 +89,7 @@ SHORTER = {
     r'^python -m blind\.coverage$': '--rows 1 --losses 1',
     r'^python -m blind\.coverage --faults$': '--rows 1',
     r'^python -m blind\.thesis$': '--parts 1',
+    r'^python -m bench\.campaign\.camera\b': '--frames 10',
     r'^python -m blind\.clock$': '--runs 5',
     r'^python -m blind\.modes$': '--rigs 3',
     r'^python -m blind\.motion\b': '--runs 1 --seconds 4',
