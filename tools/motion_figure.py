@@ -1,4 +1,4 @@
-"""Draw docs/figures/motion.png: a switched load and a lost laser. ``python tools/motion_figure.py [FILE]``."""
+"""Draw docs/figures/motion.png: a switched load and a lost laser. ``python -m tools.motion_figure [FILE]``."""
 
 from __future__ import annotations
 

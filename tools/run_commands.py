@@ -210,7 +210,7 @@ def blocks_to_run() -> list[list[Command]]:
     out = []
     for block in blocks.values():
         if block[0].page == JOURNEY:
-            out.append(block)
+            out.append([c for c in block if run_by_ci(c.line) is None])
             continue
         if all(is_quick(c.line) or run_by_ci(c.line) for c in block):
             continue
