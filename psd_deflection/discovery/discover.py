@@ -20,12 +20,12 @@ from psd_deflection.config import Rig, replace_values
 from psd_deflection.discovery import proposals as propose
 from psd_deflection.discovery.cleaning import clean
 from psd_deflection.discovery.coincidence import Coincidence, coincidences
-from psd_deflection.discovery.experiment import Suggestion, suggest
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.hidden import FIRST, SETUP, beginning, mistakes
 from psd_deflection.discovery.laws import FoundLaw, find_law
 from psd_deflection.discovery.localise import Localisation, localise
 from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.planning import Suggestion, suggest
 from psd_deflection.discovery.screen import Screen
 from psd_deflection.discovery.search import BIC_ACCEPT, BUDGET, P_ACCEPT, Search, SearchResult, far, unphysical
 from psd_deflection.discovery.setup import likely_delays, likely_jumps, noise_finding, said, wire
@@ -56,11 +56,14 @@ RIVAL_BIC = 10.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rival:
-    """An effect in place of a named one, with its fitted values; ``delta_bic``: how much worse, below 0 better."""
+    """An effect in place of a named one, with its fitted values; ``delta_bic``: how much worse, below 0 better.
+    ``fit``: the whole model with it.
+    """
 
     active: ActiveEffect
     sd: Mapping[str, float]
     delta_bic: float
+    fit: Fit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,6 +132,11 @@ class Discovery:
     def floors(self) -> float:
         """The gap that remains, in units of the gap that noise alone leaves."""
         return self.gap_after / self.gap_floor if self.gap_floor > 0.0 else 0.0
+
+    @property
+    def rivals(self) -> list[Fit]:
+        """The whole models that these recordings do not exclude beside ``fit``."""
+        return [r.fit for e in self.effects for r in e.rivals]
 
     @property
     def active_effects(self) -> list[ActiveEffect]:
@@ -460,7 +468,7 @@ def _named(search: Search, result: SearchResult, fit: Fit, heldout: Sequence[Hel
             if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < EQUIVALENT_BIC):
                 equal.append(f)
             if (bic < RIVAL_BIC or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
-                rivals.append(Rival(f.effects[-1], _sd(f, f.covariance(), len(f.effects) - 1), bic))
+                rivals.append(Rival(f.effects[-1], _sd(f, f.covariance(), len(f.effects) - 1), bic, f))
         names = tuple(dict.fromkeys(f.effects[-1].effect.name for f in equal))
         named.append(
             NamedEffect(

@@ -17,7 +17,7 @@ import pytest
 from scipy.stats import chi2 as chi2_law
 
 from psd_deflection.config import load_rig
-from psd_deflection.discovery import experiment
+from psd_deflection.discovery import planning
 from psd_deflection.discovery.coincidence import coincidences
 from psd_deflection.discovery.discover import _accept, _credible, _named, _tied, _unknown
 from psd_deflection.discovery.fit import Fit, refit
