@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from blind.cases import EFFECTS, Array, gap_of, histories, scaled
-from blind.generator import Generator
+from blind.cases import EFFECTS, gap_of, histories, scaled
+from blind.generator import Array, Generator
 from psd_deflection.config import load_rig, replace_values
 from psd_deflection.discovery.discover import discover
 from psd_deflection.discovery.experiment import Limits, proposals
@@ -38,7 +38,7 @@ WANTED_SHARE, WANTED_MEDIAN = 1.0, 1.0
 
 
 def first_recordings() -> dict[str, tuple[Array, Array]]:
-    """Loads and temperature of designs that leave much open: weights, weights in a warming room, rest in it, a good one."""
+    """Loads and temperature: weights; weights in a warming room; rest in it; and one that shows much."""
     levels = [(0, 0, 0), (0, -10, -5.85), (0, -30, -17.55), (0, -50, -29.25), (0, 0, 0), (0, -30, 0), (0, -50, 0)]
     weights = np.repeat(np.array([*levels, (0, 0, 0)], dtype=np.float64), 1200, axis=0)
     n = len(weights)

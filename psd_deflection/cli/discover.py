@@ -10,8 +10,13 @@ DIR gets model.yaml (the rig with the effects found; use it as --params-file), r
 result.json. Where no effect fits, DIR also gets law.yaml: an empirical law for what remains. With --adopt NAME
 the law becomes an effect of yours, and model.yaml has it. The exit status is 0 whatever was found.
 
+With --next, DIR also gets next_loads.csv: the loads of the recording that best tells apart the effects that
+explain these recordings equally well; simulate --loads takes it. With --run that recording is made on the
+simulated rig and searched, and so on, until the answer is unique or no recording within the limits would help.
+
   psd-deflection discover odd.csv --out found
   psd-deflection discover a.csv b.csv --params-file my_rig.yaml --out found
+  psd-deflection discover odd.csv --out found --next --limit swing=0 --limit lengths=0.4,0.5
 """
 
 from __future__ import annotations
@@ -26,12 +31,14 @@ from pathlib import Path
 from tqdm import tqdm
 
 from psd_deflection import __version__
-from psd_deflection.cli._options import make_folder, namespace_option, seed
+from psd_deflection.cli import _next
+from psd_deflection.cli._options import make_folder, namespace_option, refuse, seed
 from psd_deflection.cli._progress import told
-from psd_deflection.cli._report import save, show, warn
+from psd_deflection.cli._report import save, show, show_text, warn
 from psd_deflection.cli._rig_file import rig_file
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.discovery.discover import Discovery, discover
+from psd_deflection.discovery.loop import Settled, next_of, settle
 from psd_deflection.discovery.report import report_html
 from psd_deflection.discovery.result import model_yaml, result, sentence
 from psd_deflection.errors import RecordingError, UsageError
@@ -42,7 +49,9 @@ from psd_deflection.simulation.declaration import ActiveEffect
 from psd_deflection.simulation.laws import Law, effect_of, law_text, values_of
 
 STEPS = 8
-"""Steps that the progress bar counts: described, signatures, adding, weighing, alternatives, where, report, done."""
+"""Steps that the progress bar counts: described, signatures, adding, weighing, alternatives, where, report, done.
+
+Planning and further searches go on at its end."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,6 +76,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='NAME',
         help='if a law is found, write it as the effect NAME to the folder of your effects and into model.yaml',
     )
+    _next.add_arguments(parser)
+    parser.epilog = _next.HELP
     namespace_option(parser)
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     parser.add_argument('--json', action='store_true', help='print the content of result.json')
@@ -79,6 +90,13 @@ def run(args: argparse.Namespace) -> int:
         if name not in effect_names():
             raise UsageError(f'--without {name}: no effect of that name; there are: {", ".join(effect_names())}')
     folder = None if args.adopt is None else _adopting(args.adopt)
+    limits = _next.limits_from_words(args.limit)
+    if args.make_it and not args.next:
+        raise UsageError('--run is for --next')
+    if not args.next:
+        refuse(args, {'limit': []}, 'is for --next')
+    if not args.make_it:
+        refuse(args, {'effect': [], 'world': [], 'at_most': 3}, 'is for the simulated rig of --next --run')
     with told('reading', quiet=args.quiet or args.json):
         observations = read_observations(args.recordings, given, namespace=args.namespace, warn=warn, any_rate=True)
     out = Path(args.out)
@@ -96,12 +114,37 @@ def run(args: argparse.Namespace) -> int:
             if bar.n < STEPS - 1:
                 bar.update()
 
-        found = discover(observations, rig, seed=args.seed, without=args.without, progress=progress)
+        done: Settled | None = None
+        if args.make_it:
+            record = _next.simulated(args, rig, out)
+            done = settle(
+                observations,
+                rig,
+                record,
+                limits=limits,
+                most=args.at_most,
+                seed=args.seed,
+                without=args.without,
+                progress=progress,
+            )
+            found, plan = done.found, done.open
+        else:
+            found = discover(observations, rig, seed=args.seed, without=args.without, progress=progress)
+            progress('planning')
+            plan = next_of(found, limits) if args.next else None
         progress('report')
         page = report_html(found)
         bar.set_description_str('done')
         bar.update(STEPS - bar.n)
-    in_json = json.dumps(result(found), indent=1, allow_nan=False)
+    tree = result(found)
+    if args.next:
+        tree['next'] = None if plan is None else plan.tree()
+    if done is not None:
+        made = [{'file': f'next_{i}.csv', **p.tree()} for i, p in enumerate(done.plans, start=1)]
+        tree['run'] = {'outcome': done.outcome, 'sentence': done.sentence, 'recordings': made}
+        _next.write_list([(f'next_{i}.csv', p) for i, p in enumerate(done.plans, start=1)], out)
+    in_json = json.dumps(tree, indent=1, allow_nan=False)
+    how = _next.write_plan(plan, out) if plan is not None and plan.useful and done is None else []
     laws = [] if found.law is None else found.law.adopted(args.adopt or 'law')
     adopted: list[Path] = []
     if folder is not None and laws:
@@ -137,6 +180,16 @@ def run(args: argparse.Namespace) -> int:
         show(f'law: {out / "law.yaml"}; --adopt NAME makes it an effect')
     elif args.adopt is not None and not laws:
         show(f'--adopt {args.adopt}: there is no law to adopt')
+    if done is not None:
+        for i, p in enumerate(done.plans, start=1):
+            show(f'{out / f"next_{i}.csv"}: {p.words}')
+        show(done.sentence)
+    elif plan is not None:
+        show('', plan.sentence, '')
+        show_text(_next.plan_table(plan))
+        show('', *how)
+    elif args.next:
+        show('No other effect explains the recordings as well: there is nothing to tell apart by a further one.')
     show(f'{found.simulations} forward simulations; see {out / "report.html"}')
     return 0
 

@@ -145,7 +145,9 @@ def pieces(rig: Rig, limits: Limits) -> list[Piece]:
         out.append(Piece(f'{g:.3g} N along both axes with {u:.3g} N m, in all corners', (_steps(corners, 1.5),)))
     if on_bar > 0.0:
         bar = [zero, (0.0, -on_bar, -on_bar * arm), zero, (0.0, -on_bar, on_bar * arm), zero]
-        out.append(Piece(f'{on_bar:.3g} N on the sidebar, {arm:.3g} m to the right and to the left', (_steps(bar, 2.0),)))
+        out.append(
+            Piece(f'{on_bar:.3g} N on the sidebar, {arm:.3g} m to the right and to the left', (_steps(bar, 2.0),))
+        )
     shares = (0.0, 0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25, 0.0)
     if f > 0.0:
         climbed = [(0.0, -s * f, 0.0) for s in shares]

@@ -17,8 +17,8 @@ Outcome = Literal['unique', 'limits', 'recordings']
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Settled:
-    """``found``: the last answer. ``plans``: those that were carried out. ``open``: the plan that was not, if rivals are
-    left. ``outcome``: one explanation is left; no recording within the limits tells the rest apart; or no more
+    """``found``: the last answer. ``plans``: those that were carried out. ``open``: the one that was not, if rivals
+    are left. ``outcome``: one explanation is left; no recording within the limits tells the rest apart; or no more
     recordings were allowed.
     """
 
@@ -59,7 +59,7 @@ def settle(
 
     ``most``: how many further recordings are made. Other arguments as for :func:`discover`.
     """
-    known, plans = list(recordings), []
+    known, plans = list(recordings), list[Plan]()
     while True:
         found = discover(known, rig, seed=seed, without=without, progress=progress)
         # A rival that needs more parameters and gains nothing by them is no longer told as equivalent.

@@ -62,9 +62,9 @@ class Suggestion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
-    """How a rival fares: ``rival`` in place of ``named``, labels of effects. ``separation``: chi-square by which it would
-    lose in the planned recording if the named effect is true; ``reverse``: by which the named one would lose if the
-    rival is true; ``possible``: the greatest of both in any recording within the limits.
+    """How a rival fares: ``rival`` in place of ``named``, labels of effects. ``separation``: chi-square by which it
+    would lose in the planned recording if the named effect is true; ``reverse``: by which the named one would lose if
+    the rival is true; ``possible``: the greatest of both in any recording within the limits.
     """
 
     rival: str
@@ -81,7 +81,7 @@ class Told:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """The next recording: ``pieces`` one after the other in ``setting``, at ``rate`` Hz. ``told``: each rival's fate."""
+    """The next recording: ``pieces`` one after the other in ``setting``, at ``rate`` Hz. ``told``: one per rival."""
 
     setting: Setting
     pieces: tuple[Piece, ...]
@@ -124,9 +124,10 @@ class Plan:
             return f'No recording within the limits would tell {self.told[0].named} from {rivals}.'
         apart = [t for t in self.told if t.separable]
         least = min(max(t.separation, t.reverse) for t in apart)
+        others = ', '.join(dict.fromkeys(t.rival for t in apart))
         out = (
-            f'Record next, {self.seconds:.0f} s: {self.words}. It tells {apart[0].named} from '
-            f'{", ".join(dict.fromkeys(t.rival for t in apart))} (chi-square {least:.0f} at least, {TELLS_APART:g} needed)'
+            f'Record next, {self.seconds:.0f} s: {self.words}. It tells {apart[0].named} from {others} '
+            f'(chi-square {least:.0f} at least, {TELLS_APART:g} needed)'
         )
         lasting = [t.rival for t in self.told if not t.separable]
         return f'{out}; nothing within the limits tells {", ".join(lasting)} apart.' if lasting else f'{out}.'
@@ -174,9 +175,7 @@ def plan_next(workspace: Workspace, named: Fit, rivals: Sequence[Fit], limits: L
     for _, group in itertools.groupby(proposals(rig, limits), key=lambda p: id(p.setting)):
         offered = list(group)
         setting = offered[0].setting
-        seen = [
-            (p.piece, shown(workspace, models, setting, p.piece.loads(rate_of(rig, setting)))) for p in offered
-        ]
+        seen = [(p.piece, shown(workspace, models, setting, p.piece.loads(rate_of(rig, setting)))) for p in offered]
         for _, s in seen:
             # The same for as long as a recording may be.
             possible = np.maximum(possible, separations(s * max(limits.seconds // s.seconds, 1.0)))
@@ -217,7 +216,7 @@ def _together(
     chosen: list[Piece] = []
     value = 0.0
     while True:
-        trials = []
+        trials: list[tuple[float, int, Piece, Shown]] = []
         for piece, s in seen:
             more = total + s
             if more.seconds <= seconds + 1e-6:
