@@ -104,7 +104,7 @@ def limits_from_words(words: Sequence[str]) -> Limits:
 
 
 def plan_table(plan: Plan) -> str:
-    """The loads of a plan, one row for each that is held or swept, if it is worth it; and what becomes of each rival."""
+    """The loads of a plan that is worth it, one row for each that is held or swept; and what becomes of each rival."""
     rows: list[tuple[str, ...]] = [('load', 'Fx / N', 'Fy / N', 'Tz / N m', 'for / s')]
     for script in plan.script:
         kind, loads, *rest = script.split(':')
