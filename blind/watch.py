@@ -23,7 +23,16 @@ from tqdm import tqdm
 from blind.generator import EI, GJ, LSB, MM_PER_V, SIGMA, Array, Generator
 from psd_deflection.config import load_rig
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.records import AppliedLoad, RawChunk
+from psd_deflection.records import (
+    AppliedLoad,
+    BlockStatus,
+    DeflectionEstimate,
+    RawChunk,
+    Record,
+    SpotMeans,
+    TipLoad,
+)
+from psd_deflection.solvers.registry import solver_from_rig
 from psd_deflection.watching.watch import Alarm, Watch
 
 RATE, LENGTH = 1000, 0.585
@@ -33,7 +42,11 @@ WITHIN_S, WANTED = 10.0, 0.95
 RUN_S, HELD_FROM_S = 34.0, 3.0
 LEVELS = ((0, 0, 0), (0, -30, 0), (0, -50, -29.25), (40, 0, 0), (0, -20, 20), (-30, -30, 0))
 DRIFT, DRIFT_HOURS = 2e-6, 3.0
-BASE_S, CHUNK = 300, 1000
+HOLD_S, HOLDS = 30, 12
+BLOCK, CHUNK = 20, 1000
+FITTED = 1.5
+"""A parabola through a block has so many times the noise of its mean, in the middle (sqrt(9/4))."""
+SPREAD = np.zeros((4, 4))
 
 
 class Run(NamedTuple):
@@ -53,10 +66,9 @@ class Chain:
         self.pipeline = Pipeline(rig)
         self.watch = Watch(rig, self.pipeline.tip_loads.compliance)
         self.at = 0
-        self.seconds = 0.0
         self.raised: list[Alarm] = []
 
-    def load(self, load: Sequence[float]) -> None:
+    def load(self, load: Array | Sequence[float]) -> None:
         """A load that is noted now."""
         self.watch.note(AppliedLoad(self.at * 1_000_000, *map(float, load)))
 
@@ -65,12 +77,9 @@ class Chain:
         seq = np.arange(self.at, self.at + len(volts), dtype=np.int64)
         chunk = RawChunk(seq, seq * 1_000_000, volts.astype(np.float32), np.zeros(len(seq), dtype=np.uint8))
         self.at += len(volts)
-        records = list(self.pipeline.process(chunk))
         before = self.watch.alarms
-        began = time.perf_counter()
-        for record in records:
+        for record in self.pipeline.process(chunk):
             self.watch.put(record)
-        self.seconds += time.perf_counter() - began
         if self.watch.alarms > before and self.watch.alarm is not None:
             self.raised.append(self.watch.alarm)
 
@@ -117,29 +126,56 @@ def one(job: tuple[str, int]) -> Run:
 
 
 def quiet(job: tuple[float, int]) -> tuple[float, int, list[str], float]:
-    """Hours in which nothing happens: hours, alarms, what they said, and seconds of the watch for each block."""
+    """Hours in which nothing happens: hours, alarms, what they said, and seconds of the watch for each block.
+
+    The watch is given block means of the second generator's clean readings with fresh noise, as much as a block's fit
+    leaves, and the poses that the method has for them: a day of samples would take the pipeline half an hour.
+    """
     hours, seed = job
     rng = np.random.default_rng(seed)
-    hold = 30 * RATE
-    order = [LEVELS[i % len(LEVELS)] for i in range(BASE_S * RATE // hold)]
-    loads = np.repeat(np.array(order, dtype=np.float64), hold, axis=0)
-    clean = Generator(loads, np.full(len(loads), 20.0), LENGTH).clean([])
-    chain = Chain()
+    rig = load_rig()
+    solver = solver_from_rig('exact', rig)
+    compliance = Pipeline(rig).tip_loads.compliance
+    watch = Watch(rig, compliance)
+    loads = np.repeat(
+        np.array([LEVELS[i % len(LEVELS)] for i in range(HOLDS)], dtype=np.float64), HOLD_S * RATE, axis=0
+    )
+    clean = Generator(loads, np.full(len(loads), 20.0), LENGTH).clean([])[:, [0, 1, 3, 4]] * MM_PER_V
+    clean = clean.reshape(-1, BLOCK, 4).mean(axis=1)
+    noise = FITTED * SIGMA * MM_PER_V / math.sqrt(BLOCK)
+    variances = np.full(4, noise**2)
+    covariance = tuple((noise**2 * np.eye(3)).ravel().tolist())
     turns = rng.uniform(0.0, 2.0 * math.pi, 4)
-    while chain.at < hours * 3600 * RATE:
-        # A repetition begins unloaded and at rest, as the one before did; the link swings there from its last load.
-        late = [round(rng.uniform(0.0, 2.0) * RATE / CHUNK) * CHUNK for _ in order]
-        due = {i * hold + wait: load for i, (load, wait) in enumerate(zip(order, late, strict=True))}
-        for start in range(0, len(clean), CHUNK):
-            if start in due:
-                chain.load(due[start])
-            t = (chain.at + np.arange(CHUNK)) / RATE
-            drift = np.zeros((CHUNK, 6))
-            swing = np.sin(2.0 * math.pi * t[:, None] / (3600.0 * DRIFT_HOURS) + turns)
-            drift[:, [0, 1, 3, 4]] = DRIFT / MM_PER_V * swing
-            chain.feed(read(clean[start : start + CHUNK] + drift, rng))
-    blocks = chain.at / 20
-    return chain.at / 3600.0 / RATE, chain.watch.alarms, [a.words for a in chain.raised], chain.seconds / blocks
+    hold = HOLD_S * RATE // BLOCK
+    said: list[str] = []
+    at, seconds = 0, 0.0
+    step_ns = BLOCK * 1_000_000
+    while at * BLOCK < hours * 3600 * RATE:
+        # Each repetition begins with a link at rest, as it is half a minute after its last load.
+        t = (at + np.arange(len(clean))) * BLOCK / RATE
+        drift = DRIFT * np.sin(2.0 * math.pi * t[:, None] / (3600.0 * DRIFT_HOURS) + turns)
+        dots = clean + drift + noise * rng.standard_normal(clean.shape)
+        poses = solver.solve_many(dots, variances).pose
+        late = {i * hold + int(rng.integers(2 * RATE // BLOCK)): LEVELS[i % len(LEVELS)] for i in range(HOLDS)}
+        for i, (four, pose) in enumerate(zip(dots.tolist(), poses.tolist(), strict=True)):
+            t_ns = (at + i) * step_ns
+            records: list[Record] = []
+            if i in late:
+                records.append(AppliedLoad(t_ns, *map(float, late[i])))
+            dx, dy, theta = pose[:3]
+            records += [
+                DeflectionEstimate(t_ns, at + i, 'exact', dx, dy, theta, 0.0, 0.0, covariance, 0.0, True),
+                TipLoad(t_ns, dx / compliance[0], dy / compliance[1], theta / compliance[2]),
+                SpotMeans(t_ns, at + i, tuple(four), (5.0, 5.0), SPREAD, BLOCK, 0, BlockStatus.OK, ''),
+            ]
+            before, began = watch.alarms, time.thread_time()
+            for record in records:
+                watch.put(record)
+            seconds += time.thread_time() - began
+            if watch.alarms > before and watch.alarm is not None:
+                said.append(watch.alarm.words)
+        at += len(clean)
+    return at * BLOCK / 3600.0 / RATE, watch.alarms, said, seconds / at
 
 
 def table(runs: Sequence[Run], hours: float, alarms: int, said: Sequence[str], cost: float) -> tuple[str, bool]:

@@ -23,7 +23,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from psd_deflection.config import Rig
+from psd_deflection.config import ZEROS, Rig
+from psd_deflection.parameter_files import EFFECTS_PREFIX
 from psd_deflection.records import (
     AppliedLoad,
     BlockStatus,
@@ -274,8 +275,8 @@ class Watch:
         self._lasting = self.alarm is not None
 
     def changed(self, change: ParameterChange, rig: Rig) -> None:
-        """Parameters have changed to those of ``rig``; values that only replay needs change nothing."""
-        if any(not name.startswith(('state.', 'environment.')) for name, _ in change.values):
+        """Parameters have changed to those of ``rig``; only those that move the readings or the pose matter."""
+        if any(name in ZEROS or name.startswith(EFFECTS_PREFIX) for name, _ in change.values):
             self.forget(rig)
 
     @property
@@ -309,8 +310,8 @@ class Watch:
         if self.load is not None and told is not None and told.t_ns == estimate.t_ns:
             for i in range(3):
                 self._off[i] += self._compliance[i] * (told[1 + i] - self.load[1 + i])
-        for i in range(3):
-            self._pose[i] += estimate[3 + i]
+        for i, value in enumerate(estimate.pose):
+            self._pose[i] += value
         self._count += 1
         if self._count == self._blocks:
             self._close(spots.t_ns)
