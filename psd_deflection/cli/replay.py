@@ -3,7 +3,7 @@
 With the recorded parameters (the default) the estimates are the published ones, bit for bit.
 --compare checks this and ends with status 1 if anything differs that the recording and its replay
 both hold; --strict also if one of them lacks a message of the other. With --params-file you see what
-another rig would have estimated from the same samples.
+another rig would have estimated from the same samples. --watch says since when the rig is not its model.
 
   psd-deflection replay recordings/psd_20260101_120000 --compare
   psd-deflection replay run.csv --params-file my_rig.yaml --out estimates.csv
@@ -28,6 +28,7 @@ from psd_deflection.recordings.comparison import Comparison
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay_engine import nominal_rig, open_for_replay, replayed
 from psd_deflection.recordings.sinks import Sink, open_sink
+from psd_deflection.recordings.watched import WatchedReplay
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock
 
 DIFFERS = 1
@@ -50,6 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--strict', action='store_true', help='with --compare: what only one side holds is a difference too'
+    )
+    parser.add_argument(
+        '--watch', action='store_true', help='test whether the rig stays its model, as the node does with watch: on'
     )
     namespace_option(parser)
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')
@@ -102,6 +106,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         sink = open_sink(args.out, rig.flat(), device_hello=recording.hello)
     totals = Totals(recording)
+    watched = WatchedReplay(rig, pipeline, recording) if args.watch else None
     began = time.perf_counter()
     bar = progress_of(recording.blocks(), quiet=args.json)
     try:
@@ -110,6 +115,8 @@ def run(args: argparse.Namespace) -> int:
                 totals.add(record)
                 if sink is not None:
                     sink.put(record)
+                if watched is not None:
+                    watched.put(record)
             if comparison is not None:
                 comparison.add(records)
     finally:
@@ -122,6 +129,8 @@ def run(args: argparse.Namespace) -> int:
     if comparison is not None:
         comparison.finish()
     _print_summary(args, rig, pipeline, totals, seconds, comparison)
+    if watched is not None:
+        show(*watched.said(totals.first_ns), aside=args.json)
     if comparison is None:
         return 0
     text = comparison.summary()

@@ -1,8 +1,8 @@
 """The watch in a run: feeds it, says what it sees, and keeps the minutes around it as a recording.
 
 The samples and inputs of the last minutes are kept in memory as they were encoded, in segments; each begins with the
-rig and the pipeline's memory, so that a replay of what is kept computes what the run did. Nothing is kept unless ``watch_dir`` names a
-folder, and nothing is written unless there is an alarm. A thread of its own writes.
+rig and the pipeline's memory, so that a replay of what is kept computes what the run did. Nothing is kept unless
+``watch_dir`` names a folder, and nothing is written unless there is an alarm. A thread of its own writes.
 """
 
 from __future__ import annotations
