@@ -37,7 +37,7 @@ from psd_deflection.watching.watch import Alarm, Watch
 
 RATE, LENGTH = 1000, 0.585
 BUMP, GAIN, SLIP = 5e-6, 0.02, 20e-6
-SIZES = {'bump': f'{1e6 * BUMP:g} um', 'gain': f'{100 * GAIN:g} %', 'slip': f'{1e6 * SLIP:g} urad'}
+SIZES = {'bump': f'{1e6 * BUMP:g} µm', 'gain': f'{100 * GAIN:g} %', 'slip': f'{1e6 * SLIP:g} µrad'}
 WITHIN_S, WANTED = 10.0, 0.95
 RUN_S, HELD_FROM_S = 34.0, 3.0
 LEVELS = ((0, 0, 0), (0, -30, 0), (0, -50, -29.25), (40, 0, 0), (0, -20, 20), (-30, -30, 0))
@@ -89,22 +89,19 @@ def read(clean: Array, rng: np.random.Generator) -> Array:
     return np.asarray(np.round((clean + SIGMA * rng.standard_normal(clean.shape)) / LSB) * LSB)
 
 
-def one(job: tuple[str, int]) -> Run:
-    """One event of a kind, drawn by ``seed``."""
-    kind, seed = job
+def happened(kind: str, seed: int) -> tuple[Array, Array, float]:
+    """One event of a kind, drawn by ``seed``: the load (3,), volts (n, 6) and the time of the event, s."""
     rng = np.random.default_rng((seed, len(kind)))
     n, held = round(RUN_S * RATE), round(HELD_FROM_S * RATE)
     event = round(rng.uniform(17.0, 22.0) * RATE)
     # A change of gain shows where the dots are off the centre.
     load = np.array(LEVELS[int(rng.integers(kind == 'gain', len(LEVELS)))], dtype=np.float64)
-    loads = np.zeros((n, 3))
-    loads[held:] = load
-    acting = loads.copy()
+    acting = np.zeros((n, 3))
+    acting[held:] = load
     if kind == 'slip':
         axis, turn = int(rng.integers(3)), float(rng.choice((-1.0, 1.0)))
         # The load that moves the tip as far as the clamp does.
-        equal = turn * SLIP * (3.0 * EI / LENGTH**2 if axis < 2 else GJ / LENGTH)
-        acting[event:, axis] += equal
+        acting[event:, axis] += turn * SLIP * (3.0 * EI / LENGTH**2 if axis < 2 else GJ / LENGTH)
     volts = Generator(acting, np.full(n, 20.0), LENGTH).clean([])
     psd = int(rng.integers(2))
     if kind == 'bump':
@@ -112,16 +109,23 @@ def one(job: tuple[str, int]) -> Run:
         volts[event:, 3 * psd : 3 * psd + 2] += BUMP / MM_PER_V * np.array([math.cos(angle), math.sin(angle)])
     elif kind == 'gain':
         volts[event:, 3 * psd : 3 * psd + 2] *= 1.0 + float(rng.choice((-1.0, 1.0))) * GAIN
+    return load, read(volts, rng), event / RATE
+
+
+def one(job: tuple[str, int]) -> Run:
+    """One event of a kind, drawn by ``seed``, seen by the whole chain."""
+    kind, seed = job
+    load, volts, event = happened(kind, seed)
+    held = round(HELD_FROM_S * RATE)
     chain = Chain()
-    chain.load(loads[0])
-    volts = read(volts, rng)
+    chain.load((0.0, 0.0, 0.0))
     chain.feed(volts[:held])
     chain.load(load)
-    for start in range(held, n, CHUNK):
+    for start in range(held, len(volts), CHUNK):
         chain.feed(volts[start : start + CHUNK])
-    early = any(a.seen_ns < event * 1_000_000 for a in chain.raised)
-    alarm = next((a for a in chain.raised if a.seen_ns >= event * 1_000_000), None)
-    after = math.nan if alarm is None else alarm.seen_ns / 1e9 - event / RATE
+    early = any(a.seen_ns < 1e9 * event for a in chain.raised)
+    alarm = next((a for a in chain.raised if a.seen_ns >= 1e9 * event), None)
+    after = math.nan if alarm is None else alarm.seen_ns / 1e9 - event
     return Run(kind, after, early, '' if alarm is None else alarm.channel)
 
 

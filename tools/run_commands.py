@@ -80,6 +80,8 @@ SHORTEST = {
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
     'blind-calibration': 'RIGS=1',
     'blind-laws': 'LAWS="--laws 1 --nulls 0"',
+    'blind-next': 'NEXT="--only clamp_torsion --designs torque"',
+    'blind-watch': 'WATCH="--runs 1 --hours 0"',
     'shots': 'SHOT_SECONDS=2',
 }
 """Variables with which a ``make`` target takes only seconds."""
@@ -104,6 +106,8 @@ VERDICTS = {
     'soak': r'real time: \d+ samples lost',
     'camera-campaign': r'adverse frames: ',
     'blind-laws': r'right variables',
+    'blind-next': r'recordings needed: ',
+    'blind-watch': r'slip of ',
     'blind': r'failures \(\d+\)',
 }
 """What a campaign says at its end: cut short, on a busy machine, it may come to another verdict than in full."""
