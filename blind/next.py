@@ -94,8 +94,8 @@ def one(job: tuple[str, str, float]) -> dict[str, Any]:
         return made[-1]
 
     done = settle([first], RIG, record, most=MOST)
-    named = [e.active.effect.name for e in done.found.effects]
-    together = sorted({n for e in done.found.effects for n in e.equivalent})
+    named = [*(e.active.effect.name for e in done.found.effects), *(f.name for f in done.found.setup)]
+    together = sorted(done.found.unsettled)
     row |= {
         'outcome': done.outcome,
         'recordings': len(done.plans),
@@ -116,7 +116,7 @@ def one(job: tuple[str, str, float]) -> dict[str, Any]:
             warm = p.setting.temperature(len(script))
             more.append(observed([hidden], script, warm, length, seed + 100 + i, f'all {i}'))
         best = discover([first, *made, *more], RIG)
-        row['separable'] = [e.active.effect.name for e in best.effects] == [name] and not best.effects[0].equivalent
+        row['separable'] = [e.active.effect.name for e in best.effects] == [name] and not best.unsettled
     row['seconds'] = time.perf_counter() - start
     return row
 

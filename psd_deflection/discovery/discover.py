@@ -104,6 +104,8 @@ class Discovery:
 
     ``setup``: mistakes of the set-up and the recording, with ``lines`` that put the rig file right; ``known``: the
     effects that the rig file has already. ``law``: describes what is unknown; it is in no gap and no effect here.
+    ``rivals``: the whole models that these recordings do not exclude beside ``fit``, also those of mistakes of the
+    set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
     """
 
     verdict: str
@@ -127,16 +129,13 @@ class Discovery:
     lines: Mapping[str, object]
     known: tuple[ActiveEffect, ...]
     law: FoundLaw | None = None
+    rivals: tuple[Fit, ...] = ()
+    unsettled: tuple[str, ...] = ()
 
     @property
     def floors(self) -> float:
         """The gap that remains, in units of the gap that noise alone leaves."""
         return self.gap_after / self.gap_floor if self.gap_floor > 0.0 else 0.0
-
-    @property
-    def rivals(self) -> list[Fit]:
-        """The whole models that these recordings do not exclude beside ``fit``."""
-        return [r.fit for e in self.effects for r in e.rivals]
 
     @property
     def active_effects(self) -> list[ActiveEffect]:
@@ -392,8 +391,10 @@ def _answer(
     for i, effect in enumerate(named):
         if effect.active.effect.name in SETUP:
             more, own = said(ws, fit, i, effect.delta_bic)
-            setup += more
+            setup += [dataclasses.replace(f, equivalent=effect.equivalent) for f in more]
             lines.update(own)
+    rivals = tuple(r.fit for e in named for r in e.rivals)
+    unsettled = tuple(dict.fromkeys(name for e in named for name in e.equivalent))
     named = [n for n in named if n.active.effect.name not in SETUP]
     setup += noise_finding(ws) if lattice is None else []
     if lattice is not None:
@@ -435,6 +436,8 @@ def _answer(
         lines,
         checked.known,
         law if verdict == 'unknown_effect' else None,
+        rivals,
+        unsettled,
     )
 
 

@@ -126,8 +126,10 @@ def pieces(rig: Rig, limits: Limits) -> list[Piece]:
     reach = float(np.hypot(*rig.centers.T).max())
     f = min(limits.force, room / physics.force_compliance)
     t = min(limits.torque, room / max(physics.torque_compliance * reach, 1e-12))
-    on_bar = min(f, t / limits.sidebar) if limits.sidebar > 0.0 else 0.0
     arm = limits.sidebar
+    # Its pull and its twist move the dots the same way.
+    both = physics.force_compliance + arm * physics.torque_compliance * reach
+    on_bar = min(limits.force, room / both) if arm > 0.0 else 0.0
     zero = (0.0, 0.0, 0.0)
     out: list[Piece] = []
     down: list[tuple[float, float, float]] = [zero, (0.0, -f, 0.0), zero, (0.0, -0.5 * f, 0.0), zero]

@@ -63,7 +63,7 @@ def settle(
     while True:
         found = discover(known, rig, seed=seed, without=without, progress=progress)
         # A rival that needs more parameters and gains nothing by them is no longer told as equivalent.
-        if not any(e.equivalent for e in found.effects):
+        if not found.unsettled:
             return Settled(found, tuple(plans), None, 'unique')
         progress('planning')
         plan = next_of(found, limits)

@@ -1,8 +1,8 @@
 """The next recording: the one that best tells apart the explanations that the recordings so far leave.
 
 ``named`` is the model of the answer, ``rivals`` are those that the data does not exclude. The value of a recording is
-the mean over them, and over which of the two is true, of the chi-square by which the wrong one would lose, counted up
-to ``SURE``. Of recordings with the same value the one with less effort is taken.
+the mean over all pairs of them, and over which of the two is true, of the chi-square by which the wrong one would lose,
+counted up to ``SURE``. Of recordings with the same value the one with less effort is taken.
 """
 
 from __future__ import annotations
@@ -164,7 +164,8 @@ def plan_next(workspace: Workspace, named: Fit, rivals: Sequence[Fit], limits: L
     limits = limits or Limits()
     models = [named, *rivals]
     known = [m.jacobian.T @ m.jacobian for m in models]
-    pairs = [(a, b) for k in range(1, len(models)) for a, b in ((0, k), (k, 0))]
+    # One of the rivals may be true: then it is to be told from the other rivals too.
+    pairs = list(itertools.permutations(range(len(models)), 2))
     rig = workspace.observations[0].rig
 
     def separations(s: Shown) -> FloatArray:
@@ -187,10 +188,12 @@ def plan_next(workspace: Workspace, named: Fit, rivals: Sequence[Fit], limits: L
     final = separations(shown(workspace, models, setting, plan.loads))
     possible = np.maximum(possible, final)
     told = []
-    for k, rival in enumerate(rivals):
-        there, back = final[2 * k : 2 * k + 2].tolist()
-        most = float(possible[2 * k : 2 * k + 2].max())
-        told.append(Told(rival.effects[-1].label, _replaced(named, rival), there, back, most))
+    for k, rival in enumerate(rivals, start=1):
+        there, back = pairs.index((0, k)), pairs.index((k, 0))
+        most = float(max(possible[there], possible[back]))
+        told.append(
+            Told(rival.effects[-1].label, _replaced(named, rival), float(final[there]), float(final[back]), most)
+        )
     return dataclasses.replace(plan, told=tuple(told))
 
 

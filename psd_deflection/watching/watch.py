@@ -6,7 +6,7 @@ Three tests, each on means over windows of half a second that are not spoilt by 
   two-sided CUSUM (Page, Biometrika 41 (1954) 100) against the level that it had under this load.
 * **base line**: the distance of the dots of two PSDs is that of their beams under every load and in motion. Its CUSUM
   needs no load.
-* **load**, if it is known: what a new load does to the pose must be what the link model says, within ``SHARE``.
+* **load**, if it is known: from one load to the next the pose must move as the link model says, within ``SHARE``.
 
 A CUSUM counts what exceeds ``allowed``: two standard deviations of a window's mean, and at least ``LEAST``. The level
 follows slow drift. The alarm comes ``CONFIRM_S`` later, unless a load is noted meanwhile: people note a load after they
@@ -19,7 +19,7 @@ import itertools
 import math
 import statistics
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -246,7 +246,8 @@ class Watch:
         self._off = [0.0, 0.0, 0.0]
         self._pose = [0.0, 0.0, 0.0]
         self._reference: tuple[list[float], list[float]] | None = None
-        self._learned_off: list[list[float]] = []
+        self._recent: deque[tuple[int, list[float], list[float]]] = deque(maxlen=LEARN + round(CONFIRM_S / WINDOW_S))
+        self._known = False
         self._line_pose: list[float] | None = None
         self._quiet = 0
 
@@ -269,7 +270,13 @@ class Watch:
             return
         for channel in self._readings:
             channel.forget()
-        self._learned_off = []
+        # The last moments in which the load was surely not on yet, so that slow drift does not add up.
+        before_ns = load.t_ns - round(1e9 * CONFIRM_S)
+        last = [r for r in self._recent if r[0] <= before_ns][-LEARN:]
+        if self._known and last:
+            self._reference = _level(last)
+        self._recent.clear()
+        self._known = False
         # What was not sure yet was this load. What was sure can no longer be seen to end.
         self._pending_ns = None
         self._lasting = self.alarm is not None
@@ -363,18 +370,16 @@ class Watch:
                 learned = channel.learn(window.mean)
             else:
                 channel.count(window.mean, began_ns, blocks, 0.0)
-        if self._readings[0].level is None or learned:
-            self._learned_off.append(off)
+        self._recent.append((began_ns + self._window_ns, pose, off))
         if learned:
-            self._new_load(pose, began_ns)
+            self._known = True
+            self._new_load(began_ns)
 
-    def _new_load(self, pose: list[float], began_ns: int) -> None:
-        """The level under a load is known: is the pose where the link model has it?"""
-        off = [statistics.median(column) for column in zip(*self._learned_off, strict=True)]
+    def _new_load(self, began_ns: int) -> None:
+        """The level under a load is known: has the pose moved from the load before as the link model says?"""
         if self._reference is None:
-            self._reference = (pose, off)
             return
-        pose0, off0 = self._reference
+        (pose, off), (pose0, off0) = _level(self._recent), self._reference
         moved = math.dist(pose[:2], pose0[:2])
         worst: tuple[float, str, float, float] = (1.0, '', 0.0, 0.0)
         for i, name in enumerate(('dx', 'dy', 'theta')):
@@ -411,3 +416,10 @@ class Watch:
         self.alarms += 1
         self._quiet = 0
         self._pending_ns = None
+
+
+def _level(windows: Collection[tuple[int, list[float], list[float]]]) -> tuple[list[float], list[float]]:
+    """Pose (3,) and how far it is off the link model (3,) in some windows: medians."""
+    _, poses, offs = zip(*windows, strict=True)
+    pose = [statistics.median(c) for c in zip(*poses, strict=True)]
+    return pose, [statistics.median(c) for c in zip(*offs, strict=True)]
