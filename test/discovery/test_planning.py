@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -11,8 +12,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from blind.next import first_recordings, one, table
-from psd_deflection.cli._next import limits_from_words
+from blind.next import table
+from psd_deflection.cli._next import limits_from_words, plan_table, write_plan
 from psd_deflection.cli.main import main
 from psd_deflection.config import Rig, load_rig, replace_values
 from psd_deflection.discovery import loop
@@ -22,6 +23,7 @@ from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.planning import TELLS_APART, Plan, plan_next
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.errors import UsageError
+from psd_deflection.recordings.observations import read_observations
 from psd_deflection.simulation import loads
 from psd_deflection.simulation.catalogue import make_active
 from psd_deflection.simulation.load_words import load_history
@@ -206,23 +208,40 @@ def test_the_command_settles_what_one_length_leaves_open(
     soft: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     limits = ['--limit', 'swing=0', '--limit', 'sweep=0', '--limit', 'seconds=12', '--quiet']
-    assert main(['discover', str(soft), '--out', str(tmp_path), '--next', *limits]) == 0
-    out = capsys.readouterr().out
-    assert 'Record next, ' in out
-    assert 'simulate --out' in out
-    plan = json.loads((tmp_path / 'result.json').read_text())['next']
-    assert plan['overrides'] == {'link.length': 0.409}
-    listed = (tmp_path / 'next.yaml').read_text()
-    assert 'link.length: 0.409' in listed
-    script = load_history(str(tmp_path / 'next_loads.csv'), 1000.0).loads
-    assert np.array_equal(script, np.concatenate([load_history(s, 1000.0).loads for s in plan['loads']]))
     truth = ['--effect', 'clamp_bending_compliance,compliance=2e-7']
     assert main(['discover', str(soft), '--out', str(tmp_path), '--next', '--run', *truth, *limits]) == 0
     assert 'The answer is unique after 1 more recording.' in capsys.readouterr().out
     tree = json.loads((tmp_path / 'result.json').read_text())
+    assert tree['next'] is None
     assert tree['run']['outcome'] == 'unique'
     assert [e['name'] for e in tree['effects']] == ['clamp_bending_compliance']
-    assert (tmp_path / 'next_1.csv').exists()
+    (made,) = tree['run']['recordings']
+    assert made['overrides'] == {'link.length': 0.409}
+    (seen,) = read_observations([tmp_path / 'next.yaml'])
+    assert (seen.name, seen.rig.link.length) == (made['file'], 0.409)
+
+
+def test_a_plan_is_written_as_files_that_the_commands_take(
+    models: tuple[Workspace, Fit, Fit], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    workspace, named, rival = models
+    plan = plan_next(workspace, named, [rival], Limits(swing=0.0, sweep=0.0, seconds=12.0))
+    assert plan is not None
+    warm = dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, swing=2.0))
+    lines = write_plan(warm, tmp_path)
+    script = load_history(str(tmp_path / 'next_loads.csv'), 1000.0).loads
+    assert np.array_equal(script, plan.loads)
+    command = shlex.split(lines[1])
+    assert command[:2] == ['psd-deflection', 'simulate']
+    assert main(command[1:]) == 0
+    (seen,) = read_observations([tmp_path / 'next.yaml'])
+    assert seen.rig.link.length == 0.409
+    assert np.array_equal(seen.loads, plan.loads)
+    assert seen.temperature is not None
+    assert np.ptp(seen.temperature) == pytest.approx(4.0, abs=0.01)
+    shown_table = plan_table(plan)
+    assert 'hold' in shown_table
+    assert 'clamp_bending_compliance' in shown_table
 
 
 @pytest.mark.parametrize(
@@ -241,17 +260,24 @@ def test_options_that_would_be_ignored_are_refused(
     assert part in capsys.readouterr().err
 
 
-@pytest.mark.statistics
-def test_the_campaign_in_short() -> None:
-    row = one(('clamp_torsional_compliance', 'torque', 4.0))
-    assert (row['outcome'], row['recordings'], row['right'], row['kind']) == ('unique', 1, True, 'confounded')
-    text, met = table([row])
-    assert met
-    assert 'settled and right in at most 3: 1' in text
-    wrong: dict[str, Any] = {**row, 'right': False}
-    assert not table([wrong])[1]
-    assert set(first_recordings()) >= {'torque', 'one weight'}
-    assert one(('thermal_drift', 'torque', 4.0))['kind'] == 'hidden'
+def row(**values: Any) -> dict[str, Any]:
+    whole = {'effect': 'creep', 'design': 'torque', 'kind': 'confounded', 'outcome': 'unique', 'recordings': 1}
+    return {**whole, 'named': ['creep'], 'together': [], 'left': [['x']], 'planned': ['do'], 'right': True, **values}
+
+
+@pytest.mark.parametrize(
+    ('rows', 'met'),
+    [
+        ([row(), row(recordings=2), row(recordings=1)], True),
+        ([row(), row(right=False)], False),
+        ([row(recordings=2), row(recordings=3)], False),
+        ([row(), row(outcome='recordings', recordings=3)], False),
+        ([row(), row(outcome='limits', separable=False)], True),
+        ([row(), row(outcome='limits', separable=True)], False),
+    ],
+)
+def test_the_campaign_wants_every_separable_case_settled(rows: list[dict[str, Any]], met: bool) -> None:
+    assert table(rows)[1] == met
 
 
 def test_a_plan_is_told_in_words() -> None:
