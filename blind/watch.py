@@ -39,7 +39,7 @@ RATE, LENGTH = 1000, 0.585
 BUMP, GAIN, SLIP = 5e-6, 0.02, 20e-6
 SIZES = {'bump': f'{1e6 * BUMP:g} µm', 'gain': f'{100 * GAIN:g} %', 'slip': f'{1e6 * SLIP:g} µrad'}
 WITHIN_S, WANTED = 10.0, 0.95
-RUN_S, HELD_FROM_S = 34.0, 3.0
+RUN_S, HELD_FROM_S = 24.0, 2.0
 LEVELS = ((0, 0, 0), (0, -30, 0), (0, -50, -29.25), (40, 0, 0), (0, -20, 20), (-30, -30, 0))
 DRIFT, DRIFT_HOURS = 2e-6, 3.0
 HOLD_S, HOLDS = 30, 12
@@ -93,7 +93,7 @@ def happened(kind: str, seed: int) -> tuple[Array, Array, float]:
     """One event of a kind, drawn by ``seed``: the load (3,), volts (n, 6) and the time of the event, s."""
     rng = np.random.default_rng((seed, len(kind)))
     n, held = round(RUN_S * RATE), round(HELD_FROM_S * RATE)
-    event = round(rng.uniform(17.0, 22.0) * RATE)
+    event = round(rng.uniform(11.0, 13.5) * RATE)
     # A change of gain shows where the dots are off the centre.
     load = np.array(LEVELS[int(rng.integers(kind == 'gain', len(LEVELS)))], dtype=np.float64)
     acting = np.zeros((n, 3))
@@ -209,7 +209,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--first', type=int, default=0, help='number of the first seed')
     parser.add_argument('--jobs', type=int, default=1, help='processes at once')
     args = parser.parse_args(argv)
-    jobs = [(kind, args.first + i) for kind in SIZES for i in range(args.runs)]
+    jobs = [(kind, args.first + i) for i in range(args.runs) for kind in SIZES]
     parts = [(args.hours / args.jobs, args.first + i) for i in range(args.jobs)] if args.hours else []
     runs, hours, alarms, costs = list[Run](), 0.0, 0, list[float]()
     said: list[str] = []
