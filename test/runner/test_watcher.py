@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -12,16 +13,20 @@ import pytest
 from msg_adapters import LOAD, to_messages
 from psd_deflection.config import load_rig
 from psd_deflection.pipeline import Pipeline
+from psd_deflection.protocol.frames import SampleFrame
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.observations import read_observation
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.replay_engine import replayed_estimates, rig_at_start
 from psd_deflection.records import AppliedLoad, DeflectionEstimate, FloatArray, RawChunk
 from psd_deflection.runner import watcher as module
-from psd_deflection.runner.diagnostics import OK, WARN
+from psd_deflection.runner.diagnostics import OK, WARN, HealthReporter
 from psd_deflection.runner.fanout import Fanout
+from psd_deflection.runner.session import Session
 from psd_deflection.runner.watcher import Watcher, WatcherWire
 from psd_deflection.simulation.simulator import RigSimulator
+from test.heard import WAIT_S
+from test.runner.conftest import Estimates, ScriptedDevice
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -147,3 +152,29 @@ def test_a_disk_without_room_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert not list(tmp_path.iterdir())
     assert 'disk_reserve' in chain.said[-1]
     assert 'disk_reserve' in chain.watcher.failure
+
+
+def test_a_session_feeds_its_watch_and_reports_it(device: ScriptedDevice, sample: Callable[..., SampleFrame]) -> None:
+    rig = load_rig(overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False, 'watch': 'on'})
+    session = Session(rig, lambda _: None)
+    try:
+        estimates = Estimates(5)
+        session.processing.sinks.append(estimates)
+        session.start()
+        device.send_frames(*(sample(seq) for seq in range(200)))
+        assert estimates.enough.wait(WAIT_S)
+        session.note_load(0.0, -3.0, 0.0)
+        assert session.watcher is not None
+        watch = session.watcher.watch
+        held = session.processing.request(lambda: watch.load)
+        assert held is not None
+        assert held.fy == -3.0
+        (entry,) = (e for e in HealthReporter(session).report(0).entries if e.name == module.NAME)
+        assert dict(entry.values)['watched'] == 'no window yet'
+    finally:
+        session.close()
+
+
+@pytest.mark.parametrize(('given', 'kept'), [(True, 'on'), ('off', 'off'), (False, 'off')])
+def test_the_watch_is_switched_by_one_parameter(given: object, kept: str) -> None:
+    assert load_rig(overrides={'watch': given}).acquisition.watch == kept
