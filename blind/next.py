@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from blind.cases import EFFECTS, gap_of, scaled
+from blind.cases import DRAWS, EFFECTS, MIMICKED, gap_of, scaled
 from blind.generator import Array, Generator
 from psd_deflection.config import load_rig, replace_values
 from psd_deflection.discovery.discover import discover
@@ -74,6 +74,9 @@ def one(job: tuple[str, str, float]) -> dict[str, Any]:
     generator = (Generator(loads, temperature, RIG.link.length),)
     row: dict[str, Any] = {'effect': name, 'design': design, 'gap': 0.0}
     try:
+        sizes = ({'name': name, **DRAWS[name](np.random.default_rng(seed), size)} for size in (1.0, 100.0))
+        if all(gap_of(generator, effect) < 1e-6 for effect in sizes):
+            return {**row, 'kind': 'hidden'}
         hidden = scaled(seed, name, gap, generator)
         row['gap'] = gap_of(generator, hidden)
     except (ValueError, OverflowError):
@@ -156,11 +159,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--only', default='', help='only effects whose name contains this')
     parser.add_argument('--designs', default='', help='only first recordings whose name contains this')
+    parser.add_argument('--mimicked', action='store_true', help='only effects that others can replace exactly')
     parser.add_argument('--gap', type=float, default=GAP, help='size of the hidden effect, in floors')
     parser.add_argument('--jobs', type=int, default=1, help='processes at once')
     parser.add_argument('--out', help='file for the rows, as JSON')
     args = parser.parse_args(argv)
-    jobs = [(n, d, args.gap) for d in first_recordings() if args.designs in d for n in EFFECTS if args.only in n]
+    effects = [n for n in EFFECTS if args.only in n and (n in MIMICKED or not args.mimicked)]
+    jobs = [(n, d, args.gap) for d in first_recordings() if args.designs in d for n in effects]
     rows = []
     with tqdm(total=len(jobs), file=sys.stderr) as bar, ProcessPoolExecutor(args.jobs) as pool:
         for row in pool.map(one, jobs):

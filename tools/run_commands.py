@@ -84,7 +84,7 @@ SHORTEST = {
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
     'blind-calibration': 'RIGS=1',
     'blind-laws': 'LAWS="--laws 1 --nulls 0"',
-    'blind-next': 'NEXT="--only clamp_torsion --designs torque"',
+    'blind-next': 'NEXT="--only quantisation --designs torque"',
     'blind-watch': 'WATCH="--runs 1 --hours 0"',
     'shots': 'SHOT_SECONDS=2',
 }

@@ -62,12 +62,10 @@ def settle(
     known, plans = list(recordings), list[Plan]()
     while True:
         found = discover(known, rig, seed=seed, without=without, progress=progress)
-        # A rival that needs more parameters and gains nothing by them is no longer told as equivalent.
-        if not found.unsettled:
-            return Settled(found, tuple(plans), None, 'unique')
         progress('planning')
         plan = next_of(found, limits)
-        if plan is None:
+        # A rival with more parameters that came out as the named effect would be has nothing left that could be tested.
+        if plan is None or not (plan.useful or found.unsettled):
             return Settled(found, tuple(plans), None, 'unique')
         if not plan.useful:
             return Settled(found, tuple(plans), plan, 'limits')

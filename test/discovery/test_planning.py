@@ -169,7 +169,11 @@ class Searches:
             return SimpleNamespace(unsettled=left)
 
         monkeypatch.setattr(loop, 'discover', discover)
-        monkeypatch.setattr(loop, 'next_of', lambda *_: SimpleNamespace(useful=useful, sentence='Nothing helps.'))
+        monkeypatch.setattr(
+            loop,
+            'next_of',
+            lambda found, _: SimpleNamespace(useful=useful and bool(found.unsettled), sentence='Nothing helps.'),
+        )
 
     def settle(self, most: int = 3) -> loop.Settled:
         first, made = cast(Observation, object()), cast(Observation, object())
