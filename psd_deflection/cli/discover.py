@@ -16,7 +16,7 @@ simulated rig and searched, and so on, until the answer is unique or no recordin
 
   psd-deflection discover odd.csv --out found
   psd-deflection discover a.csv b.csv --params-file my_rig.yaml --out found
-  psd-deflection discover odd.csv --out found --next --limit swing=0 --limit lengths=0.4,0.5
+  psd-deflection discover odd.csv --out found --next --limit lengths=0.4,0.5
 """
 
 from __future__ import annotations
