@@ -111,6 +111,12 @@ def test_micros_wraps_and_restarts_with_the_device() -> None:
     assert got == [2**32 - 1000, 2**32, 2**32 + 1000, 500, 1500]
 
 
+def test_micros_that_go_back_while_the_number_stands_still_start_again() -> None:
+    """As far back as a wrap: but a device that counts its samples does not count one for 71 minutes."""
+    extender = TimeExtender()
+    assert [extender.extend(Line(7, t, VALUES)) for t in (2**32 - 5, 3)] == [2**32 - 5, 3]
+
+
 def test_it_reads_the_rig(wired: Any, run: Any, unloaded: Any, volts: Any) -> None:
     port = wired(SimulatedLines(unloaded(load_rig()), PowerUp(first_seq=2**32 - 200)))
     running = run(load_rig(overrides={'source': 'lines', 'port': str(port.link)}))

@@ -109,6 +109,16 @@ def test_a_hello_that_does_not_fit_is_refused() -> None:
         encode(HelloFrame(1, {'serial': 'x' * 600}))
 
 
+def test_a_hello_of_512_bytes_encoded_is_sent_and_received() -> None:
+    # Type, version, {"serial":""} and CRC are 19 bytes. COBS adds one, and one after each 254: 19 + 490 + 3 = 512.
+    longest = HelloFrame(1, {'serial': 'x' * 490})
+    with pytest.raises(ValueError, match='513 bytes encoded, at most 512'):
+        encode(HelloFrame(1, {'serial': 'x' * 491}))
+    sent = encode(longest)
+    assert len(sent) == MAX_ENCODED + 1
+    assert isinstance(decode(sent)[0], HelloFrame)
+
+
 def test_a_field_that_does_not_fit_is_refused() -> None:
     with pytest.raises(ValueError, match='SampleFrame'):
         encode(SAMPLE._replace(seq=1 << 32))
