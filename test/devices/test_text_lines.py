@@ -75,6 +75,10 @@ def test_lines_come_out_however_the_stream_was_cut(cuts: list[int]) -> None:
     assert [i for a, b in itertools.pairwise(places) for i in decoder.feed(STREAM[a:b])] == ITEMS
 
 
+def test_a_whole_line_that_comes_first_is_a_line() -> None:
+    assert LineDecoder().feed(b'7,7000,0.1,-0.2,5,0,1.5,4.75\n') == [LINE]
+
+
 ALMOST = st.text('0123456789,.-+*#{} \r\n', max_size=60).map(str.encode)
 
 

@@ -100,6 +100,10 @@ def test_the_tail_of_a_frame_that_began_before_we_listened_is_passed_over() -> N
         assert FrameDecoder().feed(SAMPLE_BYTES[cut:] + SAMPLE_BYTES) == [SAMPLE]
 
 
+def test_a_whole_frame_that_comes_first_is_a_frame() -> None:
+    assert FrameDecoder().feed(SAMPLE_BYTES) == [SAMPLE]
+
+
 def test_empty_frames_are_nothing() -> None:
     assert decode(b'\x00\x00' + SAMPLE_BYTES + b'\x00') == [SAMPLE]
 

@@ -104,7 +104,7 @@ class Recorded:
         assert self.extended(seq, ms) == seq
 
     def extended(self, seq: list[int], ms: list[float], whole: bool = False) -> list[int]:
-        return self._sequence.extended(np.array(seq), self._ns(ms), whole).tolist()
+        return [int(n) for n in self._sequence.extended(np.array(seq), self._ns(ms), whole)]
 
     def follows(self, seq: list[int], ms: list[float]) -> bool:
         return self._sequence.follows(np.array(seq), self._ns(ms), False)
