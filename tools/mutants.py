@@ -1,9 +1,9 @@
 """``make mutants``: break the numerics one line at a time, and see whether a test notices.
 
 cosmic-ray makes the mutants: a sign, a number, a comparison, a truth value. Of each room so many are
-drawn with a fixed seed, each is put into a copy of this checkout, and the tests of the room run until
-one fails. What no test notices is listed; tools/mutants_equivalent.txt has those that nobody could
-notice, each with the reason, and they do not count.
+drawn with a fixed seed, each is put into a copy of this checkout, and those tests of the room that enter
+the function run until one fails. What no test notices is listed; tools/mutants_equivalent.txt has those
+that nobody could notice, each with the reason, and they do not count.
 
   python -m tools.mutants --count 32 --rooms solvers geometry
 """
@@ -11,6 +11,7 @@ notice, each with the reason, and they do not count.
 from __future__ import annotations
 
 import argparse
+import ast
 import hashlib
 import os
 import random
@@ -33,12 +34,9 @@ NOTICED = ROOT / 'build' / 'mutants' / 'noticed.txt'
 """Digests of broken files that a test has noticed: only what was not is tried again. Delete it to begin anew."""
 
 
-_LONGEST = 600.0
-"""s that a file of tests may take without a mutant."""
-
-
 class Room(NamedTuple):
-    """``code``: files and folders that are broken. ``tests``: what should notice, the quickest first.
+    """``code``: files and folders that are broken. ``tests``: what should notice.
+
     ``leave``: files that only draw or word what others computed.
     """
 
@@ -173,26 +171,42 @@ def drawn(folder: Path, room: Room, count: int, seed: int) -> list[Mutant]:
     return list(lines.values())[:count]
 
 
-@contextmanager
-def warm(python: str, folder: Path, tests: Sequence[str]) -> Iterator[Callable[[float, str], bool]]:
-    """Says whether ``tests`` pass, in a copy of the checkout; a module's own come first.
+def function_at(text: str, line: int) -> int:
+    """The line in which the innermost function around ``line`` begins, its decorators included; 0 if there is none."""
+    around = [
+        (node.lineno, min(n.lineno for n in (node, *node.decorator_list)))
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.lineno <= line <= (node.end_lineno or 0)
+    ]
+    return max(around)[1] if around else 0
 
-    The seconds are how long a file may take when it is run first; later four times of that.
+
+@contextmanager
+def warm(python: str, folder: Path, tests: Sequence[str]) -> Iterator[Callable[[str, int], bool]]:
+    """Says whether the ``tests`` that enter a function pass in a copy of the checkout: its file and first line.
+
+    Raises RuntimeError if they do not pass as it is.
     """
     environment = {**os.environ, 'PYTHONPATH': str(folder), 'PYTHONDONTWRITEBYTECODE': '1'}
     command = [python, str(ROOT / 'tools' / 'warm_pytest.py'), *tests]
     with subprocess.Popen(command, cwd=folder, env=environment, stdin=-1, stdout=-1, text=True) as process:
+        if process.stdin is None or process.stdout is None:
+            raise RuntimeError('the process that runs the tests has no pipes')
+        into, answers = process.stdin, process.stdout
 
-        def passed(seconds: float, module: str) -> bool:
-            if process.stdin is None or process.stdout is None:
-                raise RuntimeError('the process that runs the tests has no pipes')
-            process.stdin.write(f'{seconds} {module}\n')
-            process.stdin.flush()
-            answer = process.stdout.readline()
-            if not answer:
+        def answer() -> bool:
+            said = answers.readline()
+            if not said:
                 raise RuntimeError('the process that runs the tests ended')
-            return answer == '1\n'
+            return said == '1\n'
 
+        def passed(file: str, first: int) -> bool:
+            into.write(f'{file} {first}\n')
+            into.flush()
+            return answer()
+
+        if not answer():
+            raise RuntimeError(f'the tests fail without a mutant: run pytest {" ".join(tests)}')
         yield passed
         process.terminate()
 
@@ -204,8 +218,6 @@ def tried(name: str, python: str, count: int, seed: int) -> Iterator[tuple[str, 
     with tempfile.TemporaryDirectory() as scratch:
         folder = copy_of_checkout(Path(scratch))
         with warm(python, folder, room.tests) as passed:
-            if not passed(_LONGEST, name):
-                raise RuntimeError(f'{name}: the tests fail without a mutant: run pytest {" ".join(room.tests)}')
             for mutant in drawn(folder, room, count, seed):
                 file = folder / mutant.file
                 text = file.read_text()
@@ -214,7 +226,7 @@ def tried(name: str, python: str, count: int, seed: int) -> Iterator[tuple[str, 
                 seen = key in noticed
                 if not seen:
                     file.write_text(code)
-                    seen = not passed(_LONGEST, file.stem)
+                    seen = not passed(mutant.file, function_at(text, mutant.line))
                     file.write_text(text)
                     if seen:
                         with NOTICED.open('a') as stream:
