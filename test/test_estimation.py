@@ -1,0 +1,63 @@
+"""The uncertainty of an estimate by rules of one line: a held twist, half the light, light from elsewhere."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from psd_deflection.config import load_rig
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import DeflectionEstimate, FloatArray, RawChunk
+
+MEAN = {'block_fit': 'mean', 'covariance': 'file'}
+
+
+def chunk(volts: FloatArray, first: int = 0) -> RawChunk:
+    seq = np.arange(first, first + len(volts))
+    return RawChunk(seq, seq * 1_000_000, volts.astype(np.float32), np.zeros(len(seq), np.uint8))
+
+
+def estimates(volts: FloatArray, values: Mapping[str, object]) -> list[DeflectionEstimate]:
+    """The primary ones of blocks of 20."""
+    pipeline = Pipeline(load_rig(overrides=values))
+    return [r for r in pipeline.process(chunk(volts)) if isinstance(r, DeflectionEstimate) and r.primary]
+
+
+def at_rest(blocks: int, total: float = 5.0) -> FloatArray:
+    volts = np.zeros((20 * blocks, 6))
+    volts[:, 2::3] = total
+    return volts
+
+
+@pytest.mark.parametrize('seconds', [0.02, 0.5])
+def test_the_variance_of_a_held_twist_grows_to_that_of_any_twist(seconds: float) -> None:
+    """Ornstein-Uhlenbeck: v + s^2 (1 - exp(-t/T)), and the variance of the translation by the lever of the twist."""
+    blocks = 1 + round(seconds / 0.02)
+    volts = at_rest(blocks)
+    volts[20:, :3] = 0.0
+    found = estimates(volts, {**MEAN, 'degraded': 'hold', 'twist_sd': 0.01, 'twist_hold': 0.7})
+    assert len(found) == blocks
+    first, last = (np.array(e.covariance).reshape(3, 3) for e in (found[0], found[-1]))
+    want = first[2, 2] + 1e-4 * (1.0 - math.exp(-seconds / 0.7))
+    assert last[2, 2] == pytest.approx(want, rel=1e-12)
+    assert found[-1].theta == found[0].theta
+    # PSD 2 is 0.1 m from the tip's axis along -X: a twist moves its dot in y.
+    assert last[1, 1] - last[0, 0] == pytest.approx(0.1**2 * want, rel=1e-3)
+
+
+def test_half_the_light_doubles_the_noise_of_the_readings() -> None:
+    values = {**MEAN, 'splitter': True}
+    (full,), (half,) = (np.array([e.covariance for e in estimates(at_rest(1, v), values)]) for v in (5.0, 2.5))
+    np.testing.assert_allclose(half, 4.0 * full, rtol=1e-9, atol=1e-24)
+
+
+def test_other_light_may_come_from_anywhere_on_the_active_area() -> None:
+    """A share b of light from a place that is uniform over the length L: variance (b L/2)^2/3 in each reading."""
+    length, share = 10e-3, (8.0 - 5.0) / 8.0
+    dark, bright = (np.array(estimates(at_rest(1, v), MEAN)[0].covariance) for v in (5.0, 8.0))
+    # Readings of one variance v: that of the twist is v over the sum of squares about the middle of the base line.
+    own = dark[8] * (0.1**2 + 0.07**2) / 2.0
+    np.testing.assert_allclose(bright, dark * (1.0 + (share * length / 2.0) ** 2 / 3.0 / own), rtol=1e-6, atol=1e-20)
