@@ -61,6 +61,7 @@ ROOMS: Mapping[str, Room] = {
         ('psd_deflection/pipeline.py', 'psd_deflection/estimation.py', 'psd_deflection/correction.py'),
         (
             _PIPELINE,
+            'test/test_estimation.py',
             'test/uncertainty/test_pipeline_state.py',
             'test/test_more_psds.py -k psd_left or without_one or contradicts or tells_on_itself or of_all_psds',
             'test/filtering/test_motion.py -k anew or begun_at or noted or is_refused',
@@ -71,7 +72,10 @@ ROOMS: Mapping[str, Room] = {
     'uncertainty': Room(
         ('psd_deflection/uncertainty',),
         (
-            *(f'test/uncertainty/test_{n}.py' for n in ('formulas', 'consistency', 'block_fit', 'noise')),
+            *(
+                f'test/uncertainty/test_{n}.py'
+                for n in ('formulas', 'consistency', 'redundancy', 'rest', 'block_fit', 'noise')
+            ),
             'test/test_pipeline.py -k zero or contradict',
             'test/test_more_psds.py -k contradicts_the_others or degree_of_freedom or tells_on_itself or one_after_the',
             'test/uncertainty/test_pipeline_state.py',
