@@ -62,6 +62,7 @@ ROOMS: Mapping[str, Room] = {
         (
             _PIPELINE,
             'test/test_estimation.py',
+            'test/misalignment/test_spread.py',
             'test/uncertainty/test_pipeline_state.py',
             'test/test_more_psds.py -k psd_left or without_one or contradicts or tells_on_itself or of_all_psds',
             'test/filtering/test_motion.py -k anew or begun_at or noted or is_refused',
