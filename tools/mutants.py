@@ -82,7 +82,14 @@ ROOMS: Mapping[str, Room] = {
             'test/uncertainty/test_pipeline_state.py',
         ),
     ),
-    'adapters': Room(('msg_adapters',), ('test/recordings/test_adapters.py', 'test/recordings/test_contract.py')),
+    'adapters': Room(
+        ('msg_adapters',),
+        (
+            'test/recordings/test_adapters.py',
+            'test/recordings/test_contract.py',
+            'test/test_more_psds.py -k cloud_of_two',
+        ),
+    ),
     'protocol': Room(
         ('psd_deflection/protocol',),
         (
