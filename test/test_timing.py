@@ -211,7 +211,8 @@ def test_two_milliseconds_are_what_shows_a_rate(drift_ns: int, fitted: bool) -> 
     """Three minima, a second apart: the clock has run off by this much from the first to the last."""
     clock = ClockMap()
     for second in range(4):
-        clock.observe(1_000_000 * second, 1000 * MS * second + drift_ns * second // 2)
+        # The one between is no less late than the line.
+        clock.observe(1_000_000 * second, 1000 * MS * second + (drift_ns * second + 1) // 2)
     assert clock.state().points == 3
     assert (clock.state().skew_ppm != 0.0) == fitted
 

@@ -22,6 +22,8 @@ def test_two_blocks_tell_nothing_three_do() -> None:
     # From the first block to the mean of the others.
     assert moves([0.0, 2.01, 2.01]).startswith('the link moves: y1 varied by 1.2 um rms in the last 3 blocks, noise')
     assert moves([0.0, 1.99, 1.99]) == ''
+    # Of two at 0 and two at 1 m: 1/sqrt 3 m.
+    assert ' varied by 577350.3 um rms ' in moves([0.0, 0.0, 1e6, 1e6])
 
 
 @pytest.mark.parametrize(('noise_um', 'drifts', 'scatters'), [(0.01, 2.0, 10.0), (3.0, 15.0, 15.0)])
@@ -40,3 +42,10 @@ def test_moving_is_five_times_the_noise_and_micrometres(noise_um: float, drifts:
 def test_diagnostics_say_whose_noise_it_is(covariance: str, words: str) -> None:
     stamped = StampedDots(load_rig(overrides={'covariance': covariance}))
     assert dict(stamped.words())['covariance from'] == words
+
+
+def test_diagnostics_say_of_how_many_readings_too_many_a_chi_square_is() -> None:
+    third = {'psd_3.center': [0.08, -0.06]}
+    of_two, of_three = (dict(StampedDots(load_rig(overrides=more)).words()) for more in ({}, third))
+    assert of_two['chi-square of the readings'] == '0.00'
+    assert of_three['chi-square of the readings'] == '0.00 of 1 degrees of freedom'
