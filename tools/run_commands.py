@@ -61,7 +61,7 @@ CI_RUNS = (
     (
         r"^pip install '\.\[ros,monitor\]'$",
         'Makefile',
-        "pip install --quiet --disable-pip-version-check '.[ros,monitor,",
+        "pip install --quiet --disable-pip-version-check '.[ros,monitor]'",
     ),
     (r'^python bench/live\.py$', 'Makefile', 'python bench/live.py'),
     (r'^python bench/solvers\.py$', 'Makefile', 'python bench/solvers.py'),
