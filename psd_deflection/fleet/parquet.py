@@ -46,7 +46,7 @@ class ParquetFile:
                 f"--out {path} needs pyarrow: `pip install 'psd_deflection[parquet]'` or `pip install pyarrow`"
             ) from None
         self.path = Path(path)
-        self._fields = tuple(fields)
+        self.fields = tuple(fields)
         with creating(self.path):
             self._stream = self.path.open('xb')
         self._writer = parquet.ParquetWriter(self._stream, self._schema(), compression='zstd')
@@ -57,14 +57,14 @@ class ParquetFile:
         return pa.schema(
             [
                 pa.field(RECORDING, pa.dictionary(pa.int32(), pa.string())),
-                *(pa.field(f.name, kinds[f.kind], metadata={'unit': f.unit} if f.unit else None) for f in self._fields),
+                *(pa.field(f.name, kinds[f.kind], metadata={'unit': f.unit} if f.unit else None) for f in self.fields),
             ]
         )
 
     def put(self, recordings: Sequence[str], columns: Mapping[str, Any]) -> None:
         """Append rows: the recording of each (n,), and a column (n,) for each of the fields."""
         pa, schema = self._arrow, self._schema()
-        cells = [pa.array(columns[f.name], type=schema.field(f.name).type) for f in self._fields]
+        cells = [pa.array(columns[f.name], type=schema.field(f.name).type) for f in self.fields]
         names = pa.array(recordings, pa.string()).dictionary_encode()
         self._do(lambda: self._writer.write_table(pa.Table.from_arrays([names, *cells], schema=schema)))
 

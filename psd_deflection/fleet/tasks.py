@@ -44,19 +44,19 @@ def attempt(work: Callable[[str], T], name: str, version: str) -> Outcome[T]:
 
 
 def outcomes(
-    work: Callable[[str], T], names: Sequence[str], engine: Engine, ended: Callable[[], None] = lambda: None
+    work: Callable[[str], T], names: Sequence[str], engine: Engine, ended: Callable[[], object] = lambda: None
 ) -> Iterator[Outcome[T]]:
     """The outcome of ``work`` on each of ``names``, in their order; ``ended`` is called when one has ended.
 
-    ``work`` and its results must be able to go to another process. If a worker of a pool is killed, what was under way is
-    tried again, one at a time, so that only the recording that kills its worker fails. Dask does this by itself.
+    ``work`` and its results must be able to go to another process. If a worker of a pool is killed, what was under way
+    is tried again, one at a time, so that only the recording that kills its worker fails. Dask does this by itself.
     """
     return _Run(work, names, engine, ended).outcomes()
 
 
 class _Run(Generic[T]):
     def __init__(
-        self, work: Callable[[str], T], names: Sequence[str], engine: Engine, ended: Callable[[], None]
+        self, work: Callable[[str], T], names: Sequence[str], engine: Engine, ended: Callable[[], object]
     ) -> None:
         self._work = work
         self._names = names
