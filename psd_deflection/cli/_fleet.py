@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 from tqdm import tqdm
 
-from psd_deflection.cli._report import columns, print_json, show, show_text, warn
+from psd_deflection.cli._options import make_folder, make_writable
+from psd_deflection.cli._report import columns, print_json, save_all, show, show_text, warn
 from psd_deflection.errors import SomeFailedError, UsageError
 from psd_deflection.fleet.engines import FORMS, SERIAL, check_engine, open_engine
 from psd_deflection.fleet.listing import is_plain, listed
@@ -120,6 +122,47 @@ def write_rows(
     cells[ERROR.name] = [failed.get(name, '') for name in names]
     out.put(names, cells)
     out.close(failed)
+
+
+class Answer(Protocol):
+    """What the task of one recording gives: the files of its folder, the cells of its row, warnings."""
+
+    @property
+    def files(self) -> Mapping[str, str]: ...
+
+    @property
+    def cells(self) -> Mapping[str, object]: ...
+
+    @property
+    def warnings(self) -> Sequence[str]: ...
+
+
+def answer_each(
+    args: argparse.Namespace,
+    names: Sequence[str],
+    work: Callable[[str], Answer],
+    fields: Sequence[Field],
+    head: Sequence[str],
+    line: Callable[[Mapping[str, object]], Sequence[str]],
+) -> int:
+    """Do ``work`` on each recording; its files go into a folder of its own below DIR, or its cells into X.parquet."""
+    rows: dict[str, Mapping[str, object]] = {}
+    with contextlib.ExitStack() as stack:
+        out = stack.enter_context(ParquetFile(args.out, fields)) if is_parquet(args.out) else None
+        folders = {} if out is not None else folders_of(names, make_writable(args.out))
+
+        def take(name: str, answer: Answer) -> None:
+            for warning in answer.warnings:
+                warn(f'{_short(name)}: {warning}')
+            rows[name] = answer.cells
+            if out is None:
+                save_all(answer.files, make_folder(str(folders[name])))
+
+        failed = run_each(args, names, work, take)
+        if out is not None:
+            write_rows(out, names, rows, failed)
+    tell_each(args, names, rows, failed, head, line)
+    return 0
 
 
 def tell_each(

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import functools
 import math
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -181,6 +182,14 @@ def make_folder(out: str) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RecordingError(f'--out {out}: cannot be made a folder ({error.strerror or error})') from None
+    return folder
+
+
+def make_writable(out: str) -> Path:
+    """As :func:`make_folder`, before work that takes its time: RecordingError also if nothing can be written there."""
+    folder = make_folder(out)
+    if not os.access(folder, os.W_OK):
+        raise RecordingError(f'--out {out}: cannot be written in; give another folder')
     return folder
 
 
