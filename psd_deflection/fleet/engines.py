@@ -77,15 +77,19 @@ class _Processes:
         return self._pool.submit(task, *arguments)
 
     def renew(self) -> None:
-        self.end()
+        # A pool that has lost one process has ended the others.
+        self._pool.shutdown()
         self._pool = self._made()
 
     def end(self) -> None:
-        """Stop what still runs."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        """Wait for what is under way, and end the processes."""
+        self._pool.shutdown()
+
+    def kill(self) -> None:
+        """End the processes at once."""
         for process in set(multiprocessing.active_children()) - self._others:
             process.terminate()
-        self._pool.shutdown()
+        self._pool.shutdown(cancel_futures=True)
 
 
 class _Dask:
@@ -124,8 +128,10 @@ def open_engine(word: str, tell: Callable[[str], None] = lambda _: None) -> Iter
         pool = _Processes(int(processes[1] or len(os.sched_getaffinity(0))))
         try:
             yield pool
-        finally:
-            pool.end()
+        except BaseException:
+            pool.kill()
+            raise
+        pool.end()
     else:
         with _connected(word) as client:
             if not client.scheduler_info()['workers']:

@@ -59,7 +59,8 @@ def _of_word(word: str) -> list[str]:
 
 
 def _is_bag(folder: Path) -> bool:
-    return (folder / 'metadata.yaml').is_file() or any(folder.glob('*.mcap'))
+    # Without metadata it was cut off; its files have its name.
+    return (folder / 'metadata.yaml').is_file() or any(folder.glob(f'{glob.escape(folder.name)}_*.mcap'))
 
 
 def _of_list(path: Path) -> Iterator[str]:
