@@ -222,6 +222,9 @@ def _fields() -> list[Field]:
 def _each(args: argparse.Namespace, names: list[str], asked: Asked) -> int:
     if args.reference:
         raise UsageError('--reference: not with --each, which takes the reference that is in each recording')
+    if args.params_file is not None:
+        # What is wrong in it is so for all.
+        load_rig(args.params_file)
     return answer_each(args, names, partial(answer_of, asked=asked), _fields(), HEAD, _line)
 
 

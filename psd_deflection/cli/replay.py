@@ -31,7 +31,7 @@ from psd_deflection.cli._fleet import absolute, executor_option, recordings_argu
 from psd_deflection.cli._options import namespace_option, recording_name, refuse
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show, show_text, warn
-from psd_deflection.config import Rig
+from psd_deflection.config import Rig, load_rig
 from psd_deflection.errors import UsageError
 from psd_deflection.fleet.parquet import ENDING, Field, ParquetFile, is_parquet
 from psd_deflection.pipeline import Pipeline
@@ -222,6 +222,9 @@ def _columns(series: EstimateSeries) -> list[Column]:
 def _many(args: argparse.Namespace, names: list[str]) -> int:
     if args.out is not None and not is_parquet(args.out):
         raise UsageError(f'--out {args.out}: of many recordings the estimates go into one X{ENDING}')
+    if args.params_file is not None:
+        # What is wrong in it is so for all.
+        load_rig(args.params_file)
     found: dict[str, dict[str, object]] = {}
     with contextlib.ExitStack() as stack:
         out: ParquetFile | None = None

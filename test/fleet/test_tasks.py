@@ -117,13 +117,6 @@ def test_a_worker_of_another_version_is_named(monkeypatch: pytest.MonkeyPatch) -
     assert answer.error.startswith(f'a worker has psd_deflection {tasks.__version__}, here is 99.0')
 
 
-def test_processes_answer_as_this_process_does() -> None:
-    before = multiprocessing.active_children()
-    with open_engine('serial') as here, open_engine('processes:2') as pool:
-        assert list(outcomes(length, NAMES, pool)) == list(outcomes(length, NAMES, here))
-    assert multiprocessing.active_children() == before
-
-
 def test_a_killed_process_costs_only_its_task(tmp_path: Path) -> None:
     names = [str(tmp_path / name) for name in ('a', 'poison', 'bb', 'once', 'ccc')]
     with open_engine('processes:2') as pool:
