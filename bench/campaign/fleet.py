@@ -151,9 +151,10 @@ def main() -> int:
     parser.add_argument('--recordings', type=int, default=1000)
     parser.add_argument('--seconds', type=float, default=1.0, help='of each recording')
     parser.add_argument('--kills', type=int, default=2, help='workers that are killed on the way')
+    parser.add_argument('--only-killed', action='store_true', help='only the run whose workers are killed')
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        said, wrong = campaign(Path(folder), args.recordings, args.seconds, args.kills)
+        said, wrong = campaign(Path(folder), args.recordings, args.seconds, args.kills, not args.only_killed)
     print('\n'.join([said, *wrong]))
     return 1 if wrong else 0
 

@@ -14,7 +14,7 @@ row. REC may then be a pattern, or a .txt file that lists recordings and pattern
   psd-deflection calibrate run.csv --reference camera.csv --out new
   psd-deflection calibrate today.csv --check new/rig.yaml
   psd-deflection calibrate run --self --params-file my_rig.yaml --out new
-  psd-deflection calibrate 'archive/*.csv' --each --executor processes --out calibrations.parquet
+  psd-deflection calibrate 'archive/*' --each --out calibrations.parquet
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ X.parquet a row. REC may then be a pattern, or a .txt file that lists recordings
 
   psd-deflection discover odd.csv --out found
   psd-deflection discover a.csv b.csv --params-file my_rig.yaml --out found
-  psd-deflection discover 'archive/*.csv' --each --executor processes --out found
+  psd-deflection discover 'archive/*' --each --executor processes --out found
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ a pattern, or a .txt file that lists recordings and patterns.
 
   psd-deflection info bags/clean
   psd-deflection info recordings/psd_20260101_120000 --json
-  psd-deflection info 'archive/**' --executor processes --out archive.parquet
+  psd-deflection info 'recordings/*' --executor processes --out all.parquet
 """
 
 from __future__ import annotations
