@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 import pytest
 
 from bench.campaign.mortal import dies, length
+from psd_deflection import __version__
 from psd_deflection.errors import DaemonError, UsageError
-from psd_deflection.fleet import tasks
 from psd_deflection.fleet.engines import check_engine, open_engine
 from psd_deflection.fleet.tasks import AHEAD, Outcome, attempt, outcomes
 
@@ -111,10 +111,10 @@ def test_results_that_wait_for_an_earlier_one_are_bounded() -> None:
 
 
 def test_a_worker_of_another_version_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert attempt(length, 'abc', tasks.__version__).value == 3
+    assert attempt(length, 'abc', __version__).value == 3
     answer = attempt(length, 'abc', '99.0')
     assert answer.value is None
-    assert answer.error.startswith(f'a worker has psd_deflection {tasks.__version__}, here is 99.0')
+    assert answer.error.startswith(f'a worker has psd_deflection {__version__}, here is 99.0')
 
 
 def test_a_killed_process_costs_only_its_task(tmp_path: Path) -> None:
