@@ -85,12 +85,18 @@ unit: $(READY)
 run: $(VENV)/.installed
 	$(BIN)/psd-deflection estimator --monitor --record recordings $(if $(PORT),--port $(PORT)) $(ARGS)
 
-# Arguments, e.g. BENCH_LIVE='--seconds 5 --minutes 1' for a first look.
+# Arguments, e.g. BENCH_LIVE='--seconds 5 --starts 1' for a first look.
 BENCH_LIVE ?=
+BENCH_LIMITS ?=
+BENCH_RIGS ?=
 BENCH_SOLVERS ?=
 BENCH_ACCURACY ?=
+# Rows with peers and limits go into bench/results.json, of which docs/performance.md is made.
 bench: $(READY)
-	$(BIN)/python bench/live.py $(BENCH_LIVE)
+	$(BIN)/python -m bench.live $(BENCH_LIVE)
+	OMP_NUM_THREADS=1 $(BIN)/python -m bench.limits $(BENCH_LIMITS)
+	$(BIN)/python -m bench.rigs $(BENCH_RIGS)
+	$(BIN)/python -m bench.page
 	$(BIN)/python bench/solvers.py $(BENCH_SOLVERS)
 	$(BIN)/python bench/accuracy.py $(BENCH_ACCURACY)
 
