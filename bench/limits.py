@@ -65,7 +65,7 @@ TEN = (
     'axis_crosstalk,psd=1,xy=0.02',
     'sensor_gain,psd=2,x=0.01',
     'thermal_drift,psd=1,x=1e-6',
-    'mains_interference,amplitude=0.001',
+    'mains_interference,frequency=50,amplitude_x1=0.001',
 )
 
 
