@@ -95,6 +95,7 @@ BENCH_SOLVERS ?=
 BENCH_ACCURACY ?=
 # Rows with peers and limits go into bench/results.json, of which docs/performance.md is made.
 bench: $(READY)
+	rm -f bench/results.json
 	$(BIN)/python -m bench.live $(BENCH_LIVE)
 	OMP_NUM_THREADS=1 $(BIN)/python -m bench.limits $(BENCH_LIMITS)
 	$(BIN)/python -m bench.rigs $(BENCH_RIGS)

@@ -31,7 +31,6 @@ import numpy.typing as npt
 from bench.rows import RESULTS, ROOT, Row, figure, keep, tell
 
 BLOCKS_PER_S = 50
-PARTS = 10
 START_S = 4.0
 """A process has imported rclpy and found the others."""
 
@@ -296,10 +295,10 @@ def live_rows(alone: Latencies, with_page: Latencies) -> list[Row]:
     """What :func:`live` measured."""
     rows = []
     for what, found, bounds in (('', alone, (1.4, 1.2)), (', live page looked at', with_page, (None, None))):
-        for word, percent, bound in (('median', 50, bounds[0]), ('99th percentile', 99, bounds[1])):
-            # In tenths of the run, so that there is a spread.
+        for word, percent, parts, bound in (('median', 50, 10, bounds[0]), ('99th percentile', 99, 3, bounds[1])):
+            # In parts of the run, so that there is a spread.
             ours, bare = (
-                [float(np.percentile(part, percent)) for part in np.array_split(values, PARTS)]
+                [float(np.percentile(part, percent)) for part in np.array_split(values, parts)]
                 for values in (found.ours, found.bare)
             )
             rows.append(
