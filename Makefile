@@ -61,10 +61,12 @@ $(VENV)/.installed: $(VENV)/.requirements setup.py setup.cfg $(SOURCES)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall .
 	touch $@
 
-# What tests, campaigns and documents need besides. Later than the package, so that two pips never write at once.
+# What tests, campaigns and documents need besides, without another build of the package. Later than the package, so that
+# two pips never write at once.
 $(VENV)/.for_tests: $(VENV)/.requirements | $(VENV)/.installed
 	@echo 'the tools of the tests into $(VENV), once: a minute or so, 0.9 GB more'
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[ros,monitor,test]' $(if $(WITH),'$(WITH)')
+	$(BIN)/python -c 'import configparser; c = configparser.ConfigParser(); c.read("setup.cfg"); print(c["options.extras_require"]["test"])' > $(VENV)/test_tools
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r $(VENV)/test_tools $(if $(WITH),'$(WITH)')
 	touch $@
 
 setup: $(READY)

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from distributed import Client, LocalCluster
+from distributed.diagnostics.plugin import SchedulerPlugin
 from tqdm import tqdm
 
 from psd_deflection.cli.main import main as psd_deflection
@@ -74,28 +75,35 @@ def cluster_of(workers: int) -> Iterator[Any]:
         yield cluster
 
 
+class Done(SchedulerPlugin):  # type: ignore[misc]
+    """Counts tasks that were done."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def transition(self, key: object, start: str, finish: str, *_: object, **__: object) -> None:
+        """Called by the scheduler for each change of a task."""
+        self.count += finish == 'memory'
+
+
 class Killer:
-    """Kills workers of ``cluster`` that are busy, ``times`` in all: at equal parts of the ``recordings`` done."""
+    """Kills workers of ``cluster`` that are busy, ``times`` in all, spread over the ``recordings``."""
 
     def __init__(self, cluster: Any, recordings: int, times: int) -> None:
         self._cluster = cluster
-        self._at = [recordings * (n + 1) // (times + 1) for n in range(times)]
+        self._at = [recordings * (n + 1) // (times + 2) for n in range(times)]
         self._given_up = threading.Event()
         self.killed: list[int] = []
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
-        scheduler = self._cluster.scheduler
+        scheduler, done = self._cluster.scheduler, Done()
+        scheduler.add_plugin(done)
         with Client(self._cluster, set_as_default=False) as client:
-            done = 0
-            seen: set[str] = set()
+            before = done.count
             while len(self.killed) < len(self._at) and not self._given_up.wait(LOOK_S):
-                for key, task in list(scheduler.tasks.items()):
-                    if task.state == 'memory':
-                        seen.add(str(key))
-                done = max(done, len(seen))
-                if done < self._at[len(self.killed)]:
+                if done.count - before < self._at[len(self.killed)]:
                     continue
                 busy = [address for address, worker in list(scheduler.workers.items()) if worker.processing]
                 if not busy:
