@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-from psd_deflection.config import Rig
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.config import BY_NAME, Rig, replace_values
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import ParameterChange, Record, SampleBlock
+from psd_deflection.simulation.catalogue import effects_of_rig
+from psd_deflection.simulation.tip_load import TipLoads
 from psd_deflection.watching.watch import Alarm, Watch
 
 
 class WatchedReplay:
-    """Takes the records of a replay of ``recording`` by ``pipeline``. ``alarms``: all, the first first."""
+    """Takes the records of a replay of ``recording`` with ``rig``. ``alarms``: all, the first first."""
 
-    def __init__(self, rig: Rig, pipeline: Pipeline, recording: Recording) -> None:
-        self.watch = Watch(rig, pipeline.tip_loads.compliance)
+    def __init__(self, rig: Rig, recording: Recording) -> None:
+        effects = effects_of_rig(rig) if rig.estimator.wrench == 'effects' else ()
+        self.watch = Watch(rig, TipLoads(rig, effects).compliance)
         self.alarms: list[Alarm] = []
-        self._pipeline = pipeline
+        self._rig = rig
         self._loads = recording.loads()[::-1]
 
     def put(self, record: Record) -> None:
         """One record."""
         if isinstance(record, ParameterChange):
-            self.watch.changed(record, self._pipeline.rig)
+            values = {n: list(v) if isinstance(v, tuple) else v for n, v in record.values if n in BY_NAME}
+            self._rig = replace_values(self._rig, values) if values else self._rig
+            self.watch.changed(record, self._rig)
             return
         self.watch.put(record)
         if isinstance(record, SampleBlock):
