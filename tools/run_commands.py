@@ -96,6 +96,7 @@ SHORTER = {
     r'^python -m blind\.coverage --faults$': '--rows 1',
     r'^python -m blind\.thesis$': '--parts 1',
     r'^python -m blind\.clock$': '--runs 5',
+    r'^python -m blind\.watch\b': '--runs 1 --hours 0',
     r'^python -m blind\.modes$': '--rigs 3',
     r'^python -m blind\.motion\b': '--runs 1 --seconds 4',
     r'^ros2 topic echo\b': '--once',
