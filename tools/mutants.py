@@ -57,7 +57,7 @@ ROOMS: Mapping[str, Room] = {
     'averaging': Room(('psd_deflection/averaging.py',), ('test/test_averaging.py', _GOLDEN)),
     'timing': Room(('psd_deflection/timing.py',), ('test/test_timing.py', 'test/runner/test_clock_watch.py')),
     'pipeline': Room(
-        ('psd_deflection/pipeline.py', 'psd_deflection/correction.py'),
+        ('psd_deflection/pipeline.py', 'psd_deflection/estimation.py', 'psd_deflection/correction.py'),
         (_PIPELINE, _GOLDEN),
     ),
     'calibration': Room(('psd_deflection/calibration',), ('test/calibration', _GOLDEN)),
