@@ -16,6 +16,7 @@ from setuptools import setup
 PACKAGE = 'psd_deflection'
 EXECUTABLES = (
     'estimator',
+    'chain',
     'replay',
     'simulate',
     'discover',

@@ -74,7 +74,7 @@ class EndEffector(NamedTuple):
 
     ``rigid``, ``deflected``: its pose in the base. ``deflection``: the deflected pose in the frame of the rigid one.
     ``covariance`` (6, 6): of position (m) and rotation (rad) about the fixed axes of that frame, as ROS orders them.
-    ``tips``: the pose of each tip in its own rest frame.
+    ``tips``: the pose of each tip in its own rest frame. ``angles``: of the joints, rad.
     """
 
     rigid: Transform
@@ -82,6 +82,7 @@ class EndEffector(NamedTuple):
     deflection: Transform
     covariance: FloatArray
     tips: tuple[Transform, ...]
+    angles: tuple[float, ...]
 
     @property
     def vector(self) -> FloatArray:
@@ -143,9 +144,7 @@ class Chain:
 
         # What a small change of each tip does to the end effector, in the frame of the rigid one.
         carried = np.empty((6, 6 * len(self.links)))
-        for i, (rotation, at, (_, _, _, _, omega, _), pose) in enumerate(
-            zip(clamped, ends, state, poses, strict=True)
-        ):
+        for i, (rotation, at, (_, _, _, _, omega, _), pose) in enumerate(zip(clamped, ends, state, poses, strict=True)):
             to_end = rest.end.rotation.T @ rotation
             lever = rotation.T @ (deflected.position - at)
             # Rotation vector of small changes of phi, omega and theta in R = Ry(omega) Rx(phi) Rz(theta).
@@ -164,7 +163,7 @@ class Chain:
                 per_ratio = np.array([-tip.pose[1], tip.pose[0]]) / link.length
                 by_ratio = carried[:, 6 * i + 3 : 6 * i + 5] @ per_ratio * link.slope_ratio_sd
                 covariance += np.outer(by_ratio, by_ratio)
-        return EndEffector(rest.end, deflected, deflection, covariance, tuple(poses))
+        return EndEffector(rest.end, deflected, deflection, covariance, tuple(poses), rest.angles)
 
     def tips_under(self, force: FloatArray, angles: Sequence[float] | None = None) -> FloatArray:
         """(N, 3): dX, dY, theta of each tip under ``force`` (3,), N in the base, at the end effector; to first order.
@@ -213,7 +212,7 @@ class _Rest:
     def _force_of_measured(self, links: Sequence[ChainLink]) -> FloatArray:
         """(3, 3N): the force at the end effector of all deflections, by least squares in strain energy."""
         root = np.sqrt(1.0 / np.concatenate([np.diag(link.statics.compliance) for link in links]))
-        return np.linalg.pinv(root[:, None] * self.measured_of_force, rcond=_WEAKEST) * root
+        return np.asarray(np.linalg.pinv(root[:, None] * self.measured_of_force, rcond=_WEAKEST) * root, np.float64)
 
 
 def _tip_of_own(ratio_per_metre: float) -> FloatArray:

@@ -30,7 +30,7 @@ import numpy as np
 
 from psd_deflection.chains.chain import Chain, ChainLink
 from psd_deflection.chains.transform import Transform, of_position_and_angles
-from psd_deflection.config import FRAME_PREFIX, Rig, rig_from_values
+from psd_deflection.config import FRAME_PREFIX, Rig, replace_values, rig_from_values
 from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.foreign_yaml import tree_of_file
 from psd_deflection.mechanics.statics import LinkStatics
@@ -77,8 +77,11 @@ class ChainFile:
         return tuple(joint.angle for joint in self.joints)
 
 
-def read_chain(path: str | Path, given: Mapping[str, object] | None = None) -> ChainFile:
-    """The chain in the file ``path``; ``given``: parameters that every rig has. Raises ConfigError."""
+def read_chain(path: str | Path, given: Mapping[str, object] | None = None, slopes: str | None = None) -> ChainFile:
+    """The chain in the file ``path``. Raises ConfigError.
+
+    ``given``: parameters that every rig has. ``slopes``: instead of that of the file.
+    """
     path = Path(path)
     tree = _map_of(tree_of_file(path, 'chain file'), str(path), _TOP)
     links = tree.get('links')
@@ -90,7 +93,7 @@ def read_chain(path: str | Path, given: Mapping[str, object] | None = None) -> C
         raise ConfigError(f'{path}: base_frame = {frame!r}: must be the name of a frame')
     end = _place(tree.get('end_effector', {}), f'{path}: end_effector')
     try:
-        chain = Chain([link for link, _, _ in read], end, tree.get('slopes', 'ratio'))
+        chain = Chain([link for link, _, _ in read], end, slopes or tree.get('slopes', 'ratio'))
     except ConfigError as error:
         raise ConfigError(f'{path}: {error}') from None
     return ChainFile(chain, tuple(rig for _, rig, _ in read), tuple(joint for _, _, joint in read), frame)
@@ -103,7 +106,7 @@ def _link(path: Path, number: int, entry: object, given: Mapping[str, object]) -
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise ConfigError(f'{where}: name = {name!r}: must be a lower-case letter, then letters, digits and _')
     where = f'{path}: {name}'
-    rig = _rig(path, where, values, {FRAME_PREFIX: f'{name}_'}, given)
+    rig = _rig(path, where, values, name, given)
     joint = _map_of(values.get('joint', {}), f'{where}: joint', _OF_JOINT)
     axis = _three(joint.get('axis', (0.0, 0.0, 1.0)), f'{where}: joint.axis')
     length = float(np.linalg.norm(axis))
@@ -123,10 +126,8 @@ def _link(path: Path, number: int, entry: object, given: Mapping[str, object]) -
     return link, rig, Joint(joint_name, _number(joint.get('angle', 0.0), f'{where}: joint.angle'))
 
 
-def _rig(
-    path: Path, where: str, values: Mapping[str, Any], defaults: Mapping[str, object], given: Mapping[str, object]
-) -> Rig:
-    flat: dict[str, object] = dict(defaults)
+def _rig(path: Path, where: str, values: Mapping[str, Any], name: str, given: Mapping[str, object]) -> Rig:
+    flat: dict[str, object] = {FRAME_PREFIX: f'{name}_'}
     rig_file = values.get('rig')
     if rig_file is not None:
         if not isinstance(rig_file, str):
@@ -135,7 +136,9 @@ def _rig(
     flat |= flattened(_map_of(values.get('parameters', {}), f'{where}: parameters'), where)
     if values.get('port') is not None:
         flat['port'] = values['port']
-    return rig_from_values({**flat, **given}, where)
+    rig = rig_from_values({**flat, **given}, where)
+    # Recordings that begin in the same second must not be of one name.
+    return replace_values(rig, {'bag_dir': str(Path(rig.acquisition.bag_dir) / name)}, where)
 
 
 def _place(value: object, where: str) -> Transform:
@@ -146,11 +149,11 @@ def _place(value: object, where: str) -> Transform:
     )
 
 
-def _map_of(value: object, where: str, known: tuple[str, ...] | None = None) -> dict[str, Any]:
+def _map_of(value: object, where: str, known: tuple[str, ...] = ()) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ConfigError(f'{where}: must be a map' + (f' with keys of {", ".join(known)}' if known else ''))
-    for key in value if known is not None else ():
-        if key not in known:
+    for key in value if known else ():
+        if known and key not in known:
             raise ConfigError(f'{where}: unknown key {key!r}{did_you_mean(str(key), known)}')
     return value
 

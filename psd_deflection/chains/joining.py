@@ -58,11 +58,15 @@ class Joiner:
 
     def __init__(self, blocks_ns: Sequence[int]) -> None:
         self._blocks_ns = tuple(blocks_ns)
-        self._known: list[collections.deque[_At]] = [collections.deque(maxlen=KEPT) for _ in blocks_ns]
-        self._waiting: collections.deque[_At] = collections.deque()
         self.joined = 0
         self.missing = [0] * len(self._blocks_ns)
+        self._begin()
+
+    def _begin(self) -> None:
         self.newest_ns: list[int | None] = [None] * len(self._blocks_ns)
+        self._known: list[collections.deque[_At]] = [collections.deque(maxlen=KEPT) for _ in self._blocks_ns]
+        self._waiting: collections.deque[_At] = collections.deque(maxlen=KEPT)
+        self._began_ns: int | None = None
 
     def put(self, link: int, estimate: DeflectionEstimate) -> list[Joined]:
         """Take an estimate of a link (from 0); return what can be joined now, in order."""
@@ -70,28 +74,30 @@ class Joiner:
         known = self._known[link]
         if known and at.t_ns <= known[-1].t_ns:
             # Its clock was laid anew: what came before belongs to another time.
-            known.clear()
-            if link == 0:
-                self._waiting.clear()
-        elif link == 0 and known and None not in self.newest_ns:
+            self._begin()
+            known = self._known[link]
+        if link == 0 and known and self._began_ns is not None:
             lost = round((at.t_ns - known[-1].t_ns) / self._blocks_ns[0]) - 1
             self.missing[0] += max(lost, 0)
         known.append(at)
         self.newest_ns[link] = at.t_ns
         if link == 0:
             self._waiting.append(at)
-        if None in self.newest_ns:
+        if self._began_ns is None:
+            if None in self.newest_ns:
+                return []
             # Nobody misses a link that has not begun.
-            while len(self._waiting) > PATIENCE:
-                self._waiting.popleft()
-            return []
-        return self._ready()
+            self._began_ns = max(known[0].t_ns for known in self._known)
+        return self._ready(self._began_ns)
 
-    def _ready(self) -> list[Joined]:
-        out = []
+    def _ready(self, began_ns: int) -> list[Joined]:
+        out: list[Joined] = []
         while self._waiting:
             at = self._waiting[0]
-            late = self._waiting[-1].t_ns - at.t_ns > PATIENCE * self._blocks_ns[0] or len(self._waiting) > KEPT
+            if at.t_ns < began_ns:
+                self._waiting.popleft()
+                continue
+            late = self._waiting[-1].t_ns - at.t_ns > PATIENCE * self._blocks_ns[0]
             tips = [TipDeflection(at.pose, at.covariance)]
             missing = []
             for link in range(1, len(self._known)):
