@@ -80,10 +80,12 @@ run: $(VENV)/.installed
 BENCH_LIVE ?=
 BENCH_SOLVERS ?=
 BENCH_ACCURACY ?=
+BENCH_CHAIN ?=
 bench: $(VENV)/.installed
 	$(BIN)/python bench/live.py $(BENCH_LIVE)
 	$(BIN)/python bench/solvers.py $(BENCH_SOLVERS)
 	$(BIN)/python bench/accuracy.py $(BENCH_ACCURACY)
+	$(BIN)/python bench/chain.py $(BENCH_CHAIN)
 
 FAULT_TIMES ?= 20
 FAULTS ?=

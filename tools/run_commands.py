@@ -71,7 +71,7 @@ CI_RUNS = (
 
 SHORTEST = {
     'bench': 'BENCH_LIVE="--rounds 1 --seconds 2 --settle 1 --minutes 0.1" BENCH_SOLVERS="--blocks 1000" '
-    'BENCH_ACCURACY="--blocks 100"',
+    'BENCH_ACCURACY="--blocks 100" BENCH_CHAIN="--rigs 2 --seconds 1 --settle 0.5"',
     'faults': 'FAULT_TIMES=1 FAULTS="--only zero"',
     'crash': 'CRASH_TIMES=1',
     'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=1000 FUZZ_HELLOS=1000',
@@ -94,6 +94,8 @@ SHORTER = {
     r'^python -m blind\.modes$': '--rigs 3',
     r'^python -m blind\.motion\b': '--runs 1 --seconds 4',
     r'^python -m bench\.campaign\.hellos$': '1000',
+    r'^psd-deflection chain [^-]+--no-ros$': '--count 5',
+    r'^psd-deflection chain .*--record\b': '--count 50',
     r'^ros2 topic echo\b': '--once',
 }
 """Additional arguments with which a command takes only seconds."""

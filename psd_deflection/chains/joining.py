@@ -22,11 +22,11 @@ import numpy as np
 from psd_deflection.chains.chain import TipDeflection
 from psd_deflection.records import DeflectionEstimate, FloatArray
 
-KEPT = 16
+KEPT = 64
 """Estimates of each link that are kept, and times that may wait for them."""
 
-PATIENCE = 5
-"""Blocks of the first link for which a time waits for the other links."""
+PATIENCE = 25
+"""Blocks of the first link for which a time waits for the other links: half a second on the rig of the thesis."""
 
 NEXT = 1.5
 """Blocks at most this many block lengths apart are neighbours."""

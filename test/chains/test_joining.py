@@ -75,11 +75,11 @@ def test_a_lost_block_of_another_link_is_missing_at_the_times_beside_it() -> Non
 
 def test_a_link_that_ends_is_given_up_after_some_blocks_and_comes_back() -> None:
     joiner = Joiner([BLOCK_NS] * 2)
-    got = run(joiner, {0: every(0, 20), 1: every(7_000_000, 5)})
-    assert [j.t_ns // BLOCK_NS for j in got if j.missing] == list(range(5, 19 - PATIENCE))
-    got = run(joiner, {0: every(20 * BLOCK_NS, 10), 1: every(20 * BLOCK_NS + 7_000_000, 10)})
-    assert [j.t_ns // BLOCK_NS for j in got if j.tips] == list(range(21, 30))
-    assert joiner.missing[1] == 16
+    got = run(joiner, {0: every(0, 40), 1: every(7_000_000, 5)})
+    assert [j.t_ns // BLOCK_NS for j in got if j.missing] == list(range(5, 39 - PATIENCE))
+    got = run(joiner, {0: every(40 * BLOCK_NS, 10), 1: every(40 * BLOCK_NS + 7_000_000, 10)})
+    assert [j.t_ns // BLOCK_NS for j in got if j.tips] == list(range(41, 50))
+    assert joiner.missing[1] == 36
 
 
 def test_lost_blocks_of_the_first_link_are_counted_when_it_comes_back() -> None:
