@@ -17,6 +17,7 @@ PACKAGE = 'psd_deflection'
 EXECUTABLES = (
     'estimator',
     'chain',
+    'compensator',
     'replay',
     'simulate',
     'discover',

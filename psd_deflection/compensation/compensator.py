@@ -42,9 +42,9 @@ class CompensatorSettings:
     """``axes``: of the end effector that are corrected. Offsets and rates of each joint: rad or m, and 1/s.
 
     ``time_constant`` s; ``damping`` of the least squares, m; an error of 1 rad counts as one of 1 m. The offsets hold
-    if the newest deflection is older than ``stale`` (s), if a standard deviation on the axes is above ``max_sd`` (m, rad),
-    or if the deflection changes by more than ``jump`` (m, rad) from one estimate to the next. They follow again after
-    ``good`` estimates in a row.
+    if the newest deflection is older than ``stale`` (s), if a standard deviation on the axes is above ``max_sd`` (m,
+    rad), or if the deflection changes by more than ``jump`` (m, rad) from one estimate to the next. They follow again
+    after ``good`` estimates in a row.
 
     Raises ConfigError for values that cannot be.
     """

@@ -19,7 +19,8 @@ WRIST = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/><link
 <axis xyz="0 3 4"/><limit lower="-0.1" upper="0.2"/></joint>
 <joint name="turn" type="revolute"><parent link="b"/><child link="c"/><axis xyz="1 1 0"/>
 <limit lower="-1" upper="1"/></joint>
-<joint name="end" type="fixed"><parent link="c"/><child link="d"/><origin xyz="0 0.3 0" rpy="0.5 0 0"/></joint></robot>"""
+<joint name="end" type="fixed"><parent link="c"/><child link="d"/>
+<origin xyz="0 0.3 0" rpy="0.5 0 0"/></joint></robot>"""
 
 
 def test_it_is_the_rigid_chain() -> None:

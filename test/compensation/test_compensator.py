@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.simulated_arm import SimulatedArm
 from psd_deflection.chains.chain_file import read_chain
 from psd_deflection.chains.transform import IDENTITY, Transform, shift
 from psd_deflection.compensation.arm import Arm, read_arm
 from psd_deflection.compensation.compensator import Command, Compensator, CompensatorSettings, Observed, State
-from psd_deflection.compensation.simulated_arm import SimulatedArm
 from psd_deflection.errors import ConfigError
 from psd_deflection.records import FloatArray
 
@@ -200,13 +200,14 @@ def test_it_goes_back_to_zero_without_deflections_too(arm: Arm) -> None:
 
 def test_a_vibration_is_hardly_followed(arm: Arm) -> None:
     loop = Loop(arm)
-    loop.plant = SimulatedArm(read_chain(EXAMPLE).chain, ELBOW, damping=0.01)
+    loop.plant = SimulatedArm(read_chain(EXAMPLE).chain, ELBOW, damping=0.003)
     loop.compensator.enable(True)
-    loop.plant.force = PAYLOAD
+    # More would be a jump, at which the offsets hold.
+    loop.plant.force = 0.25 * PAYLOAD
     # It swings at 12 Hz about the load's deflection, by as much as that.
-    offsets = np.array([loop.run(PERIOD).offsets for _ in range(60)])[-15:]
+    offsets = np.array([loop.run(PERIOD).offsets for _ in range(90)])[-20:]
     swing = np.ptp(offsets, axis=0) / 2.0
-    assert np.all(swing < 0.15 * np.abs(offsets.mean(axis=0)))
+    assert np.all(swing < 0.1 * np.abs(offsets.mean(axis=0)))
 
 
 @pytest.mark.parametrize(
