@@ -23,6 +23,7 @@
 # make blind-laws  laws that no catalogue has, drawn by chance: does discover find where they act and on what they depend (a quarter of an hour on an idle core; LAWS='--first 500' for fresh ones)
 # make camera-campaign  render 10,000 frames, most of them bad, and see whether the camera is right about each (two hours)
 # make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
+# make demo-compensate  an arm of two flexible links with and without compensation: seconds, leaves a page
 # make demo-thesis  the experiment of the thesis redone: camera, calibrate, validate on one page (some minutes; THESIS=--short: seconds)
 # make clean    remove what the above made
 PYTHON ?= python3
@@ -37,7 +38,7 @@ PYTEST ?=
 WORKERS ?= 2
 BIN := $(VENV)/bin
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws camera-campaign demo-discover demo-thesis colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws camera-campaign demo-compensate demo-discover demo-thesis colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -181,6 +182,9 @@ blind-laws: $(VENV)/.installed
 CAMERA_FRAMES ?= 10000
 camera-campaign: $(VENV)/.installed
 	$(BIN)/python -m bench.campaign.camera --frames $(CAMERA_FRAMES)
+
+demo-compensate: $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m bench.compensate
 
 demo-discover: $(VENV)/.installed
 	rm -rf build/demo && mkdir -p build/demo

@@ -95,7 +95,6 @@ SHORTER = {
     r'^python -m blind\.motion\b': '--runs 1 --seconds 4',
     r'^python -m bench\.campaign\.hellos$': '1000',
     r'^psd-deflection chain [^-]+--no-ros$': '--count 5',
-    r'^psd-deflection chain .*--record\b': '--count 50',
     r'^ros2 topic echo\b': '--once',
 }
 """Additional arguments with which a command takes only seconds."""

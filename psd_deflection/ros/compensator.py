@@ -147,7 +147,7 @@ class CompensatorNode:
 def run_compensator(
     ros_args: Sequence[str], arm: Arm, settings: CompensatorSettings, say: Callable[[str], None], drive: bool
 ) -> int:
-    """Run the node until SIGINT or SIGTERM; then the offsets go back to zero. A second signal does not wait for them."""
+    """Run the node until SIGINT or SIGTERM; then let the offsets go back to zero, unless a second signal comes."""
     signals = Signals()
     try:
         try:

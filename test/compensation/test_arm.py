@@ -11,7 +11,7 @@ from psd_deflection.chains.chain_file import read_chain
 from psd_deflection.compensation.arm import read_arm
 from psd_deflection.errors import ConfigError
 
-URDF = Path(__file__).with_name('two_joints.urdf')
+URDF = Path(__file__).parents[2] / 'config' / 'two_links.urdf'
 EXAMPLE = Path(__file__).parents[2] / 'config' / 'two_links.yaml'
 
 WRIST = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/><link name="d"/>

@@ -26,7 +26,7 @@ CERTAIN = np.eye(6) * 1e-12
 
 @pytest.fixture(scope='module')
 def arm() -> Arm:
-    return read_arm(HERE / 'two_joints.urdf', 'tool')
+    return read_arm(EXAMPLE.with_suffix('.urdf'), 'tool')
 
 
 class Loop:

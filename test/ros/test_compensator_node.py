@@ -6,7 +6,6 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,7 @@ from psd_deflection.records import FloatArray  # noqa: E402
 from test.ros.conftest import WARNINGS  # noqa: E402
 from tools.program import PSD_DEFLECTION, ROOT, Program  # noqa: E402
 
-URDF = Path(__file__).parents[1] / 'compensation' / 'two_joints.urdf'
+URDF = ROOT / 'config' / 'two_links.urdf'
 NOMINAL = np.array([1.2, 0.6])
 PERIOD_S = 0.02
 
@@ -112,11 +111,11 @@ def test_the_loop_is_closed_held_and_handed_over(compensator: Program, peer: Any
 
         peer.until(holds, why)
         # One step may have been on its way.
-        peer.until(lambda held=held: len(plant.offsets) > held + 20, 'offsets that are held')  # type: ignore[misc]
+        peer.until(lambda held=held: len(plant.offsets) > held + 20, 'offsets that are held')
         assert np.ptp(plant.offsets[held + 10 :], axis=0).max() == 0.0
         said = len(compensator.text)
         plant.tell = lambda message: True
-        peer.until(lambda said=said: 'following' in compensator.text[said:], 'following')  # type: ignore[misc]
+        peer.until(lambda said=said: 'following' in compensator.text[said:], 'following')
     reports = peer.collect(DiagnosticArray, '/diagnostics')
     peer.until(lambda: bool(reports), 'diagnostics')
     assert [s.name for s in reports[0].status] == ['compensator: offsets']
