@@ -94,7 +94,6 @@ SHORTER = {
     r'^python -m blind\.modes$': '--rigs 3',
     r'^python -m blind\.motion\b': '--runs 1 --seconds 4',
     r'^python -m bench\.campaign\.hellos$': '1000',
-    r'^psd-deflection chain [^-]+--no-ros$': '--count 5',
     r'^ros2 topic echo\b': '--once',
 }
 """Additional arguments with which a command takes only seconds."""
@@ -131,9 +130,12 @@ QUICK = re.compile(
     r'|^psd-deflection simulate .*--(out|help)\b'
 )
 LIVE = re.compile(
-    r'^psd-deflection (estimator|monitor)\b|--serve\b|^make run\b'
-    r'|^ros2 (run|launch) psd_deflection estimator\b(?!.*--show-args)'
+    r'^psd-deflection (estimator|monitor|chain)\b|--serve\b|^make run\b'
+    r'|^ros2 (run|launch) psd_deflection (estimator|chain)\b(?!.*--show-args)'
 )
+BESIDE = re.compile(r'^ros2 run psd_deflection compensator\b')
+"""Nodes that run beside the lines below them."""
+
 ASKS = re.compile(r'^psd-deflection (echo|zero|record|load)\b')
 """Commands that speak to a running daemon."""
 
@@ -276,6 +278,9 @@ class Reader:
             self._press(line)
         elif LIVE.search(line):
             self._live(line)
+        elif BESIDE.search(line):
+            self._background.append(self._start(line))
+            self._background[-1].until('publishing ')
         elif ASKS.search(line):
             self._serve()
             self._to_the_end(line)
@@ -316,7 +321,7 @@ class Reader:
                     if b'psd_deflection monitor' not in answer.read():
                         raise RuntimeError('the address that it prints has another page')
             if not re.search(r' monitor bags/', line):
-                program.until(r'θ +[-+]\d+\.\d\d ± \d')
+                program.until(r'(θ +[-+]\d+\.\d\d|rx [-+]\d+\.\d) ± \d')
             status = program.end()
         except RuntimeError as error:
             program.end()

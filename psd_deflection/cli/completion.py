@@ -19,6 +19,9 @@ from psd_deflection.errors import ConfigError
 SHELLS = ('bash', 'zsh', 'tcsh')
 
 FILES = (
+    'ARM.urdf',
+    'CHAIN.yaml',
+    'X.csv',
     'REC',
     'IN',
     'FILE',
