@@ -32,6 +32,8 @@ VENV ?= .venv
 WITH ?=
 PORT ?=
 ARGS ?=
+# pip writes no byte code: half the time of a set-up goes into modules that nobody imports.
+export PIP_COMPILE := 0
 # Further words for pytest, e.g. PYTEST='-m "not browser"'.
 PYTEST ?=
 # Tests that run at a time; many of them wait.

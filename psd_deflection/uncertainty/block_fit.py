@@ -34,7 +34,7 @@ ORDER = 4
 _FORGET = 1.0 / 24.0
 """Share of the newest block in the running mean of c_k^2."""
 
-_BIAS = 0.1
+_BIAS = 0.4
 """Times v_k, taken off tau_k^2: a mean that cannot be negative is too large by about that where there is no motion."""
 
 _SUDDEN = 12.0

@@ -3,7 +3,8 @@
 What an estimate's covariance needs is the variance of a weighted mean over one block, so colour
 counts as much as size: gamma_cd(l), the covariance of reading c with reading d l samples later, for
 l from 0 to N - 1. It is measured in segments of 50 blocks; each segment's mean and slope are taken
-off, which costs 2 of 50 degrees of freedom and is put back.
+off, and with them two degrees of freedom of what is slow in it, which are put back (what is slow: the variance of
+means over 5 blocks, in which little is left of hum).
 
 Motion is no noise. The readings are more than the unknowns, and one combination of them (of two PSDs: how much longer
 the base line between the dots is than that between the beams) holds still whatever the plate does. A
@@ -30,6 +31,9 @@ from psd_deflection.uncertainty.combinations import Left, combinations_of
 
 SEGMENT_BLOCKS = 50
 """Blocks of one segment: a second at 50 blocks a second."""
+
+_FAR = 5
+"""Blocks over whose means what is slow is measured."""
 
 STATED_SEGMENTS = 2
 """Segments after which measured noise is used: two seconds at 50 blocks a second."""
@@ -192,9 +196,6 @@ class StreamNoise:
         dots = np.concatenate([d for _, _, d in blocks])
         series = np.column_stack((dots, self._combinations.fixed(dots)))
         lags = _autocovariance(places, series, SEGMENT_BLOCKS * size, size)
-        # Mean and slope of the segment were taken off, and with them 2 of its 50 blocks' variance.
-        taken = np.einsum('cdl,l->cd', lags, self._mean_of)
-        lags += (taken + taken.T)[:, :, None] / (SEGMENT_BLOCKS - 2)
         self._seen += 1
         rough = _roughness(places, np.column_stack((np.einsum('sc,ac->sa', dots, self._moving), series)), self._q)
         count = self._readings
@@ -285,18 +286,23 @@ def _autocovariance(places: IntArray, series: FloatArray, length: int, lags: int
     centred = series - series.sum(axis=0) / len(series)
     centred -= at[:, None] * (np.einsum('t,tc->c', at, centred) / float((at * at).sum()))
     count = series.shape[1]
-    padded = np.zeros((count + 1, 1 << (length + lags - 1).bit_length()))
+    far = _FAR * lags
+    padded = np.zeros((count + 1, 1 << (length + far - 1).bit_length()))
     padded[:count, places] = centred.T
     padded[count, places] = 1.0
     spectra = np.fft.rfft(padded)
-    pairs = np.fft.irfft(np.conj(spectra[:count, None]) * spectra[None, :count])[:, :, :lags]
-    present = np.fft.irfft(np.abs(spectra[count]) ** 2)[:lags]
+    pairs = np.fft.irfft(np.conj(spectra[:count, None]) * spectra[None, :count])[:, :, :far]
+    present = np.fft.irfft(np.abs(spectra[count]) ** 2)[:far]
     # Where two samples are never that far apart, nothing is known: taken as independent.
     each = np.where(present > 0.5, pairs / np.maximum(present, 1.0), 0.0)
+    # Mean and slope were taken off: 2 of length / far degrees of freedom of what is slower than that.
+    slow = np.einsum('cdl,l->cd', each, _mean_weights(far))
+    taken = (slow + slow.T)[:, :, None] / (length / far - 2)
+    each, pairs, present = each[:, :, :lags] + taken, pairs[:, :, :lags], present[:lags]
     # Products with 0 for what is absent are those of a covariance whatever the samples are, and stay so over one
     # divisor: that of the lag at which gaps cost most, so that none is too small.
     whole = present / (1.0 - np.arange(lags) / length)
-    sure = pairs / max(float(whole.min()), _PAIRS * float(whole[0]))
+    sure = pairs / max(float(whole.min()), _PAIRS * float(whole[0])) + taken
     out = np.zeros_like(pairs)
     for part in (slice(0, count - 1), slice(count - 1, count)):
         out[part, part] = _covariance(each[part, part], sure[part, part])

@@ -11,6 +11,8 @@ from psd_deflection.geometry import Geometry
 from psd_deflection.solvers import make_solver
 
 DRAWS = 20_000
+FEWER = 4_000
+"""Of the methods that solve block by block."""
 VARIANCES = np.array([4e-12, 1e-12, 9e-12, 2e-12, 3e-12, 6e-12])
 POSE = (1.5e-3, -2.5e-3, np.radians(-1.2))
 
@@ -60,11 +62,12 @@ def test_covariance_and_coverage(
     center = solver.solve_many(clean[None], variances).pose[0]
     if method not in BIASED:
         np.testing.assert_allclose(center, POSE, rtol=0.0, atol=1e-9)
+    draws = FEWER if method in {'pose', 'base_pair', 'beam'} or where == 'staggered' else DRAWS
     rng = np.random.default_rng(11)
-    found = solver.solve_many(clean + np.sqrt(variances) * rng.standard_normal((DRAWS, len(clean))), variances)
+    found = solver.solve_many(clean + np.sqrt(variances) * rng.standard_normal((draws, len(clean))), variances)
     assert not found.status.any()
     off = found.pose - center
-    seen = off.T @ off / DRAWS
+    seen = off.T @ off / draws
     claimed = found.covariance.mean(axis=0)
     scale = np.sqrt(np.diag(claimed))
     np.testing.assert_allclose(np.diag(seen) / np.diag(claimed), 1.0, atol=0.05)

@@ -29,6 +29,16 @@ def test_the_variance_of_a_mean_is_that_of_the_toeplitz_matrix(size: int) -> Non
     assert lags @ noise._mean_weights(size) == pytest.approx(whole.mean(), rel=1e-12)
 
 
+def put_back(lags: FloatArray) -> FloatArray:
+    """(c, c), or a number: what mean and slope took off, from the covariances (100, c, c) at the first 100 lags.
+
+    They take 2 of the 10 degrees of freedom of the means over 100 samples, a tenth of a segment.
+    """
+    apart = np.subtract.outer(np.arange(100), np.arange(100))
+    later = np.where((apart >= 0)[..., None, None], lags[np.abs(apart)], lags[np.abs(apart)].swapaxes(2, 3))
+    return np.asarray(2.0 * later.mean(axis=(0, 1)) / (10 - 2))
+
+
 def test_an_autocovariance_is_the_mean_product_of_what_is_left_of_a_line() -> None:
     n = SEGMENT_BLOCKS * SIZE
     rng = np.random.default_rng(1)
@@ -37,8 +47,9 @@ def test_an_autocovariance_is_the_mean_product_of_what_is_left_of_a_line() -> No
     series[:, 1] += 0.3 * series[:, 0]
     left = series - np.column_stack([np.polyval(np.polyfit(np.arange(n), s, 1), np.arange(n)) for s in series.T])
     got = noise._autocovariance(np.arange(n), series, n, SIZE)
+    every = np.array([left[: n - lag].T @ left[lag:] / (n - lag) for lag in range(100)])
     for lag in (0, 1, 7, 19):
-        want = left[: n - lag].T @ left[lag:] / (n - lag)
+        want = every[lag] + put_back(every)
         np.testing.assert_allclose(got[:2, :2, lag], want[:2, :2], atol=2e-3 * want[1, 1] if lag == 0 else 1e-9)
         assert got[2, 2, lag] == pytest.approx(want[2, 2], rel=2e-3, abs=1e-9)
     # The last has no covariance with the others.
@@ -56,8 +67,25 @@ def test_an_autocovariance_leaves_gaps_out() -> None:
     line = np.polyval(np.polyfit(keep, series[:, 0], 1), keep)
     here = np.full(n, np.nan)
     here[keep] = series[:, 0] - line
+    every = np.array([np.nanmean(here[: n - lag] * here[lag:]) for lag in range(100)])
     for lag in (1, 2, 13):
-        assert got[0, 0, lag] == pytest.approx(np.nanmean(here[: n - lag] * here[lag:]), abs=1e-9)
+        assert got[0, 0, lag] == pytest.approx(every[lag] + put_back(every[:, None, None]).item(), abs=1e-9)
+
+
+@pytest.mark.parametrize('hum', [0.0, 3.0])
+def test_hum_is_not_taken_for_what_a_line_takes_off(hum: float) -> None:
+    n = SEGMENT_BLOCKS * SIZE
+    rng = np.random.default_rng(4)
+    t = np.arange(100 * n).reshape(100, n)
+    lines = hum * np.sin(2.0 * np.pi * 0.06 * t)
+    found = np.mean(
+        [noise._autocovariance(t[0], np.column_stack((r, r)), n, SIZE)[0, 0] for r in rng.normal(size=t.shape) + lines],
+        axis=0,
+    )
+    lags = np.arange(SIZE)
+    want = 0.5 * hum**2 * np.cos(2.0 * np.pi * 0.06 * lags) + (lags == 0)
+    # Of the variance of a block's mean, 0.05, four per cent.
+    assert (found - want) @ noise._mean_weights(SIZE) == pytest.approx(0.0, abs=2e-3)
 
 
 def test_roughness_is_the_median_over_blocks_of_what_a_polynomial_leaves() -> None:
