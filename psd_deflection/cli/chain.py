@@ -7,7 +7,7 @@ the end effector has none.
 
   psd-deflection chain config/two_links.yaml --no-ros
   psd-deflection chain config/two_links.yaml --no-ros --json --count 3
-  psd-deflection chain config/two_links.yaml --no-ros --out end_effector.csv --record recordings
+  psd-deflection chain config/two_links.yaml --no-ros --out end.csv --record
   ros2 run psd_deflection chain my_arm.yaml
 """
 

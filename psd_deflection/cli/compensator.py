@@ -5,8 +5,9 @@ it runs dry: it publishes what it would do on /compensator/proposed. With --driv
 which your controller adds to its commands. They are zero until they are enabled. They hold their last value within
 a tenth of a second if the deflection is stale, jumps or cannot be trusted.
 
-  ros2 run psd_deflection compensator arm.urdf --tip tool0 --axes x,y,z
-  ros2 run psd_deflection compensator arm.urdf --tip tool0 --drive --max-offset 0.01
+  psd-deflection compensator config/two_links.urdf --tip tool --axes x,z
+  psd-deflection compensator arm.urdf --tip tool0 --drive --max-offset 0.01
+  ros2 run psd_deflection compensator arm.urdf --tip tool0 --drive
   ros2 service call /compensator/enable std_srvs/srv/SetBool "{data: true}"
 
 docs/compensation.md describes it.

@@ -31,6 +31,7 @@ from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.names import JOINT_STATES
 from psd_deflection.ros.wires import message_class, qos, relative
+from psd_deflection.runner.diagnostics import ERROR, OK, WARN
 from psd_deflection.runner.repeats import Repeats
 from psd_deflection.runner.signals import Signals
 
@@ -45,8 +46,7 @@ SPIN_S = 0.1
 RELEASE_S = 10.0
 """Longest time that the end waits for the offsets to go back to zero, s."""
 
-_OK, _WARN, _ERROR = range(3)
-_LEVELS = {State.OFF: _OK, State.FOLLOWING: _OK, State.RELEASING: _WARN, State.HOLDING: _ERROR}
+_LEVELS = {State.OFF: OK, State.FOLLOWING: OK, State.RELEASING: WARN, State.HOLDING: ERROR}
 
 
 class CompensatorNode:
@@ -131,7 +131,7 @@ class CompensatorNode:
         command = self.command
         level, text = _LEVELS[command.state], str(command.state) + (f': {command.why}' if command.why else '')
         if command.limited:
-            level, text = _WARN, f'{text}: a limit keeps the offsets from what the deflection asks for'
+            level, text = WARN, f'{text}: a limit keeps the offsets from what the deflection asks for'
         values = [(f'offset {name}', f'{v:.6f}') for name, v in zip(self._names, command.offsets, strict=True)]
         values.append(('residual (m)', f'{command.residual:.6f}'))
         node = self.node.get_fully_qualified_name().removeprefix('/')
