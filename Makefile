@@ -23,6 +23,7 @@
 # make blind-laws  laws that no catalogue has, drawn by chance: does discover find where they act and on what they depend (a quarter of an hour on an idle core; LAWS='--first 500' for fresh ones)
 # make camera-campaign  render 10,000 frames, most of them bad, and see whether the camera is right about each (two hours)
 # make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
+# make compensate-faults  how soon the compensator holds after a fault, each HOLD_TIMES=20 times (some minutes)
 # make demo-compensate  an arm of two flexible links with and without compensation: seconds, leaves a page
 # make demo-thesis  the experiment of the thesis redone: camera, calibrate, validate on one page (some minutes; THESIS=--short: seconds)
 # make clean    remove what the above made
@@ -40,7 +41,7 @@ PYTEST ?=
 WORKERS ?= 2
 BIN := $(VENV)/bin
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws camera-campaign demo-compensate demo-discover demo-thesis colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -112,6 +113,10 @@ SOAK_MINUTES ?= 30
 SOAK_HOURS ?= 24
 soak: $(VENV)/.installed
 	$(BIN)/python -m bench.campaign.soak --minutes $(SOAK_MINUTES) --hours $(SOAK_HOURS)
+
+HOLD_TIMES ?= 20
+compensate-faults: $(VENV)/.installed
+	$(BIN)/python -m bench.campaign.hold --times $(HOLD_TIMES)
 
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 
