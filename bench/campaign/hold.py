@@ -38,7 +38,8 @@ NOISE = 1e-6
 HOLD_S = 0.1
 """The offsets must not change later than this after a fault."""
 
-WATCHED_S = 0.5
+WATCHED_S = 0.4
+"""How long offsets are watched after a fault, s. After half a second they follow a deflection that jumped and stays."""
 LONGEST_S = 60.0
 RELAYED = '/arm/deflection'
 

@@ -46,6 +46,9 @@ SPIN_S = 0.1
 RELEASE_S = 10.0
 """Longest time that the end waits for the offsets to go back to zero, s."""
 
+LEAVE_S = 0.3
+"""Time for the last offsets to leave, s."""
+
 _LEVELS = {State.OFF: OK, State.FOLLOWING: OK, State.RELEASING: WARN, State.HOLDING: ERROR}
 
 
@@ -163,6 +166,10 @@ def run_compensator(
             signals.stop = False
             until = time.monotonic() + RELEASE_S
             while drive and not (owner.release() or signals.stop) and time.monotonic() < until:
+                executor.spin_once(timeout_sec=SPIN_S)
+            # DDS does not say when the last offsets have left. If the publisher goes first, they are lost.
+            until = time.monotonic() + LEAVE_S
+            while drive and not signals.stop and time.monotonic() < until:
                 executor.spin_once(timeout_sec=SPIN_S)
         finally:
             executor.remove_node(owner.node)
