@@ -22,6 +22,7 @@ FILES = (
     'ARM.urdf',
     'CHAIN.yaml',
     'X.csv',
+    'X.parquet',
     'REC',
     'IN',
     'FILE',

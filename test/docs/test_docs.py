@@ -358,7 +358,7 @@ def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[s
     # repeated have an action of their own and are not completed.
     assert {str(values[name]) for name in set(values) - as_path} == {
         '/NAME', 'ADDRESS', 'LINK', 'M', 'N', 'NAME', 'PPM', 'S', 'SEED', 'SOURCE',
-        'T0[,T1...]', 'TZ', 'URL', 'VALUE', 'X', 'X,Y', 'XY,THETA',
+        'T0[,T1...]', 'TZ', 'URL', 'VALUE', 'WHERE', 'X', 'X,Y', 'XY,THETA',
         "('FX', 'FY', 'TZ')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
     }  # fmt: skip
 
