@@ -4,14 +4,23 @@ import os
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import Phase, settings
 
 from test.judges import Golden, RayPlane
 
 os.environ['PSD_DEFLECTION_EFFECTS'] = ''
 
 settings.register_profile('untimed', deadline=None)
-settings.load_profile('untimed')
+# For `make mutants`: it asks only whether a test fails, each time of the same few examples.
+settings.register_profile(
+    'mutants',
+    deadline=None,
+    derandomize=True,
+    database=None,
+    phases=(Phase.explicit, Phase.generate),
+    max_examples=30,
+)
+settings.load_profile('mutants' if 'PSD_DEFLECTION_MUTANTS' in os.environ else 'untimed')
 
 
 @pytest.fixture(scope='session')

@@ -17,9 +17,11 @@ from psd_deflection.mechanics import LinkStatics
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import (
+    ENVIRONMENT,
     BlockStatus,
     Counts,
     DeflectionEstimate,
+    ParameterChange,
     RawChunk,
     Record,
     SampleBlock,
@@ -321,3 +323,34 @@ def test_what_the_readings_contradict_is_half_a_length_over_the_root_of_two(rig:
         r for r in run(Pipeline(rig).process, exact_chunk(dots)) if isinstance(r, DeflectionEstimate) and r.primary
     )
     assert best.residual_rms == pytest.approx(20e-6 / 8.0**0.5, rel=1e-3)
+
+
+def test_before_the_first_block_a_change_is_of_block_0_at_time_0(rig: Rig) -> None:
+    assert Pipeline(rig).change({'psd_1.zero': (1e-5, 0.0)}) == ParameterChange(0, 0, (('psd_1.zero', (1e-5, 0.0)),))
+    drifts = load_rig(overrides={'effects.a.name': 'thermal_drift', 'effects.a.psd': 1, 'effects.a.x': 1e-6})
+    started, first, now = ENVIRONMENT
+    assert Pipeline(drifts).temperature(21.5) == ParameterChange(0, 0, ((first, 21.5), (now, 21.5)))
+    pipeline = Pipeline(drifts)
+    pipeline.temperature(21.5)
+    memory = pipeline.memory(drifts)
+    assert memory is not None
+    assert (memory.t_ns, memory.block) == (0, 0)
+    # After a block it is of the next one.
+    records = run(pipeline.process, chunk_of(still(REST, 40, 0)))
+    change = pipeline.temperature(22.5)
+    assert change is not None
+    assert (change.t_ns, change.block) == (spots_of(records[-2:]).t_ns, 2)
+    assert dict(change.values) | {started: 0.0} == {started: 0.0, first: 21.5, now: 22.5}
+
+
+def test_counters_count(rig: Rig) -> None:
+    pipeline = Pipeline(rig)
+    counts = still(REST, 110, 0)
+    counts[20:60, :3] = 0
+    counts[80:100, 3] = 32767
+    run(pipeline.process, chunk_of(counts))
+    run(pipeline.flush)
+    # Blocks 0 and 3 are good, of block 5 half is there; lasers are lost in 1 and 2, block 4 is saturated.
+    counters = pipeline.counters
+    assert (counters.samples, counters.blocks, counters.estimates, counters.degraded) == (110, 6, 3, 0)
+    assert counters.refused == {'laser_lost': 2, 'saturated': 1}

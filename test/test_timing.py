@@ -204,3 +204,32 @@ def test_the_map_draws_near_within_a_second_at_first() -> None:
         clock.to_host_ns(np.array([10_000 * k], np.int64))
     # 300 us too late at first, 1 s later not: but for what the clock may have drifted meanwhile.
     assert clock.host_ns(990_000) - 990 * MS == pytest.approx(200_000, abs=20_000)
+
+
+@pytest.mark.parametrize(('drift_ns', 'fitted'), [(1_999_999, False), (2_000_000, True)])
+def test_two_milliseconds_are_what_shows_a_rate(drift_ns: int, fitted: bool) -> None:
+    """Three minima, a second apart: the clock has run off by this much from the first to the last."""
+    clock = ClockMap()
+    for second in range(4):
+        # The one between is no less late than the line.
+        clock.observe(1_000_000 * second, 1000 * MS * second + (drift_ns * second + 1) // 2)
+    assert clock.state().points == 3
+    assert (clock.state().skew_ppm != 0.0) == fitted
+
+
+@pytest.mark.parametrize(('early_ns', 'jumped'), [(50_000_000, False), (50_000_001, True)])
+def test_a_sample_fifty_milliseconds_early_is_a_jump(early_ns: int, jumped: bool) -> None:
+    clock = ClockMap()
+    clock.observe(0, 1000 * MS)
+    assert clock.observe(20_000, 1020 * MS - early_ns) == jumped
+
+
+def test_a_second_has_one_minimum_after_a_jump_too() -> None:
+    clock = ClockMap()
+    clock.observe(0, 0)
+    clock.lay_anew(5_000_000, 7000 * MS)
+    points = []
+    for k in range(1, 35):
+        clock.observe(5_000_000 + 100_000 * k, 7000 * MS + 100 * MS * k)
+        points.append(clock.state().points)
+    assert points == [k // 10 for k in range(1, 35)]

@@ -1,19 +1,27 @@
 """Run pytest in one child after another of a process that has imported all libraries already.
 
-Arguments: the tests, a file or folder each, perhaps with "-k WORDS". Each line of the input is a number of
-seconds and the name of a module, whose own tests come first; each line of the output is 1 if all tests passed
-in that time, 0 if not. Every child imports the program again.
+Arguments: the tests, a file or folder each, perhaps with "-k WORDS". At first all of them are run, to see which
+functions of the checkout each test enters and how long it takes; the first line of the output is 1 if all passed, 0 if
+not. Then each line of the input is a file of the checkout and the first line of a function in it, 0 for what is in no
+function. The tests that enter it are run, the quickest first, and a line of the output is 1 if all passed, 0 if not.
+Every child imports the program again.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import json
 import os
 import signal
 import sys
+import tempfile
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import CodeType, FrameType
+from typing import NamedTuple
 
 import pytest
 
@@ -24,16 +32,74 @@ OPTIONS = (
 
 OURS = ('psd_deflection', 'msg_adapters', 'test', 'blind', 'bench', 'tools')
 
+LONGEST = 600.0
+"""s that one of the arguments may take at first."""
 
-def passed(tests: Sequence[str], seconds: float) -> bool:
-    """Whether ``tests`` pass in a child of this process; ends the child and all that it started."""
+Entered = dict[int, CodeType]
+
+
+class Test(NamedTuple):
+    """How long a test takes, and the functions that it enters: file of the checkout and first line."""
+
+    seconds: float
+    entered: frozenset[tuple[str, int]]
+
+
+class Watch:
+    """A plugin of pytest that notes which functions each test enters.
+
+    What is entered while modules are imported counts for all tests, a fixture for all tests of its file.
+    """
+
+    def __init__(self) -> None:
+        self._common: Entered = {}
+        self._fixtures: dict[str, Entered] = {}
+        self._tests: dict[str, Entered] = {}
+        self._seconds: dict[str, float] = {}
+        self._into = self._common
+        threading.settrace(self._call)
+        sys.settrace(self._call)
+
+    def _call(self, frame: FrameType, event: str, arg: object) -> None:
+        self._into[id(frame.f_code)] = frame.f_code
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_setup(self, item: pytest.Item) -> Iterator[None]:
+        """Before a test."""
+        self._into = self._fixtures.setdefault(item.nodeid.partition('::')[0], {})
+        return (yield)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item: pytest.Item) -> Iterator[None]:
+        """A test."""
+        self._into = self._tests.setdefault(item.nodeid, {})
+        begun = time.monotonic()
+        try:
+            return (yield)
+        finally:
+            self._seconds[item.nodeid] = time.monotonic() - begun
+
+    def seen(self) -> str:
+        """The tests as JSON."""
+        sys.settrace(None)
+        here = str(Path.cwd()) + os.sep
+        out = {}
+        for name, own in self._tests.items():
+            codes = {**self._common, **self._fixtures[name.partition('::')[0]], **own}.values()
+            ours = [c for c in codes if c.co_filename.startswith(here)]
+            out[name] = self._seconds[name], [(c.co_filename.removeprefix(here), c.co_firstlineno) for c in ours]
+        return json.dumps(out)
+
+
+def passed(run: Callable[[], int], seconds: float) -> bool:
+    """Whether ``run`` returns 0 in a child of this process; ends the child and all that it started."""
     child = os.fork()
     if child == 0:
         os.setsid()
         nowhere = os.open(os.devnull, os.O_RDWR)
         for stream in range(3):
             os.dup2(nowhere, stream)
-        os._exit(pytest.main([*OPTIONS, *tests]))
+        os._exit(run())
     end = time.monotonic() + seconds
     done, status = 0, 1
     while not done and time.monotonic() < end:
@@ -56,18 +122,59 @@ def warm_up(tests: Sequence[str]) -> None:
             del sys.modules[name]
 
 
+def tested(tests: Sequence[str]) -> int:
+    """Run ``tests``; the exit code of pytest."""
+    return int(pytest.main([*OPTIONS, *tests]))
+
+
+def watched(tests: Sequence[str], answer: Path) -> int:
+    """Run ``tests`` and write what they enter into ``answer``; the exit code of pytest."""
+    watch = Watch()
+    code = pytest.main([*OPTIONS, *tests], plugins=[watch])
+    answer.write_text(watch.seen())
+    return int(code)
+
+
+def known(tests: Sequence[str]) -> dict[str, Test] | None:
+    """The tests by name, all that ``tests`` (the arguments) choose; None if one fails or is not found by its name."""
+    out: dict[str, Test] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        answer = Path(folder, 'seen.json')
+        for words in tests:
+            if not passed(functools.partial(watched, words.split(' ', 2), answer), LONGEST):
+                return None
+            for name, (seconds, entered) in json.loads(answer.read_text()).items():
+                out[name] = Test(seconds, frozenset((file, line) for file, line in entered))
+    # A test that is not found by its name would count as one that fails.
+    return out if passed(functools.partial(tested, ['--collect-only', *out]), LONGEST) else None
+
+
+def chosen(tests: dict[str, Test], file: str, first: int) -> list[str]:
+    """Those of ``tests`` that enter the function that begins in line ``first`` of ``file``, the quickest first.
+
+    0: all, those that enter a function of ``file`` first.
+    """
+    near = {name: any(f == file for f, _ in test.entered) for name, test in tests.items()}
+    names = [name for name, test in tests.items() if first == 0 or (file, first) in test.entered]
+    return sorted(names, key=lambda name: (not near[name], tests[name].seconds))
+
+
 def main() -> None:
     """Answer until the input ends."""
     os.environ['PYTEST_DISABLE_PLUGIN_AUTOLOAD'] = '1'
+    # test/conftest.py reads it.
+    os.environ['PSD_DEFLECTION_MUTANTS'] = '1'
     warm_up(sys.argv[1:])
-    tests = [f for t in sys.argv[1:] for f in sorted(map(str, Path(t).rglob('test_*.py'))) or [t]]
+    tests = known(sys.argv[1:])
+    print(int(tests is not None), flush=True)
+    if tests is None:
+        return
     for line in sys.stdin:
-        seconds, module = line.split()
-        end = time.monotonic() + float(seconds)
-        # One after the other: what the first notices need not wait for the imports of the rest.
-        ordered = sorted(tests, key=lambda t: module not in t)
-        good = all(passed(t.split(' ', 2), end - time.monotonic()) for t in ordered)
-        print(int(good), flush=True)
+        file, first = line.split()
+        names = chosen(tests, file, int(first))
+        # A program that never ends is noticed soon.
+        seconds = 20.0 + 4.0 * sum(tests[name].seconds for name in names)
+        print(int(not names or passed(functools.partial(tested, names), seconds)), flush=True)
 
 
 if __name__ == '__main__':

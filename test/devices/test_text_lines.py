@@ -75,6 +75,10 @@ def test_lines_come_out_however_the_stream_was_cut(cuts: list[int]) -> None:
     assert [i for a, b in itertools.pairwise(places) for i in decoder.feed(STREAM[a:b])] == ITEMS
 
 
+def test_a_whole_line_that_comes_first_is_a_line() -> None:
+    assert LineDecoder().feed(b'7,7000,0.1,-0.2,5,0,1.5,4.75\n') == [LINE]
+
+
 ALMOST = st.text('0123456789,.-+*#{} \r\n', max_size=60).map(str.encode)
 
 
@@ -109,6 +113,12 @@ def test_micros_wraps_and_restarts_with_the_device() -> None:
         for s, t in [(100, 2**32 - 1000), (101, 2**32), (102, 2**32 + 1000), (0, 500), (1, 1500)]
     ]
     assert got == [2**32 - 1000, 2**32, 2**32 + 1000, 500, 1500]
+
+
+def test_micros_that_go_back_while_the_number_stands_still_start_again() -> None:
+    """As far back as a wrap: but a device that counts its samples does not count one for 71 minutes."""
+    extender = TimeExtender()
+    assert [extender.extend(Line(7, t, VALUES)) for t in (2**32 - 5, 3)] == [2**32 - 5, 3]
 
 
 def test_it_reads_the_rig(wired: Any, run: Any, unloaded: Any, volts: Any) -> None:

@@ -101,6 +101,19 @@ def test_the_search_beats_every_pair_of_a_finer_grid() -> None:
     assert found == pytest.approx(math.sqrt(float(np.min(costs))), rel=0.02)
 
 
+def test_the_search_finds_what_lies_between_its_candidates() -> None:
+    """In what is right of x = 11 mm: as far apart as the rim allows, with the middle as near as the edge allows."""
+    pair = placement.best_pair(Room(0.100, box=(0.011, -0.2, 0.2, 0.2)))
+    y = math.sqrt(0.100**2 - 0.011**2)
+    assert pair == pytest.approx(np.array([[0.011, y], [0.011, -y]]), abs=1e-8)
+
+
+def test_a_room_holds_what_is_between_its_circles_and_in_its_box() -> None:
+    room = Room(0.1, keep_out=0.03, box=(-0.2, 0.0, 0.2, 0.2))
+    places = [(0.0, 0.03), (0.0, 0.0299), (0.0, 0.1), (0.0, 0.1001), (0.05, -0.001), (0.05, 0.0)]
+    assert room.holds(np.array(places)).tolist() == [True, False, True, False, False, True]
+
+
 @pytest.mark.parametrize(
     ('radius', 'keep_out', 'box', 'said'),
     [

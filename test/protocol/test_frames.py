@@ -100,6 +100,10 @@ def test_the_tail_of_a_frame_that_began_before_we_listened_is_passed_over() -> N
         assert FrameDecoder().feed(SAMPLE_BYTES[cut:] + SAMPLE_BYTES) == [SAMPLE]
 
 
+def test_a_whole_frame_that_comes_first_is_a_frame() -> None:
+    assert FrameDecoder().feed(SAMPLE_BYTES) == [SAMPLE]
+
+
 def test_empty_frames_are_nothing() -> None:
     assert decode(b'\x00\x00' + SAMPLE_BYTES + b'\x00') == [SAMPLE]
 
@@ -107,6 +111,16 @@ def test_empty_frames_are_nothing() -> None:
 def test_a_hello_that_does_not_fit_is_refused() -> None:
     with pytest.raises(ValueError, match='at most 512'):
         encode(HelloFrame(1, {'serial': 'x' * 600}))
+
+
+def test_a_hello_of_512_bytes_encoded_is_sent_and_received() -> None:
+    # Type, version, {"serial":""} and CRC are 19 bytes. COBS adds one, and one after each 254: 19 + 490 + 3 = 512.
+    longest = HelloFrame(1, {'serial': 'x' * 490})
+    with pytest.raises(ValueError, match='513 bytes encoded, at most 512'):
+        encode(HelloFrame(1, {'serial': 'x' * 491}))
+    sent = encode(longest)
+    assert len(sent) == MAX_ENCODED + 1
+    assert isinstance(decode(sent)[0], HelloFrame)
 
 
 def test_a_field_that_does_not_fit_is_refused() -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.protocol.sequence import WRAP, SequenceExtender, Step
+from psd_deflection.protocol.sequence import WRAP, RecordedSequence, SequenceExtender, Step
 
 
 def test_the_next_one_a_gap_and_a_repeat() -> None:
@@ -90,3 +92,71 @@ def test_numbers_given_anew_go_on_at_the_next_block() -> None:
     assert sequence.restart() == 20
     assert sequence.extend(0, 0) == (20, Step.NEXT, 0)
     assert sequence.extend(3, 3000) == (23, Step.GAP, 2)
+
+
+class Recorded:
+    """Numbers of a recording in blocks of 20; times in ms."""
+
+    def __init__(self, seq: list[int], ms: list[float]) -> None:
+        self.said: list[str] = []
+        self.restarts: list[tuple[int, int]] = []
+        self._sequence = RecordedSequence(20, self.said.append, lambda last, first: self.restarts.append((last, first)))
+        assert self.extended(seq, ms) == seq
+
+    def extended(self, seq: list[int], ms: list[float], whole: bool = False) -> list[int]:
+        return [int(n) for n in self._sequence.extended(np.array(seq), self._ns(ms), whole)]
+
+    def follows(self, seq: list[int], ms: list[float]) -> bool:
+        return self._sequence.follows(np.array(seq), self._ns(ms), False)
+
+    @staticmethod
+    def _ns(ms: list[float]) -> np.typing.NDArray[np.int64]:
+        return np.rint(np.array(ms) * 1e6).astype(np.int64)
+
+
+def test_a_recording_goes_on_if_neither_number_nor_time_goes_back() -> None:
+    of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
+    assert of.follows([8, 9], [8.0, 9.0])
+    assert not of.follows([7, 8, 9], [8.0, 9.0, 10.0])
+    assert not of.follows([8, 9], [7.0, 9.0])
+    assert not of.follows([8, 8], [8.0, 9.0])
+    assert not of.follows([8, 9], [8.0, 8.0])
+
+
+def test_a_time_that_goes_back_is_told_and_the_last_time_counts() -> None:
+    of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
+    assert of.extended([8, 9, 10], [6.5, 8.0, 9.0]) == [8, 9, 10]
+    assert of.said == ['time goes back to 6500000 ns']
+    assert not of.follows([11], [8.5])
+    assert of.follows([11], [9.5])
+
+
+def test_a_message_in_which_number_or_time_stands_still_is_refused() -> None:
+    of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
+    with pytest.raises(ValueError, match='seq does not rise'):
+        of.extended([8, 9, 9], [8.0, 9.0, 10.0])
+    with pytest.raises(ValueError, match='dt does not rise'):
+        of.extended([8, 9, 10], [8.0, 9.0, 9.0])
+
+
+def test_a_recorded_number_has_wrapped_if_20_khz_gives_as_many_samples() -> None:
+    """In 50 000 s these are 10^9 samples, and a thousand for a clock that is off."""
+    last, most = 4_000_000_000, 1_000_001_000
+    of = Recorded([last], [0.0])
+    assert of.extended([(last + most) % WRAP], [5e7]) == [last + most]
+    assert (of.said, of.restarts) == ([], [])
+    of = Recorded([last], [0.0])
+    number = (last + most + 1) % WRAP
+    # 4 10^9 is the first of a block: the next block begins 20 later.
+    first = last + 20 + number % 20
+    assert of.extended([number], [5e7]) == [first]
+    assert (of.said, of.restarts) == (['sample numbers start again after 4000000000'], [(last, first)])
+
+
+def test_a_wrap_within_a_message_and_numbers_that_were_recorded_whole() -> None:
+    assert Recorded([WRAP - 3], [0.0]).extended([WRAP - 2, WRAP - 1, 0, 1], [1.0, 2.0, 3.0, 4.0]) == [
+        *range(WRAP - 2, WRAP + 2)
+    ]
+    of = Recorded([WRAP - 1], [0.0])
+    assert of.extended([5, 6], [1.0, 2.0], whole=True) == [WRAP // 20 * 20 + 20 + 5, WRAP // 20 * 20 + 20 + 6]
+    assert len(of.restarts) == 1

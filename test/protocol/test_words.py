@@ -82,3 +82,16 @@ def test_a_hello_and_a_line_of_any_json_are_harmless(value: Any) -> None:
         i.info for i in [described] if isinstance(i, Description)
     ]:
         assert all(t.isprintable() for t in texts(info))
+
+
+@pytest.mark.parametrize(
+    ('value', 'kept'),
+    [
+        ([[1, 2]], [[1, 2]]),
+        ([[1, [2]]], [[1, '[2]']]),
+        ({'b': {'c': 1}}, {'b': {'c': 1}}),
+        ({'b': {'c': {'d': 1}}}, {'b': {'c': "{'d': 1}"}}),
+    ],
+)
+def test_what_is_nested_over_three_deep_is_kept_as_text(value: object, kept: object) -> None:
+    assert device_words({'a': value}) == {'a': kept}

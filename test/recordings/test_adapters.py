@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -27,6 +28,7 @@ from msg_adapters import (
     solver_topic,
     string,
     to_messages,
+    twist_stamped,
     vector3_stamped,
 )
 from msg_adapters.header import header, stamp_ns
@@ -44,6 +46,7 @@ from psd_deflection.records import (
     SampleBlock,
     TemperatureReading,
     TipLoad,
+    TipMotion,
 )
 
 from .making import STEP, T0, block, estimate, run, spots
@@ -83,6 +86,18 @@ def test_quaternion_is_the_rotation_of_the_contract(theta: float, phi: float, om
 
 def test_a_quaternion_that_was_never_filled_in_has_no_angles() -> None:
     assert all(map(math.isnan, angles({'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 0.0})))
+
+
+@pytest.mark.parametrize('phi', [-math.pi / 2, math.pi / 2])
+def test_a_plate_on_its_edge_has_angles(phi: float) -> None:
+    """By rounding the sine is beyond 1 for some of them."""
+    for theta in np.linspace(-3.0, 3.0, 25):
+        for omega in np.linspace(-3.0, 3.0, 25):
+            assert angles(quaternion(theta, phi, omega))[1] == pytest.approx(phi, abs=1e-7)
+
+
+def test_a_quaternion_that_is_not_finite_has_no_angles() -> None:
+    assert all(map(math.isnan, angles({'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': math.inf})))
 
 
 @given(times)
@@ -224,6 +239,29 @@ def test_a_block_is_cut_only_if_its_times_do_not_fit(span: int, pieces: int) -> 
     np.testing.assert_array_equal(times, t_ns)
 
 
+KINDS = ['int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'float32', 'float64']
+"""sensor_msgs/PointField: 1 to 8."""
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_a_cloud_of_another_program_may_have_numbers_of_any_kind(kind: str) -> None:
+    names = ['seq', 'dt', *CHANNELS]
+    own = np.dtype([(name, kind) for name in names])
+    points = np.zeros(2, own)
+    for i, name in enumerate(names):
+        points[name] = [i, 10 + i]
+    size = np.dtype(kind).itemsize
+    fields = [
+        {'name': name, 'offset': size * i, 'datatype': 1 + KINDS.index(kind), 'count': 1}
+        for i, name in enumerate(names)
+    ]
+    (m,) = to_messages(block(0))
+    cloud = {'fields': fields, 'point_step': own.itemsize, 'width': 2, 'data': points.tobytes()}
+    _, got = point_cloud2.to_points({**m.fields, **cloud})
+    assert got.dtype['x1'] == np.dtype(kind)
+    assert [tuple(row) for row in got.tolist()] == [tuple(range(8)), tuple(range(10, 18))]
+
+
 def test_points_that_contradict_themselves_are_refused() -> None:
     (m,) = to_messages(block(0))
     for change, message in (
@@ -231,7 +269,8 @@ def test_points_that_contradict_themselves_are_refused() -> None:
         ({'height': 2}, 'height'),
         ({'point_step': 28, 'width': 20, 'data': bytes(560)}, 'outside a point'),
         ({'point_step': 2**32 - 1, 'width': 0, 'data': b''}, 'a point of'),
-        ({'fields': m.fields['fields'][1:]}, "no field 'seq'"),
+        ({'fields': m.fields['fields'][1:]}, r"no field 'seq' \(fields: dt, x1, y1, sum1, x2, y2, sum2\)"),
+        ({'fields': []}, r"no field 'seq' \(fields: none\)"),
     ):
         with pytest.raises(ValueError, match=message):
             point_cloud2.to_points({**m.fields, **change})
@@ -241,6 +280,12 @@ def test_points_that_contradict_themselves_are_refused() -> None:
 def test_a_dot_that_was_not_seen_is_not_published(status: BlockStatus) -> None:
     seen = status in (BlockStatus.OK, BlockStatus.OUTSIDE_ACTIVE_AREA, BlockStatus.NOT_SOLVED)
     assert [m.topic for m in to_messages(spots(1, status))] == (list(SPOTS) if seen else [])
+
+
+def test_of_a_block_without_one_psd_the_others_are_published() -> None:
+    """PSD 2 is left out as it is dark: then it has no dot; or as it contradicts the others: then it has."""
+    for status, topics in ((BlockStatus.LASER_LOST, [SPOTS[0]]), (BlockStatus.OK, list(SPOTS))):
+        assert [m.topic for m in to_messages(replace(spots(3, status), left_out=(2,)))] == topics
 
 
 def test_each_dot_is_published_in_its_own_frame_and_axes() -> None:
@@ -281,6 +326,22 @@ def test_a_pose_lies_in_the_plane_with_all_its_angles() -> None:
     assert reference.fields['pose']['position'] == {'x': 1e-3, 'y': -2e-3, 'z': 0.0}
     # What did not measure tilts says none.
     assert angles(reference.fields['pose']['orientation']) == pytest.approx((0.01, 0.0, 0.0), abs=1e-15)
+
+
+def test_a_velocity_is_in_the_plane_and_about_z() -> None:
+    motion = TipMotion(T0, 1, 0.0, 0.0, 0.0, 0.0, 0.0, (0.0,) * 9, 1.0, 2.0, 3.0, (0.0,) * 9, False)
+    assert twist_stamped.from_motion(motion)['twist'] == {
+        'linear': {'x': 1.0, 'y': 2.0, 'z': 0.0},
+        'angular': {'x': 0.0, 'y': 0.0, 'z': 3.0},
+    }
+
+
+def test_a_reference_has_the_covariance_of_x_y_and_yaw() -> None:
+    fields = pose_with_covariance_stamped.from_estimate(estimate(3))
+    fields['pose']['covariance'] = list(range(36))
+    # Rows and columns 0, 1 and 5 of six.
+    wanted = (0, 1, 5, 6, 7, 11, 30, 31, 35)
+    assert pose_with_covariance_stamped.to_reference(fields).covariance == wanted
 
 
 def test_a_load_is_a_force_in_the_plane_and_a_torque_about_z() -> None:
@@ -362,6 +423,14 @@ def test_a_rig_of_read_only_maps_is_written_and_one_of_anything_else_is_not() ->
     assert json.loads(m.fields['data'])['parameters'] == {'psd_1.zero': [0.1, 0.2], 'nested': {'a': 1}}
     with pytest.raises(TypeError, match='has no JSON'):
         to_messages(RigState(5, 7, {'bad': {1, 2}}, None, {}, '1'))
+
+
+def test_a_text_of_a_million_characters_is_read_and_a_longer_one_is_not() -> None:
+    (m,) = to_messages(RigState(5, 7, {}, None, {}, '1'))
+    text = m.fields['data'].ljust(1_000_000)
+    assert string.to_rig({'data': text}).block == 7
+    with pytest.raises(ValueError, match='has 1000001 characters, more than 1000000'):
+        string.to_rig({'data': text + ' '})
 
 
 @pytest.mark.parametrize('text', ['', '[]', '{"version": 1}', '[' * 100_000, 'x' * (string.MAX_CHARACTERS + 1)])

@@ -138,3 +138,22 @@ def test_another_fit_goes_on_from_the_state_to_the_bit() -> None:
     assert (a.covariance == b.covariance).all()
     with pytest.raises(ValueError, match='40 values, not 3'):
         other.set_state((1.0, 2.0, 3.0))
+
+
+@pytest.mark.parametrize('present', [8, 9, 10, 11])
+def test_so_few_samples_that_they_cannot_tell_all_orders_have_errors_as_large_as_stated(present: int) -> None:
+    """Polynomials of order 4 with coefficients by chance; 8 or 9 samples tell four of the five, 10 tell all."""
+    rng = np.random.default_rng(4)
+    powers = np.vander((ALL - 9.5) / 9.5, 5, increasing=True)
+    fit = fitter()
+    for _ in range(150):
+        fit.fit(ALL, 1e-4 * powers @ rng.normal(size=(5, 4)))
+    state, errors = fit.state(), []
+    for _ in range(60):
+        fit.set_state(state)
+        coefficients = 1e-4 * rng.normal(size=(5, 4))
+        slots = np.sort(rng.choice(SIZE, present, replace=False))
+        fitted = fit.fit(slots, (powers @ coefficients)[slots])
+        errors.append((fitted.dots - coefficients[0]) / np.sqrt(fitted.covariance.diagonal()))
+    rms = float(np.sqrt(np.mean(np.square(errors))))
+    assert (0.5 if present < 10 else 0.0) < rms < 1.0

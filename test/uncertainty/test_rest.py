@@ -1,0 +1,51 @@
+"""The rest that a zero needs, by numbers that can be added up by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psd_deflection.config import load_rig
+from psd_deflection.uncertainty.rest import why_moving
+from psd_deflection.uncertainty.stamped import StampedDots
+
+
+def moves(um: list[float], noise_um: float = 0.01) -> str:
+    """What is said of blocks of which y1 goes through these places."""
+    dots = np.zeros((len(um), 4))
+    dots[:, 1] = 1e-6 * np.array(um)
+    return why_moving(dots, ((1e-6 * noise_um) ** 2,) * 4)
+
+
+def test_two_blocks_tell_nothing_three_do() -> None:
+    assert moves([0.0, 50.0]) == ''
+    # From the first block to the mean of the others.
+    assert moves([0.0, 2.01, 2.01]).startswith('the link moves: y1 varied by 1.2 um rms in the last 3 blocks, noise')
+    assert moves([0.0, 1.99, 1.99]) == ''
+    # Of two at 0 and two at 1 m: 1/sqrt 3 m.
+    assert ' varied by 577350.3 um rms ' in moves([0.0, 0.0, 1e6, 1e6])
+
+
+@pytest.mark.parametrize(('noise_um', 'drifts', 'scatters'), [(0.01, 2.0, 10.0), (3.0, 15.0, 15.0)])
+def test_moving_is_five_times_the_noise_and_micrometres(noise_um: float, drifts: float, scatters: float) -> None:
+    for share, said in ((0.99, False), (1.01, True)):
+        assert bool(moves([0.0, 0.0, share * drifts, share * drifts], noise_um)) == said
+        # Of a, -a, a, -a the standard deviation is 2 a / sqrt 3.
+        a = share * scatters * 3.0**0.5 / 2.0
+        assert bool(moves([a, -a, a, -a], noise_um)) == said
+
+
+@pytest.mark.parametrize(
+    ('covariance', 'words'),
+    [('file', 'noise of the rig file'), ('measured', 'noise of the rig file until it is measured')],
+)
+def test_diagnostics_say_whose_noise_it_is(covariance: str, words: str) -> None:
+    stamped = StampedDots(load_rig(overrides={'covariance': covariance}))
+    assert dict(stamped.words())['covariance from'] == words
+
+
+def test_diagnostics_say_of_how_many_readings_too_many_a_chi_square_is() -> None:
+    third = {'psd_3.center': [0.08, -0.06]}
+    of_two, of_three = (dict(StampedDots(load_rig(overrides=more)).words()) for more in ({}, third))
+    assert of_two['chi-square of the readings'] == '0.00'
+    assert of_three['chi-square of the readings'] == '0.00 of 1 degrees of freedom'
