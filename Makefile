@@ -1,5 +1,5 @@
-# make setup    a virtual environment in .venv with all that is needed (Python 3.11 to 3.14)
-# make run      set-up, then the daemon on the simulated rig, recorded below recordings/
+# make setup    a virtual environment in .venv with all that the targets below need (Python 3.11 to 3.14)
+# make run      set-up of what a run needs (no test tools), then the daemon on the simulated rig, recorded below recordings/
 #               (make run PORT=/dev/ttyACM0 ARGS='--params-file my_rig.yaml' for a real one)
 # make test     set-up, then lint, types, import contracts and every test
 # make bench    what it costs, as ratios to peers measured in the same run (a few minutes)
@@ -7,6 +7,7 @@
 # make crash    kill -9 at 200 random instants while recording (about 8 minutes)
 # make fuzz     coverage-guided fuzzing of all that reads strangers' bytes, FUZZ_SECONDS=600 each; 10^7 damaged frames; 10^6 HELLOs
 # make soak     SOAK_MINUTES=30 in real time, then SOAK_HOURS=24 of simulated time (a quarter of an hour on an idle core)
+# make fleet    FLEET_RECORDINGS=1000 simulated recordings through a local Dask cluster whose workers are killed (some minutes)
 # make firmware build the example firmware, run it in qemu, join it to the daemon (installs what it needs with apt-get)
 # make mutants  break the numerics line by line and see whether the tests notice (an hour; MUTANTS="--rooms solvers" for one room)
 # make golden   make the recordings in bags/ anew
@@ -31,13 +32,17 @@ VENV ?= .venv
 WITH ?=
 PORT ?=
 ARGS ?=
+# pip writes no byte code: half the time of a set-up goes into modules that nobody imports.
+export PIP_COMPILE := 0
 # Further words for pytest, e.g. PYTEST='-m "not browser"'.
 PYTEST ?=
 # Tests that run at a time; many of them wait.
 WORKERS ?= 2
 BIN := $(VENV)/bin
+# A run needs the first of these, all the others need both.
+READY := $(VENV)/.installed $(VENV)/.for_tests
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws camera-campaign demo-discover demo-thesis colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak fleet firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws camera-campaign demo-discover demo-thesis colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -47,8 +52,8 @@ SOURCES := $(shell find psd_deflection msg_adapters config launch resource -type
 $(VENV)/.requirements: setup.cfg
 	$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info[:2] <= (3, 14) else f"Python 3.11 to 3.14 is needed, this is {sys.version.split()[0]}: make PYTHON=python3.12")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@echo 'setting up $(VENV), once: a minute or two, 0.9 GB'
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[ros,monitor,test]' $(if $(WITH),'$(WITH)')
+	@echo 'setting up $(VENV), once: a minute or so, 0.6 GB'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[ros,monitor]' $(if $(WITH),'$(WITH)')
 	touch $@
 
 # Installed as a user has it (a wheel, not a link to the checkout), so that `ros2 run` finds it.
@@ -56,48 +61,63 @@ $(VENV)/.installed: $(VENV)/.requirements setup.py setup.cfg $(SOURCES)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall .
 	touch $@
 
-setup: $(VENV)/.installed
+# What tests, campaigns and documents need besides, without another build of the package. Later than the package, so that
+# two pips never write at once.
+$(VENV)/.for_tests: $(VENV)/.requirements | $(VENV)/.installed
+	@echo 'the tools of the tests into $(VENV), once: a minute or so, 0.9 GB more'
+	$(BIN)/python -c 'import configparser; c = configparser.ConfigParser(); c.read("setup.cfg"); print(c["options.extras_require"]["test"])' > $(VENV)/test_tools
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r $(VENV)/test_tools $(if $(WITH),'$(WITH)')
+	touch $@
+
+setup: $(READY)
 
 test: lint types contracts unit
 
-lint: $(VENV)/.installed
+lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: $(VENV)/.installed
+types: $(READY)
 	$(BIN)/mypy
 
-contracts: $(VENV)/.installed
+contracts: $(READY)
 	$(BIN)/lint-imports --no-cache
 
-unit: $(VENV)/.installed
+unit: $(READY)
 	$(BIN)/python -m pytest -n $(WORKERS) $(PYTEST)
 
 run: $(VENV)/.installed
 	$(BIN)/psd-deflection estimator --monitor --record recordings $(if $(PORT),--port $(PORT)) $(ARGS)
 
-# Arguments, e.g. BENCH_LIVE='--seconds 5 --minutes 1' for a first look.
+# Arguments, e.g. BENCH_LIVE='--seconds 5 --starts 1' for a first look.
 BENCH_LIVE ?=
+BENCH_LIMITS ?=
+BENCH_RIGS ?=
 BENCH_SOLVERS ?=
 BENCH_ACCURACY ?=
-bench: $(VENV)/.installed
-	$(BIN)/python bench/live.py $(BENCH_LIVE)
+# Rows with peers and limits go into bench/results.json, of which docs/performance.md is made.
+bench: $(READY)
+	rm -f bench/results.json
+	$(BIN)/python -m bench.live $(BENCH_LIVE)
+	OMP_NUM_THREADS=1 $(BIN)/python -m bench.limits $(BENCH_LIMITS)
+	$(BIN)/python -m bench.rigs $(BENCH_RIGS)
+	$(BIN)/python -m bench.page
 	$(BIN)/python bench/solvers.py $(BENCH_SOLVERS)
 	$(BIN)/python bench/accuracy.py $(BENCH_ACCURACY)
 
 FAULT_TIMES ?= 20
 FAULTS ?=
-faults: $(VENV)/.installed
+faults: $(READY)
 	$(BIN)/python -m bench.campaign.faults --times $(FAULT_TIMES) $(FAULTS)
 
 CRASH_TIMES ?= 200
-crash: $(VENV)/.installed
+crash: $(READY)
 	$(BIN)/python -m bench.campaign.crash --times $(CRASH_TIMES)
 
 FUZZ_SECONDS ?= 600
 FUZZ_FRAMES ?= 10000000
 FUZZ_HELLOS ?= 1000000
-fuzz: $(VENV)/.installed
+fuzz: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check atheris
 	$(BIN)/python -m bench.campaign.fuzz corrupted $(FUZZ_FRAMES)
 	$(BIN)/python -m bench.campaign.hellos $(FUZZ_HELLOS)
@@ -105,25 +125,29 @@ fuzz: $(VENV)/.installed
 
 SOAK_MINUTES ?= 30
 SOAK_HOURS ?= 24
-soak: $(VENV)/.installed
+soak: $(READY)
 	$(BIN)/python -m bench.campaign.soak --minutes $(SOAK_MINUTES) --hours $(SOAK_HOURS)
+
+FLEET_RECORDINGS ?= 1000
+fleet: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python -m bench.campaign.fleet --recordings $(FLEET_RECORDINGS) $(FLEET)
 
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 
-firmware: $(VENV)/.installed
+firmware: $(READY)
 	(command -v arm-none-eabi-gcc && command -v qemu-system-arm) || ($(SUDO) apt-get update -qq && $(SUDO) apt-get install -y -qq --no-install-recommends gcc-arm-none-eabi qemu-system-arm)
 	$(MAKE) -C docs/firmware OUT=$(CURDIR)/build/firmware
 	$(BIN)/python -m tools.check_firmware build/firmware/psd_synthetic.elf
 
-mutants: $(VENV)/.installed
+mutants: $(READY)
 	test -x build/mutants/bin/python || $(PYTHON) -m venv build/mutants
 	build/mutants/bin/python -m pip install --quiet --disable-pip-version-check 'cosmic-ray>=8.4,<9'
 	build/mutants/bin/python -m tools.mutants --python $(abspath $(BIN)/python) $(MUTANTS)
 
-golden: $(VENV)/.installed
+golden: $(READY)
 	$(BIN)/python bags/make.py
 
-docs: $(VENV)/.installed
+docs: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[docs]'
 	$(BIN)/python -m mkdocs build --strict --quiet --site-dir build/site
 	@echo 'open build/site/index.html (its search needs a server: python -m http.server --directory build/site)'
@@ -133,25 +157,25 @@ AXE ?=
 axe: docs
 	$(BIN)/python -m tools.accessible build/site $(AXE)
 
-notebooks: $(VENV)/.installed
+notebooks: $(READY)
 	$(BIN)/python -m pytest --nbmake --overwrite docs/*.ipynb
 
 SHOT_SECONDS ?= 40
-shots: $(VENV)/.installed
+shots: $(READY)
 	$(BIN)/python -m tools.shots --seconds $(SHOT_SECONDS)
 
 # Each command of README and docs that the tests do not run themselves; ONLY='monitor' for those with that word, or on a page with it.
-doc-commands: $(VENV)/.installed
+doc-commands: $(READY)
 	$(BIN)/python -m tools.run_commands $(ONLY)
 
 # In an environment of its own, without ROS: the wheel made from the sdist, as `pip install dist/*.whl` has it.
-wheel: $(VENV)/.installed
+wheel: $(READY)
 	rm -rf dist build/wheel && mkdir -p build/wheel
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check build
 	$(BIN)/python -m build --outdir dist . > build/wheel/log
 	$(PYTHON) -m venv build/wheel/use && build/wheel/use/bin/pip install --quiet --disable-pip-version-check dist/*.whl
 	cd build/wheel && use/bin/psd-deflection --help && use/bin/psd-deflection info ../../bags/clean
-	build/wheel/use/bin/pip install --quiet --disable-pip-version-check 'psd_deflection[monitor]' 'psd_deflection[ros]' 'psd_deflection[pandas]' 'psd_deflection[camera]' 'psd_deflection[foxglove]'
+	build/wheel/use/bin/pip install --quiet --disable-pip-version-check 'psd_deflection[monitor]' 'psd_deflection[ros]' 'psd_deflection[pandas]' 'psd_deflection[camera]' 'psd_deflection[foxglove]' 'psd_deflection[dask]' 'psd_deflection[parquet]'
 	build/wheel/use/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/*.tar.gz
 	cd build/wheel && use/bin/psd-deflection --version && use/lib/psd_deflection/replay --help > log
 
@@ -164,20 +188,20 @@ rerun:
 
 # Truth hidden by a second generator: fresh seeds, both cores with JOBS=2; a run that was stopped goes on.
 JOBS ?= $(shell nproc)
-blind: $(VENV)/.installed
+blind: $(READY)
 	$(BIN)/python -m blind.run --jobs $(JOBS) $(BLIND)
 
 RIGS ?= 200
-blind-calibration: $(VENV)/.installed
+blind-calibration: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m blind.calibration --rigs $(RIGS) --jobs $(JOBS)
 
 LAWS ?=
-blind-laws: $(VENV)/.installed
+blind-laws: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m blind.laws --jobs $(JOBS) $(LAWS)
 
 # Rendered frames: errors, cost, and adverse frames, of which no answer may be wrong (two hours on an idle core).
 CAMERA_FRAMES ?= 10000
-camera-campaign: $(VENV)/.installed
+camera-campaign: $(READY)
 	$(BIN)/python -m bench.campaign.camera --frames $(CAMERA_FRAMES)
 
 demo-discover: $(VENV)/.installed
@@ -188,7 +212,7 @@ demo-discover: $(VENV)/.installed
 	@echo 'the report: build/demo/found/report.html'
 
 THESIS ?=
-demo-thesis: $(VENV)/.installed
+demo-thesis: $(READY)
 	rm -rf build/thesis
 	OMP_NUM_THREADS=1 $(BIN)/python -m blind.redone --out build/thesis $(THESIS)
 

@@ -6,7 +6,9 @@ Every figure stands beside a peer's from the same run, as a ratio: machines diff
   publisher of the same message -> the same callback, both in the same subscriber at the same time.
 - The same with the live page open, in turns with the node alone.
 - CPU: the node with recording, as a share of one core.
-- Replay of ten minutes beside bare iteration of the same file with ``mcap``.
+- Start: from the command to the first estimate that another process hears, beside a bare publisher's.
+
+The rows go into ``bench/results.json``.
 """
 
 from __future__ import annotations
@@ -26,13 +28,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-ROOT = Path(__file__).resolve().parent.parent
+from bench.rows import RESULTS, ROOT, Row, figure, keep, tell
+
 BLOCKS_PER_S = 50
-
-
-def percentiles(values: list[float]) -> tuple[float, float]:
-    """Median and 99th percentile, in the unit of ``values``."""
-    return float(np.median(values)), float(np.percentile(values, 99))
+START_S = 4.0
+"""A process has imported rclpy and found the others."""
 
 
 def until_stdin_closes() -> threading.Event:
@@ -151,7 +151,7 @@ class Device:
 
 def child(role: str, url: str = '') -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, str(Path(__file__)), '--role', role, '--url', url],
+        [sys.executable, '-m', 'bench.live', '--role', role, '--url', url],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -172,11 +172,6 @@ class Latencies:
     ours: list[float] = field(default_factory=list)
     bare: list[float] = field(default_factory=list)
     shares: list[float] = field(default_factory=list)
-
-    def ratios(self) -> tuple[float, float]:
-        """Median and 99th percentile over those of the bare publisher."""
-        (m, p), (m0, p0) = percentiles(self.ours), percentiles(self.bare)
-        return m / m0, p / p0
 
 
 def measure(seconds: float, settle: float, page: bool, into: Latencies) -> None:
@@ -224,26 +219,13 @@ def measure(seconds: float, settle: float, page: bool, into: Latencies) -> None:
             into.ours.append((t - int(last[-1])) / 1e6)
 
 
-def live(seconds: float, settle: float, rounds: int) -> None:
+def live(seconds: float, settle: float, rounds: int) -> list[Row]:
     """The node alone and the node with the live page, in turns, each beside a bare publisher."""
     alone, with_page = Latencies(), Latencies()
     for _ in range(rounds):
         measure(seconds / rounds, settle, False, alone)
         measure(seconds / rounds, settle, True, with_page)
-    print('latency, last byte -> callback in another process (ms)')
-    print(f'  {"":36}{"median":>10}{"p99":>10}{"messages":>10}')
-    for what, found in (('psd_deflection', alone), ('psd_deflection, live page looked at', with_page)):
-        for name, values in ((what, found.ours), ('  bare publish -> callback', found.bare)):
-            m, p = percentiles(values)
-            print(f'  {name:36}{m:10.3f}{p:10.3f}{len(values):10d}')
-        m, p = found.ratios()
-        print(f'  {"  ratio (bound 2, 3)":36}{m:10.2f}{p:10.2f}')
-    (m, p), (m0, p0) = with_page.ratios(), alone.ratios()
-    print(f'  {"the live page, ratio of the ratios":36}{m / m0:10.2f}{p / p0:10.2f}')
-    share, page_share = (100 * float(np.mean(found.shares)) for found in (alone, with_page))
-    print(
-        f'CPU of the node with recording: {share:.1f} % of a core (bound 15 %), with the live page {page_share:.1f} %'
-    )
+    return live_rows(alone, with_page)
 
 
 def make_recording(folder: Path, minutes: float) -> tuple[Path, int]:
@@ -271,41 +253,74 @@ def make_recording(folder: Path, minutes: float) -> tuple[Path, int]:
     return path, n
 
 
-def replay(minutes: float) -> None:
-    from mcap.reader import make_reader
+def start(times: int) -> Row:
+    """From the command to the first callback in a process that listens already; the limit is a bare publisher's."""
+    seconds: dict[str, list[float]] = {'/link_tip/deflection': [], '/bare': []}
+    for _ in range(times):
+        device = Device()
+        device.thread.start()
+        ear = child('subscriber')
+        began: dict[str, int] = {}
+        # Its own discovery is over before the others begin.
+        time.sleep(START_S)
+        began['/bare'] = time.monotonic_ns()
+        bare = child('bare')
+        time.sleep(START_S)
+        command = [sys.executable, '-m', 'psd_deflection', 'estimator', '--port', device.port.name]
+        began['/link_tip/deflection'] = time.monotonic_ns()
+        node = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
+        assert ear.stdout is not None
+        # It says so once it has heard both.
+        ear.stdout.readline()
+        bare.communicate()
+        heard, _ = ear.communicate()
+        node.terminate()
+        node.wait(60.0)
+        device.stop.set()
+        device.thread.join()
+        for topic, found in seconds.items():
+            first = min(t for name, _, t in json.loads(heard) if name == topic)
+            found.append((first - began[topic]) / 1e9)
+    return Row(
+        'start: command to first published estimate',
+        's',
+        [
+            figure('psd_deflection estimator', 'ours', seconds['/link_tip/deflection']),
+            figure('import rclpy, a bare publisher, DDS discovery', 'limit', seconds['/bare'], 1.2),
+        ],
+    )
 
-    from psd_deflection.pipeline import Pipeline
-    from psd_deflection.recordings.readers import open_recording
-    from psd_deflection.recordings.replay_engine import replayed, rig_at_start
 
-    with tempfile.TemporaryDirectory() as folder:
-        path, n = make_recording(Path(folder), minutes)
-        (file,) = path.glob('*.mcap')
-        rounds: list[tuple[float, float]] = []
-        for _ in range(3):
-            began = time.perf_counter()
-            with file.open('rb') as stream:
-                messages = sum(1 for _ in make_reader(stream).iter_messages())
-            middle = time.perf_counter()
-            recording = open_recording(path)
-            pipeline = Pipeline(rig_at_start(recording))
-            for _records in replayed(recording, pipeline):
-                pass
-            rounds.append((middle - began, time.perf_counter() - middle))
-            if pipeline.counters.samples != n:
-                raise SystemExit(f'replay saw {pipeline.counters.samples} of {n} samples')
-        raw, ours = (sorted(r[i] for r in rounds)[1] for i in (0, 1))
-        size = file.stat().st_size / 1e6
-    print(f'replay of {minutes:g} minutes ({n} samples, {messages} messages, {size:.1f} MB)')
-    print(f'  {"psd_deflection replay":28}{ours:8.2f} s   {minutes * 60 / ours:6.0f} times real time')
-    print(f'  {"bare mcap iteration":28}{raw:8.2f} s')
-    print(f'  {"ratio (bound 3)":28}{ours / raw:8.2f}')
+def live_rows(alone: Latencies, with_page: Latencies) -> list[Row]:
+    """What :func:`live` measured."""
+    rows = []
+    for what, found, bounds in (('', alone, (1.4, 1.2)), (', live page looked at', with_page, (None, None))):
+        for word, percent, parts, bound in (('median', 50, 10, bounds[0]), ('99th percentile', 99, 3, bounds[1])):
+            # In parts of the run, so that there is a spread.
+            ours, bare = (
+                [float(np.percentile(part, percent)) for part in np.array_split(values, parts)]
+                for values in (found.ours, found.bare)
+            )
+            rows.append(
+                Row(
+                    f'live{what}: last byte of a block to callback in another process, {word}',
+                    'ms',
+                    [
+                        figure('psd_deflection', 'ours', ours),
+                        figure('bare rclpy publish to callback', 'limit', bare, bound),
+                    ],
+                )
+            )
+        shares = [100 * share for share in found.shares]
+        rows.append(Row(f'live{what}: CPU of the node, recording', '% of a core', [figure('node', 'ours', shares)]))
+    return rows
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--seconds', type=float, default=30.0, help='of the live measurement of each kind of node')
-    parser.add_argument('--minutes', type=float, default=10.0, help='of the recording that is replayed')
+    parser.add_argument('--starts', type=int, default=5, help='times that the start is measured')
+    parser.add_argument('--results', type=Path, default=RESULTS)
     parser.add_argument('--settle', type=float, default=5.0, help='seconds before each measurement')
     parser.add_argument('--rounds', type=int, default=2, help='in which it is done, so that a busy moment meets both')
     parser.add_argument('--role', choices=('subscriber', 'bare', 'looker'), help=argparse.SUPPRESS)
@@ -318,8 +333,10 @@ def main() -> int:
     elif args.role == 'looker':
         looker(args.url)
     else:
-        live(args.seconds, args.settle, args.rounds)
-        replay(args.minutes)
+        rows = [*live(args.seconds, args.settle, args.rounds), start(args.starts)]
+        for row in rows:
+            tell(row)
+        keep(rows, args.results)
     return 0
 
 

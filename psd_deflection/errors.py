@@ -20,7 +20,8 @@ EXIT_STATUSES: Mapping[int, str] = {
     4: 'a recording or an output that cannot be read or written',
     5: 'the device: missing, in use, silent, or of another protocol',
     6: 'the geometry of the rig cannot be solved',
-    7: 'a running daemon: none answers, or it refuses',
+    7: 'a running daemon or a Dask scheduler: none answers, or it refuses',
+    8: 'of many recordings some failed; the others are done',
     71: 'the machine: too little memory, or no further thread',
     INTERRUPTED: 'Ctrl-C before it was done (what runs until Ctrl-C ends with 0)',
 }
@@ -79,12 +80,21 @@ class SolverError(PsdDeflectionError):
 
 
 class DaemonError(PsdDeflectionError):
-    """No running daemon answers, or it refuses what it was asked for.
+    """No running daemon or Dask scheduler answers, or it refuses what it was asked for.
 
     Example: ``http://127.0.0.1:8790/: no daemon answers``.
     """
 
     exit_status = 7
+
+
+class SomeFailedError(PsdDeflectionError):
+    """Of many recordings some failed, and the rest was done and written.
+
+    Example: ``3 of 1000 recordings failed; the others are done``.
+    """
+
+    exit_status = 8
 
 
 class MachineError(PsdDeflectionError):

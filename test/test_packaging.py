@@ -94,7 +94,7 @@ FROM_PYPI = {
 ROS_PACKAGES = {'rclpy', 'rcl_interfaces', 'launch', 'launch_ros'}
 
 UNNAMED = {
-    **dict.fromkeys(('rerun', 'pandas', 'xarray', 'foxglove'), 'an extra'),
+    **dict.fromkeys(('rerun', 'pandas', 'xarray', 'foxglove', 'distributed', 'pyarrow'), 'an extra'),
     'shtab': 'completion in the shell, which says that it is missing; not in rosdep',
     'cyclonedds': 'another DDS as judge; not in rosdep',
     'rosbags': 'another reader as judge; from PyPI, so not forced on whoever builds the workspace',

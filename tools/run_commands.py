@@ -49,7 +49,7 @@ CI_RUNS = (
     (r'^make demo-thesis$', 'test/blind/test_redone.py', "main(['--short', "),
     (r'^colcon build$', 'Makefile', 'bin/colcon --log-base log build '),
     (
-        r"^pip install 'psd_deflection\[(ros|monitor|pandas|camera|foxglove)\]'$",
+        r"^pip install 'psd_deflection\[(ros|monitor|pandas|camera|foxglove|dask|parquet)\]'$",
         'Makefile',
         "pip install --quiet --disable-pip-version-check 'psd_deflection[",
     ),
@@ -61,9 +61,9 @@ CI_RUNS = (
     (
         r"^pip install '\.\[ros,monitor\]'$",
         'Makefile',
-        "pip install --quiet --disable-pip-version-check '.[ros,monitor,",
+        "pip install --quiet --disable-pip-version-check '.[ros,monitor]'",
     ),
-    (r'^python bench/live\.py$', 'Makefile', 'python bench/live.py'),
+    (r'^python -m bench\.live$', 'Makefile', 'python -m bench.live'),
     (r'^python bench/solvers\.py$', 'Makefile', 'python bench/solvers.py'),
     (r'^python bench/accuracy\.py$', 'Makefile', 'python bench/accuracy.py'),
     (r'^python -m blind\.run\b', 'Makefile', 'python -m blind.run --jobs'),
@@ -74,11 +74,12 @@ CI_RUNS = (
 """What CI runs without us: pattern, file, and the text in it that does."""
 
 SHORTEST = {
-    'bench': 'BENCH_LIVE="--rounds 1 --seconds 2 --settle 1 --minutes 0.1" BENCH_SOLVERS="--blocks 1000" '
-    'BENCH_ACCURACY="--blocks 100"',
+    'bench': 'BENCH_LIVE="--rounds 1 --seconds 2 --settle 1 --starts 1" BENCH_SOLVERS="--blocks 1000" '
+    'BENCH_ACCURACY="--blocks 100" BENCH_LIMITS="--times 1 --only frames" BENCH_RIGS="--most 1 --seconds 1"',
     'faults': 'FAULT_TIMES=1 FAULTS="--only zero"',
     'crash': 'CRASH_TIMES=1',
     'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=1000 FUZZ_HELLOS=1000',
+    'fleet': 'FLEET_RECORDINGS=8 FLEET="--seconds 0.2 --kills 1 --only-killed"',
     'soak': 'SOAK_MINUTES=0.05 SOAK_HOURS=0.05',
     'camera-campaign': 'CAMERA_FRAMES=20',
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import functools
 import math
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import TypeVar
 
 from psd_deflection.config import BY_NAME, Rig, replace_values, rig_from_values
 from psd_deflection.errors import ConfigError, RecordingError, UsageError
+from psd_deflection.fleet.parquet import ENDING, is_parquet
 from psd_deflection.foreign_yaml import YamlError, parse_yaml
 from psd_deflection.parameter_files import read_parameter_file
 
@@ -136,17 +138,24 @@ def in_the_world(rig: Rig, words: Sequence[str]) -> Rig:
         return replace_values(rig, values, '--world')
 
 
-def recording_name(*, rerun: bool = False) -> Callable[[str], str]:
-    """Reads the --out of a recording (an .rrd too, if ``rerun``) by its ending; what it gives raises UsageError."""
+def recording_name(*others: str) -> Callable[[str], str]:
+    """Reads the --out of a recording by its ending, which may be one of ``others``; what it gives raises UsageError."""
 
     def read(text: str) -> str:
         suffix = Path(text).suffix.lower()
-        if suffix in FOREIGN and not (rerun and suffix == '.rrd'):
-            files = 'X.csv, X.mcap, X.rrd' if rerun else 'X.csv, X.mcap'
+        if suffix in FOREIGN and suffix not in others:
+            files = ', '.join(f'X{ending}' for ending in ('.csv', '.mcap', *others))
             raise UsageError(f'--out {text}: {suffix} cannot be written; use {files} or a bag folder (X)')
         return text
 
     return read
+
+
+def parquet_name(text: str) -> str:
+    """The --out of a table of many recordings; raises UsageError."""
+    if not is_parquet(text):
+        raise UsageError(f'--out {text}: the name must end in {ENDING}')
+    return text
 
 
 def picture_name(*suffixes: str) -> Callable[[str], str]:
@@ -173,6 +182,14 @@ def make_folder(out: str) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RecordingError(f'--out {out}: cannot be made a folder ({error.strerror or error})') from None
+    return folder
+
+
+def make_writable(out: str) -> Path:
+    """As :func:`make_folder`, before work that takes its time: RecordingError also if nothing can be written there."""
+    folder = make_folder(out)
+    if not os.access(folder, os.W_OK):
+        raise RecordingError(f'--out {out}: cannot be written in; give another folder')
     return folder
 
 

@@ -73,3 +73,9 @@ def save(content: bytes, path: Path) -> None:
         replace_file(path, content)
     except OSError as error:
         raise RecordingError(f'--out {path}: cannot be written ({error.strerror or error})') from None
+
+
+def save_all(files: Mapping[str, str], folder: Path) -> None:
+    """Write texts by their names; raises RecordingError as :func:`save` does."""
+    for name, text in files.items():
+        save(text.encode(errors='replace'), folder / name)

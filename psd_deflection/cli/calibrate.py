@@ -7,35 +7,45 @@ holds what the calibration left open), report.html and calibration.json.
 --check RIG.yaml instead holds a calibrated rig file against a recording made since: what moved, by how much, how sure.
 --self takes recordings without reference and loads: the one redundant reading tells relative gains and turns.
 
+All REC together make one calibration. With --each every REC is one for itself: DIR/REC gets its files, or X.parquet a
+row. REC may then be a pattern, or a .txt file that lists recordings and patterns.
+
   psd-deflection calibrate run.csv --params-file my_rig.yaml --out new
   psd-deflection calibrate run.csv --reference camera.csv --out new
   psd-deflection calibrate today.csv --check new/rig.yaml
   psd-deflection calibrate run --self --params-file my_rig.yaml --out new
+  psd-deflection calibrate 'archive/*' --each --out calibrations.parquet
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from psd_deflection.calibrating import check as checking
 from psd_deflection.calibrating.calibrate import Calibration, calibrate
+from psd_deflection.calibrating.fit import NAMES
 from psd_deflection.calibrating.observation import Run
 from psd_deflection.calibrating.report import report_html
-from psd_deflection.calibrating.result import result, sentence, source_of, values_of
-from psd_deflection.cli._options import make_folder, namespace_option, number
+from psd_deflection.calibrating.result import REPORTED, UNITS, result, sentence, source_of, values_of
+from psd_deflection.cli._fleet import ERROR, absolute, answer_each, each_for_itself, each_option, recordings_argument
+from psd_deflection.cli._options import make_writable, namespace_option, number
 from psd_deflection.cli._progress import told
-from psd_deflection.cli._report import print_json, save, show, warn
+from psd_deflection.cli._report import print_json, save_all, show, warn
 from psd_deflection.cli._rig_file import rig_file
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.discovery.result import model_yaml
-from psd_deflection.errors import ConfigError, RecordingError, UsageError
+from psd_deflection.errors import ConfigError, UsageError
+from psd_deflection.fleet.parquet import Field
 from psd_deflection.misalignment.rig import is_calibrated
 from psd_deflection.parameter_files import with_effects_section, with_values
 from psd_deflection.recordings.calibration_runs import read_runs
@@ -47,11 +57,12 @@ MOST_EXPOSURE = 0.02
 """s. The polynomial that is fitted to the samples about a reference is 21 samples long."""
 STEPS = 5
 """Steps that the progress bar counts: noise, rows, fitting, held-out motion, report."""
+HEAD = ('state', 'by', 'undetermined', 'heldout before (um)', 'after')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('recordings', metavar='REC', nargs='+', help='recordings with a reference or with known loads')
+    recordings_argument(parser, 'recordings with a reference or with known loads')
     parser.add_argument(
         '--params-file', metavar='RIG.yaml', help='the rig as it is known (default: the parameters in the recording)'
     )
@@ -70,6 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='time over which each reference is a mean, s: the exposure of a camera (default 0)',
     )
     parser.add_argument('--out', metavar='DIR', help='folder for rig.yaml, report.html, calibration.json')
+    each_option(parser)
     parser.add_argument('--check', metavar='RIG.yaml', help='instead: does this calibrated rig file still hold?')
     parser.add_argument(
         '--self', action='store_true', dest='alone', help='by the redundant reading alone, without reference and loads'
@@ -87,20 +99,27 @@ def run(args: argparse.Namespace) -> int:
             f'give one for each, in the same order'
         )
     if args.check is not None:
-        if args.params_file is not None or args.out is not None:
-            raise UsageError('--check RIG.yaml is for itself: give neither --params-file nor --out')
+        if args.params_file is not None or args.out is not None or args.each or args.executor is not None:
+            raise UsageError('--check RIG.yaml is for itself: give none of --params-file, --out, --each, --executor')
         return _check(args)
     if args.out is None:
         raise UsageError('--out DIR (a calibration) or --check RIG.yaml (of an older one) is needed')
+    asked = Asked(
+        absolute(args.params_file),
+        args.namespace,
+        args.exposure,
+        args.alone,
+        datetime.now(UTC).date().isoformat(),
+        tuple(args.reference),
+    )
+    names = each_for_itself(args)
+    if names is not None:
+        return _each(args, names, asked)
     out = Path(args.out)
-    rig = _rig_of(args)
+    rig = asked.rig(args.recordings, warn)
     with told('reading', quiet=args.quiet or args.json):
-        runs = _runs_of(args, rig)
-    make_folder(args.out)
-    # Before the work, which takes its time.
-    if not os.access(out, os.W_OK):
-        raise RecordingError(f'--out {out}: cannot be written in; give another folder')
-    date = datetime.now(UTC).date().isoformat()
+        runs = asked.runs(args.recordings, rig)
+    make_writable(args.out)
     hidden = True if args.quiet or args.json else None
     with tqdm(total=STEPS, disable=hidden, file=sys.stderr, bar_format='{l_bar}{bar}| {elapsed}') as bar:
 
@@ -110,17 +129,10 @@ def run(args: argparse.Namespace) -> int:
 
         found = calibrate(runs, rig, alone=args.alone, progress=progress)
         progress('report')
-        report = report_html(found, date)
-    in_json = json.dumps(result(found, date), indent=1, allow_nan=False)
-    files = {
-        'rig.yaml': _rig_yaml(args.params_file, rig, found, date),
-        'calibration.json': in_json + '\n',
-        'report.html': report,
-    }
-    for name, text in files.items():
-        save(text.encode(errors='replace'), out / name)
+        files = asked.files(rig, found)
+    save_all(files, out)
     if args.json:
-        print(in_json)  # noqa: T201 - JSON has no control characters, and its lines may be long
+        print(files['calibration.json'].removesuffix('\n'))  # noqa: T201 - no control characters, long lines
         return 0
     show(sentence(found))
     for direction in found.undetermined:
@@ -129,17 +141,101 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _runs_of(args: argparse.Namespace, rig: Rig) -> list[Run]:
-    return read_runs(args.recordings, rig, references=args.reference, exposure=args.exposure, namespace=args.namespace)
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What is asked of each calibration, as the options say it; goes to a worker. ``date``: of the calibration."""
+
+    params_file: str | None
+    namespace: str | None
+    exposure: float
+    alone: bool
+    date: str
+    references: tuple[str, ...] = ()
+
+    def rig(self, recordings: Sequence[str], tell: Callable[[str], None]) -> Rig:
+        """The known rig; ``tell`` is told if the recording names none."""
+        if self.params_file is not None:
+            return load_rig(self.params_file)
+        recording = open_recording(recordings[0], namespace=self.namespace)
+        for warning in nominal_rig(recording):
+            tell(warning)
+        return rig_at_end(recording)
+
+    def runs(self, recordings: Sequence[str], rig: Rig) -> list[Run]:
+        """The recordings with their references."""
+        return read_runs(recordings, rig, references=self.references, exposure=self.exposure, namespace=self.namespace)
+
+    def files(self, rig: Rig, found: Calibration) -> dict[str, str]:
+        """The files of --out by their names."""
+        return {
+            'rig.yaml': _rig_yaml(self.params_file, rig, found, self.date),
+            'calibration.json': json.dumps(result(found, self.date), indent=1, allow_nan=False) + '\n',
+            'report.html': report_html(found, self.date),
+        }
 
 
-def _rig_of(args: argparse.Namespace) -> Rig:
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What the task of one of many recordings gives."""
+
+    files: dict[str, str]
+    cells: dict[str, object]
+    warnings: list[str]
+
+
+def answer_of(path: str, asked: Asked) -> Answer:
+    """The task for one of many recordings."""
+    warnings: list[str] = []
+    rig = asked.rig([path], warnings.append)
+    found = calibrate(asked.runs([path], rig), rig, alone=asked.alone)
+    files = asked.files(rig, found)
+    tree = result(found, asked.date)
+    cells: dict[str, object] = {
+        'kind': found.kind,
+        'refused': found.refused or '',
+        'undetermined': len(found.undetermined),
+        'heldout_before': found.gap.heldout_before,
+        'heldout_after': found.gap.heldout_after,
+        **{name: one['value'] for name, one in tree['parameters'].items()},
+        **{f'sd {name}': one['sd'] for name, one in tree['parameters'].items()},
+        'result': files['calibration.json'],
+    }
+    return Answer(files, cells, warnings)
+
+
+def _fields() -> list[Field]:
+    """Columns of --each: each parameter and its standard deviation; ``result`` is the content of calibration.json."""
+    of_parameters = [Field(NAMES[i], float, UNITS[i]) for i in REPORTED]
+    return [
+        ERROR,
+        Field('kind', str),
+        Field('refused', str),
+        Field('undetermined', int),
+        Field('heldout_before', float, 'm'),
+        Field('heldout_after', float, 'm'),
+        *of_parameters,
+        *(Field(f'sd {f.name}', float, f.unit) for f in of_parameters),
+        Field('result', str),
+    ]
+
+
+def _each(args: argparse.Namespace, names: list[str], asked: Asked) -> int:
+    if args.reference:
+        raise UsageError('--reference: not with --each, which takes the reference that is in each recording')
     if args.params_file is not None:
-        return load_rig(args.params_file)
-    recording = open_recording(args.recordings[0], namespace=args.namespace)
-    for warning in nominal_rig(recording):
-        warn(warning)
-    return rig_at_end(recording)
+        # What is wrong in it is so for all.
+        load_rig(args.params_file)
+    return answer_each(args, names, partial(answer_of, asked=asked), _fields(), HEAD, _line)
+
+
+def _line(cells: Mapping[str, Any]) -> list[str]:
+    state = 'refused' if cells['refused'] else 'calibrated'
+    return [
+        state,
+        cells['kind'],
+        str(cells['undetermined']),
+        *(f'{cells[key] * 1e6:.2f}' for key in ('heldout_before', 'heldout_after')),
+    ]
 
 
 def _rig_yaml(params_file: str | None, rig: Rig, found: Calibration, date: str) -> str:
@@ -161,7 +257,10 @@ def _check(args: argparse.Namespace) -> int:
     if not is_calibrated(rig):
         raise ConfigError(f'{args.check}: calibration.names: not there; --check takes the rig.yaml of a calibration')
     with told('checking', quiet=args.quiet or args.json):
-        found = checking.check(_runs_of(args, rig), rig, alone=args.alone)
+        runs = read_runs(
+            args.recordings, rig, references=args.reference, exposure=args.exposure, namespace=args.namespace
+        )
+        found = checking.check(runs, rig, alone=args.alone)
     if args.json:
         print_json(checking.result(found), indent=1)
         return 0

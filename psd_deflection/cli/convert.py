@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
     parser.add_argument(
         '--out',
-        type=recording_name(rerun=True),
+        type=recording_name('.rrd'),
         metavar='OUT',
         required=True,
         help='output: X.csv, X.mcap, X.rrd, or a bag folder (any other name)',

@@ -10,31 +10,40 @@ DIR gets model.yaml (the rig with the effects found; use it as --params-file), r
 result.json. Where no effect fits, DIR also gets law.yaml: an empirical law for what remains. With --adopt NAME
 the law becomes an effect of yours, and model.yaml has it. The exit status is 0 whatever was found.
 
+All REC together are one experiment. With --each every REC, or .yaml list, is one for itself: DIR/REC gets its files, or
+X.parquet a row. REC may then be a pattern, or a .txt file that lists recordings and patterns.
+
   psd-deflection discover odd.csv --out found
   psd-deflection discover a.csv b.csv --params-file my_rig.yaml --out found
+  psd-deflection discover 'archive/*' --each --executor processes --out found
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from psd_deflection import __version__
-from psd_deflection.cli._options import make_folder, namespace_option, seed
+from psd_deflection.cli._fleet import ERROR, absolute, answer_each, each_for_itself, each_option, recordings_argument
+from psd_deflection.cli._options import make_folder, make_writable, namespace_option, seed
 from psd_deflection.cli._progress import told
-from psd_deflection.cli._report import save, show, warn
+from psd_deflection.cli._report import save, save_all, show, warn
 from psd_deflection.cli._rig_file import rig_file
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.discovery.discover import Discovery, discover
+from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.report import report_html
 from psd_deflection.discovery.result import model_yaml, result, sentence
-from psd_deflection.errors import RecordingError, UsageError
+from psd_deflection.errors import UsageError
+from psd_deflection.fleet.parquet import Field
 from psd_deflection.parameter_files import with_effects_section, with_values
 from psd_deflection.recordings.observations import read_observations
 from psd_deflection.simulation.catalogue import FOLDERS, effect_folders, effect_names, effects_to_values
@@ -44,14 +53,33 @@ from psd_deflection.simulation.laws import Law, effect_of, law_text, values_of
 STEPS = 8
 """Steps that the progress bar counts: described, signatures, adding, weighing, alternatives, where, report, done."""
 
+FIELDS = (
+    ERROR,
+    Field('verdict', str),
+    Field('effects', str),
+    Field('unknown', int),
+    Field('setup', str),
+    Field('gap_before', float, 'm'),
+    Field('gap_after', float, 'm'),
+    Field('gap_floor', float, 'm'),
+    Field('heldout_before', float, 'm'),
+    Field('heldout_after', float, 'm'),
+    Field('simulations', int),
+    Field('result', str),
+)
+"""Columns of --each. ``result`` is the content of result.json."""
+
+HEAD = ('verdict', 'effects', 'gap before (um)', 'after', 'floor')
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('recordings', metavar='REC', nargs='+', help='recordings, or .yaml lists of them')
+    recordings_argument(parser, 'recordings, or .yaml lists of them')
     parser.add_argument(
         '--params-file', metavar='RIG.yaml', help='the rig as it is known (default: the parameters in the recording)'
     )
     parser.add_argument('--out', metavar='DIR', required=True, help='folder for model.yaml, report.html, result.json')
+    each_option(parser)
     parser.add_argument(
         '--seed', type=seed, default=0, help='seed of the bootstraps; the same gives the same answer (default 0)'
     )
@@ -74,19 +102,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, discover, write, and say it in a sentence."""
-    given = None if args.params_file is None else load_rig(args.params_file)
     for name in args.without:
         if name not in effect_names():
             raise UsageError(f'--without {name}: no effect of that name; there are: {", ".join(effect_names())}')
+    if args.params_file is not None:
+        # Before the search, which takes its time.
+        load_rig(args.params_file)
+    asked = Asked(absolute(args.params_file), args.namespace, args.seed, tuple(args.without), args.adopt)
+    names = each_for_itself(args)
+    if names is not None:
+        return _each(args, names, asked)
     folder = None if args.adopt is None else _adopting(args.adopt)
-    with told('reading', quiet=args.quiet or args.json):
-        observations = read_observations(args.recordings, given, namespace=args.namespace, warn=warn, any_rate=True)
     out = Path(args.out)
-    make_folder(args.out)
-    # Before the search, which takes its time.
-    if not os.access(out, os.W_OK):
-        raise RecordingError(f'--out {out}: cannot be written in; give another folder')
-    rig = observations[0].rig if given is None else given
+    with told('reading', quiet=args.quiet or args.json):
+        observations = asked.read(args.recordings, warn)
+    make_writable(args.out)
     # Reading took most of what can be foreseen; a search has as many steps as it has effects to weigh.
     hidden = True if args.quiet or args.json else None
     with tqdm(total=STEPS, disable=hidden, file=sys.stderr, bar_format='{l_bar}{bar}| {elapsed}') as bar:
@@ -96,32 +126,22 @@ def run(args: argparse.Namespace) -> int:
             if bar.n < STEPS - 1:
                 bar.update()
 
-        found = discover(observations, rig, seed=args.seed, without=args.without, progress=progress)
+        found = asked.discover(observations, progress)
         progress('report')
         page = report_html(found)
         bar.set_description_str('done')
         bar.update(STEPS - bar.n)
-    in_json = json.dumps(result(found), indent=1, allow_nan=False)
-    laws = [] if found.law is None else found.law.adopted(args.adopt or 'law')
+    laws = asked.laws(found)
     adopted: list[Path] = []
     if folder is not None and laws:
         make_folder(str(folder))
         adopted = [folder / f'{law.name}.yaml' for law in laws]
         for law, path in zip(laws, adopted, strict=True):
             save(_law_file(law).encode(), path)
-    files = {
-        'model.yaml': _model(args.params_file, rig, found, _with_law(found, laws) if adopted else found.active_effects),
-        'result.json': in_json + '\n',
-        'report.html': page,
-        **{
-            f'{law.name if args.adopt is None else law.name.replace(args.adopt, "law", 1)}.yaml': _law_file(law)
-            for law in laws
-        },
-    }
-    for name, text in files.items():
-        save(text.encode(errors='replace'), out / name)
+    files = asked.files(observations, found, page)
+    save_all(files, out)
     if args.json:
-        print(in_json)  # noqa: T201 - JSON has no control characters, and its lines may be long
+        print(files['result.json'].removesuffix('\n'))  # noqa: T201 - no control characters, and its lines may be long
         return 0
     show(sentence(found))
     for finding in found.setup:
@@ -139,6 +159,92 @@ def run(args: argparse.Namespace) -> int:
         show(f'--adopt {args.adopt}: there is no law to adopt')
     show(f'{found.simulations} forward simulations; see {out / "report.html"}')
     return 0
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What is asked of each search, as the options say it; goes to a worker."""
+
+    params_file: str | None
+    namespace: str | None
+    seed: int
+    without: tuple[str, ...]
+    adopt: str | None = None
+
+    def read(self, recordings: Sequence[str], tell: Callable[[str], None]) -> list[Observation]:
+        """The recordings; ``tell`` is told what is odd."""
+        given = None if self.params_file is None else load_rig(self.params_file)
+        return read_observations(recordings, given, namespace=self.namespace, warn=tell, any_rate=True)
+
+    def rig(self, observations: Sequence[Observation]) -> Rig:
+        """The known rig."""
+        return observations[0].rig if self.params_file is None else load_rig(self.params_file)
+
+    def discover(
+        self, observations: Sequence[Observation], progress: Callable[[str], None] = lambda _: None
+    ) -> Discovery:
+        """The search."""
+        return discover(observations, self.rig(observations), seed=self.seed, without=self.without, progress=progress)
+
+    def laws(self, found: Discovery) -> list[Law]:
+        """The laws that were found, by the name that they get."""
+        return [] if found.law is None else found.law.adopted(self.adopt or 'law')
+
+    def files(self, observations: Sequence[Observation], found: Discovery, page: str) -> dict[str, str]:
+        """The files of --out by their names."""
+        laws = self.laws(found)
+        effects = _with_law(found, laws) if self.adopt is not None and laws else found.active_effects
+        return {
+            'model.yaml': _model(self.params_file, self.rig(observations), found, effects),
+            'result.json': json.dumps(result(found), indent=1, allow_nan=False) + '\n',
+            'report.html': page,
+            **{
+                f'{law.name if self.adopt is None else law.name.replace(self.adopt, "law", 1)}.yaml': _law_file(law)
+                for law in laws
+            },
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What the task of one of many recordings gives."""
+
+    files: dict[str, str]
+    cells: dict[str, object]
+    warnings: list[str]
+
+
+def answer_of(path: str, asked: Asked) -> Answer:
+    """The task for one of many recordings."""
+    warnings: list[str] = []
+    observations = asked.read([path], warnings.append)
+    found = asked.discover(observations)
+    files = asked.files(observations, found, report_html(found))
+    cells: dict[str, object] = {
+        'verdict': found.verdict,
+        'effects': ', '.join(e.active.label for e in found.effects),
+        'unknown': len(found.unknown),
+        'setup': '; '.join(f'{f.name} {f.where}' for f in found.setup),
+        'gap_before': found.gap_before,
+        'gap_after': found.gap_after,
+        'gap_floor': found.gap_floor,
+        'heldout_before': found.gap_heldout_before,
+        'heldout_after': found.gap_heldout_after,
+        'simulations': found.simulations,
+        'result': files['result.json'],
+    }
+    return Answer(files, cells, warnings)
+
+
+def _each(args: argparse.Namespace, names: list[str], asked: Asked) -> int:
+    if args.adopt is not None:
+        raise UsageError(f'--adopt {args.adopt}: not with --each, which may find many laws; adopt one by itself')
+    return answer_each(args, names, partial(answer_of, asked=asked), FIELDS, HEAD, _line)
+
+
+def _line(cells: Mapping[str, Any]) -> list[str]:
+    effects = cells['effects'] or '-'
+    return [cells['verdict'], effects, *(f'{cells[key] * 1e6:.2f}' for key in ('gap_before', 'gap_after', 'gap_floor'))]
 
 
 def _adopting(name: str) -> Path:

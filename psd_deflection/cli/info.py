@@ -1,40 +1,85 @@
 """Summarise a recording: duration, samples, losses, topics, device and changed parameters.
 
-The whole recording is read, so that damage anywhere is found.
+The whole recording is read, so that damage anywhere is found. Of several recordings you get a table. REC may also be
+a pattern, or a .txt file that lists recordings and patterns.
 
   psd-deflection info bags/clean
   psd-deflection info recordings/psd_20260101_120000 --json
+  psd-deflection info 'recordings/*' --executor processes --out all.parquet
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import json
 from collections.abc import Mapping
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from msg_adapters import SAMPLES
-from psd_deflection.cli._options import namespace_option
+from psd_deflection.cli._fleet import (
+    ERROR,
+    executor_option,
+    recordings_argument,
+    run_each,
+    several,
+    tell_each,
+    write_rows,
+)
+from psd_deflection.cli._options import namespace_option, parquet_name
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show
+from psd_deflection.fleet.parquet import Field, ParquetFile
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.summary import summary
 
 _EPOCH_FROM_NS = 10**18
 """September 2001; smaller times do not count from the epoch."""
 
+FIELDS = (
+    ERROR,
+    Field('complete', bool),
+    Field('bytes', int, 'B'),
+    Field('start_ns', int, 'ns'),
+    Field('duration_s', float, 's'),
+    Field('samples', int),
+    Field('lost', int),
+    Field('flagged', int),
+    Field('restarts', int),
+    Field('sample_rate_hz', float, 'Hz'),
+    Field('blocks', int),
+    Field('block_size', int),
+    Field('namespace', str),
+    Field('node', str),
+    Field('version', str),
+    Field('lacks', str),
+    Field('warnings', str),
+    Field('topics', str),
+    Field('parameters', str),
+)
+"""Columns of --out. ``topics`` and ``parameters`` are JSON."""
+
+HEAD = ('state', 'seconds', 'samples', 'lost', 'flagged', 'rate (1/s)', 'lacks')
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
+    recordings_argument(parser, 'a bag folder, an .mcap or a .csv; a pattern or a .txt list of them')
+    parser.add_argument('--out', metavar='X.parquet', type=parquet_name, help='write a row a recording')
     namespace_option(parser)
+    executor_option(parser)
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the summary."""
-    recording = open_recording(Path(args.recording), namespace=args.namespace)
+    """Print the summary, or a table of many."""
+    names = several(args)
+    if names is not None:
+        return _many(args, names)
+    recording = open_recording(Path(args.recordings[0]), namespace=args.namespace)
     with told('counting messages', quiet=args.json):
         topics = recording.topics()
     found = summary(recording, topics, progress_of(recording.blocks(), topics.get(SAMPLES), quiet=args.json))
@@ -43,6 +88,41 @@ def run(args: argparse.Namespace) -> int:
         return 0
     show(*_lines(found))
     return 0
+
+
+def summary_of(name: str, namespace: str | None) -> dict[str, Any]:
+    """The task for one of many recordings."""
+    recording = open_recording(name, namespace=namespace)
+    return summary(recording, recording.topics(), recording.blocks())
+
+
+def _many(args: argparse.Namespace, names: list[str]) -> int:
+    found: dict[str, dict[str, Any]] = {}
+    with contextlib.ExitStack() as stack:
+        out = None if args.out is None else stack.enter_context(ParquetFile(args.out, FIELDS))
+        failed = run_each(args, names, partial(summary_of, namespace=args.namespace), found.__setitem__)
+        if out is not None:
+            write_rows(out, names, {name: _row(one) for name, one in found.items()}, failed)
+    tell_each(args, names, found, failed, HEAD, _line)
+    return 0
+
+
+def _row(found: Mapping[str, Any]) -> dict[str, object]:
+    texts = {name: '; '.join(found[name]) for name in ('lacks', 'warnings')}
+    return {**found, **texts, **{name: json.dumps(found[name]) for name in ('topics', 'parameters')}}
+
+
+def _line(found: Mapping[str, Any]) -> list[str]:
+    state = 'complete' if found['complete'] and not found['warnings'] else 'damaged'
+    return [
+        state,
+        f'{found["duration_s"]:.3f}',
+        str(found['samples']),
+        str(found['lost']),
+        str(found['flagged']),
+        f'{found["sample_rate_hz"]:.6g}',
+        str(len(found['lacks'])),
+    ]
 
 
 def _lines(found: Mapping[str, Any]) -> list[str]:

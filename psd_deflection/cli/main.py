@@ -28,6 +28,7 @@ from psd_deflection.errors import (
     MachineError,
     PsdDeflectionError,
     RecordingError,
+    SomeFailedError,
     UsageError,
     did_you_mean,
     printable,
@@ -212,6 +213,10 @@ def _run(argv: list[str]) -> int:
             raise
         _tell(f'psd-deflection {args.command}: interrupted{aside}')
         return INTERRUPTED
+    except SomeFailedError as error:
+        # The others are done, and their output is complete.
+        _tell(f'psd-deflection {args.command}: {error}')
+        return error.exit_status
     except PsdDeflectionError as error:
         aside = set_aside(Path(out)) if out is not None and fresh else ''
         _tell(f'psd-deflection {args.command}: {error}{aside}')

@@ -5,45 +5,59 @@ With the recorded parameters (the default) the estimates are the published ones,
 both hold; --strict also if one of them lacks a message of the other. With --params-file you see what
 another rig would have estimated from the same samples.
 
+Of several recordings you get a table; REC may also be a pattern, or a .txt file that lists recordings and patterns.
+Then --out X.parquet takes the estimates of all.
+
   psd-deflection replay recordings/psd_20260101_120000 --compare
   psd-deflection replay run.csv --params-file my_rig.yaml --out estimates.csv
   psd-deflection replay recordings/psd_20260101_120000 --out again.mcap
+  psd-deflection replay 'recordings/*' --executor processes --out estimates.parquet
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import time
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from psd_deflection.cli._fleet import absolute, executor_option, recordings_argument, run_each, several, tell_each
 from psd_deflection.cli._options import namespace_option, recording_name, refuse
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show, show_text, warn
-from psd_deflection.config import Rig
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.errors import UsageError
+from psd_deflection.fleet.parquet import ENDING, Field, ParquetFile, is_parquet
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.comparison import Comparison
+from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.replay_engine import nominal_rig, open_for_replay, replayed
+from psd_deflection.recordings.replay_engine import GatheredEstimates, nominal_rig, open_for_replay, replayed
 from psd_deflection.recordings.sinks import Sink, open_sink
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock
+from psd_deflection.tables import Column
 
 DIFFERS = 1
+HEAD = ('state', 'seconds', 'samples', 'lost', 'blocks', 'estimates', 'refused')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
+    recordings_argument(parser, 'a bag folder, an .mcap or a .csv; a pattern or a .txt list of them')
     parser.add_argument(
         '--params-file', metavar='RIG.yaml', help='use this rig instead of the parameters in the recording'
     )
     parser.add_argument(
         '--out',
-        type=recording_name(rerun=True),
+        type=recording_name('.rrd', ENDING),
         metavar='OUT',
-        help='write the estimates: X.csv, X.mcap, X.rrd or a bag folder (X)',
+        help='write the estimates: X.csv, X.mcap, X.rrd or a bag folder (X); of many recordings X.parquet',
     )
     parser.add_argument(
         '--compare', action='store_true', help='compare with the recorded estimates; exit status 1 if a bit differs'
@@ -52,6 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--strict', action='store_true', help='with --compare: what only one side holds is a difference too'
     )
     namespace_option(parser)
+    executor_option(parser)
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')
 
 
@@ -90,38 +105,57 @@ class Totals:
         return self.recording.lost(self.first_seq, self.last_seq, self.samples) if self.first_seq is not None else 0
 
 
+@dataclass
+class Replay:
+    """One recording through the pipeline."""
+
+    recording: Recording
+    rig: Rig
+    pipeline: Pipeline
+    totals: Totals
+    comparison: Comparison | None
+    warnings: list[str]
+    seconds: float = 0.0
+
+    def summary(self) -> dict[str, object]:
+        """What came out, for programs."""
+        counters = self.pipeline.counters
+        return {
+            'samples': self.totals.samples,
+            'lost': self.totals.lost,
+            'blocks': self.totals.blocks,
+            'estimates': counters.estimates,
+            'refused': counters.refused,
+            'solver': self.rig.estimator.solver,
+            'seconds': self.totals.seconds,
+            'compared': None if self.comparison is None else self.comparison.counts(),
+        }
+
+
 def run(args: argparse.Namespace) -> int:
     """Replay."""
     if not args.compare:
         refuse(args, {'strict': False}, 'needs --compare')
-    recording, rig = open_for_replay(args.recording, args.params_file, args.namespace)
-    pipeline = Pipeline(rig)
+    names = several(args)
+    if names is not None:
+        return _many(args, names)
+    path = args.recordings[0]
+    recording, rig = open_for_replay(path, args.params_file, args.namespace)
     with told('looking for what was recorded', quiet=args.json):
         comparison = Comparison(recording) if args.compare else None
     sink: Sink | None = None
     if args.out is not None:
         sink = open_sink(args.out, rig.flat(), device_hello=recording.hello)
-    totals = Totals(recording)
-    began = time.perf_counter()
     bar = progress_of(recording.blocks(), quiet=args.json)
     try:
-        for records in replayed(recording, pipeline, bar):
-            for record in records:
-                totals.add(record)
-                if sink is not None:
-                    sink.put(record)
-            if comparison is not None:
-                comparison.add(records)
+        done = _replayed(recording, rig, args.params_file, comparison, [] if sink is None else [sink.put], bar)
     finally:
         bar.close()
         if sink is not None:
             sink.close()
-    seconds = time.perf_counter() - began
-    for warning in [*recording.warnings, *nominal_rig(recording, args.params_file), *_rate_warning(recording, rig)]:
+    for warning in done.warnings:
         warn(warning)
-    if comparison is not None:
-        comparison.finish()
-    _print_summary(args, rig, pipeline, totals, seconds, comparison)
+    _print_summary(args, done)
     if comparison is None:
         return 0
     text = comparison.summary()
@@ -130,7 +164,116 @@ def run(args: argparse.Namespace) -> int:
     if comparison.same and not comparison.identical:
         text += ' (--strict counts them as differences)'
     show_text(text, aside=args.json)
-    return 0 if comparison.identical or (comparison.same and not args.strict) else DIFFERS
+    return 0 if _agrees(comparison.counts(), args.strict) else DIFFERS
+
+
+def _replayed(
+    recording: Recording,
+    rig: Rig,
+    params_file: str | None,
+    comparison: Comparison | None,
+    takers: Iterable[Callable[[Record], None]],
+    blocks: Iterable[SampleBlock] | None = None,
+) -> Replay:
+    """Every record to each of ``takers``; ``comparison`` is finished."""
+    pipeline, totals = Pipeline(rig), Totals(recording)
+    began = time.perf_counter()
+    for records in replayed(recording, pipeline, blocks):
+        for record in records:
+            totals.add(record)
+            for take in takers:
+                take(record)
+        if comparison is not None:
+            comparison.add(records)
+    seconds = time.perf_counter() - began
+    warnings = [*recording.warnings, *nominal_rig(recording, params_file), *_rate_warning(recording, rig)]
+    if comparison is not None:
+        comparison.finish()
+    return Replay(recording, rig, pipeline, totals, comparison, warnings, seconds)
+
+
+def _agrees(counts: Mapping[str, object], strict: bool) -> bool:
+    return bool(counts['identical'] or (counts['same'] and not strict))
+
+
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """What the task of one of many recordings gives: JSON, warnings, and the estimates if they are written."""
+
+    summary: dict[str, object]
+    warnings: list[str]
+    columns: list[Column]
+
+
+def replay_of(path: str, *, params_file: str | None, namespace: str | None, compare: bool, columns: bool) -> Replayed:
+    """The task for one of many recordings."""
+    recording, rig = open_for_replay(path, params_file, namespace)
+    gathered = GatheredEstimates()
+    comparison = Comparison(recording) if compare else None
+    done = _replayed(recording, rig, params_file, comparison, [gathered.add] if columns else [])
+    return Replayed(done.summary(), done.warnings, _columns(gathered.series()) if columns else [])
+
+
+def _columns(series: EstimateSeries) -> list[Column]:
+    table = series.table()
+    return [table.index, *table.columns]
+
+
+def _many(args: argparse.Namespace, names: list[str]) -> int:
+    if args.out is not None and not is_parquet(args.out):
+        raise UsageError(f'--out {args.out}: of many recordings the estimates go into one X{ENDING}')
+    if args.params_file is not None:
+        # What is wrong in it is so for all.
+        load_rig(args.params_file)
+    found: dict[str, dict[str, object]] = {}
+    with contextlib.ExitStack() as stack:
+        out: ParquetFile | None = None
+        if args.out is not None:
+            fields = [
+                Field(c.name, int if c.values.dtype.kind == 'i' else float, c.unit)
+                for c in _columns(GatheredEstimates().series())
+            ]
+            out = stack.enter_context(ParquetFile(args.out, fields))
+
+        def take(name: str, one: Replayed) -> None:
+            found[name] = one.summary
+            for warning in one.warnings:
+                warn(warning)
+            if out is not None:
+                cells = {c.name: c.values for c in one.columns}
+                out.put([name] * one.columns[0].values.size, cells)
+
+        work = partial(
+            replay_of,
+            params_file=absolute(args.params_file),
+            namespace=args.namespace,
+            compare=args.compare,
+            columns=args.out is not None,
+        )
+        failed = run_each(args, names, work, take)
+        if out is not None:
+            out.close(failed)
+    tell_each(args, names, found, failed, HEAD, partial(_line, strict=args.strict))
+    differs = args.compare and not all(_agrees(_counts(one), args.strict) for one in found.values())
+    return DIFFERS if differs else 0
+
+
+def _counts(summary: Mapping[str, Any]) -> Mapping[str, object]:
+    counts: Mapping[str, object] = summary['compared']
+    return counts
+
+
+def _line(found: Mapping[str, Any], strict: bool) -> list[str]:
+    state = 'replayed'
+    if found['compared'] is not None:
+        state = 'the same' if _agrees(_counts(found), strict) else 'DIFFERS'
+    refused = sum(found['refused'].values())
+    return [
+        state,
+        f'{found["seconds"]:.1f}',
+        *(str(found[key]) for key in ('samples', 'lost', 'blocks', 'estimates')),
+        str(refused),
+    ]
 
 
 def _rate_warning(recording: Recording, rig: Rig) -> list[str]:
@@ -143,35 +286,26 @@ def _rate_warning(recording: Recording, rig: Rig) -> list[str]:
     ]
 
 
-def _print_summary(
-    args: argparse.Namespace,
-    rig: Rig,
-    pipeline: Pipeline,
-    totals: Totals,
-    seconds: float,
-    comparison: Comparison | None,
-) -> None:
-    counters = pipeline.counters
+def _print_summary(args: argparse.Namespace, done: Replay) -> None:
+    totals, counters = done.totals, done.pipeline.counters
+    path = args.recordings[0]
     poses = np.array(totals.poses).reshape(-1, 3)
     if args.json:
-        summary = {
-            'recording': str(args.recording),
-            'samples': totals.samples,
-            'lost': totals.lost,
-            'blocks': totals.blocks,
-            'estimates': counters.estimates,
-            'refused': counters.refused,
-            'solver': rig.estimator.solver,
-            'seconds': totals.seconds,
-            'replay_seconds': seconds,
-            'out': args.out,
-            'compared': None if comparison is None else comparison.counts(),
-        }
-        print_json(summary)
+        summary = done.summary()
+        compared = summary.pop('compared')
+        print_json(
+            {
+                'recording': str(path),
+                **summary,
+                'replay_seconds': done.seconds,
+                'out': args.out,
+                'compared': compared,
+            }
+        )
         return
     show(
-        f'{args.recording}: {totals.samples} samples, {totals.lost} lost, {totals.blocks} blocks, '
-        f'{counters.estimates} estimates ({rig.estimator.solver})'
+        f'{path}: {totals.samples} samples, {totals.lost} lost, {totals.blocks} blocks, '
+        f'{counters.estimates} estimates ({done.rig.estimator.solver})'
     )
     for cause, count in sorted(counters.refused.items()):
         show(f'  no estimate: {count} {"block" if count == 1 else "blocks"}, {cause.replace("_", " ")}')
@@ -181,6 +315,6 @@ def _print_summary(
             f'  ΔX {low[0] * 1e6:+.2f} … {high[0] * 1e6:+.2f} µm, ΔY {low[1] * 1e6:+.2f} … {high[1] * 1e6:+.2f} µm, '
             f'θ {np.rad2deg(low[2]) * 1e3:+.2f} … {np.rad2deg(high[2]) * 1e3:+.2f} mdeg'
         )
-    show(f'  {totals.seconds:.1f} s of data in {seconds:.2f} s')
+    show(f'  {totals.seconds:.1f} s of data in {done.seconds:.2f} s')
     if args.out is not None:
         show(f'  written to {Path(args.out)}')

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import struct
 import zlib
+from collections.abc import Mapping
 from enum import IntEnum, StrEnum
 from typing import NamedTuple
 
@@ -136,6 +137,8 @@ _STATUS = struct.Struct('<BIh')
 _PING = struct.Struct('<BQ')
 _PONG = struct.Struct('<BQQ')
 _CRC = struct.Struct('<I')
+_RESIDUE = 0x2144DF1C
+"""CRC-32 of anything with its own CRC-32 behind it, little-endian."""
 
 
 def _seal(payload: bytes) -> bytes:
@@ -179,22 +182,22 @@ def encode(frame: GoodFrame, *, wide: bool = False) -> bytes:
         raise ValueError(f'{frame!r}: {error}') from None
 
 
-def _parse(payload: bytes, size: int, psds: int) -> Frame:
-    """``payload``: type, body and CRC, COBS decoded; ``size``: encoded size, for the report; ``psds``: of a sample."""
+def _parse(payload: bytes, size: int, samples: Mapping[int, struct.Struct]) -> Frame:
+    """``payload``: type, body and CRC, COBS decoded; ``size``: encoded size; ``samples``: layouts by the type."""
     if len(payload) < 5:
         return BadFrame(BadReason.TOO_SHORT, size)
-    body = payload[:-4]
-    if zlib.crc32(body) != _CRC.unpack_from(payload, len(payload) - 4)[0]:
+    if zlib.crc32(payload) != _RESIDUE:
         return BadFrame(BadReason.CRC, size)
-    kind = body[0]
-    if kind == FrameType.SAMPLE or kind == FrameType.WIDE_SAMPLE:
-        layout = _SAMPLES[FrameType(kind)][psds]
-        if len(body) != layout.size:
+    kind = payload[0]
+    layout = samples.get(kind)
+    if layout is not None:
+        if len(payload) != layout.size + _CRC.size:
             return BadFrame(BadReason.LENGTH, size)
-        _, flags, seq, t_device_us, *counts = layout.unpack(body)
-        if t_device_us > MAX_DEVICE_US:
+        fields = layout.unpack_from(payload)
+        if fields[3] > MAX_DEVICE_US:
             return BadFrame(BadReason.BODY, size)
-        return SampleFrame(flags, seq, t_device_us, tuple(counts))
+        return SampleFrame(fields[1], fields[2], fields[3], fields[4:])
+    body = payload[: -_CRC.size]
     if kind == FrameType.STATUS:
         if len(body) != _STATUS.size:
             return BadFrame(BadReason.LENGTH, size)
@@ -237,7 +240,7 @@ class FrameDecoder:
     """
 
     def __init__(self, psds: int = 2) -> None:
-        self._psds = psds
+        self._samples = {int(kind): layouts[psds] for kind, layouts in _SAMPLES.items()}
         self._rest = b''
         self._dropped = 0
         self._in_step = False
@@ -245,17 +248,16 @@ class FrameDecoder:
     def feed(self, received: bytes) -> list[Frame]:
         """The frames that end in ``received``, in order."""
         pieces = received.split(b'\x00')
+        self._keep(pieces[0])
         if len(pieces) == 1:
-            self._keep(received)
             return []
         frames: list[Frame] = []
-        self._keep(pieces[0])
-        self._close(frames)
-        for piece in pieces[1:-1]:
-            self._rest = piece
-            if len(piece) > MAX_ENCODED:
-                self._keep(b'')
-            self._close(frames)
+        if self._rest or self._dropped:
+            first = self._decoded(self._rest) if self._rest else BadFrame(BadReason.TOO_LONG, self._dropped)
+            if self._in_step or not isinstance(first, BadFrame):
+                frames.append(first)
+        frames += [self._decoded(piece) for piece in pieces[1:-1] if piece]
+        self._rest, self._dropped, self._in_step = b'', 0, True
         self._keep(pieces[-1])
         return frames
 
@@ -267,18 +269,12 @@ class FrameDecoder:
         if len(self._rest) > MAX_ENCODED:
             self._dropped, self._rest = len(self._rest), b''
 
-    def _close(self, frames: list[Frame]) -> None:
-        encoded, dropped, in_step = self._rest, self._dropped, self._in_step
-        self._rest, self._dropped, self._in_step = b'', 0, True
-        frame: Frame
-        if dropped:
-            frame = BadFrame(BadReason.TOO_LONG, dropped)
-        elif not encoded:
-            return
-        else:
-            try:
-                frame = _parse(cobs.decode(encoded), len(encoded), self._psds)
-            except cobs.DecodeError:
-                frame = BadFrame(BadReason.COBS, len(encoded))
-        if in_step or not isinstance(frame, BadFrame):
-            frames.append(frame)
+    def _decoded(self, encoded: bytes) -> Frame:
+        """What the bytes between two zeros are."""
+        size = len(encoded)
+        if size > MAX_ENCODED:
+            return BadFrame(BadReason.TOO_LONG, size)
+        try:
+            return _parse(cobs.decode(encoded), size, self._samples)
+        except cobs.DecodeError:
+            return BadFrame(BadReason.COBS, size)

@@ -67,7 +67,8 @@ class EstimateSeries:
         variances = np.diagonal(self.covariance, axis1=1, axis2=2)
         return np.sqrt(np.where(variances >= 0.0, variances, np.nan))
 
-    def _table(self) -> Table:
+    def table(self) -> Table:
+        """The columns with their units, over ``t`` (s)."""
         axes = ('displacement along X', 'displacement along Y', 'twist about Z')
         columns = [
             Column('t_ns', self.t_ns, 'ns', 'time, since the epoch if the recording has it'),
@@ -90,14 +91,14 @@ class EstimateSeries:
 
         Raises ConfigError if pandas is not installed.
         """
-        return self._table().to_pandas()
+        return self.table().to_pandas()
 
     def to_xarray(self) -> xarray.Dataset:
         """One variable a quantity over ``t`` (s), with ``units`` and ``long_name``.
 
         Raises ConfigError if xarray is not installed.
         """
-        return self._table().to_xarray()
+        return self.table().to_xarray()
 
     def _summary(self) -> list[tuple[str, str]]:
         rows = [('estimates', str(len(self)))]

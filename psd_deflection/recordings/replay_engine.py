@@ -118,25 +118,41 @@ def replayed_estimates(recording: Recording, rig: Rig) -> EstimateSeries:
     """
     if recording.block_size != rig.estimator.block_size:
         recording = recording.with_block_size(rig.estimator.block_size)
-    found: list[DeflectionEstimate] = []
-    wrenches: dict[int, TipLoad] = {}
-    start_ns: int | None = None
+    gathered = GatheredEstimates()
     for records in replayed(recording, Pipeline(rig)):
         for record in records:
-            if isinstance(record, DeflectionEstimate) and record.primary:
-                found.append(record)
-            elif isinstance(record, TipLoad):
-                wrenches[record.t_ns] = record
-            elif isinstance(record, SampleBlock) and start_ns is None:
-                start_ns = int(record.t_ns[0])
-    nothing = TipLoad(0, np.nan, np.nan, np.nan)
-    return EstimateSeries(
-        DEFLECTION,
-        np.array([e.t_ns for e in found], dtype=np.int64),
-        np.array([e.pose for e in found], dtype=np.float64).reshape(-1, 3),
-        np.array([(e.phi, e.omega) for e in found], dtype=np.float64).reshape(-1, 2),
-        np.array([e.covariance for e in found], dtype=np.float64).reshape(-1, 3, 3),
-        np.array([wrenches.get(e.t_ns, nothing)[1:] for e in found], dtype=np.float64).reshape(-1, 3),
-        np.array([e.chi_square for e in found], dtype=np.float64),
-        start_ns,
-    )
+            gathered.add(record)
+    return gathered.series()
+
+
+class GatheredEstimates:
+    """The primary estimates and tip loads among the records of a replay."""
+
+    def __init__(self) -> None:
+        self._found: list[DeflectionEstimate] = []
+        self._wrenches: dict[int, TipLoad] = {}
+        self._start_ns: int | None = None
+
+    def add(self, record: Record) -> None:
+        """Take one record."""
+        if isinstance(record, DeflectionEstimate) and record.primary:
+            self._found.append(record)
+        elif isinstance(record, TipLoad):
+            self._wrenches[record.t_ns] = record
+        elif isinstance(record, SampleBlock) and self._start_ns is None:
+            self._start_ns = int(record.t_ns[0])
+
+    def series(self) -> EstimateSeries:
+        """All of them so far."""
+        found = self._found
+        nothing = TipLoad(0, np.nan, np.nan, np.nan)
+        return EstimateSeries(
+            DEFLECTION,
+            np.array([e.t_ns for e in found], dtype=np.int64),
+            np.array([e.pose for e in found], dtype=np.float64).reshape(-1, 3),
+            np.array([(e.phi, e.omega) for e in found], dtype=np.float64).reshape(-1, 2),
+            np.array([e.covariance for e in found], dtype=np.float64).reshape(-1, 3, 3),
+            np.array([self._wrenches.get(e.t_ns, nothing)[1:] for e in found], dtype=np.float64).reshape(-1, 3),
+            np.array([e.chi_square for e in found], dtype=np.float64),
+            self._start_ns,
+        )

@@ -89,12 +89,12 @@ def test_a_value_that_an_option_does_not_take_is_status_2(
     assert [p.name for p in folder.iterdir()] == ['taken']
 
 
-@pytest.mark.parametrize(('command', 'also'), [('convert', '.rrd'), ('replay', '.rrd'), ('simulate', '')])
+@pytest.mark.parametrize(('command', 'also'), [('convert', '.rrd'), ('replay', '.rrd .parquet'), ('simulate', '')])
 def test_a_recording_is_not_written_under_the_ending_of_something_else(
     command: str, also: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = [] if command == 'simulate' else [CLEAN]
-    for suffix in sorted(FOREIGN - {also}):
+    for suffix in sorted(FOREIGN - {*also.split()}):
         for name in (f'run{suffix}', f'run_0.5N{suffix.upper()}'):
             status, err = refused(capsys, command, *arguments, '--out', name)
             assert status == 2

@@ -25,15 +25,19 @@ def test_a_signal_ends_the_waiting_for_a_silent_device(
 ) -> None:
     device.answer = b''
     monkeypatch.setattr('psd_deflection.runner.acquisition.SILENCE_S', 60.0)
-    before = signal.getsignal(number)
+    # Under nohup the tests themselves are started with SIGHUP ignored.
+    before = signal.signal(number, signal.SIG_DFL)
 
     def end() -> None:
         device.greeted.wait(60.0)
         os.kill(os.getpid(), number)
 
     threading.Thread(target=end, daemon=True).start()
-    assert run_headless({'port': str(device.link)}, Display().say, lambda session: None, start_views) == 0
-    assert signal.getsignal(number) is before
+    try:
+        assert run_headless({'port': str(device.link)}, Display().say, lambda session: None, start_views) == 0
+        assert signal.getsignal(number) is signal.SIG_DFL
+    finally:
+        signal.signal(number, before)
 
 
 def test_a_signal_ends_the_waiting_for_one_that_is_away(device: Any, sample: Any) -> None:

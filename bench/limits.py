@@ -1,0 +1,386 @@
+"""``make bench``, without a live line: frames, replay, conversion, simulation, discover beside peers and limits.
+
+    python -m bench.limits [--only frames] [--minutes 10] [--times 5]
+
+A peer is what a user would write with known libraries; a limit is the least that any program must do. All are measured
+in turns in this process and kept in ``bench/results.json``, from which ``python -m bench.page`` makes
+docs/performance.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import csv
+import struct
+import sys
+import tempfile
+import time
+import unittest.mock
+import zlib
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+import pandas
+from cobs import cobs
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from mcap_ros2.writer import Writer
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from scipy.signal import lsim
+
+from bench.live import make_recording
+from bench.rows import RESULTS, Row, figure, in_turns, keep, tell
+from msg_adapters import SAMPLES, point_cloud2
+from psd_deflection.config import Rig, load_rig
+from psd_deflection.discovery.discover import discover
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.protocol.frames import FrameDecoder, SampleFrame, encode
+from psd_deflection.recordings.conversion import Beside, convert
+from psd_deflection.recordings.observations import read_observation
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.replay_engine import replayed, rig_at_start
+from psd_deflection.recordings.simulated_recording import SimulatedRecording
+from psd_deflection.records import CHANNELS, FloatArray, RawChunk
+from psd_deflection.simulation.effect_words import with_effects_of
+from psd_deflection.simulation.load_words import load_history
+from psd_deflection.simulation.samples import SimulatedSamples
+from psd_deflection.simulation.simulator import ForwardModel
+
+READ_FRAMES = 18
+"""Frames of one read: the reader waits until a block is nearly whole."""
+
+TEN = (
+    'clamp_bending_compliance,compliance=1e-4',
+    'damping,bending_ratio=0.02',
+    'creep,amplitude=0.03',
+    'load_direction,angle=0.01',
+    'sensor_position,psd=1,x=1e-3',
+    'sensor_rotation,psd=2,angle=0.01',
+    'axis_crosstalk,psd=1,xy=0.02',
+    'sensor_gain,psd=2,x=0.01',
+    'thermal_drift,psd=1,x=1e-6',
+    'mains_interference,frequency=50,amplitude_x1=0.001',
+)
+
+
+def frames(times: int) -> list[Row]:
+    """A stream of samples, in pieces as the port gives them, and at once."""
+    random = np.random.default_rng(0)
+    counts = random.integers(-30000, 30000, (20000, 6)).tolist()
+    stream = b''.join(encode(SampleFrame(0, i, 1000 * i, tuple(row))) for i, row in enumerate(counts))
+    step = READ_FRAMES * len(stream) // len(counts)
+    pieces = [stream[i : i + step] for i in range(0, len(stream), step)]
+    layout, crc = struct.Struct('<BBIQ6h'), struct.Struct('<I')
+
+    def ours(received: list[bytes]) -> int:
+        decoder = FrameDecoder()
+        return sum(len(decoder.feed(piece)) for piece in received)
+
+    def peer(received: list[bytes]) -> int:
+        rest, found = b'', 0
+        for piece in received:
+            *whole, rest = (rest + piece).split(b'\0')
+            decoded = []
+            for frame in whole:
+                payload = cobs.decode(frame)
+                if zlib.crc32(payload[:-4]) == crc.unpack(payload[-4:])[0]:
+                    decoded.append(layout.unpack(payload[:-4]))
+            found += len(decoded)
+        return found
+
+    def limit(received: list[bytes]) -> None:
+        for piece in received:
+            for frame in piece.split(b'\0'):
+                zlib.crc32(frame)
+
+    if ours(pieces) != len(counts) or peer(pieces) != len(counts):
+        raise SystemExit('frames were lost')
+    per_frame = 1e6 / len(counts)
+    return [
+        in_turns(
+            f'frame decoding, {what}',
+            'us a frame',
+            per_frame,
+            times,
+            ('FrameDecoder', 'ours', partial(ours, received), None),
+            ('cobs + struct, frame by frame', 'peer', partial(peer, received), bound),
+            ('split and crc32 of the same bytes', 'limit', partial(limit, received), None),
+        )
+        for what, received, bound in (('in pieces as they are read', pieces, 1.0), ('at once', [stream], 5.0))
+    ]
+
+
+def replay(times: int, minutes: float) -> list[Row]:
+    """A recording through the pipeline with all solvers."""
+    with tempfile.TemporaryDirectory() as folder:
+        path, n = make_recording(Path(folder), minutes)
+        (file,) = path.glob('*.mcap')
+        rig = rig_at_start(open_recording(path))
+
+        def ours() -> None:
+            recording = open_recording(path)
+            pipeline = Pipeline(rig)
+            for _records in replayed(recording, pipeline):
+                pass
+            if pipeline.counters.samples != n:
+                raise SystemExit(f'replay saw {pipeline.counters.samples} of {n} samples')
+
+        def by_rosbags() -> None:
+            pipeline = Pipeline(rig)
+            with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+                wanted = [c for c in reader.connections if c.topic == SAMPLES]
+                for connection, _, raw in reader.messages(wanted):
+                    message = reader.deserialize(raw, connection.msgtype)
+                    _process(pipeline, message)
+
+        def by_mcap_ros2() -> None:
+            pipeline = Pipeline(rig)
+            with file.open('rb') as stream:
+                found = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages([SAMPLES])
+                for _, _, _, message in found:
+                    _process(pipeline, message)
+
+        def limit() -> None:
+            with file.open('rb') as stream:
+                for _message in make_reader(stream).iter_messages():
+                    pass
+
+        return [
+            in_turns(
+                f'replay of {minutes:g} minutes to estimates, all solvers',
+                's',
+                1.0,
+                times,
+                ('psd_deflection replay', 'ours', ours, None),
+                ('the pipeline fed by rosbags', 'peer', by_rosbags, 1.0),
+                ('the pipeline fed by mcap-ros2-support', 'peer', by_mcap_ros2, 1.0),
+                ('bare mcap iteration of the file', 'limit', limit, 1.3),
+            )
+        ]
+
+
+def _process(pipeline: Pipeline, message: Any) -> None:
+    """The samples of a PointCloud2 of either library."""
+    points = _points(message)
+    volts = np.stack([points[c] for c in CHANNELS], axis=1)
+    stamp = message.header.stamp
+    t_ns = int(stamp.sec) * 10**9 + int(stamp.nanosec) + 1_000_000 * np.arange(len(points), dtype=np.int64)
+    chunk = RawChunk(points['seq'].astype(np.int64), t_ns, volts, np.zeros(len(points), np.uint8))
+    for _record in pipeline.process(chunk):
+        pass
+
+
+_DTYPES = {2: 'u1', 5: '<i4', 6: '<u4', 7: '<f4', 8: '<f8'}
+
+
+def _points(message: Any) -> npt.NDArray[np.void]:
+    layout = {
+        'names': [f.name for f in message.fields],
+        'formats': [_DTYPES[f.datatype] for f in message.fields],
+        'offsets': [f.offset for f in message.fields],
+        'itemsize': message.point_step,
+    }
+    points: npt.NDArray[np.void] = np.frombuffer(bytes(message.data), np.dtype(cast(Any, layout)))
+    return points
+
+
+def conversion(times: int, minutes: float) -> list[Row]:
+    """CSV to bag and back, with the samples alone."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        table = folder / 'run.csv'
+        n = round(minutes * 60_000)
+        volts = np.random.default_rng(0).normal(0.0, 1.0, (n, 6)).astype(np.float32)
+        with table.open('w', newline='') as stream:
+            writer = csv.writer(stream)
+            writer.writerow(['t', *CHANNELS])
+            writer.writerows((f'{i / 1000:.9f}', *map(str, row)) for i, row in enumerate(volts))
+        number = iter(range(10**6))
+
+        def new(ending: str) -> Path:
+            return folder / f'out_{next(number)}{ending}'
+
+        def ours(source: Path, out: Path) -> None:
+            recording = open_recording(source)
+            if convert(recording, out, recording.parameters, Beside.of(recording), recording.blocks()) != n:
+                raise SystemExit('samples were lost')
+
+        bag = folder / 'run.mcap'
+        ours(table, bag)
+
+        def pandas_to_mcap() -> None:
+            frame = pandas.read_csv(table, dtype=dict.fromkeys(CHANNELS, np.float32))
+            points = np.zeros(len(frame), [('seq', '<u4'), *((c, '<f4') for c in CHANNELS)])
+            points['seq'] = np.arange(len(frame))
+            for channel in CHANNELS:
+                points[channel] = frame[channel]
+            t_ns = np.rint(frame['t'].to_numpy() * 1e9).astype(np.int64)
+            with new('.mcap').open('wb') as stream:
+                writer = Writer(stream)
+                schema = writer.register_msgdef('sensor_msgs/msg/PointCloud2', point_cloud2.MESSAGE.definition)
+                for first in range(0, len(points), 20):
+                    block = points[first : first + 20]
+                    at = int(t_ns[first])
+                    header = {'stamp': {'sec': at // 10**9, 'nanosec': at % 10**9}, 'frame_id': 'psd'}
+                    message = {
+                        'header': header,
+                        'height': 1,
+                        'width': len(block),
+                        'fields': [
+                            {'name': f, 'offset': of, 'datatype': 6 if f == 'seq' else 7, 'count': 1}
+                            for f, (_, of, *_) in (points.dtype.fields or {}).items()
+                        ],
+                        'is_bigendian': False,
+                        'point_step': points.dtype.itemsize,
+                        'row_step': block.nbytes,
+                        'data': block.tobytes(),
+                        'is_dense': True,
+                    }
+                    writer.write_message(SAMPLES, schema, message, at, at)
+                writer.finish()
+
+        def mcap_to_pandas() -> None:
+            parts = []
+            with bag.open('rb') as stream:
+                found = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages([SAMPLES])
+                for _, _, _, message in found:
+                    parts.append(_points(message))
+            points = np.concatenate(parts)
+            frame = pandas.DataFrame({c: points[c] for c in CHANNELS})
+            frame.insert(0, 't', np.arange(len(frame)) / 1000)
+            frame.to_csv(new('.csv'), index=False)
+
+        def copied(source: Path) -> Callable[[], None]:
+            def copy() -> None:
+                new('.copy').write_bytes(source.read_bytes())
+
+            return copy
+
+        return [
+            in_turns(
+                f'CSV to bag, {minutes:g} minutes of samples',
+                's',
+                1.0,
+                times,
+                ('psd_deflection convert', 'ours', lambda: ours(table, new('.mcap')), None),
+                ('pandas and mcap-ros2-support by hand', 'peer', pandas_to_mcap, 1.0),
+                ('reading and writing the bytes of the CSV', 'limit', copied(table), None),
+            ),
+            in_turns(
+                f'bag to CSV, {minutes:g} minutes of samples',
+                's',
+                1.0,
+                times,
+                ('psd_deflection convert', 'ours', lambda: ours(bag, new('.csv')), None),
+                ('mcap-ros2-support and pandas by hand', 'peer', mcap_to_pandas, 1.0),
+                ('reading and writing the bytes of the CSV', 'limit', copied(table), None),
+            ),
+        ]
+
+
+def simulation(times: int) -> list[Row]:
+    """60 s of the rig with ten effects; the peer has the three modes alone, without optics, effects and electronics."""
+    rig = with_effects_of(load_rig(), TEN, 'bench')
+    loads = np.zeros((60_000, 3))
+    loads[5_000:30_000] = (5.0, -10.0, 2.0)
+    model = ForwardModel(rig)
+    physics = model.physics
+    t = np.arange(len(loads)) * physics.period
+    modes = [
+        (2.0 * np.pi * f, z)
+        for f, z in (
+            (physics.bending_frequency, physics.bending_damping_ratio),
+            (physics.bending_frequency, physics.bending_damping_ratio),
+            (physics.torsion_frequency, physics.torsion_damping_ratio),
+        )
+    ]
+
+    def peer() -> None:
+        for axis, (w, z) in enumerate(modes):
+            lsim(([w * w], [1.0, 2.0 * z * w, w * w]), loads[:, axis], t, interp=False)
+
+    arrays: list[FloatArray] = [np.zeros((3, len(t))), np.zeros((4, len(t))), np.zeros((6, len(t)))]
+
+    def limit() -> None:
+        for array in arrays:
+            np.multiply(array, 1.0001)
+
+    return [
+        in_turns(
+            'forward simulation, 60 s, ten effects',
+            'ms',
+            1e3,
+            times,
+            ('ForwardModel', 'ours', lambda: ForwardModel(rig).run(loads), None),
+            ('scipy lsim of its three modes alone', 'peer', peer, 20.0),
+            ('one pass of numpy over pose, dots and volts', 'limit', limit, None),
+        )
+    ]
+
+
+def search(times: int, seconds: float) -> list[Row]:
+    """``discover`` beside the forward simulations that it made."""
+    known = load_rig()
+    rig: Rig = with_effects_of(known, ['sensor_rotation,psd=2,angle=0.01'], 'bench')
+    history = load_history('identification', 1000.0)
+    loads = np.resize(history.loads, (round(1000 * seconds), 3))
+    observation = read_observation(SimulatedRecording(rig, known, loads), known)
+    inside: list[float] = []
+    counts: list[int] = []
+    expect = ForwardModel.expect
+
+    def timed(model: ForwardModel, loads: FloatArray, temperature: FloatArray | None = None) -> SimulatedSamples:
+        began = time.perf_counter()
+        try:
+            return expect(model, loads, temperature)
+        finally:
+            inside[-1] += time.perf_counter() - began
+
+    def ours() -> None:
+        inside.append(0.0)
+        with unittest.mock.patch.object(ForwardModel, 'expect', timed):
+            found = discover([observation], known)
+        if [e.active.effect.name for e in found.effects] != ['sensor_rotation']:
+            raise SystemExit(f'discover found {found.effects}')
+        counts.append(found.simulations)
+
+    what = f'discover, {seconds:g} s of a recording, one effect'
+    row = in_turns(what, 's', 1.0, times, ('discover', 'ours', ours, None))
+    row.figures.append(figure(f'in its {counts[0]} forward simulations', 'limit', inside, 1.3))
+    return [row]
+
+
+def main() -> int:
+    """Measure and keep."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--minutes', type=float, default=10.0, help='of the recordings that are replayed and converted')
+    parser.add_argument('--seconds', type=float, default=60.0, help='of the recording that discover gets')
+    parser.add_argument('--times', type=int, default=5)
+    parser.add_argument('--only', choices=('frames', 'replay', 'conversion', 'simulation', 'discover'))
+    parser.add_argument('--results', type=Path, default=RESULTS)
+    args = parser.parse_args()
+    jobs: dict[str, Callable[[], list[Row]]] = {
+        'frames': lambda: frames(args.times),
+        'replay': lambda: replay(args.times, args.minutes),
+        'conversion': lambda: conversion(args.times, args.minutes),
+        'simulation': lambda: simulation(args.times),
+        'discover': lambda: search(max(1, args.times // 2), args.seconds),
+    }
+    for name, job in jobs.items():
+        if args.only in (None, name):
+            rows = job()
+            for row in rows:
+                tell(row)
+            keep(rows, args.results)
+    return 0
+
+
+if __name__ == '__main__':
+    with contextlib.suppress(KeyboardInterrupt):
+        sys.exit(main())

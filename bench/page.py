@@ -1,0 +1,57 @@
+"""Makes docs/performance.md from bench/results.json: ``python -m bench.page`` (the last step of ``make bench``)."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from bench.rows import RESULTS, ROOT, Figure, Row, read
+
+TEMPLATE = ROOT / 'bench' / 'performance_template.md'
+PAGE = ROOT / 'docs' / 'performance.md'
+
+
+def cell(f: Figure, unit: str) -> str:
+    spread = '' if f.runs == 1 else f' ({f.low:.3g} to {f.high:.3g})'
+    return f'{f.median:.3g}{spread} {unit}'
+
+
+def lines_of(row: Row) -> list[str]:
+    """The rows of the table."""
+    lines = []
+    for i, f in enumerate(row.figures):
+        verdict = '' if f.bound is None else ('met' if row.met(f) else '**not met**')
+        if f.kind == 'ours':
+            ratio, bound = '', '' if f.bound is None else f'≥ {f.bound:g}'
+        elif f.kind == 'peer':
+            ratio, bound = f'{row.ratio(f):.2f} × as fast', '' if f.bound is None else f'≥ {f.bound:g} ×'
+        else:
+            ratio, bound = f'{row.ratio(f):.2f} × the limit', '' if f.bound is None else f'≤ {f.bound:g} ×'
+        name = f.name if f.kind == 'ours' else f'{f.kind}: {f.name}'
+        lines.append(f'| {row.work if i == 0 else ""} | {name} | {cell(f, row.unit)} | {ratio} | {bound} | {verdict} |')
+    return lines
+
+
+def page(rows: Sequence[Row], machine: Mapping[str, Any]) -> str:
+    """The text of the page."""
+    versions = ', '.join(f'{name} {version}' for name, version in machine['versions'].items())
+    measured = (
+        f'{machine["date"]}, commit {machine["commit"]}, {machine["processor"]}, {machine["cores"]} cores, '
+        f'load {machine["load"]} at the end, Python {machine["python"]}, {versions}.'
+    )
+    table = ['| work | what | time | ours | wanted | |', '|---|---|---|---|---|---|']
+    for row in rows:
+        table += lines_of(row)
+    text = TEMPLATE.read_text(encoding='utf-8')
+    return text.replace('<!-- machine -->', measured).replace('<!-- table -->', '\n'.join(table))
+
+
+def main() -> int:
+    rows, machine = read(RESULTS)
+    PAGE.write_text(page(rows, machine), encoding='utf-8')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,147 @@
+"""What the benchmarks find: rows of ours, peers and limits, measured in turns, kept in ``bench/results.json``."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / 'bench' / 'results.json'
+PACKAGES = ('numpy', 'scipy', 'mcap', 'cobs', 'rclpy', 'pandas', 'rosbags')
+
+
+@dataclass
+class Figure:
+    """One thing measured several times. ``kind``: ours, peer or limit.
+
+    The ratio of a peer is how many times as fast ours is (``bound``: at least), of a limit how many times as much ours
+    takes (at most). ``bound`` of ours is what it must reach itself. None: there is none.
+    """
+
+    name: str
+    kind: str
+    median: float
+    low: float
+    high: float
+    runs: int
+    bound: float | None = None
+
+
+@dataclass
+class Row:
+    """One line of the table: ``figures`` begins with ours, all in ``unit``, less is better."""
+
+    work: str
+    unit: str
+    figures: list[Figure] = field(default_factory=list)
+
+    def ratio(self, figure: Figure) -> float:
+        """How ours stands to a peer or a limit."""
+        ours = self.figures[0].median
+        return figure.median / ours if figure.kind == 'peer' else ours / figure.median
+
+    def met(self, figure: Figure) -> bool:
+        """Whether the bound holds; True if there is none."""
+        if figure.bound is None:
+            return True
+        if figure.kind == 'ours':
+            return figure.median >= figure.bound
+        return self.ratio(figure) >= figure.bound if figure.kind == 'peer' else self.ratio(figure) <= figure.bound
+
+
+def figure(name: str, kind: str, values: npt.ArrayLike, bound: float | None = None) -> Figure:
+    """Of ``values``: their median, their quartiles, their number."""
+    low, middle, high = (float(v) for v in np.percentile(np.asarray(values, np.float64), (25, 50, 75)))
+    return Figure(name, kind, middle, low, high, np.size(values), bound)
+
+
+Job = tuple[str, str, Callable[[], object], float | None]
+"""Name, kind, what to time, bound."""
+
+
+def in_turns(work: str, unit: str, scale: float, times: int, *jobs: Job) -> Row:
+    """Time each of ``jobs`` ``times`` times, one after the other and again, so that a busy moment meets all.
+
+    ``scale``: from s to ``unit``.
+    """
+    seconds: list[list[float]] = [[] for _ in jobs]
+    for _ in range(times):
+        for (_, _, job, _), taken in zip(jobs, seconds, strict=True):
+            began = time.perf_counter()
+            job()
+            taken.append((time.perf_counter() - began) * scale)
+    return Row(
+        work, unit, [figure(n, kind, taken, bound) for (n, kind, _, bound), taken in zip(jobs, seconds, strict=True)]
+    )
+
+
+def tell(row: Row) -> None:
+    """Print it."""
+    print(row.work)
+    for f in row.figures:
+        words = f'  {f.name:52}{f.median:10.4g} {row.unit}  ({f.low:.4g} to {f.high:.4g}, {f.runs} runs)'
+        if f.kind != 'ours':
+            way = 'ours is so many times as fast' if f.kind == 'peer' else 'ours takes so many times as much'
+            words += f'  {row.ratio(f):.2f} {way}'
+        if f.bound is not None:
+            words += f' (bound {f.bound:g}{"" if row.met(f) else ", NOT MET"})'
+        print(words, flush=True)
+
+
+def keep(rows: Sequence[Row], path: Path = RESULTS) -> None:
+    """Put ``rows`` into the file, in the place of older ones of the same work."""
+    kept = {row.work: row for row in (read(path)[0] if path.is_file() else [])}
+    kept.update((row.work, row) for row in rows)
+    tree = {'machine': machine(), 'rows': [asdict(row) for row in kept.values()]}
+    path.write_text(json.dumps(tree, indent=1) + '\n', encoding='utf-8')
+
+
+def read(path: Path = RESULTS) -> tuple[list[Row], Mapping[str, Any]]:
+    """The rows, and the machine they were measured on."""
+    tree = json.loads(path.read_text(encoding='utf-8'))
+    rows = [Row(r['work'], r['unit'], [Figure(**f) for f in r['figures']]) for r in tree['rows']]
+    return rows, tree['machine']
+
+
+def machine() -> dict[str, object]:
+    """Where and of what the figures are; the load of the machine by others, of which the spread comes."""
+    processor = next(
+        (line.partition(':')[2].strip() for line in _lines('/proc/cpuinfo') if line.startswith('model name')),
+        platform.machine(),
+    )
+    done = subprocess.run(['git', 'rev-parse', '--short=10', 'HEAD'], cwd=ROOT, capture_output=True, text=True)
+    return {
+        'date': datetime.now(UTC).date().isoformat(),
+        'commit': done.stdout.strip(),
+        'processor': processor,
+        'cores': os.cpu_count(),
+        'load': round(os.getloadavg()[0], 1),
+        'python': platform.python_version(),
+        'versions': {name: _version(name) for name in PACKAGES},
+    }
+
+
+def _lines(path: str) -> list[str]:
+    try:
+        return Path(path).read_text(encoding='utf-8').splitlines()
+    except OSError:
+        return []
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return 'not installed'

@@ -1,0 +1,199 @@
+"""The same work on each of many recordings: options, engine, progress, table, and the exit status."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from tqdm import tqdm
+
+from psd_deflection.cli._options import make_folder, make_writable
+from psd_deflection.cli._report import columns, print_json, save_all, show, show_text, warn
+from psd_deflection.errors import SomeFailedError, UsageError
+from psd_deflection.fleet.engines import FORMS, SERIAL, check_engine, open_engine
+from psd_deflection.fleet.listing import is_plain, listed
+from psd_deflection.fleet.parquet import ENDING, Field, ParquetFile, is_parquet
+from psd_deflection.fleet.tasks import Outcome, outcomes
+
+T = TypeVar('T')
+
+ERROR = Field('error', str)
+"""Column of a table with one row a recording: why it failed, else empty."""
+
+
+def recordings_argument(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add REC..., ``what`` each is."""
+    parser.add_argument('recordings', metavar='REC', nargs='+', help=what)
+
+
+def executor_option(parser: argparse.ArgumentParser) -> None:
+    """Add --executor."""
+    parser.add_argument(
+        '--executor',
+        metavar='WHERE',
+        type=check_engine,
+        help=f'for many recordings: {FORMS} (default {SERIAL}: one after the other)',
+    )
+
+
+def each_option(parser: argparse.ArgumentParser) -> None:
+    """Add --each and --executor, for the commands that else take all recordings together."""
+    parser.add_argument(
+        '--each',
+        action='store_true',
+        help=f'each REC for itself, DIR/REC or a row of X{ENDING} for each; REC may be a pattern or a .txt list',
+    )
+    executor_option(parser)
+
+
+def several(args: argparse.Namespace) -> list[str] | None:
+    """The recordings by absolute path if there may be many, None if one is named.
+
+    Raises UsageError and RecordingError.
+    """
+    words: list[str] = args.recordings
+    if len(words) == 1 and is_plain(words[0]) and args.executor is None and not is_parquet(args.out):
+        return None
+    return _paths(words)
+
+
+def each_for_itself(args: argparse.Namespace) -> list[str] | None:
+    """The recordings by absolute path with --each, else None. Raises UsageError and RecordingError."""
+    if args.each:
+        return _paths(args.recordings)
+    if args.executor is not None:
+        raise UsageError(f'--executor {args.executor}: needs --each; without it all recordings are one task')
+    if is_parquet(args.out):
+        raise UsageError(f'--out {args.out}: needs --each; without it there is one answer, and DIR is a folder')
+    return None
+
+
+def _paths(words: Sequence[str]) -> list[str]:
+    # Workers may run in another folder.
+    return list(dict.fromkeys(os.path.abspath(name) for name in listed(words)))  # noqa: PTH100 - links stay as they are
+
+
+def absolute(path: str | None) -> str | None:
+    """``path`` for workers that run in another folder."""
+    return None if path is None else os.path.abspath(path)  # noqa: PTH100 - links stay as they are
+
+
+def folders_of(names: Sequence[str], out: Path) -> dict[str, Path]:
+    """For each recording a folder of its own below ``out``, named after its path below what all have in common."""
+    common = os.path.commonpath([os.path.dirname(name) for name in names])  # noqa: PTH120 - text, as commonpath takes
+    return {name: out / Path(name).relative_to(common) for name in names}
+
+
+def run_each(
+    args: argparse.Namespace, names: Sequence[str], work: Callable[[str], T], take: Callable[[str, T], None]
+) -> dict[str, str]:
+    """Do ``work`` on each recording with the engine of --executor; returns the errors of those that failed.
+
+    ``take`` is given each name and what came out, in order. Raises ConfigError and DaemonError.
+    """
+    failed: dict[str, str] = {}
+    hidden = True if args.json or getattr(args, 'quiet', False) else None
+    with (
+        open_engine(args.executor or SERIAL, warn) as engine,
+        tqdm(total=len(names), unit=' recordings', delay=1.0, leave=False, disable=hidden, ncols=80) as bar,
+    ):
+        for outcome in outcomes(work, names, engine, bar.update):
+            _take(outcome, take, failed)
+    return failed
+
+
+def _take(outcome: Outcome[T], take: Callable[[str, T], None], failed: dict[str, str]) -> None:
+    if outcome.value is None:
+        failed[outcome.name] = outcome.error
+    else:
+        take(outcome.name, outcome.value)
+
+
+def write_rows(
+    out: ParquetFile, names: Sequence[str], rows: Mapping[str, Mapping[str, object]], failed: Mapping[str, str]
+) -> None:
+    """One row a recording: its cells, or the error alone. Ends the file."""
+    whole = [rows.get(name, {}) for name in names]
+    cells: dict[str, list[object]] = {f.name: [row.get(f.name) for row in whole] for f in out.fields}
+    cells[ERROR.name] = [failed.get(name, '') for name in names]
+    out.put(names, cells)
+    out.close(failed)
+
+
+class Answer(Protocol):
+    """What the task of one recording gives: the files of its folder, the cells of its row, warnings."""
+
+    @property
+    def files(self) -> Mapping[str, str]: ...
+
+    @property
+    def cells(self) -> Mapping[str, object]: ...
+
+    @property
+    def warnings(self) -> Sequence[str]: ...
+
+
+def answer_each(
+    args: argparse.Namespace,
+    names: Sequence[str],
+    work: Callable[[str], Answer],
+    fields: Sequence[Field],
+    head: Sequence[str],
+    line: Callable[[Mapping[str, object]], Sequence[str]],
+) -> int:
+    """Do ``work`` on each recording; its files go into a folder of its own below DIR, or its cells into X.parquet."""
+    rows: dict[str, Mapping[str, object]] = {}
+    with contextlib.ExitStack() as stack:
+        out = stack.enter_context(ParquetFile(args.out, fields)) if is_parquet(args.out) else None
+        folders = {} if out is not None else folders_of(names, make_writable(args.out))
+
+        def take(name: str, answer: Answer) -> None:
+            for warning in answer.warnings:
+                warn(f'{_short(name)}: {warning}')
+            rows[name] = answer.cells
+            if out is None:
+                save_all(answer.files, make_folder(str(folders[name])))
+
+        failed = run_each(args, names, work, take)
+        if out is not None:
+            write_rows(out, names, rows, failed)
+    tell_each(args, names, rows, failed, head, line)
+    return 0
+
+
+def tell_each(
+    args: argparse.Namespace,
+    names: Sequence[str],
+    found: Mapping[str, Mapping[str, object]],
+    failed: Mapping[str, str],
+    head: Sequence[str],
+    line: Callable[[Mapping[str, object]], Sequence[str]],
+) -> None:
+    """Print the table, or with --json one object a line. Raises SomeFailedError if some failed.
+
+    ``found``: what is printed of each as JSON; ``line``: the cells of its line under ``head``.
+    """
+    if args.json:
+        for name in names:
+            print_json({'recording': name, 'error': failed.get(name), **found.get(name, {})})
+    else:
+        lines = [
+            (_short(name), *(line(found[name]) if name in found else ('failed', *[''] * (len(head) - 1))))
+            for name in names
+        ]
+        show_text(columns([('recording', *head), *lines], left=2))
+        show(*(f'failed: {error}' for error in failed.values())) if failed else None
+        if args.out is not None:
+            show(f'written to {args.out}')
+    if failed:
+        raise SomeFailedError(f'{len(failed)} of {len(names)} recordings failed; the others are done')
+
+
+def _short(name: str) -> str:
+    """The path from here, if it is below."""
+    here = os.path.join(os.path.abspath('.'), '')  # noqa: PTH100, PTH118 - text
+    return name.removeprefix(here)

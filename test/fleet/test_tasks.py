@@ -1,0 +1,156 @@
+"""Tasks on engines: order, failures, killed workers."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Future
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pytest
+
+from bench.campaign.mortal import dies, length
+from psd_deflection import __version__
+from psd_deflection.errors import DaemonError, UsageError
+from psd_deflection.fleet.engines import check_engine, open_engine
+from psd_deflection.fleet.tasks import AHEAD, Outcome, attempt, outcomes
+
+T = TypeVar('T')
+NAMES = ['a', 'bbb', 'refused', 'cc', 'defect', 'dddd']
+
+
+class Later:
+    """An engine that finishes what the test says, in its order; ``breaks``: names that lose all workers."""
+
+    def __init__(self, slots: int, *breaks: str) -> None:
+        self.slots = slots
+        self.breaks = list(breaks)
+        self.renewed = 0
+        self.most = 0
+        self.under_way: list[tuple[Future[Any], Callable[[], Any]]] = []
+
+    def submit(self, task: Callable[..., T], *arguments: object) -> Future[T]:
+        future: Future[T] = Future()
+        name = arguments[1]
+        if name in self.breaks:
+            self.breaks.remove(str(name))
+            for waiting in (future, *(f for f, _ in self.under_way)):
+                waiting.set_exception(BrokenExecutor('killed'))
+            self.under_way = []
+            return future
+        self.under_way.append((future, lambda: task(*arguments)))
+        self.most = max(self.most, len(self.under_way))
+        # The newest first, once all slots are full or nothing else will come.
+        if len(self.under_way) == self.slots:
+            self.finish()
+        return future
+
+    def finish(self) -> None:
+        for future, answer in reversed(self.under_way):
+            future.set_result(answer())
+        self.under_way = []
+
+    def renew(self) -> None:
+        self.renewed += 1
+
+
+def test_outcomes_come_in_order_whatever_ends_first() -> None:
+    ended: list[int] = []
+    found = list(outcomes(length, NAMES, Later(3), lambda: ended.append(1)))
+    assert [o.name for o in found] == NAMES
+    assert [o.value for o in found] == [1, 3, None, 2, None, 4]
+    assert len(ended) == len(NAMES)
+    assert found[2].error == 'refused: no such recording'
+    assert found[4].error.startswith('defect: a defect of psd_deflection, ZeroDivisionError: division by zero; ')
+
+
+def test_a_lost_worker_costs_only_what_it_worked_on() -> None:
+    # `cc` breaks the pool while `a` and `bbb` are under way, and once more alone.
+    engine = Later(3, 'cc', 'cc')
+    engine.slots = 3
+
+    def alone(task: Callable[..., T], *arguments: object) -> Future[T]:
+        future = Later.submit(engine, task, *arguments)
+        if engine.renewed:
+            engine.finish()
+        return future
+
+    engine.submit = alone  # type: ignore[method-assign]
+    found = list(outcomes(length, ['a', 'bbb', 'cc', 'dddd', 'e'], engine))
+    assert [o.value for o in found] == [1, 3, None, 4, 1]
+    assert found[2].error == 'cc: its worker was killed, twice; too little memory?'
+    assert engine.renewed == 2
+
+
+def test_results_that_wait_for_an_earlier_one_are_bounded() -> None:
+    given: list[str] = []
+    first: Future[Outcome[int]] = Future()
+
+    class Slow:
+        slots = 4
+
+        def submit(self, task: Callable[..., T], *arguments: object) -> Future[T]:
+            given.append(str(arguments[1]))
+            future: Future[Any] = first if len(given) == 1 else Future()
+            if future is not first:
+                future.set_result(task(*arguments))
+            if len(given) == 4 + AHEAD:
+                first.set_result(Outcome('0', 1))
+            return future
+
+        def renew(self) -> None:
+            raise AssertionError
+
+    names = [str(i) for i in range(200)]
+    work = outcomes(length, names, Slow())
+    assert next(work).name == '0'
+    # Nothing further was begun before the first was there.
+    assert len(given) == 4 + AHEAD
+    assert [o.name for o in work] == names[1:]
+
+
+def test_a_worker_of_another_version_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert attempt(length, 'abc', __version__).value == 3
+    answer = attempt(length, 'abc', '99.0')
+    assert answer.value is None
+    assert answer.error.startswith(f'a worker has psd_deflection {__version__}, here is 99.0')
+
+
+def test_a_killed_process_costs_only_its_task(tmp_path: Path) -> None:
+    names = [str(tmp_path / name) for name in ('a', 'poison', 'bb', 'once', 'ccc')]
+    with open_engine('processes:2') as pool:
+        found = list(outcomes(dies, names, pool))
+    assert [o.value for o in found] == [1, None, 2, 4, 3]
+    assert found[1].error.endswith('poison: its worker was killed, twice; too little memory?')
+
+
+def test_a_run_that_is_given_up_leaves_no_process() -> None:
+    before = multiprocessing.active_children()
+
+    def interrupted() -> None:
+        with open_engine('processes:2') as pool:
+            next(outcomes(length, NAMES, pool))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert multiprocessing.active_children() == before
+
+
+@pytest.mark.parametrize(
+    'word', ['process', 'processes:0', 'processes:-1', 'dask://host', 'dask://:1', 'dask://a:b', '']
+)
+def test_another_word_is_refused(word: str) -> None:
+    with pytest.raises(UsageError, match='must be serial, processes'):
+        check_engine(word)
+
+
+def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('psd_deflection.fleet.engines.CONNECT_S', 0.2)
+    # Nothing listens on the port of tcpmux.
+    with (
+        pytest.raises(DaemonError, match=r'^dask://127\.0\.0\.1:1: no Dask scheduler answers'),
+        open_engine('dask://127.0.0.1:1'),
+    ):
+        pass
