@@ -22,6 +22,8 @@
 # make blind    hide effects with a second generator and see whether discover names them (an hour or two on two cores; JOBS=1 for one)
 # make blind-calibration  200 rigs of the second generator, misaligned by chance, calibrated and checked (half an hour on two idle cores; RIGS=20 for a look)
 # make blind-laws  laws that no catalogue has, drawn by chance: does discover find where they act and on what they depend (a quarter of an hour on an idle core; LAWS='--first 500' for fresh ones)
+# make blind-next  one recording leaves several effects open: do the recordings that discover --next plans settle it (half an hour on an idle core; NEXT='--only clamp' for a look)
+# make blind-watch  bumps, gains, slips and 24 quiet hours: what the watch sees, and when it is silent (half an hour on an idle core; WATCH='--runs 5 --hours 1' for a look)
 # make camera-campaign  render 10,000 frames, most of them bad, and see whether the camera is right about each (two hours)
 # make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
 # make compensate-faults  how soon the compensator holds after a fault, each HOLD_TIMES=20 times (some minutes)
@@ -44,7 +46,7 @@ BIN := $(VENV)/bin
 # A run needs the first of these, all the others need both.
 READY := $(VENV)/.installed $(VENV)/.for_tests
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak fleet firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak fleet firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -204,6 +206,14 @@ blind-calibration: $(READY)
 LAWS ?=
 blind-laws: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m blind.laws --jobs $(JOBS) $(LAWS)
+
+NEXT ?=
+blind-next: $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m blind.next --jobs $(JOBS) $(NEXT)
+
+WATCH ?=
+blind-watch: $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m blind.watch --jobs $(JOBS) $(WATCH)
 
 # Rendered frames: errors, cost, and adverse frames, of which no answer may be wrong (two hours on an idle core).
 CAMERA_FRAMES ?= 10000

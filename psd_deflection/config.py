@@ -390,6 +390,20 @@ class AcquisitionConfig:
         "when the reserve is reached: stop, or delete the oldest file of this recording (never another's)",
         choices=('stop', 'delete_oldest'),
     )
+    watch: str = parameter(
+        'off',
+        '',
+        'test all the time whether the rig is still its model, and say in /diagnostics since when it is not (on)',
+        choices=('off', 'on'),
+        # YAML reads on and off as booleans.
+        synonyms=((True, 'on'), (False, 'off')),
+    )
+    watch_dir: str = parameter(
+        '', '', 'folder in which the minutes around an alarm of the watch are kept as a recording; empty: none are kept'
+    )
+    watch_minutes: float = parameter(
+        5.0, 'min', 'how long before an alarm what is kept begins', minimum=0.5, maximum=60.0
+    )
 
 
 @dataclass(frozen=True, slots=True)

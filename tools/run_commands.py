@@ -85,6 +85,8 @@ SHORTEST = {
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
     'blind-calibration': 'RIGS=1',
     'blind-laws': 'LAWS="--laws 1 --nulls 0"',
+    'blind-next': 'NEXT="--only quantisation --designs torque"',
+    'blind-watch': 'WATCH="--runs 1 --hours 0"',
     'shots': 'SHOT_SECONDS=2',
 }
 """Variables with which a ``make`` target takes only seconds."""
@@ -94,6 +96,7 @@ SHORTER = {
     r'^python -m blind\.coverage --faults$': '--rows 1',
     r'^python -m blind\.thesis$': '--parts 1',
     r'^python -m blind\.clock$': '--runs 5',
+    r'^python -m blind\.watch\b': '--runs 1 --hours 0',
     r'^python -m blind\.modes$': '--rigs 3',
     r'^python -m blind\.motion\b': '--runs 1 --seconds 4',
     r'^ros2 topic echo\b': '--once',
@@ -106,6 +109,8 @@ VERDICTS = {
     'soak': r'real time: \d+ samples lost',
     'camera-campaign': r'adverse frames: ',
     'blind-laws': r'right variables',
+    'blind-next': r'recordings needed: ',
+    'blind-watch': r'slip of ',
     'blind': r'failures \(\d+\)',
 }
 """What a campaign says at its end: cut short, on a busy machine, it may come to another verdict than in full."""

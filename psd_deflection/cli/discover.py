@@ -10,11 +10,16 @@ DIR gets model.yaml (the rig with the effects found; use it as --params-file), r
 result.json. Where no effect fits, DIR also gets law.yaml: an empirical law for what remains. With --adopt NAME
 the law becomes an effect of yours, and model.yaml has it. The exit status is 0 whatever was found.
 
+With --next, DIR also gets next_loads.csv: the loads of the recording that best tells apart the effects that
+explain these recordings equally well; simulate --loads takes it. With --run that recording is made on the
+simulated rig and searched, and so on, until the answer is unique or no recording within the limits would help.
+
 All REC together are one experiment. With --each every REC, or .yaml list, is one for itself: DIR/REC gets its files, or
 X.parquet a row. REC may then be a pattern, or a .txt file that lists recordings and patterns.
 
   psd-deflection discover odd.csv --out found
   psd-deflection discover a.csv b.csv --params-file my_rig.yaml --out found
+  psd-deflection discover odd.csv --out found --next --limit lengths=0.4,0.5
   psd-deflection discover 'archive/*' --each --executor processes --out found
 """
 
@@ -32,13 +37,15 @@ from typing import Any
 from tqdm import tqdm
 
 from psd_deflection import __version__
+from psd_deflection.cli import _next
 from psd_deflection.cli._fleet import ERROR, absolute, answer_each, each_for_itself, each_option, recordings_argument
-from psd_deflection.cli._options import make_folder, make_writable, namespace_option, seed
+from psd_deflection.cli._options import make_folder, make_writable, namespace_option, refuse, seed
 from psd_deflection.cli._progress import told
-from psd_deflection.cli._report import save, save_all, show, warn
+from psd_deflection.cli._report import save, save_all, show, show_text, warn
 from psd_deflection.cli._rig_file import rig_file
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.discovery.discover import Discovery, discover
+from psd_deflection.discovery.loop import Settled, next_of, settle
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.report import report_html
 from psd_deflection.discovery.result import model_yaml, result, sentence
@@ -51,7 +58,9 @@ from psd_deflection.simulation.declaration import ActiveEffect
 from psd_deflection.simulation.laws import Law, effect_of, law_text, values_of
 
 STEPS = 8
-"""Steps that the progress bar counts: described, signatures, adding, weighing, alternatives, where, report, done."""
+"""Steps that the progress bar counts: described, signatures, adding, weighing, alternatives, where, report, done.
+
+Planning and further searches go on at its end."""
 
 FIELDS = (
     ERROR,
@@ -95,6 +104,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='NAME',
         help='if a law is found, write it as the effect NAME to the folder of your effects and into model.yaml',
     )
+    _next.add_arguments(parser)
+    parser.epilog = _next.HELP
     namespace_option(parser)
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     parser.add_argument('--json', action='store_true', help='print the content of result.json')
@@ -111,8 +122,16 @@ def run(args: argparse.Namespace) -> int:
     asked = Asked(absolute(args.params_file), args.namespace, args.seed, tuple(args.without), args.adopt)
     names = each_for_itself(args)
     if names is not None:
+        refuse(args, {'next': False}, 'is not for --each')
         return _each(args, names, asked)
     folder = None if args.adopt is None else _adopting(args.adopt)
+    limits = _next.limits_from_words(args.limit)
+    if args.make_it and not args.next:
+        raise UsageError('--run is for --next')
+    if not args.next:
+        refuse(args, {'limit': []}, 'is for --next')
+    if not args.make_it:
+        refuse(args, {'effect': [], 'world': [], 'at_most': 3}, 'is for the simulated rig of --next --run')
     out = Path(args.out)
     with told('reading', quiet=args.quiet or args.json):
         observations = asked.read(args.recordings, warn)
@@ -126,7 +145,25 @@ def run(args: argparse.Namespace) -> int:
             if bar.n < STEPS - 1:
                 bar.update()
 
-        found = asked.discover(observations, progress)
+        done: Settled | None = None
+        if args.make_it:
+            rig = asked.rig(observations)
+            record = _next.simulated(args, rig, out)
+            done = settle(
+                observations,
+                rig,
+                record,
+                limits=limits,
+                most=args.at_most,
+                seed=args.seed,
+                without=args.without,
+                progress=progress,
+            )
+            found, plan = done.found, done.open
+        else:
+            found = asked.discover(observations, progress)
+            progress('planning')
+            plan = next_of(found, limits) if args.next else None
         progress('report')
         page = report_html(found)
         bar.set_description_str('done')
@@ -139,6 +176,14 @@ def run(args: argparse.Namespace) -> int:
         for law, path in zip(laws, adopted, strict=True):
             save(_law_file(law).encode(), path)
     files = asked.files(observations, found, page)
+    if args.next:
+        tree = {**json.loads(files['result.json']), 'next': None if plan is None else plan.tree()}
+        if done is not None:
+            made = [{'file': f'next_{i}.csv', **p.tree()} for i, p in enumerate(done.plans, start=1)]
+            tree['run'] = {'outcome': done.outcome, 'sentence': done.sentence, 'recordings': made}
+            _next.write_list([(f'next_{i}.csv', p) for i, p in enumerate(done.plans, start=1)], out)
+        files['result.json'] = json.dumps(tree, indent=1, allow_nan=False) + '\n'
+    how = _next.write_plan(plan, out) if plan is not None and plan.useful and done is None else []
     save_all(files, out)
     if args.json:
         print(files['result.json'].removesuffix('\n'))  # noqa: T201 - no control characters, and its lines may be long
@@ -157,6 +202,16 @@ def run(args: argparse.Namespace) -> int:
         show(f'law: {out / "law.yaml"}; --adopt NAME makes it an effect')
     elif args.adopt is not None and not laws:
         show(f'--adopt {args.adopt}: there is no law to adopt')
+    if done is not None:
+        for i, p in enumerate(done.plans, start=1):
+            show(f'{out / f"next_{i}.csv"}: {p.words}')
+        show(done.sentence)
+    elif plan is not None:
+        show('', plan.sentence, '')
+        show_text(_next.plan_table(plan))
+        show('', *how)
+    elif args.next:
+        show('No other effect explains the recordings as well: there is nothing to tell apart by a further one.')
     show(f'{found.simulations} forward simulations; see {out / "report.html"}')
     return 0
 

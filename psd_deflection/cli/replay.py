@@ -3,7 +3,7 @@
 With the recorded parameters (the default) the estimates are the published ones, bit for bit.
 --compare checks this and ends with status 1 if anything differs that the recording and its replay
 both hold; --strict also if one of them lacks a message of the other. With --params-file you see what
-another rig would have estimated from the same samples.
+another rig would have estimated from the same samples. --watch says since when the rig is not its model.
 
 Of several recordings you get a table; REC may also be a pattern, or a .txt file that lists recordings and patterns.
 Then --out X.parquet takes the estimates of all.
@@ -40,6 +40,7 @@ from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay_engine import GatheredEstimates, nominal_rig, open_for_replay, replayed
 from psd_deflection.recordings.sinks import Sink, open_sink
+from psd_deflection.recordings.watched import WatchedReplay
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock
 from psd_deflection.tables import Column
 
@@ -64,6 +65,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--strict', action='store_true', help='with --compare: what only one side holds is a difference too'
+    )
+    parser.add_argument(
+        '--watch', action='store_true', help='test whether the rig stays its model, as the node does with watch: on'
     )
     namespace_option(parser)
     executor_option(parser)
@@ -138,6 +142,7 @@ def run(args: argparse.Namespace) -> int:
         refuse(args, {'strict': False}, 'needs --compare')
     names = several(args)
     if names is not None:
+        refuse(args, {'watch': False}, 'is for one recording')
         return _many(args, names)
     path = args.recordings[0]
     recording, rig = open_for_replay(path, args.params_file, args.namespace)
@@ -146,9 +151,11 @@ def run(args: argparse.Namespace) -> int:
     sink: Sink | None = None
     if args.out is not None:
         sink = open_sink(args.out, rig.flat(), device_hello=recording.hello)
+    watched = WatchedReplay(rig, recording) if args.watch else None
+    takers = [taker.put for taker in (sink, watched) if taker is not None]
     bar = progress_of(recording.blocks(), quiet=args.json)
     try:
-        done = _replayed(recording, rig, args.params_file, comparison, [] if sink is None else [sink.put], bar)
+        done = _replayed(recording, rig, args.params_file, comparison, takers, bar)
     finally:
         bar.close()
         if sink is not None:
@@ -156,6 +163,8 @@ def run(args: argparse.Namespace) -> int:
     for warning in done.warnings:
         warn(warning)
     _print_summary(args, done)
+    if watched is not None:
+        show(*watched.said(done.totals.first_ns), aside=args.json)
     if comparison is None:
         return 0
     text = comparison.summary()

@@ -20,12 +20,12 @@ from psd_deflection.config import Rig, replace_values
 from psd_deflection.discovery import proposals as propose
 from psd_deflection.discovery.cleaning import clean
 from psd_deflection.discovery.coincidence import Coincidence, coincidences
-from psd_deflection.discovery.experiment import Suggestion, suggest
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.hidden import FIRST, SETUP, beginning, mistakes
 from psd_deflection.discovery.laws import FoundLaw, find_law
 from psd_deflection.discovery.localise import Localisation, localise
 from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.planning import Suggestion, suggest
 from psd_deflection.discovery.screen import Screen
 from psd_deflection.discovery.search import BIC_ACCEPT, BUDGET, P_ACCEPT, Search, SearchResult, far, unphysical
 from psd_deflection.discovery.setup import likely_delays, likely_jumps, noise_finding, said, wire
@@ -56,11 +56,14 @@ RIVAL_BIC = 10.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rival:
-    """An effect in place of a named one, with its fitted values; ``delta_bic``: how much worse, below 0 better."""
+    """An effect in place of a named one, with its fitted values; ``delta_bic``: how much worse, below 0 better.
+    ``fit``: the whole model with it.
+    """
 
     active: ActiveEffect
     sd: Mapping[str, float]
     delta_bic: float
+    fit: Fit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,6 +104,8 @@ class Discovery:
 
     ``setup``: mistakes of the set-up and the recording, with ``lines`` that put the rig file right; ``known``: the
     effects that the rig file has already. ``law``: describes what is unknown; it is in no gap and no effect here.
+    ``rivals``: the whole models that these recordings do not exclude beside ``fit``, also those of mistakes of the
+    set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
     """
 
     verdict: str
@@ -124,6 +129,8 @@ class Discovery:
     lines: Mapping[str, object]
     known: tuple[ActiveEffect, ...]
     law: FoundLaw | None = None
+    rivals: tuple[Fit, ...] = ()
+    unsettled: tuple[str, ...] = ()
 
     @property
     def floors(self) -> float:
@@ -384,8 +391,10 @@ def _answer(
     for i, effect in enumerate(named):
         if effect.active.effect.name in SETUP:
             more, own = said(ws, fit, i, effect.delta_bic)
-            setup += more
+            setup += [dataclasses.replace(f, equivalent=effect.equivalent) for f in more]
             lines.update(own)
+    rivals = tuple(r.fit for e in named for r in e.rivals)
+    unsettled = tuple(dict.fromkeys(name for e in named for name in e.equivalent))
     named = [n for n in named if n.active.effect.name not in SETUP]
     setup += noise_finding(ws) if lattice is None else []
     if lattice is not None:
@@ -427,6 +436,8 @@ def _answer(
         lines,
         checked.known,
         law if verdict == 'unknown_effect' else None,
+        rivals,
+        unsettled,
     )
 
 
@@ -460,7 +471,7 @@ def _named(search: Search, result: SearchResult, fit: Fit, heldout: Sequence[Hel
             if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < EQUIVALENT_BIC):
                 equal.append(f)
             if (bic < RIVAL_BIC or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
-                rivals.append(Rival(f.effects[-1], _sd(f, f.covariance(), len(f.effects) - 1), bic))
+                rivals.append(Rival(f.effects[-1], _sd(f, f.covariance(), len(f.effects) - 1), bic, f))
         names = tuple(dict.fromkeys(f.effects[-1].effect.name for f in equal))
         named.append(
             NamedEffect(

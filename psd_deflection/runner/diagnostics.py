@@ -81,6 +81,7 @@ class HealthReporter:
                 *self._motion(),
                 *(self._laser(psd, new) for psd in range(1, len(self._session.rig.psds) + 1)),
                 self._recording(),
+                *(() if s.watcher is None else (s.watcher.entry(),)),
             ),
             str(hello.info.get('serial', '')) if hello is not None else '',
         )

@@ -260,7 +260,7 @@ class Recorder:
         config = rig.acquisition
         with self._naming:
             folder = new_folder(Path(config.bag_dir).expanduser())
-            missing = _missing_room(_nearest(folder), config.disk_reserve)
+            missing = missing_room(_nearest(folder), config.disk_reserve)
             if missing:
                 raise RecordingError(f'{folder}: {missing}; make room, or {ELSEWHERE}')
             try:
@@ -343,7 +343,7 @@ class Recorder:
                 self._make_room(bag, config)
 
     def _make_room(self, bag: BagWriter, config: AcquisitionConfig) -> None:
-        while missing := _missing_room(bag.folder, config.disk_reserve):
+        while missing := missing_room(bag.folder, config.disk_reserve):
             if config.disk_full != 'delete_oldest':
                 raise _FullError(missing)
             deleted = bag.drop_oldest()
@@ -363,7 +363,7 @@ def _nearest(folder: Path) -> Path:
     return next((p for p in (folder, *folder.absolute().parents) if p.exists()), Path('/'))
 
 
-def _missing_room(folder: Path, reserve: int) -> str:
+def missing_room(folder: Path, reserve: int) -> str:
     """Why the disk of ``folder`` is too full (less than ``reserve`` bytes left); '' if it is not."""
     try:
         free = shutil.disk_usage(folder).free

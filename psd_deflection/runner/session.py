@@ -26,6 +26,7 @@ from psd_deflection.runner.processing import Processing, RecordSink
 from psd_deflection.runner.realtime import lock_memory
 from psd_deflection.runner.recorder import Recorder
 from psd_deflection.runner.simulated_rig import SimulatedRigProcess, simulates
+from psd_deflection.runner.watcher import Watcher, WatcherWire
 from psd_deflection.runner.zero_store import ZeroStore
 from psd_deflection.solvers.registry import check_arrangement, check_live
 
@@ -119,6 +120,10 @@ class Session:
             self.fanout = Fanout(rig.monitor.frame_prefix)
             self.fanout.change_wires.append(self.recorder)
             self.processing.sinks.append(self.fanout)
+            self.watcher: Watcher | None = None
+            if rig.acquisition.watch == 'on':
+                self.watcher = Watcher(pipeline, say, hello.info if hello is not None else None, node)
+                self.processing.sinks.append(self.watcher)
         except BaseException:
             if hasattr(self, 'acquisition'):
                 self.acquisition.stop()
@@ -173,6 +178,8 @@ class Session:
             self._tell(lock_memory())
         # The recorder comes last: publishing has priority.
         self.fanout.wires.append(self.recorder)
+        if self.watcher is not None and self.watcher.keeps:
+            self.fanout.wires.append(WatcherWire(self.watcher))
         self.processing.start()
         if self.rig.acquisition.record:
             asked = self.record(True)
@@ -222,6 +229,8 @@ class Session:
         Returns its record, or None if the message cannot be decoded or holds a number that is not finite.
         """
         self.recorder.put(topic, TOPIC_TYPES[topic], message, self.acquisition.now_ns())
+        if self.watcher is not None:
+            self.watcher.put_message(topic, TOPIC_TYPES[topic], message, self.acquisition.now_ns())
         try:
             record = from_fields(topic, cdr.decode(TOPIC_TYPES[topic], message))
         except ValueError:
@@ -234,6 +243,8 @@ class Session:
             self.load = record
             if self.pipeline.motion_filter is not None:
                 self.processing.later(partial(self._tell_filter, record))
+            if self.watcher is not None:
+                self.processing.later(partial(self.watcher.put, record))
         for sink in self.input_sinks:
             sink.put(record)
         return record
@@ -328,6 +339,8 @@ class Session:
         if self.processing.alive:
             self._tell(Warned('a subscriber holds up the last blocks; they are not waited for'))
         folder = self.recorder.close()
+        if self.watcher is not None and not self.watcher.close(KEEP_S):
+            self._tell(Warned('watch: the disk is slow; what was to be kept may lack its end'))
         if self._store is not None and not self._store.join(KEEP_S):
             self._tell(Warned(f'{self._store.path}: the disk is slow; the zero may not be kept'))
         if self._simulated is not None:

@@ -17,7 +17,7 @@ import pytest
 from scipy.stats import chi2 as chi2_law
 
 from psd_deflection.config import load_rig
-from psd_deflection.discovery import experiment
+from psd_deflection.discovery import experiment, planning
 from psd_deflection.discovery.coincidence import coincidences
 from psd_deflection.discovery.discover import _accept, _credible, _named, _tied, _unknown
 from psd_deflection.discovery.fit import Fit, refit
@@ -314,7 +314,7 @@ def test_an_alternative_is_equivalent_up_to_a_stated_loss(loss: float, names: tu
     result = result_of(search, [active('a', x=0.0)], [[other]])
     result = dataclasses.replace(result, fit=fit)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr('psd_deflection.discovery.discover.suggest', lambda *_: experiment.Suggestion('try this', 1.0))
+        patch.setattr('psd_deflection.discovery.discover.suggest', lambda *_: planning.Suggestion('try this', 1.0))
         (named,) = _named(search, result, fit, [HeldOut(9.0, 1.0)])
     assert named.equivalent == (('b',) if equal else ())
     assert (named.suggestion is not None) == equal
@@ -766,10 +766,13 @@ def test_an_experiment_separates_by_what_no_size_of_the_other_explains(monkeypat
     workspace = Workspace([Observation('seen', RIG, volts, history.loads)])
     named, rival = refit(workspace, [given]), refit(workspace, [other])
     new = loads.steps([(0, 0, 0), (30, 0, 0)], 0.4)
-    offered = experiment.Proposal('pull', new, None, {'link.length': 0.4})
-    idle = experiment.Proposal('wait', loads.constant((0.0, 0.0, 0.0), 0.4), None, {})
-    monkeypatch.setattr(experiment, 'proposals', lambda _: [idle, offered])
-    found = experiment.suggest(workspace, named, [rival])
+    shorter = experiment.Setting('', {'link.length': 0.4})
+    offered = experiment.Proposal(shorter, experiment.Piece('pull', ('steps:0,0,0;30,0,0:0.4',)))
+    idle = experiment.Proposal(experiment.Setting(), experiment.Piece('wait', ('constant:0,0,0:0.4',)))
+    monkeypatch.setattr(planning, 'proposals', lambda *_: [idle, offered])
+    plan = planning.plan_next(workspace, named, [rival], experiment.Limits(seconds=0.8))
+    found = planning.suggest(workspace, named, [rival], experiment.Limits(seconds=0.8))
+    assert plan is not None
     assert found is not None
     assert found.words == 'pull'
     short = load_rig(overrides={'link.length': 0.4})
@@ -791,11 +794,13 @@ def test_an_experiment_separates_by_what_no_size_of_the_other_explains(monkeypat
     # A parabola, to first order.
     curve = np.polynomial.Polynomial.fit(trials, [apart(float(c)) for c in trials], 2)
     low = float(curve(curve.deriv().roots()[0].real))
-    assert found.separation == pytest.approx(low, rel=0.05)
-    assert experiment.suggest(workspace, named, []) is None
+    (told,) = plan.told
+    assert told.separation == pytest.approx(low, rel=0.05)
+    assert found.separation == max(told.separation, told.reverse)
+    assert planning.suggest(workspace, named, []) is None
 
 
 @pytest.mark.parametrize(('separation', 'enough'), [(21.7, True), (21.5, False)])
 def test_a_suggestion_says_whether_it_is_enough(separation: float, enough: bool) -> None:
-    text = experiment.Suggestion('do it', separation).text
+    text = planning.Suggestion('do it', separation).text
     assert text.startswith('do it: in simulation' if enough else 'none of the experiments')

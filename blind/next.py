@@ -1,0 +1,182 @@
+"""Does ``discover --next`` plan recordings that settle what one recording leaves open? ``make blind-next``.
+
+The second generator hides one effect in a recording of a poor design. Where ``discover`` then says that several effects
+explain it as well, the recording that it plans is made by the second generator, and so on. Where it says that no
+recording within the limits would help, every recording that it could have planned is made, and the search is asked
+again: if that separates them, the answer was wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+import zlib
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from blind.cases import DRAWS, EFFECTS, MIMICKED, gap_of, scaled
+from blind.generator import Array, Generator
+from psd_deflection.config import load_rig, replace_values
+from psd_deflection.discovery.discover import discover
+from psd_deflection.discovery.experiment import Limits, proposals
+from psd_deflection.discovery.loop import settle
+from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.planning import Plan
+
+RIG = load_rig()
+GAP = 4.0
+"""Size of the hidden effect in the first recording, in floors."""
+MOST = 3
+WANTED_SHARE, WANTED_MEDIAN = 1.0, 1.0
+
+
+def first_recordings() -> dict[str, tuple[Array, Array]]:
+    """Loads and temperature of designs that leave much open, some seconds each."""
+
+    def held(*levels: tuple[float, float, float]) -> Array:
+        return np.repeat(np.array([(0, 0, 0), *levels, (0, 0, 0)], dtype=np.float64), 1500, axis=0)
+
+    weights = held((0, -10, -5.85), (0, -30, -17.55), (0, -50, -29.25), (0, 0, 0), (0, -30, 0), (0, -50, 0))
+    designs = {
+        'one weight': held((0, -30, 0)),
+        'sidebar': held((0, -30, -17.55)),
+        'torque': held((0, 0, 20)),
+        'sideways': held((30, 0, 0)),
+    }
+    even = {name: (loads, np.full(len(loads), 21.0)) for name, loads in designs.items()}
+    warming = np.linspace(21.0, 24.0, len(weights))
+    return {**even, 'rest, warming': (np.zeros_like(weights), warming), 'weights, warming': (weights, warming)}
+
+
+def observed(
+    truth: Sequence[dict[str, Any]], loads: Array, temperature: Array | None, length: float, seed: int, name: str
+) -> Observation:
+    """A recording of the second generator."""
+    steady = np.full(len(loads), 20.0) if temperature is None else temperature
+    volts = Generator(loads, steady, length).record(truth, 'white', seed)
+    own = replace_values(RIG, {'link.length': length}) if length != RIG.link.length else RIG
+    return Observation(name, own, volts, loads, temperature)
+
+
+def one(job: tuple[str, str, float]) -> dict[str, Any]:
+    """The effect ``name`` hidden in the first recording ``design``: what became of it."""
+    name, design, gap = job
+    start = time.perf_counter()
+    seed = zlib.crc32(f'{name}-{design}'.encode())
+    loads, temperature = first_recordings()[design]
+    generator = (Generator(loads, temperature, RIG.link.length),)
+    row: dict[str, Any] = {'effect': name, 'design': design, 'gap': 0.0}
+    try:
+        sizes = ({'name': name, **DRAWS[name](np.random.default_rng(seed), size)} for size in (1.0, 100.0))
+        if all(gap_of(generator, effect) < 1e-6 for effect in sizes):
+            return {**row, 'kind': 'hidden'}
+        hidden = scaled(seed, name, gap, generator)
+        row['gap'] = gap_of(generator, hidden)
+    except (ValueError, OverflowError):
+        # A size that the generator cannot make.
+        return {**row, 'kind': 'hidden'}
+    if not 0.5 * gap < row['gap'] < 2.0 * gap:
+        # The first recording cannot show it.
+        return {**row, 'kind': 'hidden'}
+    first = observed([hidden], loads, temperature, RIG.link.length, seed, 'first')
+    made: list[Observation] = []
+    left: list[list[str]] = []
+
+    def record(plan: Plan, number: int) -> Observation:
+        left.append(sorted({t.rival for t in plan.told}))
+        length = float(str(plan.setting.changes.get('link.length', RIG.link.length)))
+        warm = plan.setting.temperature(len(plan.loads))
+        made.append(observed([hidden], plan.loads, warm, length, seed + number, f'next {number}'))
+        return made[-1]
+
+    done = settle([first], RIG, record, most=MOST)
+    named = [*(e.active.effect.name for e in done.found.effects), *(f.name for f in done.found.setup)]
+    together = sorted(done.found.unsettled)
+    row |= {
+        'outcome': done.outcome,
+        'recordings': len(done.plans),
+        'named': named,
+        'together': together,
+        'left': left,
+        'planned': [p.words for p in done.plans],
+        'verdict': done.found.verdict,
+        'right': named == [name] or (done.outcome != 'unique' and name in (*named, *together)),
+    }
+    confounded = bool(done.plans) or done.outcome != 'unique'
+    row['kind'] = 'confounded' if confounded else 'alone'
+    if done.outcome == 'limits':
+        more = []
+        for i, p in enumerate(proposals(RIG, Limits())):
+            length = float(str(p.setting.changes.get('link.length', RIG.link.length)))
+            script = p.piece.loads(1000.0)
+            warm = p.setting.temperature(len(script))
+            more.append(observed([hidden], script, warm, length, seed + 100 + i, f'all {i}'))
+        best = discover([first, *made, *more], RIG)
+        row['separable'] = [e.active.effect.name for e in best.effects] == [name] and not best.unsettled
+    row['seconds'] = time.perf_counter() - start
+    return row
+
+
+def table(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
+    """What came out, as text, and whether it is what is wanted."""
+    lines = []
+    of = [r for r in rows if r['kind'] == 'confounded']
+    ended = [r for r in of if r['outcome'] == 'limits']
+    can = [r for r in of if r['outcome'] != 'limits' or r['separable']]
+    done = [r for r in can if r['outcome'] == 'unique' and r['right']]
+    counts = [r['recordings'] for r in done]
+    for r in of:
+        words = f'{r["effect"]} in {r["design"]}: {", ".join(r["named"]) or "none"}'
+        words += f' (or {", ".join(r["together"])})' if r['together'] else ''
+        more = '' if r['outcome'] != 'limits' else ', separable' if r['separable'] else ', nor would all together'
+        wrong = '' if r['right'] else ' WRONG'
+        lines.append(f'{words}; {r["outcome"]} after {r["recordings"]}{more}{wrong}')
+        lines += [f'    {" | ".join(rivals)}: {words}' for rivals, words in zip(r['left'], r['planned'], strict=True)]
+    alone = [r for r in rows if r['kind'] == 'alone']
+    unseen = sum(r['kind'] == 'hidden' for r in rows)
+    lines.append(f'{len(rows)} recordings; {unseen} cannot show their effect')
+    lines.append(f'named at once: {sum(r["right"] for r in alone)} of {len(alone)}')
+    lines += [f'    {r["effect"]} in {r["design"]}: {r["verdict"]} {r["named"]}' for r in alone if not r['right']]
+    lines.append(f'left open by the first recording: {len(of)}')
+    lines.append(f'separable within the limits: {len(can)}; settled and right in at most {MOST}: {len(done)}')
+    lines.append(f'said to be inseparable: {len(ended)}, rightly: {sum(not r["separable"] for r in ended)}')
+    middle = float(np.median(counts)) if counts else 0.0
+    spread = ', '.join(f'{counts.count(k)} with {k}' for k in range(1, MOST + 1))
+    lines.append(f'recordings needed: {spread}; median {middle:g}')
+    met = bool(can) and len(done) >= WANTED_SHARE * len(can) and middle <= WANTED_MEDIAN
+    return '\n'.join(lines), met
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the campaign; exit status 1 if what is wanted is not met."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--only', default='', help='only effects whose name contains this')
+    parser.add_argument('--designs', default='', help='only first recordings whose name contains this')
+    parser.add_argument('--mimicked', action='store_true', help='only effects that others can replace exactly')
+    parser.add_argument('--gap', type=float, default=GAP, help='size of the hidden effect, in floors')
+    parser.add_argument('--jobs', type=int, default=1, help='processes at once')
+    parser.add_argument('--out', help='file for the rows, as JSON')
+    args = parser.parse_args(argv)
+    effects = [n for n in EFFECTS if args.only in n and (n in MIMICKED or not args.mimicked)]
+    jobs = [(n, d, args.gap) for d in first_recordings() if args.designs in d for n in effects]
+    rows = []
+    with tqdm(total=len(jobs), file=sys.stderr) as bar, ProcessPoolExecutor(args.jobs) as pool:
+        for row in pool.map(one, jobs):
+            rows.append(row)
+            bar.update()
+            if args.out:
+                Path(args.out).write_text(json.dumps(rows, indent=1))
+    text, met = table(rows)
+    print(text)
+    return 0 if met else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

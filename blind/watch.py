@@ -1,0 +1,231 @@
+"""Does the watch see what happens to a rig, and is it silent while nothing does? ``make blind-watch``.
+
+The second generator makes the readings; the pipeline makes the records from them, and the watch reads these. Each run
+holds a load, and at an instant drawn by chance the bench is bumped (the readings of one PSD jump by 5 um in some
+direction), the gain of one PSD changes by 2 %, or the clamp slips by 20 urad about some axis, so that the link rings.
+The quiet hours have the same loads over and over with fresh noise, a drift of the readings, and loads that are noted up
+to two seconds late.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from blind.generator import EI, GJ, LSB, MM_PER_V, SIGMA, Array, Generator
+from psd_deflection.config import load_rig
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.records import (
+    AppliedLoad,
+    BlockStatus,
+    DeflectionEstimate,
+    RawChunk,
+    Record,
+    SpotMeans,
+    TipLoad,
+)
+from psd_deflection.solvers.registry import solver_from_rig
+from psd_deflection.watching.watch import Alarm, Watch
+
+RATE, LENGTH = 1000, 0.585
+BUMP, GAIN, SLIP = 5e-6, 0.02, 20e-6
+SIZES = {'bump': f'{1e6 * BUMP:g} µm', 'gain': f'{100 * GAIN:g} %', 'slip': f'{1e6 * SLIP:g} µrad'}
+WITHIN_S, WANTED = 10.0, 0.95
+RUN_S, HELD_FROM_S = 24.0, 2.0
+LEVELS = ((0, 0, 0), (0, -30, 0), (0, -50, -29.25), (40, 0, 0), (0, -20, 20), (-30, -30, 0))
+DRIFT, DRIFT_HOURS = 2e-6, 3.0
+HOLD_S, HOLDS = 30, 12
+BLOCK, CHUNK = 20, 1000
+FITTED = 1.5
+"""A parabola through a block has so many times the noise of its mean, in the middle (sqrt(9/4))."""
+SPREAD = np.zeros((4, 4))
+
+
+class Run(NamedTuple):
+    """What came of one run; ``after``: from the event to the alarm, s, NaN if there was none; ``early``: before it."""
+
+    kind: str
+    after: float
+    early: bool
+    channel: str
+
+
+class Chain:
+    """Pipeline and watch, fed with volts."""
+
+    def __init__(self) -> None:
+        rig = load_rig(overrides={'solvers': ['exact']})
+        self.pipeline = Pipeline(rig)
+        self.watch = Watch(rig, self.pipeline.tip_loads.compliance)
+        self.at = 0
+        self.raised: list[Alarm] = []
+
+    def load(self, load: Array | Sequence[float]) -> None:
+        """A load that is noted now."""
+        self.watch.note(AppliedLoad(self.at * 1_000_000, *map(float, load)))
+
+    def feed(self, volts: Array) -> None:
+        """The next samples (n, 6) V."""
+        seq = np.arange(self.at, self.at + len(volts), dtype=np.int64)
+        chunk = RawChunk(seq, seq * 1_000_000, volts.astype(np.float32), np.zeros(len(seq), dtype=np.uint8))
+        self.at += len(volts)
+        before = self.watch.alarms
+        for record in self.pipeline.process(chunk):
+            self.watch.put(record)
+        if self.watch.alarms > before and self.watch.alarm is not None:
+            self.raised.append(self.watch.alarm)
+
+
+def read(clean: Array, rng: np.random.Generator) -> Array:
+    """Volts with noise, as a converter of 16 bit has them."""
+    return np.asarray(np.round((clean + SIGMA * rng.standard_normal(clean.shape)) / LSB) * LSB)
+
+
+def happened(kind: str, seed: int) -> tuple[Array, Array, float]:
+    """One event of a kind, drawn by ``seed``: the load (3,), volts (n, 6) and the time of the event, s."""
+    rng = np.random.default_rng((seed, len(kind)))
+    n, held = round(RUN_S * RATE), round(HELD_FROM_S * RATE)
+    event = round(rng.uniform(11.0, 13.5) * RATE)
+    # A change of gain shows where the dots are off the centre.
+    load = np.array(LEVELS[int(rng.integers(kind == 'gain', len(LEVELS)))], dtype=np.float64)
+    acting = np.zeros((n, 3))
+    acting[held:] = load
+    if kind == 'slip':
+        axis, turn = int(rng.integers(3)), float(rng.choice((-1.0, 1.0)))
+        # The load that moves the tip as far as the clamp does.
+        acting[event:, axis] += turn * SLIP * (3.0 * EI / LENGTH**2 if axis < 2 else GJ / LENGTH)
+    volts = Generator(acting, np.full(n, 20.0), LENGTH).clean([])
+    psd = int(rng.integers(2))
+    if kind == 'bump':
+        angle = rng.uniform(0.0, 2.0 * math.pi)
+        volts[event:, 3 * psd : 3 * psd + 2] += BUMP / MM_PER_V * np.array([math.cos(angle), math.sin(angle)])
+    elif kind == 'gain':
+        volts[event:, 3 * psd : 3 * psd + 2] *= 1.0 + float(rng.choice((-1.0, 1.0))) * GAIN
+    return load, read(volts, rng), event / RATE
+
+
+def one(job: tuple[str, int]) -> Run:
+    """One event of a kind, drawn by ``seed``, seen by the whole chain."""
+    kind, seed = job
+    load, volts, event = happened(kind, seed)
+    held = round(HELD_FROM_S * RATE)
+    chain = Chain()
+    chain.load((0.0, 0.0, 0.0))
+    chain.feed(volts[:held])
+    chain.load(load)
+    for start in range(held, len(volts), CHUNK):
+        chain.feed(volts[start : start + CHUNK])
+    early = any(a.seen_ns < 1e9 * event for a in chain.raised)
+    alarm = next((a for a in chain.raised if a.seen_ns >= 1e9 * event), None)
+    after = math.nan if alarm is None else alarm.seen_ns / 1e9 - event
+    return Run(kind, after, early, '' if alarm is None else alarm.channel)
+
+
+def quiet(job: tuple[float, int]) -> tuple[float, int, list[str], float]:
+    """Hours in which nothing happens: hours, alarms, what they said, and seconds of the watch for each block.
+
+    The watch is given block means of the second generator's clean readings with fresh noise, as much as a block's fit
+    leaves, and the poses that the method has for them: a day of samples would take the pipeline half an hour.
+    """
+    hours, seed = job
+    rng = np.random.default_rng(seed)
+    rig = load_rig()
+    solver = solver_from_rig('exact', rig)
+    compliance = Pipeline(rig).tip_loads.compliance
+    watch = Watch(rig, compliance)
+    loads = np.repeat(
+        np.array([LEVELS[i % len(LEVELS)] for i in range(HOLDS)], dtype=np.float64), HOLD_S * RATE, axis=0
+    )
+    clean = Generator(loads, np.full(len(loads), 20.0), LENGTH).clean([])[:, [0, 1, 3, 4]] * MM_PER_V
+    clean = clean.reshape(-1, BLOCK, 4).mean(axis=1)
+    noise = FITTED * SIGMA * MM_PER_V / math.sqrt(BLOCK)
+    variances = np.full(4, noise**2)
+    covariance = tuple((noise**2 * np.eye(3)).ravel().tolist())
+    turns = rng.uniform(0.0, 2.0 * math.pi, 4)
+    hold = HOLD_S * RATE // BLOCK
+    said: list[str] = []
+    at, seconds = 0, 0.0
+    step_ns = BLOCK * 1_000_000
+    while at * BLOCK < hours * 3600 * RATE:
+        # Each repetition begins with a link at rest, as it is half a minute after its last load.
+        t = (at + np.arange(len(clean))) * BLOCK / RATE
+        drift = DRIFT * np.sin(2.0 * math.pi * t[:, None] / (3600.0 * DRIFT_HOURS) + turns)
+        dots = clean + drift + noise * rng.standard_normal(clean.shape)
+        poses = solver.solve_many(dots, variances).pose
+        late = {i * hold + int(rng.integers(2 * RATE // BLOCK)): LEVELS[i % len(LEVELS)] for i in range(HOLDS)}
+        for i, (four, pose) in enumerate(zip(dots.tolist(), poses.tolist(), strict=True)):
+            t_ns = (at + i) * step_ns
+            records: list[Record] = []
+            if i in late:
+                records.append(AppliedLoad(t_ns, *map(float, late[i])))
+            dx, dy, theta = pose[:3]
+            records += [
+                DeflectionEstimate(t_ns, at + i, 'exact', dx, dy, theta, 0.0, 0.0, covariance, 0.0, True),
+                TipLoad(t_ns, dx / compliance[0], dy / compliance[1], theta / compliance[2]),
+                SpotMeans(t_ns, at + i, tuple(four), (5.0, 5.0), SPREAD, BLOCK, 0, BlockStatus.OK, ''),
+            ]
+            before, began = watch.alarms, time.thread_time()
+            for record in records:
+                watch.put(record)
+            seconds += time.thread_time() - began
+            if watch.alarms > before and watch.alarm is not None:
+                said.append(watch.alarm.words)
+        at += len(clean)
+    return at * BLOCK / 3600.0 / RATE, watch.alarms, said, seconds / at
+
+
+def table(runs: Sequence[Run], hours: float, alarms: int, said: Sequence[str], cost: float) -> tuple[str, bool]:
+    """What came out, as text, and whether it is what is wanted."""
+    lines, met = [], alarms == 0
+    for kind in dict.fromkeys(r.kind for r in runs):
+        of = [r for r in runs if r.kind == kind]
+        seen = [r for r in of if r.after <= WITHIN_S]
+        early = sum(r.early for r in of)
+        met = met and len(seen) >= WANTED * len(of) and not early
+        after = np.array([r.after for r in seen] or [math.nan])
+        lines.append(
+            f'{kind} of {SIZES[kind]}: seen within {WITHIN_S:g} s in {len(seen)} of {len(of)}, after '
+            f'{np.median(after):.1f} s in the middle, {after.max():.1f} s at most; {early} alarms before it'
+        )
+    if hours:
+        lines.append(f'{hours:.2f} quiet hours: {alarms} alarms; {1e6 * cost:.1f} us a block')
+        lines += [f'    {words}' for words in said[:20]]
+    return '\n'.join(lines), met
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the campaign; exit status 1 if what is wanted is not met."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--runs', type=int, default=100, help='events of each kind')
+    parser.add_argument('--hours', type=float, default=24.0, help='quiet hours')
+    parser.add_argument('--first', type=int, default=0, help='number of the first seed')
+    parser.add_argument('--jobs', type=int, default=1, help='processes at once')
+    args = parser.parse_args(argv)
+    jobs = [(kind, args.first + i) for i in range(args.runs) for kind in SIZES]
+    parts = [(args.hours / args.jobs, args.first + i) for i in range(args.jobs)] if args.hours else []
+    runs, hours, alarms, costs = list[Run](), 0.0, 0, list[float]()
+    said: list[str] = []
+    with tqdm(total=len(jobs) + len(parts), file=sys.stderr) as bar, ProcessPoolExecutor(args.jobs) as pool:
+        for run in pool.map(one, jobs):
+            runs.append(run)
+            bar.update()
+        for done, count, words, cost in pool.map(quiet, parts):
+            hours, alarms = hours + done, alarms + count
+            said += words
+            costs.append(cost)
+            bar.update()
+    text, met = table(runs, hours, alarms, said, float(np.mean(costs)) if costs else 0.0)
+    print(text)
+    return 0 if met else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

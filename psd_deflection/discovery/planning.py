@@ -1,0 +1,241 @@
+"""The next recording: the one that best tells apart the explanations that the recordings so far leave.
+
+``named`` is the model of the answer, ``rivals`` are those that the data does not exclude. The value of a recording is
+the mean over all pairs of them, and over which of the two is true, of the chi-square by which the wrong one would lose,
+counted up to ``SURE``. Of recordings with the same value the one with less effort is taken.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from psd_deflection.config import Rig, replace_values
+from psd_deflection.discovery.experiment import (
+    Limits,
+    Piece,
+    Setting,
+    Shown,
+    limits_to_tree,
+    nothing_of,
+    proposals,
+    shown,
+)
+from psd_deflection.discovery.fit import Fit
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.records import FloatArray
+
+TELLS_APART = 21.6
+"""lambda sin^2(theta) from which two effects are told apart: lambda sin^2(theta/2) >= 5.4, small angles."""
+SURE = 60.0
+"""Expected chi-square beyond which more is worth nothing: its scatter of 2 sqrt(60) leaves ``TELLS_APART``."""
+WORTH = 0.02
+"""Least value that a further piece must add."""
+EFFORT_OF_A_MINUTE = 0.03
+"""Value that a minute of recording must add to be worth its time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Suggestion:
+    """``separation``: smallest chi-square between the alternatives; below ``TELLS_APART`` the experiment is not
+    enough.
+    """
+
+    words: str
+    separation: float
+
+    @property
+    def text(self) -> str:
+        """The suggestion as text, for people and result.json."""
+        if self.separation < TELLS_APART:
+            return (
+                f'none of the experiments tried tells them apart; the best, {self.words}, separates by chi-square '
+                f'{self.separation:.1f} (needed: {TELLS_APART})'
+            )
+        return f'{self.words}: in simulation this separates them by chi-square {self.separation:.0f}'
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """How a rival fares: ``rival`` in place of ``named``, labels of effects. ``separation``: chi-square by which it
+    would lose in the planned recording if the named effect is true; ``reverse``: by which the named one would lose if
+    the rival is true; ``possible``: the greatest of both in any recording within the limits.
+    """
+
+    rival: str
+    named: str
+    separation: float
+    reverse: float
+    possible: float
+
+    @property
+    def separable(self) -> bool:
+        """Whether any recording within the limits tells the two apart."""
+        return self.possible >= TELLS_APART
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """The next recording: ``pieces`` one after the other in ``setting``, at ``rate`` Hz. ``told``: one per rival."""
+
+    setting: Setting
+    pieces: tuple[Piece, ...]
+    told: tuple[Told, ...]
+    limits: Limits
+    rate: float
+
+    @property
+    def loads(self) -> FloatArray:
+        """(n, 3) N, N, N m, one row a sample."""
+        return np.concatenate([p.loads(self.rate) for p in self.pieces])
+
+    @property
+    def seconds(self) -> float:
+        """Duration, s."""
+        return len(self.loads) / self.rate
+
+    @property
+    def script(self) -> list[str]:
+        """The loads in the notation of ``simulate --loads``."""
+        return [s for p in self.pieces for s in p.script]
+
+    @property
+    def useful(self) -> bool:
+        """Whether any recording within the limits tells a rival from the named model."""
+        return any(t.separable for t in self.told)
+
+    @property
+    def words(self) -> str:
+        """What to do."""
+        counted = [(w, len(list(g))) for w, g in itertools.groupby(p.words for p in self.pieces)]
+        done = '; then '.join(w if times == 1 else f'{w}, {times} times' for w, times in counted)
+        return f'{done}, {self.setting.words}' if self.setting.words else done
+
+    @property
+    def sentence(self) -> str:
+        """The plan in one sentence."""
+        rivals = ', '.join(dict.fromkeys(t.rival for t in self.told))
+        if not self.useful:
+            return f'No recording within the limits would tell {self.told[0].named} from {rivals}.'
+        apart = [t for t in self.told if t.separable]
+        least = min(max(t.separation, t.reverse) for t in apart)
+        others = ', '.join(dict.fromkeys(t.rival for t in apart))
+        out = (
+            f'Record next, {self.seconds:.0f} s: {self.words}. It tells {apart[0].named} from {others} '
+            f'(chi-square {least:.0f} at least, {TELLS_APART:g} needed)'
+        )
+        lasting = [t.rival for t in self.told if not t.separable]
+        return f'{out}; nothing within the limits tells {", ".join(lasting)} apart.' if lasting else f'{out}.'
+
+    def tree(self) -> dict[str, Any]:
+        """The plan as result.json has it."""
+        return {
+            'sentence': self.sentence,
+            'useful': self.useful,
+            'seconds': self.seconds,
+            'sample_rate_hz': self.rate,
+            'loads': self.script,
+            'celsius': self.setting.knots if self.setting.swing else None,
+            'overrides': dict(self.setting.changes),
+            'rivals': [
+                {
+                    'name': t.rival,
+                    'instead_of': t.named,
+                    'separation': t.separation,
+                    'reverse': t.reverse,
+                    'possible': t.possible,
+                    'separable': t.separable,
+                }
+                for t in self.told
+            ],
+            'limits': limits_to_tree(self.limits),
+        }
+
+
+def plan_next(workspace: Workspace, named: Fit, rivals: Sequence[Fit], limits: Limits | None = None) -> Plan | None:
+    """The recording within ``limits`` that best tells ``named`` from ``rivals``; None without rivals."""
+    if not rivals:
+        return None
+    limits = limits or Limits()
+    models = [named, *rivals]
+    known = [m.jacobian.T @ m.jacobian for m in models]
+    # One of the rivals may be true: then it is to be told from the other rivals too.
+    pairs = list(itertools.permutations(range(len(models)), 2))
+    rig = workspace.observations[0].rig
+
+    def separations(s: Shown) -> FloatArray:
+        return np.array([s.separation(a, b, known[b]) for a, b in pairs])
+
+    possible = np.zeros(len(pairs))
+    best: tuple[float, Setting, list[Piece]] = (-np.inf, Setting(), [])
+    for _, group in itertools.groupby(proposals(rig, limits), key=lambda p: id(p.setting)):
+        offered = list(group)
+        setting = offered[0].setting
+        seen = [(p.piece, shown(workspace, models, setting, p.piece.loads(rate_of(rig, setting)))) for p in offered]
+        for _, s in seen:
+            # The same for as long as a recording may be.
+            possible = np.maximum(possible, separations(s * max(limits.seconds // s.seconds, 1.0)))
+        value, chosen = _together(seen, nothing_of(models), separations, limits.seconds)
+        if chosen and value - setting.effort > best[0]:
+            best = (value - setting.effort, setting, chosen)
+    _, setting, chosen = best
+    plan = Plan(setting, tuple(chosen), (), limits, rate_of(rig, setting))
+    final = separations(shown(workspace, models, setting, plan.loads))
+    possible = np.maximum(possible, final)
+    told = []
+    for k, rival in enumerate(rivals, start=1):
+        there, back = pairs.index((0, k)), pairs.index((k, 0))
+        most = float(max(possible[there], possible[back]))
+        told.append(
+            Told(rival.effects[-1].label, _replaced(named, rival), float(final[there]), float(final[back]), most)
+        )
+    return dataclasses.replace(plan, told=tuple(told))
+
+
+def suggest(workspace: Workspace, named: Fit, others: Sequence[Fit], limits: Limits | None = None) -> Suggestion | None:
+    """The experiment that best separates ``named`` from the worst of ``others``, added to the existing recordings."""
+    plan = plan_next(workspace, named, others, limits)
+    return None if plan is None else Suggestion(plan.words, min(max(t.separation, t.reverse) for t in plan.told))
+
+
+def rate_of(rig: Rig, setting: Setting) -> float:
+    """The sample rate in ``setting``, Hz."""
+    changed = replace_values(rig, setting.changes) if setting.changes else rig
+    return changed.converter.sample_rate_hz
+
+
+def _together(
+    seen: Sequence[tuple[Piece, Shown]],
+    total: Shown,
+    separations: Callable[[Shown], FloatArray],
+    seconds: float,
+) -> tuple[float, list[Piece]]:
+    """Pieces for one recording, the most valuable first, and the value of all."""
+    chosen: list[Piece] = []
+    value = 0.0
+    while True:
+        trials: list[tuple[float, int, Piece, Shown]] = []
+        for piece, s in seen:
+            more = total + s
+            if more.seconds <= seconds + 1e-6:
+                worth = float(np.mean(np.minimum(separations(more) / SURE, 1.0)))
+                trials.append((worth - EFFORT_OF_A_MINUTE * more.seconds / 60.0, len(trials), piece, more))
+        if not trials:
+            return value, chosen
+        best, _, piece, more = max(trials, key=lambda t: t[:2])
+        # One piece is there in any case: to say what it would be like.
+        if chosen and best < value + WORTH:
+            return value, chosen
+        value, total = best, more
+        chosen.append(piece)
+
+
+def _replaced(named: Fit, rival: Fit) -> str:
+    """The label of the effect of ``named`` that ``rival`` does without."""
+    kept = {(a.effect.name, a.choices) for a in rival.effects[:-1]}
+    return ', '.join(a.label for a in named.effects if (a.effect.name, a.choices) not in kept)

@@ -1,0 +1,41 @@
+"""The watch over a replay: it hears of loads and changes when the run did."""
+
+from __future__ import annotations
+
+from psd_deflection.config import BY_NAME, Rig, replace_values
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.records import ParameterChange, Record, SampleBlock
+from psd_deflection.simulation.catalogue import effects_of_rig
+from psd_deflection.simulation.tip_load import TipLoads
+from psd_deflection.watching.watch import Alarm, Watch
+
+
+class WatchedReplay:
+    """Takes the records of a replay of ``recording`` with ``rig``. ``alarms``: all, the first first."""
+
+    def __init__(self, rig: Rig, recording: Recording) -> None:
+        effects = effects_of_rig(rig) if rig.estimator.wrench == 'effects' else ()
+        self.watch = Watch(rig, TipLoads(rig, effects).compliance)
+        self.alarms: list[Alarm] = []
+        self._rig = rig
+        self._loads = recording.loads()[::-1]
+
+    def put(self, record: Record) -> None:
+        """One record."""
+        if isinstance(record, ParameterChange):
+            values = {n: list(v) if isinstance(v, tuple) else v for n, v in record.values if n in BY_NAME}
+            self._rig = replace_values(self._rig, values) if values else self._rig
+            self.watch.changed(record, self._rig)
+            return
+        self.watch.put(record)
+        if isinstance(record, SampleBlock):
+            if self.watch.alarms > len(self.alarms) and self.watch.alarm is not None:
+                self.alarms.append(self.watch.alarm)
+            # As live: a load is noted between two blocks.
+            while self._loads and self._loads[-1].t_ns <= record.t_ns[-1]:
+                self.watch.put(self._loads.pop())
+
+    def said(self, start_ns: int) -> list[str]:
+        """Each alarm, in s since ``start_ns``; or what was watched."""
+        lines = [f'  watch: since {(a.since_ns - start_ns) / 1e9:.1f} s: {a.words}' for a in self.alarms]
+        return lines or [f'  watch: the rig is its model; watched: {self.watch.state}']

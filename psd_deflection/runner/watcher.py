@@ -1,0 +1,197 @@
+"""The watch in a run: feeds it, says what it sees, and keeps the minutes around it as a recording.
+
+The samples and inputs of the last minutes are kept in memory as they were encoded, in segments; each begins with the
+rig and the pipeline's memory, so that a replay of what is kept computes what the run did. Nothing is kept unless
+``watch_dir`` names a folder, and nothing is written unless there is an alarm. A thread of its own writes.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from msg_adapters import INPUTS, SAMPLES
+from psd_deflection.config import Rig
+from psd_deflection.errors import Failed, RecordingError, Warned
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.recordings.bag_writer import BagWriter
+from psd_deflection.records import AppliedLoad, DiagnosticEntry, ParameterChange, Record, SampleBlock
+from psd_deflection.runner.recorder import missing_room, new_folder
+from psd_deflection.watching.watch import Alarm, Watch
+
+SEGMENT_NS = 30_000_000_000
+AFTER_NS = 60_000_000_000
+"""What follows the alarm is kept too."""
+NAME = 'psd_deflection: watch'
+OK, WARN = 0, 1
+
+Kept = ParameterChange | tuple[str, str, bytes, int]
+
+
+@dataclass(slots=True)
+class _Segment:
+    """``began_ns``: of its first block. ``memory``, ``load``: as they were before it."""
+
+    rig: Rig
+    began_ns: int
+    memory: ParameterChange | None
+    load: AppliedLoad | None
+    items: list[Kept] = field(default_factory=list)
+
+
+class Watcher:
+    """A sink of records, after the one that publishes them, and a wire. ``say``: takes a line for each alarm.
+
+    ``hello``: the device's. ``node``: full name of the ROS node, for what is kept.
+    """
+
+    def __init__(
+        self, pipeline: Pipeline, say: Callable[[str], None], hello: Mapping[str, object] | None, node: str = ''
+    ) -> None:
+        config = pipeline.rig.acquisition
+        self.watch = Watch(pipeline.rig, pipeline.tip_loads.compliance)
+        self.folder: Path | None = None
+        self.failure = ''
+        self._pipeline, self._say, self._hello, self._node = pipeline, say, hello, node
+        self._parent = Path(config.watch_dir).expanduser() if config.watch_dir else None
+        self._reserve = config.disk_reserve
+        self._segments: deque[_Segment] = deque(maxlen=2 + round(60e9 * config.watch_minutes / SEGMENT_NS))
+        self._due_ns: int | None = None
+        self._said = 0
+        self._writing: threading.Thread | None = None
+
+    @property
+    def keeps(self) -> bool:
+        """Whether the minutes around an alarm are kept."""
+        return self._parent is not None
+
+    def put(self, record: Record) -> None:
+        """One record, in the thread of the pipeline."""
+        if isinstance(record, ParameterChange):
+            self.watch.changed(record, self._pipeline.rig)
+            self.put_change(record)
+            return
+        self.watch.put(record)
+        if not isinstance(record, SampleBlock):
+            return
+        t_ns = int(record.t_ns[-1])
+        if self.watch.alarms > self._said and self.watch.alarm is not None:
+            self._said = self.watch.alarms
+            self._say(Warned(f'watch: since {_clock(self.watch.alarm.since_ns)}: {self.watch.alarm.words}'))
+            if self._parent is not None and self._due_ns is None:
+                self._due_ns = t_ns + AFTER_NS
+        if self._due_ns is not None and t_ns >= self._due_ns:
+            self._keep()
+        # A block's last record: the next one begins with what the pipeline remembers now.
+        if self.keeps and (not self._segments or t_ns - self._segments[-1].began_ns >= SEGMENT_NS):
+            rig = self._pipeline.rig
+            self._segments.append(_Segment(rig, t_ns, self._pipeline.memory(rig), self.watch.load))
+
+    def put_message(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
+        """An encoded message; of samples and inputs from any thread."""
+        if self._segments and (topic == SAMPLES or topic in INPUTS):
+            self._segments[-1].items.append((topic, type_name, message, t_ns))
+
+    def put_change(self, change: ParameterChange) -> None:
+        """A change of parameters."""
+        if self._segments:
+            self._segments[-1].items.append(change)
+
+    def close(self, patience_s: float) -> bool:
+        """Write what is still to be kept; whether the disk has taken it within ``patience_s``."""
+        if self._due_ns is not None:
+            self._keep()
+        if self._writing is not None:
+            self._writing.join(patience_s)
+            return not self._writing.is_alive()
+        return True
+
+    def entry(self) -> DiagnosticEntry:
+        """The state, for ``/diagnostics``."""
+        watch, alarm = self.watch, self.watch.alarm
+        values = [
+            ('watched', watch.state),
+            ('windows', str(watch.windows)),
+            ('spoilt by motion', str(watch.spoilt)),
+            ('alarms', str(watch.alarms)),
+            ('kept', str(self.folder or '')),
+        ]
+        if alarm is not None:
+            values += _told(alarm)
+            return DiagnosticEntry(NAME, WARN, f'since {_clock(alarm.since_ns)}: {alarm.words}', tuple(values))
+        if self.failure:
+            return DiagnosticEntry(NAME, WARN, self.failure, tuple(values))
+        return DiagnosticEntry(NAME, OK, f'the rig is its model; watched: {watch.state}', tuple(values))
+
+    def _keep(self) -> None:
+        self._due_ns = None
+        segments = list(self._segments)
+        self._segments.clear()
+        if self._writing is not None and self._writing.is_alive():
+            self._say(Warned('watch: the disk still writes what was kept before; this is not kept'))
+            return
+        self._writing = threading.Thread(target=self._write, args=(segments,), name='watch', daemon=True)
+        self._writing.start()
+
+    def _write(self, segments: list[_Segment]) -> None:
+        try:
+            self.folder = self._written(segments)
+        except RecordingError as error:
+            self.failure = f'not kept: {error}'
+            self._say(Failed(f'watch: {self.failure}'))
+            return
+        self._say(f'watch: kept as {self.folder}; see `psd-deflection discover {self.folder}`')
+
+    def _written(self, segments: list[_Segment]) -> Path:
+        if self._parent is None or not segments:
+            raise RecordingError('no block has come since the last alarm was kept')
+        folder = new_folder(self._parent)
+        if missing := missing_room(folder, self._reserve):
+            raise RecordingError(f'{folder}: {missing}; make room, or name another folder (parameter watch_dir)')
+        first = segments[0]
+        bag = BagWriter(folder, rig_values=first.rig.flat(), device_hello=self._hello, node=self._node)
+        try:
+            if first.memory is not None:
+                bag.put(first.memory)
+            if first.load is not None:
+                bag.put(first.load._replace(t_ns=first.began_ns))
+            for item in (i for s in segments for i in s.items):
+                if isinstance(item, ParameterChange):
+                    bag.put(item)
+                else:
+                    bag.write_encoded(*item)
+        finally:
+            bag.close()
+        return folder
+
+
+class WatcherWire:
+    """The watcher as one of the wires of the fan-out."""
+
+    def __init__(self, watcher: Watcher) -> None:
+        self._watcher = watcher
+
+    def put(self, topic: str, type_name: str, cdr: bytes, t_ns: int) -> None:
+        """Keep one message."""
+        self._watcher.put_message(topic, type_name, cdr, t_ns)
+
+
+def _clock(t_ns: int) -> str:
+    return time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(t_ns / 1e9))
+
+
+def _told(alarm: Alarm) -> list[tuple[str, str]]:
+    unit = 'urad' if alarm.channel == 'theta' else 'um'
+    return [
+        ('since', _clock(alarm.since_ns)),
+        ('sure since', _clock(alarm.seen_ns)),
+        ('channel', alarm.channel),
+        (f'shift ({unit})', f'{1e6 * alarm.shift:.3f}'),
+        (f'its standard deviation ({unit})', f'{1e6 * alarm.sd:.3f}'),
+        ('standard deviations', f'{alarm.sigmas:.1f}'),
+        ('also shifted', ', '.join(alarm.also)),
+    ]

@@ -1,0 +1,1 @@
+"""Whether the rig is still what its model says, while it runs."""

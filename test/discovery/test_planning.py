@@ -1,0 +1,295 @@
+"""The next recording: what the rig may be asked, which recording is chosen, and when the loop ends."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shlex
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from blind.next import table
+from psd_deflection.cli._next import limits_from_words, plan_table, write_plan
+from psd_deflection.cli.main import main
+from psd_deflection.config import Rig, load_rig, replace_values
+from psd_deflection.discovery import loop
+from psd_deflection.discovery.experiment import Limits, Setting, pieces, proposals, settings, shown
+from psd_deflection.discovery.fit import Fit, refit
+from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.planning import TELLS_APART, Plan, plan_next
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.errors import UsageError
+from psd_deflection.recordings.observations import read_observations
+from psd_deflection.simulation import loads
+from psd_deflection.simulation.catalogue import make_active
+from psd_deflection.simulation.load_words import load_history
+from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
+
+RIG = load_rig()
+EI = make_active('bending_stiffness', {'scale': -0.002, 'moves_frequency': 0}, 'test')
+CLAMP = make_active('clamp_bending_compliance', {'compliance': 2.6e-7}, 'test')
+
+
+@pytest.fixture(scope='module')
+def models() -> tuple[Workspace, Fit, Fit]:
+    """Two effects that one length does not tell apart, fitted to a recording that has the first."""
+    history = loads.steps([(0, 0, 0), (0, -50, 0), (0, 0, 0)], 0.6).loads
+    hidden = {'effects.e.name': 'bending_stiffness', **{f'effects.e.{k}': v for k, v in EI.values.items()}}
+    counts = RigSimulator(replace_values(RIG, hidden), 1).step(history).counts
+    volts = counts.astype(np.float64) * RIG.converter.volts_per_count
+    workspace = Workspace([Observation('seen', RIG, volts, history)])
+    return workspace, refit(workspace, [EI]), refit(workspace, [CLAMP])
+
+
+def test_another_length_is_planned_where_only_that_tells(models: tuple[Workspace, Fit, Fit]) -> None:
+    workspace, named, rival = models
+    plan = plan_next(workspace, named, [rival], Limits(swing=0.0, sweep=0.0))
+    assert plan is not None
+    assert plan.setting.changes == {'link.length': pytest.approx(0.7 * RIG.link.length, abs=1e-3)}
+    (told,) = plan.told
+    assert told.rival == 'clamp_bending_compliance'
+    assert told.named.startswith('bending_stiffness')
+    assert min(told.separation, told.reverse) > TELLS_APART
+    assert told.possible >= max(told.separation, told.reverse)
+    assert plan.useful
+    assert plan.seconds <= 60.0
+    assert 'on a link of 0.41 m' in plan.sentence
+    # The script is what simulate --loads takes.
+    again = np.concatenate([load_history(s, plan.rate).loads for s in plan.script])
+    assert np.array_equal(again, plan.loads)
+    tree = json.loads(json.dumps(plan.tree(), allow_nan=False))
+    assert tree['overrides'] == plan.setting.changes
+    assert tree['rivals'][0]['separable']
+
+
+def test_it_is_said_if_nothing_within_the_limits_tells(models: tuple[Workspace, Fit, Fit]) -> None:
+    workspace, named, rival = models
+    plan = plan_next(workspace, named, [rival], Limits(swing=0.0, sweep=0.0, lengths=()))
+    assert plan is not None
+    assert not plan.useful
+    assert plan.sentence.startswith('No recording within the limits would tell bending_stiffness')
+    assert plan.told[0].possible < TELLS_APART
+    assert plan_next(workspace, named, []) is None
+
+
+def test_what_pieces_show_adds_up_to_what_the_recording_shows(models: tuple[Workspace, Fit, Fit]) -> None:
+    workspace, named, rival = models
+    short = Setting('', {'link.length': 0.4})
+    first = loads.steps([(0, 0, 0), (0, -50, 0)], 3.0).loads
+    second = loads.steps([(0, -50, 0), (0, 0, 0)], 3.0).loads
+    both = [named, rival]
+    one_by_one = shown(workspace, both, short, first) + shown(workspace, both, short, second[3000:]) * 2.0
+    together = shown(workspace, both, short, np.concatenate((first, np.zeros((6000, 3)))))
+    assert one_by_one.seconds == together.seconds
+    assert one_by_one.apart[0, 1] == pytest.approx(together.apart[0, 1], rel=0.1)
+    assert one_by_one.fisher[1] == pytest.approx(together.fisher[1], rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ('limits', 'rig'),
+    [
+        (Limits(), RIG),
+        (Limits(force=500.0, torque=500.0, sideways=False, lengths=(0.4, 1.0)), RIG),
+        (Limits(rates=(500.0,), seconds=20.0, swing=0.0), load_rig(overrides={'link.length': 1.2})),
+    ],
+)
+def test_every_proposal_is_within_the_limits_and_on_the_sensors(limits: Limits, rig: Rig) -> None:
+    offered = proposals(rig, limits)
+    assert offered
+    for p in offered:
+        changed = replace_values(rig, p.setting.changes) if p.setting.changes else rig
+        rate = changed.converter.sample_rate_hz
+        history = p.piece.loads(rate)
+        assert len(history) <= limits.seconds * rate + 1.0
+        assert np.abs(history[:, :2]).max() <= limits.force
+        assert np.abs(history[:, 2]).max() <= max(limits.torque, limits.force * limits.sidebar)
+        if not limits.sideways and 'sweep' not in p.piece.words:
+            assert not history[:, 0].any()
+            assert history[:, 1].max() <= 0.0
+        if 'sweep' in p.piece.words:
+            continue
+        # At rest under the load: twice as far while it rings.
+        held = history[:: round(rate)]
+        dots = ForwardModel(changed).run(np.repeat(held, 3000, axis=0)).dots[:, 2999::3000]
+        assert np.abs(dots).max() < 0.5e-3 * changed.converter.full_scale
+    assert {p.setting.swing for p in offered} == ({0.0, limits.swing} if limits.swing else {0.0})
+    assert len(settings(rig, dataclasses.replace(limits, lengths=(), rates=(), swing=0.0))) == 1
+
+
+def test_a_rig_without_anything_can_still_be_looked_at_at_rest() -> None:
+    (only,) = pieces(RIG, Limits(force=0.0, torque=0.0, sweep=0.0))
+    assert only.words == '30 s unloaded'
+
+
+@pytest.mark.parametrize(
+    ('words', 'expected'),
+    [
+        (['force=30', 'lengths=0.4,0.5'], Limits(force=30.0, lengths=(0.4, 0.5))),
+        (['lengths=', 'rates=2000', 'sideways=no'], Limits(lengths=(), rates=(2000.0,), sideways=False)),
+        ([], Limits()),
+    ],
+)
+def test_limits_are_read(words: list[str], expected: Limits) -> None:
+    assert limits_from_words(words) == expected
+
+
+@pytest.mark.parametrize(
+    ('word', 'part'),
+    [
+        ('force', 'NAME=VALUE'),
+        ('speed=3', 'force, torque'),
+        ('force=', 'a number of at least 0'),
+        ('force=-1', 'at least 0'),
+        ('force=nan', 'at least 0'),
+        ('force=1,2', 'a number'),
+        ('lengths=0', 'numbers of at least 0.01'),
+        ('sideways=1', 'yes or no'),
+        ('seconds=1', 'at least 5'),
+    ],
+)
+def test_a_bad_limit_is_refused(word: str, part: str) -> None:
+    with pytest.raises(UsageError, match=r'--limit ') as refused:
+        limits_from_words([word])
+    assert part in str(refused.value)
+
+
+class Searches:
+    """Stands for discover: each search leaves one equivalent fewer; plans are those of ``useful``."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, equivalents: int, useful: bool = True) -> None:
+        self.seen: list[int] = []
+
+        def discover(known: list[object], rig: Rig, **_: object) -> object:
+            self.seen.append(len(known))
+            left = ('other',) * max(equivalents - len(known) + 1, 0)
+            return SimpleNamespace(unsettled=left)
+
+        monkeypatch.setattr(loop, 'discover', discover)
+        monkeypatch.setattr(
+            loop,
+            'next_of',
+            lambda found, _: SimpleNamespace(useful=useful and bool(found.unsettled), sentence='Nothing helps.'),
+        )
+
+    def settle(self, most: int = 3) -> loop.Settled:
+        first, made = cast(Observation, object()), cast(Observation, object())
+        return loop.settle([first], RIG, lambda plan, number: made, most=most)
+
+
+def test_the_loop_ends_when_the_answer_is_unique(monkeypatch: pytest.MonkeyPatch) -> None:
+    searches = Searches(monkeypatch, 2)
+    done = searches.settle()
+    assert (done.outcome, len(done.plans), done.open) == ('unique', 2, None)
+    assert searches.seen == [1, 2, 3]
+    assert done.sentence == 'The answer is unique after 2 more recordings.'
+    assert Searches(monkeypatch, 0).settle().sentence == 'The answer is unique without a further recording.'
+
+
+def test_the_loop_ends_when_nothing_would_help_or_no_more_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    done = Searches(monkeypatch, 2, useful=False).settle()
+    assert (done.outcome, len(done.plans)) == ('limits', 0)
+    assert done.sentence.endswith('Nothing helps.')
+    done = Searches(monkeypatch, 9).settle(most=1)
+    assert (done.outcome, len(done.plans)) == ('recordings', 1)
+    assert done.sentence == 'The answer is not unique after 1 more recording, and no more were allowed.'
+
+
+@pytest.fixture(scope='module')
+def soft(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp('soft') / 'one.csv'
+    hidden = 'clamp_bending_compliance,compliance=2e-7'
+    words = ['--loads', 'steps:0,0,0;0,-40,0;0,0,0:0.8', '--effect', hidden, '--seed', '3']
+    assert main(['simulate', '--out', str(path), *words]) == 0
+    return path
+
+
+@pytest.mark.statistics
+def test_the_command_settles_what_one_length_leaves_open(
+    soft: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    limits = ['--limit', 'swing=0', '--limit', 'sweep=0', '--limit', 'seconds=12', '--quiet']
+    truth = ['--effect', 'clamp_bending_compliance,compliance=2e-7']
+    assert main(['discover', str(soft), '--out', str(tmp_path), '--next', '--run', *truth, *limits]) == 0
+    assert 'The answer is unique after 1 more recording.' in capsys.readouterr().out
+    tree = json.loads((tmp_path / 'result.json').read_text())
+    assert tree['next'] is None
+    assert tree['run']['outcome'] == 'unique'
+    assert [e['name'] for e in tree['effects']] == ['clamp_bending_compliance']
+    (made,) = tree['run']['recordings']
+    assert made['overrides'] == {'link.length': 0.409}
+    (seen,) = read_observations([tmp_path / 'next.yaml'])
+    assert (seen.name, seen.rig.link.length) == (made['file'], 0.409)
+
+
+def test_a_plan_is_written_as_files_that_the_commands_take(
+    models: tuple[Workspace, Fit, Fit], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    workspace, named, rival = models
+    plan = plan_next(workspace, named, [rival], Limits(swing=0.0, sweep=0.0, seconds=12.0))
+    assert plan is not None
+    warm = dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, swing=2.0))
+    lines = write_plan(warm, tmp_path)
+    script = load_history(str(tmp_path / 'next_loads.csv'), 1000.0).loads
+    assert np.array_equal(script, plan.loads)
+    command = shlex.split(lines[1])
+    assert command[:2] == ['psd-deflection', 'simulate']
+    assert main(command[1:]) == 0
+    (seen,) = read_observations([tmp_path / 'next.yaml'])
+    assert seen.rig.link.length == 0.409
+    assert np.array_equal(seen.loads, plan.loads)
+    assert seen.temperature is not None
+    assert np.ptp(seen.temperature) == pytest.approx(4.0, abs=0.01)
+    shown_table = plan_table(plan)
+    assert 'hold' in shown_table
+    assert 'clamp_bending_compliance' in shown_table
+
+
+@pytest.mark.parametrize(
+    ('words', 'part'),
+    [
+        (['--run'], '--run is for --next'),
+        (['--limit', 'force=3'], '--limit is for --next'),
+        (['--next', '--effect', 'damping'], '--effect is for the simulated rig'),
+        (['--next', '--run', '--effect', 'nonsense,a=1'], 'no effect of that name'),
+    ],
+)
+def test_options_that_would_be_ignored_are_refused(
+    soft: Path, words: list[str], part: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(['discover', str(soft), '--out', str(tmp_path), '--quiet', *words]) == 2
+    assert part in capsys.readouterr().err
+
+
+def row(**values: Any) -> dict[str, Any]:
+    whole = {'effect': 'creep', 'design': 'torque', 'kind': 'confounded', 'outcome': 'unique', 'recordings': 1}
+    return {**whole, 'named': ['creep'], 'together': [], 'left': [['x']], 'planned': ['do'], 'right': True, **values}
+
+
+@pytest.mark.parametrize(
+    ('rows', 'met'),
+    [
+        ([row(), row(recordings=2), row(recordings=1)], True),
+        ([row(), row(right=False)], False),
+        ([row(recordings=2), row(recordings=3)], False),
+        ([row(), row(outcome='recordings', recordings=3)], False),
+        ([row(), row(outcome='limits', separable=False)], True),
+        ([row(), row(outcome='limits', separable=True)], False),
+    ],
+)
+def test_the_campaign_wants_every_separable_case_settled(rows: list[dict[str, Any]], met: bool) -> None:
+    assert table(rows)[1] == met
+
+
+def test_a_plan_is_told_in_words() -> None:
+    limits = Limits()
+    (push, *_) = pieces(RIG, limits)
+    plan = Plan(settings(RIG, limits)[1], (push, push), (), limits, 1000.0)
+    assert plan.words == f'{push.words}, 2 times, while the temperature swings by +-10 K'
+    assert plan.seconds == pytest.approx(27.0)
+    warm = plan.setting.temperature(9)
+    assert warm is not None
+    assert (warm.min(), warm.max()) == (10.0, 30.0)

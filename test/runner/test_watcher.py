@@ -1,0 +1,180 @@
+"""The watch in a run: what it says, and the recording that it keeps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from msg_adapters import LOAD, to_messages
+from psd_deflection.config import load_rig
+from psd_deflection.pipeline import Pipeline
+from psd_deflection.protocol.frames import SampleFrame
+from psd_deflection.recordings import cdr
+from psd_deflection.recordings.observations import read_observation
+from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.replay_engine import replayed_estimates, rig_at_start
+from psd_deflection.records import AppliedLoad, DeflectionEstimate, FloatArray, RawChunk
+from psd_deflection.runner import watcher as module
+from psd_deflection.runner.diagnostics import OK, WARN, HealthReporter
+from psd_deflection.runner.fanout import Fanout
+from psd_deflection.runner.session import Session
+from psd_deflection.runner.watcher import Watcher, WatcherWire
+from psd_deflection.simulation.simulator import RigSimulator
+from test.heard import WAIT_S
+from test.runner.conftest import Estimates, ScriptedDevice
+
+START_NS = 1_700_000_000_000_000_000
+
+
+class Chain:
+    """A pipeline, a fan-out and a watcher, as a session has them."""
+
+    def __init__(self, folder: Path | None, **values: Any) -> None:
+        kept = {} if folder is None else {'watch_dir': str(folder)}
+        rig = load_rig(overrides={'watch': 'on', 'solvers': ['exact'], **kept, **values})
+        self.said: list[str] = []
+        self.poses: dict[int, tuple[float, float, float]] = {}
+        self.pipeline = Pipeline(rig)
+        self.watcher = Watcher(self.pipeline, self.said.append, {'serial': 'abc'}, '/arm/psd_estimator')
+        self.fanout = Fanout()
+        if self.watcher.keeps:
+            self.fanout.wires.append(WatcherWire(self.watcher))
+        self._rig = RigSimulator(rig, 3)
+        self._seq = 0
+        self._volts = rig.converter.volts_per_count
+
+    def load(self, fx: float, fy: float, tz: float) -> None:
+        load = AppliedLoad(START_NS + self._seq * 1_000_000, fx, fy, tz)
+        (message,) = to_messages(load)
+        self.watcher.put_message(LOAD, message.type, cdr.encode(message.type, message.fields), load.t_ns)
+        self.watcher.put(load)
+
+    def feed(self, seconds: float, moved: tuple[float, ...] = (0.0,) * 6) -> None:
+        """Samples of the unloaded rig, with ``moved`` (6,) V besides."""
+        counts = self._rig.step(np.zeros((round(1000 * seconds), 3))).counts + np.rint(
+            np.array(moved) / self._volts
+        ).astype(np.int32)
+        for start in range(0, len(counts), 200):
+            seq = np.arange(self._seq, self._seq + 200, dtype=np.int64)
+            self._seq += 200
+            chunk = RawChunk(
+                seq, START_NS + seq * 1_000_000, counts[start : start + 200], np.zeros(200, np.uint8), self._volts
+            )
+            for record in self.pipeline.process(chunk):
+                if isinstance(record, DeflectionEstimate):
+                    self.poses[record.t_ns] = record.pose
+                self.fanout.put(record)
+                self.watcher.put(record)
+
+
+BUMP = (0.01, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def volts_of(folder: Path) -> FloatArray:
+    return read_observation(folder).volts
+
+
+def test_the_minutes_around_an_alarm_are_kept_ready_for_discover(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, 'AFTER_NS', 3_000_000_000)
+    chain = Chain(tmp_path)
+    chain.feed(1.0)
+    chain.load(0.0, 0.0, 0.0)
+    chain.feed(10.0)
+    assert chain.watcher.entry().level == OK
+    assert not list(tmp_path.iterdir())
+    chain.feed(10.0, BUMP)
+    assert chain.watcher.close(60.0)
+    (folder,) = tmp_path.iterdir()
+    assert folder == chain.watcher.folder
+    entry = chain.watcher.entry()
+    assert entry.level == WARN
+    values = dict(entry.values)
+    assert values['channel'] == 'x1'
+    assert float(values['shift (um)']) == pytest.approx(5.0, abs=0.3)
+    assert values['kept'] == str(folder)
+    assert chain.said[0].startswith('watch: since 2023-11-1')
+    assert str(folder) in chain.said[1]
+    observation = read_observation(folder)
+    # From the first whole block to three seconds after the alarm, which is some seconds after the bump.
+    assert 16.0 < observation.duration < 20.0
+    assert np.ptp(observation.loads) == 0.0
+    assert float(np.nanmean(volts_of(folder)[-1000:, 0]) - np.nanmean(volts_of(folder)[:1000, 0])) == pytest.approx(
+        0.01, abs=5e-4
+    )
+    recording = open_recording(folder)
+    assert recording.hello == {'serial': 'abc'}
+    # The run had measured its noise before the recording begins.
+    again = replayed_estimates(recording, rig_at_start(recording))
+    assert len(again.t_ns) > 800
+    assert [chain.poses[t] for t in again.t_ns.tolist()] == [tuple(p) for p in again.pose.tolist()]
+
+
+def test_what_is_still_to_be_kept_is_kept_at_the_end(tmp_path: Path) -> None:
+    chain = Chain(tmp_path / 'deep' / 'below')
+    chain.feed(0.2)
+    chain.load(0.0, 0.0, 0.0)
+    chain.feed(8.0)
+    chain.feed(6.0, BUMP)
+    assert chain.watcher.watch.alarms == 1
+    assert chain.watcher.close(60.0)
+    assert chain.watcher.folder is not None
+    assert 13.0 < read_observation(chain.watcher.folder).duration < 15.0
+
+
+def test_nothing_is_written_unasked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    chain = Chain(None)
+    chain.load(0.0, 0.0, 0.0)
+    chain.feed(8.0)
+    chain.feed(6.0, BUMP)
+    assert chain.watcher.watch.alarms == 1
+    assert chain.watcher.close(1.0)
+    assert chain.watcher.folder is None
+    assert not list(tmp_path.iterdir())
+    assert len(chain.said) == 1
+
+
+def test_a_disk_without_room_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = SimpleNamespace(free=1_000_000)
+    monkeypatch.setattr('psd_deflection.runner.recorder.shutil', cast(Any, SimpleNamespace(disk_usage=lambda _: usage)))
+    chain = Chain(tmp_path)
+    chain.load(0.0, 0.0, 0.0)
+    chain.feed(8.0)
+    chain.feed(6.0, BUMP)
+    assert chain.watcher.close(60.0)
+    assert not list(tmp_path.iterdir())
+    assert 'disk_reserve' in chain.said[-1]
+    assert 'disk_reserve' in chain.watcher.failure
+
+
+def test_a_session_feeds_its_watch_and_reports_it(device: ScriptedDevice, sample: Callable[..., SampleFrame]) -> None:
+    rig = load_rig(overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False, 'watch': 'on'})
+    session = Session(rig, lambda _: None)
+    try:
+        estimates = Estimates(5)
+        session.processing.sinks.append(estimates)
+        session.start()
+        device.send_frames(*(sample(seq) for seq in range(200)))
+        assert estimates.enough.wait(WAIT_S)
+        session.note_load(0.0, -3.0, 0.0)
+        assert session.watcher is not None
+        watch = session.watcher.watch
+        held = session.processing.request(lambda: watch.load)
+        assert held is not None
+        assert held.fy == -3.0
+        (entry,) = (e for e in HealthReporter(session).report(0).entries if e.name == module.NAME)
+        assert dict(entry.values)['watched'] == 'no window yet'
+    finally:
+        session.close()
+
+
+@pytest.mark.parametrize(('given', 'kept'), [(True, 'on'), ('off', 'off'), (False, 'off')])
+def test_the_watch_is_switched_by_one_parameter(given: object, kept: str) -> None:
+    assert load_rig(overrides={'watch': given}).acquisition.watch == kept
