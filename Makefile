@@ -208,11 +208,11 @@ blind-laws: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m blind.laws --jobs $(JOBS) $(LAWS)
 
 NEXT ?=
-blind-next: $(VENV)/.installed
+blind-next: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m blind.next --jobs $(JOBS) $(NEXT)
 
 WATCH ?=
-blind-watch: $(VENV)/.installed
+blind-watch: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m blind.watch --jobs $(JOBS) $(WATCH)
 
 # Rendered frames: errors, cost, and adverse frames, of which no answer may be wrong (two hours on an idle core).
