@@ -24,6 +24,8 @@
 # make blind-laws  laws that no catalogue has, drawn by chance: does discover find where they act and on what they depend (a quarter of an hour on an idle core; LAWS='--first 500' for fresh ones)
 # make camera-campaign  render 10,000 frames, most of them bad, and see whether the camera is right about each (two hours)
 # make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
+# make compensate-faults  how soon the compensator holds after a fault, each HOLD_TIMES=20 times (some minutes)
+# make demo-compensate  an arm of two flexible links with and without compensation: seconds, leaves a page
 # make demo-thesis  the experiment of the thesis redone: camera, calibrate, validate on one page (some minutes; THESIS=--short: seconds)
 # make clean    remove what the above made
 PYTHON ?= python3
@@ -42,7 +44,7 @@ BIN := $(VENV)/bin
 # A run needs the first of these, all the others need both.
 READY := $(VENV)/.installed $(VENV)/.for_tests
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak fleet firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws camera-campaign demo-discover demo-thesis colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak fleet firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -128,6 +130,10 @@ SOAK_HOURS ?= 24
 soak: $(READY)
 	$(BIN)/python -m bench.campaign.soak --minutes $(SOAK_MINUTES) --hours $(SOAK_HOURS)
 
+HOLD_TIMES ?= 20
+compensate-faults: $(READY)
+	$(BIN)/python -m bench.campaign.hold --times $(HOLD_TIMES)
+
 FLEET_RECORDINGS ?= 1000
 fleet: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m bench.campaign.fleet --recordings $(FLEET_RECORDINGS) $(FLEET)
@@ -203,6 +209,9 @@ blind-laws: $(READY)
 CAMERA_FRAMES ?= 10000
 camera-campaign: $(READY)
 	$(BIN)/python -m bench.campaign.camera --frames $(CAMERA_FRAMES)
+
+demo-compensate: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python -m bench.compensate
 
 demo-discover: $(VENV)/.installed
 	rm -rf build/demo && mkdir -p build/demo
