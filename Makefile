@@ -26,6 +26,8 @@
 # make blind-watch  bumps, gains, slips and 24 quiet hours: what the watch sees, and when it is silent (half an hour on an idle core; WATCH='--runs 5 --hours 1' for a look)
 # make camera-campaign  render 10,000 frames, most of them bad, and see whether the camera is right about each (two hours)
 # make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
+# make compensate-faults  how soon the compensator holds after a fault, each HOLD_TIMES=20 times (some minutes)
+# make demo-compensate  an arm of two flexible links with and without compensation: seconds, leaves a page
 # make demo-thesis  the experiment of the thesis redone: camera, calibrate, validate on one page (some minutes; THESIS=--short: seconds)
 # make clean    remove what the above made
 PYTHON ?= python3
@@ -44,7 +46,7 @@ BIN := $(VENV)/bin
 # A run needs the first of these, all the others need both.
 READY := $(VENV)/.installed $(VENV)/.for_tests
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak fleet firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign demo-discover demo-thesis colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak fleet firmware mutants golden docs notebooks axe shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -130,6 +132,10 @@ SOAK_HOURS ?= 24
 soak: $(READY)
 	$(BIN)/python -m bench.campaign.soak --minutes $(SOAK_MINUTES) --hours $(SOAK_HOURS)
 
+HOLD_TIMES ?= 20
+compensate-faults: $(READY)
+	$(BIN)/python -m bench.campaign.hold --times $(HOLD_TIMES)
+
 FLEET_RECORDINGS ?= 1000
 fleet: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m bench.campaign.fleet --recordings $(FLEET_RECORDINGS) $(FLEET)
@@ -202,17 +208,20 @@ blind-laws: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m blind.laws --jobs $(JOBS) $(LAWS)
 
 NEXT ?=
-blind-next: $(VENV)/.installed
+blind-next: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m blind.next --jobs $(JOBS) $(NEXT)
 
 WATCH ?=
-blind-watch: $(VENV)/.installed
+blind-watch: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m blind.watch --jobs $(JOBS) $(WATCH)
 
 # Rendered frames: errors, cost, and adverse frames, of which no answer may be wrong (two hours on an idle core).
 CAMERA_FRAMES ?= 10000
 camera-campaign: $(READY)
 	$(BIN)/python -m bench.campaign.camera --frames $(CAMERA_FRAMES)
+
+demo-compensate: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python -m bench.compensate
 
 demo-discover: $(VENV)/.installed
 	rm -rf build/demo && mkdir -p build/demo

@@ -16,6 +16,8 @@ from setuptools import setup
 PACKAGE = 'psd_deflection'
 EXECUTABLES = (
     'estimator',
+    'chain',
+    'compensator',
     'replay',
     'simulate',
     'discover',

@@ -319,7 +319,7 @@ def live_rows(alone: Latencies, with_page: Latencies) -> list[Row]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--seconds', type=float, default=30.0, help='of the live measurement of each kind of node')
-    parser.add_argument('--starts', type=int, default=5, help='times that the start is measured')
+    parser.add_argument('--starts', type=int, default=5, help='times that the start is measured; 0: not at all')
     parser.add_argument('--results', type=Path, default=RESULTS)
     parser.add_argument('--settle', type=float, default=5.0, help='seconds before each measurement')
     parser.add_argument('--rounds', type=int, default=2, help='in which it is done, so that a busy moment meets both')
@@ -333,7 +333,9 @@ def main() -> int:
     elif args.role == 'looker':
         looker(args.url)
     else:
-        rows = [*live(args.seconds, args.settle, args.rounds), start(args.starts)]
+        rows = live(args.seconds, args.settle, args.rounds)
+        if args.starts:
+            rows.append(start(args.starts))
         for row in rows:
             tell(row)
         keep(rows, args.results)

@@ -54,6 +54,8 @@ LOAD = '/link_tip/load'
 REFERENCE = '/reference/deflection'
 REFERENCE_WITH_COVARIANCE = '/reference/deflection_with_covariance'
 TEMPERATURE = '/environment/temperature'
+END_EFFECTOR = '/end_effector/deflection'
+"""Of a chain of links (``pose_with_covariance_stamped.from_end_effector``); no rig publishes it."""
 
 
 def spot_topics(psds: int) -> tuple[str, ...]:

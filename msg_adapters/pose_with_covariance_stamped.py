@@ -11,7 +11,13 @@ from msg_adapters.header import Fields, header, stamp_ns
 from msg_adapters.message_type import MessageType
 from msg_adapters.orientation import angles
 from msg_adapters.pose_stamped import FRAME, pose
-from psd_deflection.records import DeflectionEstimate, FloatArray, ReferenceWithCovariance, TipMotion
+from psd_deflection.records import (
+    DeflectionEstimate,
+    EndEffectorDeflection,
+    FloatArray,
+    ReferenceWithCovariance,
+    TipMotion,
+)
 
 MESSAGE = MessageType(
     'geometry_msgs/msg/PoseWithCovarianceStamped',
@@ -38,6 +44,16 @@ def from_estimate(e: DeflectionEstimate | TipMotion | ReferenceWithCovariance) -
     return {
         'header': header(e.t_ns, FRAME),
         'pose': {'pose': pose(e.dx, e.dy, e.theta, e.phi, e.omega), 'covariance': covariance},
+    }
+
+
+def from_end_effector(e: EndEffectorDeflection, frame: str) -> Fields:
+    """Fields of a chain's end effector in ``frame``, that of its rigid pose."""
+    place = dict(zip('xyz', e.position, strict=True))
+    turned = dict(zip('xyzw', e.quaternion, strict=True))
+    return {
+        'header': header(e.t_ns, frame),
+        'pose': {'pose': {'position': place, 'orientation': turned}, 'covariance': list(e.covariance)},
     }
 
 

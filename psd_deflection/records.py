@@ -192,6 +192,19 @@ class TipMotion(NamedTuple):
     coasted: float = 0.0
 
 
+class EndEffectorDeflection(NamedTuple):
+    """Where the end effector of a chain of links is, in the frame of its rigid pose.
+
+    ``position`` m; ``quaternion`` (x, y, z, w); ``covariance``: 6 x 6 row by row, of position and of rotation about
+    the fixed axes, m^2, m rad, rad^2.
+    """
+
+    t_ns: int
+    position: tuple[float, ...]
+    quaternion: tuple[float, ...]
+    covariance: tuple[float, ...]
+
+
 class AppliedLoad(NamedTuple):
     """A known load at the tip centroid in ``link_tip_rest``, held until the next one: N, N, N m."""
 

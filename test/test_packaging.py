@@ -26,6 +26,8 @@ which the tests of the reports open in a browser."""
 
 EXECUTABLES = (
     'estimator',
+    'chain',
+    'compensator',
     'replay',
     'simulate',
     'discover',

@@ -74,7 +74,7 @@ CI_RUNS = (
 """What CI runs without us: pattern, file, and the text in it that does."""
 
 SHORTEST = {
-    'bench': 'BENCH_LIVE="--rounds 1 --seconds 2 --settle 1 --starts 1" BENCH_SOLVERS="--blocks 1000" '
+    'bench': 'BENCH_LIVE="--rounds 1 --seconds 2 --settle 1 --starts 0" BENCH_SOLVERS="--blocks 1000" '
     'BENCH_ACCURACY="--blocks 100" BENCH_LIMITS="--times 1 --only frames" BENCH_RIGS="--most 1 --seconds 1"',
     'faults': 'FAULT_TIMES=1 FAULTS="--only zero"',
     'crash': 'CRASH_TIMES=1',
@@ -137,9 +137,12 @@ QUICK = re.compile(
     r'|^psd-deflection simulate .*--(out|help)\b'
 )
 LIVE = re.compile(
-    r'^psd-deflection (estimator|monitor)\b|--serve\b|^make run\b'
-    r'|^ros2 (run|launch) psd_deflection estimator\b(?!.*--show-args)'
+    r'^psd-deflection (estimator|monitor|chain)\b|--serve\b|^make run\b'
+    r'|^ros2 (run|launch) psd_deflection (estimator|chain)\b(?!.*--show-args)'
 )
+BESIDE = re.compile(r'^ros2 run psd_deflection compensator\b')
+"""Nodes that run beside the lines below them."""
+
 ASKS = re.compile(r'^psd-deflection (echo|zero|record|load)\b')
 """Commands that speak to a running daemon."""
 
@@ -290,6 +293,9 @@ class Reader:
             self._press(line)
         elif LIVE.search(line):
             self._live(line)
+        elif BESIDE.search(line):
+            self._background.append(self._start(line))
+            self._background[-1].until('publishing ')
         elif ASKS.search(line):
             self._serve()
             self._to_the_end(line)
@@ -330,7 +336,7 @@ class Reader:
                     if b'psd_deflection monitor' not in answer.read():
                         raise RuntimeError('the address that it prints has another page')
             if not re.search(r' monitor bags/', line):
-                program.until(r'θ +[-+]\d+\.\d\d ± \d')
+                program.until(r'(θ +[-+]\d+\.\d\d|rx [-+]\d+\.\d) ± \d')
             status = program.end()
         except RuntimeError as error:
             program.end()

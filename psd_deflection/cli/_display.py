@@ -8,6 +8,7 @@ import shlex
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from psd_deflection.cli._program import program
@@ -28,15 +29,19 @@ class Display:
         self._lock = threading.Lock()
         self._last = 0.0
         self._shown = False
-        self._samples = 0
+        self._counted = 0
         self._recorded: list[Path] = []
 
     def watch(self, session: Session) -> None:
         """Watch a running session: show its state, and remember its recordings."""
+        self.note_recorded(session)
+        self.update(session)
+
+    def note_recorded(self, session: Session) -> None:
+        """Remember the recording that the session makes, for :meth:`tell_recorded`."""
         folder = session.recorder.folder
         if folder is not None and folder not in self._recorded:
             self._recorded.append(folder)
-        self.update(session)
 
     def tell_recorded(self) -> None:
         """Print the recordings that were made, and how to replay them."""
@@ -51,6 +56,10 @@ class Display:
 
     def update(self, session: Session) -> None:
         """Show the state, if an update is due."""
+        self.show(session.acquisition.counters.samples, lambda rate: live_line(session, rate))
+
+    def show(self, count: int, line: Callable[[float], str]) -> None:
+        """Show ``line`` of the rate (1/s) at which ``count`` grows, if an update is due."""
         now = time.monotonic()
         passed = now - self._last
         if passed < self._wait:
@@ -58,13 +67,12 @@ class Display:
         if self._last and not self._live:
             # In a journal regular lines are noise; changes have their own messages.
             self._wait = min(2.0 * self._wait, PLAIN_REFRESH_LATER_S)
-        samples = session.acquisition.counters.samples
-        rate = (samples - self._samples) / passed if self._last else math.nan
-        if samples < self._samples:
+        rate = (count - self._counted) / passed if self._last else math.nan
+        if count < self._counted:
             # Another session, which counts from zero.
             rate = math.nan
-        self._last, self._samples = now, samples
-        text = live_line(session, rate)
+        self._last, self._counted = now, count
+        text = line(rate)
         with self._lock:
             self._put(text + ('' if self._live else '\n'), shown=self._live)
 

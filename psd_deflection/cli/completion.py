@@ -19,6 +19,10 @@ from psd_deflection.errors import ConfigError
 SHELLS = ('bash', 'zsh', 'tcsh')
 
 FILES = (
+    'ARM.urdf',
+    'CHAIN.yaml',
+    'X.csv',
+    'X.parquet',
     'REC',
     'IN',
     'FILE',

@@ -43,6 +43,11 @@ def delivery(topic: str) -> Delivery:
     return _DELIVERY.get(topic, Delivery(depth=10))
 
 
+END, END_REST = 'end_effector', 'end_effector_rest'
+"""Frames of a chain of links: the end effector, and where it were if no link bent."""
+
+JOINT_STATES = 'joint_states'
+
 ZERO, RECORD = '~/zero', '~/record'
 SERVICES = (ZERO, RECORD)
 """Services of the node; ``~`` stands for the node's name."""

@@ -30,9 +30,10 @@ def installed() -> bool:
     return importlib.util.find_spec('tf2_msgs') is not None
 
 
-def _transform(prefix: str, parent: str, child: str, t_ns: int, at: Vector, rotation: dict[str, float]) -> Any:
-    out = TransformStamped(child_frame_id=prefix + child)
-    out.header.frame_id = prefix + parent
+def transform_message(parent: str, child: str, t_ns: int, at: Vector, rotation: dict[str, float]) -> Any:
+    """The TransformStamped of ``child`` in ``parent``, m."""
+    out = TransformStamped(child_frame_id=child)
+    out.header.frame_id = parent
     out.header.stamp.sec, out.header.stamp.nanosec = divmod(t_ns, 1_000_000_000)
     out.transform.translation.x, out.transform.translation.y, out.transform.translation.z = at
     out.transform.rotation = Quaternion(**rotation)
@@ -44,9 +45,9 @@ def static_transforms(rig: Rig, t_ns: int) -> list[Any]:
     prefix = rig.monitor.frame_prefix
     holder = REST if psds_at_base(rig) else TIP
     return [
-        _transform(prefix, BASE, REST, t_ns, (0.0, 0.0, rig.link.length), _UPRIGHT),
+        transform_message(prefix + BASE, prefix + REST, t_ns, (0.0, 0.0, rig.link.length), _UPRIGHT),
         *(
-            _transform(prefix, holder, name, t_ns, (*psd.center, psd.height), _UPRIGHT)
+            transform_message(prefix + holder, prefix + name, t_ns, (*psd.center, psd.height), _UPRIGHT)
             for name, psd in zip(PSDS, rig.psds, strict=False)
         ),
     ]
@@ -55,7 +56,8 @@ def static_transforms(rig: Rig, t_ns: int) -> list[Any]:
 def tip_transform(rig: Rig, e: DeflectionEstimate) -> Any:
     """The TransformStamped of the tip, true to scale."""
     rotation = quaternion(e.theta, e.phi, e.omega)
-    return _transform(rig.monitor.frame_prefix, REST, TIP, e.t_ns, (e.dx, e.dy, 0.0), rotation)
+    prefix = rig.monitor.frame_prefix
+    return transform_message(prefix + REST, prefix + TIP, e.t_ns, (e.dx, e.dy, 0.0), rotation)
 
 
 class TransformPublisher:

@@ -34,12 +34,13 @@ def message_class(type_name: str) -> Any:
     return getattr(importlib.import_module(f'{package}.msg'), name)
 
 
-def relative(topic: str) -> str:
+def relative(topic: str, below: str = '') -> str:
     """``topic`` as a relative name in the node's namespace, so that two rigs can share a graph.
 
-    Without a namespace this is the topic's own name. ``/diagnostics`` stays absolute, as is usual.
+    Without a namespace this is the topic's own name. ``below``: a further namespace, for a node of several rigs.
+    ``/diagnostics`` stays absolute, as is usual.
     """
-    return topic if topic == DIAGNOSTICS else topic.removeprefix('/')
+    return topic if topic == DIAGNOSTICS else (below + topic).removeprefix('/')
 
 
 def qos(topic: str) -> QoSProfile:
@@ -59,11 +60,15 @@ def topics_of(rig: Rig) -> dict[str, str]:
 
 
 class PublisherWire:
-    """Publishes encoded messages: a wire of the fan-out. While it is not ``active``, diagnostics alone."""
+    """Publishes encoded messages: a wire of the fan-out. While it is not ``active``, diagnostics alone.
 
-    def __init__(self, node: Node, topics: Mapping[str, str]) -> None:
+    ``below``: namespace of the topics in that of the node.
+    """
+
+    def __init__(self, node: Node, topics: Mapping[str, str], below: str = '') -> None:
         self.active = False
         self._node = node
+        self._below = below
         self._publishers: dict[str, Publisher] = {}
         self.offer(topics)
 
@@ -74,7 +79,7 @@ class PublisherWire:
         options = QoSOverridingOptions.with_default_policies()
         for topic in [t for t in topics if t not in self._publishers]:
             self._publishers[topic] = self._node.create_publisher(
-                message_class(topics[topic]), relative(topic), qos(topic), qos_overriding_options=options
+                message_class(topics[topic]), relative(topic, self._below), qos(topic), qos_overriding_options=options
             )
 
     def names(self, topics: Iterable[str]) -> list[str]:
@@ -107,16 +112,16 @@ class InputRecorder:
     """Records known loads, references and temperatures as they arrive.
 
     ``session``: the one that records, or None. A message that is too long for its type is ignored and
-    counted in ``refused``, so that another node cannot fill the disk.
+    counted in ``refused``, so that another node cannot fill the disk. ``below``: as of :class:`PublisherWire`.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, below: str = '') -> None:
         self.session: Session | None = None
         self.refused = 0
         for topic in INPUTS:
             node.create_subscription(
                 message_class(TOPIC_TYPES[topic]),
-                relative(topic),
+                relative(topic, below),
                 lambda message, topic=topic: self._received(topic, message),
                 qos(topic),
                 raw=True,

@@ -1,12 +1,12 @@
-"""Runs a session without ROS, until a signal ends it."""
+"""Runs a session or a chain without ROS, until a signal ends it."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Protocol
+from typing import Protocol, TypeVar
 
-from psd_deflection.config import Rig, rig_from_values
+from psd_deflection.config import rig_from_values
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.session import Session
 from psd_deflection.runner.signals import Signals, StopRequestedError
@@ -23,6 +23,30 @@ class Companion(Protocol):
         """End it, before the session."""
 
 
+class Run(Protocol):
+    """What runs: a session or a chain. ``failed``: the error that ended it, or None."""
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still runs."""
+
+    @property
+    def failed(self) -> BaseException | None:
+        """The error that ended it, or None."""
+
+    def responsive(self) -> bool:
+        """Whether its threads completed a round lately."""
+
+    def start(self) -> None:
+        """Let samples flow."""
+
+    def close(self) -> object:
+        """End it."""
+
+
+R = TypeVar('R', bound=Run)
+
+
 def run_headless(
     values: Mapping[str, object],
     say: Say,
@@ -34,9 +58,26 @@ def run_headless(
     ``watch``: called every 0.1 s. ``start_companion``: called before samples flow. Raises the error that ended
     the session.
     """
+
+    def begin() -> Session:
+        return Session(rig_from_values(values, 'command line'), say)
+
+    return run_until_signal(begin, watch, lambda session: start_companion(session, say))
+
+
+def run_until_signal(
+    begin: Callable[[], R],
+    watch: Callable[[R], object],
+    start_companion: Callable[[R], Companion | None] = lambda run: None,
+) -> int:
+    """Run what ``begin`` opens until SIGINT, SIGTERM or SIGHUP, or until ``watch`` returns True; return 0.
+
+    ``watch``: called every 0.1 s. ``start_companion``: called before samples flow. Raises the error that ended
+    the run.
+    """
     signals = Signals()
     try:
-        return _run_until(signals, rig_from_values(values, 'command line'), say, watch, start_companion)
+        return _run_until(signals, begin, watch, start_companion)
     except StopRequestedError:
         return 0
     finally:
@@ -45,29 +86,29 @@ def run_headless(
 
 def _run_until(
     signals: Signals,
-    rig: Rig,
-    say: Say,
-    watch: Callable[[Session], None],
-    start_companion: Callable[[Session, Say], Companion | None],
+    begin: Callable[[], R],
+    watch: Callable[[R], object],
+    start_companion: Callable[[R], Companion | None],
 ) -> int:
-    session = signals.interruptible(lambda: Session(rig, say))
+    run = signals.interruptible(begin)
     watchdog = Watchdog()
     companion = None
     try:
         settle()
-        companion = start_companion(session, say)
-        session.start()
+        companion = start_companion(run)
+        run.start()
         watchdog.ready()
-        while not signals.stop and session.processing.alive:
+        while not signals.stop and run.alive:
             time.sleep(LOOK_S)
-            if session.responsive():
+            if run.responsive():
                 watchdog.alive()
-            watch(session)
+            if watch(run) is True:
+                break
     finally:
         watchdog.stopping()
         if companion is not None:
             companion.close()
-        session.close()
-    if session.failed is not None:
-        raise session.failed
+        run.close()
+    if run.failed is not None:
+        raise run.failed
     return 0

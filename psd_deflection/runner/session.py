@@ -152,6 +152,11 @@ class Session:
         return self._simulated is not None
 
     @property
+    def alive(self) -> bool:
+        """Whether blocks are still processed."""
+        return self.processing.alive
+
+    @property
     def failed(self) -> BaseException | None:
         """The error that ended the pipeline or the reader thread, or None."""
         return self.processing.failed or self.acquisition.failed

@@ -24,6 +24,8 @@ ENDLESS = (
     'record',
     'load',
     'estimator',
+    'chain',
+    'compensator',
     'monitor',
     'discover',
     'devices',

@@ -1,4 +1,4 @@
-"""The launch file: its arguments are parameters, and each reaches the node."""
+"""The launch files: their arguments reach the node."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ import pytest
 
 from psd_deflection.config import BY_NAME
 
-FILE = Path(__file__).parent.parent.parent / 'launch' / 'estimator.launch.py'
+LAUNCH = Path(__file__).parent.parent.parent / 'launch'
+FILE = LAUNCH / 'estimator.launch.py'
 KINDS = {'string': str, 'bool': bool, 'double': float, 'integer': int}
 
 
@@ -29,8 +30,8 @@ class Configuration:
 
 
 @pytest.fixture
-def launch_file(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """The names of the launch file, run with stand-ins that keep their arguments."""
+def launch_modules(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stand-ins for launch and launch_ros that keep their arguments."""
 
     def keep(*words: object, **named: object) -> SimpleNamespace:
         return SimpleNamespace(words=words, **named)
@@ -48,6 +49,11 @@ def launch_file(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         made = ModuleType(module)
         vars(made).update(names)
         monkeypatch.setitem(sys.modules, module, made)
+
+
+@pytest.fixture
+def launch_file(launch_modules: None) -> dict[str, Any]:
+    """The names of the estimator's launch file."""
     return runpy.run_path(str(FILE))
 
 
@@ -74,6 +80,18 @@ def test_what_is_given_reaches_the_node_and_nothing_else_does(launch_file: dict[
         *('--params-file', 'params_file'),
         *('--log-level', 'log_level'),
     ]
+
+
+def test_the_chain_is_launched_with_its_file(launch_modules: None) -> None:
+    names = runpy.run_path(str(LAUNCH / 'chain.launch.py'))
+    declared = {a.words[0]: a for a in names['generate_launch_description']() if hasattr(a, 'description')}
+    assert declared.keys() == {'chain', *names['ARGUMENTS']}
+    assert all(a.description for a in declared.values())
+    (plain,) = names['chain'](dict.fromkeys(declared, ''))
+    assert [a.name for a in plain.arguments] == ['chain']
+    (node,) = names['chain'](dict.fromkeys(declared, '') | {'slopes': 'end_force', 'record': 'bags'})
+    assert node.arguments[1:] == ['--slopes', 'end_force', '--record', 'bags']
+    assert (node.executable, node.namespace.name) == ('chain', 'namespace')
 
 
 @pytest.mark.skipif(shutil.which('ros2') is None, reason='ros2 launch comes with a ROS installation')

@@ -1,0 +1,50 @@
+"""An arm whose links bend under a load at its end: what the compensator is tried on.
+
+The links bend as ``chains`` composes them, statically, and swing about that as one damped mode. The joints follow
+their commands with a lag of first order.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from psd_deflection.chains.chain import Chain, EndEffector, TipDeflection
+from psd_deflection.records import FloatArray
+
+LAG_S = 0.02
+"""Time constant of the joints."""
+
+_CERTAIN = np.zeros((3, 3))
+
+
+class SimulatedArm:
+    """``chain``: the links; ``angles``: of its joints at the start, rad; ``frequency`` Hz and ``damping`` of the mode.
+
+    ``force`` (3,): the load at the end effector, N in the base. ``angles``: where the joints are now.
+    """
+
+    def __init__(self, chain: Chain, angles: FloatArray, frequency: float = 12.0, damping: float = 0.01) -> None:
+        self.chain = chain
+        self.angles = np.array(angles, dtype=np.float64)
+        self.force = np.zeros(3)
+        self._omega, self._damping = 2.0 * math.pi * frequency, damping
+        self._swing = np.zeros((2, len(chain.links), 3))
+
+    def step(self, commanded: FloatArray, seconds: float) -> None:
+        """Let ``seconds`` pass with the joints commanded to ``commanded`` (n,), rad."""
+        self.angles += (commanded - self.angles) * -math.expm1(-seconds / LAG_S)
+        static = self.chain.tips_under(self.force, self.angles.tolist())
+        # Exact for a load that is held over the step.
+        swing, speed = self._swing
+        x, v = swing - static, speed
+        decay, damped = self._damping * self._omega, self._omega * math.sqrt(1.0 - self._damping**2)
+        c, s, e = math.cos(damped * seconds), math.sin(damped * seconds), math.exp(-decay * seconds)
+        self._swing[0] = static + e * (x * c + (v + decay * x) / damped * s)
+        self._swing[1] = e * (v * c - (self._omega**2 * x + decay * v) / damped * s)
+
+    def end(self) -> EndEffector:
+        """Where the end effector is."""
+        tips = [TipDeflection(tip, _CERTAIN) for tip in self._swing[0]]
+        return self.chain.compose(tips, self.angles.tolist())

@@ -1,0 +1,243 @@
+"""Links in series: the end effector's rigid pose, its deflected pose, and their difference with covariance.
+
+A link is clamped in its frame ``link_base``; Z leads along it. ``mount`` places this frame in the tip of the link
+before, and the joint turns it there. At rest the tip is at (0, 0, L). The rig measures dX, dY and theta of
+the tip. The tilts of the tip come from the link as a beam, in one of two ways:
+
+- ``ratio``: phi = -k dY/L, omega = k dX/L with the rig file's slope ratio k. A force at the tip gives k = 3/2.
+- ``end_force``: a force at the end effector is all that loads the chain, and it has a lever on each tip. The force is
+  found from all deflections by least squares; each residual counts by the strain energy that it stands for. With
+  the moments M about X and Y at the tip, phi = -3/2 dY/L + Mx L/4EI and omega = 3/2 dX/L + My L/4EI
+  (from dX = F L^3/3EI + M L^2/2EI and omega = F L^2/2EI + M L/EI).
+
+The poses are composed without approximation. The covariance is of first order: each tip's errors are carried to the
+end effector by the adjoint of what lies between (Barfoot, State Estimation for Robotics, 2017, 7.1).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from psd_deflection.chains.transform import IDENTITY, Transform, cross_matrix, shift, turn
+from psd_deflection.errors import ConfigError
+from psd_deflection.mechanics.statics import LinkStatics
+from psd_deflection.records import FloatArray
+
+SLOPES = ('ratio', 'end_force')
+FORCE_RATIO = 1.5
+"""Slope ratio of a link under a force at its tip."""
+
+_WEAKEST = 1e-9
+"""A direction of the force that bends the chain less than this share of the strongest one is not seen."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChainLink:
+    """One link. ``mount``: ``link_base`` at joint angle 0, in the tip frame of the link before (or in the base).
+
+    ``statics``: length and stiffnesses. ``slope_ratio``: k, with its standard deviation ``slope_ratio_sd``.
+    ``axis``: unit vector of the joint in the frame ``mount``.
+    """
+
+    name: str
+    mount: Transform
+    statics: LinkStatics
+    slope_ratio: float = FORCE_RATIO
+    slope_ratio_sd: float = 0.0
+    axis: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+
+    @property
+    def length(self) -> float:
+        """L, m."""
+        return self.statics.length
+
+    def base(self, angle: float) -> Transform:
+        """``link_base`` in the tip frame of the link before, at this angle of the joint, rad."""
+        return self.mount @ turn(self.axis, angle) if angle else self.mount
+
+
+class TipDeflection(NamedTuple):
+    """What one rig measured: ``pose`` (dX, dY, theta), m, m, rad; ``covariance`` (3, 3)."""
+
+    pose: FloatArray
+    covariance: FloatArray
+
+
+class EndEffector(NamedTuple):
+    """The end effector of a deflected chain.
+
+    ``rigid``, ``deflected``: its pose in the base. ``deflection``: the deflected pose in the frame of the rigid one.
+    ``covariance`` (6, 6): of position (m) and rotation (rad) about the fixed axes of that frame, as ROS orders them.
+    ``tips``: the pose of each tip in its own rest frame. ``angles``: of the joints, rad.
+    """
+
+    rigid: Transform
+    deflected: Transform
+    deflection: Transform
+    covariance: FloatArray
+    tips: tuple[Transform, ...]
+    angles: tuple[float, ...]
+
+    @property
+    def vector(self) -> FloatArray:
+        """(6,): translation, m, and rotation vector, rad, of the deflection."""
+        return np.concatenate([self.deflection.position, self.deflection.rotation_vector])
+
+    @property
+    def deviations(self) -> FloatArray:
+        """(6,): standard deviations of :attr:`vector`, m and rad."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+class Chain:
+    """``links`` from the base on; ``end``: the end effector in the frame of the last tip; ``slopes``: see above.
+
+    Raises ConfigError if there is no link, two have one name, or ``slopes`` is unknown.
+    """
+
+    def __init__(self, links: Sequence[ChainLink], end: Transform = IDENTITY, slopes: str = 'ratio') -> None:
+        if not links:
+            raise ConfigError('a chain has at least one link')
+        names = [link.name for link in links]
+        for name in names:
+            if names.count(name) > 1:
+                raise ConfigError(f'two links have the name {name}')
+        if slopes not in SLOPES:
+            raise ConfigError(f'slopes = {slopes}: must be one of {", ".join(SLOPES)}')
+        self.links = tuple(links)
+        self.end = end
+        self.slopes = slopes
+        self._rest: _Rest | None = None
+
+    def rigid(self, angles: Sequence[float] | None = None) -> Transform:
+        """The end effector's pose in the base while no link is deflected. ``angles``: of the joints, rad; all 0."""
+        return self._at(angles).end
+
+    def compose(self, tips: Sequence[TipDeflection], angles: Sequence[float] | None = None) -> EndEffector:
+        """The end effector, from each link's deflection and the ``angles`` of the joints (rad; all 0)."""
+        rest = self._at(angles)
+        if len(tips) != len(self.links):
+            raise ValueError(f'{len(tips)} deflections for {len(self.links)} links')
+        # (dX, dY, dZ, phi, omega, theta) of each tip, one below the other.
+        state = rest.tip_of_measured @ np.concatenate([tip.pose for tip in tips])
+        state = state.reshape(-1, 6)
+
+        # Forward: every frame in the base, as it is now.
+        clamped: list[FloatArray] = []
+        frame = IDENTITY
+        poses, ends = [], []
+        for link, angle, (dx, dy, dz, phi, omega, theta) in zip(self.links, rest.angles, state, strict=True):
+            frame = frame @ link.base(angle) @ shift(0.0, 0.0, link.length)
+            clamped.append(frame.rotation)
+            pose = Transform(_tilted(theta, phi, omega), np.array([dx, dy, dz]))
+            frame = frame @ pose
+            poses.append(pose)
+            ends.append(frame.position)
+        deflected = frame @ self.end
+        deflection = rest.end.inverse() @ deflected
+
+        # What a small change of each tip does to the end effector, in the frame of the rigid one.
+        carried = np.empty((6, 6 * len(self.links)))
+        for i, (rotation, at, (_, _, _, _, omega, _), pose) in enumerate(zip(clamped, ends, state, poses, strict=True)):
+            to_end = rest.end.rotation.T @ rotation
+            lever = rotation.T @ (deflected.position - at)
+            # Rotation vector of small changes of phi, omega and theta in R = Ry(omega) Rx(phi) Rz(theta).
+            axes = np.column_stack([[math.cos(omega), 0.0, -math.sin(omega)], [0.0, 1.0, 0.0], pose.rotation[:, 2]])
+            block = carried[:, 6 * i : 6 * i + 6]
+            block[:3, :3], block[3:, :3] = to_end, 0.0
+            block[:3, 3:] = -to_end @ cross_matrix(lever) @ axes
+            block[3:, 3:] = to_end @ axes
+
+        jacobian = carried @ rest.tip_of_measured
+        covariance = np.zeros((6, 6))
+        for i, (link, tip) in enumerate(zip(self.links, tips, strict=True)):
+            own = jacobian[:, 3 * i : 3 * i + 3]
+            covariance += own @ tip.covariance @ own.T
+            if link.slope_ratio_sd:
+                per_ratio = np.array([-tip.pose[1], tip.pose[0]]) / link.length
+                by_ratio = carried[:, 6 * i + 3 : 6 * i + 5] @ per_ratio * link.slope_ratio_sd
+                covariance += np.outer(by_ratio, by_ratio)
+        return EndEffector(rest.end, deflected, deflection, covariance, tuple(poses), rest.angles)
+
+    def tips_under(self, force: FloatArray, angles: Sequence[float] | None = None) -> FloatArray:
+        """(N, 3): dX, dY, theta of each tip under ``force`` (3,), N in the base, at the end effector; to first order.
+
+        m, m, rad.
+        """
+        return (self._at(angles).measured_of_force @ force).reshape(-1, 3)
+
+    def _at(self, angles: Sequence[float] | None) -> _Rest:
+        wanted = tuple(angles) if angles is not None else (0.0,) * len(self.links)
+        if len(wanted) != len(self.links):
+            raise ValueError(f'{len(wanted)} angles for {len(self.links)} joints')
+        # Another thread may put another one here meanwhile.
+        rest = self._rest
+        if rest is None or rest.angles != wanted:
+            self._rest = rest = _Rest(self, wanted)
+        return rest
+
+
+class _Rest:
+    """What depends on the angles of the joints alone."""
+
+    def __init__(self, chain: Chain, angles: tuple[float, ...]) -> None:
+        self.angles = angles
+        tips = []
+        frame = IDENTITY
+        for link, angle in zip(chain.links, angles, strict=True):
+            frame = frame @ link.base(angle) @ shift(0.0, 0.0, link.length)
+            tips.append(frame)
+        self.end = frame @ chain.end
+        # A force F (3,) at the end effector to the load (Fx, Fy, Tz) and the moments (Mx, My) at each tip.
+        loads = [_load_of_force(tip, self.end.position) for tip in tips]
+        self.measured_of_force = np.vstack(
+            [_bent(link.statics, load) for link, load in zip(chain.links, loads, strict=True)]
+        )
+        self.tip_of_measured = np.zeros((6 * len(tips), 3 * len(tips)))
+        for i, link in enumerate(chain.links):
+            ratio = link.slope_ratio if chain.slopes == 'ratio' else FORCE_RATIO
+            self.tip_of_measured[6 * i : 6 * i + 6, 3 * i : 3 * i + 3] = _tip_of_own(ratio / link.length)
+        if chain.slopes == 'end_force':
+            force_of_measured = self._force_of_measured(chain.links)
+            for i, (link, load) in enumerate(zip(chain.links, loads, strict=True)):
+                per_moment = link.length / (4.0 * link.statics.bending_stiffness)
+                self.tip_of_measured[6 * i + 3 : 6 * i + 5] += per_moment * load[3:] @ force_of_measured
+
+    def _force_of_measured(self, links: Sequence[ChainLink]) -> FloatArray:
+        """(3, 3N): the force at the end effector of all deflections, by least squares in strain energy."""
+        root = np.sqrt(1.0 / np.concatenate([np.diag(link.statics.compliance) for link in links]))
+        return np.asarray(np.linalg.pinv(root[:, None] * self.measured_of_force, rcond=_WEAKEST) * root, np.float64)
+
+
+def _tip_of_own(ratio_per_metre: float) -> FloatArray:
+    """(6, 3): dX, dY, theta to (dX, dY, dZ, phi, omega, theta), the tilts proportional to the deflection."""
+    out = np.zeros((6, 3))
+    out[0, 0] = out[1, 1] = out[5, 2] = 1.0
+    out[3, 1], out[4, 0] = -ratio_per_metre, ratio_per_metre
+    return out
+
+
+def _load_of_force(tip: Transform, end: FloatArray) -> FloatArray:
+    """(5, 3): a force in the base at ``end`` to (Fx, Fy, Tz, Mx, My) in the frame of ``tip``."""
+    force = tip.rotation.T
+    moment = tip.rotation.T @ cross_matrix(end - tip.position)
+    return np.vstack([force[:2], moment[2:], moment[:2]])
+
+
+def _bent(statics: LinkStatics, load: FloatArray) -> FloatArray:
+    """(3, 3): the force of which ``load`` (5, 3) is to dX, dY, theta. A moment bends by M L^2/2EI."""
+    out: FloatArray = statics.compliance @ load[:3]
+    by_moment = statics.length**2 / (2.0 * statics.bending_stiffness)
+    out[0] += by_moment * load[4]
+    out[1] -= by_moment * load[3]
+    return out
+
+
+def _tilted(theta: float, phi: float, omega: float) -> FloatArray:
+    return Rotation.from_euler('YXZ', (omega, phi, theta)).as_matrix()

@@ -1,0 +1,181 @@
+"""The node ``compensator``: the end effector's deflection in, offsets of the joints out.
+
+It subscribes to ``end_effector/deflection`` and ``joint_states``. Every 10 ms it publishes the offsets as
+trajectory_msgs/JointTrajectory with one point: on ``~/proposed`` if it runs dry, else on ``~/offsets``, which a
+controller adds to its commands. Then ``~/enable`` lets the offsets follow, or go back to zero. Everything is done in
+the main thread.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from scipy.spatial.transform import Rotation
+from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from msg_adapters import DEFLECTION_WITH_COVARIANCE, DIAGNOSTICS, END_EFFECTOR, TOPIC_TYPES, to_messages
+from psd_deflection.chains.transform import Transform
+from psd_deflection.compensation.arm import Arm
+from psd_deflection.compensation.compensator import Command, Compensator, CompensatorSettings, Observed, State
+from psd_deflection.errors import ConfigError, Warned
+from psd_deflection.recordings import cdr
+from psd_deflection.records import DiagnosticEntry, DiagnosticReport
+from psd_deflection.ros.names import JOINT_STATES
+from psd_deflection.ros.wires import message_class, qos, relative
+from psd_deflection.runner.diagnostics import ERROR, OK, WARN
+from psd_deflection.runner.repeats import Repeats
+from psd_deflection.runner.signals import Signals
+
+NODE_NAME = 'compensator'
+ENABLE = '~/enable'
+OFFSETS, PROPOSED = '~/offsets', '~/proposed'
+PERIOD_S = 0.01
+NEWS = 6
+"""Changes to one state that are told one by one, before they are counted and told together."""
+
+SPIN_S = 0.1
+RELEASE_S = 10.0
+"""Longest time that the end waits for the offsets to go back to zero, s."""
+
+LEAVE_S = 0.3
+"""Time for the last offsets to leave, s."""
+
+_LEVELS = {State.OFF: OK, State.FOLLOWING: OK, State.RELEASING: WARN, State.HOLDING: ERROR}
+
+
+class CompensatorNode:
+    """The node; ``drive``: publish offsets for a controller, else proposals."""
+
+    def __init__(self, arm: Arm, settings: CompensatorSettings, say: Callable[[str], None], drive: bool) -> None:
+        self.compensator = Compensator(arm, settings, dry=not drive)
+        self.compensator.enable(not drive)
+        self.command = self.compensator.watch(time.monotonic())
+        self._say = say
+        self._repeats = Repeats(say)
+        self._names = list(arm.names)
+        self._places: tuple[list[str], list[int]] = ([], [])
+        self.node = node = Node(NODE_NAME)
+        kind = message_class(TOPIC_TYPES[DEFLECTION_WITH_COVARIANCE])
+        node.create_subscription(kind, relative(END_EFFECTOR), self._seen, 5)
+        node.create_subscription(message_class('sensor_msgs/msg/JointState'), JOINT_STATES, self._joints, 5)
+        self._out = node.create_publisher(JointTrajectory, OFFSETS if drive else PROPOSED, 5)
+        self._health = node.create_publisher(message_class(TOPIC_TYPES[DIAGNOSTICS]), DIAGNOSTICS, qos(DIAGNOSTICS))
+        if drive:
+            node.create_service(SetBool, ENABLE, self._enable)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(PERIOD_S, self._tick, clock=steady)
+        node.create_timer(1.0, self._report, clock=steady)
+        say(f'publishing {self._out.topic_name} for {", ".join(arm.names)}')
+
+    def release(self) -> bool:
+        """Let the offsets go back to zero; True when they are there."""
+        if self.compensator.enabled:
+            self.compensator.enable(False)
+        return not np.any(self.command.offsets)
+
+    def _seen(self, message: Any) -> None:
+        at, turned = message.pose.pose.position, message.pose.pose.orientation
+        quaternion = np.array([turned.x, turned.y, turned.z, turned.w])
+        rotation = np.full((3, 3), np.nan)
+        if np.all(np.isfinite(quaternion)) and np.any(quaternion):
+            rotation = Rotation.from_quat(quaternion).as_matrix()
+        stamp = message.header.stamp
+        t_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+        deflection = Transform(rotation, np.array([at.x, at.y, at.z]))
+        covariance = np.array(message.pose.covariance).reshape(6, 6)
+        seen = Observed(t_ns / 1e9, deflection, covariance, (time.time_ns() - t_ns) / 1e9)
+        self._take(self.compensator.observe(time.monotonic(), seen))
+
+    def _joints(self, message: Any) -> None:
+        names = list(message.name)
+        if names != self._places[0]:
+            missing = [name for name in self._names if name not in names]
+            if missing:
+                # Another part of the robot may publish its joints on the same topic.
+                return
+            self._places = names, [names.index(name) for name in self._names]
+        positions = np.array(message.position, dtype=np.float64)
+        if len(positions) == len(names):
+            self.compensator.joints(time.monotonic(), positions[self._places[1]])
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        self._repeats.settle(now)
+        self._take(self.compensator.watch(now))
+        point = JointTrajectoryPoint(positions=self.command.offsets.tolist())
+        message = JointTrajectory(joint_names=self._names, points=[point])
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
+        self._out.publish(message)
+
+    def _take(self, command: Command) -> None:
+        before, self.command = self.command, command
+        if before.state is not command.state or (command.state is State.HOLDING and before.why != command.why):
+            line = f'{command.state}{": " if command.why else ""}{command.why}'
+            bad = command.state is State.HOLDING
+            self._repeats.tell(str(command.state), Warned(line) if bad else line, time.monotonic(), NEWS)
+
+    def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self.compensator.enable(request.data)
+        self._take(self.compensator.watch(time.monotonic()))
+        response.success = True
+        response.message = f'{self.command.state}{": " if self.command.why else ""}{self.command.why}'
+        return response
+
+    def _report(self) -> None:
+        command = self.command
+        level, text = _LEVELS[command.state], str(command.state) + (f': {command.why}' if command.why else '')
+        if command.limited:
+            level, text = WARN, f'{text}: a limit keeps the offsets from what the deflection asks for'
+        values = [(f'offset {name}', f'{v:.6f}') for name, v in zip(self._names, command.offsets, strict=True)]
+        values.append(('residual (m)', f'{command.residual:.6f}'))
+        node = self.node.get_fully_qualified_name().removeprefix('/')
+        entry = DiagnosticEntry(f'{node}: offsets', level, text, tuple(values))
+        for message in to_messages(DiagnosticReport(time.time_ns(), (entry,))):
+            self._health.publish(cdr.encode(message.type, message.fields))
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self.node.destroy_node()
+
+
+def run_compensator(
+    ros_args: Sequence[str], arm: Arm, settings: CompensatorSettings, say: Callable[[str], None], drive: bool
+) -> int:
+    """Run the node until SIGINT or SIGTERM; then let the offsets go back to zero, unless a second signal comes."""
+    signals = Signals()
+    try:
+        try:
+            rclpy.init(args=[NODE_NAME, *ros_args], signal_handler_options=SignalHandlerOptions.NO)
+        except RuntimeError as error:
+            raise ConfigError('ROS arguments: ' + str(error).splitlines()[0]) from None
+        owner = CompensatorNode(arm, settings, say, drive)
+        executor = SingleThreadedExecutor()
+        executor.add_node(owner.node)
+        try:
+            while not signals.stop:
+                executor.spin_once(timeout_sec=SPIN_S)
+            signals.stop = False
+            until = time.monotonic() + RELEASE_S
+            while drive and not (owner.release() or signals.stop) and time.monotonic() < until:
+                executor.spin_once(timeout_sec=SPIN_S)
+            # DDS does not say when the last offsets have left. If the publisher goes first, they are lost.
+            until = time.monotonic() + LEAVE_S
+            while drive and not signals.stop and time.monotonic() < until:
+                executor.spin_once(timeout_sec=SPIN_S)
+        finally:
+            executor.remove_node(owner.node)
+            executor.shutdown(timeout_sec=0.2)
+            owner.close()
+    finally:
+        rclpy.try_shutdown()
+        signals.restore()
+    return 0

@@ -1,0 +1,197 @@
+"""Composed deflections beside an independent finite-element frame (PyNite), and their covariance beside chance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psd_deflection.chains.chain import Chain, ChainLink, EndEffector, TipDeflection
+from psd_deflection.chains.transform import IDENTITY, Transform, of_position_and_angles, shift
+from psd_deflection.errors import ConfigError
+from psd_deflection.mechanics.statics import LinkStatics
+from psd_deflection.records import FloatArray
+from psd_deflection.thesis.scaling import FORCE, TwinLink, table_b1_cases
+
+CERTAIN = np.zeros((3, 3))
+RIGID = 1e7
+"""How much stiffer than the link a piece is that does not bend."""
+
+
+def random_chain(rng: np.random.Generator, links: int, slopes: str) -> Chain:
+    """Links of other stiffnesses in other directions, with joints between them that have a size."""
+    return Chain(
+        [
+            ChainLink(
+                f'link_{n}',
+                of_position_and_angles(rng.uniform(-0.1, 0.1, 3) * (n > 0), rng.uniform(-1.2, 1.2, 3)),
+                LinkStatics(rng.uniform(0.3, 0.7), rng.uniform(800.0, 2000.0), rng.uniform(600.0, 1500.0)),
+            )
+            for n in range(links)
+        ],
+        of_position_and_angles(rng.uniform(-0.1, 0.1, 3), rng.uniform(-1.0, 1.0, 3)),
+        slopes,
+    )
+
+
+class Frame:
+    """A chain as a frame of beams under a force at its end. ``tips``: dX, dY, theta of each link; ``end`` (6,)."""
+
+    def __init__(self, chain: Chain, force: FloatArray) -> None:
+        pynite = pytest.importorskip('Pynite', reason='the finite elements: pip install PyNiteFEA')
+        self.model = pynite.FEModel3D()
+        self.model.add_material('unit', 1.0, 1.0, 0.0, 0.0)
+        self._count = 0
+        at = IDENTITY
+        root = self._node(at.position)
+        self.model.def_support(root, *([True] * 6))
+        ends: list[tuple[str, str, Transform, float]] = []
+        for link in chain.links:
+            base = at @ link.base(0.0)
+            foot = self._beam(root, at.position, base, RIGID, RIGID)
+            tip = base @ shift(0.0, 0.0, link.length)
+            root = self._beam(
+                foot, base.position, tip, link.statics.bending_stiffness, link.statics.torsional_stiffness
+            )
+            ends.append((foot, root, base, link.length))
+            at = tip
+        end = self._beam(root, at.position, at @ chain.end, RIGID, RIGID)
+        for axis, value in zip('XYZ', force, strict=True):
+            self.model.add_node_load(end, f'F{axis}', float(value))
+        self.model.analyze_linear()
+        self.end = self._moved(end)
+        self.tips = []
+        for foot, tip_name, base, length in ends:
+            below, above = self._moved(foot), self._moved(tip_name)
+            carried = below[:3] + np.cross(below[3:], base.rotation[:, 2] * length)
+            bent, turned = base.rotation.T @ (above[:3] - carried), base.rotation.T @ (above[3:] - below[3:])
+            self.tips.append(np.array([bent[0], bent[1], turned[2]]))
+
+    def _node(self, at: FloatArray) -> str:
+        self._count += 1
+        self.model.add_node(f'N{self._count}', *map(float, at))
+        return f'N{self._count}'
+
+    def _beam(self, start: str, at: FloatArray, end: Transform, bending: float, torsion: float) -> str:
+        if np.linalg.norm(end.position - at) < 1e-9:
+            return start
+        name = f'{bending} {torsion}'
+        if name not in self.model.sections:
+            self.model.add_section(name, RIGID, bending, bending, torsion)
+        node = self._node(end.position)
+        self.model.add_member(f'M{node}', start, node, 'unit', name)
+        return node
+
+    def _moved(self, node: str) -> FloatArray:
+        n = self.model.nodes[node]
+        return np.array([d['Combo 1'] for d in (n.DX, n.DY, n.DZ, n.RX, n.RY, n.RZ)])
+
+
+def in_base(found: EndEffector) -> FloatArray:
+    """Translation and rotation vector of the end effector, in the base."""
+    return np.concatenate([found.rigid.rotation @ found.vector[:3], found.rigid.rotation @ found.vector[3:]])
+
+
+def assert_agrees(found: EndEffector, truth: FloatArray, share: float) -> None:
+    moved = in_base(found)
+    for part in (slice(0, 3), slice(3, 6)):
+        assert np.linalg.norm(moved[part] - truth[part]) < share * np.linalg.norm(truth[part])
+
+
+CASES = [pytest.param(case.link, id=case.what) for case in table_b1_cases()]
+
+
+@pytest.mark.parametrize('link', CASES)
+def test_point_d_of_appendix_b(link: TwinLink) -> None:
+    chain = Chain([ChainLink('BC', IDENTITY, link.statics)], shift(link.length, 0.0, 0.0))
+    # The frame's model is of first order: a tenth of the force of the appendix.
+    frame = Frame(chain, np.array([0.0, 0.1 * FORCE, 0.0]))
+    assert_agrees(chain.compose([TipDeflection(frame.tips[0], CERTAIN)]), frame.end, 0.005)
+    # The appendix lets the twist carry D along an arc, as the composed pose does.
+    bent = chain.tips_under(np.array([0.0, FORCE, 0.0]))[0]
+    found = chain.compose([TipDeflection(bent, CERTAIN)])
+    assert found.vector[1] == pytest.approx(link.tip_total(FORCE), rel=1e-3)
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_three_links_in_any_direction_bend_as_a_frame_of_beams(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    chain = random_chain(rng, 3, 'end_force')
+    force = rng.uniform(-5.0, 5.0, 3)
+    frame = Frame(chain, force)
+    assert_agrees(chain.compose([TipDeflection(tip, CERTAIN) for tip in frame.tips]), frame.end, 0.005)
+    assert chain.tips_under(force) == pytest.approx(np.array(frame.tips), rel=1e-4, abs=1e-9)
+
+
+def test_the_slope_ratio_of_a_force_is_wrong_for_a_link_that_carries_another_one() -> None:
+    """What docs/chains.md says of ``ratio``; the moment of the next link's load bends too."""
+    rng = np.random.default_rng(0)
+    chain = random_chain(rng, 3, 'ratio')
+    frame = Frame(chain, np.array([3.0, -4.0, 5.0]))
+    found = in_base(chain.compose([TipDeflection(tip, CERTAIN) for tip in frame.tips]))
+    error = np.linalg.norm(found[:3] - frame.end[:3]) / np.linalg.norm(frame.end[:3])
+    assert 0.03 < error < 0.3
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize('slopes', ['ratio', 'end_force'])
+def test_covariance_is_that_of_chance(slopes: str) -> None:
+    rng = np.random.default_rng(5)
+    chain = random_chain(rng, 3, slopes)
+    tips = chain.tips_under(np.array([30.0, -40.0, 20.0]))
+    covariances = []
+    for _ in tips:
+        mixed = rng.normal(size=(3, 3)) * 1e-4
+        covariances.append(mixed @ mixed.T)
+    angles = [0.3, -0.8, 1.1]
+    said = chain.compose([TipDeflection(p, c) for p, c in zip(tips, covariances, strict=True)], angles).covariance
+    # Draws of which mean and covariance are exact, so that few are enough.
+    draws = rng.normal(size=(400, 9))
+    draws -= draws.mean(axis=0)
+    draws @= np.linalg.inv(np.linalg.cholesky(draws.T @ draws / len(draws))).T
+    roots = [np.linalg.cholesky(c) for c in covariances]
+    mean = chain.compose([TipDeflection(p, CERTAIN) for p in tips], angles).deflection
+    errors = np.empty((len(draws), 6))
+    for row, draw in zip(errors, draws, strict=True):
+        drawn = [p + r @ d for p, r, d in zip(tips, roots, draw.reshape(3, 3), strict=True)]
+        at = chain.compose([TipDeflection(p, CERTAIN) for p in drawn], angles).deflection
+        row[:3] = at.position - mean.position
+        row[3:] = Transform(at.rotation @ mean.rotation.T, at.position).rotation_vector
+    seen = errors.T @ errors / len(draws)
+    whitened = np.linalg.solve(np.linalg.cholesky(said), np.linalg.cholesky(seen))
+    assert np.linalg.svd(whitened, compute_uv=False) == pytest.approx(np.ones(6), abs=0.025)
+
+
+def test_an_uncertain_slope_ratio_widens_by_its_lever() -> None:
+    link = ChainLink('BC', IDENTITY, LinkStatics(0.5, 1500.0, 1000.0), slope_ratio_sd=0.1)
+    chain = Chain([link], shift(0.0, 0.0, 0.4))
+    found = chain.compose([TipDeflection(np.array([1e-3, 0.0, 0.0]), CERTAIN)])
+    # k dX/L turns the tip about Y, and the end effector is 0.4 m beyond it.
+    assert found.deviations[4] == pytest.approx(0.1 * 1e-3 / 0.5, rel=1e-5)
+    assert found.deviations[0] == pytest.approx(0.4 * found.deviations[4], rel=1e-4)
+    assert found.deviations[[1, 3, 5]] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_joints_turn_what_follows_them() -> None:
+    straight = LinkStatics(0.5, 1500.0, 1000.0)
+    elbow = ChainLink('fore', IDENTITY, straight, axis=np.array([0.0, 1.0, 0.0]))
+    chain = Chain([ChainLink('upper', IDENTITY, straight), elbow])
+    assert chain.rigid().position == pytest.approx([0.0, 0.0, 1.0])
+    assert chain.rigid([0.0, np.pi / 2]).position == pytest.approx([0.5, 0.0, 0.5])
+    twisted = [TipDeflection(np.array([0.0, 0.0, 0.01]), CERTAIN), TipDeflection(np.zeros(3), CERTAIN)]
+    found = chain.compose(twisted, [0.0, np.pi / 2])
+    assert in_base(found)[:3] == pytest.approx([0.5 * (np.cos(0.01) - 1), 0.5 * np.sin(0.01), 0.0], abs=1e-12)
+    assert in_base(found)[3:] == pytest.approx([0.0, 0.0, 0.01], abs=1e-12)
+
+
+def test_what_is_no_chain_is_refused() -> None:
+    link = ChainLink('BC', IDENTITY, LinkStatics(0.5, 1500.0, 1000.0))
+    with pytest.raises(ConfigError, match='at least one link'):
+        Chain([])
+    with pytest.raises(ConfigError, match='two links have the name BC'):
+        Chain([link, link])
+    with pytest.raises(ConfigError, match='slopes = none: must be one of ratio, end_force'):
+        Chain([link], slopes='none')
+    with pytest.raises(ValueError, match='2 deflections for 1 links'):
+        Chain([link]).compose([TipDeflection(np.zeros(3), CERTAIN)] * 2)
+    with pytest.raises(ValueError, match='2 angles for 1 joints'):
+        Chain([link]).rigid([0.0, 0.0])

@@ -1,0 +1,144 @@
+"""Two rigs in one process, and the end effector composed of them."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psd_deflection.chains.chain_file import ChainFile, read_chain
+from psd_deflection.chains.joining import PATIENCE
+from psd_deflection.errors import DeviceError
+from psd_deflection.protocol.frames import SampleFrame
+from psd_deflection.runner.chain import ChainSession, Composed
+from test.heard import WAIT_S
+from test.runner.conftest import ScriptedDevice
+
+Sample = Callable[..., SampleFrame]
+
+CHAIN = """
+links:
+  - {name: upper, port: PORT_0, joint: {name: shoulder, axis: [0, 1, 0]}}
+  - {name: fore, port: PORT_1}
+end_effector: {xyz: [0, 0, 0.1]}
+"""
+
+
+@pytest.fixture
+def devices(tmp_path: Path) -> Iterator[list[ScriptedDevice]]:
+    both = [ScriptedDevice(tmp_path / f'port_{n}') for n in range(2)]
+    yield both
+    for device in both:
+        if not device._gone.is_set():
+            device.unplug()
+
+
+@pytest.fixture
+def file(devices: list[ScriptedDevice], tmp_path: Path) -> ChainFile:
+    text = CHAIN
+    for n, device in enumerate(devices):
+        text = text.replace(f'PORT_{n}', str(device.link))
+    (tmp_path / 'chain.yaml').write_text(text)
+    given = {'keep_zero': False, 'realtime': False, 'bag_dir': str(tmp_path / 'recordings')}
+    return read_chain(tmp_path / 'chain.yaml', given)
+
+
+class Running:
+    """A chain whose devices have sent ``count`` samples each; ``composed``: what came of them."""
+
+    def __init__(self, file: ChainFile) -> None:
+        self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.chain = ChainSession(file, self.said.put)
+        self.composed: queue.SimpleQueue[Composed] = queue.SimpleQueue()
+        self.chain.listeners.append(self.composed.put)
+        self.chain.start()
+        self.sent = 0
+
+    def send(self, devices: list[ScriptedDevice], sample: Sample, count: int) -> None:
+        for device in devices:
+            device.send_frames(*(sample(self.sent + n) for n in range(count)))
+        self.sent += count
+
+    def heard(self, text: str) -> None:
+        while text not in self.said.get(timeout=WAIT_S):
+            pass
+
+    def until(self, wanted: Callable[[Composed], bool]) -> Composed:
+        while not wanted(one := self.composed.get(timeout=WAIT_S)):
+            pass
+        return one
+
+
+@pytest.fixture
+def running(file: ChainFile, devices: list[ScriptedDevice], sample: Sample) -> Iterator[Running]:
+    one = Running(file)
+    one.send(devices, sample, 200)
+    yield one
+    one.chain.close()
+
+
+def test_the_end_effector_is_composed_of_both(running: Running) -> None:
+    one = running.until(lambda c: c.end is not None)
+    assert one.end is not None
+    assert np.abs(one.end.vector).max() < 1e-9
+    record = one.as_record()
+    assert record is not None
+    assert record.t_ns == one.t_ns
+    assert len(record.covariance) == 36
+    first, second = (session.acquisition.to_ros_ns for session in running.chain.sessions)
+    assert first == second
+
+
+def test_a_link_that_is_away_is_missing_and_named(running: Running, devices: list[ScriptedDevice]) -> None:
+    last = running.until(lambda c: c.end is not None)
+    devices[1].unplug()
+    running.heard('waiting for it to come back')
+    upper = running.chain.sessions[0].pipeline.last_estimate
+    assert upper is not None
+    # The stamps of what would come from the other device, without waiting for them.
+    for block in range(1, 2 * PATIENCE):
+        running.chain.take(0, upper._replace(t_ns=last.t_ns + 10**9 + block * 20_000_000))
+    one = running.until(lambda c: c.end is None)
+    assert one.why == 'fore: no estimate'
+    assert one.as_record() is None
+    assert running.chain.missing['fore'] > 0
+    running.heard('end effector: not composed: fore: no estimate')
+    running.until(lambda c: c.t_ns > last.t_ns + 10**9)
+
+
+def test_a_turned_joint_counts_from_the_next_time_on(
+    running: Running, devices: list[ScriptedDevice], sample: Sample
+) -> None:
+    one = running.until(lambda c: c.end is not None)
+    assert one.end is not None
+    assert one.end.rigid.position == pytest.approx([0.0, 0.0, 1.27])
+    running.chain.turn({'shoulder': np.pi / 2, 'wrist': 1.0})
+    assert running.chain.angles == (np.pi / 2, 0.0)
+    running.send(devices, sample, 200)
+    two = running.until(lambda c: c.end is not None and c.end.angles[0] > 0.0)
+    assert two.end is not None
+    assert two.end.rigid.position == pytest.approx([1.27, 0.0, 0.0], abs=1e-12)
+
+
+def test_all_links_are_zeroed_and_recorded(
+    running: Running, devices: list[ScriptedDevice], sample: Sample, tmp_path: Path
+) -> None:
+    running.until(lambda c: c.end is not None)
+    assert all(change is not None for change in running.chain.zero())
+    folders = [asked.result(WAIT_S) for asked in running.chain.record(True)]
+    assert [folder.parent for folder in folders if folder is not None] == [
+        tmp_path / 'recordings' / name for name in ('upper', 'fore')
+    ]
+    assert [asked.result(WAIT_S) for asked in running.chain.record(False)] == folders
+
+
+def test_a_link_that_cannot_be_opened_ends_the_others(file: ChainFile, devices: list[ScriptedDevice]) -> None:
+    devices[1].unplug()
+    before = threading.active_count()
+    with pytest.raises(DeviceError, match='port_1'):
+        ChainSession(file, lambda line: None)
+    assert threading.active_count() <= before
