@@ -3,7 +3,7 @@
 Two PSDs give four readings for three unknowns. What is left is one number a block: how much longer
 the base line between the dots is than that between the beams, r = a^T e for errors e of the readings,
 with a = (n, -n)/sqrt(2) and n along the base line. Over its variance a^T C a it is a chi-square of one
-degree of freedom. A sound rig is beyond ``LIMIT`` in one block of 10^5; a dead, stuck, swapped or
+degree of freedom. A sound rig is beyond ``LIMIT`` in one block of 10^6; a dead, stuck, swapped or
 inverted reading, a PSD that is turned or scaled, and a plate that tilts are beyond it as soon as they
 cost more than a few standard deviations.
 
@@ -24,8 +24,9 @@ import numpy as np
 
 from psd_deflection.records import FloatArray
 
-LIMIT = 20.0
-"""Chi-square beyond which the readings contradict each other: one sound block in 130 000 (Gaussian noise)."""
+LIMIT = 25.0
+"""Chi-square beyond which the readings contradict each other: one sound block in 1.7 million (Gaussian noise), and with it
+the second that it holds for: one block in 35 000."""
 
 NAMES = ('x1', 'y1', 'x2', 'y2')
 

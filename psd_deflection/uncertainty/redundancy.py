@@ -22,7 +22,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.uncertainty.block_fit import inverse
 from psd_deflection.uncertainty.consistency import Checked
 
-CONTRADICTS, DOUBTFUL = 7.7442e-6, 0.01
+CONTRADICTS, DOUBTFUL = 5.7330e-7, 0.01
 """Shares of sound blocks that are taken for contradictory, and for doubtful: those of two PSDs (``consistency``)."""
 
 HOLD = 50

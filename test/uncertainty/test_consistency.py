@@ -55,15 +55,15 @@ def scaled_to(chi_square: float) -> FloatArray:
 @pytest.mark.parametrize(
     ('chi_square', 'contradict', 'widens', 'limit'),
     [
-        (19.9, False, True, 20.0),
-        (20.1, True, True, 20.0),
+        (24.9, False, True, 25.0),
+        (25.1, True, True, 25.0),
         # Chance exceeds 6.635 once in a hundred.
-        (6.7, False, True, 20.0),
-        (6.5, False, False, 20.0),
-        (319.0, False, True, 320.0),
-        (321.0, True, True, 320.0),
-        (107.0, False, True, 320.0),
-        (105.0, False, False, 320.0),
+        (6.7, False, True, 25.0),
+        (6.5, False, False, 25.0),
+        (399.0, False, True, 400.0),
+        (401.0, True, True, 400.0),
+        (107.0, False, True, 400.0),
+        (105.0, False, False, 400.0),
     ],
 )
 def test_limits(chi_square: float, contradict: bool, widens: bool, limit: float) -> None:
@@ -83,8 +83,8 @@ def test_a_contradiction_is_held_and_forgotten_by_a_fiftieth_a_block() -> None:
         blocks += 1
         assert got.chi_square == pytest.approx(0.0, abs=1e-9)
         assert np.abs(got.possible) == pytest.approx(np.abs(first.possible) * 0.98 ** (blocks / 2.0))
-    # 60 falls to 20.
-    assert blocks == math.floor(math.log(3.0) / -math.log(0.98))
+    # 60 falls to 25.
+    assert blocks == math.floor(math.log(2.4) / -math.log(0.98))
     assert of.held == 0.0
     assert got.possible == (0.0, 0.0, 0.0, 0.0)
 
