@@ -172,9 +172,11 @@ SHOT_SECONDS ?= 40
 shots: $(READY)
 	$(BIN)/python -m tools.shots --seconds $(SHOT_SECONDS)
 
-# Each command of README and docs that the tests do not run themselves; ONLY='monitor' for those with that word, or on a page with it.
+# Each command of README and docs that the tests do not run themselves; ONLY='monitor' for those with that word, or on a page with it;
+# CAMPAIGNS=--no-campaigns: without those that take minutes even in their shortest form.
+CAMPAIGNS ?=
 doc-commands: $(READY)
-	$(BIN)/python -m tools.run_commands $(ONLY)
+	$(BIN)/python -m tools.run_commands $(CAMPAIGNS) $(ONLY)
 
 # In an environment of its own, without ROS: the wheel made from the sdist, as `pip install dist/*.whl` has it.
 wheel: $(READY)

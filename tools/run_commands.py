@@ -129,6 +129,8 @@ ADMINISTRATION = re.compile(r'/opt/psd_deflection|^(apt|install|journalctl|ssh|s
 HOURS = re.compile(r'^make mutants\b')
 """Campaigns whose shortest form says nothing: never run here."""
 
+NO_CAMPAIGNS = '--no-campaigns'
+
 NEVER_HERE = ('a machine to administer', 'ros2', 'two hours')
 """Needs that NEED_TOOLS=1 (any other missing program is a failure) does not ask for."""
 
@@ -207,8 +209,9 @@ JOURNEY = 'docs/first-day.md'
 
 
 def is_quick(line: str) -> bool:
-    """Whether the tests run it within themselves."""
-    return QUICK.search(line) is not None and '--serve' not in line and run_by_ci(line) is None
+    """Whether the tests run it within themselves; `replay --watch` is of what the line before it has recorded."""
+    slow = '--serve' in line or '--watch' in line
+    return QUICK.search(line) is not None and not slow and run_by_ci(line) is None
 
 
 def typed_as(line: str) -> str:
@@ -217,6 +220,13 @@ def typed_as(line: str) -> str:
     if target is not None and target[1] in SHORTEST:
         return target[0]
     return next((pattern for pattern in SHORTER if re.search(pattern, line)), line)
+
+
+def is_campaign(line: str) -> bool:
+    """Whether it takes minutes or hours unless it is cut short."""
+    target = re.match(r'make (\S+)', line)
+    by_name = target is not None and target[1] in SHORTEST
+    return by_name or (line.startswith('python') and typed_as(line) != line)
 
 
 def blocks_to_run() -> list[list[Command]]:
@@ -408,10 +418,14 @@ def copy_checkout(target: Path) -> None:
 
 
 def main() -> int:
-    """Run them all, or those that hold the words given, as ``PAGE: LINE``; the exit status is 1 where one failed."""
+    """Run them all, or those that hold the words given, as ``PAGE: LINE``; the exit status is 1 where one failed.
+
+    ``--no-campaigns``: without those that have a short form.
+    """
     # A shell that runs us in the background has it ignored, and so would all that we start.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    only = ' '.join(sys.argv[1:])
+    campaigns = NO_CAMPAIGNS not in sys.argv
+    only = ' '.join(word for word in sys.argv[1:] if word != NO_CAMPAIGNS)
     environment = Path(sys.prefix)
     failures = 0
     with tempfile.TemporaryDirectory() as temporary, a_domain_of_our_own() as domain:
@@ -440,7 +454,10 @@ def main() -> int:
             for block in blocks_to_run():
                 lines = [c.line for c in block if only in f'{c.page}: {c.line}']
                 for line in [*lines]:
-                    if missing := what_is_missing(line):
+                    if not campaigns and is_campaign(line):
+                        lines.remove(line)
+                        passed_over.setdefault(NO_CAMPAIGNS, []).append(line)
+                    elif missing := what_is_missing(line):
                         lines.remove(line)
                         passed_over.setdefault(missing, []).append(line)
                         failures += os.environ.get('NEED_TOOLS') == '1' and missing not in NEVER_HERE
@@ -449,7 +466,8 @@ def main() -> int:
             reader.close()
         for missing, lines in passed_over.items():
             where = ', run by the apt job of .github/workflows/ci.yml' if missing == 'ros2' else ''
-            print(f'not run here, for want of {missing}{where}: {"; ".join(lines)}')
+            why = 'because of' if missing == NO_CAMPAIGNS else 'for want of'
+            print(f'not run here, {why} {missing}{where}: {"; ".join(lines)}')
     for pattern in stale():
         failures += 1
         print(f'FAILED: nothing in the documents is like {pattern} any more')

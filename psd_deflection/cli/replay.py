@@ -11,7 +11,7 @@ Then --out X.parquet takes the estimates of all.
   psd-deflection replay recordings/psd_20260101_120000 --compare
   psd-deflection replay run.csv --params-file my_rig.yaml --out estimates.csv
   psd-deflection replay recordings/psd_20260101_120000 --out again.mcap
-  psd-deflection replay 'recordings/*' --executor processes --out estimates.parquet
+  psd-deflection replay 'recordings/*' --executor processes --out all.parquet
 """
 
 from __future__ import annotations

@@ -41,9 +41,9 @@ class ParquetFile:
         try:
             self._arrow = importlib.import_module('pyarrow')
             parquet = importlib.import_module('pyarrow.parquet')
-        except ImportError:
+        except ImportError as error:
             raise ConfigError(
-                f"--out {path} needs pyarrow: `pip install 'psd_deflection[parquet]'` or `pip install pyarrow`"
+                f"--out {path} needs pyarrow ({error}): `pip install 'psd_deflection[parquet]'`"
             ) from None
         self.path = Path(path)
         self.fields = tuple(fields)

@@ -25,8 +25,8 @@ import numpy as np
 from psd_deflection.records import FloatArray
 
 LIMIT = 25.0
-"""Chi-square beyond which the readings contradict each other: one sound block in 1.7 million (Gaussian noise), and with it
-the second that it holds for: one block in 35 000."""
+"""Chi-square beyond which the readings contradict each other: one sound block in 1.7 million (Gaussian noise), with the
+second that it holds for: one block in 35 000."""
 
 NAMES = ('x1', 'y1', 'x2', 'y2')
 

@@ -139,7 +139,7 @@ def test_the_page_is_self_contained(made: Path) -> None:
     ('argv', 'status', 'words'),
     [
         ([], 2, '--out DIR .* or --check'),
-        (['--check', str(RIG), '--out', 'x'], 2, 'give neither --params-file nor --out'),
+        (['--check', str(RIG), '--out', 'x'], 2, 'give none of --params-file, --out'),
         (['--reference', 'a', '--reference', 'b', '--out', 'x'], 2, '--reference is given 2 times for 1 recordings'),
         (['--check', str(RIG)], 3, 'calibration.names: not there; --check takes the rig.yaml of a calibration'),
     ],

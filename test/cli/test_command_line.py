@@ -93,7 +93,7 @@ def test_recordings_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[
     folder.mkdir()
     empty = tmp_path / 'empty.mcap'
     empty.touch()
-    text = tmp_path / 'notes.txt'
+    text = tmp_path / 'notes.md'
     text.write_text('hello')
     fake = tmp_path / 'fake.mcap'
     fake.write_text('hello, this is no mcap')
