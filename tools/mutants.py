@@ -47,7 +47,9 @@ class Room(NamedTuple):
 
 _PIPELINE = 'test/test_pipeline.py -k not(drift or rms_errors or rotation or crosstalk or nonlinearity or iterative)'
 _GOLDEN = 'test/test_golden.py'
-_SOLVERS = ('truth', 'golden', 'interface', 'properties', 'degenerate', 'registry', 'gauss_newton', 'one_psd')
+_SOLVERS = (
+    *('sensitivity', 'truth', 'golden', 'interface', 'properties', 'degenerate', 'registry', 'gauss_newton', 'one_psd'),
+)
 
 ROOMS: Mapping[str, Room] = {
     'solvers': Room(

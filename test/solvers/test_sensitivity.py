@@ -1,0 +1,296 @@
+"""How an answer goes with each dot, by differences of the answers, is the judge of every stated gain and covariance."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psd_deflection.config import rig_from_values
+from psd_deflection.errors import SolverError
+from psd_deflection.geometry import Geometry
+from psd_deflection.solvers import SolverStatus, make_solver
+from psd_deflection.solvers.interface import Solver
+from psd_deflection.solvers.some_psds import geometry_of, solver_of_some
+from test.solvers.test_truth import FLAT_THREE, RAISED, THREE, TWO, VARIANCES, least_squares
+
+Array = np.ndarray[Any, Any]
+
+SKEW = Geometry(np.array([[0.06, 0.05], [-0.05, -0.03]]), np.array([[3e-4, -2e-4], [1e-4, 5e-4]]), np.zeros(2), 0.585)
+AT_THE_BASE = Geometry(
+    np.array([[0.01, 0.07], [-0.1, 0.02]]), np.array([[3e-4, -2e-4], [1e-4, 5e-4]]), np.array([-0.585, -0.485]), 0.585
+)
+OTHER_WEIGHTS: dict[str, Any] = {'weights': 'thesis', 'row_scaling': (0.3, 0.5, 2.0, 0.4)}
+POSES = ((2e-3, -3e-3, 0.04), (-4e-3, 1e-3, -0.05))
+
+
+def tied(geometry: Geometry, pose: tuple[float, float, float]) -> tuple[float, ...]:
+    """The pose with a cantilever's tilts, phi = -k dY/L and omega = k dX/L."""
+    k = geometry.slope_ratio / geometry.link_length
+    return (*pose, -k * pose[1], k * pose[0])
+
+
+def by_differences(solver: Solver, dots: Array, variances: Array) -> Array:
+    """d(dX, dY, theta)/d(dots), (3, 2P)."""
+    columns = []
+    for i in range(len(dots)):
+        ends = []
+        for step in (1e-6, -1e-6):
+            moved = dots.copy()
+            moved[i] += step
+            ends.append(np.array(solver.solve(tuple(moved.tolist()), tuple(variances.tolist()))[:3]))
+        columns.append((ends[0] - ends[1]) / 2e-6)
+    return np.stack(columns, axis=1)
+
+
+TIP: list[tuple[str, dict[str, Any], Geometry, tuple[float, float]]] = [
+    ('exact', {}, SKEW, (0.0, 0.0)),
+    ('exact', {}, FLAT_THREE, (0.0, 0.0)),
+    ('iterative', {}, SKEW, (0.0, 0.0)),
+    ('iterative', {}, FLAT_THREE, (0.0, 0.0)),
+    ('ols', {}, SKEW, (0.01, 0.01)),
+    ('ols', {}, FLAT_THREE, (0.01, 0.01)),
+    ('wls', {}, SKEW, (0.01, 0.01)),
+    ('wls', OTHER_WEIGHTS, SKEW, (0.01, 0.01)),
+    ('wls_exact', {}, SKEW, (0.0, 0.0)),
+    ('wls_exact', {}, FLAT_THREE, (0.0, 0.0)),
+    ('wls_exact', OTHER_WEIGHTS, SKEW, (0.0, 0.0)),
+    ('minimum_tilt', {}, SKEW, (0.2, -0.15)),
+    ('minimum_tilt', {'angles': 'azimuth'}, SKEW, (0.2, -0.15)),
+    ('pose', {}, THREE, (0.02, -0.03)),
+]
+
+
+@pytest.mark.parametrize('pose', POSES)
+@pytest.mark.parametrize(('method', 'options', 'geometry', 'tilt'), TIP)
+def test_gain_and_covariance_are_those_of_the_answer(
+    rays: Any,
+    method: str,
+    options: dict[str, Any],
+    geometry: Geometry,
+    tilt: tuple[float, float],
+    pose: tuple[float, float, float],
+) -> None:
+    solver = make_solver(method, geometry, **options)
+    judged(solver, np.asarray(rays.tip_dots(geometry, (*pose, *tilt))), 1e-5, 1e-5)
+
+
+def judged(solver: Solver, dots: Array, covariance_within: float, gain_within: float) -> None:
+    """Covariance against K V K^T and the stated gain against K, each in units of its own size."""
+    variances = np.array(VARIANCES[: len(dots)])
+    gain = by_differences(solver, dots, variances)
+    one = solver.solve(tuple(dots.tolist()), tuple(variances.tolist()))
+    assert one.status is SolverStatus.OK
+    want = gain * variances @ gain.T
+    sd = np.sqrt(np.maximum(np.diag(want), 1e-24))
+    stated = np.reshape(one.covariance, (3, 3))
+    np.testing.assert_allclose(stated / np.outer(sd, sd), want / np.outer(sd, sd), rtol=0.0, atol=covariance_within)
+    size = np.abs(gain).max(axis=1, keepdims=True) + 1e-9
+    of_dots = solver.gain(tuple(dots.tolist()), tuple(variances.tolist()), one)
+    np.testing.assert_allclose(of_dots / size, gain / size, rtol=0.0, atol=gain_within)
+
+
+def test_the_gain_of_iterative_knows_that_the_base_line_is_not_the_beams(rays: Any) -> None:
+    """Its covariance does not: it counts the beams' spread, some per cent more than the dots' own."""
+    dots = np.asarray(rays.tip_dots(SKEW, (2e-3, -3e-3, 0.04, 0.2, -0.15)))
+    judged(make_solver('iterative', SKEW), dots, 0.1, 1e-5)
+
+
+@pytest.mark.parametrize('pose', POSES)
+@pytest.mark.parametrize(('geometry', 'gain_within'), [(TWO, 0.02), (FLAT_THREE, 0.02), (RAISED, 0.3)])
+def test_the_covariance_of_beam_is_that_of_its_answer(
+    rays: Any, geometry: Geometry, gain_within: float, pose: tuple[float, float, float]
+) -> None:
+    """Its gain is a flat plate's, so it misses what heights do: k h/L of it."""
+    dots = np.asarray(rays.tip_dots(geometry, tied(geometry, pose)))
+    judged(make_solver('beam', geometry), dots, 1e-5, gain_within)
+
+
+@pytest.mark.parametrize('assume', ['beam', 'no_twist'])
+@pytest.mark.parametrize('pose', POSES)
+def test_the_base_pair_is_weighted_least_squares_of_its_model(
+    rays: Any, assume: str, pose: tuple[float, float, float]
+) -> None:
+    k = AT_THE_BASE.slope_ratio / AT_THE_BASE.link_length
+    variances = np.array(VARIANCES[:4])
+
+    def model(x: Array) -> Array:
+        five = (*x, -k * x[1], k * x[0]) if assume == 'beam' else (x[0], x[1], 0.0, x[2], x[3])
+        return np.asarray(rays.base_dots(AT_THE_BASE, five))
+
+    unknowns = 3 if assume == 'beam' else 4
+    x = np.array((*pose, 0.004)[:unknowns] if assume == 'beam' else (*pose[:2], 0.004, -0.006))
+    # Of four readings four unknowns leave no residual.
+    dots = model(x) + np.array([6e-6, -4e-6, 3e-6, 5e-6]) * (assume == 'beam')
+    solver = make_solver('base_pair', AT_THE_BASE, assume=assume)
+    got = solver.solve(tuple(dots.tolist()), tuple(variances.tolist()))
+    want, covariance, residual, gain = least_squares(model, dots, variances, unknowns)
+    if assume == 'beam':
+        five = (*want, -k * want[1], k * want[0])
+    else:
+        five = (want[0], want[1], 0.0, want[2], want[3])
+        keep = [0, 1]
+        gain = np.vstack((gain[keep], np.zeros(4)))
+        whole = np.zeros((3, 3))
+        whole[:2, :2] = covariance[:2, :2]
+        covariance = whole
+    np.testing.assert_allclose(got[:5], five, rtol=0.0, atol=3e-9)
+    np.testing.assert_allclose(got.residual, residual, rtol=0.0, atol=3e-9)
+    sd = np.sqrt(np.diag(covariance)) + 1e-12
+    stated = np.reshape(got.covariance, (3, 3))
+    np.testing.assert_allclose(stated / np.outer(sd, sd), covariance / np.outer(sd, sd), rtol=0.0, atol=2e-3)
+    stated_gain = solver.gain(tuple(dots.tolist()), tuple(variances.tolist()), got)
+    np.testing.assert_allclose(stated_gain, gain, rtol=0.0, atol=2e-3 * np.abs(gain).max())
+
+
+@pytest.mark.parametrize('method', ['exact', 'iterative', 'ols', 'wls', 'wls_exact'])
+@pytest.mark.parametrize('geometry', [SKEW, FLAT_THREE])
+def test_a_flat_plates_method_says_of_tilts_that_there_are_none(rays: Any, method: str, geometry: Geometry) -> None:
+    variances = VARIANCES[: 2 * len(geometry.centers)]
+    dots = rays.tip_dots(geometry, (1e-3, 2e-3, 0.03, 0.0, 0.0))
+    solver = make_solver(method, geometry)
+    one, many = solver.solve(tuple(dots.tolist()), variances), solver.solve_many(dots[None], np.array(variances))
+    assert one[3:5] == (0.0, 0.0)
+    assert not many.tilt.any()
+    closed = method in ('ols', 'wls', 'wls_exact')
+    assert (one.iterations == 0) == closed
+
+
+def test_the_thesis_weights_say_no_tilts_and_take_no_steps() -> None:
+    one = make_solver('wls', SKEW, weights='thesis').solve((1e-3, 0.0, -1e-3, 2e-3), VARIANCES[:4])
+    assert (one.phi, one.omega, one.iterations) == (0.0, 0.0, 0)
+
+
+@pytest.mark.parametrize(('geometry', 'steps'), [(SKEW, 3), (FLAT_THREE, 6)])
+def test_newton_doubles_its_digits(rays: Any, geometry: Geometry, steps: int) -> None:
+    """From some millidegrees off two steps reach the last digit, and a third sees that nothing changes.
+
+    With three PSDs the start is farther off if the weights differ.
+    """
+    variances = VARIANCES[: 2 * len(geometry.centers)]
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        noise = rng.normal(size=len(variances)) * 2e-5
+        dots = rays.tip_dots(geometry, (2e-3, -1e-3, rng.uniform(-0.05, 0.05), 0.0, 0.0)) + noise
+        one = make_solver('exact', geometry).solve(tuple(dots.tolist()), variances)
+        assert one.status is SolverStatus.OK
+        assert one.iterations <= steps
+
+
+def test_newton_keeps_its_pace_where_the_dots_contradict_the_model() -> None:
+    """Half a radian from the start to the answer: the slope and its own slope must both be right."""
+    variances = np.array([1e-12, 9e-10, 4e-12, 1e-10])
+    dots = np.array([0.02, -0.03, -0.025, 0.03])
+    many = make_solver('exact', SKEW)
+    one = many.solve(tuple(dots.tolist()), tuple(variances.tolist()))
+    assert one.status is SolverStatus.OK
+    assert one.iterations <= 6, one
+    q, spread = SKEW.centers + dots.reshape(2, 2), variances.reshape(2, 2)
+
+    def cost(theta: Array) -> Array:
+        """The smallest sum of squares at each angle: of two dots, what their difference is off."""
+        lx, ly = SKEW.beams[0] - SKEW.beams[1]
+        qx, qy = q[0] - q[1]
+        off_x, off_y = qx - np.cos(theta) * lx - np.sin(theta) * ly, qy - np.cos(theta) * ly + np.sin(theta) * lx
+        return np.asarray(off_x**2 / spread[:, 0].sum() + off_y**2 / spread[:, 1].sum())
+
+    angles = np.linspace(-np.pi, np.pi, 200_001)
+    assert one.theta == pytest.approx(float(angles[np.argmin(cost(angles))]), abs=4e-5)
+    assert many.solve_many(dots[None], variances).pose[0] == pytest.approx(one[:3], abs=1e-13)
+
+
+def test_dots_that_lie_on_one_another_turn_nothing() -> None:
+    """The plate points of both dots are one: no angle is better than another, and 0 is said by one block and many."""
+    meet = SKEW.centers[1] - SKEW.centers[0]
+    dots, solver = np.array([*meet, 0.0, 0.0]), make_solver('exact', SKEW)
+    assert solver.solve(tuple(dots.tolist()), (1e-12,) * 4).theta == 0.0
+    got = solver.solve_many(np.array([dots, [1e-3, 0.0, 0.0, 0.0]]), np.full(4, 1e-12))
+    # Both beams' middle comes to where the dots are.
+    np.testing.assert_allclose(got.pose[0], [*(SKEW.beams.mean(axis=0) - SKEW.centers[1]), 0.0], atol=1e-15)
+    assert got.status.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize('count', [2, 4098])
+def test_of_many_blocks_each_has_its_own_variances(rays: Any, count: int) -> None:
+    """More of them than are worked on at once, too."""
+    rng = np.random.default_rng(6)
+    dots = rays.tip_dots(SKEW, (1e-3, 2e-3, 0.02, 0.0, 0.0)) + rng.normal(size=(count, 4)) * 1e-4
+    variances = rng.uniform(1.0, 9.0, (count, 4)) * 1e-12
+    solver = make_solver('exact', SKEW)
+    many = solver.solve_many(dots, variances)
+    for i in {0, 1, count - 2, count - 1}:
+        one = solver.solve(tuple(dots[i].tolist()), tuple(variances[i].tolist()))
+        np.testing.assert_allclose(many.pose[i], one[:3], rtol=0.0, atol=1e-13)
+        np.testing.assert_allclose(many.covariance[i].ravel(), one.covariance, rtol=1e-9, atol=1e-22)
+        np.testing.assert_allclose(many.residual[i], one.residual, rtol=0.0, atol=1e-14)
+    assert not many.tilt.any()
+
+
+def of_three(**values: Any) -> Any:
+    """A rig of three PSDs at different heights, which see the tilts together."""
+    places: dict[str, Any] = {}
+    for i, ((x, y), (zx, zy), height) in enumerate(zip(THREE.centers, THREE.zeros, THREE.heights, strict=True), 1):
+        places |= {f'psd_{i}.center': [x, y], f'psd_{i}.zero': [zx, zy], f'psd_{i}.height': float(height)}
+    return rig_from_values({**places, 'solver': 'pose', 'solvers': ['pose'], **values})
+
+
+def test_two_of_three_psds_allow_for_the_tilt_that_they_do_not_see(rays: Any) -> None:
+    """The middle between no tilt and a cantilever's, by least squares, and the way to either end as one more error."""
+    rig, kept = of_three(), [0, 2]
+    geometry = geometry_of(rig, kept)
+    np.testing.assert_array_equal(geometry.centers, THREE.centers[kept])
+    np.testing.assert_array_equal(geometry.zeros, THREE.zeros[kept])
+    np.testing.assert_array_equal(geometry.heights, THREE.heights[kept])
+    solver = solver_of_some('pose', rig, kept)
+    assert solver is not None
+    variances = np.array(VARIANCES[:4])
+    dots = np.asarray(rays.tip_dots(geometry, tied(geometry, (2e-3, -3e-3, 0.02)))) + np.array(
+        [3e-6, 1e-6, -2e-6, 4e-6]
+    )
+    fits = []
+    for share in (0.5, 1.0):
+        k = share * geometry.slope_ratio / geometry.link_length
+        fits.append(
+            least_squares(
+                lambda x, k=k: np.asarray(rays.tip_dots(geometry, (*x, -k * x[1], k * x[0]))), dots, variances, 3
+            )
+        )
+    (middle, covariance, residual, _), (end, *_) = fits
+    got = solver.solve(tuple(dots.tolist()), tuple(variances.tolist()))
+    np.testing.assert_allclose(got[:3], middle, rtol=0.0, atol=2e-9)
+    k = 0.5 * geometry.slope_ratio / geometry.link_length
+    np.testing.assert_allclose(got[3:5], (-k * middle[1], k * middle[0]), rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(got.residual, residual, rtol=0.0, atol=2e-9)
+    apart = end - middle
+    assert np.abs(apart[:2]).max() > 1e-5
+    np.testing.assert_allclose(np.reshape(got.covariance, (3, 3)), covariance + np.outer(apart, apart), rtol=2e-3)
+    allowed = solver.allowance(tuple(dots.tolist()), tuple(variances.tolist()))
+    assert allowed is not None
+    np.testing.assert_allclose(allowed, np.outer(apart, apart), rtol=2e-3)
+    want = make_solver('beam', Geometry(geometry.centers, geometry.zeros, geometry.heights, 0.585, 0.75))
+    args = tuple(dots.tolist()), tuple(variances.tolist())
+    np.testing.assert_allclose(solver.gain(*args, got), want.gain(*args, want.solve(*args)), rtol=1e-12)
+
+
+def test_a_middle_without_its_end_is_no_answer() -> None:
+    solver = solver_of_some('pose', of_three(), [0, 1])
+    assert solver is not None
+    bad = solver.solve((float('nan'), 0.0, 0.0, 0.0), VARIANCES[:4])
+    assert bad.status is SolverStatus.NOT_CONVERGED
+
+
+def test_who_can_do_with_fewer_psds() -> None:
+    """Every method that needs no third; minimum_tilt takes two at height 0 and no others; one PSD gives no twist."""
+    rig = of_three()
+    for name in ('exact', 'beam', 'wls', 'ols', 'iterative', 'wls_exact'):
+        some = solver_of_some(name, rig, [1, 2])
+        assert some is not None
+        assert some.name == name
+        assert some.allowance((0.0,) * 4, VARIANCES[:4]) is None
+    assert solver_of_some('minimum_tilt', rig, [1, 2]) is None
+    assert solver_of_some('pose', rig, [1]) is None
+    assert solver_of_some('exact', rig, [1]) is None
+    three = solver_of_some('pose', rig, [0, 1, 2])
+    assert three is not None
+    assert three.tilts == 'free'
