@@ -104,6 +104,7 @@ ROOMS: Mapping[str, Room] = {
         ('psd_deflection/simulation/effects',),
         (
             'test/simulation/test_catalogue.py',
+            'test/simulation/test_effect_terms.py',
             'test/simulation/test_effect_formulas.py',
             'test/simulation/test_effects.py -k back or play or pieces or (wrench and (creep or friction or load))',
         ),

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from psd_deflection.config import rig_from_values
-from psd_deflection.errors import SolverError
+from psd_deflection.errors import ConfigError, SolverError
 from psd_deflection.geometry import Geometry
-from psd_deflection.solvers import SolverStatus, make_solver
+from psd_deflection.solvers import SolverStatus, make_solver, solver_from_rig
 from psd_deflection.solvers.interface import Solver
+from psd_deflection.solvers.registry import check_arrangement
 from psd_deflection.solvers.some_psds import geometry_of, solver_of_some
 from test.solvers.test_truth import FLAT_THREE, RAISED, THREE, TWO, VARIANCES, least_squares
 
@@ -178,6 +179,44 @@ def test_newton_doubles_its_digits(rays: Any, geometry: Geometry, steps: int) ->
         assert one.iterations <= steps
 
 
+@pytest.mark.parametrize('geometry', [SKEW, FLAT_THREE])
+@pytest.mark.parametrize('method', ['exact', 'iterative'])
+def test_the_residual_is_what_the_plate_at_the_answer_does_not_explain(
+    rays: Any, method: str, geometry: Geometry
+) -> None:
+    variances = VARIANCES[: 2 * len(geometry.centers)]
+    off = np.random.default_rng(8).normal(size=len(variances)) * 1e-4
+    dots = rays.tip_dots(geometry, (2e-3, -1e-3, 0.04, 0.0, 0.0)) + off
+    one = make_solver(method, geometry).solve(tuple(dots.tolist()), variances)
+    np.testing.assert_allclose(one.residual, dots - rays.tip_dots(geometry, one[:5]), rtol=0.0, atol=1e-14)
+    assert np.abs(one.residual).max() > 1e-5
+
+
+def test_minimum_tilt_leaves_no_residual(rays: Any) -> None:
+    dots = rays.tip_dots(SKEW, (2e-3, -1e-3, 0.04, 0.1, -0.1))
+    one = make_solver('minimum_tilt', SKEW).solve(tuple(dots.tolist()), VARIANCES[:4])
+    assert one.residual == (0.0, 0.0, 0.0, 0.0)
+    assert (one.status, one.iterations) == (SolverStatus.OK, 0)
+
+
+def test_trial_angles_treble_their_digits(rays: Any) -> None:
+    """From 0 to 3 degrees: 0.05 rad, a third of its cube, a third of that one's cube."""
+    for theta in (0.05, -0.05):
+        dots = tuple(rays.tip_dots(SKEW, (1e-3, 2e-3, theta, 0.0, 0.0)).tolist())
+        one = make_solver('iterative', SKEW).solve(dots, VARIANCES[:4])
+        assert one.theta == pytest.approx(theta, abs=1e-14)
+        assert one.iterations == 3
+    still = make_solver('iterative', SKEW).solve(tuple(rays.tip_dots(SKEW, (0.0,) * 5).tolist()), VARIANCES[:4])
+    assert (still.theta, still.iterations) == (pytest.approx(0.0, abs=1e-15), 1)
+
+
+@pytest.mark.parametrize(('method', 'tries'), [('exact', 30), ('iterative', 50)])
+def test_what_never_ends_is_given_up(method: str, tries: int) -> None:
+    one = make_solver(method, SKEW).solve((float('nan'), 0.0, 0.0, 0.0), VARIANCES[:4])
+    assert one.status is SolverStatus.NOT_CONVERGED
+    assert one.iterations == tries
+
+
 def test_newton_keeps_its_pace_where_the_dots_contradict_the_model() -> None:
     """Half a radian from the start to the answer: the slope and its own slope must both be right."""
     variances = np.array([1e-12, 9e-10, 4e-12, 1e-10])
@@ -294,3 +333,68 @@ def test_who_can_do_with_fewer_psds() -> None:
     three = solver_of_some('pose', rig, [0, 1, 2])
     assert three is not None
     assert three.tilts == 'free'
+
+
+def test_where_the_psds_are_is_said_once() -> None:
+    """PSDs nearer to the base than to the tip are at the base; halfway they may still be at the tip."""
+    check_arrangement(rig_from_values({'link.length': 0.5, 'psd_1.height': -0.25}))
+    with pytest.raises(ConfigError, match=r'psd_2\.height = -0\.251 m: that is nearer to the base'):
+        check_arrangement(rig_from_values({'link.length': 0.5, 'psd_2.height': -0.251}))
+    base = {'solver': 'base_pair', 'solvers': ['base_pair'], 'psd_1.height': -0.585, 'psd_2.height': -0.485}
+    check_arrangement(rig_from_values({**base, 'degraded': 'none'}))
+    with pytest.raises(ConfigError, match='one PSD at the base gives no pose'):
+        check_arrangement(rig_from_values({**base, 'degraded': 'hold'}))
+    for values, others in (
+        ({**base, 'solvers': ['base_pair', 'wls']}, 'wls'),
+        ({'solvers': ['base_pair']}, 'base_pair'),
+    ):
+        with pytest.raises(ConfigError, match=f'; {others} of solvers have not'):
+            check_arrangement(rig_from_values({**values, 'degraded': 'none'}))
+
+
+@pytest.mark.parametrize(('apart', 'taken'), [(0.9e-6, False), (1.1e-6, True)])
+def test_planes_closer_than_a_micrometre_are_one(apart: float, taken: bool) -> None:
+    """Of three PSDs at the tip and of two at the base. Just above, what noise makes of it is another matter."""
+    heights = np.array([0.0, apart, 0.0])
+    staggered = Geometry(THREE.centers, THREE.zeros, heights, 0.585)
+    planes = Geometry(AT_THE_BASE.centers, AT_THE_BASE.zeros, np.array([-0.5, -0.5 - apart]), 0.585)
+    if taken:
+        make_solver('pose', staggered)
+        with pytest.raises(SolverError, match='some motion of the tip moves no dot'):
+            make_solver('base_pair', planes, assume='no_twist')
+        return
+    with pytest.raises(SolverError, match='coplanar'):
+        make_solver('pose', staggered)
+    with pytest.raises(SolverError, match='all PSD planes'):
+        make_solver('base_pair', planes, assume='no_twist')
+
+
+@pytest.mark.parametrize(('gain', 'taken'), [(0.9e-3, False), (1.1e-3, True), (-0.9e-3, False), (-1.1e-3, True)])
+def test_a_deflection_that_moves_a_dot_by_less_than_a_thousandth_is_unseen(gain: float, taken: bool) -> None:
+    """1 - k L_i/L, by which a dot at the base follows the deflection."""
+    geometry = Geometry(AT_THE_BASE.centers, AT_THE_BASE.zeros, np.full(2, -0.5), 0.5, 1.0 - gain)
+    if taken:
+        make_solver('base_pair', geometry)
+    else:
+        with pytest.raises(SolverError, match='the deflection cannot be seen'):
+            make_solver('base_pair', geometry)
+
+
+def test_options_come_from_the_rig_file() -> None:
+    """Each has another answer, or another refusal, than the default."""
+    base = {'solver': 'base_pair', 'solvers': ['base_pair'], 'degraded': 'none'}
+    rig = rig_from_values({**base, 'psd_1.height': -0.585, 'psd_2.height': -0.485, 'base_pair.assume': 'no_twist'})
+    dots = (1e-3, -2e-3, 5e-4, 1e-3)
+    said = solver_from_rig('base_pair', rig).solve(dots, VARIANCES[:4])
+    assert said == make_solver('base_pair', Geometry.from_rig(rig), assume='no_twist').solve(dots, VARIANCES[:4])
+    assert said != make_solver('base_pair', Geometry.from_rig(rig)).solve(dots, VARIANCES[:4])
+    rig = rig_from_values({'minimum_tilt.angles': 'azimuth'})
+    far = (1e-3, 2e-3, -1e-3, -3e-3)
+    said = solver_from_rig('minimum_tilt', rig).solve(far, VARIANCES[:4])
+    assert said == make_solver('minimum_tilt', Geometry.from_rig(rig), angles='azimuth').solve(far, VARIANCES[:4])
+    assert said.theta != make_solver('minimum_tilt', Geometry.from_rig(rig)).solve(far, VARIANCES[:4]).theta
+    two = {'psd_1.height': 0.02, 'psd_2.height': -0.03}
+    for effect, in_dots in (({}, True), ({'effects.t.name': 'plane_tilt', 'effects.t.slope_ratio': 1.5}, False)):
+        rig = rig_from_values({**two, **effect})
+        said = solver_from_rig('beam', rig).solve(dots, VARIANCES[:4])
+        assert said == make_solver('beam', Geometry.from_rig(rig), tilt_in_dots=in_dots).solve(dots, VARIANCES[:4])

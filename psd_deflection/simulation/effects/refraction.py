@@ -7,9 +7,8 @@ from psd_deflection.simulation.samples import SimulatedSamples
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
-    for i in (0, 2):
-        samples.beams[i] += values['x'] * samples.warmer
-        samples.beams[i + 1] += values['y'] * samples.warmer
+    samples.beams[0::2] += values['x'] * samples.warmer
+    samples.beams[1::2] += values['y'] * samples.warmer
 
 
 EFFECT = Effect(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
@@ -17,12 +19,15 @@ def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
 
 def _correct(reading: Reading, values: Values) -> None:
     i = 2 * (int(values['psd']) - 1)
+    k = values['k']
     read = np.hypot(reading.dots[i], reading.dots[i + 1])
-    true = read.copy()
+    # With k < 0 the reading falls again farther out: no dot is sought where its slope is below a tenth.
+    farthest = math.sqrt(0.3 / -k) if k < 0.0 else math.inf
+    true = np.minimum(read, farthest)
     for _ in range(6):
         # Newton on true (1 + k true^2) = read; six steps reach rounding anywhere on a sensor.
-        true -= (true * (1.0 + values['k'] * true**2) - read) / np.maximum(1.0 + 3.0 * values['k'] * true**2, 0.1)
-    grown = 1.0 + values['k'] * true**2
+        true = np.minimum(true - (true * (1.0 + k * true**2) - read) / (1.0 + 3.0 * k * true**2), farthest)
+    grown = 1.0 + k * true**2
     reading.dots[i] /= grown
     reading.dots[i + 1] /= grown
 
