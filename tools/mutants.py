@@ -112,9 +112,12 @@ ROOMS: Mapping[str, Room] = {
     'discovery': Room(
         ('psd_deflection/discovery',),
         (
-            'test/discovery/test_rules.py',
-            # Its pieces: a whole discovery takes seconds.
+            *(f'test/discovery/test_{n}.py' for n in ('formulas', 'law_formulas', 'answers', 'rules')),
+            # Their pieces: a whole discovery of the catalogue takes seconds.
             'test/discovery/test_discover.py -k known or stripped or refined or coarse or imagined or floor',
+            'test/discovery/test_planning.py -k planned or tells or adds or within_the or loop or words',
+            'test/discovery/test_setup.py -k put_right or other_unit or at_its or outliers or stuck or late_loads',
+            'test/discovery/test_laws.py -k scores or variance or no_law',
         ),
         leave=('psd_deflection/discovery/report.py',),
     ),

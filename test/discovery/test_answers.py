@@ -1,0 +1,857 @@
+"""What discover proposes, names and writes, piece by piece: against counts by hand and sentences."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from psd_deflection import __version__
+from psd_deflection.commissioning.checkup import Finding
+from psd_deflection.discovery import discover as answer
+from psd_deflection.discovery import planning, proposals
+from psd_deflection.discovery import result as told
+from psd_deflection.discovery.discover import Discovery, NamedEffect, Rival, Unknown, _unknown, discover
+from psd_deflection.discovery.experiment import Limits, Piece, Setting, Shown
+from psd_deflection.discovery.fit import Fit, refit
+from psd_deflection.discovery.hidden import beginning, mistakes, only_in
+from psd_deflection.discovery.localise import Cell, Dependence, Localisation
+from psd_deflection.discovery.planning import Plan, Suggestion, Told
+from psd_deflection.discovery.search import comes_late, far, promising, slot, unbound, unphysical
+from psd_deflection.discovery.setup import _blocks, _units, likely_delays, likely_jumps, noise_finding, said
+from psd_deflection.discovery.signatures import Candidate, candidates, signature_columns
+from psd_deflection.discovery.validate import HeldOut
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.catalogue import catalogue, make_active
+from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter
+from psd_deflection.simulation.physics import Physics
+from psd_deflection.simulation.samples import SimulatedSamples
+from psd_deflection.simulation.simulator import ForwardModel
+
+from .test_formulas import RIG, observed
+
+EVERY = catalogue()
+
+
+@pytest.fixture(scope='module')
+def workspace() -> Workspace:
+    """Two recordings, the second without temperature."""
+    return Workspace([observed(), observed(1, name='second', warm=None)])
+
+
+# Mistakes of the set-up.
+
+
+def of_setup(name: str) -> Effect:
+    listed = mistakes(2, [0.04, -0.02], [(1, 2, 0.5)])
+    return next(e for e in listed if e.name == name)
+
+
+def some_samples(**given: Any) -> SimulatedSamples:
+    rng = np.random.default_rng(0)
+    n = 8
+    rows = {'pose': rng.normal(size=(3, n)), 'dots': rng.normal(size=(4, n)), 'beams': rng.normal(size=(4, n))}
+    t = np.arange(n) * 1e-3
+    return SimulatedSamples(t, 0.0 * t, rng.normal(size=(3, n)), Physics.of(RIG), **{**rows, **given})
+
+
+def test_a_mistake_is_declared_once_for_each_place() -> None:
+    names = [e.name for e in mistakes(1, [], [])]
+    assert names == ['sensitivity', 'link_length', 'sample_rate']
+    listed = mistakes(2, [0.04], [(1, 2, 0.5), (2, 1, 0.25)])
+    assert [e.name for e in listed] == [*names, 'load_delay', 'zero', 'jump', 'jump']
+    assert listed[3].parameter('late_by').grid == (0.04,)
+    assert [v['recording'] for v in listed[4].variants()] == [1.0, 1.0, 2.0, 2.0]
+    assert [v['of_reading'] for v in listed[4].variants()] == [0.0, 1.0, 0.0, 1.0]
+    assert [dict(next(e.variants())) for e in listed[5:]] == [
+        {'recording': 1.0, 'psd': 2.0, 'time_us': 500_000.0},
+        {'recording': 2.0, 'psd': 1.0, 'time_us': 250_000.0},
+    ]
+    # Of a rig: each recording and each PSD has one, all others one in all.
+    assert [[p.name for p in e.parameters if p.each] for e in listed] == [
+        *([],) * 4,
+        ['recording'],
+        ['recording', 'psd'],
+        ['recording', 'psd'],
+    ]
+
+
+def test_what_a_mistake_does_is_what_its_name_says() -> None:
+    before = Physics.of(RIG)
+    for name, changed in (('sensitivity', 'sensitivity'), ('link_length', 'length')):
+        after = Physics.of(RIG)
+        configure = of_setup(name).configure
+        assert configure is not None
+        configure(after, {'error': 0.25})
+        np.testing.assert_allclose(getattr(after, changed), 1.25 * np.asarray(getattr(before, changed)))
+    after = Physics.of(RIG)
+    configure = of_setup('sample_rate').configure
+    assert configure is not None
+    configure(after, {'error': 0.25})
+    # A quarter more samples a second.
+    assert 1.0 / after.period == pytest.approx(1250.0)
+    configure = of_setup('zero').configure
+    assert configure is not None
+    moved = {'x1': 1e-3, 'y1': -2e-3, 'x2': 3e-3, 'y2': 4e-3}
+    for of_reading, sign, place in ((0.0, 1.0, 'beams'), (1.0, -1.0, 'centers')):
+        after = Physics.of(RIG)
+        configure(after, {**moved, 'of_reading': of_reading})
+        want = getattr(before, place) + sign * np.array([[1e-3, -2e-3], [3e-3, 4e-3]])
+        np.testing.assert_allclose(getattr(after, place), want)
+        other = 'centers' if place == 'beams' else 'beams'
+        np.testing.assert_array_equal(getattr(after, other), getattr(before, other))
+
+
+def test_late_loads_are_those_of_later_and_a_jump_stays() -> None:
+    samples = some_samples()
+    loads = samples.loads.copy()
+    apply = of_setup('load_delay').apply
+    assert apply is not None
+    apply(samples, {'late_by': 2.5e-3}, {})
+    np.testing.assert_allclose(samples.loads[:, :5], 0.5 * (loads[:, 2:7] + loads[:, 3:8]))
+    np.testing.assert_allclose(samples.loads[:, 6:], loads[:, [7, 7]])
+    for psd in (1, 2):
+        samples = some_samples()
+        dots = samples.dots.copy()
+        apply = of_setup('jump').apply
+        assert apply is not None
+        apply(samples, {'psd': psd, 'time_us': 3000.0, 'jump_x': 0.5, 'jump_y': -0.25}, {})
+        change = np.zeros((4, 8))
+        change[2 * psd - 2, 3:], change[2 * psd - 1, 3:] = 0.5, -0.25
+        np.testing.assert_allclose(samples.dots, dots + change)
+
+
+def test_a_recording_that_begins_in_motion_rings_out() -> None:
+    """Free motion of each mode, a cos + b sin at its own frequency, from its start on."""
+    effect = beginning([0.0, 3e-3])
+    names = [f'{wave}_{axis}' for axis in ('dx', 'dy', 'theta') for wave in ('cos', 'sin')]
+    assert [p.name for p in effect.parameters] == ['recording', *names]
+    values = dict(zip(names, (1.0, -0.5, 0.3, 0.2, -0.7, 0.9), strict=True))
+    p = Physics.of(RIG)
+    assert effect.apply is not None
+    for recording, start in ((1, 0.0), (2, 3e-3)):
+        samples = some_samples()
+        pose = samples.pose.copy()
+        effect.apply(samples, {**values, 'recording': recording}, {})
+        modes = [(p.bending_frequency, p.bending_damping_ratio)] * 2 + [(p.torsion_frequency, p.torsion_damping_ratio)]
+        for axis, (frequency, zeta) in enumerate(modes):
+            w = 2 * math.pi * frequency
+            for i, t in enumerate(samples.t - start):
+                root = complex(-zeta * w, w * math.sqrt(1 - zeta**2))
+                a, b = values[names[2 * axis]], values[names[2 * axis + 1]]
+                added = ((a - 1j * b) * np.exp(root * t)).real if t >= 0.0 else 0.0
+                assert samples.pose[axis, i] - pose[axis, i] == pytest.approx(added, abs=1e-12)
+
+
+def test_an_effect_of_one_recording_acts_in_that_alone() -> None:
+    everywhere = make_active('creep', {'amplitude': 0.1}, 'test')
+    first, second = (ActiveEffect(of_setup('zero'), {'recording': n}) for n in (1.0, 2.0))
+    assert only_in([everywhere, first, second], 0) == [everywhere, first]
+    assert only_in([everywhere, first, second], 1) == [everywhere, second]
+
+
+def fit_of(workspace: Workspace, *effects: ActiveEffect, **given: Any) -> Fit:
+    fit = refit(workspace, effects, 0)
+    return dataclasses.replace(fit, **given) if given else fit
+
+
+def test_a_mistake_is_said_with_its_line(workspace: Workspace) -> None:
+    def words(name: str, **values: float) -> tuple[Any, dict[str, object]]:
+        fit = cast(Fit, SimpleNamespace(effects=(None, ActiveEffect(of_setup(name), values))))
+        (finding,), lines = said(workspace, fit, 1, 33.0)
+        assert (finding.name, finding.evidence) == (name, 33.0)
+        return finding, lines
+
+    finding, lines = words('link_length', error=0.02)
+    assert (finding.where, finding.value, finding.fix) == ('link.length', 1.02, 'link.length: 0.5967')
+    assert lines == {'link.length': 0.5967}
+    finding, lines = words('sample_rate', error=-0.2)
+    assert (finding.where, finding.value) == ('converter.sample_rate_hz', 0.8)
+    assert lines == {'converter.sample_rate_hz': 800.0}
+    finding, lines = words('sensitivity', error=0.5)
+    assert lines == {'amplifier.sensitivity': 1.5 * RIG.amplifier.sensitivity}
+    for late, word in ((0.04, 'late'), (-0.04, 'early')):
+        finding, lines = words('load_delay', late_by=late)
+        assert (finding.where, finding.value, lines) == ('load_fx load_fy load_tz', late, {})
+        assert finding.fix == f'the loads are noted 0.04 s {word}: subtract {late:g} s from their times'
+    finding, lines = words('jump', recording=2.0, psd=1.0, time_us=2_500_000.0, jump_x=3e-6, jump_y=-4e-6)
+    assert (finding.where, finding.value, lines) == ('psd_1', 2.5, {})
+    assert finding.fix.startswith('PSD 1 of second jumps by 3 µm along x and -4 µm along y')
+    finding, lines = words('zero', recording=2.0, x1=1e-4, y1=-2e-4, x2=0.0, y2=5e-5)
+    assert (finding.where, finding.value, lines) == ('second', 2e-4, {})
+    assert finding.fix == 'overrides of second: psd_1.zero: [0.0001, -0.0002], psd_2.zero: [0.0, 5e-05]'
+
+
+@pytest.mark.parametrize(('factor', 'is_told'), [(2.1, True), (1.9, False), (0.52, False), (0.48, True)])
+def test_noise_is_told_from_twice_or_half_of_the_files_on(factor: float, is_told: bool) -> None:
+    """With the converter's own rounding, which the file's noise does not hold."""
+    o = observed()
+    stated = math.sqrt(np.mean(RIG.noises[:, :2] ** 2) + RIG.converter.volts_per_count**2 / 12.0)
+    fake = SimpleNamespace(
+        observations=[o], noise=[SimpleNamespace(sigma=np.array([factor, factor, 9.0] * 2) * stated)]
+    )
+    found = noise_finding(cast(Workspace, fake))
+    assert bool(found) == is_told
+    if found:
+        assert (found[0].name, found[0].where, found[0].value) == ('noise_level', 'x1 y1 x2 y2', round(factor, 3))
+        assert found[0].evidence == pytest.approx(abs(math.log(factor)))
+        assert found[0].fix == f'amplifier.noise: {float(f"{factor * RIG.amplifier.noise:.2g}")}'
+
+
+NAN = math.nan
+
+
+@pytest.mark.parametrize(
+    ('sizes', 'units'),
+    [
+        ((1.0, 1.0, 1.0), {}),
+        ((9.80665, 9.7, NAN), {0: 'kg instead of N', 1: 'kg instead of N'}),
+        ((NAN, 9.80665 * 0.971, 1.0), {1: 'kg instead of N'}),
+        ((NAN, 9.80665 * 0.969, 1.0), {}),
+        ((9.80665, 1.0, 1.0), {}),
+        ((1e3, NAN, 1e3), {0: 'kN instead of N', 2: 'kN m instead of N m'}),
+        ((4.45, 4.44, 0.0981), {0: 'lbf instead of N', 1: 'lbf instead of N', 2: 'kg cm instead of N m'}),
+        ((NAN, 1 / 9.80665, NAN), {1: 'N, and then converted from kg once more'}),
+        ((NAN, NAN, 0.01), {2: 'N cm instead of N m'}),
+        ((NAN, NAN, 100.0), {2: 'N m, and then converted from N cm once more'}),
+        # A digit of Young's modulus is no unit: the forces alone, by ten.
+        ((10.0, 10.05, 1.0), {}),
+        ((0.1, 0.1, 1.05), {}),
+        ((10.0, 10.0, 1.2), {0: 'kg instead of N', 1: 'kg instead of N'}),
+    ],
+)
+def test_a_size_is_a_unit_within_three_per_cent(sizes: tuple[float, float, float], units: dict[int, str]) -> None:
+    assert {k: unit for k, (_, unit) in _units(np.array(sizes)).items()} == units
+
+
+def test_a_block_counts_from_half_of_its_samples_on() -> None:
+    rows = np.arange(12.0).reshape(1, 12)
+    rows[0, [0, 1]] = np.nan
+    rows[0, [4, 5, 6]] = np.nan
+    np.testing.assert_array_equal(_blocks(rows, 4), [[2.5, np.nan, 9.5]])
+    assert _blocks(rows, 5).shape == (1, 2)
+
+
+def test_delays_and_jumps_are_looked_for_where_they_show() -> None:
+    """The shift at which the readings follow the loads best, and its neighbours; the step that gains most."""
+    o = observed(history=np.repeat(np.random.default_rng(3).uniform(-20, 20, (12, 3)), 400, axis=0), warm=None)
+    for shift in (40, -40):
+        late = Workspace([dataclasses.replace(o, loads=np.roll(o.loads, shift, axis=0))])
+        assert likely_delays(late) == pytest.approx(sorted(s / 1000.0 + shift / 1000.0 for s in (-4, 0, 4)))
+    # The link follows its loads as simulated: nothing is late.
+    assert likely_delays(Workspace([o])) == []
+    short = Workspace([observed()])
+    assert likely_delays(short) == []
+    part = 0.01 * np.random.default_rng(0).standard_normal((6, 300))
+    part[4, 120:] += 2.0
+    part[3, 120:] -= 1.0
+    fake = cast(
+        Workspace,
+        SimpleNamespace(split=lambda r: [r, r[:, :49]], fine=[4, 4], observations=[o, o]),
+    )
+    # n1 n2/n (2^2 + 1^2) = 360: beyond 50.
+    assert likely_jumps(fake, part) == [(1, 2, pytest.approx(0.48))]
+    assert likely_jumps(fake, 0.4 * part) == [(1, 2, pytest.approx(0.48))]
+    assert likely_jumps(fake, 0.35 * part) == []
+
+
+# Signatures.
+
+
+def declared(*parameters: EffectParameter, **given: Any) -> Effect:
+    whole = {'name': 'made_up', 'stage': 'psd', 'point': 'dots', 'apply': lambda *_: None}
+    return Effect(summary='', equation='', source='', needs='', parameters=parameters, **{**whole, **given})
+
+
+def listed(effect: Effect, **found: list[float]) -> list[Candidate]:
+    """Its candidates, as if the catalogue were empty."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr('psd_deflection.discovery.signatures.catalogue', dict)
+        return list(candidates(Physics.of(RIG), found, (), [effect]))
+
+
+def test_a_candidate_has_its_choices_and_shapes_fixed() -> None:
+    choice = EffectParameter('way', '', 0, 1, 1, '', kind='choice', choices=(0, 1))
+    size = EffectParameter('size', 'V', -1.0, 1.0, 0.1, '', nominal=0.5)
+    shape = EffectParameter('f', 'Hz', 1.0, 60.0, 1.0, '', nominal=5.0, kind='shape', grid=(2.0, 50.0, 70.0))
+    got = listed(declared(choice, size, shape))
+    assert [(c.start['way'], c.start['f'], c.start['size'], c.free) for c in got] == [
+        (way, f, 0.5, ('size',)) for way in (0.0, 1.0) for f in (2.0, 50.0)
+    ]
+    assert [c.variant for c in got] == [('made_up', way) for way in (0.0, 0.0, 1.0, 1.0)]
+    assert len({c.key for c in got}) == 4
+    assert [c.off['size'] for c in got] == [0.5] * 4
+    # Peaks of the residual's spectrum besides the grid; lines instead of it.
+    for propose, wanted in (('spectral', [7.0, 2.0, 50.0]), ('line', [9.0])):
+        named = dataclasses.replace(shape, propose=propose)
+        got = listed(declared(size, named), spectral=[7.0, 61.0], line=[9.0])
+        assert [c.start['f'] for c in got] == wanted
+    # What a small dose does not show is probed at the values to try.
+    probed = EffectParameter('limit', 'V', 0.0, 1.0, 0.1, '', grid=(0.2, 0.4))
+    got = listed(declared(probed, finite=True))
+    assert [(c.start['limit'], c.free, c.one_sided) for c in got] == [(0.2, ('limit',), True), (0.4, ('limit',), True)]
+    got = listed(declared(dataclasses.replace(probed, propose='highest'), finite=True), highest=[0.9])
+    assert [c.start['limit'] for c in got] == [0.9]
+    whole = list(candidates(Physics.of(RIG), {}, ['creep', 'made_up'], [declared(size)]))
+    unproposed = {'creep', 'mains_interference', 'amplifier_saturation', 'quantisation'}
+    assert {c.effect.name for c in whole} == {*EVERY} - unproposed
+    for least, nominal, one_sided in ((0.0, 0.0, True), (-1.0, 0.0, False), (0.5, 0.5, True), (0.4, 0.5, False)):
+        (only,) = listed(declared(dataclasses.replace(size, minimum=least, nominal=nominal)))
+        assert only.one_sided == one_sided
+    two = listed(declared(size, dataclasses.replace(size, name='other', minimum=0.0, nominal=0.0)))
+    assert [c.one_sided for c in two] == [False]
+
+
+def test_coefficients_of_a_finite_effect_scale_its_probe() -> None:
+    for power, want in ((1, 0.2 * 9.0), (2, 0.2 * 3.0), (0, 0.2)):
+        probed = EffectParameter('radius', 'm', 0.0, 9.0, 0.1, '', grid=(0.2,), power=power)
+        (c,) = listed(declared(probed, finite=True))
+        assert c.from_coefficients(np.array([9.0])).values['radius'] == pytest.approx(want)
+        # A negative coefficient is a very small one.
+        least = c.from_coefficients(np.array([-1.0])).values['radius']
+        assert least == pytest.approx(0.2 * 1e-4 ** (1.0 / power) if power else 0.2)
+
+
+class Linear:
+    """Stands for a workspace: what it simulates is ``of`` the last effect's values."""
+
+    def __init__(self, of: Any) -> None:
+        self.of, self.asked = of, 0
+
+    def simulate(self, effects: list[ActiveEffect]) -> list[FloatArray]:
+        self.asked += 1
+        return [np.full((6, 2), float(sum(self.of(a.values) for a in effects)))]
+
+
+def test_a_signature_is_the_change_by_one_probe() -> None:
+    size = EffectParameter('a', 'V', -1.0, 1.0, 0.1, '', nominal=0.3)
+    phase = EffectParameter('p', 'rad', -7.0, 7.0, 1.0, '', kind='phase', partner='a')
+    place = EffectParameter('q', 'm', -1.0, 1.0, 0.25, '', kind='coupled')
+    (c,) = listed(declared(size, phase, place))
+    plant = Linear(lambda v: 100.0 * v['a'] + 1000.0 * v['p'] + v['a'] * (7.0 * v['q'] + 3.0))
+    base = [ActiveEffect(c.effect, {'a': 1.0, 'p': 0.0, 'q': 0.0})]
+    nominal = [np.full((6, 2), 103.0 + 30.9)]
+    first, second, third = signature_columns(c, cast(Workspace, plant), nominal, base)
+    # One probe more of a; a probe of it at a quarter turn; beside a probe of a one of q.
+    assert first[0][0, 0] == pytest.approx(103.0 * 0.1)
+    assert second[0][0, 0] == pytest.approx(103.0 * 0.1 + 1000.0 * math.pi / 2 - 30.9)
+    assert third[0][0, 0] == pytest.approx(0.4 * 7.0 * 0.25)
+    assert plant.asked == 4
+    # At its greatest value it is probed downward.
+    (c,) = listed(declared(dataclasses.replace(size, nominal=1.0)))
+    ((column,),) = signature_columns(c, cast(Workspace, Linear(lambda v: v['a'] ** 2)), [np.full((6, 2), 1.0)], [])
+    assert column[0, 0] == pytest.approx(1.0 - 0.9**2)
+    probed = EffectParameter('limit', 'V', 0.0, 1.0, 0.1, '', grid=(0.2,))
+    (c,) = listed(declared(probed, finite=True))
+    ((column,),) = signature_columns(
+        c, cast(Workspace, Linear(lambda v: 5.0 * v['limit'])), [np.full((6, 2), 0.25)], []
+    )
+    assert column[0, 0] == pytest.approx(0.75)
+
+
+# Proposals.
+
+
+def test_a_limit_is_looked_for_at_the_highest_voltage_and_a_little_below() -> None:
+    o = observed()
+    volts = np.zeros_like(o.volts)
+    volts[3, 2], volts[7, 4], volts[9, 0] = -4.0, 3.0, np.nan
+    o = dataclasses.replace(o, volts=volts)
+    assert proposals.highest_voltages([o], True, 0.01) == pytest.approx([3.98, 3.96, 3.88, 3.92])
+    assert proposals.highest_voltages([o], False, 0.01) == pytest.approx([2.98, 2.96, 2.88, 2.94])
+    assert proposals.highest_voltages([o], False, 0.3) == pytest.approx([2.4, 1.8, 2.94])
+
+
+def test_lines_come_strongest_first_each_once() -> None:
+    rng = np.random.default_rng(1)
+    t = np.arange(4096) * 1e-3
+    rows = [rng.standard_normal((4096, 6)) for _ in range(2)]
+    sines = ((33.3, 0.9, 0), (71.7, 1.5, 3), (120.1, 0.75, 2), (200.2, 0.62, 1))
+    for f, size, c in sines:
+        rows[0][:, c] += size * np.sin(2 * np.pi * f * t)
+    rows[1][:, 4] += 3.0 * np.sin(2 * np.pi * 71.75 * t)
+    rows[1][:, 5] += 9.0 * np.sin(2 * np.pi * 1.5 * t)
+    got = proposals.spectral_peaks(rows, [np.ones(6)] * 2, [1e-3] * 2)
+    # That of 71.75 Hz in the other recording is the same; below 2 Hz is motion; three are enough.
+    assert got == pytest.approx([71.75, 33.3, 120.1], abs=0.01)
+    assert proposals.spectral_peaks(rows, [np.ones(6)] * 2, [1e-3] * 2, 4)[-1] == pytest.approx(200.2, abs=0.02)
+    assert proposals.spectral_peaks([r[:255] for r in rows], [np.ones(6)] * 2, [1e-3] * 2) == []
+    # By the noise of its channel: a line in a channel ten times as noisy is ten times as weak.
+    scaled = np.ones(6)
+    scaled[3] = 10.0
+    assert proposals.spectral_peaks(rows[:1], [scaled], [1e-3])[0] == pytest.approx(33.3, abs=0.01)
+    assert proposals.persistent([71.7, 33.3], rows[:1], [np.ones(6)], [1e-3]) == [71.7, 33.3]
+    # A line of half the recording, or one that turns its phase halfway, is no hum.
+    faded, turned = rng.standard_normal((4096, 6)), rng.standard_normal((4096, 6))
+    sine = np.sin(2 * np.pi * 50.0 * t)
+    faded[:, 0] += 2.0 * sine * np.repeat([1.0, 1.0, 1.0, 0.3], 1024)
+    turned[:, 0] += 2.0 * sine * np.repeat([1.0, 1.0, 1.0, -1.0], 1024)
+    for rows_of in (faded, turned):
+        assert proposals.persistent([50.0], [rows_of], [np.ones(6)], [1e-3]) == []
+        assert proposals.persistent([50.0], [rows_of[:3072]], [np.ones(6)], [1e-3]) == [50.0]
+
+
+@pytest.mark.parametrize(('counts', 'seen'), [(1, False), (2, False), (3, True), (40, True)])
+def test_a_step_is_coarse_from_three_counts_on(counts: int, seen: bool) -> None:
+    """All readings are whole multiples of it; its deviation is that of rounding to counts, 1/sqrt(12)."""
+    lsb = RIG.converter.volts_per_count
+    rng = np.random.default_rng(2)
+    k = np.rint(rng.uniform(-300, 300, (2000, 6)))
+    o = dataclasses.replace(observed(), volts=k * counts * lsb, loads=np.zeros((2000, 3)), temperature=None)
+    found = proposals.coarse_step(o)
+    assert (found is not None) == seen
+    if found is not None:
+        values = np.unique(k)
+        assert found[0] == pytest.approx(counts * lsb, rel=1e-9)
+        assert found[1] == pytest.approx(lsb / math.sqrt(12.0 * float(values @ values)), rel=1e-9)
+    # Readings between the steps, and there are none; few values prove nothing.
+    off = o.volts.copy()
+    off[::50] += 0.31 * counts * lsb
+    assert counts < 40 or proposals.coarse_step(dataclasses.replace(o, volts=off)) is None
+    assert proposals.coarse_step(dataclasses.replace(o, volts=np.sign(o.volts) * counts * lsb)) is None
+
+
+# The search's small rules.
+
+
+def test_what_ran_into_a_bound_is_something_else(workspace: Workspace) -> None:
+    size = EffectParameter('a', 'V', 0.0, 1.0, 0.1, '')
+    shape = EffectParameter('f', 'Hz', 1.0, 60.0, 1.0, '', nominal=5.0, kind='shape')
+    effect = declared(size, dataclasses.replace(size, name='b'), shape)
+    jacobian = np.ones((5, 3)) * [1.0, 2.0, 3.0]
+    for values, bound, wrong in (
+        ((0.5, 0.5, 5.0), (), False),
+        ((0.5, 0.0, 5.0), ('b',), False),
+        ((0.0, 0.0, 5.0), ('a', 'b'), True),
+        ((0.5, 1.0, 5.0), ('b',), True),
+        ((0.5, 0.5, 60.0), ('f',), True),
+    ):
+        active = ActiveEffect(effect, dict(zip('abf', values, strict=True)))
+        free = tuple((0, n) for n in 'abf')
+        fit = Fit((active,), 1.0, np.zeros(5), [], jacobian, free, tuple((0, n) for n in bound))
+        assert unphysical(workspace, fit, 0) == wrong
+        keep = [i for i, n in enumerate('abf') if n not in bound]
+        np.testing.assert_array_equal(unbound(fit), jacobian[:, keep])
+    assert far(dataclasses.replace(fit, chi2=50.1))
+    assert not far(dataclasses.replace(fit, chi2=49.9))
+    zero, jump = ActiveEffect(of_setup('zero'), {'recording': 1.0}), of_setup('jump')
+    assert not comes_late([zero])
+    assert comes_late([zero, active])
+    assert slot(jump, {'recording': 1.0, 'psd': 2.0, 'time_us': 7.0}) == ('jump', 1.0, 2.0)
+    assert slot(effect, {}) == ('made_up',)
+
+
+def test_the_best_of_each_variant_is_tried() -> None:
+    def score(name: str, gain: float, dof: int = 1) -> Any:
+        return SimpleNamespace(gain=gain, dof=dof, candidate=SimpleNamespace(variant=(name,)))
+
+    scores = [
+        score('a', 100.0),
+        score('a', 90.0),
+        score('b', 60.0, 9),
+        score('c', 55.0),
+        score('d', 29.0),
+        score('e', 31.0),
+    ]
+    assert [s.candidate.variant[0] for s in promising(scores, 3.0, 0.3, 9)] == ['a', 'c', 'b', 'e']
+    assert len(promising(scores, 3.0, 0.3, 2)) == 2
+    assert promising([score('a', 0.0)], 3.0, 0.0, 9) == []
+    assert promising([], 3.0, 0.3, 9) == []
+
+
+# Plans.
+
+
+def told_of(rival: str, separation: float, reverse: float, possible: float) -> Told:
+    return Told(rival, 'creep', separation, reverse, possible)
+
+
+def test_a_plan_says_what_it_tells_apart() -> None:
+    piece, other = Piece('push', ('constant:0,-5,0:3',)), Piece('wait', ('constant:0,0,0:1', 'constant:0,0,0:2'))
+    limits = Limits(seconds=30.0)
+    warm = Setting('while it is warm', {'link.length': 0.4}, 5.0)
+    tells = (told_of('damping', 30.0, 40.0, 50.0), told_of('tip_mass', 90.0, 22.0, 99.0), told_of('x', 1.0, 2.0, 21.5))
+    plan = Plan(warm, (piece, piece, other), tells, limits, 500.0)
+    assert plan.words == 'push, 2 times; then wait, while it is warm'
+    assert plan.seconds == 9.0
+    assert plan.loads[:1500].tolist() == plan.loads[1500:3000].tolist() == [[0.0, -5.0, 0.0]] * 1500
+    assert plan.script == ['constant:0,-5,0:3', 'constant:0,-5,0:3', 'constant:0,0,0:1', 'constant:0,0,0:2']
+    assert plan.useful
+    assert plan.sentence == (
+        'Record next, 9 s: push, 2 times; then wait, while it is warm. It tells creep from damping, tip_mass '
+        '(chi-square 40 at least, 21.6 needed); nothing within the limits tells x apart.'
+    )
+    assert dataclasses.replace(plan, told=tells[:1]).sentence.endswith(
+        'from damping (chi-square 40 at least, 21.6 needed).'
+    )
+    idle = dataclasses.replace(plan, setting=Setting(), told=(tells[2], dataclasses.replace(tells[2], rival='y')))
+    assert not idle.useful
+    assert idle.words == 'push, 2 times; then wait'
+    assert idle.sentence == 'No recording within the limits would tell creep from x, y.'
+    tree = plan.tree()
+    assert tree['celsius'] == warm.knots
+    assert idle.tree()['celsius'] is None
+    assert (tree['seconds'], tree['sample_rate_hz'], tree['overrides']) == (9.0, 500.0, {'link.length': 0.4})
+    assert tree['rivals'][1] == {
+        'name': 'tip_mass',
+        'instead_of': 'creep',
+        'separation': 90.0,
+        'reverse': 22.0,
+        'possible': 99.0,
+        'separable': True,
+    }
+    assert (tree['useful'], tree['loads'], tree['limits']['seconds']) == (True, plan.script, 30.0)
+    assert [told_of('x', 0.0, 0.0, p).separable for p in (21.5, 21.6)] == [False, True]
+    assert Suggestion('do', 21.7).text == 'do: in simulation this separates them by chi-square 22'
+    assert planning.rate_of(RIG, Setting('', {'converter.sample_rate_hz': 250.0})) == 250.0
+    assert planning.rate_of(RIG, Setting()) == 1000.0
+
+
+def test_pieces_are_put_together_as_long_as_each_is_worth_it() -> None:
+    """A minute costs 0.03; a further piece must add 0.02; beyond a chi-square of 60 there is nothing more to gain."""
+
+    def shows(gain: float, seconds: float) -> Shown:
+        return Shown(np.array([[gain]]), [], [], seconds)
+
+    seen = [(Piece(n, ()), shows(g, s)) for n, g, s in (('a', 30.0, 10.0), ('b', 25.0, 1.0), ('c', 1.0, 1.0))]
+
+    def together(seconds: float) -> tuple[float, str]:
+        value, chosen = planning._together(seen, shows(0.0, 0.0), lambda s: s.apart[0], seconds)
+        return value, ''.join(p.words for p in chosen)
+
+    # 30/60 - 0.005 against 25/60 - 0.0005; then the same again; then nothing is left to gain.
+    assert together(60.0) == (pytest.approx(1.0 - 0.03 * 20.0 / 60.0), 'aa')
+    assert together(11.0) == (pytest.approx(55.0 / 60.0 - 0.03 * 11.0 / 60.0), 'ab')
+    assert together(10.9)[1] == 'a'
+    assert together(1.0) == (pytest.approx(25.0 / 60.0 - 0.0005), 'b')
+    assert together(0.5) == (0.0, '')
+    # One piece is there in any case, even if it is worth nothing.
+    poor = [(Piece('c', ()), shows(0.0, 1.0))]
+    assert len(planning._together(poor, shows(0.0, 0.0), lambda s: s.apart[0], 9.0)[1]) == 1
+
+
+def test_the_effect_that_a_rival_does_without_is_named() -> None:
+    a, b, c = (
+        make_active('creep', {'amplitude': 0.1}, 't'),
+        make_active('sensor_gain', {'psd': 1, 'x': 0.1}, 't'),
+        make_active('sensor_gain', {'psd': 2, 'x': 0.1}, 't'),
+    )
+    named, rival = (
+        cast(Fit, SimpleNamespace(effects=e))
+        for e in ((a, b, c), (a, c, make_active('load_direction', {'angle': 0.1}, 't')))
+    )
+    assert planning._replaced(named, rival) == 'sensor_gain (psd 1)'
+
+
+# What is said.
+
+
+def left_with(**given: Any) -> Localisation:
+    whole = {'cells': (), 'dependences': (), 'excess': 100.0, 'p': 0.0, 'map': np.zeros((1, 6, 6)), 'spans': ()}
+    return Localisation(**{**whole, **given})
+
+
+def test_what_remains_is_told_in_words() -> None:
+    cells = (
+        Cell('y2', 0, (1.0, 2.5), (9.0, 17.0), (), 9.0, 0.009, 50.0),
+        Cell('x1', 0, (0.0, 1.0), (0.0, 2.0), (), 5.0, 0.011, 20.0),
+    )
+    depends = tuple(
+        Dependence('x2', name, gain, p) for name, gain, p in (('load_fx', 60.0, 1e-9), ('dot_x', 50.0, 1.1e-3))
+    )
+    (u,) = _unknown(left_with(cells=cells, dependences=depends), 300.0, 5e-6, 3e-6)
+    assert u.signature == (
+        'on y2, x2; 4 µm rms (1.7 times the noise remain); follows load_fx; mostly odd; '
+        'strongest at 1.0 to 2.5 s, 9 to 17 Hz'
+    )
+    assert (u.rms, u.explains) == (pytest.approx(4e-6), pytest.approx(0.25))
+    many = tuple(Dependence('x2', f'load_{i}', 10.0, 1e-9) for i in range(9))
+    (u,) = _unknown(left_with(dependences=many), 0.0)
+    assert u.depends_on == tuple(f'load_{i}' for i in range(6))
+    assert 'follows load_0, load_1, load_2;' in u.signature
+    for second, lagging in ((1, True), (2, False)):
+        depends = tuple(
+            Dependence('x2', 'history of load_fx' if i == second else 'dot_x', 10.0, 1e-9) for i in range(3)
+        )
+        assert ('hysteretic' in _unknown(left_with(dependences=depends), 0.0)[0].signature) == lagging
+    # Twice as much of one kind is most of it.
+    for even, word in (
+        (20.1, 'mostly even'),
+        (19.9, 'odd and even parts'),
+        (5.1, 'odd and even parts'),
+        (4.9, 'mostly odd'),
+    ):
+        depends = (Dependence('x2', 'dot_x^2', even, 1e-9), Dependence('x2', 'dot_x', 10.0, 1e-9))
+        assert word in _unknown(left_with(dependences=depends), 0.0)[0].signature
+    # What coarse steps do varies with the signal: a fiftieth of what they explain is nothing else.
+    assert _unknown(left_with(excess=99.0), 0.0, steps=5000.0) == ()
+    assert _unknown(left_with(excess=101.0), 0.0, steps=5000.0) != ()
+
+
+@pytest.mark.parametrize(
+    ('regressor', 'even'),
+    [
+        ('dot_x^2', True),
+        ('|rate of dot_x|', True),
+        ('constant', True),
+        ('dot_x dot_y', True),
+        ('dot_x r^2', True),
+        ('dot_x', False),
+        ('load_fx', False),
+        ('time', False),
+    ],
+)
+def test_a_regressor_is_even_or_odd(regressor: str, even: bool) -> None:
+    assert answer._even(regressor) == even
+
+
+def test_a_gap_that_remains_is_never_left_unsaid() -> None:
+    assert answer._unsaid(9e-6, 1.5e-6, 1e-6) == ()
+    (u,) = answer._unsaid(3e-6, 1.6e-6, 1e-6)
+    assert u.signature == '1.25 µm remain, 1.6 times the noise, in no single place or band'
+    assert (u.rms, u.explains, u.remains) == (
+        pytest.approx(math.sqrt(1.56) * 1e-6),
+        pytest.approx((1.6 / 3) ** 2),
+        True,
+    )
+    assert answer._beyond(5.0, 3.0) == 4.0
+    assert answer._beyond(3.0, 5.0) == 0.0
+
+
+def test_the_end_of_late_loads_and_what_is_between_steps_goes() -> None:
+    o = observed()
+    cut = answer._without_end(o, 0.0105)
+    assert np.flatnonzero(np.isnan(cut.volts).all(axis=1)).tolist() == list(range(1200 - 12, 1200))
+    assert not np.isnan(cut.volts[: 1200 - 12]).any()
+    snapped = answer._snapped(o, 0.01)
+    assert np.abs(snapped.volts - o.volts).max() <= 0.005 + 1e-12
+    np.testing.assert_allclose(snapped.volts / 0.01, np.rint(o.volts / 0.01))
+    assert (cut.digest, snapped.digest) == (o.hashed(), o.hashed())
+    assert answer._snapped(dataclasses.replace(o, digest='x'), 0.01).digest == 'x'
+
+
+def test_coarse_steps_are_as_likely_as_all_readings_on_them(workspace: Workspace) -> None:
+    """Each by chance with the converter's step over theirs; the likelihood is the product."""
+    lsb = RIG.converter.volts_per_count
+    lattice = make_active('quantisation', {'step': 8.0 * lsb}, 'test')
+    samples = sum(o.volts.size for o in workspace.observations)
+    assert answer._lattice_gain(workspace, lattice) == pytest.approx(samples * math.log(8.0))
+    assert answer._lattice_gain(workspace, make_active('quantisation', {'step': 0.5 * lsb}, 'test')) == 0.0
+    coarse = [dataclasses.replace(o, volts=np.rint(o.volts / (8 * lsb)) * 8 * lsb) for o in workspace.observations]
+    effects, physics = [e for e in EVERY.values() if e.lattice], Physics.of(RIG)
+    found = answer._lattice(coarse, physics, (), effects)
+    assert found is not None
+    assert found.values['step'] == pytest.approx(8.0 * lsb, rel=1e-3)
+    # One recording without them, or an effect that has them already, and they are none.
+    assert answer._lattice([coarse[0], workspace.observations[1]], physics, (), effects) is None
+    assert answer._lattice(coarse, physics, (lattice,), effects) is None
+    assert answer._lattice(coarse, physics, (), []) is None
+    named = answer._named_lattice(Workspace(coarse), lattice)
+    gain = answer._lattice_gain(workspace, lattice)
+    steps = [s for o in coarse if (s := proposals.coarse_step(o)) is not None]
+    assert named.sd == {'step': min(s[1] for s in steps)}
+    assert (named.delta_bic, named.p) == (pytest.approx(2.0 * gain), 0.0)
+    assert named.heldout == HeldOut(pytest.approx(gain), pytest.approx(math.sqrt(2.0 * gain)))
+
+
+# The files.
+
+
+def named_effect(active: ActiveEffect, **given: Any) -> NamedEffect:
+    whole = {'sd': {}, 'p': 1e-9, 'delta_bic': 50.0, 'heldout': HeldOut(20.0, 2.0), 'equivalent': (), 'rivals': ()}
+    return NamedEffect(active, **{**whole, 'alternatives': (), 'suggestion': None, **given})
+
+
+@pytest.mark.parametrize(
+    ('value', 'sd', 'words'),
+    [
+        (0.003987, 2e-5, 'angle 0.003987 ± 2e-05 rad'),
+        (0.1234, 0.05, 'angle 0.12 ± 0.05 rad'),
+        (0.1, 0.0, 'angle 0.1 ± 0 rad'),
+        (0.1, 0.051, ''),
+        (-1.23456789, 1e-9, 'angle -1.23457 ± 1e-09 rad'),
+    ],
+)
+def test_a_size_is_told_to_the_digits_that_its_deviation_leaves(value: float, sd: float, words: str) -> None:
+    """Two digits more than the deviation's first, six at most; within two deviations of nothing it is none."""
+    effect = named_effect(make_active('sensor_rotation', {'psd': 2, 'angle': value}, 't'), sd={'angle': sd})
+    assert told.size_of(effect) == words
+    assert told.size_of(dataclasses.replace(effect, sd={})) == ''
+
+
+def test_numbers_of_json_are_finite() -> None:
+    assert [told._number(v) for v in (math.nan, math.inf, -math.inf, 1.5)] == [0.0, 1e300, -1e300, 1.5]
+    active = make_active('damping', {'bending_ratio': 0.03}, 't')
+    tree = told.parameters_of(named_effect(active, sd={'bending_ratio': math.inf}))
+    assert tree == {'bending_ratio': {'value': 0.03, 'sd': 1e300, 'unit': ''}}
+    turned = named_effect(make_active('sensor_rotation', {'psd': 2, 'angle': 0.1}, 't'))
+    assert told.parameters_of(turned) == {'psd': 2, 'angle': {'value': 0.1, 'sd': 0.0, 'unit': 'rad'}}
+    assert told._nested({'a.b': (1, 2), 'a.c.d': 'x', 'e': 3}) == {'a': {'b': [1, 2], 'c': {'d': 'x'}}, 'e': 3}
+
+
+# A whole discovery of few effects.
+
+FEW = ('sensor_rotation', 'sensor_gain', 'bending_stiffness')
+HIDDEN = {'psd': 2, 'angle': 0.03}
+
+
+@pytest.fixture(scope='module')
+def found() -> Discovery:
+    """A turned sensor in 1.2 s, looked for among three effects."""
+    o = observed(9, (make_active('sensor_rotation', HIDDEN, 'test'),))
+    return discover([o], RIG, without=[name for name in EVERY if name not in FEW])
+
+
+def test_every_number_of_the_answer_is_that_of_its_model(found: Discovery) -> None:
+    """Gaps from simulations made here: rms of block means of 20 samples over the four dots, m."""
+    (named,) = found.effects
+    assert named.active.effect.name == 'sensor_rotation'
+    assert abs(named.active.values['angle'] - 0.03) < 4.0 * named.sd['angle']
+    (o,) = found.workspace.observations
+
+    def gaps(*effects: ActiveEffect) -> FloatArray:
+        off = o.volts - ForwardModel(RIG, list(effects)).expect(o.loads, o.temperature).volts.T
+        dots = off[:, [0, 1, 3, 4]] * RIG.sensitivities.ravel()
+        blocks = dots.reshape(60, 20, 4).mean(axis=1)
+        return np.asarray(np.sqrt(np.mean(blocks**2, axis=0)))
+
+    before, after = gaps(), gaps(named.active)
+    assert found.gap_before == found.gap_heldout_before == pytest.approx(float(np.sqrt(np.mean(before**2))), rel=1e-6)
+    assert found.gap_after == pytest.approx(float(np.sqrt(np.mean(after**2))), rel=1e-6)
+    for i, name in enumerate(('x1', 'y1', 'x2', 'y2')):
+        assert found.per_channel[name] == pytest.approx((before[i], after[i]), rel=1e-6)
+    floor = float(
+        np.sqrt(np.mean((found.workspace.noise[0].sigma[[0, 1, 3, 4]] * RIG.sensitivities.ravel()) ** 2 / 20.0))
+    )
+    assert found.gap_floor == pytest.approx(floor, rel=1e-6)
+    assert found.floors == pytest.approx(found.gap_after / floor)
+    assert found.gap_heldout_after == pytest.approx(found.gap_after, rel=0.1)
+    assert found.gap_heldout_after > found.gap_after
+    assert found.waterfall == (
+        ('as described', found.gap_before),
+        ('+ sensor_rotation', found.gap_after),
+        ('noise alone', found.gap_floor),
+    )
+    assert (found.verdict, found.unknown, found.setup, found.law, found.lines) == ('effects_found', (), (), None, {})
+    assert (found.seed, found.known, found.rivals, found.unsettled) == (0, (), (), ())
+    assert found.active_effects == [named.active]
+    # One picture, whose length is the deviation: of the turn about the centre of the PSD.
+    h = 1e-4
+    plus = ActiveEffect(named.active.effect, {**named.active.values, 'angle': named.active.values['angle'] + h})
+    slope = (
+        ForwardModel(RIG, [plus]).expect(o.loads, o.temperature).volts
+        - ForwardModel(RIG, [named.active]).expect(o.loads, o.temperature).volts
+    ) / h
+    sigma = found.workspace.noise[0].sigma
+    information = float(((slope / sigma[:, None]) ** 2).sum())
+    assert named.sd['angle'] == pytest.approx(information**-0.5, rel=0.01)
+    gain = found.search.null.chi2 - found.fit.chi2
+    assert named.delta_bic == pytest.approx(gain - math.log(6 * 1200 / 20), rel=1e-9)
+    assert named.heldout.gain == pytest.approx(0.5 * gain, rel=0.05)
+    assert named.p == 0.0 or named.p < 1e-12
+    assert repr(found) == (
+        f'<Discovery effects_found: sensor_rotation (psd 2); gap {1e6 * found.gap_before:.3f} → '
+        f'{1e6 * found.gap_after:.3f} µm (noise alone: {1e6 * found.gap_floor:.3f} µm)>'
+    )
+    assert {c.channel for c in found.where.cells[:2]} <= {'x2', 'y2'}
+    assert found.simulations == found.workspace.simulations
+
+
+def test_the_answer_is_written_as_it_is(found: Discovery) -> None:
+    tree = told.result(found)
+    (named,) = found.effects
+    assert tree['gap'] == {
+        'unit': 'm',
+        'before': found.gap_before,
+        'after': found.gap_after,
+        'floor': found.gap_floor,
+        'heldout_before': found.gap_heldout_before,
+        'heldout_after': found.gap_heldout_after,
+        'per_channel': {k: {'before': a, 'after': b} for k, (a, b) in found.per_channel.items()},
+    }
+    assert tree['remaining'] == {'rms': found.gap_after, 'floors': found.floors}
+    (effect,) = tree['effects']
+    assert effect['name'] == 'sensor_rotation'
+    assert effect['stage'] == 'psd'
+    assert effect['evidence'] == {
+        'delta_bic': named.delta_bic,
+        'p': named.p,
+        'heldout_gain': named.heldout.gain,
+        'heldout_gain_error': named.heldout.error,
+    }
+    assert (effect['suggested_experiment'], effect['rivals'], effect['equivalent']) == (None, [], [])
+    cells = [c for c in found.where.cells if c.p < 0.05]
+    assert [(w['channel'], w['recording'], w['when'], w['band_hz']) for w in tree['where']] == [
+        (c.channel, 'seen', list(c.when), list(c.band)) for c in cells
+    ]
+    assert [w['statistic'] for w in tree['where']] == [c.statistic for c in cells]
+    assert [w['depends_on'] for w in tree['where']] == [list(c.depends_on) for c in cells]
+    source = tree['provenance']
+    assert (source['version'], source['seed'], source['forward_simulations']) == (__version__, 0, found.simulations)
+    (o,) = found.workspace.observations
+    (recording,) = source['recordings']
+    assert recording['sha256'] == o.hashed()
+    assert recording['seconds'] == pytest.approx(1.2)
+    assert recording['noise_v'] == found.workspace.noise[0].sigma.tolist()
+    assert recording['coloured'] == [False] * 6
+    before, left = 1e6 * found.gap_before, 1e6 * found.gap_after
+    size = told.size_of(named)
+    assert told.sentence(found) == (
+        f'sensor_rotation (psd 2) is missing from the model; adding it closes the gap from {before:.3f} to {left:.3f} '
+        f'µm, {found.floors:.2f} times what noise alone leaves ({1e6 * found.gap_floor:.3f} µm). '
+        f'Fitted: sensor_rotation {size}.'
+    )
+
+
+def test_other_answers_have_other_sentences(found: Discovery) -> None:
+    (named,) = found.effects
+    floor = f'{1e6 * found.gap_floor:.3f} µm'
+    left = f'{1e6 * found.gap_after:.3f} µm, {found.floors:.2f} times what noise alone leaves ({floor})'
+    before = f'{1e6 * found.gap_before:.3f}'
+
+    def sentence(**given: Any) -> str:
+        return told.sentence(dataclasses.replace(found, **given))
+
+    assert sentence(verdict='nothing_missing', effects=()) == f'Nothing is missing: the gap is {left}.'
+    assert sentence(verdict='unknown_effect', effects=(), unknown=(Unknown('', (), 1.0),)) == (
+        f'An effect that is not in the catalogue: the gap is {left}.'
+    )
+    assert sentence(verdict='unknown_effect', unknown=(Unknown('', (), 0.5),)) == (
+        'sensor_rotation (psd 2) explains part, but an unknown effect remains: '
+        f'the gap goes from {before} µm to {left}.'
+    )
+    two = (named, dataclasses.replace(named, equivalent=('a', 'b'), sd={}))
+    said_of_two = sentence(effects=two)
+    assert said_of_two.startswith(
+        'sensor_rotation (psd 2) and sensor_rotation (psd 2) (or a, b: this data cannot tell) are missing from the '
+        f'model; adding them closes the gap from {before} to {left}.'
+    )
+    assert said_of_two.count('Fitted') == 1
+    assert sentence(effects=two, verdict='unknown_effect', unknown=(Unknown('', (), 1.0, remains=False),)).endswith(
+        f' close the gap from {before} to {left}, but their sizes are tied: '
+        'one effect that is not in the catalogue is likelier.'
+    )
+    setup = (Finding('channel_sign', 'y1', -1.0, 'x'), Finding('channel_sign', 'y1', -1.0, 'y'))
+    assert sentence(verdict='nothing_missing', effects=(), setup=setup) == (
+        'The set-up is not as the rig file or the recording says: channel_sign (y1). '
+        f'Nothing is missing besides: the gap is {left}.'
+    )
+    tree = told.result(dataclasses.replace(found, setup=setup[:1], unknown=(Unknown('s', ('d',), 0.4, True, 2e-6),)))
+    assert tree['unknown'] == [{'signature': 's', 'depends_on': ['d'], 'explains': 0.4, 'rms': 2e-6, 'law': None}]
+    assert tree['setup'] == [
+        {'name': 'channel_sign', 'where': 'y1', 'value': -1.0, 'fix': 'x', 'evidence': 0.0, 'equivalent': []}
+    ]
+    rival = Rival(named.active, {'angle': 1e-3}, 4.0, found.fit)
+    listed_rivals = told.result(dataclasses.replace(found, effects=(dataclasses.replace(named, rivals=(rival,)),)))
+    assert listed_rivals['effects'][0]['rivals'] == [
+        {
+            'name': 'sensor_rotation',
+            'parameters': {'psd': 2, 'angle': {'value': named.active.values['angle'], 'sd': 1e-3, 'unit': 'rad'}},
+            'delta_bic': 4.0,
+        }
+    ]

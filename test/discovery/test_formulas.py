@@ -1,0 +1,485 @@
+"""The formulas of discover, piece by piece, against the same thing written in another way."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from psd_deflection.config import load_rig, replace_values
+from psd_deflection.discovery import experiment
+from psd_deflection.discovery.cleaning import clean, outliers, stuck
+from psd_deflection.discovery.experiment import Limits, Shown, nothing_of, pieces, settings
+from psd_deflection.discovery.fit import Fit
+from psd_deflection.discovery.localise import _plain, regressors
+from psd_deflection.discovery.noise import NoiseModel, rest_windows, strip_lines
+from psd_deflection.discovery.observation import Observation, load_cases
+from psd_deflection.discovery.trust import energies, gain_beyond
+from psd_deflection.discovery.validate import fold_of_case
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.errors import RecordingError
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation import loads
+from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.simulation.simulator import ForwardModel
+
+RIG = load_rig()
+PUSHES = [(0.0, 0.0, 0.0), (5.0, -20.0, -9.0), (-10.0, 10.0, 12.0), (0.0, 0.0, 0.0)]
+HISTORY = loads.steps(PUSHES, 0.3).loads
+WARM = 21.0 + np.linspace(0.0, 2.0, len(HISTORY)) ** 2
+
+
+def observed(seed: int = 0, effects: tuple[ActiveEffect, ...] = (), name: str = 'seen', **given: Any) -> Observation:
+    """1.2 s of the rig with white noise of its own level."""
+    history = given.pop('history', HISTORY)
+    warm = given.pop('warm', WARM)
+    volts = ForwardModel(RIG, list(effects)).run(history, warm).volts
+    volts += RIG.noises.ravel()[:, None] * np.random.default_rng(seed).standard_normal(volts.shape)
+    return Observation(name, RIG, volts.T.copy(), history, warm, **given)
+
+
+@pytest.fixture(scope='module')
+def workspace() -> Workspace:
+    """Two recordings, the second without temperature."""
+    return Workspace([observed(), observed(1, name='second', warm=None)])
+
+
+# What a rig can be asked to do.
+
+
+def script(levels: list[tuple[float, float, float]], dwell: float) -> tuple[str, ...]:
+    """Steps in the notation of ``simulate --loads``, three decimals."""
+
+    def number(v: float) -> str:
+        return f'{round(v, 3) + 0.0:g}'
+
+    return ('steps:' + ';'.join(','.join(map(number, level)) for level in levels) + f':{dwell:g}',)
+
+
+@pytest.mark.parametrize('zero', [0.0, 5e-4])
+@pytest.mark.parametrize('sideways', [True, False])
+def test_what_can_be_done_to_a_link_uses_the_room_on_its_sensors(sideways: bool, zero: float) -> None:
+    """A force bends by L^3/(3 EI), a torque twists by L/GJ; the dots may go 80 % of the way to the edge."""
+    rig = replace_values(RIG, {'psd_2.zero': [0.0, -zero], 'link.youngs_modulus': 7e9})
+    link = rig.link
+    per_force, per_torque = link.length**3 / (3.0 * link.bending_stiffness), link.length / link.torsional_stiffness
+    half = 0.5 * min(min(p.active_area) for p in rig.psds)
+    room = 0.8 * (min(half, rig.converter.full_scale * float(rig.sensitivities.min())) - zero)
+    reach = max(math.hypot(*c) for c in rig.centers.tolist())
+    f, t = min(50.0, room / per_force), min(29.25, room / (per_torque * reach))
+    assert f < 50.0
+    arm = loads.SIDEBAR_ARM
+    bar = room / (per_force + arm * per_torque * reach)
+    o, h = (0.0, 0.0, 0.0), (0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25)
+    up = [0.0, *h, 0.0]
+    want: list[tuple[str, ...]] = []
+    if sideways:
+        want.append(script([o, (0, -f, 0), o, (0, f, 0), o, (f, 0, 0), o, (-f, 0, 0), o], 1.5))
+        want.append(script([o, (0, 0, t), o, (0, 0, -t), o], 2.0))
+        g, u = f / 2, 0.6 * t
+        corners = [(1, 1, 1), (-1, 1, -1), (-1, -1, 1), (1, -1, -1), (1, 1, -1), (-1, -1, -1)]
+        want.append(script([o, *((a * g, b * g, c * u) for a, b, c in corners), o], 1.5))
+    else:
+        want.append(script([o, (0, -f, 0), o, (0, -f / 2, 0), o], 2.0))
+    want.append(script([o, (0, -bar, -bar * arm), o, (0, -bar, bar * arm), o], 2.0))
+    want.append(script([(0, -s * f, 0) for s in up], 1.5))
+    if sideways:
+        want.append(script([(s * f, 0, 0) for s in up], 1.5))
+        want.append(script([(0, 0, s * t) for s in up], 1.5))
+
+    def n(v: float) -> str:
+        return f'{round(v, 3) + 0.0:g}'
+
+    twist = -0.3 * t if sideways else 0.0
+    want.append(('constant:0,0,0:1', f'constant:0,{n(-0.8 * f)},{n(twist)}:24', 'constant:0,0,0:14.4'))
+    want.append(('constant:0,0,0:30',))
+    want.append((f'chirp:{n(0.06 * f)},{n(0.06 * f)},{n(0.07 * t)}:2,40:15',))
+    want.append((f'chirp:{n(0.3 * f)},{n(0.3 * f)},{n(0.3 * t)}:40,150:12',))
+    got = pieces(rig, Limits(sideways=sideways))
+    assert [p.script for p in got] == want
+    # The words name the same sizes.
+    assert got[0].words.startswith(f'{f:.3g} N along -Y' if sideways else f'weights of {f:.3g} N and half of it')
+    assert got[len(got) - 4].words == f'{0.8 * f:.3g} N held for 24 s, then 14.4 s unloaded'
+    assert [p.words for p in got[-3:]] == [
+        '30 s unloaded',
+        'a sweep from 2 to 40 Hz on both axes and in torsion',
+        'a sweep from 40 to 150 Hz on both axes and in torsion',
+    ]
+
+
+@pytest.mark.parametrize(
+    ('limits', 'ends'),
+    [
+        (Limits(sweep=45.0), ['2,40:15']),
+        (Limits(sweep=46.0), ['2,40:15', '40,46:12']),
+        (Limits(sweep=30.0), ['2,30:15']),
+        (Limits(sweep=2.0), []),
+        (Limits(sweep=900.0), ['2,40:15', '40,400:12']),
+    ],
+)
+def test_sweeps_go_as_high_as_the_exciter_and_the_samples_let_them(limits: Limits, ends: list[str]) -> None:
+    """Up to four tenths of the sample rate."""
+    chirps = [p.script[0] for p in pieces(RIG, limits) if p.script[0].startswith('chirp')]
+    assert [c.split(':', 2)[2] for c in chirps] == ends
+
+
+def test_lesser_forces_torques_and_times_are_kept() -> None:
+    limits = Limits(force=3.0, torque=0.5, sidebar=0.1, seconds=20.0)
+    got = [p.script for p in pieces(RIG, limits)]
+    assert got[0] == script(
+        [(0, 0, 0), (0, -3, 0), (0, 0, 0), (0, 3, 0), (0, 0, 0), (3, 0, 0), (0, 0, 0), (-3, 0, 0), (0, 0, 0)], 1.5
+    )
+    assert script([(0, 0, 0), (0, 0, 0.5), (0, 0, 0), (0, 0, -0.5), (0, 0, 0)], 2.0) in got
+    assert script([(0, 0, 0), (0, -3, -0.3), (0, 0, 0), (0, -3, 0.3), (0, 0, 0)], 2.0) in got
+    assert ('constant:0,0,0:1', 'constant:0,-2.4,-0.15:12', 'constant:0,0,0:7.2') in got
+    assert ('constant:0,0,0:20',) in got
+    without = pieces(RIG, Limits(force=3.0, torque=0.0, sidebar=0.0, sweep=0.0))
+    assert not any('N m' in p.words or 'sidebar' in p.words for p in without)
+    assert len(without) == 5
+    only_torque = pieces(RIG, Limits(force=0.0, torque=0.5, sweep=0.0))
+    assert [p.words for p in only_torque] == [
+        'pure torque of +-0.5 N m',
+        '0 N along both axes with 0.3 N m, in all corners',
+        'up to 0.5 N m in four steps and down again',
+        '30 s unloaded',
+    ] or only_torque[2].words.startswith('0 N on the sidebar')
+
+
+def test_settings_are_lengths_rates_and_temperatures_other_than_now() -> None:
+    limits = Limits(swing=4.0, lengths=(0.4, RIG.link.length, 0.9), rates=(500.0, 1000.0))
+    got = settings(RIG, limits)
+    assert [(s.words, dict(s.changes), s.swing) for s in got] == [
+        ('', {}, 0.0),
+        ('while the temperature swings by +-4 K', {}, 4.0),
+        ('on a link of 0.40 m', {'link.length': 0.4}, 0.0),
+        ('on a link of 0.90 m', {'link.length': 0.9}, 0.0),
+        ('at 500 samples/s', {'converter.sample_rate_hz': 500.0}, 0.0),
+    ]
+    # Nothing is easier than the rig as it is; a link is hardest to exchange.
+    assert [s.effort for s in got] == [0.0, 0.03, 0.05, 0.05, 0.02]
+    assert settings(RIG, Limits(swing=0.0))[1].changes == {'link.length': 0.409 if RIG.link.length == 0.585 else None}
+    assert got[0].knots == [20.0]
+    assert got[0].temperature(5) is None
+    assert got[1].knots == [20.0, 22.0, 24.0, 22.0, 20.0, 18.0, 16.0, 18.0, 20.0]
+    warm = got[1].temperature(801)
+    assert warm is not None
+    assert warm[[0, 100, 150, 200, 600]] == pytest.approx([20.0, 22.0, 23.0, 24.0, 16.0], abs=0.02)
+    tree = experiment.limits_to_tree(limits)
+    assert tree == {
+        'force_n': 50.0,
+        'torque_nm': 29.25,
+        'sidebar_m': loads.SIDEBAR_ARM,
+        'sideways': True,
+        'sweep_hz': 150.0,
+        'swing_k': 4.0,
+        'lengths_m': [0.4, RIG.link.length, 0.9],
+        'rates_hz': [500.0, 1000.0],
+        'seconds': 60.0,
+    }
+    assert experiment.limits_to_tree(Limits())['lengths_m'] is None
+
+
+def some_shown(rng: np.random.Generator, seconds: float = 2.0) -> tuple[Shown, list[FloatArray], list[FloatArray]]:
+    """What random pictures of two models show: with no parameter, and with three."""
+    rows = [rng.standard_normal(40) for _ in range(2)]
+    slopes = [rng.standard_normal((40, k)) for k in (0, 3)]
+    apart = np.array([[float((a - b) @ (a - b)) for b in rows] for a in rows])
+    pull = [[c.T @ (a - b) for b, c in zip(rows, slopes, strict=True)] for a in rows]
+    return Shown(apart, pull, [c.T @ c for c in slopes], seconds), rows, slopes
+
+
+def test_a_separation_is_what_least_squares_leaves_of_both_recordings() -> None:
+    """The other model adapts to the new data and to the old, whose curvature is known."""
+    rng = np.random.default_rng(3)
+    seen, rows, slopes = some_shown(rng)
+    old = rng.standard_normal((15, 3))
+    both = np.vstack((slopes[1], old))
+    target = np.concatenate((rows[0] - rows[1], np.zeros(15)))
+    left = target - both @ np.linalg.lstsq(both, target, rcond=None)[0]
+    assert seen.separation(0, 1, old.T @ old) == pytest.approx(float(left @ left), rel=1e-9)
+    # One without parameters cannot adapt.
+    assert seen.separation(1, 0, np.zeros((0, 0))) == pytest.approx(seen.apart[0, 1])
+    again, _, _ = some_shown(rng, 3.0)
+    total = seen + again * 2.0
+    assert total.seconds == 8.0
+    np.testing.assert_allclose(total.apart, seen.apart + 2.0 * again.apart)
+    np.testing.assert_allclose(total.fisher[1], seen.fisher[1] + 2.0 * again.fisher[1])
+    np.testing.assert_allclose(total.pull[0][1], seen.pull[0][1] + 2.0 * again.pull[0][1])
+    models = cast(list[Fit], [SimpleNamespace(free=()), SimpleNamespace(free=((0, 'a'), (0, 'b'), (1, 'c')))])
+    nothing = nothing_of(models)
+    assert nothing.seconds == 0.0
+    for a, b in ((nothing + seen, seen), (seen + nothing, seen)):
+        np.testing.assert_array_equal(a.apart, b.apart)
+        np.testing.assert_array_equal(a.fisher[1], b.fisher[1])
+        np.testing.assert_array_equal(a.pull[0][1], b.pull[0][1])
+
+
+# Where, and on what it depends.
+
+
+def test_regressors_are_the_words_they_have(workspace: Workspace) -> None:
+    table = regressors(workspace)
+    assert list(table[0]) == list(table[1])
+    for r, o in enumerate(workspace.observations):
+        samples = ForwardModel(RIG, []).run(o.loads, o.temperature)
+
+        def mean(row: FloatArray) -> FloatArray:
+            return row.reshape(-1, 4).mean(axis=1)
+
+        dots, (fx, fy, tz) = [1e3 * mean(d) for d in samples.dots], map(mean, o.loads.T)
+        n = len(fx)
+        t = np.arange(n) / n
+        warmer = mean(o.temperature - o.temperature[0]) if o.temperature is not None else np.zeros(n)
+        ways = np.zeros_like(o.loads)
+        for k in range(3):
+            way = 0.0
+            for i in range(1, len(o.loads)):
+                change = o.loads[i, k] - o.loads[i - 1, k]
+                way = math.copysign(1.0, change) if change else way
+                ways[i, k] = way
+        for psd in range(2):
+            x, y = dots[2 * psd], dots[2 * psd + 1]
+            dx, dy = np.gradient(x), np.gradient(y)
+            want = {
+                'constant': t**0,
+                'time': t,
+                'time^2': t * t,
+                'load_fx': fx,
+                'load_fy': fy,
+                'load_tz': tz,
+                'load_fx^2': fx * fx,
+                'load_fy^2': fy * fy,
+                'load_tz^2': tz * tz,
+                'dot_x': x,
+                'dot_y': y,
+                'dot_x^2': x * x,
+                'dot_y^2': y * y,
+                'dot_x dot_y': x * y,
+                'dot_x r^2': x**3 + x * y**2,
+                'dot_y r^2': y**3 + y * x**2,
+                '|dot_x|': abs(x),
+                '|dot_y|': abs(y),
+                'rate of dot_x': dx,
+                'rate of dot_y': dy,
+                '|rate of dot_x|': abs(dx),
+                '|rate of dot_y|': abs(dy),
+                'history of load_fx': mean(ways[:, 0]),
+                'history of load_fy': mean(ways[:, 1]),
+                'history of load_tz': mean(ways[:, 2]),
+                'temperature': warmer,
+                'temperature^2': warmer * warmer,
+            }
+            assert set(want) == set(table[psd])
+            for name, values in want.items():
+                np.testing.assert_allclose(table[psd][name][r], values, rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ('regressor', 'word'),
+    [
+        ('load_fx^2', 'load_fx'),
+        ('history of load_fy', 'load_fy'),
+        ('load_tz', 'load_tz'),
+        ('|rate of dot_x|', 'rate'),
+        ('dot_x dot_y', 'dot_position'),
+        ('temperature^2', 'temperature'),
+        ('time', 'time'),
+        ('constant', 'constant'),
+    ],
+)
+def test_a_regressor_has_a_plain_word(regressor: str, word: str) -> None:
+    assert _plain(regressor) == word
+
+
+def test_energies_are_those_of_band_passed_rows(workspace: Workspace) -> None:
+    """By masks on the full spectrum (Parseval); the gain in a band counts if it is beyond what may be wrong there."""
+    rng = np.random.default_rng(2)
+    one, other, explained = (rng.standard_normal(len(workspace.data)) for _ in range(3))
+    edges = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, math.inf)
+
+    def bands(vector: FloatArray) -> FloatArray:
+        out = np.zeros((2, 6, 6))
+        for r, part in enumerate(workspace.split(vector)):
+            spectrum = np.abs(np.fft.fft(part, axis=1)) ** 2 / part.shape[1]
+            f = np.abs(np.fft.fftfreq(part.shape[1], 0.004))
+            for b, (low, high) in enumerate(itertools.pairwise(edges)):
+                out[r, :, b] = spectrum[:, (f >= low) & (f < high)].sum(axis=1)
+        return out
+
+    np.testing.assert_allclose(energies(workspace, one), bands(one), rtol=1e-9, atol=1e-9)
+    assert energies(workspace, one).sum() == pytest.approx(float(one @ one))
+    for size in (0.0, 1.0, 300.0, 3000.0):
+        gain = bands(one) - bands(other)
+        allowed = 0.002**2 * size**2 * bands(explained)
+        want = sum(g for g, a in zip(gain.ravel(), allowed.ravel(), strict=True) if g < 0.0 or g > a)
+        assert gain_beyond(workspace, one, other, size * explained) == pytest.approx(want, rel=1e-6)
+
+
+def test_folds_are_dealt_out_in_turn(workspace: Workspace) -> None:
+    cases = max(int(c.max()) for c in workspace.case) + 1
+    assert fold_of_case(workspace).tolist() == [i % 4 for i in range(cases)]
+    # The second recording's cases are others than the first one's.
+    assert workspace.case[1].min() == workspace.case[0].max() + 1
+    one = Workspace([observed(history=np.zeros((400, 3)), warm=None)])
+    assert fold_of_case(one).tolist() == [0, 1, 2, 3]
+
+
+def test_a_load_case_begins_after_a_quarter_of_a_second_of_rest() -> None:
+    rows = np.zeros((2000, 3))
+    rows[100:, 0] = 1.0
+    rows[349:, 1] = 2.0
+    rows[599:, 2] = 3.0
+    rows[1700:, 2] = 4.0
+    # The second change comes 249 samples after the first, the third 250 after the second.
+    assert [int(np.argmax(load_cases(rows, 1e-3) == k)) for k in range(4)] == [0, 100, 599, 1700]
+    assert np.bincount(load_cases(rows[:700], 1e-3)).tolist() == [100, 499, 101]
+    assert np.bincount(load_cases(np.zeros((10, 3)), 1e-3)).tolist() == [3, 2, 3, 2]
+
+
+@pytest.mark.parametrize(
+    ('change', 'said_of_it'),
+    [
+        ({'loads': np.zeros((5, 3))}, 'do not match'),
+        ({'volts': np.zeros((len(HISTORY), 5))}, 'do not match'),
+        ({'loads': np.full((len(HISTORY), 3), np.nan)}, 'a load is not a finite number'),
+        ({'temperature': np.full(len(HISTORY), np.inf)}, 'a temperature is not a finite number'),
+        ({'volts': np.zeros((79, 6)), 'loads': np.zeros((79, 3))}, '79 samples: discover needs at least 4 blocks'),
+    ],
+)
+def test_what_is_no_recording_is_refused(change: dict[str, Any], said_of_it: str) -> None:
+    with pytest.raises(RecordingError, match=said_of_it):
+        dataclasses.replace(observed(), **change)
+
+
+def test_a_recording_knows_its_length_and_its_digest() -> None:
+    o = observed()
+    assert (o.period, o.duration) == (1e-3, pytest.approx(1.2))
+    Observation('least', RIG, np.zeros((80, 6)), np.zeros((80, 3)))
+    assert o.temperature is not None
+    for other in (
+        dataclasses.replace(o, volts=o.volts + 1e-3),
+        dataclasses.replace(o, loads=o.loads + 1.0),
+        dataclasses.replace(o, temperature=o.temperature + 1.0),
+        dataclasses.replace(o, temperature=None),
+    ):
+        assert other.hashed() != o.hashed()
+    assert dataclasses.replace(o, name='other').hashed() == o.hashed()
+
+
+# Noise.
+
+
+def test_whitening_predicts_each_block_from_those_before_it() -> None:
+    """By a loop; a block counts if all that its prediction needs is there, by the square root of its share."""
+    rng = np.random.default_rng(4)
+    fine, count = rng.standard_normal((6, 30)), rng.choice([0.0, 0.5, 1.0], (6, 30), p=[0.1, 0.2, 0.7])
+    ar = np.array([[0.5, -0.2], [0.3, 0.0], [0.0, 0.4], [0.0, 0.0], [-0.6, 0.1], [0.2, 0.2]])
+    innovation = rng.uniform(1.0, 2.0, 6)
+    model = NoiseModel(innovation, ar, innovation, innovation, 0.0, (False,) * 6)
+    want = np.zeros((6, 30))
+    for c in range(6):
+        for k in range(30):
+            needed = [j for j in (1, 2) if ar[c, j - 1] and k >= j]
+            if count[c, k] > 0.0 and all(count[c, k - j] > 0.0 for j in needed):
+                rest = fine[c, k] - sum(ar[c, j - 1] * fine[c, k - j] for j in needed)
+                want[c, k] = rest * math.sqrt(count[c, k]) / innovation[c]
+    np.testing.assert_allclose(model.whiten(fine, count), want, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(('dwell', 'seen'), [(4.29, 2), (4.27, 1)])
+def test_rest_needs_three_tenths_of_a_second_after_the_ringing(dwell: float, seen: int) -> None:
+    """7/(2 pi 14 Hz 0.02) = 3.979 s after a change; nothing before it if the recording begins under load."""
+    slow = min(
+        RIG.dynamics.bending_frequency * RIG.dynamics.bending_damping_ratio,
+        RIG.dynamics.torsion_frequency * RIG.dynamics.torsion_damping_ratio,
+    )
+    assert 7.0 / (2.0 * math.pi * slow) == pytest.approx(3.979, abs=1e-3)
+    history = loads.steps([(0, 0, 0), (0, -10, 0)], dwell).loads
+    windows = rest_windows(
+        dataclasses.replace(observed(), volts=np.zeros((len(history), 6)), loads=history, temperature=None)
+    )
+    assert len(windows) == seen
+    first = round(1000 * dwell)
+    assert windows[0] == slice(0, first)
+    if seen == 2:
+        assert windows[1] == slice(first + 3978, 2 * first)
+    loaded = dataclasses.replace(observed(), volts=np.zeros((5000, 6)), loads=np.ones((5000, 3)), temperature=None)
+    assert rest_windows(loaded) == [slice(3978, 5000)]
+
+
+def test_of_many_lines_the_strongest_four_are_stripped() -> None:
+    rng = np.random.default_rng(0)
+    t = np.arange(4000) * 1e-3
+    lines = [np.sin(2 * np.pi * f * t + f) * s for f, s in ((50, 9.0), (100, 8.0), (150, 7.0), (200, 6.0), (250, 5.0))]
+    noise = rng.standard_normal(4000)
+    left = strip_lines(noise + sum(lines[:4]) + 3.0)
+    assert left.std() == pytest.approx(1.0, abs=0.05)
+    assert left.mean() == pytest.approx(0.0, abs=1e-9)
+    # The fifth, 5 sin, stays: variance 12.5 more.
+    assert strip_lines(noise + sum(lines)).var() == pytest.approx(1.0 + 12.5, rel=0.1)
+    assert strip_lines(noise + sum(lines), 5).std() == pytest.approx(1.0, abs=0.05)
+
+
+# What of a recording is no measurement.
+
+
+def test_a_single_wild_sample_of_any_place_is_an_outlier_and_no_other() -> None:
+    rng = np.random.default_rng(5)
+    residual = 1e-3 * rng.standard_normal((400, 6))
+    places = {(0, 0), (1, 1), (50, 2), (51, 2), (200, 3), (398, 4), (399, 5)}
+    for i, c in places:
+        residual[i, c] += 0.05 if i % 2 else -0.05
+    found = outliers(residual, 1e-4)
+    assert {(int(i), int(c)) for i, c in np.argwhere(found)} == places
+    residual[::10, 0] = np.nan
+    assert not outliers(residual, 1e-4)[::10, 0].any()
+    # Below the least standard deviation that is assumed nothing stands out.
+    assert not outliers(residual, 0.05).any()
+
+
+@pytest.mark.parametrize(('count', 'is_stuck'), [(29, False), (30, True)])
+def test_a_channel_is_stuck_from_three_hundredths_of_a_second_on(count: int, is_stuck: bool) -> None:
+    rng = np.random.default_rng(6)
+    volts = rng.standard_normal((500, 2))
+    volts[100 : 100 + count, 1] = 0.1
+    found = stuck(volts, 1e-3, np.full(2, 0.01), 1e-3)
+    assert not found[:, 0].any()
+    assert np.flatnonzero(found[:, 1]).tolist() == (list(range(100, 100 + count)) if is_stuck else [])
+    # At its highest and lowest it may be limited; a channel quieter than the converter's step may rest.
+    for limit in (9.0, -9.0):
+        high = volts.copy()
+        high[100 : 100 + count, 1] = limit
+        assert not stuck(high, 1e-3, np.full(2, 0.01), 1e-3).any()
+    assert not stuck(volts, 1e-3, np.full(2, 1e-3), 1e-3).any()
+    dead = np.full((500, 2), 0.7)
+    assert stuck(dead, 1e-3, np.full(2, 0.01), 1e-3).all()
+    # Eight samples at least, however slow they are taken.
+    slow = rng.standard_normal((100, 1))
+    slow[20:27, 0] = 0.1
+    assert not stuck(slow, 1.0, np.full(1, 0.01), 1e-3).any()
+    slow[20:28, 0] = 0.1
+    assert stuck(slow, 1.0, np.full(1, 0.01), 1e-3).any()
+
+
+def test_what_is_known_of_a_recording_is_told() -> None:
+    o = observed()
+    told = dataclasses.replace(o, unknown_load=(100, 50), stated_rate_hz=500.0)
+    cleaned, (rate, coverage) = clean(told, ())
+    assert (rate.name, rate.where, rate.value) == ('sample_rate', 'converter.sample_rate_hz', 2.0)
+    assert rate.fix == 'converter.sample_rate_hz: 1000.0'
+    assert rate.evidence == pytest.approx(math.log(2.0))
+    assert (coverage.name, coverage.value, coverage.evidence) == ('load_coverage', 150 / 1200, 150 / 1200)
+    assert 'its first 0.10 s and its last 0.05 s' in coverage.fix
+    gone = np.isnan(cleaned.volts).all(axis=1)
+    assert np.flatnonzero(gone).tolist() == [*range(100), *range(1150, 1200)]
+    assert cleaned.digest == told.hashed()
+    # Up to a twentieth is left out and not told; and what is whole stays as it is.
+    quiet, findings = clean(dataclasses.replace(o, unknown_load=(30, 30)), ())
+    assert findings == []
+    assert np.isnan(quiet.volts).all(axis=1).sum() == 60
+    assert clean(o, ())[0] is o

@@ -1,0 +1,419 @@
+"""The formulas behind a law, piece by piece: grids counted by hand, sums written out, states by brute force."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from psd_deflection.discovery import law_features, laws
+from psd_deflection.discovery.fit import Fit, refit
+from psd_deflection.discovery.law_features import responses, score, switchings, terms
+from psd_deflection.discovery.validate import fold_of_case, heldout_gap
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.simulation.catalogue import make_active
+from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.simulation.laws import TARGETS, VARIABLES, Law, Term, effect_of, values_of
+from psd_deflection.simulation.simulator import ForwardModel
+
+from .test_formulas import HISTORY, RIG, observed
+
+
+@pytest.fixture(scope='module')
+def seen() -> tuple[Workspace, Fit]:
+    """1.2 s of noise, and a fit of one effect to it."""
+    workspace = Workspace([observed(3)])
+    return workspace, refit(workspace, [make_active('sensor_rotation', {'psd': 2, 'angle': 0.0}, 'test')], 2)
+
+
+def term_names(found: list[Term]) -> dict[tuple[str, tuple[str, ...]], list[dict[str, float]]]:
+    out: dict[tuple[str, tuple[str, ...]], list[dict[str, float]]] = {}
+    for t in found:
+        out.setdefault((t.form, t.of), []).append(dict(t.shapes))
+    return out
+
+
+def test_the_terms_that_are_tried_are_those_of_a_grid(seen: tuple[Workspace, Fit]) -> None:
+    (r,) = responses(*seen)
+    assert set(r.known) == set(VARIABLES)
+    # load_fx takes a few values, load_tz never changes, x1 many.
+    few = np.repeat([0.0, 5.0, -10.0, 1.0], 300)
+    ramp = np.linspace(-1e-3, 3e-3, 1200)
+    still = np.zeros(1200)
+    known = dict.fromkeys(VARIABLES, still) | {'load_fx': few, 'x1': ramp, 'time': np.arange(1200) * 1e-3}
+    got = term_names(list(terms([dataclasses.replace(r, known=known)])))
+    moving = ['load_fx', 'x1', 'time']
+    products = [(a,) for a in moving]
+    products += [(a, b) for i, a in enumerate(moving) for b in moving[i:]]
+    products += [(a, a, a) for a in moving]
+    assert {of for form, of in got if form == 'product'} == set(products)
+    alone = [of for form, of in got if form not in ('product', 'relaxed', 'resonance')]
+    assert set(alone) == {('load_fx',), ('x1',)}
+
+    def numbers(form: str, name: str, shape: str) -> list[float]:
+        return [s[shape] for s in got[form, (name,)]]
+
+    for name, low, high in (('load_fx', -10.0, 5.0), ('x1', -1e-3, 3e-3)):
+        size = max(abs(low), abs(high))
+        eighths = [low + (high - low) * (k + 0.5) / 8 for k in range(8)]
+        for form in ('above', 'below'):
+            assert numbers(form, name, 'threshold') == pytest.approx(eighths)
+        for form in ('beyond', 'within'):
+            assert numbers(form, name, 'threshold') == pytest.approx([s * size for s in (0.05, 0.15, 0.3, 0.5, 0.7)])
+        assert numbers('play', name, 'half_width') == pytest.approx([0.02 * size, 0.1 * size, 0.3 * size])
+        taus = [0.02, 0.1, 0.3, 1.0, 3.0, 10.0]
+        assert numbers('relaxed', name, 'tau') == [s['tau'] for s in got['relaxed', (name, name)]] == taus
+    # Between the values that held loads take; else two dozen levels.
+    assert numbers('over', 'load_fx', 'threshold') == [-5.0, 0.5, 3.0]
+    assert numbers('over', 'x1', 'threshold') == pytest.approx([-1e-3 + 4e-3 * (k + 0.5) / 24 for k in range(24)])
+    waves = [(s['period'], s['phase']) for s in got['wave', ('x1',)]]
+    assert waves == [
+        (pytest.approx(share * 3e-3), phase)
+        for share in (0.2, 0.3, 0.45, 0.7, 1.0, 1.5)
+        for phase in (0.0, math.pi / 2)
+    ]
+    rings = [(s['natural_frequency'], s['zeta']) for s in got['resonance', ('load_fx',)]]
+    assert rings == [(pytest.approx(2.0 * 90.0 ** (k / 47)), 0.04) for k in range(48)]
+    # A load has no rate, a dot no direction.
+    only = {form: {of[0] for f, of in got if f == form} for form in ('rate', 'rate_absolute', 'drag', 'direction')}
+    assert only == {'rate': {'x1'}, 'rate_absolute': {'x1'}, 'drag': {'x1'}, 'direction': {'load_fx'}}
+    assert {form for form, _ in got} == {
+        *('product', 'absolute', 'signed_square', 'above', 'below', 'beyond', 'within', 'over', 'rate'),
+        *('rate_absolute', 'drag', 'direction', 'play', 'relaxed', 'wave', 'resonance'),
+    }
+
+
+def test_two_dozen_values_are_few_and_one_more_is_many(seen: tuple[Workspace, Fit]) -> None:
+    (r,) = responses(*seen)
+    for count, thresholds in ((24, 23), (25, 24)):
+        known = {n: np.zeros(1200) for n in VARIABLES} | {'load_fy': np.resize(np.arange(count) * 1.0, 1200)}
+        got = term_names(list(terms([dataclasses.replace(r, known=known)])))
+        assert len(got['over', ('load_fy',)]) == thresholds
+
+
+@pytest.mark.parametrize(
+    ('target', 'of'),
+    [
+        ('x1', 'load_fy'),
+        ('y2', 'dx'),
+        ('sum1', 'load_tz'),
+        ('sum2', 'temperature'),
+        ('dx', 'load_tz'),
+        ('theta', 'dy'),
+        ('static_dy', 'load_fx'),
+        ('static_theta', 'load_fx'),
+    ],
+)
+def test_a_gain_is_that_of_the_simulated_picture(seen: tuple[Workspace, Fit], target: str, of: str) -> None:
+    """The term is put into the simulation, and its picture, freed of what the fit explains, held to the residual."""
+    workspace, fit = seen
+    law = Law('one', TARGETS[target].stage, target, (Term('product', (of,), 1.0),))
+    size = {'load_fy': 1e-9, 'load_tz': 1e-9, 'dx': 1e-5, 'dy': 1e-5, 'load_fx': 1e-9, 'temperature': 1e-9}[of]
+    size *= 1e3 if target.startswith('sum') else 1.0
+    values = {**values_of(law), 'c1': size}
+    base = [*workspace.base, *fit.effects]
+    there = workspace.simulate([*base, ActiveEffect(effect_of(law), values)])
+    picture = workspace.whiten([a - b for a, b in zip(there, workspace.simulate(base), strict=True)]) / size
+    q, _ = np.linalg.qr(fit.jacobian)
+    across = picture - q @ (q.T @ picture)
+    want = float(across @ fit.residual) ** 2 / float(across @ across)
+    found = responses(workspace, fit)
+    (got,) = score(found, [Term('product', (of,))], (target,))
+    # A first-order answer: held over a fine block, and the optics at the middle of it.
+    assert got.gain == pytest.approx(want, rel=0.1, abs=0.02)
+    assert got.term.coefficient == pytest.approx(float(across @ fit.residual) / float(across @ across), rel=0.1)
+    assert score(found, [Term('product', ('dx',))], ('static_dx', 'load_fx')) == []
+
+
+def test_what_a_target_lacks_is_estimated_with_its_weight(seen: tuple[Workspace, Fit]) -> None:
+    """Of a dot: the residual in volts times the sensitivity, weighted by the noise. It costs one simulation."""
+    workspace, fit = seen
+    before = workspace.simulations
+    (r,) = responses(workspace, fit)
+    assert workspace.simulations == before + 1
+    noise, sensitivity = workspace.noise[0], RIG.sensitivities.ravel()
+    (part,) = workspace.split(fit.residual)
+    assert not any(noise.coloured)
+    for i, channel in enumerate(('x1', 'y1', 'x2', 'y2')):
+        c = CHANNELS.index(channel)
+        t = law_features.SOUGHT.index(channel)
+        np.testing.assert_allclose(r.error[t], part[c] * noise.innovation[c] * sensitivity[i], rtol=1e-9)
+        np.testing.assert_allclose(r.power[t], 1.0 / (noise.innovation[c] * sensitivity[i]) ** 2, rtol=1e-9)
+    for i, channel in enumerate(('sum1', 'sum2')):
+        t = law_features.SOUGHT.index(channel)
+        np.testing.assert_allclose(r.error[t], part[3 * i + 2] * noise.innovation[3 * i + 2], rtol=1e-9)
+    assert (r.period, r.fine) == (1e-3, 4)
+    dynamics = RIG.dynamics
+    assert r.rings == (
+        round(1.0 / dynamics.bending_frequency / 0.004),
+        round(1.0 / dynamics.torsion_frequency / 0.004),
+    )
+
+
+def test_what_whitening_does_to_noise_with_a_memory_is_undone_by_its_transpose() -> None:
+    rng = np.random.default_rng(1)
+    ar, n = np.array([0.5, -0.3]), 12
+    matrix = np.eye(n) - 0.5 * np.eye(n, k=-1) + 0.3 * np.eye(n, k=-2)
+    rows = rng.standard_normal((3, n))
+    np.testing.assert_allclose(law_features._unwhiten(rows, ar), rows @ matrix, rtol=1e-12)
+
+
+def test_the_optics_answer_to_the_pose_as_their_difference_says() -> None:
+    model = ForwardModel(RIG, [])
+    samples = model.run(HISTORY[:40])
+    pose, beams = samples.pose + 1e-3, samples.beams
+    got = law_features._jacobian(pose, beams, model)
+    p, theta = model.physics, pose[2]
+    # Of parallel planes: m = R(-theta)(l - d) - c.
+    c, s = np.cos(theta), np.sin(theta)
+    for i in range(2):
+        x, y = beams[2 * i] - pose[0], beams[2 * i + 1] - pose[1]
+        want = [(-c, s), (-s, -c), (-s * x + c * y, -c * x - s * y)]
+        for k, rows in enumerate(want):
+            np.testing.assert_allclose(got[k, 2 * i : 2 * i + 2], rows, rtol=1e-6, atol=1e-9)
+    assert p.slope_ratio == 0.0
+
+
+@pytest.mark.parametrize('blocks', [1, 2, 5])
+def test_an_average_is_over_so_many_neighbours(blocks: int) -> None:
+    values = np.random.default_rng(0).standard_normal(20)
+    got = law_features._averaged(values, blocks)
+    for k in range(5, 15):
+        left = k - blocks // 2
+        assert got[k] == pytest.approx(values[left : left + blocks].mean()) or got[k] == pytest.approx(
+            values[left + 1 - blocks % 2 : left + 1 - blocks % 2 + blocks].mean()
+        )
+    assert (got == values).all() == (blocks == 1)
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_the_likeliest_states_are_those_of_all_that_gain_most(seed: int) -> None:
+    """Of 2^10 sequences; each change costs 24, and the state before the first is 0."""
+    gain = np.random.default_rng(seed).normal(3.0, 25.0, 10)
+    best = max(
+        itertools.product((0, 1), repeat=10),
+        key=lambda s: (
+            sum(g for g, on in zip(gain, s, strict=True) if on) - 24.0 * int(np.abs(np.diff(s, prepend=0)).sum())
+        ),
+    )
+    assert law_features._likeliest(gain).tolist() == list(best)
+
+
+def test_two_levels_are_told_apart_from_a_stated_gain_on() -> None:
+    """A box of the height A and n blocks of weight w gains n w A^2 in chi-square, for two changes of 24."""
+    rng = np.random.default_rng(2)
+    n = 200
+    own = np.zeros(n)
+    own[60:110] = 2.0
+    own[150:170] = 2.0
+    v = rng.uniform(0.5, 2.0, n) * rng.choice((-1.0, 1.0), n)
+    v[5] = 0.0
+    assert law_features._two_levels(own * v, np.full(n, 3.0), v) == [60, 110, 150, 170]
+    ones = np.ones(n)
+    box = np.zeros(n)
+    box[60:110] = 1.0
+    assert law_features._two_levels(box, ones * 1.2 * 48.0 / 50.0, ones) == [60, 110]
+    assert law_features._two_levels(box, ones * 0.8 * 48.0 / 50.0, ones) == []
+    assert law_features._two_levels(box, ones * 0.4 * 48.0 / 50.0, ones) == []
+    assert law_features._two_levels(np.zeros(n), ones, ones) == []
+    # To the end of the recording one change is enough.
+    late = np.zeros(n)
+    late[150:] = -1.0
+    assert law_features._two_levels(late, ones, ones) == [150]
+
+
+def test_times_that_show_are_terms_and_become_better(seen: tuple[Workspace, Fit]) -> None:
+    workspace = Workspace(
+        [
+            observed(
+                4,
+                (
+                    ActiveEffect(
+                        effect_of(law := Law('bump', 'psd', 'y1', (Term('switched', (), 3e-5, times=(0.313, 0.871)),))),
+                        values_of(law),
+                    ),
+                ),
+            )
+        ]
+    )
+    found = responses(workspace, refit(workspace, ()))
+    first, *_ = switchings(found, ('y1',))
+    assert (first.form, first.of) == ('switched', ())
+    assert first.times == pytest.approx((0.313, 0.871), abs=0.0011)
+    rough = law_features.with_better_times(found, 'y1', Term('switched', (), times=(0.25, 0.95)))
+    assert rough.times == pytest.approx((0.313, 0.871), abs=0.0011)
+    assert {t.of for t in switchings(found, ('y1',))} <= {(), ('x1',), ('y1',)}
+
+
+# Laws and their fits.
+
+
+def fit_of(jacobian: FloatArray, *effects: ActiveEffect, **given: Any) -> Fit:
+    free = tuple((i, name) for i, a in enumerate(effects) for name in a.values)
+    empty = np.zeros(len(jacobian))
+    return dataclasses.replace(Fit(effects, 100.0, empty, [], jacobian, free[: jacobian.shape[1]], ()), **given)
+
+
+def test_a_fitted_law_has_the_numbers_of_the_fit_and_their_deviations() -> None:
+    law = Law('law_y2', 'psd', 'y2', (Term('above', ('load_fy',), shapes={'threshold': 4.0}), Term('product', ('dx',))))
+    values = {'c1': 2.0, 'threshold1': 5.0, 'c2': -3.0}
+    beside = make_active('sensor_gain', {'psd': 1, 'x': 0.1, 'y': 0.2}, 'test')
+    jacobian = np.random.default_rng(0).standard_normal((30, 5)) * [1.0, 2.0, 3.0, 4.0, 0.005]
+    fit = Fit(
+        (beside, ActiveEffect(effect_of(law), values)),
+        0.0,
+        np.zeros(30),
+        [],
+        jacobian,
+        ((0, 'x'), (0, 'y'), (1, 'c1'), (1, 'threshold1'), (1, 'c2')),
+        (),
+    )
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    np.testing.assert_allclose(laws._covariance(fit), covariance, rtol=1e-6)
+    sd = np.sqrt(np.diag(covariance))
+    got = laws._fitted(law, fit, laws._covariance(fit), 1)
+    first, second = got.terms
+    assert (first.coefficient, first.shapes, second.coefficient) == (2.0, {'threshold': 5.0}, -3.0)
+    assert first.sd == pytest.approx({'coefficient': sd[2], 'threshold': sd[3]})
+    assert second.sd == pytest.approx({'coefficient': sd[4]})
+    assert dataclasses.replace(got, terms=()) == dataclasses.replace(law, terms=())
+    # A hundred times its value is no deviation: the recording does not determine the number.
+    for factor, told in ((99.0, True), (101.0, False)):
+        wide = covariance.copy()
+        wide[4, 4] = (factor * 3.0) ** 2
+        assert ('coefficient' in laws._fitted(law, fit, wide, 1).terms[1].sd) == told
+    # Two pictures that are one: what cannot be told apart has a large deviation, and stays finite.
+    same = dataclasses.replace(fit, jacobian=np.column_stack((jacobian[:, :4], jacobian[:, 3])))
+    assert laws._covariance(same)[3, 3] > 1e6 * covariance[3, 3]
+
+
+def test_terms_are_added_to_the_law_on_their_quantity_and_left_out_one_by_one() -> None:
+    a, b, c = (Term('product', (v,)) for v in ('load_fx', 'load_fy', 'load_tz'))
+    first = Law('law_y2', 'psd', 'y2', (a,))
+    (both,) = laws._with([first], law_features.Scored('y2', b, 1.0))
+    assert both == Law('law_y2', 'psd', 'y2', (a, b))
+    two = laws._with([both], law_features.Scored('static_dx', c, 1.0))
+    assert two == (both, Law('law_static_dx', 'link', 'static_dx', (c,)))
+    x1 = Law('law_static_dx', 'link', 'static_dx', (c,))
+    assert laws._fewer(two) == [
+        (dataclasses.replace(both, terms=(b,)), x1),
+        (dataclasses.replace(both, terms=(a,)), x1),
+        (both,),
+    ]
+
+
+def trial(law: Law, cost: float, chi2: float, *beside: ActiveEffect) -> laws._Trial:
+    fit = SimpleNamespace(chi2=chi2, effects=(*beside, ActiveEffect(effect_of(law), values_of(law))))
+    return laws._Trial((law,), cast(Fit, fit), cost)
+
+
+def test_of_laws_that_cannot_be_told_apart_the_simplest_is_taken() -> None:
+    two = trial(Law('a', 'psd', 'y2', (Term('product', ('load_fx', 'load_fy')),)), 10.0, 5.0)
+    one = Law('b', 'psd', 'y2', (Term('product', ('x2',)),))
+    assert laws._simplest(two, [trial(one, 19.9, 26.5)]).laws == (one,)
+    assert laws._simplest(two, [trial(one, 20.1, 6.0)]) is two
+    assert laws._simplest(two, [trial(one, 11.0, 26.7)]) is two
+    # Beside other effects it is another answer; a dot goes before the pose; of equals the cheaper.
+    assert laws._simplest(two, [trial(one, 11.0, 6.0, make_active('creep', {'amplitude': 0.1}, 'test'))]) is two
+    of_pose = trial(Law('c', 'psd', 'y2', (Term('product', ('dx',)),)), 5.0, 5.0)
+    assert laws._simplest(of_pose, [trial(one, 6.0, 5.0)]).laws == (one,)
+    on_link = trial(Law('c', 'link', 'theta', (Term('product', ('dx',)),)), 5.0, 5.0)
+    assert laws._simplest(on_link, [trial(one, 6.0, 5.0)]) is on_link
+    assert laws._simplest(trial(one, 6.0, 5.0), [on_link]) == on_link
+
+
+def test_laws_that_the_recording_cannot_exclude_are_listed_once() -> None:
+    best = Law('a', 'psd', 'y2', (Term('product', ('load_fx',)),))
+    beam, link = dataclasses.replace(best, stage='optics', acts_on='beam_y2'), Law('b', 'link', 'dy', best.terms)
+    far, dear = dataclasses.replace(link, acts_on='dx'), dataclasses.replace(link, acts_on='theta')
+    others = [
+        trial(link, 31.5, 26.5),
+        trial(beam, 12.0, 6.0),
+        trial(dataclasses.replace(beam, name='again'), 14.0, 6.0),
+        trial(far, 11.0, 26.7),
+        trial(dear, 31.7, 5.0),
+        trial(best, 10.0, 5.0),
+    ]
+    assert laws._tied(trial(best, 10.0, 5.0), others) == (beam, link)
+
+
+def test_variances_are_the_likeliest() -> None:
+    """a and b of a + b v^2 against a scan of the likelihood of normal values, which is its sum of logarithms."""
+    rng = np.random.default_rng(3)
+    v2 = rng.uniform(0.0, 1.0, 4000)
+    squares = (1.0 + 0.7 * v2) * rng.standard_normal(4000) ** 2
+    a, b = laws._variance(squares, v2)
+
+    def likelihood(a: float, b: float) -> float:
+        return float(sum(-math.log(a + b * v) - s / (a + b * v) for s, v in zip(squares, v2, strict=True)))
+
+    assert laws._likelihood(squares, a + b * v2) == pytest.approx(likelihood(a, b))
+    assert laws._likelihood(squares, 2.0) == pytest.approx(likelihood(2.0, 0.0))
+    here = likelihood(a, b)
+    for da, db in ((0.02, 0.0), (-0.02, 0.0), (0.0, 0.04), (0.0, -0.04)):
+        assert likelihood(a + da, b + db) < here
+    # Noise does not grow negative, nor vanish.
+    assert laws._variance(squares, 1.0 - v2)[1] == 0.0
+    assert laws._variance(np.full(10, 1e-6), np.linspace(0.0, 1.0, 10)) == pytest.approx((0.05, 0.0), abs=1e-9)
+
+
+def test_noise_that_grows_with_a_load_is_told_with_its_size_and_evidence() -> None:
+    """Against the likelihoods of the same squares, counted here."""
+    rng = np.random.default_rng(5)
+    o = observed(6)
+    volts = o.volts.copy()
+    full = np.abs(o.loads[:, 1]).max()
+    volts[:, 4] += 4e-3 * (o.loads[:, 1] / full) * rng.standard_normal(len(volts))
+    workspace = Workspace([dataclasses.replace(o, volts=volts)])
+    fit = refit(workspace, ())
+    found = laws.find_jitter(workspace, fit, 3.0)
+    assert found is not None
+    (term,) = found.law.terms
+    assert (found.law.acts_on, found.law.stage, term.form, found.channels) == ('y2', 'electronics', 'jitter', ('y2',))
+    assert term.of in (('load_fy',), ('y1',), ('y2',), ('dy',))
+    squares = workspace.split(fit.residual)[0][4] ** 2
+    known = law_features.known_fine(workspace, (), term.of[0])[0]
+    a, b = laws._variance(squares, known**2 / (known**2).max())
+    gain = laws._likelihood(squares, a + b * known**2 / (known**2).max()) - laws._likelihood(squares, squares.mean())
+    assert found.delta_bic == pytest.approx(gain - 3.0, rel=1e-9)
+    # Of block means: what is added to one sample, by the square root of four samples in a fine block.
+    scale = workspace.noise[0].innovation[4] * math.sqrt(4.0) * float(RIG.sensitivities.ravel()[3])
+    assert term.coefficient == pytest.approx(math.sqrt(b / (known**2).max()) * scale, rel=1e-9)
+    assert term.sd == pytest.approx({'coefficient': term.coefficient / math.sqrt(gain)})
+    assert found.heldout.error == pytest.approx(math.sqrt(gain))
+    # Each fold of load cases with the variances of the others.
+    fold = np.concatenate([fold_of_case(workspace)[case] for case in workspace.case])
+    v2, want = known**2 / (known**2).max(), 0.0
+    for k in set(fold.tolist()):
+        a, b = laws._variance(squares[fold != k], v2[fold != k])
+        own = squares[fold == k]
+        want += laws._likelihood(own, a + b * v2[fold == k]) - laws._likelihood(own, squares[fold != k].mean())
+    assert found.heldout.gain == pytest.approx(0.5 * want, rel=1e-9)
+    assert found.laws == (found.law,)
+    assert [law.stage for law in found.equivalent] == ['psd']
+    assert found.adopted('mine') == [dataclasses.replace(found.law, name='mine')]
+    twice = dataclasses.replace(found, further=(found.law, found.law))
+    assert [law.name for law in twice.adopted('mine')] == ['mine', 'mine_2', 'mine_3']
+    assert found.beside == ()
+    added = float(np.mean((term.coefficient * known) ** 2)) / 4.0 / 20.0
+    assert found.heldout_gap == pytest.approx(math.sqrt(max(heldout_gap(workspace, fit) ** 2 - added, 0.0)), rel=1e-9)
+    assert laws.find_jitter(workspace, fit, gain) is None
+
+
+def test_a_law_shows_where_a_twentieth_of_its_energy_is(seen: tuple[Workspace, Fit]) -> None:
+    workspace, _ = seen
+    big = Law('big', 'psd', 'y2', (Term('product', ('load_fy',), 1e-5),))
+    for share, shown in ((0.06, ('x1', 'y2')), (0.04, ('y2',))):
+        # The residuals' energies per volt are those of the channels' noise.
+        sigma = workspace.noise[0].innovation
+        ratio = math.sqrt(share / (1.0 - share)) * sigma[0] / sigma[4]
+        small = Law('small', 'psd', 'x1', (Term('product', ('load_fy',), 1e-5 * ratio),))
+        effects = tuple(ActiveEffect(effect_of(law), values_of(law)) for law in (big, small))
+        fit = refit(workspace, effects, 0)
+        assert laws._channels(workspace, laws._Trial((big, small), fit, 0.0)) == shown
