@@ -229,7 +229,7 @@ def test_regressors_are_the_words_they_have(workspace: Workspace) -> None:
         samples = ForwardModel(RIG, []).run(o.loads, o.temperature)
 
         def mean(row: FloatArray) -> FloatArray:
-            return row.reshape(-1, 4).mean(axis=1)
+            return np.asarray(row.reshape(-1, 4).mean(axis=1), dtype=np.float64)
 
         dots, (fx, fy, tz) = [1e3 * mean(d) for d in samples.dots], map(mean, o.loads.T)
         n = len(fx)
@@ -358,7 +358,8 @@ def test_what_is_no_recording_is_refused(change: dict[str, Any], said_of_it: str
 
 def test_a_recording_knows_its_length_and_its_digest() -> None:
     o = observed()
-    assert (o.period, o.duration) == (1e-3, pytest.approx(1.2))
+    assert o.period == 1e-3
+    assert o.duration == pytest.approx(1.2)
     Observation('least', RIG, np.zeros((80, 6)), np.zeros((80, 3)))
     assert o.temperature is not None
     for other in (

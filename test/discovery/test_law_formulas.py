@@ -49,7 +49,7 @@ def test_the_terms_that_are_tried_are_those_of_a_grid(seen: tuple[Workspace, Fit
     known = dict.fromkeys(VARIABLES, still) | {'load_fx': few, 'x1': ramp, 'time': np.arange(1200) * 1e-3}
     got = term_names(list(terms([dataclasses.replace(r, known=known)])))
     moving = ['load_fx', 'x1', 'time']
-    products = [(a,) for a in moving]
+    products: list[tuple[str, ...]] = [(a,) for a in moving]
     products += [(a, b) for i, a in enumerate(moving) for b in moving[i:]]
     products += [(a, a, a) for a in moving]
     assert {of for form, of in got if form == 'product'} == set(products)
@@ -72,13 +72,13 @@ def test_the_terms_that_are_tried_are_those_of_a_grid(seen: tuple[Workspace, Fit
     # Between the values that held loads take; else two dozen levels.
     assert numbers('over', 'load_fx', 'threshold') == [-5.0, 0.5, 3.0]
     assert numbers('over', 'x1', 'threshold') == pytest.approx([-1e-3 + 4e-3 * (k + 0.5) / 24 for k in range(24)])
-    waves = [(s['period'], s['phase']) for s in got['wave', ('x1',)]]
+    waves: Any = [(s['period'], s['phase']) for s in got['wave', ('x1',)]]
     assert waves == [
         (pytest.approx(share * 3e-3), phase)
         for share in (0.2, 0.3, 0.45, 0.7, 1.0, 1.5)
         for phase in (0.0, math.pi / 2)
     ]
-    rings = [(s['natural_frequency'], s['zeta']) for s in got['resonance', ('load_fx',)]]
+    rings: Any = [(s['natural_frequency'], s['zeta']) for s in got['resonance', ('load_fx',)]]
     assert rings == [(pytest.approx(2.0 * 90.0 ** (k / 47)), 0.04) for k in range(48)]
     # A load has no rate, a dot no direction.
     only = {form: {of[0] for f, of in got if f == form} for form in ('rate', 'rate_absolute', 'drag', 'direction')}
@@ -285,7 +285,7 @@ def test_a_fitted_law_has_the_numbers_of_the_fit_and_their_deviations() -> None:
     assert dataclasses.replace(got, terms=()) == dataclasses.replace(law, terms=())
     # A hundred times its value is no deviation: the recording does not determine the number.
     for factor, told in ((99.0, True), (101.0, False)):
-        wide = covariance.copy()
+        wide = np.array(covariance, dtype=np.float64)
         wide[4, 4] = (factor * 3.0) ** 2
         assert ('coefficient' in laws._fitted(law, fit, wide, 1).terms[1].sd) == told
     # Two pictures that are one: what cannot be told apart has a large deviation, and stays finite.

@@ -19,7 +19,7 @@ from psd_deflection.config import load_rig
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.simulation import loads
 from psd_deflection.simulation.catalogue import catalogue
-from psd_deflection.simulation.declaration import ActiveEffect, Reading, Traced
+from psd_deflection.simulation.declaration import ActiveEffect, Reading, State, Traced
 from psd_deflection.simulation.physics import Physics
 from psd_deflection.simulation.samples import SimulatedSamples
 from psd_deflection.simulation.simulator import ForwardModel
@@ -42,10 +42,10 @@ def samples_of(seed: int = 1, psds: int = 2) -> SimulatedSamples:
     rng = np.random.default_rng(seed)
 
     def rows(count: int, size: float) -> FloatArray:
-        return rng.uniform(0.3, 1.0, (count, COUNT)) * rng.choice((-size, size), (count, COUNT))
+        return np.asarray(rng.uniform(0.3, 1.0, (count, COUNT)) * rng.choice((-size, size), (count, COUNT)))
 
     return SimulatedSamples(
-        t=0.7 + np.arange(COUNT) * 1e-3,
+        t=0.7 + np.arange(COUNT, dtype=np.float64) * 1e-3,
         warmer=rng.uniform(1.0, 5.0, COUNT),
         loads=rows(3, 30.0),
         physics=physics(),
@@ -188,7 +188,7 @@ def test_samples_change_by_the_formula_and_nothing_else_does(name: str, given: d
         np.testing.assert_allclose(getattr(after, row), expected, rtol=1e-12, atol=1e-18, err_msg=row)
 
 
-@pytest.mark.parametrize(('name', 'given'), [c for c in CASES if EFFECTS[c.values[0]].correct is not None])
+@pytest.mark.parametrize(('name', 'given'), [c for c in CASES if EFFECTS[str(c.values[0])].correct is not None])
 def test_the_correction_takes_off_all_of_it(name: str, given: dict[str, float]) -> None:
     """At sizes far beyond what a rig has, and of the other PSD nothing."""
     before = samples_of()
@@ -225,6 +225,19 @@ def test_a_reading_that_no_dot_could_have_is_corrected_to_something_finite() -> 
     true = reading.dots[0, 1]
     assert true * (1.0 - 8000.0 * true**2) == pytest.approx(3.9e-3, rel=1e-9)
     assert (reading.dots[1:] == dots[1:]).all()
+
+
+@pytest.mark.parametrize('k', [1e5, -1e4])
+def test_a_bent_reading_is_straightened_to_rounding_at_the_strongest_bend(k: float) -> None:
+    """The ends of what a coefficient may be, out to the edge of a sensor."""
+    true = np.array([5e-3, -4e-3, 1e-3])
+    dots = np.zeros((4, 3))
+    dots[2], dots[3] = 0.8 * true * (1.0 + k * true**2), 0.6 * true * (1.0 + k * true**2)
+    reading = Reading(dots, np.ones((2, 3)), np.zeros(3), np.zeros(3))
+    correct = EFFECTS['sensor_nonlinearity'].correct
+    assert correct is not None
+    correct(reading, {'psd': 2.0, 'k': k})
+    np.testing.assert_allclose(reading.dots[2:], [0.8 * true, 0.6 * true], rtol=0.0, atol=1e-8)
 
 
 def test_more_light_than_there_is_leaves_a_thousandth() -> None:
@@ -390,13 +403,14 @@ def smooth(t: FloatArray) -> FloatArray:
 
 def electronics(name: str, given: Values, phase: float, cuts: list[int]) -> tuple[FloatArray, FloatArray]:
     """Times and volts of an effect on ``smooth``, taken ``phase`` after each sample, in pieces."""
-    p, state, out = physics(), {}, []
+    p, out = physics(), []
+    state: State = {}
     p.phase = phase
     period = p.period
     apply = EFFECTS[name].apply
     assert apply is not None
     for first, end in itertools.pairwise(cuts):
-        at = np.arange(first, end) * period
+        at = np.arange(first, end, dtype=np.float64) * period
 
         def between(later: float, at: FloatArray = at) -> FloatArray:
             assert 0.0 <= later <= period
@@ -406,7 +420,7 @@ def electronics(name: str, given: Values, phase: float, cuts: list[int]) -> tupl
         samples = SimulatedSamples(t, 0.0 * t, np.zeros((3, len(t))), p, volts=smooth(t), between=between)
         apply(samples, values_of(name, given), state)
         out.append(samples.volts)
-    return np.arange(cuts[-1]) * period + phase, np.concatenate(out, axis=1)
+    return np.arange(cuts[-1], dtype=np.float64) * period + phase, np.concatenate(out, axis=1)
 
 
 PIECES = [0, 0, 1, 2, 5, 5, 60]
@@ -434,7 +448,9 @@ def test_an_amplifier_is_settled_before_the_first_sample() -> None:
     """On whatever is there first: a constant stays."""
     p = physics()
     ones = np.arange(1.0, 7.0)[:, None] * np.ones(5)
-    samples = SimulatedSamples(np.arange(5) * 1e-3, np.zeros(5), np.zeros((3, 5)), p, volts=ones.copy())
+    samples = SimulatedSamples(
+        np.arange(5, dtype=np.float64) * 1e-3, np.zeros(5), np.zeros((3, 5)), p, volts=ones.copy()
+    )
     samples.between = lambda later: ones.copy()
     apply = EFFECTS['amplifier_lag'].apply
     assert apply is not None
@@ -458,13 +474,15 @@ def test_whole_periods_of_delay_ask_for_nothing_between_samples() -> None:
     p = physics()
     delays = [float(np.nextafter(n * p.period, side)) for n in (3, 7) for side in (-1.0, 1.0)] + [5 * p.period]
     for delay in delays:
-        asked = []
+        asked: list[float] = []
 
         def between(later: float, asked: list[float] = asked) -> FloatArray:
             asked.append(later)
             return np.zeros((6, 3))
 
-        samples = SimulatedSamples(np.arange(3) * 1e-3, np.zeros(3), np.zeros((3, 3)), p, volts=np.zeros((6, 3)))
+        samples = SimulatedSamples(
+            np.arange(3, dtype=np.float64) * 1e-3, np.zeros(3), np.zeros((3, 3)), p, volts=np.zeros((6, 3))
+        )
         samples.between = between
         apply = EFFECTS['channel_skew'].apply
         assert apply is not None
@@ -479,7 +497,8 @@ def held(rng: np.random.Generator, count: int) -> FloatArray:
 
 def linked(name: str, given: Values, static: FloatArray, point: str, phase: float = 0.0) -> FloatArray:
     """What an effect makes of static poses, in pieces; of ``pose``, 0 before."""
-    p, state, out = physics(), {}, []
+    p, out = physics(), []
+    state: State = {}
     p.phase = phase
     apply = EFFECTS[name].apply
     assert apply is not None
@@ -487,7 +506,9 @@ def linked(name: str, given: Values, static: FloatArray, point: str, phase: floa
     for first, end in itertools.pairwise(cuts):
         part = static[:, first:end].copy()
         n = end - first
-        samples = SimulatedSamples(np.arange(n) * p.period, np.zeros(n), np.zeros((3, n)), p, static=part)
+        samples = SimulatedSamples(
+            np.arange(n, dtype=np.float64) * p.period, np.zeros(n), np.zeros((3, n)), p, static=part
+        )
         samples.pose = np.zeros((3, n))
         apply(samples, values_of(name, given), state)
         if point == 'pose':
@@ -537,8 +558,12 @@ def test_a_second_mode_rings_as_its_equation_says(shares: int, phase: float) -> 
         w, at, state, out = 2.0 * np.pi * hertz, 0.0, np.zeros(2), []
         for load in q:
             end = at + p.period
+
+            def change(t: float, s: FloatArray, load: float = load) -> tuple[float, float]:
+                return float(s[1]), w * w * (load - float(s[0])) - 2.0 * zeta * w * float(s[1])
+
             found = solve_ivp(
-                lambda t, s, load=load: (s[1], w * w * (load - s[0]) - 2.0 * zeta * w * s[1]),
+                change,
                 (at, end),
                 state,
                 t_eval=[at + phase, end],
@@ -611,7 +636,7 @@ def test_half_a_loop_further_on_the_way_it_came(axis: int, rows: tuple[bool, ...
             got = freed(width, axis, poses) - poses
             others = [i for i in range(3) if i != row]
             assert not got[:, others].any()
-            return (way * got[:, row] / half).tolist() if half else got[:, row].tolist()
+            return [float(v) for v in (way * got[:, row] / half if half else got[:, row])]
 
         one = 1.0 if sticks else 0.0
         # Below half of half a loop from rest it has not moved, above it has.
