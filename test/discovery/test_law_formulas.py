@@ -417,3 +417,139 @@ def test_a_law_shows_where_a_twentieth_of_its_energy_is(seen: tuple[Workspace, F
         effects = tuple(ActiveEffect(effect_of(law), values_of(law)) for law in (big, small))
         fit = refit(workspace, effects, 0)
         assert laws._channels(workspace, laws._Trial((big, small), fit, 0.0)) == shown
+
+
+# The search for a law, with costs that are given.
+
+
+class Given(laws._Seeker):
+    """A search whose trials cost what ``costs`` says of (terms' variables, effects beside them); 1000 else."""
+
+    def __init__(self, costs: dict[tuple[str, str], float], chi2: float = 1e9) -> None:
+        self.costs, self.chi2, self.asked = costs, chi2, list[tuple[str, str, int]]()
+        self.ws = cast(Workspace, SimpleNamespace(size=200, simulations=0, physics=Workspace([observed()]).physics))
+        self.start = cast(Fit, SimpleNamespace(effects=()))
+        self.penalty, self.last, self.found, self.listed = 3.0, 600, [], []
+
+    def trial(self, found: Any, beside: Any, iterations: int) -> laws._Trial:
+        key = ' '.join(v for law in found for t in law.terms for v in t.of), ' '.join(a.effect.name for a in beside)
+        self.asked.append((*key, iterations))
+        effects = (*beside, *(ActiveEffect(effect_of(law), values_of(law)) for law in found))
+        fit = cast(Fit, SimpleNamespace(chi2=self.chi2, effects=effects, parameters=1))
+        return laws._Trial(tuple(found), fit, self.costs.get(key, 1000.0))
+
+
+def law_of(*variables: str, on: str = 'y2') -> Law:
+    return Law(f'law_{on}', TARGETS[on].stage, on, tuple(Term('product', (v,)) for v in variables))
+
+
+BESIDE = (make_active('creep', {'amplitude': 0.1}, 't'), make_active('sensor_gain', {'psd': 1, 'x': 0.1}, 't'))
+
+
+@pytest.mark.parametrize(('more', 'left'), [(9.9, ('sensor_gain',)), (10.1, ('creep', 'sensor_gain'))])
+def test_an_effect_that_stood_in_for_the_law_goes(more: float, left: tuple[str, ...]) -> None:
+    """If that costs no more than an effect must gain."""
+    seeker = Given({('dx', 'creep sensor_gain'): 50.0, ('dx', 'sensor_gain'): 50.0 + more, ('dx', 'creep'): 90.0})
+    got = seeker.lean(seeker.trial([law_of('dx')], BESIDE, 1))
+    assert tuple(a.effect.name for a in got.beside) == left
+
+
+@pytest.mark.parametrize(('without', 'terms_left'), [(109.9, 'dx'), (110.1, 'dx dy')])
+def test_a_term_that_the_law_does_not_miss_goes(without: float, terms_left: str) -> None:
+    seeker = Given({('dx dy', ''): 100.0, ('dx', ''): without, ('dy', ''): 300.0}, chi2=0.0)
+    got = seeker.grown(seeker.trial([law_of('dx', 'dy')], (), 1))
+    assert ' '.join(got.variables) == terms_left
+    assert got.terms == len(terms_left.split())
+
+
+@pytest.mark.parametrize(('second', 'grown'), [(89.9, 'dx dy'), (90.1, 'dx')])
+def test_a_further_term_must_gain_as_an_effect_must(monkeypatch: pytest.MonkeyPatch, second: float, grown: str) -> None:
+    offered = [
+        law_features.Scored('y2', Term('product', (v,)), g) for v, g in (('theta', 9.0), ('dy', 8.0), ('x1', 7.0))
+    ]
+    monkeypatch.setattr(laws, 'responses', lambda *_: [])
+    monkeypatch.setattr(laws, 'score', lambda *_: offered)
+    seeker = Given({('dx', ''): 100.0, ('dx dy', ''): second})
+    got = seeker.grown(seeker.trial([law_of('dx')], (), 1))
+    assert ' '.join(got.variables) == grown
+    # The two that explain most are refitted, no third.
+    assert ('dx theta', '', 4) in seeker.asked
+    assert ('dx x1', '', 4) not in seeker.asked
+    # No more than four terms, however good.
+    ever = Given({})
+    ever.costs = cast(Any, SimpleNamespace(get=lambda key, _: 1000.0 - 50.0 * len(key[0].split())))
+    assert ever.grown(ever.trial([law_of('dx')], (), 1)).terms == 4
+
+
+def test_a_search_is_done_when_noise_is_left_or_enough_was_tried() -> None:
+    """Of 200 values four deviations of their chi-square, 4 sqrt(400) = 80."""
+    seeker = Given({})
+    for chi2, simulations, done in ((279.0, 0, True), (281.0, 0, False), (281.0, 600, False), (281.0, 601, True)):
+        seeker.chi2, seeker.ws.simulations = chi2, simulations
+        assert seeker.done(seeker.trial([law_of('dx')], (), 1)) == done
+
+
+def test_whatever_was_looked_for_counts_as_a_parameter() -> None:
+    seeker = Given({})
+    fit = cast(Fit, SimpleNamespace(chi2=50.0, parameters=2))
+    assert seeker.cost([law_of('dx')], fit) == 56.0
+    switched = Law('s', 'psd', 'y2', (Term('switched', (), times=(1.0, 2.0, 3.0)),))
+    assert seeker.cost([switched, law_of('dx')], fit) == 65.0
+
+
+def test_the_best_of_each_kind_is_refitted_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Down to three tenths of the best gain, a dozen at most; the cheapest three once more in full."""
+    names = list(VARIABLES)
+    scored = [law_features.Scored('y2', Term('product', (v,)), 100.0 - i) for i, v in enumerate(names)]
+    scored.insert(1, dataclasses.replace(scored[0], gain=99.5))
+    monkeypatch.setattr(laws, 'score', lambda *_: scored)
+    seeker = Given({(v, ''): 100.0 - i for i, v in enumerate(names)})
+    got = seeker.first()
+    quick = [a[0] for a in seeker.asked if a[2] == 3]
+    assert quick == names[:12]
+    assert [a[0] for a in seeker.asked if a[2] == 8] == names[::-1][:3]
+    assert [t.cost for t in got] == sorted(t.cost for t in got)
+    assert len(got) == 12
+    weak = [scored[0], law_features.Scored('y2', Term('product', ('dy',)), 29.9)]
+    monkeypatch.setattr(laws, 'score', lambda *_: weak)
+    seeker = Given({})
+    assert len(seeker.first()) == 1
+
+
+def test_a_law_shows_alike_at_other_stages() -> None:
+    """A dot as a beam and as a voltage; a static pose as the load that bends or twists the link so far."""
+    seeker = Given({('load_fx', ''): 5.0})
+    beam, volts = seeker.same_elsewhere(seeker.trial([law_of('load_fx')], (), 1))
+    assert (beam.laws[0].acts_on, beam.laws[0].stage) == ('beam_y2', 'optics')
+    assert (volts.laws[0].acts_on, volts.laws[0].stage, volts.cost) == ('y2', 'electronics', 5.0)
+    link = RIG.link
+    for on, load, per in (
+        ('static_dx', 'load_fx', link.length**3 / (3.0 * link.bending_stiffness)),
+        ('static_dy', 'load_fy', link.length**3 / (3.0 * link.bending_stiffness)),
+        ('static_theta', 'load_tz', link.length / link.torsional_stiffness),
+    ):
+        law = dataclasses.replace(law_of('load_fx', on=on), terms=(Term('product', ('load_fx',), 3e-6),))
+        (moved,) = seeker.same_elsewhere(seeker.trial([law, law_of('dx')], (), 1))
+        assert (moved.laws[0].acts_on, moved.laws[0].stage) == (load, 'load')
+        assert moved.laws[0].terms[0].coefficient == pytest.approx(3e-6 / per)
+        assert moved.laws[1] == law_of('dx')
+    assert seeker.same_elsewhere(seeker.trial([law_of('load_fx', on='dx')], (), 1)) == []
+
+
+def test_a_shape_at_its_bound_is_not_the_right_form(seen: tuple[Workspace, Fit]) -> None:
+    workspace, fit = seen
+    before = workspace.simulations
+    seeker = laws._Seeker(workspace, fit, 3.0)
+    assert seeker.tried == len(seeker.listed) * len(law_features.SOUGHT)
+    assert seeker.last == before + 600
+    got = seeker.trial([law_of('load_fy')], fit.effects, 2)
+    assert got.cost == pytest.approx(got.fit.chi2 + 3.0 * got.fit.parameters)
+    assert got.laws[0].terms[0].coefficient == got.fit.effects[-1].values['c1']
+    assert got.beside == got.fit.effects[:1]
+    bound = Law('b', 'psd', 'y2', (Term('wave', ('x1',), shapes={'period': 1e-3, 'phase': 0.0}),))
+    whole = refit(workspace, [*fit.effects, ActiveEffect(effect_of(bound), values_of(bound))], 0)
+    with pytest.MonkeyPatch.context() as patch:
+        for at, refused in (((0, 'angle'), False), ((1, 'period1'), True)):
+            stopped = dataclasses.replace(whole, at_bound=(at,))
+            patch.setattr(laws, 'refit', lambda *_, stopped=stopped: stopped)
+            assert math.isinf(seeker.trial([bound], fit.effects, 1).cost) == refused

@@ -1,0 +1,432 @@
+"""The steps of a search and of its localisation, on the plant of ``test_rules``, whose answers are least squares."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from scipy.stats import chi2 as chi2_law
+from scipy.stats import norm
+
+from psd_deflection.calibration import Wiring
+from psd_deflection.discovery import search as steps
+from psd_deflection.discovery.coincidence import coincidences
+from psd_deflection.discovery.fit import Fit, refit
+from psd_deflection.discovery.localise import Dependence, dependences, localise
+from psd_deflection.discovery.proposals import coarse_step
+from psd_deflection.discovery.screen import Screen
+from psd_deflection.discovery.search import Search
+from psd_deflection.discovery.setup import _changes, _movement, _noise_energy, _sizes, _words
+from psd_deflection.discovery.signatures import Candidate
+from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.simulation.declaration import ActiveEffect, EffectParameter
+from psd_deflection.simulation.physics import Physics
+from psd_deflection.simulation.simulator import ForwardModel
+
+from .test_formulas import RIG, observed
+from .test_rules import CASES, FINE, SIGMA, Pictures, Plant, active, candidate, columns, noise, pictures, without_noise
+
+A, B, C = ('a', 'x'), ('b', 'x'), ('c', 'x')
+
+
+def searching(plant: Plant, shown: Pictures, names: Sequence[str], said: list[str] | None = None) -> Search:
+    """A search among effects of one size each, with the pictures that the plant shows."""
+    found: list[tuple[Candidate, list[list[FloatArray]]]] = [
+        (candidate(n, 'x'), [[1e-3 * shown[n, 'x']]]) for n in names
+    ]
+    return Search(plant, lambda ws, _: Screen(ws, found), (said if said is not None else []).append)
+
+
+def across(picture: FloatArray, *others: FloatArray) -> FloatArray:
+    """What of a picture is not in the others, at the first one's length."""
+    matrix = np.stack([o.ravel() for o in others], axis=1)
+    rest = picture.ravel() - matrix @ np.linalg.lstsq(matrix, picture.ravel(), rcond=None)[0]
+    return np.asarray(rest.reshape(picture.shape) * np.linalg.norm(picture) / np.linalg.norm(rest))
+
+
+def named(fit: Fit) -> list[str]:
+    return sorted(a.effect.name for a in fit.effects)
+
+
+def test_a_stand_in_is_dropped_once_the_causes_are_there() -> None:
+    """The sum of two pictures is explained best by a third that is near to both; in the end the two are left."""
+    shown = pictures(A, B, C)
+    shown[B] = across(shown[B], shown[A])
+    shown[C] = shown[A] + shown[B] + 0.6 * across(shown[C], shown[A], shown[B])
+    plant = Plant(shown, without_noise((shown[A], 3000.0), (shown[B], 3000.0)) + noise())
+    said: list[str] = []
+    result = searching(plant, shown, 'abc', said).run()
+    assert said[0] == 'adding c'
+    assert named(result.fit) == ['a', 'b']
+    assert len(result.p) == len(result.delta_bic) == len(result.delta_chi2) == len(result.alternatives) == 2
+    assert result.null.effects == ()
+    assert all(line.endswith(']') for line in result.trace)
+
+
+def test_two_that_hide_each_other_are_found_as_a_pair() -> None:
+    """Alone neither explains much: their pictures are nearly opposite."""
+    shown = pictures(A, B, C, ('d', 'x'))
+    b = across(shown[B], shown[A])
+    shown[B] = -shown[A] + 0.1 * b
+    # Two others explain a part of the difference, one after the other.
+    d, e = across(shown[C], shown[A], b), across(shown['d', 'x'], shown[A], b, shown[C])
+    shown[C], shown['d', 'x'] = 0.5 * b + d, 0.5 * b + e
+    plant = Plant(shown, without_noise((b, 5000.0)) + noise())
+    said: list[str] = []
+    result = searching(plant, shown, 'abcd', said).run()
+    assert 'a better pair: ' in ''.join(said)
+    assert named(result.fit) == ['a', 'b']
+
+
+@pytest.mark.parametrize(('left', 'taken'), [(0.005, True), (0.02, False)])
+def test_a_mistake_is_taken_first_if_it_explains_nearly_all(left: float, taken: bool) -> None:
+    """All but a hundredth of what is beyond noise. Beside an effect it is not looked for."""
+    shown = {('sensitivity', 'x'): pictures(A)[A], B: pictures(B, seed=4)[B]}
+    shown[B] = across(shown[B], shown['sensitivity', 'x'])
+    whole = 100_000.0
+    plant = Plant(
+        shown, without_noise((shown['sensitivity', 'x'], whole * (1 - left)), (shown[B], whole * left)) + noise()
+    )
+    said: list[str] = []
+    search = searching(plant, shown, ['sensitivity', 'b'], said)
+    null = refit(plant, ())
+    scores = search.screen.score(null.residual)
+    first = search._mistake(null, scores)
+    assert named(first) == (['sensitivity'] if taken else [])
+    assert said == (['the set-up: sensitivity'] if taken else [])
+    if taken:
+        assert named(searching(plant, shown, ['sensitivity', 'b']).run().fit) == ['b', 'sensitivity']
+    # One that is weaker than the best by more than the third of it is not even tried.
+    weak = [
+        dataclasses.replace(s, gain=0.29 * scores[0].gain) if s.candidate.effect.name == 'sensitivity' else s
+        for s in scores
+    ]
+    best = dataclasses.replace(scores[0], candidate=candidate('b', 'x'))
+    assert search._mistake(null, [best, *weak[:1]]) is null
+    assert search._mistake(null, [dataclasses.replace(s, p=0.011) for s in scores]) is null
+    assert search._mistake(null, []) is null
+
+
+def test_another_sample_rate_is_tried_from_afar() -> None:
+    """A linear step does not reach it; the rates of the list are starts of their own."""
+    tried: list[float] = []
+    shown = {('sample_rate', 'error'): pictures(A)[A]}
+
+    class Far(Plant):
+        def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
+            tried.extend(a.values['error'] for a in effects)
+            return super().simulate(effects)
+
+    plant = Far(shown, without_noise((shown['sample_rate', 'error'], 50.0 * 6 * FINE)))
+    found = [(candidate('sample_rate', 'error'), [[1e-3 * shown['sample_rate', 'error']]])]
+    search = Search(plant, lambda ws, _: Screen(ws, found))
+    null = refit(plant, ())
+    first = search._mistake(null, search.screen.score(null.residual))
+    assert named(first) == ['sample_rate']
+    assert {-0.2, -0.1, -0.04, 0.04, 0.1, 0.25} <= set(tried)
+
+
+def test_at_most_four_effects_are_added_and_none_beyond_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = 'abcdef'
+    shown = pictures(*((n, 'x') for n in names))
+    plant = Plant(shown, without_noise(*((shown[n, 'x'], 900.0) for n in names)) + noise())
+    assert len(searching(plant, shown, names).run().fit.effects) == 4
+    # The fit of no effect is one simulation; after the first effect there are more than two.
+    for budget, effects in ((1, 0), (2, 1)):
+        monkeypatch.setattr(steps, 'BUDGET', budget)
+        assert len(searching(plant, shown, names).run().fit.effects) == effects
+
+
+def test_of_two_that_explain_alike_the_better_one_stays_and_the_other_is_its_alternative() -> None:
+    shown = pictures(A, B)
+    shown[B] = shown[A] + 0.3 * across(shown[B], shown[A])
+    plant = Plant(shown, without_noise((shown[A], 900.0)) + noise())
+    search = searching(plant, shown, 'ab')
+    result = search.run()
+    assert named(result.fit) == ['a']
+    ((other,),) = result.alternatives
+    assert named(other) == ['b']
+    data, size = plant.measured[0].ravel() / SIGMA, 6 * FINE
+    want = float(np.linalg.lstsq(columns(shown, B), data, rcond=None)[1][0])
+    assert other.chi2 == pytest.approx(want, rel=1e-6)
+    # From the worse one it swaps to the better.
+    null, worse = refit(plant, ()), refit(plant, [active('b', x=0.0)])
+    better, others = search._swap(null, worse)
+    assert named(better) == ['a']
+    assert [named(f) for f in others[0]] == [['b']]
+    assert search.spent == plant.simulations - search._begun
+    assert search.library_p(9.0, 1) == pytest.approx(1.0 - (1.0 - chi2_law.sf(9.0, 1)) ** 2)
+    assert search.library_p(-1.0, 1) == 1.0
+    assert search.penalty == pytest.approx(math.log(size * 4 / 20))
+
+
+def test_noise_is_estimated_again_and_kept_if_it_is_the_same() -> None:
+    shown = pictures(A)
+    plant = Plant(shown, without_noise((shown[A], 900.0)) + noise())
+    search = searching(plant, shown, 'a')
+    fit, before = refit(plant, [active('a', x=0.0)]), plant.noise
+    for factor, again in ((1.019, False), (0.981, False), (1.03, True), (0.97, True)):
+        louder = [dataclasses.replace(before[0], innovation=factor * before[0].innovation)]
+
+        def estimate(effects: object, louder: object = louder) -> None:
+            plant.noise = louder  # type: ignore[assignment]
+
+        plant.estimate_noise = estimate  # type: ignore[method-assign]
+        plant.noise = before
+        got = search.renoise(fit)
+        assert (got is not fit) == again
+        assert (plant.noise is louder) == again
+        if again:
+            assert got.chi2 == pytest.approx(fit.chi2 / factor**2, rel=1e-6)
+
+
+EDGES = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, math.inf)
+
+
+def energy_of(residual: FloatArray, explained: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+    """z (case, channel, band) as a normal deviate of the chi-square, and the energy beyond noise."""
+    length = FINE // CASES
+    f = np.abs(np.fft.fftfreq(length, 0.004))
+    z, excess = np.zeros((CASES, 6, 6)), np.zeros((CASES, 6, 6))
+    for case in range(CASES):
+        span = slice(case * length, (case + 1) * length)
+        spectrum = np.abs(np.fft.fft(residual.reshape(6, FINE)[:, span], axis=1)) ** 2 / length
+        for b in range(6):
+            at = (f >= EDGES[b]) & (f < EDGES[b + 1])
+            dof, energy = int(at.sum()), spectrum[:, at].sum(axis=1)
+            if explained is not None:
+                wrong = np.abs(np.fft.fft(explained.reshape(6, FINE)[:, span], axis=1)) ** 2 / length
+                energy = energy / (1.0 + 0.002**2 * wrong[:, at].sum(axis=1) / dof)
+            p = chi2_law.sf(energy, dof)
+            z[case, :, b], excess[case, :, b] = norm.isf(np.maximum(p, 1e-300)), energy - dof
+    return z, excess
+
+
+@pytest.mark.parametrize('explains', [False, True])
+def test_cells_are_normal_deviates_of_their_energy(explains: bool) -> None:
+    """By the chi-square law itself; two thousandths of what is explained may be the simulation's own error."""
+    residual = noise(6) / SIGMA
+    t = np.arange(50) * 0.004
+    residual[3, 150:200] += 1.2 * np.sin(2 * np.pi * 20.0 * t)
+    residual[1, 350:400] += 1.2
+    explained = 400.0 * noise(11).ravel() / SIGMA if explains else None
+    plant = Plant({}, noise())
+    found = localise(plant, residual.ravel(), None, np.random.default_rng(1), explained=explained)
+    z, excess = energy_of(residual.ravel(), explained)
+    # The cube root of a chi-square is normal but for its lowest values.
+    inside = (z > -1.0) & (z < 5.0)
+    assert np.abs(found.map - z)[inside].max() < 0.25
+    order = np.argsort(-z, axis=None)
+    first = [np.unravel_index(int(i), z.shape) for i in order[:2]]
+    for cell, (case, c, b) in zip(found.cells[:2], first, strict=True):
+        assert (cell.channel, cell.recording) == (CHANNELS[int(c)], 0)
+        assert cell.when == pytest.approx((0.2 * case, 0.2 * (case + 1)))
+        assert cell.band == (EDGES[int(b)], min(EDGES[int(b) + 1], 125.0))
+        assert cell.energy == pytest.approx(excess[case, c, b], rel=1e-6)
+        assert cell.statistic == found.map[case, c, b]
+        assert cell.p < 0.01
+    assert len(found.cells) == 12
+    assert all(a.statistic >= b.statistic for a, b in zip(found.cells, found.cells[1:], strict=False))
+    assert found.spans == tuple((0, pytest.approx(0.2 * k), pytest.approx(0.2 * (k + 1))) for k in range(8))
+    significant = [c for c in found.cells if c.p < 0.01]
+    assert found.excess == pytest.approx(sum(c.energy for c in significant), rel=1e-6)
+    few = localise(plant, residual.ravel(), None, np.random.default_rng(1), limit=3)
+    assert len(few.cells) == 3
+
+
+def test_the_chance_of_the_greatest_cell_is_that_of_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of noise alone it is anything between 0 and 1; what the model has fitted is taken off the noise too."""
+    monkeypatch.setattr('psd_deflection.discovery.localise.dependences', lambda *_: [])
+    plant = Plant({}, noise())
+    chances = [
+        localise(plant, noise(20 + k).ravel() / SIGMA, None, np.random.default_rng(k)).cells[0].p for k in range(6)
+    ]
+    assert 0.1 < float(np.mean(chances)) < 0.9
+    assert min(chances) > 1e-3
+    # A fitted column that holds most of one cell: noise is expected to be smaller there.
+    known = np.zeros((6 * FINE, 1))
+    known[:50, 0] = 1.0
+    residual = noise(3).ravel() / SIGMA
+    taken = residual - known[:, 0] * (known[:, 0] @ residual) / 50.0
+    assert localise(plant, taken, known, np.random.default_rng(0)).p > 0.01
+
+
+def test_what_a_channel_follows_is_named_where_it_is_slow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two words at most for a channel, those of its strongest dependences; none from 25 Hz on."""
+    depends = [
+        Dependence('x2', 'load_fx^2', 90.0, 1e-9),
+        Dependence('x2', 'history of load_fx', 80.0, 1e-9),
+        Dependence('x2', 'dot_x', 70.0, 0.009),
+        Dependence('x2', 'time', 60.0, 1e-9),
+        Dependence('y1', 'time^2', 50.0, 0.011),
+    ]
+    monkeypatch.setattr('psd_deflection.discovery.localise.dependences', lambda *_: depends)
+    residual = noise(6) / SIGMA
+    t = np.arange(50) * 0.004
+    residual[3, 150:200] += 2.5 * np.sin(2 * np.pi * 20.0 * t) + 2.5 * np.sin(2 * np.pi * 80.0 * t)
+    residual[1, 150:200] += 2.5 * np.sin(2 * np.pi * 20.0 * t)
+    found = localise(Plant({}, noise()), residual.ravel(), None, np.random.default_rng(1))
+    words = {(c.channel, c.band[0]): c.depends_on for c in found.cells if c.p < 0.01}
+    assert words[('x2', 17.0)] == ('load_fx', 'dot_position')
+    assert words[('x2', 60.0)] == ()
+    assert words[('y1', 17.0)] == ()
+    # Three tones of some hundred each; the strongest dependence counts if it is more.
+    assert found.excess > 400.0
+    depends[0] = Dependence('x2', 'load_fx^2', 5000.0, 1e-9)
+    assert localise(Plant({}, noise()), residual.ravel(), None, np.random.default_rng(1)).excess == 5000.0
+    quiet = localise(Plant({}, noise()), noise(7).ravel() / SIGMA, None, np.random.default_rng(1))
+    assert quiet.p == pytest.approx(2e-9)
+
+
+def test_what_the_simulation_may_be_wrong_by_is_no_dependence() -> None:
+    """A five-hundredth of the length of what is explained on that channel is taken off each product."""
+    workspace = Workspace([observed()])
+    rng = np.random.default_rng(2)
+    residual, explained = rng.standard_normal(len(workspace.data)), rng.standard_normal(len(workspace.data))
+    plain = {(d.channel, d.regressor): d.gain for d in dependences(workspace, residual, None)}
+    assert len(plain) == 6 * 27
+    for size in (100.0, 1000.0):
+        beyond = {(d.channel, d.regressor): d.gain for d in dependences(workspace, residual, None, size * explained)}
+        for (channel, name), gain in plain.items():
+            own = workspace.split(size * explained)[0][CHANNELS.index(channel)]
+            root = max(math.sqrt(gain) - 0.002 * float(np.linalg.norm(own)), 0.0)
+            assert beyond[channel, name] == pytest.approx(root**2, rel=1e-6, abs=1e-9)
+
+
+def amplitudes(*kinds: tuple[str, str, float], same: bool = False, finite: bool = False) -> Fit:
+    """A fit of sizes with these units and values, each known to a thousandth of 1; of one effect or of each its own."""
+    effects: list[ActiveEffect] = []
+    for i, (name, unit, value) in enumerate(kinds):
+        parameter = EffectParameter(name, unit, -9.0, 9.0, 1e-3, '')
+        whole = dataclasses.replace(
+            active('e', **{name: 0.0}).effect, name=f'e{i}', parameters=(parameter,), finite=finite
+        )
+        effects.append(ActiveEffect(whole, {name: value}))
+    free = [(i, name) for i, (name, _, _) in enumerate(kinds)]
+    if same:
+        parameters = tuple(p for a in effects for p in a.effect.parameters)
+        values = {n: v for a in effects for n, v in a.values.items()}
+        effects = [ActiveEffect(dataclasses.replace(effects[0].effect, parameters=parameters), values)]
+        free = [(0, name) for name, _, _ in kinds]
+    return Fit(tuple(effects), 0.0, np.zeros(9), [], 1e3 * np.eye(9)[:, : len(kinds)], tuple(free), ())
+
+
+def test_only_sizes_of_one_kind_and_of_different_effects_are_compared() -> None:
+    physics = Physics.of(RIG)
+    two = [('x', 'V', 0.5), ('y', 'V', 0.5)]
+    ((tie),) = coincidences(amplitudes(*two), physics)
+    assert (tie.first, tie.second, tie.sizes, tie.unit) == ((0, 'x'), (1, 'y'), (0.5, 0.5), 'V')
+    assert coincidences(amplitudes(*two, same=True), physics) == []
+    assert coincidences(amplitudes(('x', 'V', 0.5), ('y', 'm', 0.5)), physics) == []
+    # An angle is a number.
+    assert coincidences(amplitudes(('x', 'rad', 0.5), ('y', '', 0.5)), physics)[0].unit == ''
+    # Five deviations from nothing, or it has no size; and what a step does at once has none.
+    for size, pairs in ((0.0049, 1), (0.0051, 3)):
+        (first,) = coincidences(amplitudes(*two, ('z', 'V', size)), physics)
+        assert first.odds == pytest.approx(tie.odds / pairs)
+    assert coincidences(amplitudes(*two, finite=True), physics) == []
+    # The more pairs there are, the likelier one of them agrees.
+    three = coincidences(amplitudes(*two, ('z', 'V', 0.1)), physics)
+    assert [t.odds for t in three] == pytest.approx([tie.odds / 3.0])
+    several = coincidences(amplitudes(*two, ('z', 'V', 0.501)), physics)
+    assert [t.odds for t in several] == sorted((t.odds for t in several), reverse=True)
+    assert len(several) == 3
+
+
+def test_turned_loads_are_changes_as_wirings_are() -> None:
+    file = Wiring.from_rig(RIG)
+    assert _changes(file, file, np.array([0.5, -1.0, math.nan])) == 1
+    assert _changes(file, file, np.array([-0.5, -1.0, -2.0])) == 3
+    other = dataclasses.replace(file, axes=(('-x', 'y'), *file.axes[1:]))
+    assert _changes(other, file, np.array([1.0, 1.0, -1.0])) == 2
+    assert _words(file, file, np.array([1.0, 0.5, math.nan])) == 'as the rig file says'
+    assert _words(other, file, np.array([-1.0, 0.5, -1.0])) == (
+        'channel_sign of x1 and load_sign of fx and load_sign of tz'
+    )
+
+
+@pytest.mark.parametrize(('least', 'most', 'sign'), [(0.0, 1.0, 1.0), (-1.0, 0.0, -1.0)])
+def test_a_size_leaves_its_bound_for_however_little_it_gains(least: float, most: float, sign: float) -> None:
+    """Half a standard deviation inside; outside it stays."""
+    shown = pictures(A)
+    for inside in (1.0, -1.0):
+        plant = Plant(shown, sign * inside * without_noise((shown[A], 0.25)))
+        fit = refit(plant, [active('a', least, most, x=0.0)])
+        want = sign * 0.5 * SIGMA / np.linalg.norm(shown[A]) if inside > 0.0 else 0.0
+        assert fit.effects[0].values['x'] == pytest.approx(want, rel=1e-3, abs=1e-12)
+        assert fit.at_bound == (() if inside > 0.0 else ((0, 'x'),))
+
+
+@pytest.mark.parametrize(
+    ('gain', 'short', 'again'), [(200.0, 59.0, True), (200.0, 61.0, False), (400.0, 79.0, True), (400.0, 81.0, False)]
+)
+def test_an_alternative_that_comes_close_is_refitted_in_full(
+    monkeypatch: pytest.MonkeyPatch, gain: float, short: float, again: bool
+) -> None:
+    """Short of the named effect by less than 60 in chi-square, or by a fifth of what that explains."""
+    shown = pictures(A, B)
+    share = 1.0 - short / gain
+    shown[B] *= np.linalg.norm(shown[A]) / np.linalg.norm(shown[B])
+    shown[B] = math.sqrt(share) * shown[A] + math.sqrt(1.0 - share) * across(shown[B], shown[A])
+    plant = Plant(shown, without_noise((shown[A], gain)))
+    search = searching(plant, shown, 'ab')
+    null, fit = refit(plant, ()), refit(plant, [active('a', x=0.0)])
+    asked: list[int] = []
+
+    def counted(ws: Workspace, effects: Sequence[ActiveEffect], iterations: int = 8) -> Fit:
+        asked.append(iterations)
+        return refit(ws, effects, iterations)
+
+    monkeypatch.setattr(steps, 'refit', counted)
+    (other,) = search.alternatives(null, fit, 0, gain)
+    assert other.chi2 == pytest.approx(short, rel=1e-3)
+    assert asked == ([3, 8] if again else [3])
+    # After twice the budget there are none; beyond the budget two are tried.
+    search._begun = plant.simulations - 1001
+    assert search.alternatives(null, fit, 0, gain) == []
+
+
+def test_a_recording_with_too_little_of_it_is_left_out_and_the_next_is_not() -> None:
+    whole = observed(warm=None)
+    volts = whole.volts.copy()
+    volts[60:] = np.nan
+    poor = dataclasses.replace(whole, volts=volts)
+    (one, both) = (_movement(o, ()) for o in ([whole], [poor, whole]))
+    assert both.squared == one.squared > 0.0
+    np.testing.assert_array_equal(both.cross, one.cross)
+    np.testing.assert_array_equal(both.own, one.own)
+    volts[60:80] = whole.volts[60:80]
+    assert _movement([dataclasses.replace(whole, volts=volts), whole], ()).squared > one.squared
+    # Sums over the blocks of what the dots moved about their mean, m^2.
+    dots = whole.volts[:, [0, 1, 3, 4]] * RIG.amplifier.sensitivity
+    blocks = dots.reshape(60, 20, 4).mean(axis=1)
+    assert one.squared == pytest.approx(float(((blocks - blocks.mean(axis=0)) ** 2).sum()))
+    noise_of_dots = float(np.mean(RIG.noises[:, :2] ** 2)) * RIG.amplifier.sensitivity**2
+    assert one.noise == pytest.approx(noise_of_dots / 20.0)
+    # A load moves as much as it does alone, in proportion.
+    for k in range(3):
+        only = np.zeros_like(whole.loads)
+        only[:, k] = whole.loads[:, k]
+        moved = ForwardModel(RIG, []).run(only).dots.T.reshape(60, 20, 4).mean(axis=1)
+        moved -= moved.mean(axis=0)
+        assert one.own[k, k] == pytest.approx(float((moved**2).sum()), rel=1e-2)
+        np.testing.assert_allclose(
+            np.diag(one.cross[k]).sum(), float((moved * (blocks - blocks.mean(axis=0))).sum()), rtol=2e-2
+        )
+    left, sizes = _sizes(one, Wiring.from_rig(RIG))
+    assert sizes == pytest.approx([1.0, 1.0, 1.0], abs=0.02)
+    assert left < 1e-3 * one.squared
+    assert _noise_energy([whole, whole]) == pytest.approx(2 * noise_of_dots * 4 * 1200 / 400)
+
+
+@pytest.mark.parametrize(('values', 'seen'), [(4, True), (3, False)])
+def test_of_so_coarse_steps_four_values_are_enough(values: int, seen: bool) -> None:
+    """Each lies on them by a chance of a thousandth; three are too few however coarse they are."""
+    lsb = RIG.converter.volts_per_count
+    k = np.resize(np.arange(values) - 1.0, (2000, 6))
+    o = dataclasses.replace(observed(warm=None), volts=k * 2000.0 * lsb, loads=np.zeros((2000, 3)))
+    assert (coarse_step(o) is not None) == seen
