@@ -430,3 +430,20 @@ def test_of_so_coarse_steps_four_values_are_enough(values: int, seen: bool) -> N
     k = np.resize(np.arange(values) - 1.0, (2000, 6))
     o = dataclasses.replace(observed(warm=None), volts=k * 2000.0 * lsb, loads=np.zeros((2000, 3)))
     assert (coarse_step(o) is not None) == seen
+
+
+def test_a_step_that_makes_it_worse_is_shortened_five_times() -> None:
+    """A plant that answers to the small step of the derivative alone: one start, one derivative, five trials."""
+    shown = pictures(A)
+
+    class Kink(Plant):
+        def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
+            self.simulations += 1
+            (value,) = (a.values['x'] for a in effects)
+            return [shown[A] * (0.0 if value == 0.0 else value if abs(value - 5e-5) < 1e-12 else -1.0)]
+
+    plant = Kink(shown, without_noise((shown[A], 900.0)))
+    fit = refit(plant, [active('a', x=0.0)])
+    assert fit.effects[0].values['x'] == 0.0
+    assert fit.chi2 == pytest.approx(900.0)
+    assert plant.simulations == 7
