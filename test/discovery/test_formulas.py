@@ -479,6 +479,10 @@ def test_what_is_known_of_a_recording_is_told() -> None:
     gone = np.isnan(cleaned.volts).all(axis=1)
     assert np.flatnonzero(gone).tolist() == [*range(100), *range(1150, 1200)]
     assert cleaned.digest == told.hashed()
+    for unknown, gone_samples in (((100, 0), range(100)), ((0, 100), range(1100, 1200))):
+        half, (one,) = clean(dataclasses.replace(o, unknown_load=unknown), ())
+        assert one.value == pytest.approx(100 / 1200)
+        assert np.flatnonzero(np.isnan(half.volts).all(axis=1)).tolist() == list(gone_samples)
     # Up to a twentieth is left out and not told; and what is whole stays as it is.
     quiet, findings = clean(dataclasses.replace(o, unknown_load=(30, 30)), ())
     assert findings == []

@@ -231,7 +231,7 @@ def test_cells_are_normal_deviates_of_their_energy(explains: bool) -> None:
         assert cell.p < 0.01
     assert len(found.cells) == 12
     assert all(a.statistic >= b.statistic for a, b in zip(found.cells, found.cells[1:], strict=False))
-    assert found.spans == tuple((0, pytest.approx(0.2 * k), pytest.approx(0.2 * (k + 1))) for k in range(8))
+    np.testing.assert_allclose(found.spans, [(0, 0.2 * k, 0.2 * (k + 1)) for k in range(8)])
     significant = [c for c in found.cells if c.p < 0.01]
     assert found.excess == pytest.approx(sum(c.energy for c in significant), rel=1e-6)
     few = localise(plant, residual.ravel(), None, np.random.default_rng(1), limit=3)
