@@ -243,6 +243,9 @@ def test_delays_and_jumps_are_looked_for_where_they_show() -> None:
     for shift in (40, -40):
         late = Workspace([dataclasses.replace(o, loads=np.roll(o.loads, shift, axis=0))])
         assert likely_delays(late) == pytest.approx(sorted(s / 1000.0 + shift / 1000.0 for s in (-4, 0, 4)))
+    # Late by one fine block: no delay at all is looked for anyway.
+    late = Workspace([dataclasses.replace(o, loads=np.roll(o.loads, 4, axis=0))])
+    assert likely_delays(late) == pytest.approx([0.004, 0.008])
     # The link follows its loads as simulated: nothing is late.
     assert likely_delays(Workspace([o])) == []
     short = Workspace([observed()])

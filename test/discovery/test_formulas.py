@@ -439,6 +439,11 @@ def test_a_single_wild_sample_of_any_place_is_an_outlier_and_no_other() -> None:
     assert {(int(i), int(c)) for i, c in np.argwhere(found)} == places
     residual[::10, 0] = np.nan
     assert not outliers(residual, 1e-4)[::10, 0].any()
+    # What is 7 deviations off is none, though five places from one, whose neighbours' cubics it does not spoil.
+    calm = 1e-3 * rng.standard_normal((400, 6))
+    calm[90:111] = 0.0
+    calm[100], calm[[95, 105]] = 0.5, 7e-3
+    assert np.flatnonzero(outliers(calm, 1e-4).any(axis=1)).tolist() == [100]
     # Below the least standard deviation that is assumed nothing stands out.
     assert not outliers(residual, 0.05).any()
 

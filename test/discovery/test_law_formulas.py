@@ -553,3 +553,47 @@ def test_a_shape_at_its_bound_is_not_the_right_form(seen: tuple[Workspace, Fit])
             stopped = dataclasses.replace(whole, at_bound=(at,))
             patch.setattr(laws, 'refit', lambda *_, stopped=stopped: stopped)
             assert math.isinf(seeker.trial([bound], fit.effects, 1).cost) == refused
+
+
+class StopError(Exception):
+    """Ends a search in the middle."""
+
+
+@pytest.mark.parametrize(
+    ('done', 'grown'), [('second', ['first']), ('first', []), ('none', ['first', 'second', 'third'])]
+)
+def test_where_one_law_leaves_only_noise_no_other_gets_further_terms(
+    monkeypatch: pytest.MonkeyPatch, seen: tuple[Workspace, Fit], done: str, grown: list[str]
+) -> None:
+    """The three cheapest are followed, up to the first that is done; the cheapest of them goes on."""
+    names = ('first', 'second', 'third', 'fourth')
+    trials = [dataclasses.replace(trial(law_of('dx'), cost, 5.0), cost=cost) for cost in (1.0, 2.0, 3.0, 4.0)]
+    asked: list[str] = []
+
+    def name_of(t: laws._Trial) -> str:
+        return names[next(i for i, other in enumerate(trials) if other is t)]
+
+    class Follower:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def first(self) -> list[laws._Trial]:
+            return [trials[3], trials[1], trials[0], trials[2], dataclasses.replace(trials[0], cost=math.inf)]
+
+        def done(self, t: laws._Trial) -> bool:
+            return name_of(t) == done
+
+        def grown(self, t: laws._Trial) -> laws._Trial:
+            asked.append(name_of(t))
+            return t
+
+        def lean(self, t: laws._Trial) -> laws._Trial:
+            assert name_of(t) == 'first'
+            raise StopError
+
+    monkeypatch.setattr(laws, '_Seeker', Follower)
+    workspace, _ = seen
+    null = refit(workspace, ())
+    with pytest.raises(StopError):
+        laws._law_of_the_mean(workspace, null, null, 3.0, 0.0, np.random.default_rng(0))
+    assert asked == grown
