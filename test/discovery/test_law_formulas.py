@@ -91,10 +91,12 @@ def test_the_terms_that_are_tried_are_those_of_a_grid(seen: tuple[Workspace, Fit
 
 def test_two_dozen_values_are_few_and_one_more_is_many(seen: tuple[Workspace, Fit]) -> None:
     (r,) = responses(*seen)
-    for count, thresholds in ((24, 23), (25, 24)):
-        known = {n: np.zeros(1200) for n in VARIABLES} | {'load_fy': np.resize(np.arange(count) * 1.0, 1200)}
+    for count in (24, 25):
+        values = np.arange(count) ** 2.0
+        known = {n: np.zeros(1200) for n in VARIABLES} | {'load_fy': np.resize(values, 1200)}
         got = term_names(list(terms([dataclasses.replace(r, known=known)])))
-        assert len(got['over', ('load_fy',)]) == thresholds
+        between = 0.5 * (values[1:] + values[:-1]) if count == 24 else values[-1] * (np.arange(24) + 0.5) / 24
+        assert [s['threshold'] for s in got['over', ('load_fy',)]] == pytest.approx(between.tolist())
 
 
 @pytest.mark.parametrize(
