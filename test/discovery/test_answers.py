@@ -628,6 +628,25 @@ def test_a_gap_that_remains_is_never_left_unsaid() -> None:
     assert answer._beyond(3.0, 5.0) == 0.0
 
 
+def test_a_waterfall_falls_effect_by_effect() -> None:
+    names = ('creep', 'damping', 'tip_mass')
+    effects = tuple(ActiveEffect(EVERY[name], {}) for name in names)
+    base = ActiveEffect(EVERY['plane_tilt'], {})
+    fake = SimpleNamespace(
+        base=(base,),
+        residual=lambda e: (None, [a.effect.name for a in e]),
+        gap=lambda d: 10.0 - len(d),
+        floor=lambda: 0.5,
+    )
+    for count in range(4):
+        fit = cast(Fit, SimpleNamespace(effects=effects[:count]))
+        steps = [('as described', 20.0), ('+ creep', 8.0), ('+ damping', 7.0), ('+ tip_mass', 1.0)][: count + 1]
+        if count:
+            steps[-1] = (steps[-1][0], 1.0)
+        got = answer._waterfall(cast(Workspace, fake), fit, 20.0, 1.0)
+        assert got == (*steps, ('noise alone', 0.5))
+
+
 def test_the_end_of_late_loads_and_what_is_between_steps_goes() -> None:
     o = observed()
     cut = answer._without_end(o, 0.0105)
