@@ -557,6 +557,19 @@ def test_a_shape_at_its_bound_is_not_the_right_form(seen: tuple[Workspace, Fit])
             assert math.isinf(seeker.trial([bound], fit.effects, 1).cost) == refused
 
 
+@pytest.mark.parametrize('recordings', [1, 2])
+def test_events_are_looked_for_in_one_recording_only(monkeypatch: pytest.MonkeyPatch, recordings: int) -> None:
+    """In another one they have other times."""
+    term, event = Term('product', ('dx',)), Term('switched', (), times=(1.0,))
+    monkeypatch.setattr(laws, 'responses', lambda *_: [])
+    monkeypatch.setattr(laws, 'terms', lambda _: iter([term]))
+    monkeypatch.setattr(laws, 'switchings', lambda _: [event])
+    ws = cast(Workspace, SimpleNamespace(observations=[None] * recordings, simulations=7))
+    seeker = laws._Seeker(ws, cast(Fit, None), 3.0)
+    assert seeker.listed == [term, event][: 3 - recordings]
+    assert (seeker.last, seeker.tried) == (607, len(seeker.listed) * 12)
+
+
 class StopError(Exception):
     """Ends a search in the middle."""
 
