@@ -158,6 +158,7 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
     """
     block = observation.rig.estimator.block_size
     windows = rest_windows(observation)
+    long = [w for w in windows if w.stop - w.start > 100]
     n = len(residual)
     sigma, innovation, block_sigma = np.empty(6), np.empty(6), np.empty(6)
     ar = np.zeros((6, ORDER))
@@ -172,8 +173,8 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
         floor = float(floors[c])
         white = max(np.sqrt(level), floor)
         # A residual is 0 where a sample is missing, so that each product counts two that were measured.
-        rest = [strip_lines(detrend(filled[w])) * there[w] for w in windows if w.stop - w.start > 100]
-        seen = [there[w].astype(np.float64) for w in windows if w.stop - w.start > 100]
+        rest = [strip_lines(detrend(filled[w])) * there[w] for w in long]
+        seen = [there[w].astype(np.float64) for w in long]
         count = int(sum(s.sum() for s in seen))
         lags = 4 * max(block, fine) * 3
         acov = np.zeros(lags)

@@ -421,6 +421,8 @@ def test_of_many_lines_the_strongest_four_are_stripped() -> None:
     left = strip_lines(noise + sum(lines[:4]) + 3.0)
     assert left.std() == pytest.approx(1.0, abs=0.05)
     assert left.mean() == pytest.approx(0.0, abs=1e-9)
+    # A channel that reads 0 has none.
+    assert not strip_lines(np.zeros(1000)).any()
     # The fifth, 5 sin, stays: variance 12.5 more.
     assert strip_lines(noise + sum(lines)).var() == pytest.approx(1.0 + 12.5, rel=0.1)
     assert strip_lines(noise + sum(lines), 5).std() == pytest.approx(1.0, abs=0.05)
