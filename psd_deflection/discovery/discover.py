@@ -286,7 +286,7 @@ def _credible(
     while True:
         explained = result.null.residual - fit.residual if fit.free else None
         left = localise(ws, fit.residual, fit.jacobian if fit.free else None, rng, explained=explained)
-        if not fit.effects or not _unknown(left, max(result.null.chi2 - fit.chi2, 0.0) + seen, steps=seen):
+        if not fit.effects or not _unknown(left, 0.0, steps=seen):
             break
         weakest = int(np.argmin(result.delta_chi2))
         if result.delta_chi2[weakest] >= left.excess:
