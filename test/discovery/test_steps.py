@@ -14,6 +14,7 @@ from scipy.stats import norm
 from psd_deflection.calibration import Wiring
 from psd_deflection.discovery import search as steps
 from psd_deflection.discovery.coincidence import coincidences
+from psd_deflection.discovery.discover import _named
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.localise import Dependence, dependences, localise
 from psd_deflection.discovery.proposals import coarse_step
@@ -21,6 +22,7 @@ from psd_deflection.discovery.screen import Screen
 from psd_deflection.discovery.search import Search
 from psd_deflection.discovery.setup import _changes, _movement, _noise_energy, _sizes, _words
 from psd_deflection.discovery.signatures import Candidate
+from psd_deflection.discovery.validate import HeldOut
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.simulation.declaration import ActiveEffect, EffectParameter
@@ -447,3 +449,27 @@ def test_a_step_that_makes_it_worse_is_shortened_five_times() -> None:
     assert fit.effects[0].values['x'] == 0.0
     assert fit.chi2 == pytest.approx(900.0)
     assert plant.simulations == 7
+
+
+@pytest.mark.parametrize(('loss', 'is_rival'), [(6.9, True), (7.1, False)])
+def test_what_comes_close_in_bic_is_a_rival(loss: float, is_rival: bool) -> None:
+    """By up to 10, with 3 for its further parameter; an equivalent one would have to be as close as 6."""
+    shown = pictures(A)
+    search = searching(Plant(shown, without_noise((shown[A], 500.0))), shown, 'a')
+    search.penalty = 3.0
+    fit = refit(search.workspace, [active('a', x=0.0)])
+    jacobian = np.eye(fit.residual.size)[:, :2]
+    other = dataclasses.replace(
+        fit, effects=(active('b', x=0.1, y=0.1),), chi2=fit.chi2 + loss, free=((0, 'x'), (0, 'y')), jacobian=jacobian
+    )
+    null = refit(search.workspace, ())
+    result = steps.SearchResult(null, fit, [0.0], [99.0], [500.0], [], [[other]])
+    (found,) = _named(search, result, fit, [HeldOut(9.0, 1.0)])
+    assert found.equivalent == ()
+    assert [(r.active.effect.name, r.delta_bic, r.fit) for r in found.rivals] == [('b', loss + 3.0, other)] * is_rival
+    if is_rival:
+        assert found.rivals[0].sd == pytest.approx({'x': 1.0, 'y': 1.0})
+    # One that ran into its bound is none.
+    stopped = dataclasses.replace(other, at_bound=((0, 'x'), (0, 'y')))
+    (found,) = _named(search, dataclasses.replace(result, alternatives=[[stopped]]), fit, [HeldOut(9.0, 1.0)])
+    assert found.rivals == ()
