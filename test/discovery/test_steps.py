@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,15 +14,17 @@ from scipy.stats import chi2 as chi2_law
 from scipy.stats import norm
 
 from psd_deflection.calibration import Wiring
+from psd_deflection.discovery import planning
 from psd_deflection.discovery import search as steps
 from psd_deflection.discovery.coincidence import coincidences
 from psd_deflection.discovery.discover import _named
+from psd_deflection.discovery.experiment import Limits, Piece, Proposal, Setting, Shown
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.localise import Dependence, dependences, localise
 from psd_deflection.discovery.proposals import coarse_step
 from psd_deflection.discovery.screen import Screen
 from psd_deflection.discovery.search import Search
-from psd_deflection.discovery.setup import _changes, _movement, _noise_energy, _sizes, _words
+from psd_deflection.discovery.setup import _changes, _movement, _noise_energy, _sizes, _words, wire
 from psd_deflection.discovery.signatures import Candidate
 from psd_deflection.discovery.validate import HeldOut
 from psd_deflection.discovery.workspace import Workspace
@@ -473,3 +477,45 @@ def test_what_comes_close_in_bic_is_a_rival(loss: float, is_rival: bool) -> None
     stopped = dataclasses.replace(other, at_bound=((0, 'x'), (0, 'y')))
     (found,) = _named(search, dataclasses.replace(result, alternatives=[[stopped]]), fit, [HeldOut(9.0, 1.0)])
     assert found.rivals == ()
+
+
+def test_evidence_is_what_the_file_leaves_over_what_is_left() -> None:
+    o = observed(warm=None)
+    _, (unit,), _ = wire([dataclasses.replace(o, loads=o.loads / [9.80665, 9.80665, 1.0])], ())
+    # The wiring is right: a unit leaves no more of the movement than another size does.
+    assert (unit.name, unit.where) == ('load_unit', 'fx fy')
+    assert unit.evidence == pytest.approx(1.0)
+    turned = dataclasses.replace(o, volts=o.volts * [1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+    _, (sign,), _ = wire([turned], ())
+    m, file = _movement([turned], ()), Wiring.from_rig(RIG)
+    right = dataclasses.replace(file, axes=(('x', '-y'), file.axes[1]))
+    energy = _noise_energy([turned])
+    told, sizes = _sizes(m, file)
+    # With the file's wiring a load seems to pull the wrong way: then it explains nothing.
+    assert (sizes < 0.0).any()
+    assert told < m.squared
+    assert sign.evidence == pytest.approx((m.squared + energy) / (_sizes(m, right)[0] + energy))
+
+
+@pytest.mark.parametrize(('efforts', 'taken'), [((0.0, 0.05), 'first'), ((0.05, 0.0), 'second')])
+def test_of_recordings_of_the_same_value_the_easier_one_is_planned(
+    monkeypatch: pytest.MonkeyPatch, efforts: tuple[float, float], taken: str
+) -> None:
+    offered = [
+        Proposal(Setting(words, effort=effort), Piece('push', ('constant:0,-5,0:3',)))
+        for words, effort in zip(('first', 'second'), efforts, strict=True)
+    ]
+    apart = np.array([[0.0, 40.0], [30.0, 0.0]])
+    none = [[np.zeros(0)] * 2] * 2
+    monkeypatch.setattr(planning, 'proposals', lambda *_: offered)
+    monkeypatch.setattr(planning, 'shown', lambda *_: Shown(apart, none, [np.zeros((0, 0))] * 2, 3.0))
+    fits = [
+        cast(Fit, SimpleNamespace(jacobian=np.zeros((5, 0)), free=(), effects=(active(name, x=0.1),))) for name in 'ab'
+    ]
+    ws = cast(Workspace, SimpleNamespace(observations=[observed(warm=None)]))
+    plan = planning.plan_next(ws, fits[0], fits[1:], Limits(seconds=6.0))
+    assert plan is not None
+    assert plan.setting.words == taken
+    (told,) = plan.told
+    # The same for as long as a recording may be shows twice as much.
+    assert (told.rival, told.named, told.separation, told.reverse, told.possible) == ('b', 'a', 40.0, 30.0, 80.0)
