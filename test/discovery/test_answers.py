@@ -63,13 +63,13 @@ def some_samples(**given: Any) -> SimulatedSamples:
 def test_a_mistake_is_declared_once_for_each_place() -> None:
     names = [e.name for e in mistakes(1, [], [])]
     assert names == ['sensitivity', 'link_length', 'sample_rate']
-    listed = mistakes(2, [0.04], [(1, 2, 0.5), (2, 1, 0.25)])
+    listed = mistakes(2, [0.04], [(1, 2, 30.5), (2, 1, 0.25)])
     assert [e.name for e in listed] == [*names, 'load_delay', 'zero', 'jump', 'jump']
     assert listed[3].parameter('late_by').grid == (0.04,)
     assert [v['recording'] for v in listed[4].variants()] == [1.0, 1.0, 2.0, 2.0]
     assert [v['of_reading'] for v in listed[4].variants()] == [0.0, 1.0, 0.0, 1.0]
     assert [dict(next(e.variants())) for e in listed[5:]] == [
-        {'recording': 1.0, 'psd': 2.0, 'time_us': 500_000.0},
+        {'recording': 1.0, 'psd': 2.0, 'time_us': 30_500_000.0},
         {'recording': 2.0, 'psd': 1.0, 'time_us': 250_000.0},
     ]
     # Of a rig: each recording and each PSD has one, all others one in all.
