@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from psd_deflection.discovery.discover import Discovery, NamedEffect
+from psd_deflection.discovery.discover import Discovery
 from psd_deflection.discovery.law_features import known_values
 from psd_deflection.discovery.laws import FoundLaw
 from psd_deflection.discovery.result import parameters_of, provenance, sentence, size_of
 from psd_deflection.discovery.screen import Score
 from psd_deflection.discovery.trust import BANDS
+from psd_deflection.discovery.weighing import NamedEffect
 from psd_deflection.pages import page, picture, table
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.simulation.laws import VARIABLES

@@ -10,8 +10,9 @@ import yaml
 
 from psd_deflection import __version__
 from psd_deflection.config import DESCRIPTION, Rig
-from psd_deflection.discovery.discover import Discovery, NamedEffect, Rival
+from psd_deflection.discovery.discover import Discovery
 from psd_deflection.discovery.laws import FoundLaw
+from psd_deflection.discovery.weighing import NamedEffect, Rival
 from psd_deflection.simulation.catalogue import effects_to_values
 from psd_deflection.simulation.declaration import ActiveEffect
 
