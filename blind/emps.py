@@ -23,6 +23,8 @@ RATE = 1000.0
 KEPT = 10
 """Every tenth sample of the position is compared."""
 SEGMENT_S = 2.0
+STEP = 2
+"""Samples a step of the simulation."""
 
 
 def _scale(name: str, words: str) -> Effect:
@@ -59,12 +61,12 @@ class Emps(Plant):
         count = len(rows) // n
         position = rows[: count * n, 1].reshape(count, n)
         self._voltage = rows[: count * n, 2].reshape(count, n)
-        # Speed at the start of each segment, from a parabola through the first 40 ms on either side.
+        # Speed at the start of each segment, from a polynomial through 80 ms on either side.
         speed = np.zeros(count)
-        reach = 40
+        reach = 80
         for i in range(1, count):
             around = rows[i * n - reach : i * n + reach + 1, 1]
-            speed[i] = np.polyfit(np.arange(-reach, reach + 1) / RATE, around, 2)[1]
+            speed[i] = np.polyfit(np.arange(-reach, reach + 1) / RATE, around, 4)[3]
         self._start = np.stack([position[:, 0], speed])
         self._measured = [row[None, ::KEPT] for row in position]
         self.cases = tuple(f'{SEGMENT_S * i:.0f} s' for i in range(count))
@@ -96,18 +98,23 @@ class Emps(Plant):
         at = np.clip(np.arange(n) - of('input_delay', 'delay') * RATE, 0.0, n - 1.0)
         low = np.minimum(at.astype(np.int64), n - 2)
         voltage = self._voltage[:, low] + (at - low) * (self._voltage[:, low + 1] - self._voltage[:, low])
-        force = (GAIN * (1.0 + of('drive_gain', 'scale')) * voltage - offset).T
+        means = voltage.reshape(len(voltage), -1, STEP).mean(axis=2)
+        force = (GAIN * (1.0 + of('drive_gain', 'scale')) * means - offset).T
         q, v = self._start[0].copy(), self._start[1].copy()
-        out = np.empty((n, len(q)))
-        h = 1.0 / RATE
-        for i in range(n):
+        out = np.empty((len(force), len(q)))
+        # With the force held over a step, viscous friction is exact.
+        h = STEP / RATE
+        fade = np.exp(-h * viscous / mass)
+        gain = (1.0 - fade) / viscous
+        for i, given in enumerate(force):
             out[i] = q
-            push = force[i] - viscous * v - spring * q
+            push = given - spring * q
             if drag:
                 push = push - drag * v * np.abs(v)
+            free = fade * v + gain * push
             # Friction holds what would turn round within the step.
-            free = v + h * push / mass
-            v = np.sign(free) * np.maximum(np.abs(free) - h * coulomb / mass, 0.0) if coulomb else free
-            q = q + h * v
-        seen = out[::KEPT].T * (1.0 + of('position_gain', 'scale')) + of('position_offset', 'shift')
+            after = np.sign(free) * np.maximum(np.abs(free) - gain * coulomb, 0.0)
+            q = q + 0.5 * h * (v + after)
+            v = after
+        seen = out[:: KEPT // STEP].T * (1.0 + of('position_gain', 'scale')) + of('position_offset', 'shift')
         return [row[None, :] for row in seen]

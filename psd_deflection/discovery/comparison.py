@@ -25,7 +25,7 @@ class Comparison(ABC):
     case of each column, counted over all recordings. ``first``: names of effects that are only looked for before any
     other is found; ``setup``: of those that are mistakes of the set-up. ``open_level``: the level of what remains is
     fitted too, because nobody knows how exact the model of the machine is. ``budget``: forward simulations after which
-    nothing more is added; the alternatives end at twice as many.
+    nothing more is added; the alternatives end at twice as many. ``digits``: format of a gap in the sentence.
     """
 
     physics: Physics | None
@@ -38,6 +38,7 @@ class Comparison(ABC):
     setup: frozenset[str] = frozenset()
     open_level: bool = False
     budget: int = 500
+    digits: str = '.4g'
 
     @property
     @abstractmethod
@@ -99,9 +100,37 @@ class Comparison(ABC):
     def folds(self) -> IntArray:
         """The fold of each load case, for the hold-out."""
 
+    @property
     @abstractmethod
-    def worded(self, size: float) -> str:
+    def unit(self) -> str:
+        """Of the gap over all channels."""
+
+    @property
+    @abstractmethod
+    def scale_shown(self) -> tuple[float, str]:
+        """By what a gap is multiplied for people, and the unit that it has then."""
+
+    @property
+    @abstractmethod
+    def units_shown(self) -> tuple[str, ...]:
+        """Of the rows of ``shown``."""
+
+    @abstractmethod
+    def shown(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
+        """A residual by ``channels``, as the gap counts it, for pictures; NaN where nothing was measured."""
+
+    @abstractmethod
+    def against(self) -> dict[str, list[FloatArray]]:
+        """What ``shown`` may be held against in a picture, by name with unit; the first is the time or the number."""
+
+    @abstractmethod
+    def provenance(self) -> list[dict[str, object]]:
+        """Of each recording, for result.json."""
+
+    def worded(self, size: float, digits: str = '.3g') -> str:
         """A gap with its unit, for people."""
+        scale, unit = self.scale_shown
+        return f'{scale * size:{digits}} {unit}'.rstrip() if np.isfinite(size) else 'not known'
 
     def loss(self, residual: FloatArray) -> float:
         """Twice the negative log-likelihood of a vector (D,), up to a constant: chi-square if the noise is known."""

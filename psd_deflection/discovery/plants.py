@@ -287,13 +287,42 @@ class PlantComparison(Comparison):
         """The gap from the plant's noise; NaN if that is not known."""
         return self._joined(self.known) if self.plant.noise else float('nan')
 
-    def worded(self, size: float) -> str:
-        """A gap with its unit."""
-        if not np.isfinite(size):
-            return 'not known'
-        return (
-            f'{100.0 * size:.3g} % of the gap before' if self.shares else f'{size:.4g} {self.plant.units[0]}'.rstrip()
-        )
+    @property
+    def unit(self) -> str:
+        """That of the channels if they have one."""
+        return 'share of the gap before' if self.shares else self.plant.units[0]
+
+    @property
+    def scale_shown(self) -> tuple[float, str]:
+        """The unit of the channels if they have one, else shares."""
+        return (100.0, '% of the gap before') if self.shares else (1.0, self.plant.units[0])
+
+    @property
+    def units_shown(self) -> tuple[str, ...]:
+        """Those of the channels."""
+        return self.plant.units
+
+    def shown(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
+        """As they are."""
+        return [np.where(t, x, np.nan) for x, t in zip(tables, self.there, strict=True)]
+
+    def against(self) -> dict[str, list[FloatArray]]:
+        """Time or number of the reading, the inputs, and what was measured."""
+        period = self.plant.period
+        ends = np.cumsum([0, *(m.shape[1] for m in self.measured)])
+        along = [(a + np.arange(m.shape[1])) * (period or 1.0) for a, m in zip(ends[:-1], self.measured, strict=True)]
+        out = {'time / s (cases one after another)' if period > 0.0 else 'number of the reading': along}
+        out.update({name: [np.asarray(v) for v in values] for name, values in self.plant.inputs().items()})
+        for c, (channel, unit) in enumerate(zip(self.channels, self.plant.units, strict=True)):
+            out[f'{channel} / {unit}' if unit else channel] = [m[c] for m in self.measured]
+        return out
+
+    def provenance(self) -> list[dict[str, object]]:
+        """Of each case: how much was measured."""
+        return [
+            {'name': name, 'values': int(t.sum()), 'lost': int(t.size - t.sum())}
+            for name, t in zip(self.names, self.there, strict=True)
+        ]
 
     def beginning(self, null: Fit) -> None:
         """What the fit without any effect leaves becomes the gap before."""

@@ -28,6 +28,7 @@ FINE_SECONDS = 0.004
 FOLDS = 4
 PIECE_SECONDS = 0.5
 DOTS = list(DOT_CHANNELS)
+LOADS_SHOWN = ('load_fx / N', 'load_fy / N', 'load_tz / N m')
 MAX_FINE = 60_000
 """Approximate total number of fine blocks; long recordings get longer blocks, which limits memory."""
 
@@ -51,6 +52,7 @@ class Workspace(Comparison):
     physics: Physics
     first = FIRST
     setup = SETUP
+    digits = '.3f'
 
     def __init__(self, observations: Sequence[Observation], base: Sequence[ActiveEffect] = ()) -> None:
         self.observations = tuple(observations)
@@ -218,6 +220,51 @@ class Workspace(Comparison):
             out[cases] = i
         return out
 
-    def worded(self, size: float) -> str:
-        """A gap in micrometres."""
-        return f'{1e6 * size:.3g} µm'
+    @property
+    def unit(self) -> str:
+        """Metres."""
+        return 'm'
+
+    @property
+    def scale_shown(self) -> tuple[float, str]:
+        """Micrometres."""
+        return 1e6, 'µm'
+
+    @property
+    def units_shown(self) -> tuple[str, ...]:
+        """Micrometres."""
+        return ('µm',) * 4
+
+    def shown(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
+        """Block means of the dots (4, blocks), µm."""
+        return [1e6 * d for d in self.block_dots(tables)]
+
+    def against(self) -> dict[str, list[FloatArray]]:
+        """Time, loads and the dots as measured, block by block."""
+        out: dict[str, list[FloatArray]] = {'time / s (recordings one after another)': []}
+        start = 0.0
+        for o, dots in zip(self.observations, self.block_dots(self.measured), strict=True):
+            size, n = o.rig.estimator.block_size, dots.shape[1]
+            out['time / s (recordings one after another)'].append(
+                np.asarray(start + (np.arange(n) + 0.5) * size * o.period)
+            )
+            start += o.duration
+            for name, row in zip(LOADS_SHOWN, fine_means(o.loads.T, size), strict=True):
+                out.setdefault(name, []).append(row[:n])
+            for name, row in zip(self.channels, dots, strict=True):
+                out.setdefault(f'{name} / mm', []).append(1e3 * row)
+        return out
+
+    def provenance(self) -> list[dict[str, object]]:
+        """Of each recording: hash, length, noise."""
+        return [
+            {
+                'name': o.name,
+                'sha256': o.digest or o.hashed(),
+                'seconds': o.duration,
+                'rest_seconds': w.rest_seconds,
+                'noise_v': [float(s) for s in w.sigma],
+                'coloured': list(w.coloured),
+            }
+            for o, w in zip(self.observations, self.noise, strict=True)
+        ]

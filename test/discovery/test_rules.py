@@ -20,7 +20,15 @@ from psd_deflection.config import load_rig
 from psd_deflection.discovery import experiment, planning
 from psd_deflection.discovery.coincidence import coincidences
 from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.localise import Dependence, Localisation, _energies, _layouts, dependences, localise, regressors
+from psd_deflection.discovery.localise import (
+    Dependence,
+    Localisation,
+    _energies,
+    _layouts,
+    dependences,
+    localise,
+    regressors,
+)
 from psd_deflection.discovery.noise import NoiseModel, _ar_density, _block_autocovariance, _level, estimate_noise
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.screen import Screen
