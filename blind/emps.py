@@ -1,7 +1,8 @@
 """A positioning system driven by a voltage (EMPS): a plant for ``discover_in``.
 
-The data are the public benchmark of a drive (nonlinearbenchmark.org; repository wmkouw/NSI-EMPS, MIT licence). The model
-is M q'' = gain u - Fv q' - Fc sgn(q') - offset. Every two seconds the simulation starts again from the measured state.
+The data are the public benchmark of a drive (nonlinearbenchmark.org; repository wmkouw/NSI-EMPS, MIT licence). The
+model is M q'' = gain u - Fv q' - Fc sgn(q') - offset. Every two seconds the simulation starts again from the measured
+state.
 """
 
 from __future__ import annotations
@@ -23,8 +24,6 @@ RATE = 1000.0
 KEPT = 10
 """Every tenth sample of the position is compared."""
 SEGMENT_S = 2.0
-STEP = 2
-"""Samples a step of the simulation."""
 
 
 def _scale(name: str, words: str) -> Effect:
@@ -50,11 +49,12 @@ class Emps(Plant):
 
     channels = ('position',)
     units = ('m',)
-    library = LIBRARY
+    library: tuple[Effect, ...] = LIBRARY
     period = KEPT / RATE
 
-    def __init__(self, without: Sequence[str] = (), folder: Path = DATA / 'emps') -> None:
-        """Raises OSError if ``folder`` has no ``emps.csv``."""
+    def __init__(self, without: Sequence[str] = (), folder: Path = DATA / 'emps', step: int = 2) -> None:
+        """``step``: samples a step of the simulation. Raises OSError if ``folder`` has no ``emps.csv``."""
+        self._step = step
         with (folder / 'emps.csv').open(newline='') as stream:
             rows = np.array([[float(v) for v in row] for row in list(csv.reader(stream))[1:]])
         n = round(SEGMENT_S * RATE)
@@ -98,12 +98,12 @@ class Emps(Plant):
         at = np.clip(np.arange(n) - of('input_delay', 'delay') * RATE, 0.0, n - 1.0)
         low = np.minimum(at.astype(np.int64), n - 2)
         voltage = self._voltage[:, low] + (at - low) * (self._voltage[:, low + 1] - self._voltage[:, low])
-        means = voltage.reshape(len(voltage), -1, STEP).mean(axis=2)
+        means = voltage.reshape(len(voltage), -1, self._step).mean(axis=2)
         force = (GAIN * (1.0 + of('drive_gain', 'scale')) * means - offset).T
         q, v = self._start[0].copy(), self._start[1].copy()
         out = np.empty((len(force), len(q)))
         # With the force held over a step, viscous friction is exact.
-        h = STEP / RATE
+        h = self._step / RATE
         fade = np.exp(-h * viscous / mass)
         gain = (1.0 - fade) / viscous
         for i, given in enumerate(force):
@@ -116,5 +116,5 @@ class Emps(Plant):
             after = np.sign(free) * np.maximum(np.abs(free) - gain * coulomb, 0.0)
             q = q + 0.5 * h * (v + after)
             v = after
-        seen = out[:: KEPT // STEP].T * (1.0 + of('position_gain', 'scale')) + of('position_offset', 'shift')
+        seen = out[:: KEPT // self._step].T * (1.0 + of('position_gain', 'scale')) + of('position_offset', 'shift')
         return [row[None, :] for row in seen]

@@ -125,7 +125,10 @@ class PlantComparison(Comparison):
         self.simulations = 0
         self.base = ()
         self.nuisance = tuple(ActiveEffect(e, e.off_values(None, next(e.variants()))) for e in plant.nuisance)
-        self.measured = [_table(t, f'measured, {c}') for c, t in zip(plant.cases, plant.measured(), strict=True)]
+        tables = plant.measured()
+        if len(tables) != len(plant.cases):
+            raise ConfigError(f'measured: {len(tables)} tables for {len(plant.cases)} cases')
+        self.measured = [_table(t, f'measured, {c}') for c, t in zip(plant.cases, tables, strict=True)]
         if not self.measured:
             raise ConfigError('cases: there is none; discover_in needs at least one')
         for name, rows in zip(plant.cases, self.measured, strict=True):
@@ -185,6 +188,8 @@ class PlantComparison(Comparison):
         self.simulations += 1
         model = {a.effect.name: dict(a.values) for a in effects}
         simulated = self.plant.simulate(model)
+        if len(simulated) != len(self.measured):
+            raise ConfigError(f'simulate: {len(simulated)} tables for {len(self.measured)} cases')
         out = []
         for name, rows, m, there in zip(self.plant.cases, simulated, self.measured, self.there, strict=True):
             table = _table(rows, f'simulate, {name}')
@@ -339,6 +344,10 @@ class PlantDiscovery(Conclusion):
     workspace: PlantComparison
 
 
+def _powers(name: str, values: Sequence[FloatArray]) -> dict[str, Sequence[FloatArray]]:
+    return {name: values, f'{name}^2': [v**2 for v in values], f'{name}^3': [v**3 for v in values]}
+
+
 def _regressors(ws: PlantComparison, fit: Fit) -> list[tuple[str, dict[str, Sequence[FloatArray]]]]:
     """Of each channel: time, the inputs, its own reading and rate."""
     simulated = [m - d for m, d in zip(ws.measured, fit.difference, strict=True)]
@@ -347,11 +356,11 @@ def _regressors(ws: PlantComparison, fit: Fit) -> list[tuple[str, dict[str, Sequ
         time = [np.linspace(-1.0, 1.0, m.shape[1]) for m in ws.measured]
         shared.update({'time': time, 'time^2': [t**2 for t in time]})
     for name, values in ws.plant.inputs().items():
-        shared.update({name: values, f'{name}^2': [np.asarray(v) ** 2 for v in values]})
+        shared.update(_powers(name, [np.asarray(v, dtype=np.float64) for v in values]))
     out = []
     for c, channel in enumerate(ws.channels):
         own = [np.nan_to_num(s[c]) for s in simulated]
-        named = {**shared, channel: own, f'{channel}^2': [x**2 for x in own], f'|{channel}|': [np.abs(x) for x in own]}
+        named = {**shared, **_powers(channel, own), f'|{channel}|': [np.abs(x) for x in own]}
         if ws.plant.period > 0.0 and min(len(x) for x in own) > 1:
             rate = [np.gradient(x) for x in own]
             named.update({f'rate of {channel}': rate, f'sign of rate of {channel}': [np.sign(r) for r in rate]})

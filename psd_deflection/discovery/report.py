@@ -294,11 +294,12 @@ def report_html(discovery: Conclusion) -> str:
         body.append(picture(against, 'residual before and after against loads and position'))
     if of_rig is not None:
         body.append(picture(_spectrum_figure(of_rig), 'spectrum before and after'))
+    factor = 1.0 if of_rig is None else discovery.workspace.scale_shown[0]
     channels = [
-        (n, *(f'{v:.4g}' for v in (a, b, discovery.heldout_per_channel[n])))
-        for n, (a, b) in discovery.per_channel.items()
+        (n, *(f'{factor * v:.4g}' for v in (*gaps, discovery.heldout_per_channel[n])), unit)
+        for (n, gaps), unit in zip(discovery.per_channel.items(), discovery.workspace.units_shown, strict=True)
     ]
-    body.append(table(('gap, rms', 'before', 'after', 'on unseen load cases'), channels))
+    body.append(table(('gap, rms', 'before', 'after', 'on unseen load cases', 'unit'), channels))
     body.append('<h2>How it was found</h2><details><summary>Where simulation and data part</summary>')
     body.append(picture(_where_figure(discovery), 'where simulation and data part'))
     body.append(_where_table(discovery))

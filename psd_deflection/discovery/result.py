@@ -257,7 +257,7 @@ def _missing(discovery: Conclusion, besides: str = '') -> str:
     if named:
         explains = 'explains' if len(parts) == 1 else 'explain'
         return (
-            f'{named} {explains} part, but an unknown effect remains: the gap goes from {before} {ws.scale_shown[1]} to '
-            f'{left}.{fitted}'
+            f'{named} {explains} part, but an unknown effect remains: the gap goes from {before} '
+            f'{ws.scale_shown[1]} to {left}.{fitted}'
         )
     return f'An effect that is not in the catalogue: the gap is {left}.'
