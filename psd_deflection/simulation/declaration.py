@@ -143,7 +143,7 @@ class Reading:
 class Traced:
     """One block on the way back from the tip's pose to the load. Changed in place.
 
-    ``pose``: [dX m, dY m, theta rad], without the constants' ``static_offset``. ``loads``: [Fx N, Fy N, Tz N m], set
+    ``pose``: [dX m, dY m, theta rad], without the constants' ``at_rest``. ``loads``: [Fx N, Fy N, Tz N m], set
     after the last effect on a pose. ``seconds``: since the last block. ``physics``: the constants with all effects.
     """
 
