@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psd_deflection.calibration import dot_noise_variances
 from psd_deflection.commissioning.checkup import Finding
 from psd_deflection.config import Rig, replace_values
 from psd_deflection.discovery import proposals as propose
@@ -48,6 +49,7 @@ from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.simulation.catalogue import catalogue, effects_of_rig
 from psd_deflection.simulation.declaration import ActiveEffect, Effect
 from psd_deflection.simulation.physics import Physics
+from psd_deflection.solvers import solver_from_rig
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -58,6 +60,7 @@ class Discovery(Conclusion):
     effects that the rig file has already. ``law``: describes what is unknown; it is in no gap and no effect here.
     ``rivals``: the whole models that these recordings do not exclude beside ``fit``, also those of mistakes of the
     set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
+    ``moves``: by how much at most the effects change an estimate that does not know of them: dX m, dY m, theta rad.
     """
 
     workspace: Workspace
@@ -67,6 +70,7 @@ class Discovery(Conclusion):
     law: FoundLaw | None = None
     rivals: tuple[Fit, ...] = ()
     unsettled: tuple[str, ...] = ()
+    moves: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def active_effects(self) -> list[ActiveEffect]:
@@ -324,7 +328,23 @@ def _answer(
         law if verdict == 'unknown_effect' else None,
         rivals,
         unsettled,
+        pose_change(ws, fit) if named else (0.0, 0.0, 0.0),
     )
+
+
+def pose_change(ws: Workspace, fit: Fit) -> tuple[float, float, float]:
+    """By how much at most the effects of ``fit`` change the estimates of the recordings: dX m, dY m, theta rad."""
+    tables = ws.block_dots(ws.simulate([*ws.base, *fit.effects])), ws.block_dots(ws.simulate(ws.base))
+    most = np.zeros(3)
+    for o, dots, nominal in zip(ws.observations, *tables, strict=True):
+        solver = solver_from_rig(o.rig.estimator.solver, o.rig)
+        there = np.isfinite(dots).all(axis=0) & np.isfinite(nominal).all(axis=0)
+        variances = dot_noise_variances(o.rig) / o.rig.estimator.block_size
+        poses = [solver.solve_many(d[:, there].T, variances).pose for d in (dots, nominal)]
+        change = np.abs(poses[0] - poses[1])
+        if np.isfinite(change).any():
+            most = np.fmax(most, np.nanmax(change, axis=0))
+    return (float(most[0]), float(most[1]), float(most[2]))
 
 
 def _beside(

@@ -107,6 +107,7 @@ def result(discovery: Conclusion) -> dict[str, Any]:
             }
             for f in (() if of_rig is None else of_rig.setup)
         ],
+        'moves': None if of_rig is None else dict(zip(('dx_m', 'dy_m', 'theta_rad'), of_rig.moves, strict=True)),
         'remaining': {'rms': discovery.gap_after, 'floors': discovery.floors},
         'gap': {
             'unit': discovery.workspace.unit,
@@ -215,7 +216,21 @@ def sentence(discovery: Conclusion) -> str:
     """The verdict in one sentence, after one about the set-up if that is wrong."""
     if not isinstance(discovery, Discovery):
         return _missing(discovery)
-    return _setup(discovery) + _missing(discovery, ' besides' if discovery.setup else '') + _law(discovery)
+    return (
+        _setup(discovery)
+        + _missing(discovery, ' besides' if discovery.setup else '')
+        + _moved(discovery)
+        + _law(discovery)
+    )
+
+
+def _moved(discovery: Discovery) -> str:
+    """What the effects do to an estimate, in a sentence, or nothing."""
+    if not discovery.effects:
+        return ''
+    dx, dy, theta = (1e6 * v for v in discovery.moves)
+    them = 'it' if len(discovery.effects) == 1 else 'them'
+    return f' Without {them} an estimate is wrong by up to ΔX {dx:.3g} µm, ΔY {dy:.3g} µm, θ {theta:.3g} µrad.'
 
 
 def _law(discovery: Discovery) -> str:
