@@ -211,7 +211,7 @@ class Search:
             else:
                 self._say('adding ' + better.effects[-1].label)
             current = better
-            if not renoised:
+            if not renoised or ws.open_level:
                 renoised = True
                 current = self.renoise(current)
                 null = refit(ws, ())
