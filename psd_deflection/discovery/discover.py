@@ -356,7 +356,7 @@ def _beside(
         active = fit.effects[i]
         if (active.effect.name, active.choices) not in kept:
             search.trace.append(f'{active.label} only stood in for the law')
-            fit = without_one(search.workspace, result, fit, i)
+            fit = without_one(search, result, fit, i)
             heldout = [h for j, h in enumerate(heldout) if j != i]
     return fit, heldout
 

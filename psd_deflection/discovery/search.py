@@ -224,7 +224,7 @@ class Search:
             current = self.renoise(current)
             null = refit(ws, ())
         current, others = self._swap(null, current)
-        p, delta_bic, delta_chi2 = self._weigh(null, current)
+        p, delta_bic, delta_chi2 = self.weigh(null, current)
         return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace)
 
     def _further(self, current: Fit, scores: Sequence[Score]) -> Fit | None:
@@ -264,7 +264,7 @@ class Search:
         others: list[list[Fit]] = []
         for swaps in range(3):
             others = []
-            _, _, gains = self._weigh(null, current)
+            _, _, gains = self.weigh(null, current)
             best = current
             for i in range(len(current.effects)):
                 fits = self.alternatives(null, current, i, gains[i])
@@ -309,7 +309,8 @@ class Search:
             current = best
         return current
 
-    def _weigh(self, null: Fit, current: Fit) -> tuple[list[float], list[float], list[float]]:
+    def weigh(self, null: Fit, current: Fit) -> tuple[list[float], list[float], list[float]]:
+        """For each effect of ``current``: p over the library, loss in BIC and in chi-square if it were dropped."""
         p, delta_bic, delta_chi2 = [], [], []
         for i, without in enumerate(self.without_each(current, null)):
             gain = without.chi2 - current.chi2

@@ -129,7 +129,6 @@ def credible(
     search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut], seen: float, look: Look
 ) -> tuple[Fit, list[HeldOut], Localisation]:
     """Remove effects that explain less than the unknown remainder: they probably stand in for it."""
-    ws = search.workspace
     while True:
         left = look(fit, result.null)
         if not fit.effects or not unknown_of(left, max(result.null.chi2 - fit.chi2, 0.0) + seen, steps=seen):
@@ -138,7 +137,7 @@ def credible(
         if result.delta_chi2[weakest] >= left.excess:
             break
         search.trace.append(f'{fit.effects[weakest].label} explains less than what remains unknown')
-        fit = without_one(ws, result, fit, weakest)
+        fit = without_one(search, result, fit, weakest)
         heldout = [h for j, h in enumerate(heldout) if j != weakest]
     return fit, heldout, left
 
@@ -166,16 +165,16 @@ def accept(search: Search, result: SearchResult, rng: np.random.Generator) -> tu
             break
         _, worst = min(fails)
         search.trace.append(f'{fit.effects[worst].label} fails the joint rule')
-        fit = without_one(ws, result, fit, worst)
+        fit = without_one(search, result, fit, worst)
     return heldout, fit
 
 
-def without_one(ws: Comparison, result: SearchResult, fit: Fit, index: int) -> Fit:
-    """``fit`` refitted without one effect, which is taken out of ``result`` too."""
-    for listed in (result.p, result.delta_bic, result.delta_chi2):
-        del listed[index]
+def without_one(search: Search, result: SearchResult, fit: Fit, index: int) -> Fit:
+    """``fit`` refitted without one effect; ``result`` weighs the rest anew."""
     rest = [a for j, a in enumerate(fit.effects) if j != index]
-    return refit(ws, rest, iterations=6) if rest else result.null
+    left = refit(search.workspace, rest, iterations=6) if rest else result.null
+    result.p[:], result.delta_bic[:], result.delta_chi2[:] = search.weigh(result.null, left)
+    return left
 
 
 def named_effects(

@@ -129,7 +129,7 @@ def search_of(plant: Plant, library: int = 1, penalty: float = 3.0) -> Search:
 
 def result_of(search: Search, effects: Sequence[ActiveEffect], others: Sequence[Sequence[Fit]] = ()) -> SearchResult:
     null, fit = refit(search.workspace, ()), refit(search.workspace, effects)
-    p, bic, gains = search._weigh(null, fit)
+    p, bic, gains = search.weigh(null, fit)
     return SearchResult(null, fit, p, bic, gains, [], [list(o) for o in others])
 
 
@@ -186,6 +186,35 @@ def test_the_sd_of_a_named_effect_is_that_of_least_squares() -> None:
     named = named_effects(search, result, result.fit, [HeldOut(9.0, 1.0)] * 2)
     assert [n.sd['x'] for n in named] == pytest.approx(want.tolist(), rel=1e-6)
     assert [n.active.effect.name for n in named] == ['a', 'b']
+
+
+def test_a_model_that_is_not_exact_has_the_sd_of_its_scatter_over_load_cases() -> None:
+    """Each fold has an effect of another size: the jackknife of least squares tells how sure it is."""
+    shown = pictures(A)
+    plant = Plant(shown, noise())
+    fold = np.tile(plant.case[0] % 4, 6).reshape(6, FINE)
+    plant.measured[0] += np.array([3e-3, 5e-3, 9e-3, 4e-3])[fold] * shown[A]
+    plant.data = plant.whiten(plant.measured)
+    result = result_of(search_of(plant), [active('a', x=0.0)], [[]])
+    sizes = []
+    for k in range(4):
+        rest = fold != k
+        sizes.append(np.sum(plant.measured[0][rest] * shown[A][rest]) / np.sum(shown[A][rest] ** 2))
+    want = math.sqrt(3 / 4 * np.sum((np.array(sizes) - np.mean(sizes)) ** 2))
+    (named,) = named_effects(search_of(plant), result, result.fit, [HeldOut(9.0, 1.0)])
+    assert named.sd['x'] == pytest.approx(want, rel=1e-3)
+    # Nothing but noise: the sd of least squares.
+    exact = Plant(shown, 5e-3 * shown[A] + noise())
+    result = result_of(search_of(exact), [active('a', x=0.0)], [[]])
+    (named,) = named_effects(search_of(exact), result, result.fit, [HeldOut(9.0, 1.0)])
+    assert named.sd['x'] == pytest.approx(SIGMA / np.linalg.norm(shown[A]), rel=1e-6)
+
+
+def test_four_recordings_are_left_out_one_by_one() -> None:
+    plant = Plant(pictures(A), noise())
+    assert plant.folds().tolist() == [0, 1, 2, 3, 0, 1, 2, 3]
+    plant.case = [np.repeat([2 * i, 2 * i + 1], FINE // 2) for i in range(4)]
+    assert plant.folds().tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
 def test_what_an_effect_weighs_is_the_chi_square_that_is_lost_without_it() -> None:
