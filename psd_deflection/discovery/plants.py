@@ -19,7 +19,7 @@ from psd_deflection.discovery.comparison import Comparison
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.localise import Cell, Localisation, dependences
 from psd_deflection.discovery.screen import Screen
-from psd_deflection.discovery.search import Search
+from psd_deflection.discovery.search import Search, SearchResult
 from psd_deflection.discovery.signatures import candidates, signatures_beside
 from psd_deflection.discovery.validate import heldout_tables
 from psd_deflection.discovery.weighing import (
@@ -422,6 +422,14 @@ def discover_in(plant: Plant, *, seed: int = 0, progress: Callable[[str], None] 
     result = search.run()
     progress('weighing')
     heldout, fit = accept(search, result, rng)
+    for _ in range(2):
+        if fit is result.fit or not fit.effects:
+            break
+        # Without what did not hold, another effect may be the better one.
+        fit, others = search.swap(result.null, fit)
+        weights = search.weigh(result.null, fit)
+        result = SearchResult(result.null, fit, *weights, result.first_scores, others, search.trace)
+        heldout, fit = accept(search, result, rng)
     fit, heldout, left = credible(search, result, fit, heldout, 0.0, look)
     progress('alternatives')
     named = named_effects(search, result, fit, heldout)

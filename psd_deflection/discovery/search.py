@@ -223,7 +223,7 @@ class Search:
         if current.effects:
             current = self.renoise(current)
             null = refit(ws, ())
-        current, others = self._swap(null, current)
+        current, others = self.swap(null, current)
         p, delta_bic, delta_chi2 = self.weigh(null, current)
         return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace)
 
@@ -259,7 +259,7 @@ class Search:
         self._say('the set-up: ' + found.effects[-1].label)
         return found
 
-    def _swap(self, null: Fit, current: Fit) -> tuple[Fit, list[list[Fit]]]:
+    def swap(self, null: Fit, current: Fit) -> tuple[Fit, list[list[Fit]]]:
         """Try to replace each effect by its alternatives and keep the better model; at most two rounds."""
         others: list[list[Fit]] = []
         for swaps in range(3):
@@ -332,6 +332,9 @@ class Search:
         scores = self.screen.score(without.residual, unbound(without))
         # Screening is linear: a candidate that falls short by little needs a full refit.
         bar = min(SWAP_REACH * gain, gain - 60.0) if gain > 100.0 else 0.5 * gain
+        if self.workspace.open_level:
+            # A rough machine is far from linear.
+            bar = 0.0
         best: dict[str, Score] = {}
         for s in scores:
             name = s.candidate.effect.name
@@ -346,7 +349,7 @@ class Search:
         fits = []
         for s in ranked:
             start = [*rest, s.candidate.from_coefficients(s.coefficients)]
-            quick = refit(self.workspace, start, iterations=3)
+            quick = refit(self.workspace, start, iterations=10 if self.workspace.open_level else 3)
             if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain) and self.spent < 2 * self.workspace.budget:
                 quick = refit(self.workspace, quick.effects, iterations=8)
             fits.append(quick)
