@@ -97,14 +97,18 @@ def make(kind: str, seconds: float, seed: int) -> Run:
 def run_of(loads: Array, seed: int) -> Run:
     """The run under ``loads`` (n, 3)."""
     pose, velocity = moved(loads)
+    return Run(loads, pose, velocity, volts_of(pose, np.random.default_rng([seed, 1])))
+
+
+def volts_of(pose: Array, rng: np.random.Generator) -> Array:
+    """Readings (n, 6) of the poses (n, 3), with the rig's noise and converter."""
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     volts = np.full((len(pose), 6), 5.0)
     for psd, (lx, ly) in enumerate(PLACES):
         x, y = lx - pose[:, 0], ly - pose[:, 1]
         volts[:, 3 * psd] = (c * x + s * y - lx) / MM_PER_V
         volts[:, 3 * psd + 1] = (c * y - s * x - ly) / MM_PER_V
-    noise = np.random.default_rng([seed, 1]).normal(0.0, SIGMA, volts.shape)
-    return Run(loads, pose, velocity, output(volts + noise, []))
+    return output(volts + rng.normal(0.0, SIGMA, volts.shape), [])
 
 
 @dataclass(frozen=True)

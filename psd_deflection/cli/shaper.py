@@ -8,7 +8,6 @@ the limits of the joints is refused.
   psd-deflection shaper --params-file modes/rig.yaml
   psd-deflection shaper --frequency 14 --damping-ratio 0.02 --shaper ei
   ros2 run psd_deflection shaper --params-file modes/rig.yaml --urdf arm.urdf
-  ros2 run psd_deflection shaper --shaper none --ros-args -r ~/shaped:=/arm/joints
 
 docs/shaping.md describes it.
 """

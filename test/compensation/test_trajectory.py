@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench import damping
 from psd_deflection.compensation.arm import JointLimits, read_limits
 from psd_deflection.compensation.trajectory import Trajectory, TrajectoryShaper, checked
 from psd_deflection.errors import ConfigError
@@ -192,3 +193,8 @@ def test_shapers_in_series_end_both_modes() -> None:
     assert list(both.times) == sorted(both.times)
     assert both.residual(12.0, 0.02)[0] < 1e-9
     assert both.residual(21.0, 0.01)[0] < 1e-9
+
+
+@pytest.mark.parametrize(('kind', 'wrong'), [('zv', 1.0), ('mzv', 1.0), ('zvd', 0.95), ('ei', 1.05)])
+def test_after_a_shaped_move_of_the_arm_five_percent_of_the_vibration_are_left(kind: str, wrong: float) -> None:
+    assert damping.left(shaper(kind, wrong * damping.FREQUENCY, damping.RATIO)) < 0.05
