@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.simulated_arm import LAG_S
 from blind import motion
-from blind.generator import Array
+from blind.generator import RATE, Array
 from psd_deflection.compensation.damper import Damper, DamperSettings
 from psd_deflection.compensation.trajectory import Trajectory
 from psd_deflection.pipeline import Pipeline
@@ -41,7 +41,7 @@ class Swung(NamedTuple):
 
     def decrement(self, first: float, last: float) -> float:
         """Mean logarithmic decrement of a period between two times, s."""
-        a, b = (float(self.amplitude[round(t * motion.RATE)]) for t in (first, last))
+        a, b = (float(self.amplitude[round(t * RATE)]) for t in (first, last))
         return math.log(a / b) / ((last - first) * FREQUENCY)
 
 
@@ -62,10 +62,10 @@ def swing(
     pipeline, damper = Pipeline(motion.rig_of()), Damper(settings or SETTINGS)
     damper.enable(settings is not None)
     rng = np.random.default_rng(seed)
-    n, h = round(seconds * motion.RATE), 1.0 / motion.RATE
+    n, h = round(seconds * RATE), 1.0 / RATE
     wanted = np.zeros(n)
     if trajectory is not None:
-        wanted = trajectory.at(np.arange(n) * h - start)[:, 0, 0]
+        wanted = trajectory.at(np.arange(n, dtype=np.float64) * h - start)[:, 0, 0]
     turned = OMEGA * math.sqrt(1.0 - RATIO**2)
     c, s, e = math.cos(turned * h), math.sin(turned * h), math.exp(-RATIO * OMEGA * h)
     q = v = offset = 0.0
@@ -79,7 +79,7 @@ def swing(
         before, rate = rate, (angle - earlier) / h
         earlier = angle
         v -= motion.LENGTH * (rate - before)
-        if i == round(knocked * motion.RATE):
+        if i == round(knocked * RATE):
             v += knock
         q, v = (
             e * (q * c + (v + RATIO * OMEGA * q) / turned * s),

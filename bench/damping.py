@@ -113,9 +113,9 @@ def moved_rows(links: dict[str, Swung]) -> list[tuple[str, ...]]:
 
 def knock_rows() -> list[tuple[str, ...]]:
     """Logarithmic decrement and largest offset after knocks, without damping, with it, and at its limits."""
+    out: list[tuple[str, ...]] = []
     held = replace(damped_link.SETTINGS, max_offset=2e-4)
     wrong = replace(damped_link.SETTINGS, lever=-damped_link.SETTINGS.lever)
-    out = []
     for name, settings, knock, windows in (
         ('no damping', None, 0.2, ((0.6, 0.8),)),
         ('damping', damped_link.SETTINGS, 0.2, ((0.6, 0.8),)),

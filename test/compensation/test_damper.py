@@ -153,4 +153,4 @@ def test_too_few_velocities_are_no_use() -> None:
 )
 def test_settings_are_checked(changed: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        replace(MINE, **changed)
+        replace(MINE, **changed)  # type: ignore[arg-type]
