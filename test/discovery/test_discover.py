@@ -12,7 +12,8 @@ import pytest
 
 import psd_deflection
 from psd_deflection.cli.main import main
-from psd_deflection.config import DESCRIPTION, Rig, load_rig, replace_values
+from psd_deflection.config import Rig, load_rig, replace_values
+from psd_deflection.declarations import DESCRIPTION
 from psd_deflection.discovery import proposals
 from psd_deflection.discovery.coincidence import coincidences
 from psd_deflection.discovery.discover import Discovery, discover
