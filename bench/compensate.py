@@ -141,8 +141,11 @@ def main(argv: list[str] | None = None) -> int:
         rows.append((name, f'{before * 1e3:.4f}', f'{after * 1e3:.4f}', f'{100.0 * after / before:.2f} %'))
         print(f'{name:34}{before * 1e3:10.4f} mm{after * 1e3:10.4f} mm{100.0 * after / before:8.2f} %')
     drawn, links = figure(without, ran), damping.moved_links()
-    for row in damping.moved_rows(links):
-        print(f'{row[0]:34}{row[1]:>13}{row[3]:>21}')
+    print(f'vibration after a quick move without a shaper: {1e3 * damping.unshaped():.2f} mm')
+    shapers, moved, knocks = damping.rows(), damping.moved_rows(links), damping.knock_rows()
+    heads = damping.SHAPER_HEAD, damping.MOVED_HEAD, damping.KNOCK_HEAD
+    for titles, rows_of in zip(heads, (shapers, moved, knocks), strict=True):
+        damping.printed(titles, rows_of)
     head = ('rms distance from the rigid pose', 'without, mm', 'with, mm', 'left')
     body = [
         '<h1>A payload on a flexible arm, with and without compensation</h1>',
@@ -152,13 +155,13 @@ def main(argv: list[str] | None = None) -> int:
         picture(drawn, 'distance from the rigid pose and offsets of the joints over time'),
         '<h1>A quick move, with and without a shaper and active damping</h1>',
         '<p>What each shaper leaves of the vibration of the arm. The frequency is right, or 5 % wrong.</p>',
-        table(damping.SHAPER_HEAD, damping.rows()),
+        table(damping.SHAPER_HEAD, shapers),
         '<p>One link, of which the shaper has a frequency that is 10 % wrong, as with another payload. Active damping '
         'takes the velocity from the filter of the motion.</p>',
-        table(damping.MOVED_HEAD, damping.moved_rows(links)),
+        table(damping.MOVED_HEAD, moved),
         picture(damping.figure(links), 'deflection of the tip over time'),
         '<p>The same link, knocked.</p>',
-        table(damping.KNOCK_HEAD, damping.knock_rows()),
+        table(damping.KNOCK_HEAD, knocks),
     ]
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / 'report.html').write_text(page('Compensation', body), encoding='utf-8')

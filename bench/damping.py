@@ -11,6 +11,7 @@ shaper for a frequency that is 10 % wrong, and it is knocked, so hard too that t
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -147,13 +148,18 @@ MOVED_HEAD = ('one link, shaper 10 % wrong', 'when the joint has arrived', '0.6 
 KNOCK_HEAD = ('one link, knocked', 'knock', 'logarithmic decrement', 'largest offset')
 
 
+def printed(head: Sequence[str], body: Sequence[Sequence[str]]) -> None:
+    """Print a table in Markdown."""
+    print('\n| ' + ' | '.join(head) + ' |\n' + '|---' * len(head) + '|')
+    for row in body:
+        print('| ' + ' | '.join(row) + ' |')
+
+
 def main() -> None:
     """Print the tables."""
     print(f'without a shaper: {1e3 * unshaped():.2f} mm')
     for head, body in ((SHAPER_HEAD, rows()), (MOVED_HEAD, moved_rows(moved_links())), (KNOCK_HEAD, knock_rows())):
-        print('\n| ' + ' | '.join(head) + ' |\n' + '|---' * len(head) + '|')
-        for row in body:
-            print('| ' + ' | '.join(row) + ' |')
+        printed(head, body)
 
 
 if __name__ == '__main__':

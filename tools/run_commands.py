@@ -142,7 +142,7 @@ LIVE = re.compile(
     r'^psd-deflection (estimator|monitor|chain)\b|--serve\b|^make run\b'
     r'|^ros2 (run|launch) psd_deflection (estimator|chain)\b(?!.*--show-args)'
 )
-BESIDE = re.compile(r'^ros2 run psd_deflection compensator\b')
+BESIDE = re.compile(r'^(ros2 (run|launch) psd_deflection|psd-deflection) (compensator|shaper)\b')
 """Nodes that run beside the lines below them."""
 
 ASKS = re.compile(r'^psd-deflection (echo|zero|record|load)\b')
