@@ -84,6 +84,9 @@ class Score:
         best = found[0]
         self.frequency.append(best.frequency / hertz - 1.0)
         self.damping.append(best.damping / zeta - 1.0)
+        # pyOMA2 gives none.
+        if not math.isfinite(best.frequency_sd):
+            return
         self.inside.append(
             (
                 abs(best.frequency - hertz) <= 1.96 * best.frequency_sd,
@@ -129,11 +132,13 @@ def scored(seeds: Iterable[int], *, operation: bool = False, pyoma2: bool = Fals
 def report(name: str, score: Score) -> str:
     """One line."""
     f, z = np.abs(score.frequency), np.abs(score.damping)
-    held = 100.0 * np.mean(score.inside, axis=0)
+    held = ['', '']
+    if score.inside:
+        held = [f', {100.0 * share:.1f} % inside' for share in np.mean(score.inside, axis=0)]
     return (
-        f'{name:20} frequency {100 * np.median(f):.4f} % median, {100 * f.max():.4f} % at most, '
-        f'{held[0]:.1f} % inside; '
-        f'damping {100 * np.median(z):.2f} %, {100 * z.max():.2f} %, {held[1]:.1f} % inside; missed {score.missed}'
+        f'{name:20} frequency {100 * np.median(f):.4f} % median, {100 * f.max():.4f} % at most'
+        f'{held[0]}; '
+        f'damping {100 * np.median(z):.2f} %, {100 * z.max():.2f} %{held[1]}; missed {score.missed}'
     )
 
 

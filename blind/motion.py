@@ -263,7 +263,7 @@ def figures(results: Iterable[Result]) -> list[Figures]:
 
 
 def by_frequency(results: Iterable[Result]) -> list[float]:
-    """Largest ratio of the foretold pose's rms error to the held one's of a chirp's bands up to the mode, of each axis."""
+    """Largest ratio of foretold to held rms error over the bands of a chirp up to the mode, of each axis."""
     results = list(results)
     out = []
     for axis in range(3):

@@ -34,17 +34,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('--params-file', metavar='RIG.yaml', help='rig file with the modes, as `identify` writes it')
     parser.add_argument(
-        '--modes', metavar='NAMES', default=MODES[0], help='modes of the rig file: bending, torsion or both (bending)'
+        '--modes', metavar='NAME', default=MODES[0], help='modes of the rig file: bending, torsion or both (bending)'
     )
     parser.add_argument(
-        '--frequency', type=number('--frequency', 0.1, 1000.0), metavar='HZ', help='of a mode, instead of a rig file'
+        '--frequency',
+        type=number('--frequency', 0.1, 1000.0),
+        metavar='VALUE',
+        help='Hz, of a mode, instead of a rig file',
     )
     parser.add_argument(
-        '--damping-ratio', type=number('--damping-ratio', 0.0, 0.9), metavar='RATIO', help='of that mode'
+        '--damping-ratio', type=number('--damping-ratio', 0.0, 0.9), metavar='VALUE', help='of that mode'
     )
     parser.add_argument(
         '--shaper',
-        metavar='KIND',
+        metavar='NAME',
         default=RECOMMENDED,
         help=f'{", ".join(KINDS)}; {NONE}: pass trajectories through; default: the shortest that leaves '
         '5 %% at most if the frequency is 5 %% off',
