@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import BPoly
+from scipy.interpolate import PPoly
 
 from psd_deflection.compensation.arm import JointLimits
 from psd_deflection.errors import ConfigError
@@ -26,6 +26,8 @@ from psd_deflection.records import FloatArray
 
 MOST_POINTS = 10_000
 MOST_SECONDS = 3600.0
+LARGEST = 1e6
+"""Of a position, velocity or acceleration, rad or m."""
 KINK_S = 1e-3
 """Where a motion is replaced its velocity may leap. A point so long before keeps the leap short, s."""
 SAME_S = 1e-6
@@ -52,9 +54,28 @@ class Trajectory:
         return float(self.times[-1])
 
     @functools.cached_property
-    def _curve(self) -> BPoly:
-        """Position over time, of two points or more."""
-        return BPoly.from_derivatives(self.times, self.states)
+    def _curve(self) -> PPoly:
+        """Position over time, of two points or more: a polynomial from each point to the next."""
+        h = np.diff(self.times)[:, None]
+        orders = self.states.shape[1]
+        (p, v, a), (p1, v1, a1) = (
+            [side[:, k] if k < orders else 0.0 for k in range(3)] for side in (self.states[:-1], self.states[1:])
+        )
+        d = (p1 - p) / h
+        if orders == 1:
+            powers = [d, p]
+        elif orders == 2:
+            powers = [(v + v1 - 2.0 * d) / h**2, (3.0 * d - 2.0 * v - v1) / h, v, p]
+        else:
+            powers = [
+                (6.0 * d - 3.0 * (v + v1) + 0.5 * (a1 - a) * h) / h**4,
+                (8.0 * v + 7.0 * v1 - 15.0 * d + (1.5 * a - a1) * h) / h**3,
+                (10.0 * d - 6.0 * v - 4.0 * v1 + (0.5 * a1 - 1.5 * a) * h) / h**2,
+                0.5 * a,
+                v,
+                p,
+            ]
+        return PPoly(np.stack(powers), self.times)
 
     def at(self, times: FloatArray) -> FloatArray:
         """States (m, k, j) at ``times`` (m,), s from the start: before the first point and from the last on at rest."""
@@ -99,8 +120,10 @@ def checked(names: Sequence[str], times: Sequence[float], points: Sequence[Seque
             if len(values) != wanted:
                 raise ConfigError(f'point {i} has {len(values)} {QUANTITIES[k]}, must be {wanted} as of the others')
     states = np.array([[list(values) for values in point[:orders]] for point in points], dtype=np.float64)
-    if not np.all(np.isfinite(states)):
-        raise ConfigError(f'point {int(np.argwhere(~np.isfinite(states))[0, 0])} is not finite')
+    # NaN is no number within the bound.
+    beyond = np.argwhere(~(np.abs(states) <= LARGEST))
+    if len(beyond):
+        raise ConfigError(f'point {beyond[0, 0]} is not finite, or beyond {LARGEST:g}')
     at = np.array(times, dtype=np.float64)
     late = np.flatnonzero(~(np.diff(at, prepend=-KINK_S) >= KINK_S * (1.0 - 1e-6)))
     if len(late):

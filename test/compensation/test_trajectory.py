@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import BPoly
 
 from bench import damping
 from psd_deflection.compensation.arm import JointLimits, read_limits
@@ -172,6 +173,7 @@ GOOD = [[0.0], [], []]
         (['a'], [0.0, 1.0], [[[0.0], [0.0], []], GOOD], 'point 1 has 0 velocities, must be 1'),
         (['a'], [0.0, 1.0], [GOOD, [[0.0], [], [0.0]]], 'point 1 has 1 accelerations, must be 0'),
         (['a'], [0.0, 1.0], [GOOD, [[math.nan], [], []]], 'point 1 is not finite'),
+        (['a'], [0.0, 1.0], [GOOD, [[1e300], [], []]], r'point 1 is not finite, or beyond 1e\+06'),
         (['a'], [0.0, math.nan], [GOOD, GOOD], 'time_from_start = nan'),
         (['a'], [1.0, 1.0], [GOOD, GOOD], r'point 1: time_from_start = 1 s: must be 0.001 s after'),
         (['a'], [-1.0, 1.0], [GOOD, GOOD], r'point 0: time_from_start = -1 s'),
@@ -198,3 +200,14 @@ def test_shapers_in_series_end_both_modes() -> None:
 @pytest.mark.parametrize(('kind', 'wrong'), [('zv', 1.0), ('mzv', 1.0), ('zvd', 0.95), ('ei', 1.05)])
 def test_after_a_shaped_move_of_the_arm_five_percent_of_the_vibration_are_left(kind: str, wrong: float) -> None:
     assert damping.left(shaper(kind, wrong * damping.FREQUENCY, damping.RATIO)) < 0.05
+
+
+@pytest.mark.parametrize('orders', [1, 2, 3])
+def test_between_its_points_it_meets_the_states_of_both(orders: int) -> None:
+    rng = np.random.default_rng(orders)
+    times, states = np.array([0.0, 0.3, 1.1, 1.2]), rng.normal(size=(4, orders, 2))
+    path = Trajectory(NAMES, times, states)
+    wanted = BPoly.from_derivatives(times, states)
+    at = np.linspace(0.0, 1.1999, 300)
+    for order in range(orders):
+        np.testing.assert_allclose(path.at(at)[:, order], wanted(at, nu=order), atol=1e-9)
