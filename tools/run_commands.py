@@ -85,6 +85,7 @@ SHORTEST = {
     'crash': 'CRASH_TIMES=1',
     'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=1000 FUZZ_HELLOS=1000',
     'fleet': 'FLEET_RECORDINGS=8 FLEET="--seconds 0.2 --kills 1 --only-killed"',
+    'compensate-faults': 'HOLD_TIMES=1 HOLD="--only silent"',
     'soak': 'SOAK_MINUTES=0.05 SOAK_HOURS=0.05',
     'camera-campaign': 'CAMERA_FRAMES=20',
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',

@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Duration
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.time import Time
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -129,9 +129,9 @@ def _trajectory(message: Any) -> Trajectory:
 def _message(trajectory: Trajectory, header: Any) -> Any:
     out = JointTrajectory(header=header, joint_names=list(trajectory.names))
     for t, states in zip(trajectory.times.tolist(), trajectory.states.tolist(), strict=True):
-        sec, nanosec = divmod(round(1e9 * t), 1_000_000_000)
         fields = dict(zip(QUANTITIES, states, strict=False))
-        out.points.append(JointTrajectoryPoint(time_from_start=Duration(sec=sec, nanosec=nanosec), **fields))
+        since = Duration(nanoseconds=round(1e9 * t)).to_msg()
+        out.points.append(JointTrajectoryPoint(time_from_start=since, **fields))
     return out
 
 
