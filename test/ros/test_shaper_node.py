@@ -10,8 +10,8 @@ import pytest
 pytestmark = pytest.mark.ros
 pytest.importorskip('rclpy')
 
-from builtin_interfaces.msg import Duration  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from rclpy.duration import Duration  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
 from bench.damping import END, FREQUENCY, MOVE_S, NAMES, RATIO, START, move, played  # noqa: E402
@@ -37,7 +37,7 @@ def message(*points: JointTrajectoryPoint, names: tuple[str, ...] = NAMES) -> Jo
 
 
 def point(seconds: float, positions: list[float]) -> JointTrajectoryPoint:
-    at = Duration(sec=int(seconds), nanosec=round(1e9 * (seconds % 1.0)))
+    at = Duration(nanoseconds=round(1e9 * seconds)).to_msg()
     return JointTrajectoryPoint(time_from_start=at, positions=positions, velocities=[0.0] * len(positions))
 
 
