@@ -55,8 +55,9 @@ _ROOT_2PI = math.sqrt(2.0 * math.pi)
 MOST_BLUR = 1.0
 """Longest motion blur with an answer, in units of a disc's radius."""
 
-MEAN_OF_BLUR = 0.22
-"""Error of the mean place over the exposure, one sd in units of the standard deviation of the motion within it."""
+MEAN_OF_BLUR = 0.2
+"""Error of the mean place over the exposure, one sd in units of the standard deviation of the motion within it.
+The worst is two pictures of like strength, of which one is taken: by one standard deviation of the motion."""
 
 MOST_DEFOCUS = 0.15
 """Largest blur (sd) of an image at rest with an answer, in units of a disc's radius."""
@@ -291,8 +292,9 @@ class Fitter:
         xx, xy, yy = nx * nx, 2 * nx * ny, ny * ny
         across = bxx * xx + bxy * xy + byy * yy
         per_sigma = 1.0 / np.sqrt(across)
-        # The rim's curvature moves the half level by the blur along it.
-        z = (self._radius * shape.swell - rho) / steep - (bxx + byy - across) * steep * (0.5 / self._radius)
+        # The rim's curvature, det(slopes)^2 / (radius steep^3), moves the half level by the blur along it.
+        bent = each(np.linalg.det(slopes) ** 2 * (0.5 / self._radius)) / (steep * steep * steep)
+        z = (self._radius * shape.swell - rho) / steep - (bxx + byy - across) * bent
         z *= per_sigma
         bell = np.exp(-0.5 * z * z) * (1.0 / _ROOT_2PI)
         rise = bell * per_sigma
@@ -399,6 +401,12 @@ class Fitter:
         chi_square = float(residual @ residual) / (count - 30)
         stiff, pull = _beforehand(shape, prior)
         inverse = np.linalg.inv(normal.hessian / chi_square + np.diag(stiff))
+        # What the model does not say: a level that is off by the misfit moves the rim by that over the steepest rise.
+        # It may be one disc's alone, and moves a rim more easily than it bends one.
+        wrong = 4.0 * misfit * _ROOT_2PI * math.hypot(sharp, motion)
+        bent = inverse @ _of_bent_rims(normal, rims, scored) / (pixel_radius * chi_square)
+        bent[:, :6] *= math.hypot(CENTRE_FLOOR, wrong)
+        bent[:, 6:] *= 0.5 * wrong
         scored *= residual / chi_square
         columns = np.ascontiguousarray(scored.T)
         wider, ones, every = np.ones(6), np.ones(count, dtype=np.float32), np.arange(count)
@@ -411,12 +419,9 @@ class Fitter:
             sandwich = inverse @ (scores.T @ scores) @ inverse
             wider = np.maximum(wider, np.sqrt(np.maximum(np.diag(sandwich)[:6] / np.diag(inverse)[:6], 1.0)))
         covariance = inverse[:6, :6] * np.outer(wider, wider)
-        # What the first three moments of the motion do not say of its mean, and what the model does not say at all: a
-        # level that is off by the misfit moves the rim by that over the steepest rise.
-        # It may be one disc's alone, which a mean over three would hide.
-        wrong = 4.0 * misfit * _ROOT_2PI * math.hypot(sharp, motion)
-        floor = math.sqrt(CENTRE_FLOOR**2 + (MEAN_OF_BLUR * max(motion - 0.15, 0.0)) ** 2 + wrong**2)
-        covariance += self._moved_centres(shape, floor)
+        covariance += bent[:6] @ bent[:6].T
+        # What the first three moments of the motion do not say of its mean.
+        covariance += self._moved_centres(shape, MEAN_OF_BLUR * max(motion - 0.15, 0.0))
         noise = float(np.sqrt(np.mean(raw * raw)))
         return TargetPose(
             shape.rotation,
@@ -432,11 +437,11 @@ class Fitter:
         )
 
     def _moved_centres(self, shape: _Shape, pixels: float) -> FloatArray:
-        """Covariance (6, 6) of an error of ``pixels`` at each disc: in place, and about the normal."""
+        """Covariance (6, 6) of an error of ``pixels`` that the discs share, or that turns them about the normal."""
         variance = (pixels * float(shape.place[2]) / self._lens.focal) ** 2
         out = np.zeros((6, 6))
         out[2, 2] = variance / float(np.sum(self._centres**2))
-        out[3:, 3:] = shape.rotation @ np.diag([variance, variance, 0.0]) @ shape.rotation.T / len(self._centres)
+        out[3:, 3:] = shape.rotation @ np.diag([variance, variance, 0.0]) @ shape.rotation.T
         return out
 
     @staticmethod
@@ -500,6 +505,24 @@ class Fitter:
         left = np.maximum.accumulate(dwell)
         right = np.maximum.accumulate(dwell[::-1])[::-1]
         return bool(np.any(dwell[1:-1] < DIP * np.minimum(left[:-2], right[2:]) - 0.015))
+
+
+def _of_bent_rims(normal: _Normal, rims: _Rims, scored: Pixels) -> FloatArray:
+    """What rims that are not where the model has them do to the gradient (p, 15), for a shift of the pixel radius.
+
+    Of each disc the shifts by the cosine and sine of the angle around it (columns 0 to 5), by those of twice the angle,
+    which are a tilt, and all around.
+    """
+    x, y = normal.side
+    moved, bent = [], []
+    for a, b in zip(rims.begin[:-1].tolist(), rims.begin[1:].tolist(), strict=True):
+        along, down = x[a:b], y[a:b]
+        around = np.stack([along, down, along * along - down * down, 2 * along * down, np.ones_like(along)])
+        # The derivative by the radius is that by a shift of the whole rim.
+        by_shape = (scored[:, a:b] @ (around * normal.rows[_LIGHTS + 6, a:b]).T).astype(float)
+        moved.append(by_shape[:, :2])
+        bent.append(by_shape[:, 2:])
+    return np.hstack(moved + bent)
 
 
 def _to_plane(shape: _Shape) -> FloatArray:
