@@ -50,7 +50,7 @@ class Discs:
             raise RefusedError(Status.SMALL)
         if regions[1].axes[0] < math.cos(_OBLIQUE) * regions[1].axes[1]:
             raise RefusedError(Status.OBLIQUE)
-        apart = regions[0].centre - regions[2].centre
+        apart = np.subtract(regions[0].centre, regions[2].centre)
         upright = float(apart @ self._up) / float(np.linalg.norm(apart))
         if self._answered and abs(upright) < _UNSURE:
             # The target looks the same after half a turn.
@@ -96,9 +96,10 @@ class Discs:
 
     def _tilt(self, region: Region, frontal: FloatArray) -> FloatArray:
         """A turn about the long axis of the ellipse that makes it as narrow as it is, in the target's axes, rad."""
-        values, vectors = np.linalg.eigh(region.shape)
-        ratio = math.sqrt(min(max(values[0] / values[1], 0.0), 1.0))
-        return np.asarray((frontal.T @ np.append(vectors[:, 1], 0.0)) * max(math.acos(ratio), 0.03))
+        xx, xy, yy = region.shape
+        angle = math.atan2(2.0 * xy, xx - yy) / 2
+        ratio = min(region.axes[0] / region.axes[1], 1.0)
+        return np.asarray(frontal.T @ [math.cos(angle), math.sin(angle), 0.0] * max(math.acos(ratio), 0.03))
 
     def _place(self, rays: FloatArray, rotation: FloatArray) -> FloatArray:
         """Where a target of this rotation has its centres on ``rays`` (3, 2): linear least squares."""
