@@ -23,6 +23,9 @@ AFFINE_TILT_SD = 0.05
 MOTION_TILT_SD = 0.05
 """Tilt of the plate against its rest, one sd, rad: a link of this kind tilts by some hundredths."""
 
+ALIKE = 30.0
+"""Twice the log of how much more likely one of two tilts must be: else the covariance has both."""
+
 _OBLIQUE = math.radians(60.0)
 _UNSURE = math.cos(math.radians(75.0))
 
@@ -85,7 +88,13 @@ class Discs:
                 reason = error
         if not fits:
             raise reason
-        return min(fits, key=lambda f: f.cost)
+        best, *others = sorted(fits, key=lambda f: f.cost)
+        for other in others:
+            if (other.cost - best.cost) * best.residuals < ALIKE:
+                turn = best.rotation.T @ other.rotation
+                off = np.concatenate([(turn - turn.T)[(2, 0, 1), (1, 2, 0)] / 2, other.place - best.place])
+                best = best._replace(covariance=best.covariance + np.outer(off, off))
+        return best
 
     def _frontal(self, rays: FloatArray) -> FloatArray:
         """The rotation of a plate that faces the camera, by the line of discs."""

@@ -126,6 +126,17 @@ def test_a_disc_that_just_saturates_tilts_the_plate_by_no_more_than_is_said() ->
     assert 1e-3 < tilt < 2.0 * sd
 
 
+def test_of_two_mirrored_tilts_the_right_one_is_taken() -> None:
+    """With weak perspective a plate tilted to the other side looks much the same."""
+    scene = Scene(focal=1200.0, distance=0.49, tilt=(0.0, -0.145), blur=1.8, white=146.0, read_noise=5.9)
+    for seed in range(6):
+        reference = CameraReference(replace(settings_of(scene), rest_frames=1), target_of)
+        reference.take(0, photograph(scene, [Pose()], np.random.default_rng(seed)))
+        assert reference.rest is not None
+        off = camera_of(scene)[0].T @ reference.rest.rotation
+        assert abs(off[0, 2]) < min(0.05, 5.0 * math.sqrt(reference.rest.covariance[1, 1]))
+
+
 def test_a_small_thing_beside_a_disc_is_noticed_in_a_large_image() -> None:
     scene = SCENES['large']
     image = photograph(scene, [Pose()], np.random.default_rng(8))
