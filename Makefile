@@ -36,8 +36,10 @@ VENV ?= .venv
 WITH ?=
 PORT ?=
 ARGS ?=
-# pip writes no byte code: half the time of a set-up goes into modules that nobody imports.
+# pip writes no byte code: half the time of a set-up goes into modules that nobody imports. The first import of a module
+# writes it for all that come after, whatever the environment says of it: the tests and the documents start Python hundreds of times.
 export PIP_COMPILE := 0
+unexport PYTHONDONTWRITEBYTECODE
 # Further words for pytest, e.g. PYTEST='-m "not browser"'.
 PYTEST ?=
 # Tests that run at a time; many of them wait.

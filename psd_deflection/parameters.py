@@ -9,7 +9,7 @@ A field of a section declares one, once::
     LINK = Section(LinkConfig, 'link.')
 
 The parameter files, the command line, the node and the documentation read what the sections of
-:mod:`psd_deflection.config` declare. :func:`check_value` is the one place that validates a value.
+:mod:`psd_deflection.declarations` declare. :func:`check_value` is the one place that validates a value.
 """
 
 from __future__ import annotations

@@ -21,8 +21,9 @@ import numpy.typing as npt
 from psd_deflection.averaging import BlockCutter, block_middle_ns, covariance
 from psd_deflection.calibration import Calibration, counts_to_volts
 from psd_deflection.calibration.health import OpticsHealth
-from psd_deflection.config import ZEROS, Rig, replace_values
+from psd_deflection.config import Rig, replace_values
 from psd_deflection.correction import Correction
+from psd_deflection.declarations import ZEROS
 from psd_deflection.errors import ConfigError
 from psd_deflection.estimation import Answer, Dots, Estimation, HeldTwist, SeenBlock
 from psd_deflection.filtering.motion import STATE, ModalFilter, joined_ns, split_ns

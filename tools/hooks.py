@@ -19,7 +19,7 @@ from typing import Any
 from psd_deflection import errors
 from psd_deflection.cli.effects import explained
 from psd_deflection.cli.main import COMMANDS, main, make_parser
-from psd_deflection.config import PARAMETERS
+from psd_deflection.declarations import PARAMETERS
 from psd_deflection.simulation.catalogue import catalogue
 
 ROOT = Path(__file__).resolve().parent.parent

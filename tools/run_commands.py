@@ -47,6 +47,11 @@ CI_RUNS = (
     (r'^make axe$', '.ci/run', 'make axe '),
     (r'^make colcon$', '.ci/run', 'make colcon '),
     (r'^make demo-thesis$', 'test/blind/test_redone.py', "main(['--short', "),
+    (
+        r'^psd-deflection compare-methods --out ',
+        'test/cli/test_compare_methods.py',
+        "main(['compare-methods', '--out', ",
+    ),
     (r'^colcon build$', 'Makefile', 'bin/colcon --log-base log build '),
     (
         r"^pip install 'psd_deflection\[(ros|monitor|pandas|camera|foxglove|dask|parquet)\]'$",

@@ -325,7 +325,8 @@ def records_target() -> tuple[Target, list[bytes]]:
 
 def yaml_target() -> tuple[Target, list[bytes]]:
     """A parameter file and a ``metadata.yaml`` that are YAML, with anchors, aliases, merge keys and tags."""
-    from psd_deflection.config import BY_NAME, load_rig
+    from psd_deflection.config import load_rig
+    from psd_deflection.declarations import BY_NAME
     from psd_deflection.errors import PsdDeflectionError
     from psd_deflection.recordings.bag_reader import read_information
 

@@ -19,7 +19,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from psd_deflection.config import PsdConfig
+from psd_deflection.declarations import PsdConfig
 from psd_deflection.errors import ConfigError
 from psd_deflection.records import FloatArray
 

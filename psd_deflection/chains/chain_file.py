@@ -30,7 +30,8 @@ import numpy as np
 
 from psd_deflection.chains.chain import Chain, ChainLink
 from psd_deflection.chains.transform import Transform, of_position_and_angles
-from psd_deflection.config import FRAME_PREFIX, Rig, replace_values, rig_from_values
+from psd_deflection.config import Rig, replace_values, rig_from_values
+from psd_deflection.declarations import FRAME_PREFIX
 from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.foreign_yaml import tree_of_file
 from psd_deflection.mechanics.statics import LinkStatics

@@ -6,8 +6,9 @@ import argparse
 import contextlib
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from tqdm import tqdm
 
@@ -124,17 +125,13 @@ def write_rows(
     out.close(failed)
 
 
-class Answer(Protocol):
+@dataclass(frozen=True, slots=True)
+class Answer:
     """What the task of one recording gives: the files of its folder, the cells of its row, warnings."""
 
-    @property
-    def files(self) -> Mapping[str, str]: ...
-
-    @property
-    def cells(self) -> Mapping[str, object]: ...
-
-    @property
-    def warnings(self) -> Sequence[str]: ...
+    files: Mapping[str, str]
+    cells: Mapping[str, object]
+    warnings: Sequence[str]
 
 
 def answer_each(

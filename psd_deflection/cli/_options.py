@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from psd_deflection.config import BY_NAME, Rig, replace_values, rig_from_values
+from psd_deflection.config import Rig, replace_values, rig_from_values
+from psd_deflection.declarations import BY_NAME
 from psd_deflection.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.fleet.parquet import ENDING, is_parquet
 from psd_deflection.foreign_yaml import YamlError, parse_yaml

@@ -37,7 +37,15 @@ from psd_deflection.calibrating.fit import NAMES
 from psd_deflection.calibrating.observation import Run
 from psd_deflection.calibrating.report import report_html
 from psd_deflection.calibrating.result import REPORTED, UNITS, result, sentence, source_of, values_of
-from psd_deflection.cli._fleet import ERROR, absolute, answer_each, each_for_itself, each_option, recordings_argument
+from psd_deflection.cli._fleet import (
+    ERROR,
+    Answer,
+    absolute,
+    answer_each,
+    each_for_itself,
+    each_option,
+    recordings_argument,
+)
 from psd_deflection.cli._options import make_writable, namespace_option, number
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save_all, show, warn
@@ -172,15 +180,6 @@ class Asked:
             'calibration.json': json.dumps(result(found, self.date), indent=1, allow_nan=False) + '\n',
             'report.html': report_html(found, self.date),
         }
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """What the task of one of many recordings gives."""
-
-    files: dict[str, str]
-    cells: dict[str, object]
-    warnings: list[str]
 
 
 def answer_of(path: str, asked: Asked) -> Answer:

@@ -38,7 +38,15 @@ from tqdm import tqdm
 
 from psd_deflection import __version__
 from psd_deflection.cli import _next
-from psd_deflection.cli._fleet import ERROR, absolute, answer_each, each_for_itself, each_option, recordings_argument
+from psd_deflection.cli._fleet import (
+    ERROR,
+    Answer,
+    absolute,
+    answer_each,
+    each_for_itself,
+    each_option,
+    recordings_argument,
+)
 from psd_deflection.cli._options import make_folder, make_writable, namespace_option, refuse, seed
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import save, save_all, show, show_text, warn
@@ -258,15 +266,6 @@ class Asked:
                 for law in laws
             },
         }
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """What the task of one of many recordings gives."""
-
-    files: dict[str, str]
-    cells: dict[str, object]
-    warnings: list[str]
 
 
 def answer_of(path: str, asked: Asked) -> Answer:

@@ -24,7 +24,8 @@ from collections.abc import Iterator
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import given_parameters, namespace_option, over_file, parameter_option, refuse
 from psd_deflection.cli._report import warn
-from psd_deflection.config import MONITOR, replace_values
+from psd_deflection.config import replace_values
+from psd_deflection.declarations import MONITOR
 from psd_deflection.errors import UsageError
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.monitor.foxglove import FeedBeside, FoxgloveServer

@@ -12,7 +12,8 @@ from __future__ import annotations
 import argparse
 
 from psd_deflection.cli._report import print_json, show
-from psd_deflection.config import PARAMETERS, load_rig
+from psd_deflection.config import load_rig
+from psd_deflection.declarations import PARAMETERS
 from psd_deflection.pipeline import Pipeline
 
 

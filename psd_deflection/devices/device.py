@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
-from psd_deflection.config import LEAST_BITS, MOST_BITS
+from psd_deflection.declarations import LEAST_BITS, MOST_BITS
 from psd_deflection.protocol.text_lines import positive
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ from typing import Any
 import yaml
 
 from psd_deflection import __version__
-from psd_deflection.config import DESCRIPTION, Rig
+from psd_deflection.config import Rig
+from psd_deflection.declarations import DESCRIPTION
 from psd_deflection.discovery.discover import Discovery, NamedEffect, Rival
 from psd_deflection.discovery.laws import FoundLaw
 from psd_deflection.simulation.catalogue import effects_to_values

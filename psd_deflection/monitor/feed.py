@@ -9,7 +9,7 @@ import math
 import queue
 from typing import NamedTuple, TypeGuard
 
-from psd_deflection.config import ZEROS
+from psd_deflection.declarations import ZEROS
 from psd_deflection.records import (
     AppliedLoad,
     DeflectionEstimate,

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 
 from msg_adapters import INPUTS, MESSAGE_TYPES, RIG, TOPIC_TYPES
 from psd_deflection import __version__
-from psd_deflection.config import MonitorConfig, Rig
+from psd_deflection.config import Rig
+from psd_deflection.declarations import MonitorConfig
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.records import ParameterChange, Record, RigState, SpotMeans

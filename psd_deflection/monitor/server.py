@@ -28,7 +28,7 @@ from typing import Any
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from psd_deflection import __version__
-from psd_deflection.config import MonitorConfig
+from psd_deflection.declarations import MonitorConfig
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor import access
 from psd_deflection.monitor.feed import BlockResult, Feed, mark_json, reference_json, row_columns, row_json

@@ -23,7 +23,7 @@ from mcap.writer import CompressionType, Writer
 
 from msg_adapters import LATCHED, MESSAGE_TYPES, to_messages
 from psd_deflection import __version__
-from psd_deflection.config import FRAME_PREFIX
+from psd_deflection.declarations import FRAME_PREFIX
 from psd_deflection.errors import RecordingError, creating
 from psd_deflection.files import HeldFolder
 from psd_deflection.recordings import cdr

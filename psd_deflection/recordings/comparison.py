@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from msg_adapters import DIAGNOSTICS, FILTERED, INPUTS, RIG, SAMPLES, pose_stamped, to_messages
-from psd_deflection.config import FRAME_PREFIX
+from psd_deflection.declarations import FRAME_PREFIX
 from psd_deflection.errors import RecordingError
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.recording import Recording

@@ -11,7 +11,8 @@ import math
 import re
 from collections.abc import Collection, Iterator, Sequence
 from decimal import Decimal
-from operator import itemgetter
+from itertools import chain
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +26,7 @@ from psd_deflection.recordings.recording import LOAD_COLUMNS, REFERENCE_COLUMNS,
 from psd_deflection.records import (
     MOST_PSDS,
     AppliedLoad,
+    FloatArray,
     RawChunk,
     ReferencePose,
     TemperatureReading,
@@ -46,6 +48,9 @@ _NUMBER = re.compile(
     r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?|[+-]?(?:nan|inf|infinity)', re.ASCII | re.IGNORECASE
 )
 
+_SECONDS = re.compile(r'(1?[0-9]{1,9})\.([0-9]{1,9})', re.ASCII)
+"""Seconds that are below the bound and whole nanoseconds, as most loggers write them."""
+
 _RATE_ROWS = 10_000
 
 _BATCH = 500
@@ -56,6 +61,9 @@ class _Row(NamedTuple):
     line: int
     t_ns: int
     cells: list[str]
+
+
+_CELLS = attrgetter('cells')
 
 
 class CsvRecording(Recording):
@@ -69,6 +77,7 @@ class CsvRecording(Recording):
         self._warnings: list[str] = []
         self._header, self._columns = self._read_header()
         self._channels = channel_names(self.psds)
+        self._take = itemgetter(*(self._columns[c] for c in self._channels))
         self._step_ns = 1e9 / sample_rate_hz if sample_rate_hz else self._find_step()
         self.sample_rate_hz = 1e9 / self._step_ns
 
@@ -160,6 +169,9 @@ class CsvRecording(Recording):
 
     def _nanoseconds(self, cell: str, line: int) -> int:
         text = cell.strip()
+        plain = _SECONDS.fullmatch(text)
+        if plain is not None:
+            return int(plain[1] + plain[2].ljust(9, '0'))
         if _NUMBER.fullmatch(text) is None:
             raise self._refuse(f'column t holds {text!r}, which is not a number', line)
         seconds = Decimal(text)
@@ -205,10 +217,8 @@ class CsvRecording(Recording):
         remainder is carried to the next row and decays slowly, so that neither jitter of less than half a
         step nor a clock that runs slightly fast looks like a loss.
         """
-        take = itemgetter(*(self._columns[c] for c in self._channels))
+        rows: list[_Row] = []
         seqs: list[int] = []
-        times: list[int] = []
-        volts: list[list[float]] = []
         seq = 0
         left_over = 0.0
         last_t: int | None = None
@@ -220,31 +230,43 @@ class CsvRecording(Recording):
                     left_over = 0.9 * (passed - steps)
                     seq += steps
                 last_t = row.t_ns
-                cells = take(row.cells)
-                try:
-                    values = list(map(float, cells))
-                except ValueError:
-                    values = [math.nan]
-                # Python takes `1_000` and digits of every script; in a recording they are typing errors.
-                together = ''.join(cells)
-                if '_' in together or not together.isascii():
-                    values = [math.nan]
-                # NaN and values beyond the bound show in the sum; only then the cell is searched.
-                if not sum(map(abs, values)) <= MAX_VOLTS:
-                    values = [self._number(row, c, MAX_VOLTS) for c in self._channels]
+                rows.append(row)
                 seqs.append(seq)
-                times.append(row.t_ns)
-                volts.append(values)
-                if len(seqs) == _BATCH:
-                    yield _chunk(seqs, times, volts)
-                    seqs, times, volts = [], [], []
+                if len(rows) == _BATCH:
+                    full, numbers = rows, seqs
+                    rows, seqs = [], []
+                    yield from self._chunk(full, numbers)
         except RecordingError:
             # Rows before the bad one are good.
-            if seqs:
-                yield _chunk(seqs, times, volts)
+            if rows:
+                yield from self._chunk(rows, seqs)
             raise
-        if seqs:
-            yield _chunk(seqs, times, volts)
+        if rows:
+            yield from self._chunk(rows, seqs)
+
+    def _chunk(self, rows: list[_Row], seqs: list[int]) -> Iterator[RawChunk]:
+        """One chunk of ``rows``. Before it raises RecordingError, one of those before the bad row."""
+        cells = list(chain.from_iterable(map(self._take, map(_CELLS, rows))))
+        volts = _floats(cells)
+        bad: RecordingError | None = None
+        if not (np.abs(volts) <= MAX_VOLTS).all():
+            good: list[list[float]] = []
+            try:
+                for row in rows:
+                    good.append([self._number(row, c, MAX_VOLTS) for c in self._channels])
+            except RecordingError as error:
+                bad = error
+            volts = np.array(good, dtype=np.float64)
+        count = volts.size // len(self._channels)
+        if count:
+            yield RawChunk(
+                np.array(seqs[:count], dtype=np.int64),
+                np.array([row.t_ns for row in rows[:count]], dtype=np.int64),
+                volts.astype(np.float32).reshape(count, -1),
+                np.zeros(count, dtype=np.uint8),
+            )
+        if bad is not None:
+            raise bad
 
     def topics(self) -> dict[str, int]:
         """Number of messages by topic, as in a bag of the same samples."""
@@ -263,12 +285,23 @@ class CsvRecording(Recording):
         if names[0] not in self._columns:
             return
         at = [self._columns[n] for n in names]
+        before: list[str] = []
+        values: tuple[float, ...] = ()
         for row in self._rows():
-            filled = [n for n, i in zip(names, at, strict=True) if row.cells[i].strip()]
-            if filled and len(filled) < len(names):
-                raise self._refuse(f'has {", ".join(filled)} without the others of {", ".join(names)}', row.line)
-            if filled:
-                yield row.t_ns, tuple(self._number(row, n) for n in names)
+            cells = [row.cells[i] for i in at]
+            # Most rows repeat the load and the temperature of the row before.
+            if cells != before:
+                values = self._values(row, names)
+                before = cells
+            if values:
+                yield row.t_ns, values
+
+    def _values(self, row: _Row, names: Sequence[str]) -> tuple[float, ...]:
+        """The numbers in these columns; none if all are empty."""
+        filled = [n for n in names if row.cells[self._columns[n]].strip()]
+        if filled and len(filled) < len(names):
+            raise self._refuse(f'has {", ".join(filled)} without the others of {", ".join(names)}', row.line)
+        return tuple(self._number(row, n) for n in filled)
 
     def loads(self) -> list[AppliedLoad]:
         """The first load and each load that differs from the one before it."""
@@ -302,10 +335,13 @@ class CsvRecording(Recording):
         return {}
 
 
-def _chunk(seqs: list[int], times: list[int], volts: list[list[float]]) -> RawChunk:
-    return RawChunk(
-        np.array(seqs, dtype=np.int64),
-        np.array(times, dtype=np.int64),
-        np.array(volts, dtype=np.float32),
-        np.zeros(len(seqs), dtype=np.uint8),
-    )
+def _floats(cells: list[str]) -> FloatArray:
+    """The numbers of ``cells``; one NaN if a cell is none of those that :data:`_NUMBER` takes."""
+    together = ''.join(cells)
+    # Python takes `1_000` and digits of every script; in a recording they are typing errors.
+    if '_' in together or not together.isascii():
+        return np.array([np.nan])
+    try:
+        return np.array(list(map(float, cells)))
+    except ValueError:
+        return np.array([np.nan])

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from msg_adapters import DEFLECTION
-from psd_deflection.config import BY_NAME, Rig, load_rig, replace_values, rig_as_recorded
+from psd_deflection.config import Rig, load_rig, replace_values, rig_as_recorded
+from psd_deflection.declarations import BY_NAME
 from psd_deflection.errors import ConfigError
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings.estimates import EstimateSeries

@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from msg_adapters import DEFLECTION, LOAD, SAMPLES
-from psd_deflection.config import BY_NAME, left_as_in_the_thesis
+from psd_deflection.config import left_as_in_the_thesis
+from psd_deflection.declarations import BY_NAME
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import SampleBlock
 

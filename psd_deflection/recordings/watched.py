@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from psd_deflection.config import BY_NAME, Rig, replace_values
+from psd_deflection.config import Rig, replace_values
+from psd_deflection.declarations import BY_NAME
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import ParameterChange, Record, SampleBlock
 from psd_deflection.simulation.catalogue import effects_of_rig

@@ -8,6 +8,7 @@ the pipeline threads.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import math
 import time
@@ -15,12 +16,9 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future as DiskFuture
 from typing import Any
 
-import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
@@ -28,10 +26,11 @@ from msg_adapters import DEFLECTION_WITH_COVARIANCE, DIAGNOSTICS, END_EFFECTOR, 
 from msg_adapters.pose_with_covariance_stamped import from_end_effector
 from psd_deflection.chains.chain_file import ChainFile
 from psd_deflection.chains.transform import Transform
-from psd_deflection.errors import ConfigError, PsdDeflectionError, Warned
+from psd_deflection.errors import PsdDeflectionError, Warned
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.names import BASE, END, END_REST, JOINT_STATES, RECORD, REST, TF, TF_STATIC, TIP, ZERO
+from psd_deflection.ros.running import SPIN_S, executor_of, ros
 from psd_deflection.ros.transforms import installed, static_transforms, transform_message
 from psd_deflection.ros.wires import InputRecorder, PublisherWire, message_class, qos, relative, topics_of
 from psd_deflection.runner.chain import ChainSession, Composed
@@ -42,7 +41,6 @@ from psd_deflection.runner.session import Session, why_no_zero, zero_text
 from psd_deflection.runner.signals import Signals, StopRequestedError
 
 NODE_NAME = 'chain'
-SPIN_S = 0.1
 _KIND = TOPIC_TYPES[DEFLECTION_WITH_COVARIANCE]
 
 
@@ -224,20 +222,8 @@ def run_chain(
 
     Raises the errors of the package if the run cannot start, or if a pipeline failed.
     """
-    signals = Signals()
-    try:
-        try:
-            rclpy.init(args=[NODE_NAME, *ros_args], signal_handler_options=SignalHandlerOptions.NO)
-        except RuntimeError as error:
-            raise ConfigError('ROS arguments: ' + str(error).splitlines()[0]) from None
-        try:
-            _spin(file, say, watch, signals)
-        except StopRequestedError:
-            pass
-        finally:
-            rclpy.try_shutdown()
-    finally:
-        signals.restore()
+    with ros(NODE_NAME, ros_args) as signals, contextlib.suppress(StopRequestedError):
+        _spin(file, say, watch, signals)
     return 0
 
 
@@ -247,22 +233,19 @@ def _spin(
     if not installed():
         say(Warned('tf2_msgs is not installed: no frames on /tf'))
     owner = ChainNode(file, say, signals)
-    executor = SingleThreadedExecutor()
-    executor.add_node(owner.node)
     watchdog = Watchdog()
     try:
-        settle()
-        owner.start()
-        watchdog.ready()
-        while not signals.stop and owner.chain.alive:
-            executor.spin_once(timeout_sec=SPIN_S)
-            if owner.chain.responsive():
-                watchdog.alive()
-            watch(owner.chain)
+        with executor_of(owner.node) as executor:
+            settle()
+            owner.start()
+            watchdog.ready()
+            while not signals.stop and owner.chain.alive:
+                executor.spin_once(timeout_sec=SPIN_S)
+                if owner.chain.responsive():
+                    watchdog.alive()
+                watch(owner.chain)
     finally:
         watchdog.stopping()
-        executor.remove_node(owner.node)
-        executor.shutdown(timeout_sec=0.2)
         owner.close()
     if owner.chain.failed is not None:
         raise owner.chain.failed

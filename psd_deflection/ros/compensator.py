@@ -13,11 +13,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from scipy.spatial.transform import Rotation
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -26,14 +23,14 @@ from msg_adapters import DEFLECTION_WITH_COVARIANCE, DIAGNOSTICS, END_EFFECTOR, 
 from psd_deflection.chains.transform import Transform
 from psd_deflection.compensation.arm import Arm
 from psd_deflection.compensation.compensator import Command, Compensator, CompensatorSettings, Observed, State
-from psd_deflection.errors import ConfigError, Warned
+from psd_deflection.errors import Warned
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.names import JOINT_STATES
+from psd_deflection.ros.running import SPIN_S, executor_of, ros
 from psd_deflection.ros.wires import message_class, qos, relative
 from psd_deflection.runner.diagnostics import ERROR, OK, WARN
 from psd_deflection.runner.repeats import Repeats
-from psd_deflection.runner.signals import Signals
 
 NODE_NAME = 'compensator'
 ENABLE = '~/enable'
@@ -42,7 +39,6 @@ PERIOD_S = 0.01
 NEWS = 6
 """Changes to one state that are told one by one, before they are counted and told together."""
 
-SPIN_S = 0.1
 RELEASE_S = 10.0
 """Longest time that the end waits for the offsets to go back to zero, s."""
 
@@ -151,31 +147,20 @@ def run_compensator(
     ros_args: Sequence[str], arm: Arm, settings: CompensatorSettings, say: Callable[[str], None], drive: bool
 ) -> int:
     """Run the node until SIGINT or SIGTERM; then let the offsets go back to zero, unless a second signal comes."""
-    signals = Signals()
-    try:
-        try:
-            rclpy.init(args=[NODE_NAME, *ros_args], signal_handler_options=SignalHandlerOptions.NO)
-        except RuntimeError as error:
-            raise ConfigError('ROS arguments: ' + str(error).splitlines()[0]) from None
+    with ros(NODE_NAME, ros_args) as signals:
         owner = CompensatorNode(arm, settings, say, drive)
-        executor = SingleThreadedExecutor()
-        executor.add_node(owner.node)
         try:
-            while not signals.stop:
-                executor.spin_once(timeout_sec=SPIN_S)
-            signals.stop = False
-            until = time.monotonic() + RELEASE_S
-            while drive and not (owner.release() or signals.stop) and time.monotonic() < until:
-                executor.spin_once(timeout_sec=SPIN_S)
-            # DDS does not say when the last offsets have left. If the publisher goes first, they are lost.
-            until = time.monotonic() + LEAVE_S
-            while drive and not signals.stop and time.monotonic() < until:
-                executor.spin_once(timeout_sec=SPIN_S)
+            with executor_of(owner.node) as executor:
+                while not signals.stop:
+                    executor.spin_once(timeout_sec=SPIN_S)
+                signals.stop = False
+                until = time.monotonic() + RELEASE_S
+                while drive and not (owner.release() or signals.stop) and time.monotonic() < until:
+                    executor.spin_once(timeout_sec=SPIN_S)
+                # DDS does not say when the last offsets have left. If the publisher goes first, they are lost.
+                until = time.monotonic() + LEAVE_S
+                while drive and not signals.stop and time.monotonic() < until:
+                    executor.spin_once(timeout_sec=SPIN_S)
         finally:
-            executor.remove_node(owner.node)
-            executor.shutdown(timeout_sec=0.2)
             owner.close()
-    finally:
-        rclpy.try_shutdown()
-        signals.restore()
     return 0

@@ -16,15 +16,13 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
-from rclpy.executors import SingleThreadedExecutor, await_or_execute
+from rclpy.executors import await_or_execute
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos_overriding_options import InvalidQosOverridesError
-from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
@@ -37,6 +35,7 @@ from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.log import NodeLog
 from psd_deflection.ros.names import RECORD, ZERO
 from psd_deflection.ros.parameters import LiveParameters
+from psd_deflection.ros.running import SPIN_S, executor_of, ros
 from psd_deflection.ros.transforms import TransformPublisher, installed
 from psd_deflection.ros.wires import InputRecorder, PublisherWire, VoltsPublisher, topics_of
 from psd_deflection.runner.diagnostics import STALE, HealthReporter
@@ -50,9 +49,8 @@ if TYPE_CHECKING:
 
 NODE_NAME = 'estimator'
 
-SPIN_S = 0.1
 ANSWER_S = 0.3
-"""Longest time until a signal takes effect, s."""
+"""Time for the last answer of a service to leave, s."""
 
 
 class _ManagedNode(LifecycleNode):  # type: ignore[misc]
@@ -371,19 +369,12 @@ def run(
     about ten times a second, for a display. Raises the errors of the package if the run cannot
     start, or if the pipeline failed.
     """
-    signals = Signals()
-    try:
+    with ros(NODE_NAME, ros_args) as signals:
+        estimator = EstimatorNode(overrides, say, signals)
+        failed: BaseException | None = None
+        watchdog = Watchdog()
         try:
-            rclpy.init(args=[NODE_NAME, *ros_args], signal_handler_options=SignalHandlerOptions.NO)
-        except RuntimeError as error:
-            raise ConfigError('ROS arguments: ' + str(error).splitlines()[0]) from None
-        try:
-            estimator = EstimatorNode(overrides, say, signals)
-            executor = SingleThreadedExecutor()
-            executor.add_node(estimator.node)
-            failed: BaseException | None = None
-            watchdog = Watchdog()
-            try:
+            with executor_of(estimator.node) as executor:
                 settle()
                 estimator.start()
                 watchdog.ready()
@@ -402,17 +393,11 @@ def run(
                     until = time.monotonic() + ANSWER_S
                     while not signals.stop and (left := until - time.monotonic()) > 0.0:
                         executor.spin_once(timeout_sec=left)
-            except StopRequestedError:
-                pass
-            finally:
-                watchdog.stopping()
-                executor.remove_node(estimator.node)
-                executor.shutdown(timeout_sec=0.2)
-                estimator.close()
-            if failed is not None:
-                raise failed
+        except StopRequestedError:
+            pass
         finally:
-            rclpy.try_shutdown()
-    finally:
-        signals.restore()
+            watchdog.stopping()
+            estimator.close()
+        if failed is not None:
+            raise failed
     return 0

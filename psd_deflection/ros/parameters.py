@@ -19,15 +19,8 @@ from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from psd_deflection.config import (
-    BY_NAME,
-    QOS_OVERRIDES_PREFIX,
-    ROS_OWN,
-    SIMULATED,
-    Rig,
-    replace_values,
-    rig_from_values,
-)
+from psd_deflection.config import Rig, replace_values, rig_from_values
+from psd_deflection.declarations import BY_NAME, QOS_OVERRIDES_PREFIX, ROS_OWN, SIMULATED
 from psd_deflection.devices.registry import source_names
 from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.parameters import Parameter

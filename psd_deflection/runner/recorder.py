@@ -22,7 +22,8 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from pathlib import Path
 
-from psd_deflection.config import AcquisitionConfig, Rig
+from psd_deflection.config import Rig
+from psd_deflection.declarations import AcquisitionConfig
 from psd_deflection.errors import Failed, RecordingError, Warned
 from psd_deflection.recordings.bag_writer import BagWriter
 from psd_deflection.records import ParameterChange

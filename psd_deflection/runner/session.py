@@ -15,7 +15,8 @@ from functools import partial
 from pathlib import Path
 
 from msg_adapters import LOAD, TOPIC_TYPES, from_fields, to_messages
-from psd_deflection.config import ZEROS, Rig, left_as_in_the_thesis, replace_values
+from psd_deflection.config import Rig, left_as_in_the_thesis, replace_values
+from psd_deflection.declarations import ZEROS
 from psd_deflection.errors import Failed, Warned, printable
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings import cdr

@@ -18,7 +18,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.config import BY_NAME, Rig, replace_values
+from psd_deflection.config import Rig, replace_values
+from psd_deflection.declarations import BY_NAME
 from psd_deflection.errors import ConfigError, Failed, Warned
 from psd_deflection.files import replace_file
 from psd_deflection.parameters import check_value

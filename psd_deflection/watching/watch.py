@@ -23,7 +23,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from psd_deflection.config import ZEROS, Rig
+from psd_deflection.config import Rig
+from psd_deflection.declarations import ZEROS
 from psd_deflection.parameter_files import EFFECTS_PREFIX
 from psd_deflection.records import (
     AppliedLoad,

@@ -151,7 +151,7 @@ def test_a_spread_is_numpy_s() -> None:
 
 @pytest.mark.statistics
 def test_simulated_minutes_lose_nothing_and_keep_time(capsys: pytest.CaptureFixture[str]) -> None:
-    assert soak.simulated_time(200 / 3600)
+    assert soak.simulated_time(100 / 3600)
     assert 'wrapped past 2^32' in capsys.readouterr().out
 
 

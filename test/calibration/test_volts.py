@@ -17,7 +17,8 @@ from psd_deflection.calibration import (
     dot_noise_variances,
     make_sensor,
 )
-from psd_deflection.config import SENSOR_TYPES, PsdConfig, rig_from_values
+from psd_deflection.config import rig_from_values
+from psd_deflection.declarations import SENSOR_TYPES, PsdConfig
 from psd_deflection.records import CHANNELS
 
 

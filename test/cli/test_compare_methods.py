@@ -16,9 +16,16 @@ from psd_deflection.thesis.figures import FIGURES
 DOCS = Path(__file__).parents[2] / 'docs'
 
 
-def test_tables(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['compare-methods']) == 0
-    lines = capsys.readouterr().out.splitlines()
+def test_tables_and_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['compare-methods', '--out', str(tmp_path / 'new' / 'figures')]) == 0
+    said = capsys.readouterr().out
+    written = sorted((tmp_path / 'new' / 'figures').iterdir())
+    assert [p.name for p in written] == sorted(f'{name}.png' for name in FIGURES)
+    for path in written:
+        assert f'wrote {path}' in said
+        assert path.read_bytes().startswith(b'\x89PNG')
+        assert 5_000 < path.stat().st_size < 150_000
+    lines = [line for line in said.splitlines() if not line.startswith('wrote ')]
     assert max(len(line) for line in lines) <= 120
     end = next(i for i, line in enumerate(lines) if line.startswith('Standard deviations'))
     rows = {m.label: [line for line in lines[:end] if line.startswith(m.label + '  ')] for m in methods()}
@@ -53,17 +60,6 @@ def test_programs_get_the_errors_in_si_units(capsys: pytest.CaptureFixture[str])
     assert cantilever['largest'] == pytest.approx([8.98e-6, 6.30e-6, math.radians(3.32e-3)], rel=2e-3)
     silent = max(condition['silent'] for condition in found['Appendix D iterative'].values())
     assert silent == pytest.approx(0.058, abs=5e-4)
-
-
-def test_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['compare-methods', '--out', str(tmp_path / 'new' / 'figures')]) == 0
-    written = sorted((tmp_path / 'new' / 'figures').iterdir())
-    assert [p.name for p in written] == sorted(f'{name}.png' for name in FIGURES)
-    said = capsys.readouterr().out
-    for path in written:
-        assert f'wrote {path}' in said
-        assert path.read_bytes().startswith(b'\x89PNG')
-        assert 5_000 < path.stat().st_size < 150_000
 
 
 def test_a_folder_that_cannot_be_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -110,13 +110,13 @@ def lines_of(turn: Turn) -> dict[str, object]:
 
 
 @pytest.mark.statistics
-@pytest.mark.parametrize('size', [10.0, 10.0 * BLOCK], ids=['of a sample', 'of a block'])
-def test_each_of_the_127_wrong_wirings_is_named_from_three_pushes_at_ten_times_the_noise(size: float) -> None:
+def test_each_of_the_127_wrong_wirings_is_named_from_three_pushes_at_ten_times_the_noise() -> None:
     turns = every_turn()
     assert len(turns) == 128
-    loads = pushes(size)
     misnamed = []
     for seed, turn in enumerate(turns):
+        # Ten times the noise of a block is the harder one; that of a sample, now and then.
+        loads = pushes(10.0 if seed % 8 == 7 else 10.0 * BLOCK)
         found = checked(recorded(loads, seed, turn), loads)
         wanted = lines_of(turn)
         if found.verdict != (WRONG if wanted else RIGHT) or found.lines != wanted or len(found.found) != 1:

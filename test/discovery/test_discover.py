@@ -12,7 +12,8 @@ import pytest
 
 import psd_deflection
 from psd_deflection.cli.main import main
-from psd_deflection.config import DESCRIPTION, Rig, load_rig, replace_values
+from psd_deflection.config import Rig, load_rig, replace_values
+from psd_deflection.declarations import DESCRIPTION
 from psd_deflection.discovery import proposals
 from psd_deflection.discovery.coincidence import coincidences
 from psd_deflection.discovery.discover import Discovery, discover
@@ -177,7 +178,7 @@ def two_effects(first: dict[str, object], second: dict[str, object]) -> Rig:
 @pytest.mark.statistics
 def test_sizes_that_agree_beyond_chance_are_put_down_to_one_cause() -> None:
     lag = observe(with_effect('amplifier_lag', time_constant=3e-5))
-    found = discover([lag], RIG, without=['amplifier_lag'])
+    found = discover([lag], RIG, without=['amplifier_lag'], bank=BANK)
     assert [e.active.effect.name for e in found.effects] == ['channel_skew', 'channel_skew']
     assert found.verdict == 'unknown_effect'
     assert not found.unknown[0].remains
