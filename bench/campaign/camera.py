@@ -415,7 +415,7 @@ def main() -> int:
     fine = True
     if args.only in (None, 'accuracy'):
         fine &= accuracy_table(min(args.frames // 10, 200), args.seed)
-    if args.only in (None, 'boards'):
+    if args.only == 'boards' or (args.only is None and args.frames >= 100):
         fine &= boards_table(min(max(args.frames // 50, 3), 20), args.seed, short=args.frames < 100)
     if args.only in (None, 'cost'):
         cost_table(min(40, args.frames // 10 + 3), args.seed)
