@@ -13,18 +13,19 @@ import pytest
 from psd_deflection import __version__
 from psd_deflection.commissioning.checkup import Finding
 from psd_deflection.discovery import discover as answer
-from psd_deflection.discovery import planning, proposals
+from psd_deflection.discovery import planning, proposals, weighing
 from psd_deflection.discovery import result as told
-from psd_deflection.discovery.discover import Discovery, NamedEffect, Rival, Unknown, _unknown, discover
+from psd_deflection.discovery.discover import Discovery, discover
 from psd_deflection.discovery.experiment import Limits, Piece, Setting, Shown
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.hidden import beginning, mistakes, only_in
 from psd_deflection.discovery.localise import Cell, Dependence, Localisation
 from psd_deflection.discovery.planning import Plan, Suggestion, Told
-from psd_deflection.discovery.search import comes_late, far, promising, slot, unbound, unphysical
+from psd_deflection.discovery.search import far, promising, slot, unbound, unphysical
 from psd_deflection.discovery.setup import _blocks, _units, likely_delays, likely_jumps, noise_finding, said
 from psd_deflection.discovery.signatures import Candidate, candidates, signature_columns
 from psd_deflection.discovery.validate import HeldOut
+from psd_deflection.discovery.weighing import NamedEffect, Rival, Unknown, unknown_of
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.catalogue import catalogue, make_active
@@ -274,10 +275,8 @@ def declared(*parameters: EffectParameter, **given: Any) -> Effect:
 
 
 def listed(effect: Effect, **found: list[float]) -> list[Candidate]:
-    """Its candidates, as if the catalogue were empty."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr('psd_deflection.discovery.signatures.catalogue', dict)
-        return list(candidates(Physics.of(RIG), found, (), [effect]))
+    """Its candidates."""
+    return list(candidates([effect], Physics.of(RIG), found))
 
 
 def test_a_candidate_has_its_choices_and_shapes_fixed() -> None:
@@ -303,9 +302,6 @@ def test_a_candidate_has_its_choices_and_shapes_fixed() -> None:
     assert [(c.start['limit'], c.free, c.one_sided) for c in got] == [(0.2, ('limit',), True), (0.4, ('limit',), True)]
     got = listed(declared(dataclasses.replace(probed, propose='highest'), finite=True), highest=[0.9])
     assert [c.start['limit'] for c in got] == [0.9]
-    whole = list(candidates(Physics.of(RIG), {}, ['creep', 'made_up'], [declared(size)]))
-    unproposed = {'creep', 'mains_interference', 'amplifier_saturation', 'quantisation'}
-    assert {c.effect.name for c in whole} == {*EVERY} - unproposed
     for least, nominal, one_sided in ((0.0, 0.0, True), (-1.0, 0.0, False), (0.5, 0.5, True), (0.4, 0.5, False)):
         (only,) = listed(declared(dataclasses.replace(size, minimum=least, nominal=nominal)))
         assert only.one_sided == one_sided
@@ -445,9 +441,7 @@ def test_what_ran_into_a_bound_is_something_else(workspace: Workspace) -> None:
         np.testing.assert_array_equal(unbound(fit), jacobian[:, keep])
     assert far(dataclasses.replace(fit, chi2=50.1))
     assert not far(dataclasses.replace(fit, chi2=49.9))
-    zero, jump = ActiveEffect(of_setup('zero'), {'recording': 1.0}), of_setup('jump')
-    assert not comes_late([zero])
-    assert comes_late([zero, active])
+    jump = of_setup('jump')
     assert slot(jump, {'recording': 1.0, 'psd': 2.0, 'time_us': 7.0}) == ('jump', 1.0, 2.0)
     assert slot(effect, {}) == ('made_up',)
 
@@ -557,6 +551,10 @@ def test_the_effect_that_a_rival_does_without_is_named() -> None:
 # What is said.
 
 
+def micrometres(value: float) -> str:
+    return f'{1e6 * value:.3g} µm'
+
+
 def left_with(**given: Any) -> Localisation:
     whole = {'cells': (), 'dependences': (), 'excess': 100.0, 'p': 0.0, 'map': np.zeros((1, 6, 6)), 'spans': ()}
     return Localisation(**{**whole, **given})
@@ -570,7 +568,7 @@ def test_what_remains_is_told_in_words() -> None:
     depends = tuple(
         Dependence('x2', name, gain, p) for name, gain, p in (('load_fx', 60.0, 1e-9), ('dot_x', 50.0, 1.1e-3))
     )
-    (u,) = _unknown(left_with(cells=cells, dependences=depends), 300.0, 5e-6, 3e-6)
+    (u,) = unknown_of(left_with(cells=cells, dependences=depends), 300.0, 5e-6, 3e-6, worded=micrometres)
     assert u.signature == (
         'on y2, x2; 4 µm rms (1.7 times the noise remain); follows load_fx; mostly odd; '
         'strongest at 1.0 to 2.5 s, 9 to 17 Hz'
@@ -578,14 +576,14 @@ def test_what_remains_is_told_in_words() -> None:
     assert u.rms == pytest.approx(4e-6)
     assert u.explains == pytest.approx(0.25)
     many = tuple(Dependence('x2', f'load_{i}', 10.0, 1e-9) for i in range(9))
-    (u,) = _unknown(left_with(dependences=many), 0.0)
+    (u,) = unknown_of(left_with(dependences=many), 0.0)
     assert u.depends_on == tuple(f'load_{i}' for i in range(6))
     assert 'follows load_0, load_1, load_2;' in u.signature
     for second, lagging in ((1, True), (2, False)):
         depends = tuple(
             Dependence('x2', 'history of load_fx' if i == second else 'dot_x', 10.0, 1e-9) for i in range(3)
         )
-        assert ('hysteretic' in _unknown(left_with(dependences=depends), 0.0)[0].signature) == lagging
+        assert ('hysteretic' in unknown_of(left_with(dependences=depends), 0.0)[0].signature) == lagging
     # Twice as much of one kind is most of it.
     for even, word in (
         (20.1, 'mostly even'),
@@ -594,10 +592,10 @@ def test_what_remains_is_told_in_words() -> None:
         (4.9, 'mostly odd'),
     ):
         depends = (Dependence('x2', 'dot_x^2', even, 1e-9), Dependence('x2', 'dot_x', 10.0, 1e-9))
-        assert word in _unknown(left_with(dependences=depends), 0.0)[0].signature
+        assert word in unknown_of(left_with(dependences=depends), 0.0)[0].signature
     # What coarse steps do varies with the signal: a fiftieth of what they explain is nothing else.
-    assert _unknown(left_with(excess=99.0), 0.0, steps=5000.0) == ()
-    assert _unknown(left_with(excess=101.0), 0.0, steps=5000.0) != ()
+    assert unknown_of(left_with(excess=99.0), 0.0, steps=5000.0) == ()
+    assert unknown_of(left_with(excess=101.0), 0.0, steps=5000.0) != ()
 
 
 @pytest.mark.parametrize(
@@ -614,18 +612,19 @@ def test_what_remains_is_told_in_words() -> None:
     ],
 )
 def test_a_regressor_is_even_or_odd(regressor: str, even: bool) -> None:
-    assert answer._even(regressor) == even
+    assert weighing._even(regressor) == even
 
 
 def test_a_gap_that_remains_is_never_left_unsaid() -> None:
-    assert answer._unsaid(9e-6, 1.5e-6, 1e-6) == ()
-    (u,) = answer._unsaid(3e-6, 1.6e-6, 1e-6)
+    noise = cast(Workspace, SimpleNamespace(floor=lambda: 1e-6, worded=micrometres))
+    assert weighing.unsaid(noise, 9e-6, 1.5e-6) == ()
+    (u,) = weighing.unsaid(noise, 3e-6, 1.6e-6)
     assert u.signature == '1.25 µm remain, 1.6 times the noise, in no single place or band'
     assert u.rms == pytest.approx(math.sqrt(1.56) * 1e-6)
     assert u.explains == pytest.approx((1.6 / 3) ** 2)
     assert u.remains
-    assert answer._beyond(5.0, 3.0) == 4.0
-    assert answer._beyond(3.0, 5.0) == 0.0
+    assert weighing._beyond(5.0, 3.0) == 4.0
+    assert weighing._beyond(3.0, 5.0) == 0.0
 
 
 def test_a_waterfall_falls_effect_by_effect() -> None:
@@ -639,11 +638,11 @@ def test_a_waterfall_falls_effect_by_effect() -> None:
         floor=lambda: 0.5,
     )
     for count in range(4):
-        fit = cast(Fit, SimpleNamespace(effects=effects[:count]))
+        fit = cast(Fit, SimpleNamespace(effects=effects[:count], nuisance=()))
         steps = [('as described', 20.0), ('+ creep', 8.0), ('+ damping', 7.0), ('+ tip_mass', 1.0)][: count + 1]
         if count:
             steps[-1] = (steps[-1][0], 1.0)
-        got = answer._waterfall(cast(Workspace, fake), fit, 20.0, 1.0)
+        got = weighing.waterfall_of(cast(Workspace, fake), fit, 20.0, 1.0)
         assert got == (*steps, ('noise alone', 0.5))
 
 
@@ -780,11 +779,12 @@ def test_every_number_of_the_answer_is_that_of_its_model(found: Discovery) -> No
     assert named.heldout.gain == pytest.approx(0.5 * gain, rel=0.05)
     assert named.p == 0.0 or named.p < 1e-12
     assert repr(found) == (
-        f'<Discovery effects_found: sensor_rotation (psd 2); gap {1e6 * found.gap_before:.3f} → '
-        f'{1e6 * found.gap_after:.3f} µm (noise alone: {1e6 * found.gap_floor:.3f} µm)>'
+        f'<Discovery effects_found: sensor_rotation (psd 2); gap {1e6 * found.gap_before:.3g} µm → '
+        f'{1e6 * found.gap_after:.3g} µm (noise alone: {1e6 * found.gap_floor:.3g} µm)>'
     )
     assert {c.channel for c in found.where.cells[:2]} <= {'x2', 'y2'}
-    assert found.simulations == found.workspace.simulations
+    # Reading the answer costs simulations too.
+    assert 0 < found.simulations <= found.workspace.simulations
 
 
 def test_the_answer_is_written_as_it_is(found: Discovery) -> None:
@@ -797,7 +797,10 @@ def test_the_answer_is_written_as_it_is(found: Discovery) -> None:
         'floor': found.gap_floor,
         'heldout_before': found.gap_heldout_before,
         'heldout_after': found.gap_heldout_after,
-        'per_channel': {k: {'before': a, 'after': b} for k, (a, b) in found.per_channel.items()},
+        'per_channel': {
+            k: {'before': a, 'after': b, 'heldout': found.heldout_per_channel[k]}
+            for k, (a, b) in found.per_channel.items()
+        },
     }
     assert tree['remaining'] == {'rms': found.gap_after, 'floors': found.floors}
     (effect,) = tree['effects']
@@ -826,10 +829,12 @@ def test_the_answer_is_written_as_it_is(found: Discovery) -> None:
     assert recording['coloured'] == [False] * 6
     before, left = 1e6 * found.gap_before, 1e6 * found.gap_after
     size = told.size_of(named)
+    dx, dy, theta = (1e6 * v for v in found.moves)
+    off = f'ΔX {dx:.3g} µm, ΔY {dy:.3g} µm, θ {theta:.3g} µrad'
     assert told.sentence(found) == (
         f'sensor_rotation (psd 2) is missing from the model; adding it closes the gap from {before:.3f} to {left:.3f} '
         f'µm, {found.floors:.2f} times what noise alone leaves ({1e6 * found.gap_floor:.3f} µm). '
-        f'Fitted: sensor_rotation {size}.'
+        f'Fitted: sensor_rotation {size}. Without it an estimate is wrong by up to {off}.'
     )
 
 
@@ -840,7 +845,8 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
     before = f'{1e6 * found.gap_before:.3f}'
 
     def sentence(**given: Any) -> str:
-        return told.sentence(dataclasses.replace(found, **given))
+        """Without what the effects do to an estimate."""
+        return told.sentence(dataclasses.replace(found, **given)).partition(' Without ')[0]
 
     assert sentence(verdict='nothing_missing', effects=()) == f'Nothing is missing: the gap is {left}.'
     assert sentence(verdict='unknown_effect', effects=(), unknown=(Unknown('', (), 1.0),)) == (
@@ -848,7 +854,7 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
     )
     assert sentence(verdict='unknown_effect', unknown=(Unknown('', (), 0.5),)) == (
         'sensor_rotation (psd 2) explains part, but an unknown effect remains: '
-        f'the gap goes from {before} µm to {left}.'
+        f'the gap goes from {before} µm to {left}. Fitted: sensor_rotation {told.size_of(named)}.'
     )
     two = (named, dataclasses.replace(named, equivalent=('a', 'b'), sd={}))
     said_of_two = sentence(effects=two)

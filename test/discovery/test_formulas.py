@@ -20,10 +20,9 @@ from psd_deflection.discovery.localise import _plain, regressors
 from psd_deflection.discovery.noise import NoiseModel, rest_windows, strip_lines
 from psd_deflection.discovery.observation import Observation, load_cases
 from psd_deflection.discovery.trust import energies, gain_beyond
-from psd_deflection.discovery.validate import fold_of_case
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.errors import RecordingError
-from psd_deflection.records import FloatArray
+from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.simulation import loads
 from psd_deflection.simulation.declaration import ActiveEffect
 from psd_deflection.simulation.simulator import ForwardModel
@@ -223,8 +222,11 @@ def test_a_separation_is_what_least_squares_leaves_of_both_recordings() -> None:
 
 
 def test_regressors_are_the_words_they_have(workspace: Workspace) -> None:
-    table = regressors(workspace)
-    assert list(table[0]) == list(table[1])
+    named = regressors(workspace)
+    assert [channel for channel, _ in named] == list(CHANNELS)
+    # One table for each PSD, of its channels.
+    table = [of for _, of in named][::3]
+    assert [list(of) for _, of in named] == [list(table[0])] * 6
     for r, o in enumerate(workspace.observations):
         samples = ForwardModel(RIG, []).run(o.loads, o.temperature)
 
@@ -322,11 +324,11 @@ def test_energies_are_those_of_band_passed_rows(workspace: Workspace) -> None:
 
 def test_folds_are_dealt_out_in_turn(workspace: Workspace) -> None:
     cases = max(int(c.max()) for c in workspace.case) + 1
-    assert fold_of_case(workspace).tolist() == [i % 4 for i in range(cases)]
+    assert workspace.folds().tolist() == [i % 4 for i in range(cases)]
     # The second recording's cases are others than the first one's.
     assert workspace.case[1].min() == workspace.case[0].max() + 1
     one = Workspace([observed(history=np.zeros((400, 3)), warm=None)])
-    assert fold_of_case(one).tolist() == [0, 1, 2, 3]
+    assert one.folds().tolist() == [0, 1, 2, 3]
 
 
 def test_a_load_case_begins_after_a_quarter_of_a_second_of_rest() -> None:

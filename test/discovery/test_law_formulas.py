@@ -14,7 +14,7 @@ import pytest
 from psd_deflection.discovery import law_features, laws
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.law_features import responses, score, switchings, terms
-from psd_deflection.discovery.validate import fold_of_case, heldout_gap
+from psd_deflection.discovery.validate import heldout_gap
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.simulation.catalogue import make_active
@@ -390,7 +390,7 @@ def test_noise_that_grows_with_a_load_is_told_with_its_size_and_evidence() -> No
     assert term.sd == pytest.approx({'coefficient': term.coefficient / math.sqrt(gain)})
     assert found.heldout.error == pytest.approx(math.sqrt(gain))
     # Each fold of load cases with the variances of the others.
-    fold = np.concatenate([fold_of_case(workspace)[case] for case in workspace.case])
+    fold = np.concatenate([workspace.folds()[case] for case in workspace.case])
     v2, want = known**2 / (known**2).max(), 0.0
     for k in set(fold.tolist()):
         a, b = laws._variance(squares[fold != k], v2[fold != k])

@@ -17,16 +17,16 @@ from psd_deflection.calibration import Wiring
 from psd_deflection.discovery import planning
 from psd_deflection.discovery import search as steps
 from psd_deflection.discovery.coincidence import coincidences
-from psd_deflection.discovery.discover import _named
 from psd_deflection.discovery.experiment import Limits, Piece, Proposal, Setting, Shown
 from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.localise import Dependence, dependences, localise
+from psd_deflection.discovery.localise import Dependence, dependences, localise, regressors
 from psd_deflection.discovery.proposals import coarse_step
 from psd_deflection.discovery.screen import Screen
 from psd_deflection.discovery.search import Search
 from psd_deflection.discovery.setup import _changes, _movement, _noise_energy, _sizes, _words, wire
 from psd_deflection.discovery.signatures import Candidate
 from psd_deflection.discovery.validate import HeldOut
+from psd_deflection.discovery.weighing import named_effects
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.simulation.declaration import ActiveEffect, EffectParameter
@@ -143,7 +143,7 @@ def test_at_most_four_effects_are_added_and_none_beyond_the_budget(monkeypatch: 
     assert len(searching(plant, shown, names).run().fit.effects) == 4
     # The fit of no effect is one simulation; after the first effect there are more than two.
     for budget, effects in ((1, 0), (2, 1)):
-        monkeypatch.setattr(steps, 'BUDGET', budget)
+        monkeypatch.setattr(plant, 'budget', budget)
         assert len(searching(plant, shown, names).run().fit.effects) == effects
 
 
@@ -161,7 +161,7 @@ def test_of_two_that_explain_alike_the_better_one_stays_and_the_other_is_its_alt
     assert other.chi2 == pytest.approx(want, rel=1e-6)
     # From the worse one it swaps to the better.
     null, worse = refit(plant, ()), refit(plant, [active('b', x=0.0)])
-    better, others = search._swap(null, worse)
+    better, others = search.swap(null, worse)
     assert named(better) == ['a']
     assert [named(f) for f in others[0]] == [['b']]
     assert search.spent == plant.simulations - search._begun
@@ -293,10 +293,13 @@ def test_what_the_simulation_may_be_wrong_by_is_no_dependence() -> None:
     workspace = Workspace([observed()])
     rng = np.random.default_rng(2)
     residual, explained = rng.standard_normal(len(workspace.data)), rng.standard_normal(len(workspace.data))
-    plain = {(d.channel, d.regressor): d.gain for d in dependences(workspace, residual, None)}
+    table = regressors(workspace)
+    plain = {(d.channel, d.regressor): d.gain for d in dependences(workspace, table, residual, None)}
     assert len(plain) == 6 * 27
     for size in (100.0, 1000.0):
-        beyond = {(d.channel, d.regressor): d.gain for d in dependences(workspace, residual, None, size * explained)}
+        beyond = {
+            (d.channel, d.regressor): d.gain for d in dependences(workspace, table, residual, None, size * explained)
+        }
         for (channel, name), gain in plain.items():
             own = workspace.split(size * explained)[0][CHANNELS.index(channel)]
             root = max(math.sqrt(gain) - 0.002 * float(np.linalg.norm(own)), 0.0)
@@ -468,14 +471,14 @@ def test_what_comes_close_in_bic_is_a_rival(loss: float, is_rival: bool) -> None
     )
     null = refit(search.workspace, ())
     result = steps.SearchResult(null, fit, [0.0], [99.0], [500.0], [], [[other]])
-    (found,) = _named(search, result, fit, [HeldOut(9.0, 1.0)])
+    (found,) = named_effects(search, result, fit, [HeldOut(9.0, 1.0)])
     assert found.equivalent == ()
     assert [(r.active.effect.name, r.delta_bic, r.fit) for r in found.rivals] == [('b', loss + 3.0, other)] * is_rival
     if is_rival:
         assert found.rivals[0].sd == pytest.approx({'x': 1.0, 'y': 1.0})
     # One that ran into its bound is none.
     stopped = dataclasses.replace(other, at_bound=((0, 'x'), (0, 'y')))
-    (found,) = _named(search, dataclasses.replace(result, alternatives=[[stopped]]), fit, [HeldOut(9.0, 1.0)])
+    (found,) = named_effects(search, dataclasses.replace(result, alternatives=[[stopped]]), fit, [HeldOut(9.0, 1.0)])
     assert found.rivals == ()
 
 
