@@ -135,8 +135,9 @@ soak: $(READY)
 	$(BIN)/python -m bench.campaign.soak --minutes $(SOAK_MINUTES) --hours $(SOAK_HOURS)
 
 HOLD_TIMES ?= 20
+HOLD ?=
 compensate-faults: $(READY)
-	$(BIN)/python -m bench.campaign.hold --times $(HOLD_TIMES)
+	$(BIN)/python -m bench.campaign.hold --times $(HOLD_TIMES) $(HOLD)
 
 FLEET_RECORDINGS ?= 1000
 fleet: $(READY)

@@ -18,6 +18,7 @@ EXECUTABLES = (
     'estimator',
     'chain',
     'compensator',
+    'shaper',
     'replay',
     'simulate',
     'discover',

@@ -1,7 +1,7 @@
-"""An arm whose links bend under a load at its end: what the compensator is tried on.
+"""An arm whose links bend under a load at its end: what the compensator and the shaper are tried on.
 
 The links bend as ``chains`` composes them, statically, and swing about that as one damped mode. The joints follow
-their commands with a lag of first order.
+their commands with a lag of first order. A mass at the end loads the links by its inertia too.
 """
 
 from __future__ import annotations
@@ -22,20 +22,31 @@ _CERTAIN = np.zeros((3, 3))
 class SimulatedArm:
     """``chain``: the links; ``angles``: of its joints at the start, rad; ``frequency`` Hz and ``damping`` of the mode.
 
-    ``force`` (3,): the load at the end effector, N in the base. ``angles``: where the joints are now.
+    ``force`` (3,): the load at the end effector, N in the base. ``angles``: where the joints are now. ``mass``, kg, at
+    the end effector: only its inertia, as of the rigid arm.
     """
 
-    def __init__(self, chain: Chain, angles: FloatArray, frequency: float = 12.0, damping: float = 0.01) -> None:
+    def __init__(
+        self, chain: Chain, angles: FloatArray, frequency: float = 12.0, damping: float = 0.01, mass: float = 0.0
+    ) -> None:
         self.chain = chain
+        self.mass = mass
         self.angles = np.array(angles, dtype=np.float64)
         self.force = np.zeros(3)
         self._omega, self._damping = 2.0 * math.pi * frequency, damping
         self._swing = np.zeros((2, len(chain.links), 3))
+        self._rigid = chain.rigid(self.angles.tolist()).position
+        self._velocity = np.zeros(3)
 
     def step(self, commanded: FloatArray, seconds: float) -> None:
         """Let ``seconds`` pass with the joints commanded to ``commanded`` (n,), rad."""
         self.angles += (commanded - self.angles) * -math.expm1(-seconds / LAG_S)
-        static = self.chain.tips_under(self.force, self.angles.tolist())
+        load = self.force
+        if self.mass:
+            before, self._rigid = self._rigid, self.chain.rigid(self.angles.tolist()).position
+            earlier, self._velocity = self._velocity, (self._rigid - before) / seconds
+            load = load - self.mass * (self._velocity - earlier) / seconds
+        static = self.chain.tips_under(load, self.angles.tolist())
         # Exact for a load that is held over the step.
         swing, speed = self._swing
         x, v = swing - static, speed
@@ -44,7 +55,22 @@ class SimulatedArm:
         self._swing[0] = static + e * (x * c + (v + decay * x) / damped * s)
         self._swing[1] = e * (v * c - (self._omega**2 * x + decay * v) / damped * s)
 
+    def settle(self) -> None:
+        """Let the links come to rest under their load."""
+        self._swing[0], self._swing[1] = self.chain.tips_under(self.force, self.angles.tolist()), 0.0
+
     def end(self) -> EndEffector:
         """Where the end effector is."""
-        tips = [TipDeflection(tip, _CERTAIN) for tip in self._swing[0]]
-        return self.chain.compose(tips, self.angles.tolist())
+        return self._composed(self._swing[0])
+
+    def vibration(self) -> float:
+        """Amplitude of the end effector's swing about where it comes to rest, m."""
+        static = self.chain.tips_under(self.force, self.angles.tolist())
+        there = self._composed(static).deflected.position
+        size = 0.0
+        for part in (self._swing[0] - static, self._swing[1] / self._omega):
+            size += float(np.sum(np.square(self._composed(static + part).deflected.position - there)))
+        return math.sqrt(size)
+
+    def _composed(self, tips: FloatArray) -> EndEffector:
+        return self.chain.compose([TipDeflection(tip, _CERTAIN) for tip in tips], self.angles.tolist())

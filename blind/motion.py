@@ -7,6 +7,9 @@ with the rig's noise and converter, without the product's simulator. The samples
 Columns: rms error of the velocity by the filter (``own``: what its covariance says), and by the Savitzky-Golay filter
 of block means that does best, which knows the future; normalised innovations squared a sample, ``inside``: share of
 the seconds in which they are in their 95 % band; rms error of the pose between the blocks, foretold and held.
+
+Below the table: the same error by frequency, from the chirp, as the largest ratio of foretold to held up to the first
+mode; and the share of the poses that are inside three standard deviations after 100 ms without samples.
 """
 
 from __future__ import annotations
@@ -34,6 +37,10 @@ REST = 3.0
 BLOCK = 20
 AXES = ('dX', 'dY', 'theta')
 KINDS = ('steps', 'chirp', 'operation')
+UNSEEN = 100
+"""Samples that do not come."""
+BANDS = 8
+"""Bands of frequency of a chirp."""
 LATER = np.arange(1, BLOCK + 1) / RATE
 
 
@@ -97,14 +104,18 @@ def make(kind: str, seconds: float, seed: int) -> Run:
 def run_of(loads: Array, seed: int) -> Run:
     """The run under ``loads`` (n, 3)."""
     pose, velocity = moved(loads)
+    return Run(loads, pose, velocity, volts_of(pose, np.random.default_rng([seed, 1])))
+
+
+def volts_of(pose: Array, rng: np.random.Generator) -> Array:
+    """Readings (n, 6) of the poses (n, 3), with the rig's noise and converter."""
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     volts = np.full((len(pose), 6), 5.0)
     for psd, (lx, ly) in enumerate(PLACES):
         x, y = lx - pose[:, 0], ly - pose[:, 1]
         volts[:, 3 * psd] = (c * x + s * y - lx) / MM_PER_V
         volts[:, 3 * psd + 1] = (c * y - s * x - ly) / MM_PER_V
-    noise = np.random.default_rng([seed, 1]).normal(0.0, SIGMA, volts.shape)
-    return Run(loads, pose, velocity, output(volts + noise, []))
+    return output(volts + rng.normal(0.0, SIGMA, volts.shape), [])
 
 
 @dataclass(frozen=True)
@@ -114,6 +125,8 @@ class Result:
     ``velocity``, ``own``: error of the velocity at the end of a block, and the standard deviation that it is given.
     ``smoothed``: error of the best Savitzky-Golay filter in the middle. ``squares``: NIS of a block. ``foretold``,
     ``held`` (20 B, 3): error of the pose at each sample until the next block is there. ``pose``, ``pose_own``.
+    ``unseen``: error of the pose 100 ms after the block if no more samples come, in standard deviations; NaN in the
+    last five.
     """
 
     velocity: Array
@@ -124,6 +137,7 @@ class Result:
     held: Array
     pose: Array
     pose_own: Array
+    unseen: Array
 
 
 def chunk(run: Run, block: int) -> RawChunk:
@@ -178,6 +192,7 @@ def judge(run: Run, rig: Rig) -> Result:
     velocity, own, squares = np.zeros((blocks, 3)), np.zeros((blocks, 3)), np.zeros((blocks, 3))
     pose, pose_own = np.zeros((blocks, 3)), np.zeros((blocks, 3))
     foretold, held = np.zeros((blocks * BLOCK, 3)), np.zeros((blocks * BLOCK, 3))
+    unseen = np.full((blocks, 3), np.nan)
     first = int(REST * RATE) // BLOCK
     for block in range(blocks):
         before = motion.innovations
@@ -196,6 +211,10 @@ def judge(run: Run, rig: Rig) -> Result:
             ahead = slice(BLOCK * (block + 1), BLOCK * (block + 2))
             foretold[ahead] = motion.predicted(LATER).pose - run.pose[ahead]
             held[ahead] = np.array(estimate.pose) - run.pose[ahead]
+        at = BLOCK * (block + 1) - 1 + UNSEEN
+        if at < len(run.pose):
+            later = motion.predicted(np.array([UNSEEN / RATE]))
+            unseen[block] = (later.pose[0] - run.pose[at]) / np.sqrt(later.variance[0])
     part, samples = slice(first, blocks), slice(first * BLOCK, blocks * BLOCK)
     return Result(
         velocity[part],
@@ -206,6 +225,7 @@ def judge(run: Run, rig: Rig) -> Result:
         held[samples],
         pose[part],
         pose_own[part],
+        unseen[part],
     )
 
 
@@ -242,6 +262,24 @@ def figures(results: Iterable[Result]) -> list[Figures]:
     return out
 
 
+def by_frequency(results: Iterable[Result]) -> list[float]:
+    """Largest ratio of foretold to held rms error over the bands of a chirp up to the mode, of each axis."""
+    results = list(results)
+    out = []
+    for axis in range(3):
+        ratios = []
+        # From 0.5 Hz to 1.2 times the mode, evenly in time.
+        below = math.floor(BANDS * (1.0 - 0.5 / MODES[axis][0]) / (1.2 - 0.5 / MODES[axis][0]))
+        for band in range(below):
+            foretold, held = (
+                np.concatenate([np.array_split(getattr(r, name)[:, axis], BANDS)[band] for r in results])
+                for name in ('foretold', 'held')
+            )
+            ratios.append(rms(foretold) / rms(held))
+        out.append(max(ratios))
+    return out
+
+
 def table(found: Mapping[str, list[Figures]]) -> str:
     """A Markdown table."""
     rows = [
@@ -266,11 +304,21 @@ def main() -> None:
     parser.add_argument('--seconds', type=float, default=23.0, help='of a run, the first three at rest')
     parser.add_argument('--seed', type=int, default=0)
     args = parser.parse_args()
-    found: dict[str, list[Figures]] = {}
+    judged: dict[str, list[Result]] = {}
     for kind in KINDS:
         seeds = range(args.seed, args.seed + args.runs)
-        found[kind] = figures([judge(make(kind, args.seconds, seed), rig_of()) for seed in tqdm(seeds, kind)])
-    print(table(found))
+        judged[kind] = [judge(make(kind, args.seconds, seed), rig_of()) for seed in tqdm(seeds, kind)]
+    print(table({kind: figures(results) for kind, results in judged.items()}))
+    worst = by_frequency(judged['chirp'])
+    print(
+        'foretold / held at its worst up to the mode: '
+        + ', '.join(f'{a} {r:.2f}' for a, r in zip(AXES, worst, strict=True))
+    )
+    for kind, results in judged.items():
+        unseen = np.concatenate([r.unseen for r in results])
+        inside = np.mean(np.abs(unseen[np.isfinite(unseen[:, 0])]) < 3.0, axis=0)
+        shares = ', '.join(f'{a} {share:.1%}' for a, share in zip(AXES, inside, strict=True))
+        print(f'{kind}: inside three standard deviations after {UNSEEN} ms without samples: {shares}')
 
 
 if __name__ == '__main__':

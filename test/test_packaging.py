@@ -28,6 +28,7 @@ EXECUTABLES = (
     'estimator',
     'chain',
     'compensator',
+    'shaper',
     'replay',
     'simulate',
     'discover',

@@ -85,6 +85,7 @@ SHORTEST = {
     'crash': 'CRASH_TIMES=1',
     'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=1000 FUZZ_HELLOS=1000',
     'fleet': 'FLEET_RECORDINGS=8 FLEET="--seconds 0.2 --kills 1 --only-killed"',
+    'compensate-faults': 'HOLD_TIMES=1 HOLD="--only silent"',
     'soak': 'SOAK_MINUTES=0.05 SOAK_HOURS=0.05',
     'camera-campaign': 'CAMERA_FRAMES=20',
     'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
@@ -147,7 +148,7 @@ LIVE = re.compile(
     r'^psd-deflection (estimator|monitor|chain)\b|--serve\b|^make run\b'
     r'|^ros2 (run|launch) psd_deflection (estimator|chain)\b(?!.*--show-args)'
 )
-BESIDE = re.compile(r'^ros2 run psd_deflection compensator\b')
+BESIDE = re.compile(r'^(ros2 (run|launch) psd_deflection|psd-deflection) (compensator|shaper)\b')
 """Nodes that run beside the lines below them."""
 
 ASKS = re.compile(r'^psd-deflection (echo|zero|record|load)\b')

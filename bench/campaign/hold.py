@@ -1,9 +1,11 @@
 """``make compensate-faults``: how soon the offsets hold after what they follow has gone wrong, over real DDS.
 
-A simulated arm is on the graph, its deflection comes through a process that stands for the estimator, and the real
-compensator drives its joints. Each fault is injected again and again: a deflection that is not finite, one that jumps,
-none, and an estimator that is killed. Judged is the last time at which an offset changed, and whether they follow
-again.
+A simulated arm is on the graph. Its deflection comes through a process that stands for the estimator, the positions of
+its joints through one that stands for the robot's driver, and the real compensator drives it. Each fault is injected
+again and again: a deflection that is not finite, one that jumps, a stale one, none, an estimator that is killed
+(SIGKILL), and a DDS that is gone: all that the compensator hears from is killed at once, or stopped (SIGSTOP: the
+participants are still there, and nothing comes). Judged is the last time at which an offset changed, and whether they
+follow again.
 
   python -m bench.campaign.hold --times 20
 """
@@ -12,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import signal
 import subprocess
 import sys
 import time
@@ -41,7 +44,11 @@ HOLD_S = 0.1
 WATCHED_S = 0.4
 """How long offsets are watched after a fault, s. After half a second they follow a deflection that jumped and stays."""
 LONGEST_S = 60.0
-RELAYED = '/arm/deflection'
+RELAYED = {
+    'estimator': ('/arm/deflection', '/end_effector/deflection', PoseWithCovarianceStamped),
+    'driver': ('/arm/joints', '/joint_states', JointState),
+}
+"""What a process passes on: from the arm, to the compensator, and the type."""
 
 Tell = Callable[[Any], bool]
 
@@ -63,6 +70,13 @@ def jumps(message: Any) -> bool:
     return True
 
 
+def stale(message: Any) -> bool:
+    """A deflection of a second ago."""
+    t_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec - 1_000_000_000
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(t_ns, 10**9)
+    return True
+
+
 def silent(message: Any) -> bool:
     """No deflection."""
     return False
@@ -71,9 +85,17 @@ def silent(message: Any) -> bool:
 FAULTS: dict[str, tuple[Tell, str]] = {
     'not finite': (no_number, 'not finite'),
     'jump': (jumps, 'jumps by'),
+    'stale': (stale, 'is older than'),
     'silent': (silent, 'no deflection for'),
 }
 """What the arm tells, and what the compensator says then."""
+
+SENT: dict[str, tuple[int, tuple[str, ...]]] = {
+    'estimator killed': (signal.SIGKILL, ('estimator',)),
+    'DDS killed': (signal.SIGKILL, ('estimator', 'driver')),
+    'DDS stopped': (signal.SIGSTOP, ('estimator', 'driver')),
+}
+"""Faults that are signals, and the processes that get them."""
 
 
 class Plant:
@@ -83,7 +105,7 @@ class Plant:
     ``stamps`` their times, s.
     """
 
-    def __init__(self, node: Any, topic: str = '/end_effector/deflection') -> None:
+    def __init__(self, node: Any, topic: str = '/end_effector/deflection', joints: str = '/joint_states') -> None:
         self.arm = SimulatedArm(read_chain(ROOT / 'config' / 'two_links.yaml').chain, NOMINAL, damping=0.1)
         self.arm.force = np.array([0.0, 0.0, -40.0])
         self.rigid = self.arm.chain.rigid(NOMINAL.tolist())
@@ -92,7 +114,7 @@ class Plant:
         self.tell: Tell = faithful
         self._noise = np.random.default_rng(0)
         self._deflections = node.create_publisher(PoseWithCovarianceStamped, topic, 5)
-        self._joints = node.create_publisher(JointState, '/joint_states', 5)
+        self._joints = node.create_publisher(JointState, joints, 5)
         node.create_subscription(JointTrajectory, '/compensator/offsets', self._heard, 5)
         self._then = time.monotonic()
         node.create_timer(PERIOD_S, self._step)
@@ -122,30 +144,41 @@ class Plant:
 
 
 class Relay:
-    """The process that stands for the estimator."""
+    """The process that stands for one of ``RELAYED``."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str) -> None:
+        self._name = name
         self._process = self._start()
 
     def _start(self) -> subprocess.Popen[bytes]:
-        return subprocess.Popen([sys.executable, '-m', 'bench.campaign.hold', '--relay'], cwd=ROOT)
+        return subprocess.Popen([sys.executable, '-m', 'bench.campaign.hold', '--relay', self._name], cwd=ROOT)
 
-    def kill(self) -> None:
-        """SIGKILL."""
+    def signal(self, number: int) -> None:
+        """SIGKILL or SIGSTOP."""
+        self._process.send_signal(number)
+        if number == signal.SIGKILL:
+            self._process.wait()
+
+    def again(self) -> None:
+        """Let it go on if it was stopped; another one if it was killed."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGCONT)
+        else:
+            self._process = self._start()
+
+    def close(self) -> None:
+        """Kill it."""
         self._process.kill()
         self._process.wait()
 
-    def again(self) -> None:
-        """Another one."""
-        self._process = self._start()
 
-
-def relay() -> None:
-    """Pass deflections on until killed."""
+def relay(name: str) -> None:
+    """Pass messages on until killed."""
+    heard, told, kind = RELAYED[name]
     rclpy.init()
-    node = rclpy.create_node('stands_for_the_estimator')
-    out = node.create_publisher(PoseWithCovarianceStamped, '/end_effector/deflection', 5)
-    node.create_subscription(PoseWithCovarianceStamped, RELAYED, out.publish, 5, raw=True)
+    node = rclpy.create_node(f'stands_for_the_{name}')
+    out = node.create_publisher(kind, told, 5)
+    node.create_subscription(kind, heard, out.publish, 5, raw=True)
     rclpy.spin(node)
 
 
@@ -157,8 +190,8 @@ class Campaign:
         self.node = rclpy.create_node('campaign')
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
-        self.plant = Plant(self.node, RELAYED)
-        self.relay = Relay()
+        self.plant = Plant(self.node, *(heard for heard, _, _ in RELAYED.values()))
+        self.relays = {name: Relay(name) for name in RELAYED}
         arguments = ['compensator', str(URDF), '--tip', 'tool', '--axes', 'x,z', '--drive']
         self.compensator = Program([*PSD_DEFLECTION, *arguments])
 
@@ -187,22 +220,24 @@ class Campaign:
         """One fault: the time after it at which an offset changed last, s (0 if none did)."""
         self.spin(self.follows, LONGEST_S, 'offsets that follow')
         began = time.time()
-        if name == 'killed':
-            self.relay.kill()
-        else:
+        number, victims = SENT.get(name, (0, ()))
+        for victim in victims:
+            self.relays[victim].signal(number)
+        if not victims:
             self.plant.tell = FAULTS[name][0]
         self.spin(lambda: False, WATCHED_S)
         changed = np.any(np.diff(self.plant.offsets, axis=0) != 0.0, axis=1)
         last = float(np.array(self.plant.stamps)[1:][changed].max())
         self.plant.tell = faithful
-        if name == 'killed':
-            self.relay.again()
+        for victim in victims:
+            self.relays[victim].again()
         return max(last - began, 0.0)
 
     def close(self) -> None:
         """End everything."""
         self.compensator.end()
-        self.relay.kill()
+        for one in self.relays.values():
+            one.close()
         self.executor.shutdown()
         self.node.destroy_node()
         rclpy.try_shutdown()
@@ -212,20 +247,21 @@ def main(argv: list[str] | None = None) -> int:
     """Inject every fault, print a line for each; status 1 if the offsets held too late."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--times', type=int, default=20, help='of each fault')
-    parser.add_argument('--relay', action='store_true', help=argparse.SUPPRESS)
+    parser.add_argument('--only', choices=(*FAULTS, *SENT), help='this fault alone')
+    parser.add_argument('--relay', choices=tuple(RELAYED), help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
     if args.relay:
-        relay()
+        relay(args.relay)
         return 0
     campaign = Campaign()
     late = 0
     try:
         campaign.enable()
-        for name in (*FAULTS, 'killed'):
+        for name in (args.only,) if args.only else (*FAULTS, *SENT):
             times = [campaign.inject(name) for _ in range(args.times)]
             late += sum(t > HOLD_S for t in times)
             print(
-                f'{name:12}{len(times):4} times: held after {np.median(times) * 1e3:3.0f} ms, at most '
+                f'{name:18}{len(times):4} times: held after {np.median(times) * 1e3:3.0f} ms, at most '
                 f'{max(times) * 1e3:3.0f} ms; followed again each time'
             )
         campaign.spin(campaign.follows, LONGEST_S, 'offsets that follow')

@@ -38,6 +38,7 @@ COMMANDS: dict[str, str] = {
     'estimator': 'acquire, estimate, publish on ROS 2 and record (the daemon)',
     'chain': 'several links in series: the deflection of the end effector',
     'compensator': 'joint offsets that put a deflected end effector back (a ROS node)',
+    'shaper': 'shape joint trajectories so that they do not ring the link (a ROS node)',
     'monitor': 'serve a web page that shows the rig live, or plays a recording',
     'echo': 'print what a running daemon measures, without ROS',
     'zero': 'make a running daemon take the zero, without ROS',
@@ -292,12 +293,27 @@ def _executable(command: str) -> Callable[[], int]:
     return lambda: main([command, *sys.argv[1:]])
 
 
-estimator, chain, compensator, replay, simulate, discover, calibrate, camera, check, effects, validate, identify = map(
+(
+    estimator,
+    chain,
+    compensator,
+    shaper,
+    replay,
+    simulate,
+    discover,
+    calibrate,
+    camera,
+    check,
+    effects,
+    validate,
+    identify,
+) = map(
     _executable,
     (
         'estimator',
         'chain',
         'compensator',
+        'shaper',
         'replay',
         'simulate',
         'discover',

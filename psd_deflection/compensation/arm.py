@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -85,9 +86,32 @@ class Arm:
         return frame, at
 
 
-def read_arm(path: str | Path, tip: str, base: str = '') -> Arm:
-    """The joints from the link ``base`` (default: the root) to the link ``tip`` of a URDF file. Raises ConfigError."""
+class JointLimits(NamedTuple):
+    """Limits of a joint: positions, rad or m; ``speed``, rad/s or m/s."""
+
+    lower: float
+    upper: float
+    speed: float
+
+
+def read_limits(path: str | Path) -> dict[str, JointLimits]:
+    """The limits of each joint of a URDF file that moves, infinite if it has none. Raises ConfigError."""
     path = Path(path)
+    out = {}
+    for element in _robot(path).iterfind('joint'):
+        name, kind, limit = element.get('name', ''), element.get('type', ''), element.find('limit')
+        if kind in MOVABLE:
+            where = f'{path}: joint {name}'
+            lower, upper = _range(limit, kind, where)
+            speed = limit.get('velocity') if limit is not None else None
+            out[name] = JointLimits(
+                lower, upper, math.inf if speed is None else _numbers(speed, 1, f'{where}: velocity')[0]
+            )
+    return out
+
+
+def _robot(path: Path) -> ElementTree.Element:
+    """The root of a URDF file."""
     text = text_of_file(path, 'URDF file', MOST_BYTES)
     if '<!DOCTYPE' in text or '<!ENTITY' in text:
         raise ConfigError(f'{path}: has a document type or entities, which a URDF file does not need')
@@ -97,6 +121,13 @@ def read_arm(path: str | Path, tip: str, base: str = '') -> Arm:
         raise ConfigError(f'{path}: not XML ({error}); expand xacro files first') from None
     if root.tag != 'robot':
         raise ConfigError(f'{path}: not a URDF file: its root is <{root.tag}>, not <robot>')
+    return root
+
+
+def read_arm(path: str | Path, tip: str, base: str = '') -> Arm:
+    """The joints from the link ``base`` (default: the root) to the link ``tip`` of a URDF file. Raises ConfigError."""
+    path = Path(path)
+    root = _robot(path)
     links = [link.get('name', '') for link in root.iterfind('link')]
     parents = {}
     for element in root.iterfind('joint'):
@@ -136,12 +167,17 @@ def _joint(path: Path, element: ElementTree.Element) -> ArmJoint:
     length = float(np.linalg.norm(direction))
     if not length:
         raise ConfigError(f'{where}: its axis is zero')
-    lower, upper = -math.inf, math.inf
-    if limit is not None and kind in ('revolute', 'prismatic'):
-        lower, upper = (_numbers(limit.get(side, '0'), 1, f'{where}: {side}')[0] for side in ('lower', 'upper'))
-        if lower > upper:
-            raise ConfigError(f'{where}: lower = {lower:g} is above upper = {upper:g}')
-    return ArmJoint(name, kind, place, direction / length, lower, upper)
+    return ArmJoint(name, kind, place, direction / length, *_range(limit, kind, where))
+
+
+def _range(limit: ElementTree.Element | None, kind: str, where: str) -> tuple[float, float]:
+    """Least and largest position of a joint."""
+    if limit is None or kind not in ('revolute', 'prismatic'):
+        return -math.inf, math.inf
+    lower, upper = (_numbers(limit.get(side, '0'), 1, f'{where}: {side}')[0] for side in ('lower', 'upper'))
+    if lower > upper:
+        raise ConfigError(f'{where}: lower = {lower:g} is above upper = {upper:g}')
+    return lower, upper
 
 
 def _three(

@@ -171,6 +171,10 @@ class Compensator:
             return Command(self._offsets.copy(), State.HOLDING, self._fault)
         return Command(self._offsets.copy(), State.FOLLOWING, '', self._residual, self._limited)
 
+    def keep(self, offsets: FloatArray) -> None:
+        """Hold at ``offsets``: those that the joints got. Newer ones were never sent."""
+        self._offsets = offsets.copy()
+
     def _refusal(self, now: float, seen: Observed) -> str:
         settings = self.settings
         finite = all(np.all(np.isfinite(part)) for part in (*seen.deflection, seen.covariance))

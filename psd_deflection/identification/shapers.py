@@ -7,6 +7,7 @@ Japan/USA Symposium on Flexible Automation (1996). MZV: the ZV of three impulses
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,6 +79,17 @@ def shaper(kind: str, frequency: float, damping: float) -> Shaper:
         raise ValueError(f'{kind!r} is no shaper; there are {", ".join(KINDS)}')
     total = math.fsum(sizes)
     return Shaper(kind, tuple(times), tuple(s / total for s in sizes))
+
+
+def in_series(shapers: Sequence[Shaper]) -> Shaper:
+    """One shaper that does what ``shapers`` do one after the other, for a link that rings with several modes."""
+    times, sizes = np.zeros(1), np.ones(1)
+    for each in shapers:
+        times = np.add.outer(times, each.times).ravel()
+        sizes = np.multiply.outer(sizes, each.sizes).ravel()
+    order = np.argsort(times, kind='stable')
+    name = '+'.join(each.name for each in shapers)
+    return Shaper(name, tuple(times[order].tolist()), tuple(sizes[order].tolist()))
 
 
 def recommended(frequency: float, frequency_sd: float, damping: float) -> Shaper:

@@ -2,12 +2,16 @@
 
 It subscribes to ``end_effector/deflection`` and ``joint_states``. Every 10 ms it publishes the offsets as
 trajectory_msgs/JointTrajectory with one point: on ``~/proposed`` if it runs dry, else on ``~/offsets``, which a
-controller adds to its commands. Then ``~/enable`` lets the offsets follow, or go back to zero. Everything is done in
-the main thread.
+controller adds to its commands. Then ``~/enable`` lets the offsets follow, or go back to zero.
+
+A thread of its own publishes the offsets and finds that deflections come no more, whatever the main thread waits for: a
+message, a terminal that does not read, a disk. On a busy machine it may be late. Then it sends no offset that it did
+not send before: what is sent is never newer than a deflection that is not stale.
 """
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -22,7 +26,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from msg_adapters import DEFLECTION_WITH_COVARIANCE, DIAGNOSTICS, END_EFFECTOR, TOPIC_TYPES, to_messages
 from psd_deflection.chains.transform import Transform
 from psd_deflection.compensation.arm import Arm
-from psd_deflection.compensation.compensator import Command, Compensator, CompensatorSettings, Observed, State
+from psd_deflection.compensation.compensator import Compensator, CompensatorSettings, Observed, State
 from psd_deflection.errors import Warned
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
@@ -36,6 +40,8 @@ NODE_NAME = 'compensator'
 ENABLE = '~/enable'
 OFFSETS, PROPOSED = '~/offsets', '~/proposed'
 PERIOD_S = 0.01
+TOLD_S = 0.02
+"""Changes of state that are shorter are not told, s."""
 NEWS = 6
 """Changes to one state that are told one by one, before they are counted and told together."""
 
@@ -54,7 +60,12 @@ class CompensatorNode:
     def __init__(self, arm: Arm, settings: CompensatorSettings, say: Callable[[str], None], drive: bool) -> None:
         self.compensator = Compensator(arm, settings, dry=not drive)
         self.compensator.enable(not drive)
-        self.command = self.compensator.watch(time.monotonic())
+        self._lock = threading.Lock()
+        """Of the compensator and of what was sent."""
+        self.command = self._told = self.compensator.watch(time.monotonic())
+        self._ended = threading.Event()
+        self._failed: BaseException | None = None
+        self._sender = threading.Thread(target=self._send_until_the_end, name='offsets', daemon=True)
         self._say = say
         self._repeats = Repeats(say)
         self._names = list(arm.names)
@@ -68,14 +79,16 @@ class CompensatorNode:
         if drive:
             node.create_service(SetBool, ENABLE, self._enable)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(PERIOD_S, self._tick, clock=steady)
+        node.create_timer(TOLD_S, self._tell, clock=steady)
         node.create_timer(1.0, self._report, clock=steady)
+        self._sender.start()
         say(f'publishing {self._out.topic_name} for {", ".join(arm.names)}')
 
     def release(self) -> bool:
         """Let the offsets go back to zero; True when they are there."""
-        if self.compensator.enabled:
-            self.compensator.enable(False)
+        with self._lock:
+            if self.compensator.enabled:
+                self.compensator.enable(False)
         return not np.any(self.command.offsets)
 
     def _seen(self, message: Any) -> None:
@@ -89,7 +102,8 @@ class CompensatorNode:
         deflection = Transform(rotation, np.array([at.x, at.y, at.z]))
         covariance = np.array(message.pose.covariance).reshape(6, 6)
         seen = Observed(t_ns / 1e9, deflection, covariance, (time.time_ns() - t_ns) / 1e9)
-        self._take(self.compensator.observe(time.monotonic(), seen))
+        with self._lock:
+            self.compensator.observe(time.monotonic(), seen)
 
     def _joints(self, message: Any) -> None:
         names = list(message.name)
@@ -101,29 +115,52 @@ class CompensatorNode:
             self._places = names, [names.index(name) for name in self._names]
         positions = np.array(message.position, dtype=np.float64)
         if len(positions) == len(names):
-            self.compensator.joints(time.monotonic(), positions[self._places[1]])
+            with self._lock:
+                self.compensator.joints(time.monotonic(), positions[self._places[1]])
 
-    def _tick(self) -> None:
-        now = time.monotonic()
-        self._repeats.settle(now)
-        self._take(self.compensator.watch(now))
-        point = JointTrajectoryPoint(positions=self.command.offsets.tolist())
+    def _send_until_the_end(self) -> None:
+        """Send the offsets every ``PERIOD_S``; a time that was missed is left out."""
+        due = time.monotonic()
+        try:
+            while not self._ended.wait(max(due - time.monotonic(), 0.0)):
+                self._send()
+                due = max(due + PERIOD_S, time.monotonic())
+        except BaseException as error:
+            self._failed = error
+
+    def _send(self) -> None:
+        with self._lock:
+            now, t_ns = time.monotonic(), time.time_ns()
+            command = self.compensator.watch(now)
+            if command.state is State.HOLDING:
+                self.compensator.keep(self.command.offsets)
+                command = command._replace(offsets=self.command.offsets)
+            self.command = command
+        point = JointTrajectoryPoint(positions=command.offsets.tolist())
         message = JointTrajectory(joint_names=self._names, points=[point])
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(t_ns, 1_000_000_000)
         self._out.publish(message)
 
-    def _take(self, command: Command) -> None:
-        before, self.command = self.command, command
+    def check(self) -> None:
+        """Raise what ended the thread that sends the offsets, if anything did."""
+        if self._failed is not None:
+            raise self._failed
+
+    def _tell(self) -> None:
+        self._repeats.settle(time.monotonic())
+        command = self.command
+        before, self._told = self._told, command
         if before.state is not command.state or (command.state is State.HOLDING and before.why != command.why):
             line = f'{command.state}{": " if command.why else ""}{command.why}'
             bad = command.state is State.HOLDING
             self._repeats.tell(str(command.state), Warned(line) if bad else line, time.monotonic(), NEWS)
 
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self.compensator.enable(request.data)
-        self._take(self.compensator.watch(time.monotonic()))
+        with self._lock:
+            self.compensator.enable(request.data)
+            command = self.compensator.watch(time.monotonic())
         response.success = True
-        response.message = f'{self.command.state}{": " if self.command.why else ""}{self.command.why}'
+        response.message = f'{command.state}{": " if command.why else ""}{command.why}'
         return response
 
     def _report(self) -> None:
@@ -139,7 +176,9 @@ class CompensatorNode:
             self._health.publish(cdr.encode(message.type, message.fields))
 
     def close(self) -> None:
-        """Leave the graph."""
+        """Send no more, and leave the graph."""
+        self._ended.set()
+        self._sender.join()
         self.node.destroy_node()
 
 
@@ -153,6 +192,7 @@ def run_compensator(
             with executor_of(owner.node) as executor:
                 while not signals.stop:
                     executor.spin_once(timeout_sec=SPIN_S)
+                    owner.check()
                 signals.stop = False
                 until = time.monotonic() + RELEASE_S
                 while drive and not (owner.release() or signals.stop) and time.monotonic() < until:

@@ -26,6 +26,7 @@ ENDLESS = (
     'estimator',
     'chain',
     'compensator',
+    'shaper',
     'monitor',
     'discover',
     'devices',

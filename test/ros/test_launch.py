@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from psd_deflection.cli.main import make_parser
 from psd_deflection.declarations import BY_NAME
 
 LAUNCH = Path(__file__).parent.parent.parent / 'launch'
@@ -92,6 +93,18 @@ def test_the_chain_is_launched_with_its_file(launch_modules: None) -> None:
     (node,) = names['chain'](dict.fromkeys(declared, '') | {'slopes': 'end_force', 'record': 'bags'})
     assert node.arguments[1:] == ['--slopes', 'end_force', '--record', 'bags']
     assert (node.executable, node.namespace.name) == ('chain', 'namespace')
+
+
+def test_the_shaper_is_launched_with_its_options(launch_modules: None) -> None:
+    names = runpy.run_path(str(LAUNCH / 'shaper.launch.py'))
+    declared = {a.words[0]: a for a in names['generate_launch_description']() if hasattr(a, 'description')}
+    assert declared.keys() == {'namespace', *names['ARGUMENTS'], *names['TOPICS']}
+    assert all(a.description for a in declared.values())
+    options = make_parser(['shaper']).parse_args(['shaper'])
+    assert set(names['ARGUMENTS']) <= vars(options).keys()
+    (node,) = names['shaper'](dict.fromkeys(declared, '') | {'frequency': '14', 'damping_ratio': '0.02'})
+    assert node.arguments == ['--frequency', '14', '--damping-ratio', '0.02']
+    assert [(a, b.name) for a, b in node.remappings] == [('~/trajectory', 'given'), ('~/shaped', 'shaped')]
 
 
 @pytest.mark.skipif(shutil.which('ros2') is None, reason='ros2 launch comes with a ROS installation')

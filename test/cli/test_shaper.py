@@ -1,0 +1,64 @@
+"""``shaper``: where it takes the mode from, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.cli.main import main, make_parser
+from psd_deflection.cli.shaper import shaper_of
+from psd_deflection.identification.shapers import Shaper, in_series, recommended, shaper
+
+CONFIG = Path(__file__).parents[2] / 'config'
+RIG = str(CONFIG / 'thesis_rig.yaml')
+
+
+def chosen(*options: str) -> Shaper:
+    return shaper_of(make_parser(['shaper']).parse_args(['shaper', *options]))[0]
+
+
+def test_the_mode_comes_from_the_rig_file_or_the_options(tmp_path: Path) -> None:
+    rig = tmp_path / 'rig.yaml'
+    rig.write_text(
+        '/**:\n  ros__parameters:\n    dynamics: {bending_frequency: 11.0, bending_damping_ratio: 0.03, '
+        'torsion_frequency: 25.0, torsion_damping_ratio: 0.01}\n'
+    )
+    assert chosen('--params-file', str(rig)) == recommended(11.0, 0.0, 0.03)
+    assert chosen('--params-file', str(rig), '--modes', 'torsion', '--shaper', 'zv') == shaper('zv', 25.0, 0.01)
+    both = in_series([shaper('ei', 11.0, 0.03), shaper('ei', 25.0, 0.01)])
+    assert chosen('--params-file', str(rig), '--modes', 'bending,torsion', '--shaper', 'ei') == both
+    assert chosen('--frequency', '9', '--damping-ratio', '0', '--shaper', 'mzv') == shaper('mzv', 9.0, 0.0)
+    assert chosen('--shaper', 'none').times == (0.0,)
+
+
+@pytest.mark.parametrize(
+    ('options', 'status', 'message'),
+    [
+        ([], 2, 'which mode: give --params-file, or --frequency and --damping-ratio; or --shaper none'),
+        (['--shaper', 'zvx'], 2, '--shaper zvx: must be one of zv, mzv, zvd, ei, recommended, none'),
+        (['--frequency', '9'], 2, '--frequency and --damping-ratio: must be given together'),
+        (['--frequency', '-9', '--damping-ratio', '0'], 2, '--frequency -9: must be a number of at least 0.1'),
+        (['--frequency', '9', '--damping-ratio', '0', '--params-file', RIG], 2, 'must not be given together'),
+        (
+            ['--params-file', RIG, '--modes', 'bending,bending'],
+            2,
+            '--modes bending,bending: must be of bending, torsion',
+        ),
+        (['--params-file', 'gone.yaml'], 3, 'gone.yaml: no such parameter file'),
+        (['--shaper', 'none', '--urdf', 'gone.urdf'], 3, 'gone.urdf: no such URDF file'),
+    ],
+)
+def test_refused(options: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['shaper', *options]) == status
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count('\n') == 1
+
+
+def test_a_rig_file_without_modes_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = tmp_path / 'rig.yaml'
+    rig.write_text('/**:\n  ros__parameters:\n    link.length: 0.6\n')
+    assert main(['shaper', '--params-file', str(rig)]) == 3
+    said = capsys.readouterr().err
+    assert f'{rig}: has no dynamics.bending_frequency; `psd-deflection identify` finds it' in said

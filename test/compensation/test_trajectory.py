@@ -1,0 +1,213 @@
+"""Shaped trajectories: what they are between their points, their limits, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import BPoly
+
+from bench import damping
+from psd_deflection.compensation.arm import JointLimits, read_limits
+from psd_deflection.compensation.trajectory import Trajectory, TrajectoryShaper, checked
+from psd_deflection.errors import ConfigError
+from psd_deflection.identification.shapers import KINDS, Shaper, in_series, shaper
+from psd_deflection.records import FloatArray
+
+S = 1_000_000_000
+NAMES = ('shoulder', 'elbow')
+ZVD = shaper('zvd', 12.0, 0.02)
+ZV = shaper('zv', 12.0, 0.02)
+
+
+def moved(orders: int, seconds: float = 0.5, to: float = 0.8) -> Trajectory:
+    """From rest to rest, with a point on the way."""
+    half = [0.5 * to, 0.1 * to], [1.5 * to / seconds, 0.2 * to], [0.0, 0.3]
+    end = [to, 0.2 * to], [0.0, 0.0], [0.0, 0.0]
+    start = [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]
+    points = [[list(v) if k < orders else [] for k, v in enumerate(point)] for point in (start, half, end)]
+    return checked(NAMES, [0.0, 0.5 * seconds, seconds], points)
+
+
+def summed(by: Shaper, path: Trajectory, at: FloatArray) -> FloatArray:
+    """The weighted sum itself."""
+    return np.asarray(sum(a * path.at(at - t)[:, 0] for t, a in zip(by.times, by.sizes, strict=True)))
+
+
+@pytest.mark.parametrize('orders', [1, 2, 3])
+@pytest.mark.parametrize('kind', KINDS)
+def test_the_controller_follows_the_sum_exactly(kind: str, orders: int) -> None:
+    by, path = shaper(kind, 12.0, 0.02), moved(orders)
+    shaped = TrajectoryShaper(by).shape(5 * S, path, {})
+    assert shaped.states.shape[1] == orders
+    assert shaped.duration == pytest.approx(path.duration + by.duration, abs=1e-9)
+    assert np.array_equal(shaped.states[0, 0], path.states[0, 0])
+    assert np.array_equal(shaped.states[-1, 0], path.states[-1, 0])
+    assert np.all(np.diff(shaped.times) > 0.0)
+    at = np.linspace(0.0, shaped.duration, 997)
+    np.testing.assert_allclose(shaped.at(at)[:, 0], summed(by, path, at), atol=2e-5)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.tuples(st.floats(0.02, 1.0), st.floats(-2.0, 2.0)), min_size=2, max_size=6), st.sampled_from(KINDS))
+def test_positions_and_speeds_stay_within_those_that_were_given(legs: list[tuple[float, float]], kind: str) -> None:
+    times = np.cumsum([leg[0] for leg in legs]) - legs[0][0]
+    points = [[[leg[1]], [0.0], []] for leg in legs]
+    path = checked(['a'], times.tolist(), points)
+    shaped = TrajectoryShaper(shaper(kind, 9.0, 0.01)).shape(0, path, {})
+    (low, high, speed), (least, most, fastest) = path.fastest(), shaped.fastest()
+    assert low[0] - 1e-6 <= least[0] <= most[0] <= high[0] + 1e-6
+    assert fastest[0] <= speed[0] * 1.02 + 1e-6
+
+
+@pytest.mark.parametrize('orders', [1, 2, 3])
+def test_one_that_replaces_another_goes_on_from_it(orders: int) -> None:
+    by = TrajectoryShaper(ZVD)
+    first = by.shape(0, moved(orders), {})
+    now = 0.2
+    there = moved(orders).at(np.array([now]))[0]
+    back = checked(NAMES, [0.0, 0.4], [[*there, *[[]] * (3 - orders)], [[0.0, 0.0]] * orders + [[]] * (3 - orders)])
+    second = by.shape(round(now * S), back, {})
+    # No step where it is replaced, nor later; a step is more than the fastest goes in 2 ms.
+    at = np.arange(0.0, second.duration, 0.002)
+    whole = np.concatenate([first.at(np.arange(0.0, now, 0.002))[:, 0], second.at(at)[:, 0]])
+    assert np.abs(np.diff(whole, axis=0)).max() < 0.002 * 5.0
+    # It is what the history asks for.
+    history = [moved(orders).at(np.minimum(at + now - t, now))[:, 0] for t in ZVD.times]
+    wanted = sum(
+        a * np.where((at - t >= 0.0)[:, None], back.at(at - t)[:, 0], past)
+        for t, a, past in zip(ZVD.times, ZVD.sizes, history, strict=True)
+    )
+    np.testing.assert_allclose(second.at(at)[:, 0], wanted, atol=2e-3)
+    assert np.array_equal(second.states[-1, 0], [0.0, 0.0])
+
+
+def test_a_stream_of_set_points_is_shaped() -> None:
+    by = TrajectoryShaper(ZV, max_step=0.05)
+    period, heard = 0.02, []
+    for n in range(60):
+        target = [min(0.01 * n, 0.3)]
+        point = checked(['a'], [period], [[target, [], []]])
+        shaped = by.shape(round((10.0 + n * period) * S), point, {'a': 0.0})
+        heard.append(shaped.at(np.array([0.0]))[0, 0, 0])
+    # Point n is reached after n + 1 periods.
+    wanted = sum(
+        a
+        * np.interp(
+            np.arange(60) * period - t, np.arange(61) * period, np.append(0.0, np.minimum(0.01 * np.arange(60), 0.3))
+        )
+        for t, a in zip(ZV.times, ZV.sizes, strict=True)
+    )
+    np.testing.assert_allclose(heard, wanted, atol=1e-6)
+    assert len(by._pieces) < 6
+
+
+def test_it_begins_where_the_joints_are() -> None:
+    without_start = checked(NAMES, [0.5], [[[0.8, 0.1], [0.0, 0.0], []]])
+    by = TrajectoryShaper(ZV)
+    with pytest.raises(ConfigError, match='no point at 0 s, and the position of elbow is not known'):
+        by.shape(0, without_start, {'shoulder': 0.3})
+    shaped = by.shape(0, without_start, {'shoulder': 0.3, 'elbow': 0.2, 'wrist': 0.0})
+    assert shaped.times[0] == 0.0
+    assert shaped.states[0].tolist() == [[0.3, 0.2], [0.0, 0.0]]
+    # Another arm may not be under way, or elsewhere.
+    other = checked(['wrist'], [0.0], [[[0.1], [], []]])
+    with pytest.raises(ConfigError, match='other joints are under way: shoulder, elbow'):
+        by.shape(S // 10, other, {})
+    assert by.shape(3 * S, other, {}).duration == pytest.approx(ZV.duration)
+    with pytest.raises(ConfigError, match=r'begins 0.4 rad or m from where wrist is, must be at most 0.05'):
+        TrajectoryShaper(ZV).shape(0, other, {'wrist': 0.5})
+
+
+def test_a_stop_is_forgotten() -> None:
+    by = TrajectoryShaper(ZVD)
+    by.shape(0, moved(2), {})
+    assert by.moves(round(0.5 * S))
+    assert not by.moves(round((0.5 + ZVD.duration + 0.01) * S))
+    by.forget()
+    assert not by.moves(round(0.1 * S))
+    elsewhere = checked(NAMES, [0.0], [[[2.0, 2.0], [], []]])
+    assert by.shape(round(0.1 * S), elsewhere, {}).states[0, 0].tolist() == [2.0, 2.0]
+
+
+def test_a_jump_under_way_is_refused_and_nothing_changes() -> None:
+    by = TrajectoryShaper(ZV)
+    by.shape(0, moved(1), {})
+    far = checked(NAMES, [0.0, 1.0], [[[2.0, 0.0], [], []], [[0.0, 0.0], [], []]])
+    with pytest.raises(ConfigError, match=r'begins .* from where shoulder is commanded'):
+        by.shape(round(0.2 * S), far, {})
+    there = moved(1).at(np.array([0.2]))[0]
+    again = checked(NAMES, [0.0], [[there[0].tolist(), [], []]])
+    assert by.shape(round(0.2 * S), again, {}).states[0, 0, 0] < there[0, 0]
+
+
+def test_limits_of_the_arm_are_those_of_its_file() -> None:
+    limits = read_limits(Path(__file__).parents[2] / 'config' / 'two_links.urdf')
+    assert limits == {'shoulder': JointLimits(-2.0, 2.0, 1.0), 'elbow': JointLimits(-math.inf, math.inf, math.inf)}
+    by = TrajectoryShaper(ZV, limits)
+    with pytest.raises(ConfigError, match=r'shoulder goes to 2.4, must be at most 2 rad or m'):
+        by.shape(0, moved(2, seconds=10.0, to=2.4), {})
+    with pytest.raises(ConfigError, match=r'shoulder goes to -2.4, must be at least -2'):
+        by.shape(0, moved(1, seconds=10.0, to=-2.4), {})
+    with pytest.raises(ConfigError, match=r'shoulder is as fast as 2.4, must be at most 1 rad/s'):
+        by.shape(0, moved(2, seconds=0.5, to=0.8), {})
+    assert not by.moves(S)
+    assert by.shape(0, moved(2, seconds=4.0, to=1.9), {}).states[-1, 0, 0] == 1.9
+
+
+GOOD = [[0.0], [], []]
+
+
+@pytest.mark.parametrize(
+    ('names', 'times', 'points', 'why'),
+    [
+        ([], [0.0], [[[], [], []]], 'joint_names: must be at least one'),
+        (['a', 'a'], [0.0], [[[0.0, 0.0], [], []]], 'none twice'),
+        (['a'], [], [], 'there are 0, must be 1 to 10000'),
+        (['a'], [0.0], [[[], [], []]], 'point 0 has no positions'),
+        (['a'], [0.0], [[[0.0, 1.0], [], []]], 'point 0 has 2 positions, must be 1'),
+        (['a'], [0.0, 1.0], [[[0.0], [0.0], []], GOOD], 'point 1 has 0 velocities, must be 1'),
+        (['a'], [0.0, 1.0], [GOOD, [[0.0], [], [0.0]]], 'point 1 has 1 accelerations, must be 0'),
+        (['a'], [0.0, 1.0], [GOOD, [[math.nan], [], []]], 'point 1 is not finite'),
+        (['a'], [0.0, 1.0], [GOOD, [[1e300], [], []]], r'point 1 is not finite, or beyond 1e\+06'),
+        (['a'], [0.0, math.nan], [GOOD, GOOD], 'time_from_start = nan'),
+        (['a'], [1.0, 1.0], [GOOD, GOOD], r'point 1: time_from_start = 1 s: must be 0.001 s after'),
+        (['a'], [-1.0, 1.0], [GOOD, GOOD], r'point 0: time_from_start = -1 s'),
+        (['a'], [0.0, 1e5], [GOOD, GOOD], 'it takes 100000 s, must be at most 3600 s'),
+        (['a'], [0.0, 1.0], [[[0.0], [0.0], []], [[1.0], [0.2], []]], 'ends in motion: a at 0.2 rad/s'),
+    ],
+)
+def test_what_cannot_be_followed_is_refused(
+    names: list[str], times: list[float], points: list[list[list[float]]], why: str
+) -> None:
+    with pytest.raises(ConfigError, match=why):
+        checked(names, times, points)
+
+
+def test_shapers_in_series_end_both_modes() -> None:
+    both = in_series([shaper('zv', 12.0, 0.02), shaper('zvd', 21.0, 0.01)])
+    assert sum(both.sizes) == pytest.approx(1.0)
+    assert both.name == 'zv+zvd'
+    assert list(both.times) == sorted(both.times)
+    assert both.residual(12.0, 0.02)[0] < 1e-9
+    assert both.residual(21.0, 0.01)[0] < 1e-9
+
+
+@pytest.mark.parametrize(('kind', 'wrong'), [('zv', 1.0), ('mzv', 1.0), ('zvd', 0.95), ('ei', 1.05)])
+def test_after_a_shaped_move_of_the_arm_five_percent_of_the_vibration_are_left(kind: str, wrong: float) -> None:
+    assert damping.left(shaper(kind, wrong * damping.FREQUENCY, damping.RATIO)) < 0.05
+
+
+@pytest.mark.parametrize('orders', [1, 2, 3])
+def test_between_its_points_it_meets_the_states_of_both(orders: int) -> None:
+    rng = np.random.default_rng(orders)
+    times, states = np.array([0.0, 0.3, 1.1, 1.2]), rng.normal(size=(4, orders, 2))
+    path = Trajectory(NAMES, times, states)
+    wanted = BPoly.from_derivatives(times, states)
+    at = np.linspace(0.0, 1.1999, 300)
+    for order in range(orders):
+        np.testing.assert_allclose(path.at(at)[:, order], wanted(at, nu=order), atol=1e-9)
