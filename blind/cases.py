@@ -26,7 +26,7 @@ SIZES = (1.0, 3.0, 10.0)
 SHOWS_ACROSS_LENGTHS = frozenset(
     (
         *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
-        *('self_weight', 'mount_tilt'),
+        *('self_weight', 'mount_tilt', 'tip_force'),
     )
 )
 """Effects that one link length cannot distinguish; half of their cases have two lengths."""
@@ -39,6 +39,7 @@ MIMICKED: Mapping[str, str] = {
     'sensor_rotation': 'axis_crosstalk',
     'self_weight': 'mount_tilt',
     'mount_tilt': 'sensor_position of both PSDs',
+    'tip_force': 'mount_tilt',
     'refraction': 'thermal_drift of both PSDs',
     'axis_crosstalk': 'sensor_rotation and sensor_gain on the diagonals these loads give',
 }
@@ -169,6 +170,7 @@ DRAWS: Mapping[str, Draw] = {
     'amplifier_lag': _one('time_constant', 1e-4, signed=False),
     'channel_skew': _one('delay', 1e-4, signed=False, psd=True),
     'quantisation': _one('step', 1e-3, signed=False),
+    'tip_force': _xy(1e-2),
     'alien_cubic_spring': _one('size', 1e-4),
     'alien_quadratic_load': _one('size', 1e-9),
     'alien_soft_mode': _one('size', 1e-4),

@@ -138,7 +138,12 @@ def motion(loads: Array, length: float, effects: Sequence[Spec], warm: Array | N
                 static[i, axis] = follower
     sag = np.zeros(3)
     for e in find(effects, 'self_weight'):
-        sag[1] -= e['weight_per_length'] * length**4 / (8.0 * stiff_b)
+        # Its moment w L^2/2 turns the clamp too.
+        clamp = sum(c['compliance'] for c in find(effects, 'clamp_bending_compliance'))
+        sag[1] -= e['weight_per_length'] * (length**4 / (8.0 * stiff_b) + clamp * length**3 / 2.0)
+    for e in find(effects, 'tip_force'):
+        sag[0] += e['x'] * give_b
+        sag[1] += e['y'] * give_b
     for e in find(effects, 'mount_tilt'):
         sag[0] += e['x'] * length
         sag[1] += e['y'] * length
@@ -438,6 +443,7 @@ LINK = frozenset(
     (
         *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
         *('clamp_friction', 'creep', 'damping', 'tip_mass', 'second_bending_mode', 'self_weight', 'mount_tilt'),
+        'tip_force',
         *('load_offset', 'load_direction', 'alien_cubic_spring', 'alien_quadratic_load', 'alien_soft_mode'),
         *('law_load', 'law_link'),
     )

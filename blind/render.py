@@ -211,20 +211,31 @@ def developed(scene: Scene, grey: Array, rng: np.random.Generator) -> npt.NDArra
     return np.clip(np.rint(grey + sd * rng.standard_normal(grey.shape)), 0, 255).astype(np.uint8)
 
 
-def board(scene: Scene, pose: Pose, texture: Array, size: tuple[float, float], parts: int = 4) -> Array:
-    """A flat picture on the tip plate in place of discs: the white share; ``size`` m, its middle at the origin."""
+def board(scene: Scene, pose: Pose, texture: Array, size: tuple[float, float]) -> Array:
+    """A flat picture on the tip plate in place of discs: the white share; ``size`` m, its middle at the origin.
+
+    A pixel whose corners and middle are not all alike is sampled at the 89 places of a Fibonacci lattice, no two of
+    which are in a row or a column: an edge along the rows of the image is then as fine as any other.
+    """
     ray_x, ray_y, k = rays(scene.width, scene.height, scene.focal, tuple(scene.centre), tuple(scene.distortion))
-    out = np.zeros((scene.height, scene.width))
     sign = 1.0 if scene.view == 'outside' else -1.0
     high, wide = texture.shape
-    for i in range(parts * parts):
-        du, dv = (i // parts + 0.5) / parts - 0.5, (i % parts + 0.5) / parts - 0.5
-        x, y = on_plate(scene, pose, ray_x + k[0] * du + k[1] * dv, ray_y + k[2] * du + k[3] * dv)
+
+    def sampled(of: npt.NDArray[np.bool_], du: float, dv: float) -> Array:
+        rx, ry = (r[of] + a[of] * du + b[of] * dv for r, a, b in ((ray_x, k[0], k[1]), (ray_y, k[2], k[3])))
+        x, y = on_plate(scene, pose, rx, ry)
         column = np.floor((sign * x / size[0] + 0.5) * wide).astype(int)
         row = np.floor((0.5 - y / size[1]) * high).astype(int)
         on = (column >= 0) & (column < wide) & (row >= 0) & (row < high)
-        out += np.where(on, texture[np.clip(row, 0, high - 1), np.clip(column, 0, wide - 1)], 1.0)
-    return out / parts**2
+        return np.where(on, texture[np.clip(row, 0, high - 1), np.clip(column, 0, wide - 1)], 1.0)
+
+    everywhere = np.ones((scene.height, scene.width), dtype=bool)
+    out = sampled(everywhere, 0.0, 0.0).reshape(everywhere.shape)
+    ends = [sampled(everywhere, du, dv).reshape(out.shape) for du in (-0.5, 0.5) for dv in (-0.5, 0.5)]
+    edge = np.any(np.array(ends) != out, axis=0)
+    lattice = [((i + 0.5) / 89 - 0.5, (55 * i % 89 + 0.5) / 89 - 0.5) for i in range(89)]
+    out[edge] = np.mean([sampled(edge, du, dv) for du, dv in lattice], axis=0)
+    return out
 
 
 def photograph_of(scene: Scene, part: Array, rng: np.random.Generator) -> npt.NDArray[np.uint8]:

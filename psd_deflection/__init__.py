@@ -11,6 +11,7 @@
     pd.solve([0.0, -1e-3, 0.0, -2e-3], rig).pose         # dots in m (x1, y1, x2, y2) to dX m, dY m, theta rad
     pd.simulate(rig, (0, -10, -5.85), seconds=2)         # a recording of this rig under a load, N, N, N m
     pd.discover([recording], rig)                        # the effects that the simulation lacks
+    pd.discover_in(plant)                                # the same for a machine of yours that simulates itself
 
 SI units everywhere. What is refused raises a subclass of ``psd_deflection.errors.PsdDeflectionError``: one line with
 the file or argument, the value and its bound. The command ``psd-deflection`` does the same from a shell, and more.
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
     from psd_deflection.config import Rig
     from psd_deflection.discovery.discover import Discovery
+    from psd_deflection.discovery.plants import Plant, PlantDiscovery
     from psd_deflection.recordings.estimates import EstimateSeries
     from psd_deflection.recordings.recording import Recording
     from psd_deflection.recordings.simulated_recording import SimulatedRecording
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
 
 __version__ = '0.1.0'
 
-__all__ = ['discover', 'load_rig', 'open', 'replay', 'simulate', 'solve']
+__all__ = ['discover', 'discover_in', 'load_rig', 'open', 'replay', 'simulate', 'solve']
 
 # Every function imports what it needs when it is called, to keep `import psd_deflection` fast.
 
@@ -192,6 +194,20 @@ def discover(
 
     known = None if rig is None else _rig(rig)
     return of_observations(read_observations(recordings, known, any_rate=True), known, seed=seed)
+
+
+def discover_in(plant: Plant, *, seed: int = 0) -> PlantDiscovery:
+    """Name the effects that the simulation of ``plant``, a machine of yours, lacks to explain what was measured.
+
+    ``plant``: a :class:`psd_deflection.discovery.plants.Plant`, which has measured tables, a simulation and a library
+    of effects that may be missing. Search, rules and answer are those of :func:`discover`;
+    ``psd_deflection.discovery.result.result`` and ``psd_deflection.discovery.report.report_html`` turn the answer into
+    ``result.json`` and a page. The same ``seed`` gives the same answer. Raises
+    :class:`psd_deflection.errors.ConfigError` if the plant contradicts itself.
+    """
+    from psd_deflection.discovery.plants import discover_in as of_plant
+
+    return of_plant(plant, seed=seed)
 
 
 def _rig(rig: Rig | str | Path | None) -> Rig:

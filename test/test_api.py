@@ -41,7 +41,15 @@ def test_the_import_is_fast_and_brings_nothing_along() -> None:
 
 def test_help_teaches() -> None:
     text = pydoc.plain(pydoc.render_doc(psd_deflection))
-    assert sorted(psd_deflection.__all__) == ['discover', 'load_rig', 'open', 'replay', 'simulate', 'solve']
+    assert sorted(psd_deflection.__all__) == [
+        'discover',
+        'discover_in',
+        'load_rig',
+        'open',
+        'replay',
+        'simulate',
+        'solve',
+    ]
     for name in psd_deflection.__all__:
         assert f'\n    {name}(' in text
         assert f'.{name}(' in text.partition('FUNCTIONS')[0]

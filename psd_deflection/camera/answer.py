@@ -39,7 +39,7 @@ class TargetPose(NamedTuple):
     """Where the target is in the camera's axes: a point P of the target lies at ``rotation @ P + place``, m.
 
     ``covariance`` (6, 6) of a small turn about the target's own axes (rad) and of ``place`` (m).
-    ``cost``: weighted sum of squares of the residuals, to compare two poses of one image.
+    ``cost``: minus twice the log likelihood for each of the ``residuals``, to compare two poses of one image.
     ``points`` (n, 2): pixels of what was found (centres of discs, corners). ``blur``: length of the motion blur, px.
     ``scale``: apparent radius of the discs, in units of what the spacing makes it (1.0 for other targets).
     ``noise``: rms of the residuals, grey levels or px. ``planar``: the distance is not known (no camera matrix).
@@ -50,6 +50,7 @@ class TargetPose(NamedTuple):
     place: FloatArray
     covariance: FloatArray
     cost: float
+    residuals: int
     points: FloatArray
     blur: float = 0.0
     scale: float = 1.0

@@ -23,6 +23,9 @@ AFFINE_TILT_SD = 0.05
 MOTION_TILT_SD = 0.05
 """Tilt of the plate against its rest, one sd, rad: a link of this kind tilts by some hundredths."""
 
+ALIKE = 30.0
+"""Twice the log of how much more likely one of two tilts must be: else the covariance has both."""
+
 _OBLIQUE = math.radians(60.0)
 _UNSURE = math.cos(math.radians(75.0))
 
@@ -50,7 +53,7 @@ class Discs:
             raise RefusedError(Status.SMALL)
         if regions[1].axes[0] < math.cos(_OBLIQUE) * regions[1].axes[1]:
             raise RefusedError(Status.OBLIQUE)
-        apart = regions[0].centre - regions[2].centre
+        apart = np.subtract(regions[0].centre, regions[2].centre)
         upright = float(apart @ self._up) / float(np.linalg.norm(apart))
         if self._answered and abs(upright) < _UNSURE:
             # The target looks the same after half a turn.
@@ -85,7 +88,13 @@ class Discs:
                 reason = error
         if not fits:
             raise reason
-        return min(fits, key=lambda f: f.cost)
+        best, *others = sorted(fits, key=lambda f: f.cost)
+        for other in others:
+            if (other.cost - best.cost) * best.residuals < ALIKE:
+                turn = best.rotation.T @ other.rotation
+                off = np.concatenate([(turn - turn.T)[(2, 0, 1), (1, 2, 0)] / 2, other.place - best.place])
+                best = best._replace(covariance=best.covariance + np.outer(off, off))
+        return best
 
     def _frontal(self, rays: FloatArray) -> FloatArray:
         """The rotation of a plate that faces the camera, by the line of discs."""
@@ -96,9 +105,10 @@ class Discs:
 
     def _tilt(self, region: Region, frontal: FloatArray) -> FloatArray:
         """A turn about the long axis of the ellipse that makes it as narrow as it is, in the target's axes, rad."""
-        values, vectors = np.linalg.eigh(region.shape)
-        ratio = math.sqrt(min(max(values[0] / values[1], 0.0), 1.0))
-        return np.asarray((frontal.T @ np.append(vectors[:, 1], 0.0)) * max(math.acos(ratio), 0.03))
+        xx, xy, yy = region.shape
+        angle = math.atan2(2.0 * xy, xx - yy) / 2
+        ratio = min(region.axes[0] / region.axes[1], 1.0)
+        return np.asarray(frontal.T @ [math.cos(angle), math.sin(angle), 0.0] * max(math.acos(ratio), 0.03))
 
     def _place(self, rays: FloatArray, rotation: FloatArray) -> FloatArray:
         """Where a target of this rotation has its centres on ``rays`` (3, 2): linear least squares."""

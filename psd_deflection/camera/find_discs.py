@@ -8,14 +8,13 @@ spacing / radius: a ratio that no view of a plane changes as long as perspective
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from psd_deflection.camera.answer import RefusedError, Status
 from psd_deflection.camera.opencv import opencv
-from psd_deflection.records import FloatArray
 
 CLEAR = 8.0
 """Least distance of another bright thing from the rim of a disc, px."""
@@ -34,45 +33,75 @@ _MAX_REGIONS = 400
 _MIN_CONTRAST = 8.0
 
 
-class Region(NamedTuple):
-    """An outline: centre (x, y) px, ``shape`` (2, 2) with (u - centre)^T shape^-1 (u - centre) = 1 on the ellipse."""
+_COARSE_HEIGHT, _COARSE_RADIUS = 200, 15.0
+"""Rows of an image made small for the first look, at least; half-width of a disc in it, px, with which it counts."""
 
-    centre: FloatArray
-    shape: FloatArray
+
+class Region(NamedTuple):
+    """An outline: centre (x, y) px, half-axes ``axes`` px, the shorter first.
+
+    ``shape`` (xx, xy, yy), px^2: (u - centre)^T shape^-1 (u - centre) = 1 on the ellipse.
+    """
+
+    centre: tuple[float, float]
+    shape: tuple[float, float, float]
+    axes: tuple[float, float]
     round: bool
     at_border: bool
 
-    @property
-    def axes(self) -> tuple[float, float]:
-        """Half-axes, px: the shorter, the longer."""
-        small, large = np.linalg.eigvalsh(self.shape)
-        return math.sqrt(max(small, 0.0)), math.sqrt(max(large, 0.0))
-
-    def half_width(self, direction: FloatArray) -> float:
+    def half_width(self, x: float, y: float) -> float:
         """Half-width through the centre along a unit vector, px."""
-        return 1.0 / math.sqrt(float(direction @ np.linalg.solve(self.shape, direction)))
+        xx, xy, yy = self.shape
+        return math.sqrt((xx * yy - xy * xy) / (yy * x * x - 2.0 * xy * x * y + xx * y * y))
+
+    def away(self, other: Region) -> float:
+        """Distance of the centres, px."""
+        return math.dist(self.centre, other.centre)
+
+    def enlarged(self, by: int) -> Region:
+        """The same in an image whose pixels were taken together ``by`` x ``by``."""
+        x, y = (by * c + (by - 1) / 2 for c in self.centre)
+        xx, xy, yy = (by * by * s for s in self.shape)
+        return self._replace(centre=(x, y), shape=(xx, xy, yy), axes=(by * self.axes[0], by * self.axes[1]))
 
 
 def find_discs(grey: Any, ratio: float) -> list[Region]:
     """The three discs in an 8-bit image, from one end of the line to the other; ``ratio``: spacing / radius.
 
+    Large discs show in an image made small, which takes less time; what is not found there is sought in all pixels.
     Raises RefusedError with the reason if there is no target, or more than one.
     """
+    by = min(grey.shape) // _COARSE_HEIGHT
+    if by > 1:
+        rows, columns = (n // by for n in grey.shape)
+        small = opencv().resize(grey[: rows * by, : columns * by], (columns, rows), interpolation=opencv().INTER_AREA)
+        try:
+            found = _found([next(_binaries(small, smooth=False))], ratio, CLEAR / by)
+        except RefusedError as error:
+            if error.status is Status.DOUBLED:
+                raise
+        else:
+            if min(r.axes[0] for r in found) > _COARSE_RADIUS:
+                return [r.enlarged(by) for r in found]
+    return _found(_binaries(grey), ratio, CLEAR)
+
+
+def _found(binaries: Iterable[Any], ratio: float, clear: float) -> list[Region]:
     best: tuple[int, Status] = (0, Status.MISSING)
-    for binary in _binaries(grey):
+    for binary in binaries:
         regions = _regions(binary)
         lines = _lines([r for r in regions if r.round and not r.at_border], ratio)
         if len(lines) > 1:
             raise RefusedError(Status.DOUBLED)
         if lines:
-            if _crowded(lines[0], regions):
+            if _crowded(lines[0], regions, clear):
                 raise RefusedError(Status.DOUBLED)
             return lines[0]
         best = max(best, _why(regions, ratio), key=lambda b: b[0])
     raise RefusedError(best[1])
 
 
-def _binaries(grey: Any) -> Iterator[Any]:
+def _binaries(grey: Any, *, smooth: bool = True) -> Iterator[Any]:
     """The image cut at several levels: the one between the two commonest first."""
     cv2 = opencv()
     thin = max(min(grey.shape) // 120, 1)
@@ -81,15 +110,16 @@ def _binaries(grey: Any) -> Iterator[Any]:
     if high - low < _MIN_CONTRAST:
         raise RefusedError(Status.MISSING)
     # Noise of a pixel must not fray the outline; the sub-pixel fit sees the image as it is.
-    smooth = cv2.blur(grey, (3, 3))
-    level, binary = cv2.threshold(smooth, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
+    if smooth:
+        grey = cv2.blur(grey, (3, 3))
+    level, binary = cv2.threshold(grey, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
     yield binary
     for part in (0.5, 0.25, 0.75):
         other = low + part * (high - low)
         if abs(other - level) > 0.05 * (high - low):
-            yield cv2.threshold(smooth, other, 255, cv2.THRESH_BINARY)[1]
+            yield cv2.threshold(grey, other, 255, cv2.THRESH_BINARY)[1]
     block = 2 * (min(grey.shape) // 6) + 1
-    yield cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, block, -0.1 * (high - low))
+    yield cv2.adaptiveThreshold(grey, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, block, -0.1 * (high - low))
 
 
 def _regions(binary: Any) -> list[Region]:
@@ -105,18 +135,21 @@ def _regions(binary: Any) -> list[Region]:
         area = m['m00']
         if area < 20.0:
             continue
-        # The outline joins the centres of the outer pixels: half a pixel is missing all around.
-        shape = 4.0 / area * np.array([[m['mu20'], m['mu11']], [m['mu11'], m['mu02']]])
-        small, large = np.sqrt(np.maximum(np.linalg.eigvalsh(shape), 1e-9))
+        scale = 4.0 / area
+        xx, xy, yy = scale * m['mu20'], scale * m['mu11'], scale * m['mu02']
+        half, apart = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)
+        least, most = math.sqrt(max(half - apart, 1e-9)), math.sqrt(max(half + apart, 1e-9))
         is_round = (
-            abs(math.pi * small * large / area - 1.0) < _ELLIPSE_MISFIT + 0.3 / small
-            and small > _MIN_AXIS_RATIO * large
+            abs(math.pi * least * most / area - 1.0) < _ELLIPSE_MISFIT + 0.3 / least and least > _MIN_AXIS_RATIO * most
         )
         x, y, w, h = cv2.boundingRect(outline)
         at_border = x <= 1 or y <= 1 or x + w >= columns - 1 or y + h >= rows - 1
-        centre = np.array([m['m10'], m['m01']]) / area
-        found.append(Region(centre, shape * ((small + 0.5) / small) ** 2, bool(is_round), at_border))
-    found.sort(key=lambda r: -float(np.linalg.det(r.shape)))
+        # The outline joins the centres of the outer pixels: half a pixel is missing all around.
+        wider = (least + 0.5) / least
+        xx, xy, yy = (s * wider * wider for s in (xx, xy, yy))
+        centre = (m['m10'] / area, m['m01'] / area)
+        found.append(Region(centre, (xx, xy, yy), (least * wider, most * wider), is_round, at_border))
+    found.sort(key=lambda r: -r.axes[0] * r.axes[1])
     return found[:_MAX_REGIONS]
 
 
@@ -126,33 +159,35 @@ def _lines(regions: list[Region], ratio: float) -> list[list[Region]]:
     large = [r for r in regions if r.axes[0] >= 2.0][:60]
     for i, first in enumerate(large):
         for last in large[i + 1 :]:
-            apart = last.centre - first.centre
-            distance = float(np.linalg.norm(apart)) / 2
-            along = apart / (2 * distance)
-            widths = [first.half_width(along), last.half_width(along)]
+            distance = first.away(last) / 2
+            if distance < 1.0:
+                continue
+            along = [(b - a) / (2 * distance) for a, b in zip(first.centre, last.centre, strict=True)]
+            widths = [first.half_width(*along), last.half_width(*along)]
             mean = sum(widths) / 2
             if abs(widths[0] - widths[1]) > _SIZE_TOLERANCE * mean:
                 continue
             # Where an outline was cut is known to a pixel or so.
             if abs(distance / mean / ratio - 1.0) > _RATIO_TOLERANCE + 1.0 / mean:
                 continue
+            between = [(a + b) / 2 for a, b in zip(first.centre, last.centre, strict=True)]
             for middle in large:
-                off = float(np.linalg.norm(middle.centre - (first.centre + last.centre) / 2))
+                off = math.dist(middle.centre, between)
                 if off > _MIDDLE_TOLERANCE * mean or middle is first or middle is last:
                     continue
-                if abs(middle.half_width(along) - mean) <= _SIZE_TOLERANCE * mean:
+                if abs(middle.half_width(*along) - mean) <= _SIZE_TOLERANCE * mean:
                     lines.append([first, middle, last])
     return lines
 
 
-def _crowded(line: list[Region], regions: list[Region]) -> bool:
+def _crowded(line: list[Region], regions: list[Region], clear: float) -> bool:
     """Whether something as bright and not much smaller is so near to a disc that it lights its rim."""
     for disc in line:
         size = disc.axes[1]
         for other in regions:
             if any(other is d for d in line) or not 0.2 * size < other.axes[1] < 1.5 * size:
                 continue
-            if np.linalg.norm(other.centre - disc.centre) < size + other.axes[1] + CLEAR:
+            if disc.away(other) < size + other.axes[1] + clear:
                 return True
     return False
 
@@ -163,11 +198,7 @@ def _why(regions: list[Region], ratio: float) -> tuple[int, Status]:
     whole = [r for r in fair if r.round and not r.at_border]
     if len(whole) in (1, 2):
         reach = 2.4 * ratio * max(r.axes[1] for r in whole)
-        if any(
-            r.at_border and np.linalg.norm(r.centre - w.centre) < reach and r.axes[1] < 1.5 * w.axes[1]
-            for r in fair
-            for w in whole
-        ):
+        if any(r.at_border and r.away(w) < reach and r.axes[1] < 1.5 * w.axes[1] for r in fair for w in whole):
             return 4, Status.OUTSIDE
         return 3, Status.HIDDEN
     if len(whole) >= 3:

@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
 from scipy.special import ndtr
 
 from psd_deflection.camera.answer import RefusedError, Status, TargetPose
@@ -35,6 +34,7 @@ _SETTLED = 5.0
 """A step of fewer standard deviations is the last once the picture fits: over it the model is linear."""
 _THINNED = 4
 _LIGHTS = 6
+_HALF_OCTANT = math.tan(math.pi / 8)
 _SECTORS = 16
 """Parts of a rim whose residuals are taken together: what is correlated along a rim widens the covariance."""
 
@@ -55,8 +55,9 @@ _ROOT_2PI = math.sqrt(2.0 * math.pi)
 MOST_BLUR = 1.0
 """Longest motion blur with an answer, in units of a disc's radius."""
 
-MEAN_OF_BLUR = 0.22
-"""Error of the mean place over the exposure, one sd in units of the standard deviation of the motion within it."""
+MEAN_OF_BLUR = 0.2
+"""Error of the mean place over the exposure, one sd in units of the standard deviation of the motion within it.
+The worst is two pictures of like strength, of which one is taken: by one standard deviation of the motion."""
 
 MOST_DEFOCUS = 0.15
 """Largest blur (sd) of an image at rest with an answer, in units of a disc's radius."""
@@ -92,21 +93,23 @@ class Prior(NamedTuple):
 
 
 class _Rims(NamedTuple):
-    """The pixels near the rims, disc after disc: ``begin`` (4) of each disc, grey levels, rays x and y, place (3, n)
-    in the image as (1, u, v) from the disc's centre in units of its size; ``bend`` (3, 2, 2): d ray / d pixel there."""
+    """The pixels near the rims, disc after disc: ``begin`` (4) of each disc, grey levels, rays (3, n), place (3, n) in
+    the image as (1, u, v) from the disc's centre in units of its size; ``bend`` (3, 2, 2): d ray / d pixel there;
+    ``pixel``: number of the pixel in the image."""
 
     begin: IntArray
     level: Pixels
-    x: Pixels
-    y: Pixels
+    rays: Pixels
     flat: Pixels
     bend: FloatArray
+    pixel: IntArray
 
     def thinned(self) -> _Rims:
         """Each fourth pixel, for the first steps."""
-        chosen = np.arange(0, self.begin[-1], _THINNED)
-        begin = np.searchsorted(chosen, self.begin)
-        return _Rims(begin, self.level[chosen], self.x[chosen], self.y[chosen], self.flat[:, chosen], self.bend)
+        chosen = np.s_[::_THINNED]
+        begin = -(-self.begin // _THINNED)
+        rays, flat = np.ascontiguousarray(self.rays[:, chosen]), np.ascontiguousarray(self.flat[:, chosen])
+        return _Rims(begin, self.level[chosen], rays, flat, self.bend, self.pixel[chosen])
 
 
 class _Shape(NamedTuple):
@@ -142,11 +145,9 @@ class Fitter:
     def __init__(self, lens: Lens, image_shape: tuple[int, int], centres: FloatArray, radius: float) -> None:
         self._lens, self._centres, self._radius = lens, centres, radius
         grid = lens.grid(image_shape)
-        self._x = np.ascontiguousarray(grid[..., 0], dtype=np.float32)
-        self._y = np.ascontiguousarray(grid[..., 1], dtype=np.float32)
-        self._step = 1.0 / lens.focal
-        turn = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
-        self._circle = radius * np.column_stack([np.cos(turn), np.sin(turn), np.zeros(24)])
+        self._rows, self._columns = image_shape
+        self._rays = np.ones((3, grid[..., 0].size), dtype=np.float32)
+        self._rays[:2] = grid.reshape(-1, 2).T
         self._points = np.column_stack([centres, np.zeros(len(centres))])
         self._blur = np.eye(2)
 
@@ -157,20 +158,19 @@ class Fitter:
         """
         shape = _Shape(rotation, place, 1.0, self._blur, np.zeros(0), np.zeros((len(self._centres), _LIGHTS)))
         pixel_radius = self._radius * self._lens.focal / float(place[2])
-        half = min(4.5, 0.6 * pixel_radius)
-        rims = self._gather(image, shape, half)
-        shape = shape._replace(light=self._first_light(rims.thinned(), shape))
+        half = min(_width(self._blur), 0.6 * pixel_radius)
+        rims, light = self._gather(image, shape, half)
+        shape = shape._replace(light=light)
         for _ in range(4):
             shape, noise = self._converge(rims.thinned(), shape, prior)
-            widest = math.sqrt(float(np.linalg.eigvalsh(shape.blur)[1]))
-            wanted = min(max(3.2 * widest + 1.0, 4.0), 0.75 * pixel_radius)
+            wanted = min(_width(shape.blur), 0.75 * pixel_radius)
             skewed = _motion(shape.blur) > _SKEW_BLUR and not shape.skew.size
             if skewed:
                 shape = shape._replace(skew=np.zeros(4))
             if not skewed and wanted < 1.15 * half:
                 break
             half = max(wanted, half)
-            rims = self._gather(image, shape, half)
+            rims, _ = self._gather(image, shape, half)
         for _ in range(3):
             normal = self._linearise(rims, shape, noise)
             shape, step, deviation = self._stepped(normal, shape, prior, len(rims.level))
@@ -181,40 +181,50 @@ class Fitter:
             self._blur = shape.blur
         return found
 
-    def _gather(self, image: Any, shape: _Shape, half: float) -> _Rims:
-        rows, columns = self._x.shape
-        inverse = _to_plane(shape)
-        turned_points = self._points @ shape.rotation.T + shape.place
-        middles = self._lens.project(turned_points)
-        seen = self._lens.project((self._circle @ shape.rotation.T)[None] + turned_points[:, None])
-        low, high = seen.min(axis=1), seen.max(axis=1)
-        if low.min() < half + 2 or (high > (columns - half - 3, rows - half - 3)).any():
-            raise RefusedError(Status.OUTSIDE)
+    def _gather(self, image: Any, shape: _Shape, half: float) -> tuple[_Rims, FloatArray]:
+        """The pixels nearer than ``half`` to a rim, and first lights by the means in and out of it."""
+        rows, columns = self._rows, self._columns
+        middles = self._lens.project(self._points @ shape.rotation.T + shape.place)
         bends = self._bends(middles)
+        # Over a disc the way from the image to the plane is nearly affine: good enough to choose pixels.
+        slopes = self._slopes(_to_plane(shape), shape, bends)
+        squares = slopes.transpose(0, 2, 1) @ slopes
+        reach = self._radius * np.sqrt(np.linalg.inv(squares)[:, (0, 1), (0, 1)])
+        if (middles - reach).min() < half + 2 or (middles + reach > (columns - half - 3, rows - half - 3)).any():
+            raise RefusedError(Status.OUTSIDE)
         # Wide enough for the direction in which the picture is the longest.
-        bands = half * np.linalg.norm(self._slopes(inverse, shape, bends), 2, axis=(1, 2))
-        starts = np.floor(low - half - 1).astype(int).tolist()
-        ends = np.ceil(high + half + 2).astype(int).tolist()
-        begin, parts = [0], []
+        bands = half * np.sqrt(np.linalg.eigvalsh(squares)[:, 1])
+        starts = np.floor(middles - reach - half - 1).astype(int).tolist()
+        ends = np.ceil(middles + reach + half + 2).astype(int).tolist()
+        begin, places, parts = [0], [], []
+        wide = np.arange(max(self._rows, self._columns), dtype=float)
+        light = np.zeros((len(self._centres), _LIGHTS))
         for k, ((left, top), (right, bottom)) in enumerate(zip(starts, ends, strict=True)):
-            window = np.s_[top:bottom, left:right]
-            x, y = self._x[window], self._y[window]
-            px, py = _on_plane(inverse, x, y)
-            px -= float(self._centres[k, 0])
-            py -= float(self._centres[k, 1])
-            px *= px
-            py *= py
-            px += py
-            least = max(self._radius - float(bands[k]), 0.0) ** 2
-            near = np.flatnonzero((px > least) & (px < (self._radius + float(bands[k])) ** 2))
-            v, u = np.divmod(near, right - left)
-            size = 2.0 / float(high[k, 0] - low[k, 0])
-            u = (u + (left - float(middles[k, 0]))) * size
-            v = (v + (top - float(middles[k, 1]))) * size
-            parts.append((image[window].ravel()[near], x.ravel()[near], y.ravel()[near], u, v))
+            u, v = wide[: right - left] + (left - middles[k, 0]), wide[: bottom - top] + (top - middles[k, 1])
+            (xx, xy), (_, yy) = squares[k].tolist()
+            away = np.multiply.outer((2 * xy * v).astype(np.float32), u.astype(np.float32))
+            away += (xx * u * u).astype(np.float32)
+            away += (yy * v * v).astype(np.float32)[:, None]
+            least, most = max(self._radius - float(bands[k]), 0.0) ** 2, (self._radius + float(bands[k])) ** 2
+            near = np.flatnonzero((away > least) & (away < most))
+            down, along = np.divmod(near, right - left)
+            place = near + (down * (columns - right + left) + (top * columns + left))
+            inside = (away.ravel()[near] < self._radius**2).astype(float)
+            level = image.ravel()[place]
+            many, total = float(inside.sum()), float(level.sum())
+            bright = float(inside @ level)
+            light[k, 0], light[k, 3] = (total - bright) / max(len(near) - many, 1.0), bright / max(many, 1.0)
+            size = 1.0 / float(reach[k, 0])
+            flat = np.empty((3, len(near)), dtype=np.float32)
+            flat[0] = 1.0
+            np.multiply(u[along], size, out=flat[1])
+            np.multiply(v[down], size, out=flat[2])
+            places.append(place)
+            parts.append(flat)
             begin.append(begin[-1] + len(near))
-        level, x, y, u, v = (np.concatenate(p).astype(np.float32) for p in zip(*parts, strict=True))
-        return _Rims(np.array(begin), level, x, y, np.stack([np.ones_like(u), u, v]), bends)
+        chosen = np.concatenate(places)
+        level = image.ravel()[chosen].astype(np.float32)
+        return _Rims(np.array(begin), level, self._rays[:, chosen], np.hstack(parts), bends, chosen), light
 
     def _bends(self, pixels: FloatArray) -> FloatArray:
         """d ray / d pixel (n, 2, 2) at pixels (n, 2)."""
@@ -227,16 +237,6 @@ class Fitter:
         far = self._centres @ shape.rotation[2, :2] + shape.place[2]
         forward = inverse[:2, :2] - self._centres[:, :, None] * inverse[2, :2]
         return np.asarray((forward * far[:, None, None]) @ bends)
-
-    def _first_light(self, rims: _Rims, shape: _Shape) -> FloatArray:
-        light = np.zeros((len(self._centres), _LIGHTS))
-        px, py = _on_plane(_to_plane(shape), rims.x, rims.y)
-        for k, centre in enumerate(self._centres):
-            of = slice(rims.begin[k], rims.begin[k + 1])
-            away = (px[of] - float(centre[0])) ** 2 + (py[of] - float(centre[1])) ** 2
-            inside = away < self._radius**2
-            light[k, 0], light[k, 3] = float(rims.level[of][~inside].mean()), float(rims.level[of][inside].mean())
-        return light
 
     def _converge(self, rims: _Rims, shape: _Shape, prior: Prior) -> tuple[_Shape, tuple[float, float] | None]:
         """The shape by some of the pixels, and the noise outside and inside."""
@@ -269,70 +269,85 @@ class Fitter:
 
     def _linearise(self, rims: _Rims, shape: _Shape, noise: tuple[float, float] | None) -> _Normal:
         """Normal equations at ``shape``; ``noise``: variances outside and inside, None: equal."""
-        lengths = np.diff(rims.begin)
         inverse = _to_plane(shape)
-        px, py = _on_plane(inverse, rims.x, rims.y)
-
-        def each(values: FloatArray) -> Pixels:
-            """One number a disc to one a pixel."""
-            return np.repeat(values.astype(np.float32), lengths)
-
-        ox, oy = px - each(self._centres[:, 0]), py - each(self._centres[:, 1])
+        slopes = self._slopes(inverse, shape, rims.bend)
+        curved = (slopes[:, 0, 0] * slopes[:, 1, 1] - slopes[:, 0, 1] * slopes[:, 1, 0]) ** 2 * (0.5 / self._radius)
+        discs = np.column_stack([self._centres, slopes.reshape(-1, 4), curved]).astype(np.float32)
+        # One number a disc to one a pixel.
+        centre_x, centre_y, uu, vu, uv, vv, curved = np.repeat(discs.T, np.diff(rims.begin), axis=1)
+        px, py, depth = inverse.astype(np.float32) @ rims.rays
+        px /= depth
+        py /= depth
+        ox, oy = px - centre_x, py - centre_y
         rho = np.sqrt(ox * ox + oy * oy)
         ox /= rho
         oy /= rho
-        slopes = self._slopes(inverse, shape, rims.bend)
-        nx = ox * each(slopes[:, 0, 0]) + oy * each(slopes[:, 1, 0])
-        ny = ox * each(slopes[:, 0, 1]) + oy * each(slopes[:, 1, 1])
-        steep = np.sqrt(nx * nx + ny * ny)
-        nx /= steep
-        ny /= steep
+        nx, ny = ox * uu, ox * vu
+        nx += oy * uv
+        ny += oy * vv
+        flat = 1.0 / np.sqrt(nx * nx + ny * ny)
+        nx *= flat
+        ny *= flat
         bxx, bxy, byy = (float(b) for b in (shape.blur[0, 0], shape.blur[0, 1], shape.blur[1, 1]))
         xx, xy, yy = nx * nx, 2 * nx * ny, ny * ny
         across = bxx * xx + bxy * xy + byy * yy
         per_sigma = 1.0 / np.sqrt(across)
-        # The rim's curvature moves the half level by the blur along it.
-        z = (self._radius * shape.swell - rho) / steep - (bxx + byy - across) * steep * (0.5 / self._radius)
+        # The rim's curvature, det(slopes)^2 / (radius |slope|^3), moves the half level by the blur along it.
+        curved *= flat * flat
+        curved *= (bxx + byy) - across
+        z = self._radius * shape.swell - rho
+        z -= curved
+        z *= flat
         z *= per_sigma
-        bell = np.exp(-0.5 * z * z) * (1.0 / _ROOT_2PI)
-        rise = bell * per_sigma
+        bell = np.exp(-0.5 * z * z)
+        bell *= 1.0 / _ROOT_2PI
         level = ndtr(z)
-        count = 10 + shape.skew.size
-        rows = np.empty((_LIGHTS + count + 1, len(z)), dtype=np.float32)
+        rows = np.empty((_LIGHTS + 11 + shape.skew.size, len(z)), dtype=np.float32)
         parameters = rows[_LIGHTS:-1]
+        contrast = np.empty_like(z)
+        begin = rims.begin.tolist()
+        for k, light in enumerate(shape.light.astype(np.float32)):
+            of = slice(begin[k], begin[k + 1])
+            np.matmul(light[3:] - light[:3], rims.flat[:, of], out=contrast[of])
+            np.matmul(light[:3], rims.flat[:, of], out=rows[-1, of])
         if shape.skew.size:
             cubes = np.stack([xx * nx, xx * ny, nx * yy, yy * ny])
             skew = np.asarray(shape.skew.astype(np.float32) @ cubes)
             zz = z * z
             level = level - skew * (zz - 1) * bell * (1 / 6)
-            rise = rise - skew * z * (3 - zz) * bell * per_sigma * (1 / 6)
-            parameters[10:] = cubes * ((1 - zz) * bell * (1 / 6))
+            rise = (1 - skew * z * (3 - zz) * (1 / 6)) * (bell * per_sigma * contrast)
+            parameters[10:] = cubes * ((1 - zz) * bell * contrast * (1 / 6))
+        else:
+            rise = bell * per_sigma
+            rise *= contrast
+        np.multiply(rims.flat, level, out=rows[3:6])
+        np.subtract(rims.flat, rows[3:6], out=rows[:3])
+        rows[-1] += contrast * level
+        np.subtract(rims.level, rows[-1], out=rows[-1])
+        # A small turn or shift moves the target's point along the normal. The ray that meets it comes from the camera.
         r = shape.rotation
-        # The ray's direction in the target's axes; a small turn or shift moves the target's point along the normal.
-        dx, dy, dz = (float(r[0, i]) * rims.x + float(r[1, i]) * rims.y + float(r[2, i]) for i in range(3))
-        towards = (ox * dx + oy * dy) / dz
-        by_rho = rise / steep
-        side = towards * by_rho
-        parameters[0] = -py * side
-        parameters[1] = px * side
-        parameters[2] = (oy * px - ox * py) * by_rho
-        ox_rise, oy_rise = ox * by_rho, oy * by_rho
-        for i in range(3):
-            parameters[3 + i] = float(r[i, 0]) * ox_rise + float(r[i, 1]) * oy_rise - float(r[i, 2]) * side
-        parameters[6] = by_rho * self._radius
-        widening = z * rise * per_sigma * -0.5
-        parameters[7], parameters[8], parameters[9] = widening * xx, widening * xy, widening * yy
-        rows[:3] = rims.flat * (1 - level)
-        rows[3:6] = rims.flat * level
+        camera = (-shape.place @ r).tolist()
+        by_rho = rise * flat
+        ways = np.empty((3, len(z)), dtype=np.float32)
+        np.multiply(ox, by_rho, out=ways[0])
+        np.multiply(oy, by_rho, out=ways[1])
+        np.multiply(ways[0], px - camera[0], out=ways[2])
+        ways[2] += ways[1] * (py - camera[1])
+        ways[2] *= 1.0 / camera[2]
+        np.multiply(py, ways[2], out=parameters[0])
+        np.multiply(px, -ways[2], out=parameters[1])
+        np.multiply(ways[1], px, out=parameters[2])
+        parameters[2] -= ways[0] * py
+        np.matmul(r.astype(np.float32), ways, out=parameters[3:6])
+        np.multiply(by_rho, self._radius, out=parameters[6])
+        rise *= z
+        rise *= per_sigma
+        rise *= -0.5
+        for row, square in zip(parameters[7:10], (xx, xy, yy), strict=True):
+            np.multiply(rise, square, out=row)
         root = None
         if noise is not None:
             root = 1.0 / np.sqrt(noise[0] + (noise[1] - noise[0]) * np.clip((z + 1.5) / 3.0, 0.0, 1.0))
-        begin = rims.begin.tolist()
-        for k, light in enumerate(shape.light.astype(np.float32)):
-            of = slice(begin[k], begin[k + 1])
-            parameters[:, of] *= (light[3:] - light[:3]) @ rims.flat[:, of]
-            rows[-1, of] = rims.level[of] - light @ rows[:6, of]
-        if root is not None:
             rows *= root
         return self._eliminated(rims, rows, z, (nx, ny), root)
 
@@ -342,7 +357,7 @@ class Fitter:
         spans = zip(rims.begin[:-1].tolist(), rims.begin[1:].tolist(), strict=True)
         gram = np.stack([part @ part.T for part in (rows[:, a:b] for a, b in spans)]).astype(float)
         lights = gram[:, :_LIGHTS, :_LIGHTS]
-        stiff = 1e-7 * np.trace(lights, axis1=1, axis2=2)[:, None, None] * np.eye(_LIGHTS)
+        stiff = 1e-7 * np.einsum('kii->k', lights)[:, None, None] * np.eye(_LIGHTS)
         back = np.linalg.solve(lights + stiff, gram[:, :_LIGHTS, _LIGHTS:])
         rest = (gram[:, _LIGHTS:, _LIGHTS:] - gram[:, _LIGHTS:, :_LIGHTS] @ back).sum(axis=0)
         return _Normal(rest[:-1, :-1], rest[:-1, -1], back, rows, z, side, root, max(float(rest[-1, -1]), 0.0))
@@ -373,7 +388,7 @@ class Fitter:
         if contrast.min() <= 0.0 or contrast.min() < 0.3 * contrast.max():
             raise RefusedError(Status.HIDDEN)
         motion = _motion(shape.blur)
-        sharp = math.sqrt(float(np.linalg.eigvalsh(shape.blur)[0]))
+        sharp = math.sqrt(_spread(shape.blur)[0])
         if math.sqrt(12.0) * motion > MOST_BLUR * pixel_radius:
             raise RefusedError(Status.BLURRED)
         if sharp > MOST_DEFOCUS * pixel_radius:
@@ -399,30 +414,30 @@ class Fitter:
         chi_square = float(residual @ residual) / (count - 30)
         stiff, pull = _beforehand(shape, prior)
         inverse = np.linalg.inv(normal.hessian / chi_square + np.diag(stiff))
-        scored *= residual / chi_square
-        columns = np.ascontiguousarray(scored.T)
-        wider, ones, every = np.ones(6), np.ones(count, dtype=np.float32), np.arange(count)
-        # Pixels may be wrong together: along a rim, or along the rows or columns in which a camera is read.
-        lines = (np.rint(a / a.dtype.type(self._step)) for a in (rims.x - rims.x.min(), rims.y - rims.y.min()))
-        for together in (sector, *(line.astype(int) for line in lines)):
-            # Row i of the sparse matrix sums the pixels of group i.
-            groups = csr_matrix((ones, (together, every)), shape=(int(together.max()) + 1, count))
-            scores = (groups @ columns).astype(float)
-            sandwich = inverse @ (scores.T @ scores) @ inverse
-            wider = np.maximum(wider, np.sqrt(np.maximum(np.diag(sandwich)[:6] / np.diag(inverse)[:6], 1.0)))
-        covariance = inverse[:6, :6] * np.outer(wider, wider)
-        # What the first three moments of the motion do not say of its mean, and what the model does not say at all: a
-        # level that is off by the misfit moves the rim by that over the steepest rise.
-        # It may be one disc's alone, which a mean over three would hide.
+        # What the model does not say: a level that is off by the misfit moves the rim by that over the steepest rise.
+        # It may be one disc's alone, and moves a rim more easily than it bends one.
         wrong = 4.0 * misfit * _ROOT_2PI * math.hypot(sharp, motion)
-        floor = math.sqrt(CENTRE_FLOOR**2 + (MEAN_OF_BLUR * max(motion - 0.15, 0.0)) ** 2 + wrong**2)
-        covariance += self._moved_centres(shape, floor)
+        bent = inverse @ _of_bent_rims(normal, rims, scored) / (pixel_radius * chi_square)
+        bent[:, :6] *= math.hypot(CENTRE_FLOOR, wrong)
+        bent[:, 6:] *= 0.5 * wrong
+        # Pixels may be wrong together: along a rim, or along the rows or columns in which a camera is read.
+        pulls = (inverse[:6].astype(np.float32) @ scored) * (residual / chi_square)
+        line, column = np.divmod(rims.pixel, self._columns)
+        wider = np.ones(6)
+        for group in (sector, line - int(line.min()), column - int(column.min())):
+            squares = [float(total @ total) for total in (np.bincount(group, pull) for pull in pulls)]
+            wider = np.maximum(wider, np.sqrt(np.divide(squares, np.diag(inverse)[:6])))
+        covariance = inverse[:6, :6] * np.outer(wider, wider)
+        covariance += bent[:6] @ bent[:6].T
+        # What the first three moments of the motion do not say of its mean.
+        covariance += self._moved_centres(shape, MEAN_OF_BLUR * max(motion - 0.15, 0.0))
         noise = float(np.sqrt(np.mean(raw * raw)))
         return TargetPose(
             shape.rotation,
             shape.place,
             covariance,
-            2 * count * math.log(max(noise, 1e-3)) + float(np.sum(stiff * pull**2)),
+            2 * math.log(max(noise, 1e-3)) + float(np.sum(stiff * pull**2)) / count,
+            count,
             self._lens.project(self._points @ shape.rotation.T + shape.place),
             math.sqrt(12.0) * motion,
             shape.swell,
@@ -432,11 +447,11 @@ class Fitter:
         )
 
     def _moved_centres(self, shape: _Shape, pixels: float) -> FloatArray:
-        """Covariance (6, 6) of an error of ``pixels`` at each disc: in place, and about the normal."""
+        """Covariance (6, 6) of an error of ``pixels`` that the discs share, or that turns them about the normal."""
         variance = (pixels * float(shape.place[2]) / self._lens.focal) ** 2
         out = np.zeros((6, 6))
         out[2, 2] = variance / float(np.sum(self._centres**2))
-        out[3:, 3:] = shape.rotation @ np.diag([variance, variance, 0.0]) @ shape.rotation.T / len(self._centres)
+        out[3:, 3:] = shape.rotation @ np.diag([variance, variance, 0.0]) @ shape.rotation.T
         return out
 
     @staticmethod
@@ -502,26 +517,27 @@ class Fitter:
         return bool(np.any(dwell[1:-1] < DIP * np.minimum(left[:-2], right[2:]) - 0.015))
 
 
+def _of_bent_rims(normal: _Normal, rims: _Rims, scored: Pixels) -> FloatArray:
+    """What rims that are not where the model has them do to the gradient (p, 15), for a shift of the pixel radius.
+
+    Of each disc the shifts by the cosine and sine of the angle around it (columns 0 to 5), by those of twice the angle,
+    which are a tilt, and all around.
+    """
+    x, y = normal.side
+    moved, bent = [], []
+    for a, b in zip(rims.begin[:-1].tolist(), rims.begin[1:].tolist(), strict=True):
+        along, down = x[a:b], y[a:b]
+        around = np.stack([along, down, along * along - down * down, 2 * along * down, np.ones_like(along)])
+        # The derivative by the radius is that by a shift of the whole rim.
+        by_shape = (scored[:, a:b] @ (around * normal.rows[_LIGHTS + 6, a:b]).T).astype(float)
+        moved.append(by_shape[:, :2])
+        bent.append(by_shape[:, 2:])
+    return np.hstack(moved + bent)
+
+
 def _to_plane(shape: _Shape) -> FloatArray:
     """The homography (3, 3) from rays to the target's plane."""
     return np.asarray(np.linalg.inv(np.column_stack([shape.rotation[:, 0], shape.rotation[:, 1], shape.place])))
-
-
-def _on_plane(inverse: FloatArray, x: Pixels, y: Pixels) -> tuple[Pixels, Pixels]:
-    """Points of the plane that rays meet."""
-    h = inverse.tolist()
-    depth = h[2][0] * x
-    depth += h[2][1] * y
-    depth += h[2][2]
-    px = h[0][0] * x
-    px += h[0][1] * y
-    px += h[0][2]
-    px /= depth
-    py = h[1][0] * x
-    py += h[1][1] * y
-    py += h[1][2]
-    py /= depth
-    return px, py
 
 
 def _beforehand(shape: _Shape, prior: Prior) -> tuple[FloatArray, FloatArray]:
@@ -538,8 +554,10 @@ def _beforehand(shape: _Shape, prior: Prior) -> tuple[FloatArray, FloatArray]:
 
 def _moved(shape: _Shape, step: FloatArray, light: FloatArray) -> _Shape:
     blur = shape.blur + np.array([[step[7], step[8]], [step[8], step[9]]])
-    values, vectors = np.linalg.eigh(blur)
-    blur = (vectors * np.clip(values, _SHARPEST**2, 900.0)) @ vectors.T
+    small, large = _spread(blur)
+    if small < _SHARPEST**2 or large > 900.0:
+        values, vectors = np.linalg.eigh(blur)
+        blur = (vectors * np.clip(values, _SHARPEST**2, 900.0)) @ vectors.T
     return _Shape(
         shape.rotation @ turned(step[:3]),
         shape.place + step[3:6],
@@ -562,12 +580,27 @@ def turned(v: FloatArray) -> FloatArray:
 
 def _motion(blur: FloatArray) -> float:
     """Standard deviation of the motion within the exposure, px: what the blur has more along one axis."""
-    small, large = np.linalg.eigvalsh(blur)
-    return math.sqrt(max(float(large - small), 0.0))
+    small, large = _spread(blur)
+    return math.sqrt(large - small)
 
 
 def _sectors(side: tuple[Pixels, Pixels], rims: _Rims) -> IntArray:
-    """The part of a rim to which each pixel belongs, counted through all discs."""
-    part = np.floor((np.arctan2(side[1], side[0]) * (0.5 / np.pi) + 0.5) * _SECTORS).astype(int)
-    of = np.repeat(np.arange(len(rims.begin) - 1), np.diff(rims.begin))
-    return np.asarray(of * _SECTORS + np.minimum(part, _SECTORS - 1))
+    """The part of a rim to which each pixel belongs, counted through all discs: 16 parts of equal angle."""
+    x, y = np.abs(side[0]), np.abs(side[1])
+    part = np.repeat(_SECTORS * np.arange(len(rims.begin) - 1), np.diff(rims.begin))
+    part += side[0] > 0
+    part += 2 * (side[1] > 0)
+    part += 4 * (y > x)
+    part += 8 * (np.minimum(x, y) > _HALF_OCTANT * np.maximum(x, y))
+    return part
+
+
+def _width(blur: FloatArray) -> float:
+    """How far from a rim its pixels are used, px: up to where a rise of this blur has ended."""
+    return max(3.2 * math.sqrt(_spread(blur)[1]) + 1.7, 3.5)
+
+
+def _spread(blur: FloatArray) -> tuple[float, float]:
+    """The eigenvalues of a variance (2, 2), the smaller first."""
+    half, apart = (blur[0, 0] + blur[1, 1]) / 2, math.hypot((blur[0, 0] - blur[1, 1]) / 2, blur[0, 1])
+    return float(half - apart), float(half + apart)

@@ -220,6 +220,10 @@ def run(args: argparse.Namespace) -> int:
         show('', *how)
     elif args.next:
         show('No other effect explains the recordings as well: there is nothing to tell apart by a further one.')
+    if args.next is False and found.unsettled:
+        show('next: psd-deflection discover with these recordings and --next plans the recording that tells')
+    elif found.effects and found.verdict == 'effects_found':
+        show(f'next: psd-deflection estimator --params-file {out / "model.yaml"} corrects readings for what it can')
     show(f'{found.simulations} forward simulations; see {out / "report.html"}')
     return 0
 

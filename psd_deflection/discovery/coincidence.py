@@ -42,10 +42,12 @@ class Coincidence:
     odds: float
 
 
-def _amplitudes(fit: Fit, physics: Physics, covariance: FloatArray) -> list[tuple[int, float, str]]:
+def _amplitudes(fit: Fit, physics: Physics | None, covariance: FloatArray) -> list[tuple[int, float, str]]:
     """Column, distance from off and unit of every amplitude that is significantly different from zero."""
     out = []
     for column, (i, name) in enumerate(fit.free):
+        if i < 0:
+            continue
         p = fit.effects[i].effect.parameter(name)
         size = fit.effects[i].values[name] - p.off(physics)
         clear = abs(size) > 5.0 * math.sqrt(max(float(covariance[column, column]), 0.0))
@@ -54,7 +56,7 @@ def _amplitudes(fit: Fit, physics: Physics, covariance: FloatArray) -> list[tupl
     return out
 
 
-def coincidences(fit: Fit, physics: Physics) -> list[Coincidence]:
+def coincidences(fit: Fit, physics: Physics | None) -> list[Coincidence]:
     """The ties between amplitudes of different effects of ``fit`` that are beyond chance, the strongest first."""
     covariance = fit.covariance()
     sizes = _amplitudes(fit, physics, covariance)

@@ -1,9 +1,6 @@
-"""Compare, localise, name, add, show: :func:`discover` runs all steps.
+"""Compare, localise, name, add, show: :func:`discover` runs all steps for the rig.
 
-The default answer is "nothing missing"; an effect is named only if all of these hold: library-wide
-p <= 0.01, a BIC better by more than 10, a gain of more than two standard errors on held-out load
-cases, and parameters within their bounds. A discrepancy that no effect explains is described as
-unknown.
+The default answer is "nothing missing". A discrepancy that no effect explains is described as unknown.
 """
 
 from __future__ import annotations
@@ -15,137 +12,70 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psd_deflection.calibration import dot_noise_variances
 from psd_deflection.commissioning.checkup import Finding
 from psd_deflection.config import Rig, replace_values
 from psd_deflection.discovery import proposals as propose
 from psd_deflection.discovery.cleaning import clean
-from psd_deflection.discovery.coincidence import Coincidence, coincidences
+from psd_deflection.discovery.coincidence import coincidences
+from psd_deflection.discovery.comparison import Comparison
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.hidden import FIRST, SETUP, beginning, mistakes
 from psd_deflection.discovery.laws import FoundLaw, find_law
 from psd_deflection.discovery.localise import Localisation, localise
 from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.planning import Suggestion, suggest
+from psd_deflection.discovery.planning import suggest
 from psd_deflection.discovery.screen import Screen
-from psd_deflection.discovery.search import BIC_ACCEPT, BUDGET, P_ACCEPT, Search, SearchResult, far, unphysical
+from psd_deflection.discovery.search import BIC_ACCEPT, Search, SearchResult, far
 from psd_deflection.discovery.setup import likely_delays, likely_jumps, noise_finding, said, wire
-from psd_deflection.discovery.signatures import SignatureBank, candidates, signature_columns
-from psd_deflection.discovery.validate import HeldOut, heldout_gain, heldout_gap
+from psd_deflection.discovery.signatures import SignatureBank, candidates, signatures_beside
+from psd_deflection.discovery.validate import HeldOut, heldout_tables
+from psd_deflection.discovery.weighing import (
+    UNSAID,
+    Conclusion,
+    NamedEffect,
+    accept,
+    credible,
+    heldout_per_channel_of,
+    named_effects,
+    per_channel_of,
+    tied,
+    unknown_of,
+    unsaid,
+    waterfall_of,
+    without_one,
+)
 from psd_deflection.discovery.workspace import Workspace
-from psd_deflection.records import FloatArray
 from psd_deflection.simulation.catalogue import catalogue, effects_of_rig
 from psd_deflection.simulation.declaration import ActiveEffect, Effect
 from psd_deflection.simulation.physics import Physics
-
-EQUIVALENT = 21.6
-"""Loss in chi-square below which an alternative of no more parameters counts as equivalent: at
-lambda sin^2(theta/2) = 5.4 one in a hundred would be misnamed, and sin^2(theta) is four times that."""
-EQUIVALENT_BIC = 6.0
-"""An alternative with more parameters must also be this close in BIC, because a more flexible effect always
-fits as well.
-"""
-UNKNOWN_P = 1e-4
-UNKNOWN_EXCESS = 60.0
-STEPS_SHARE = 0.02
-"""Coarse steps cause noise that varies with the signal; up to this share of what they explain it is nothing else."""
-UNSAID = 1.5
-"""A gap of more floors than this never remains without being reported as unknown."""
-RIVAL_BIC = 10.0
-"""An effect in place of the named one counts as its rival up to this loss in BIC."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Rival:
-    """An effect in place of a named one, with its fitted values; ``delta_bic``: how much worse, below 0 better.
-    ``fit``: the whole model with it.
-    """
-
-    active: ActiveEffect
-    sd: Mapping[str, float]
-    delta_bic: float
-    fit: Fit
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NamedEffect:
-    """One effect of the answer. ``sd``: per fitted parameter. ``alternatives``: (name, loss in
-    chi-square, difference of BIC), the closest first; ``equivalent``: those that this data cannot exclude;
-    ``rivals``: those and what else comes close in BIC.
-    """
-
-    active: ActiveEffect
-    sd: Mapping[str, float]
-    p: float
-    delta_bic: float
-    heldout: HeldOut
-    equivalent: tuple[str, ...]
-    rivals: tuple[Rival, ...]
-    alternatives: tuple[tuple[str, float, float], ...]
-    suggestion: Suggestion | None
-
-
-@dataclass(frozen=True, slots=True)
-class Unknown:
-    """A discrepancy that no effect explains, or only several tied effects: ``signature`` in words,
-    ``explains``: its fraction of the gap's energy. ``remains``: whether it is still present with all effects added.
-    ``rms``: its size, m, as the gap counts it, without noise.
-    """
-
-    signature: str
-    depends_on: tuple[str, ...]
-    explains: float
-    remains: bool = True
-    rms: float = 0.0
+from psd_deflection.solvers import solver_from_rig
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Discovery:
-    """The answer. Gaps in m (rms of block means over x1 y1 x2 y2).
+class Discovery(Conclusion):
+    """The answer for the rig. Gaps in m (rms of block means over x1 y1 x2 y2).
 
     ``setup``: mistakes of the set-up and the recording, with ``lines`` that put the rig file right; ``known``: the
     effects that the rig file has already. ``law``: describes what is unknown; it is in no gap and no effect here.
     ``rivals``: the whole models that these recordings do not exclude beside ``fit``, also those of mistakes of the
     set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
+    ``moves``: by how much at most the effects change an estimate that does not know of them: dX m, dY m, theta rad.
     """
 
-    verdict: str
-    effects: tuple[NamedEffect, ...]
-    unknown: tuple[Unknown, ...]
-    where: Localisation
-    left: Localisation
-    gap_before: float
-    gap_after: float
-    gap_floor: float
-    gap_heldout_before: float
-    gap_heldout_after: float
-    per_channel: Mapping[str, tuple[float, float]]
-    waterfall: tuple[tuple[str, float], ...]
-    simulations: int
-    search: SearchResult
-    fit: Fit
     workspace: Workspace
-    seed: int
     setup: tuple[Finding, ...]
     lines: Mapping[str, object]
     known: tuple[ActiveEffect, ...]
     law: FoundLaw | None = None
     rivals: tuple[Fit, ...] = ()
     unsettled: tuple[str, ...] = ()
-
-    @property
-    def floors(self) -> float:
-        """The gap that remains, in units of the gap that noise alone leaves."""
-        return self.gap_after / self.gap_floor if self.gap_floor > 0.0 else 0.0
+    moves: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def active_effects(self) -> list[ActiveEffect]:
         """The effects to add to the rig file."""
         return [*self.known, *(e.active for e in self.effects)]
-
-    def __repr__(self) -> str:
-        named = ', '.join(e.active.label for e in self.effects) or 'no effect'
-        before, after, floor = (f'{1e6 * v:.3f}' for v in (self.gap_before, self.gap_after, self.gap_floor))
-        return f'<Discovery {self.verdict}: {named}; gap {before} → {after} µm (noise alone: {floor} µm)>'
 
 
 def _proposals(workspace: Workspace) -> dict[str, list[float]]:
@@ -217,17 +147,17 @@ def discover(
 
     looked_for = set(FIRST)
 
-    def screen(ws: Workspace, current: Fit | None) -> Screen:
+    def screen(_: Comparison, current: Fit | None) -> Screen:
+        ws = workspace
         residual = ws.residual(ws.base)[0] if current is None else current.residual
         more = mistakes(len(observations), delays, likely_jumps(ws, residual))
         more = [e for e in more if e.name not in FIRST or e.name in looked_for]
-        listed = candidates(physics, found, (*without, *(e.name for e in of_lattice)), more)
+        library = [e for e in catalogue().values() if e.name not in without and not e.lattice]
+        listed = candidates([*library, *more], physics, found)
         if current is None or not far(current):
             return Screen(ws, [(c, kept.get(c, ws)) for c in listed])
         # A large effect changes the signatures of the others.
-        beside = [*ws.base, *current.effects]
-        now = ws.simulate(beside)
-        return Screen(ws, [(c, signature_columns(c, ws, now, beside)) for c in listed])
+        return Screen(ws, signatures_beside(ws, listed, current))
 
     progress('signatures of every effect')
     search = Search(workspace, screen, progress)
@@ -246,13 +176,18 @@ def discover(
         else:
             workspace.noise = noise
     progress('weighing')
-    heldout, fit = _accept(search, result, rng)
+    heldout, fit = accept(search, result, rng)
     seen = 0.0 if lattice is None else 2.0 * _lattice_gain(workspace, lattice)
-    fit, heldout, left = _credible(search, result, fit, heldout, seen, rng)
+
+    def look(fit: Fit, null: Fit) -> Localisation:
+        explained = null.residual - fit.residual if fit.free else None
+        return localise(workspace, fit.residual, fit.jacobian if fit.free else None, rng, explained=explained)
+
+    fit, heldout, left = credible(search, result, fit, heldout, seen, look)
     if lattice is not None:
         workspace.base = tuple(a for a in workspace.base if a is not lattice)
     checked = _Checked(findings, lines, tuple(base), before)
-    return _answer(search, result, fit, heldout, left, lattice, rng, seed, progress, checked)
+    return _answer(workspace, search, result, fit, heldout, left, lattice, rng, seed, progress, checked)
 
 
 def _beginnings(workspace: Workspace) -> list[ActiveEffect]:
@@ -276,25 +211,6 @@ class _Checked:
     lines: Mapping[str, object]
     known: tuple[ActiveEffect, ...]
     gap: float
-
-
-def _credible(
-    search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut], seen: float, rng: np.random.Generator
-) -> tuple[Fit, list[HeldOut], Localisation]:
-    """Remove effects that explain less than the unknown remainder: they probably stand in for it."""
-    ws = search.workspace
-    while True:
-        explained = result.null.residual - fit.residual if fit.free else None
-        left = localise(ws, fit.residual, fit.jacobian if fit.free else None, rng, explained=explained)
-        if not fit.effects or not _unknown(left, max(result.null.chi2 - fit.chi2, 0.0) + seen, steps=seen):
-            break
-        weakest = int(np.argmin(result.delta_chi2))
-        if result.delta_chi2[weakest] >= left.excess:
-            break
-        search.trace.append(f'{fit.effects[weakest].label} explains less than what remains unknown')
-        fit = _without(ws, result, fit, weakest)
-        heldout = [h for j, h in enumerate(heldout) if j != weakest]
-    return fit, heldout, left
 
 
 def _lattice(
@@ -324,42 +240,8 @@ def _without_end(o: Observation, seconds: float) -> Observation:
     return dataclasses.replace(o, volts=volts, digest=o.digest or o.hashed())
 
 
-def _accept(search: Search, result: SearchResult, rng: np.random.Generator) -> tuple[list[HeldOut], Fit]:
-    """The joint rule: remove the effects that fail it, the weakest first, and refit the rest."""
-    ws, fit = search.workspace, result.fit
-    while True:
-        heldout = []
-        fails: list[tuple[float, int]] = []
-        for i, without in enumerate(search.without_each(fit, result.null)):
-            gain = heldout_gain(ws, without, fit, rng)
-            heldout.append(gain)
-            columns = fit.columns_of(i)
-            chi2 = without.chi2 - fit.chi2
-            bic = chi2 - search.penalty * len(columns)
-            if (
-                not gain.holds
-                or unphysical(ws, fit, i)
-                or search.library_p(chi2, len(columns)) > P_ACCEPT
-                or bic <= BIC_ACCEPT
-            ):
-                fails.append((bic, i))
-        if not fails:
-            break
-        _, worst = min(fails)
-        search.trace.append(f'{fit.effects[worst].label} fails the joint rule')
-        fit = _without(ws, result, fit, worst)
-    return heldout, fit
-
-
-def _without(ws: Workspace, result: SearchResult, fit: Fit, index: int) -> Fit:
-    """``fit`` refitted without one effect, which is taken out of ``result`` too."""
-    for listed in (result.p, result.delta_bic, result.delta_chi2):
-        del listed[index]
-    rest = [a for j, a in enumerate(fit.effects) if j != index]
-    return refit(ws, rest, iterations=6) if rest else result.null
-
-
 def _answer(
+    ws: Workspace,
     search: Search,
     result: SearchResult,
     fit: Fit,
@@ -371,14 +253,14 @@ def _answer(
     progress: Callable[[str], None],
     checked: _Checked,
 ) -> Discovery:
-    ws, null = search.workspace, result.null
+    null = result.null
     if lattice is not None:
         null = refit(ws, ())
         ws.base = (*ws.base, lattice)
     law = None
     # Coarse steps cause noise that varies with the signal, which is no law.
     if lattice is None and (
-        _unknown(left, 1.0) or ws.gap(fit.difference) > UNSAID * ws.floor() or coincidences(fit, ws.physics)
+        unknown_of(left, 1.0) or ws.gap(fit.difference) > UNSAID * ws.floor() or coincidences(fit, ws.physics)
     ):
         law = find_law(ws, null, fit, search.penalty, left.excess, rng, progress)
     if law is not None:
@@ -386,7 +268,13 @@ def _answer(
         explains = null.residual - fit.residual if fit.free else None
         left = localise(ws, fit.residual, fit.jacobian if fit.free else None, rng, explained=explains)
     progress('alternatives')
-    named = _named(search, result, fit, heldout)
+    named = named_effects(
+        search,
+        result,
+        fit,
+        heldout,
+        lambda best, equal: suggest(ws, best, equal[: 3 if ws.simulations < ws.budget else 1]),
+    )
     setup, lines = list(checked.findings), dict(checked.lines)
     for i, effect in enumerate(named):
         if effect.active.effect.name in SETUP:
@@ -408,12 +296,12 @@ def _answer(
     explained = max(null.chi2 - fit.chi2, 0.0) + steps
     gap_before, gap_after = checked.gap or ws.gap(null.difference), ws.gap(fit.difference)
     unknown = (
-        _unknown(left, explained, gap_after, floor, steps)
-        or _unsaid(gap_before, gap_after, floor)
-        or _tied(coincidences(fit, ws.physics), fit, result, before)
+        unknown_of(left, explained, gap_after, floor, steps, ws.worded)
+        or unsaid(ws, gap_before, gap_after)
+        or tied(coincidences(fit, ws.physics), fit, result, before)
     )
     verdict = 'unknown_effect' if unknown else 'effects_found' if named else 'nothing_missing'
-    channels = ws.gap_per_channel(null.difference), ws.gap_per_channel(fit.difference)
+    held = heldout_tables(ws, fit)
     return Discovery(
         verdict,
         tuple(named),
@@ -424,21 +312,39 @@ def _answer(
         gap_after,
         floor,
         gap_before,
-        heldout_gap(ws, fit),
-        {n: (float(a), float(b)) for n, a, b in zip(('x1', 'y1', 'x2', 'y2'), *channels, strict=True)},
-        _waterfall(ws, fit, gap_before, gap_after),
+        ws.gap(held),
+        per_channel_of(ws, null.difference, fit.difference),
+        heldout_per_channel_of(ws, held),
+        waterfall_of(ws, fit, gap_before, gap_after),
         ws.simulations,
         result,
         fit,
         ws,
         seed,
+        (),
         tuple(setup),
         lines,
         checked.known,
         law if verdict == 'unknown_effect' else None,
         rivals,
         unsettled,
+        pose_change(ws, fit) if named else (0.0, 0.0, 0.0),
     )
+
+
+def pose_change(ws: Workspace, fit: Fit) -> tuple[float, float, float]:
+    """By how much at most the effects of ``fit`` change the estimates of the recordings: dX m, dY m, theta rad."""
+    tables = ws.block_dots(ws.simulate([*ws.base, *fit.effects])), ws.block_dots(ws.simulate(ws.base))
+    most = np.zeros(3)
+    for o, dots, nominal in zip(ws.observations, *tables, strict=True):
+        solver = solver_from_rig(o.rig.estimator.solver, o.rig)
+        there = np.isfinite(dots).all(axis=0) & np.isfinite(nominal).all(axis=0)
+        variances = dot_noise_variances(o.rig) / o.rig.estimator.block_size
+        poses = [solver.solve_many(d[:, there].T, variances).pose for d in (dots, nominal)]
+        change = np.abs(poses[0] - poses[1])
+        if np.isfinite(change).any():
+            most = np.fmax(most, np.nanmax(change, axis=0))
+    return (float(most[0]), float(most[1]), float(most[2]))
 
 
 def _beside(
@@ -450,59 +356,9 @@ def _beside(
         active = fit.effects[i]
         if (active.effect.name, active.choices) not in kept:
             search.trace.append(f'{active.label} only stood in for the law')
-            fit = _without(search.workspace, result, fit, i)
+            fit = without_one(search, result, fit, i)
             heldout = [h for j, h in enumerate(heldout) if j != i]
     return fit, heldout
-
-
-def _named(search: Search, result: SearchResult, fit: Fit, heldout: Sequence[HeldOut]) -> list[NamedEffect]:
-    """The effects of ``fit`` with their standard deviations and the equally good alternatives."""
-    ws, covariance = search.workspace, fit.covariance()
-    # If the joint rule has removed effects, their alternatives are no longer comparable.
-    as_found = fit is result.fit
-    named: list[NamedEffect] = []
-    for i, active in enumerate(fit.effects):
-        fits = result.alternatives[i] if as_found else search.alternatives(result.null, fit, i, result.delta_chi2[i])
-        rows, equal, rivals = [], [], []
-        for f in fits:
-            loss = f.chi2 - fit.chi2
-            bic = loss + search.penalty * (f.parameters - fit.parameters)
-            rows.append((f.effects[-1].effect.name, loss, bic))
-            if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < EQUIVALENT_BIC):
-                equal.append(f)
-            if (bic < RIVAL_BIC or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
-                rivals.append(Rival(f.effects[-1], _sd(f, f.covariance(), len(f.effects) - 1), bic, f))
-        names = tuple(dict.fromkeys(f.effects[-1].effect.name for f in equal))
-        named.append(
-            NamedEffect(
-                active,
-                _sd(fit, covariance, i),
-                result.p[i],
-                result.delta_bic[i],
-                heldout[i],
-                names,
-                tuple(sorted(rivals, key=lambda r: r.delta_bic)),
-                tuple(rows),
-                suggest(ws, fit, equal[: 3 if ws.simulations < BUDGET else 1]) if equal else None,
-            )
-        )
-    return named
-
-
-def _sd(fit: Fit, covariance: FloatArray, index: int) -> dict[str, float]:
-    """Standard deviation of each fitted parameter of effect ``index``."""
-    return {fit.free[j][1]: float(np.sqrt(max(covariance[j, j], 0.0))) for j in fit.columns_of(index)}
-
-
-def _waterfall(ws: Workspace, fit: Fit, gap_before: float, gap_after: float) -> tuple[tuple[str, float], ...]:
-    """The gap after each effect is added, and the gap from noise alone."""
-    steps = [('as described', gap_before)]
-    for i in range(len(fit.effects) - 1):
-        _, difference = ws.residual([*ws.base, *fit.effects[: i + 1]])
-        steps.append(('+ ' + fit.effects[i].effect.name, ws.gap(difference)))
-    if fit.effects:
-        steps.append(('+ ' + fit.effects[-1].effect.name, gap_after))
-    return (*steps, ('noise alone', ws.floor()))
 
 
 def _lattice_gain(workspace: Workspace, lattice: ActiveEffect) -> float:
@@ -517,65 +373,3 @@ def _named_lattice(workspace: Workspace, lattice: ActiveEffect) -> NamedEffect:
     sd = min(s[1] for o in workspace.observations if (s := propose.coarse_step(o)) is not None)
     heldout = HeldOut(gain, float(np.sqrt(2.0 * gain)))
     return NamedEffect(lattice, {lattice.effect.lattice: sd}, 0.0, 2.0 * gain, heldout, (), (), (), None)
-
-
-def _beyond(gap: float, floor: float) -> float:
-    """The part of a gap, m, that noise does not explain."""
-    return float(np.sqrt(max(gap**2 - floor**2, 0.0)))
-
-
-def _unsaid(before: float, after: float, floor: float) -> tuple[Unknown, ...]:
-    """What remains although no place of it stands out: several small differences, or the simulation's own error."""
-    if after <= UNSAID * floor:
-        return ()
-    size = _beyond(after, floor)
-    words = f'{1e6 * size:.3g} µm remain, {after / floor:.1f} times the noise, in no single place or band'
-    return (Unknown(words, (), float(min((after / before) ** 2, 1.0)), rms=size),)
-
-
-def _unknown(
-    left: Localisation, explained: float, gap: float = 0.0, floor: float = 0.0, steps: float = 0.0
-) -> tuple[Unknown, ...]:
-    """``gap``, ``floor``: what remains and what noise leaves, m. ``steps``: chi-square that coarse steps explain."""
-    if left.p > UNKNOWN_P or left.excess < max(UNKNOWN_EXCESS, STEPS_SHARE * steps):
-        return ()
-    strong = [d for d in left.dependences if d.p < 1e-3][:6]
-    channels = list(dict.fromkeys([*(c.channel for c in left.cells if c.p < 0.01), *(d.channel for d in strong)]))
-    names = tuple(dict.fromkeys(d.regressor for d in strong))
-    even = sum(d.gain for d in strong if _even(d.regressor))
-    odd = sum(d.gain for d in strong if not _even(d.regressor))
-    lagging = any('history' in d.regressor for d in strong[:2])
-    size = _beyond(gap, floor)
-    words = [f'on {", ".join(channels) or "no single channel"}']
-    if size > 0.0:
-        words.append(f'{1e6 * size:.3g} µm rms ({gap / floor:.1f} times the noise remain)')
-    if strong:
-        words.append(f'follows {", ".join(names[:3])}')
-        words.append('mostly even' if even > 2.0 * odd else 'mostly odd' if odd > 2.0 * even else 'odd and even parts')
-    if lagging:
-        words.append('hysteretic: it depends on which way the load last changed')
-    if left.cells:
-        c = left.cells[0]
-        words.append(f'strongest at {c.when[0]:.1f} to {c.when[1]:.1f} s, {c.band[0]:g} to {c.band[1]:g} Hz')
-    share = left.excess / max(left.excess + explained, 1e-300)
-    return (Unknown('; '.join(words), names, float(min(max(share, 0.0), 1.0)), rms=size),)
-
-
-def _tied(ties: Sequence[Coincidence], fit: Fit, result: SearchResult, before: Localisation) -> tuple[Unknown, ...]:
-    """Effects whose sizes agree beyond chance are reported as one unknown cause."""
-    if not ties:
-        return ()
-    tie = ties[0]
-    (i, first), (j, second) = tie.first, tie.second
-    (a, b), unit = tie.sizes, f' {tie.unit}' if tie.unit else ''
-    words = (
-        f'{fit.effects[i].label} and {fit.effects[j].label} agree in size ({first} {a:.4g}, {second} {b:.4g}{unit}) as '
-        f'independent effects hardly would (odds {tie.odds:.0f} to 1): one cause that is not in the catalogue'
-    )
-    names = tuple(dict.fromkeys(d.regressor for d in before.dependences[:6] if d.p < 1e-3))
-    share = (result.delta_chi2[i] + result.delta_chi2[j]) / max(result.null.chi2 - fit.chi2, 1e-300)
-    return (Unknown(words, names, float(min(max(share, 0.0), 1.0)), remains=False),)
-
-
-def _even(regressor: str) -> bool:
-    return '^2' in regressor or '|' in regressor or regressor in ('constant', 'dot_x dot_y')

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.discovery.comparison import Comparison
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.declaration import ActiveEffect, EffectParameter
 
@@ -25,9 +25,10 @@ STOP = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """``chi2``: squared length of ``residual`` (D,), whitened. ``jacobian`` (D, p), whitened, per unit
+    """``chi2``: loss of ``residual`` (D,), whitened. ``jacobian`` (D, p), whitened, per unit
     of each parameter, in the order of ``free``: (index of the effect, parameter).
-    ``difference``: measured minus simulated, fine-block volts. ``at_bound``: parameters stopped there.
+    ``difference``: measured minus simulated. ``at_bound``: parameters stopped there. ``nuisance``: what every model
+    has, as fitted here; in ``free`` it counts from the end: -1 is the last.
     """
 
     effects: tuple[ActiveEffect, ...]
@@ -37,6 +38,12 @@ class Fit:
     jacobian: FloatArray
     free: tuple[tuple[int, str], ...]
     at_bound: tuple[tuple[int, str], ...]
+    nuisance: tuple[ActiveEffect, ...] = ()
+
+    @property
+    def whole(self) -> tuple[ActiveEffect, ...]:
+        """Nuisance and effects."""
+        return (*self.nuisance, *self.effects)
 
     @property
     def parameters(self) -> int:
@@ -69,8 +76,18 @@ def _moved(
     return [ActiveEffect(a.effect, v) for a, v in zip(effects, values, strict=True)]
 
 
-def refit(workspace: Workspace, effects: Sequence[ActiveEffect], iterations: int = 8) -> Fit:
-    """Fit all parameters of ``effects``, starting from their current values."""
+def refit(
+    workspace: Comparison,
+    effects: Sequence[ActiveEffect],
+    iterations: int = 8,
+    nuisance: Sequence[ActiveEffect] | None = None,
+) -> Fit:
+    """Fit all parameters of ``effects``, and of the nuisance, starting from their current values.
+
+    ``nuisance``: where it starts; by default at the values of ``workspace``.
+    """
+    beside = tuple(workspace.nuisance if nuisance is None else nuisance)
+    count, effects = len(beside), (*beside, *effects)
     free = _free(effects)
     x = np.array([effects[i].values[p.name] for i, p in free])
     bounds = [p.bounds(workspace.physics, effects[i].values) for i, p in free]
@@ -85,7 +102,7 @@ def refit(workspace: Workspace, effects: Sequence[ActiveEffect], iterations: int
         return workspace.whiten(difference), difference, simulated
 
     residual, difference, simulated = evaluate(x)
-    chi2 = float(residual @ residual)
+    chi2 = workspace.loss(residual)
     jacobian = np.empty((len(residual), len(free)))
     damping = 1e-4
     for _ in range(iterations if free else 0):
@@ -114,7 +131,7 @@ def refit(workspace: Workspace, effects: Sequence[ActiveEffect], iterations: int
             if np.array_equal(trial, x):
                 break
             r, d, s = evaluate(trial)
-            c = float(r @ r)
+            c = workspace.loss(r)
             if c < chi2:
                 gained = chi2 - c
                 x, residual, difference, simulated, chi2 = trial, r, d, s, c
@@ -123,6 +140,7 @@ def refit(workspace: Workspace, effects: Sequence[ActiveEffect], iterations: int
             damping = max(damping * 20.0, 1e-4)
         if gained < STOP + 1e-7 * chi2:
             break
-    bound = tuple((i, p.name) for (i, p), v, (a, b) in zip(free, x, bounds, strict=True) if v <= a or v >= b)
+    named = [(i - count, p.name) for i, p in free]
+    bound = tuple(name for name, v, (a, b) in zip(named, x, bounds, strict=True) if v <= a or v >= b)
     final = tuple(_moved(effects, free, x))
-    return Fit(final, chi2, residual, difference, jacobian, tuple((i, p.name) for i, p in free), bound)
+    return Fit(final[count:], chi2, residual, difference, jacobian, tuple(named), bound, final[:count])

@@ -32,7 +32,7 @@ from psd_deflection.discovery.law_features import (
     with_better_times,
 )
 from psd_deflection.discovery.search import BIC_ACCEPT, P_ACCEPT
-from psd_deflection.discovery.validate import HeldOut, fold_of_case, heldout_gain, heldout_gap
+from psd_deflection.discovery.validate import HeldOut, heldout_gain, heldout_gap
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.simulation.declaration import ActiveEffect
@@ -341,7 +341,7 @@ def _law_of_the_mean(
 def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     """The channel and the variable that its noise grows with, or None: variance = a + b v^2."""
     known = {name: known_fine(ws, fit.effects, name) for name in VARIABLES}
-    folds = [fold_of_case(ws)[case] for case in ws.case]
+    folds = [ws.folds()[case] for case in ws.case]
     fold = np.concatenate(folds)
     best: tuple[float, str, str, float, float] | None = None
     tried = 0

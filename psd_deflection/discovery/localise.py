@@ -10,11 +10,13 @@ the dependence is odd or even.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2 as chi2_law
 
+from psd_deflection.discovery.comparison import Comparison
 from psd_deflection.discovery.hidden import only_in
 from psd_deflection.discovery.trust import BANDS, RELATIVE
 from psd_deflection.discovery.workspace import Workspace, fine_means
@@ -124,8 +126,8 @@ def _energies(
     return z, excess
 
 
-def regressors(workspace: Workspace) -> list[dict[str, list[FloatArray]]]:
-    """Per PSD (two), per name, per recording: regressors of a residual, on fine blocks (nf,)."""
+def regressors(workspace: Workspace) -> list[tuple[str, dict[str, list[FloatArray]]]]:
+    """Per channel, per name, per recording: regressors of a residual, on fine blocks (nf,)."""
     out: list[dict[str, list[FloatArray]]] = [{}, {}]
     for i, (o, size) in enumerate(zip(workspace.observations, workspace.fine, strict=True)):
         chunk = ForwardModel(o.rig, only_in(workspace.base, i)).run(o.loads, o.temperature)
@@ -167,36 +169,28 @@ def regressors(workspace: Workspace) -> list[dict[str, list[FloatArray]]]:
             }
             for name, values in named.items():
                 out[psd].setdefault(name, []).append(values)
-    return out
+    return [(channel, out[c // 3]) for c, channel in enumerate(CHANNELS)]
 
 
 def dependences(
-    workspace: Workspace, residual: FloatArray, known: FloatArray | None, explained: FloatArray | None = None
+    workspace: Comparison,
+    table: Sequence[tuple[str, Mapping[str, Sequence[FloatArray]]]],
+    residual: FloatArray,
+    known: FloatArray | None,
+    explained: FloatArray | None = None,
 ) -> list[Dependence]:
     """Every channel against every regressor, after projecting out ``known`` (D, p).
 
-    What the simulation of ``explained`` (D,) may be wrong by does not count.
+    ``table``: the name of each channel, and its regressors. What the simulation of ``explained`` (D,) may be wrong by
+    does not count.
     """
-    table = regressors(workspace)
     q = None
     if known is not None and known.shape[1]:
         q, _ = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))
     found: list[tuple[str, str, float]] = []
-    for c, channel in enumerate(CHANNELS):
-        names = list(table[c // 3])
-        columns = []
-        for name in names:
-            fine = []
-            for values in table[c // 3][name]:
-                rows = np.zeros((6, len(values)))
-                rows[c] = values
-                fine.append(rows)
-            columns.append(
-                np.concatenate(
-                    [w.whiten(f, v)[c] for f, w, v in zip(fine, workspace.noise, workspace.count, strict=True)]
-                )
-            )
-        matrix = np.stack(columns, axis=1)
+    for c, (channel, named) in enumerate(table):
+        names = list(named)
+        matrix = np.stack([workspace.row(c, values) for values in named.values()], axis=1)
         e = np.concatenate([part[c] for part in workspace.split(residual)])
         lengths = np.einsum('ij,ij->j', matrix, matrix)
         g = matrix.T @ e
@@ -256,7 +250,7 @@ def localise(
     def p_of(value: float) -> float:
         return float(-np.expm1(-np.exp(-max((value - mu) / beta, -5.0))))
 
-    depends = dependences(workspace, residual, known, explained)
+    depends = dependences(workspace, regressors(workspace), residual, known, explained)
     main: dict[str, list[str]] = {}
     for d in depends:
         if d.p < 0.01 and len(main.setdefault(d.channel, [])) < 2:

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from psd_deflection.discovery.discover import Discovery, NamedEffect
+from psd_deflection.discovery.discover import Discovery
 from psd_deflection.discovery.law_features import known_values
 from psd_deflection.discovery.laws import FoundLaw
 from psd_deflection.discovery.result import parameters_of, provenance, sentence, size_of
 from psd_deflection.discovery.screen import Score
 from psd_deflection.discovery.trust import BANDS
+from psd_deflection.discovery.weighing import Conclusion, NamedEffect
 from psd_deflection.pages import page, picture, table
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.simulation.laws import VARIABLES
@@ -24,24 +25,56 @@ BEFORE, AFTER, HELD, FLOOR = '#c44e52', '#4c72b0', '#55a868', '#8c8c8c'
 DOTS = ('x1', 'y1', 'x2', 'y2')
 
 
-def _residual_figure(discovery: Discovery) -> Figure:
+def _residual_figure(discovery: Conclusion) -> Figure:
     ws = discovery.workspace
-    before = ws.block_dots(discovery.search.null.difference)
-    after = ws.block_dots(discovery.fit.difference)
-    figure = Figure(figsize=(10, 6.4), layout='constrained')
-    axes = figure.subplots(4, 1, sharex=True)
-    start = 0.0
-    for o, b, a in zip(ws.observations, before, after, strict=True):
-        t = start + (np.arange(b.shape[1]) + 0.5) * o.rig.estimator.block_size * o.period
+    before, after = ws.shown(discovery.search.null.difference), ws.shown(discovery.fit.difference)
+    along, times = next(iter(ws.against().items()))
+    count = len(ws.channels)
+    figure = Figure(figsize=(10, 1.6 + 1.2 * count), layout='constrained')
+    axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+    mark = '.-' if sum(len(t) for t in times) < 200 else '-'
+    for i, (t, b, a) in enumerate(zip(times, before, after, strict=True)):
         for row, axis in enumerate(axes):
-            axis.plot(t, b[row] * 1e6, color=BEFORE, lw=0.8, label='before' if start == 0.0 else None)
-            axis.plot(t, a[row] * 1e6, color=AFTER, lw=0.8, label='after' if start == 0.0 else None)
-            axis.set_ylabel(f'{DOTS[row]} / µm')
-            axis.grid(alpha=0.25)
-        start += o.duration
+            axis.plot(t, b[row], mark, color=BEFORE, lw=0.8, label='before' if i == 0 else None)
+            axis.plot(t, a[row], mark, color=AFTER, lw=0.8, label='after' if i == 0 else None)
+    for axis, name, unit in zip(axes, ws.channels, ws.units_shown, strict=True):
+        axis.set_ylabel(f'{name} / {unit}' if unit else name)
+        axis.grid(alpha=0.25)
     axes[0].legend(loc='upper right', ncols=2, frameon=False)
-    axes[-1].set_xlabel('time / s (recordings one after another)')
-    figure.suptitle('measured minus simulated dot, block means')
+    axes[-1].set_xlabel(along)
+    figure.suptitle('measured minus simulated')
+    return figure
+
+
+def _against_figure(discovery: Conclusion) -> Figure | None:
+    """What was missing against each input and position, in the channel where the effects changed most."""
+    ws = discovery.workspace
+    tables = ws.shown(discovery.search.null.difference), ws.shown(discovery.fit.difference)
+    gaps = list(discovery.per_channel.values())
+    row = max(range(len(gaps)), key=lambda c: (gaps[c][0] ** 2 - gaps[c][1] ** 2) / max(gaps[c][0], 1e-300) ** 2)
+    before, after = (np.concatenate([t[row] for t in table]) for table in tables)
+    varied = []
+    for name, values in list(ws.against().items())[1:]:
+        at = np.concatenate(values)
+        if np.any(np.isfinite(at)) and np.nanmax(at) > np.nanmin(at):
+            varied.append((name, at))
+    if not varied:
+        return None
+    columns = min(4, len(varied))
+    rows = -(-len(varied) // columns)
+    figure = Figure(figsize=(10, 0.6 + 2.4 * rows), layout='constrained')
+    axes = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
+    for axis, (name, at) in zip(axes, varied, strict=False):
+        axis.plot(at, before, '.', ms=2.5, color=BEFORE, label='before')
+        axis.plot(at, after, '.', ms=2.5, color=AFTER, label='after')
+        axis.set_xlabel(name)
+        axis.grid(alpha=0.25)
+    for axis in axes[len(varied) :]:
+        axis.set_visible(False)
+    axes[0].legend(frameon=False)
+    unit = ws.units_shown[row]
+    axes[0].set_ylabel(f'{ws.channels[row]} / {unit}' if unit else ws.channels[row])
+    figure.suptitle(f'measured minus simulated {ws.channels[row]} against loads and position')
     return figure
 
 
@@ -82,11 +115,14 @@ def _spectrum_figure(discovery: Discovery) -> Figure:
     return figure
 
 
-def _waterfall_figure(discovery: Discovery) -> Figure:
-    bars = [(n, 1e6 * v, AFTER) for n, v in discovery.waterfall]
+def _waterfall_figure(discovery: Conclusion) -> Figure:
+    scale, unit = discovery.workspace.scale_shown
+    bars = [(n, scale * v, AFTER) for n, v in discovery.waterfall]
     bars[0] = (*bars[0][:2], BEFORE)
     bars[-1] = (*bars[-1][:2], FLOOR)
-    bars.insert(-1, ('on unseen load cases', 1e6 * discovery.gap_heldout_after, HELD))
+    bars.insert(-1, ('on unseen load cases', scale * discovery.gap_heldout_after, HELD))
+    # Nobody may know the noise.
+    bars = [b for b in bars if np.isfinite(b[1])]
     names, values, colors = zip(*bars, strict=True)
     figure = Figure(figsize=(10, 0.6 + 0.42 * len(bars)), layout='constrained')
     axis = figure.subplots()
@@ -97,26 +133,30 @@ def _waterfall_figure(discovery: Discovery) -> Figure:
     # Linear, from zero: the length of a bar is the size of the gap. The numbers say what is too short to be seen.
     axis.set_xlim(0.0, 1.18 * max(values))
     for i, v in enumerate(values):
-        axis.text(v + 0.01 * max(values), i, f'{v:.3f} µm', va='center', fontsize=9)
-    axis.set_xlabel('gap / µm rms')
+        axis.text(v + 0.01 * max(values), i, f'{v:{discovery.workspace.digits}} {unit}', va='center', fontsize=9)
+    axis.set_xlabel(f'gap, rms, {unit}')
     return figure
 
 
-def _where_figure(discovery: Discovery) -> Figure:
+def _where_figure(discovery: Conclusion) -> Figure:
     shown = np.clip(discovery.where.map, 0.0, 60.0)
-    bands = [f'{a:g}-{b:g}' for a, b in itertools.pairwise(BANDS)]
+    of_rig = isinstance(discovery, Discovery)
+    bands = [f'{a:g}-{b:g}' for a, b in itertools.pairwise(BANDS)] if of_rig else ['']
+    names = CHANNELS if of_rig else discovery.workspace.channels
     figure = Figure(figsize=(10, 3.4), layout='constrained')
-    axes = figure.subplots(1, 6, sharey=True)
+    axes = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     top = max(8.0, float(shown.max()))
     for c, axis in enumerate(axes):
         picture = axis.imshow(shown[:, c, :], aspect='auto', cmap='magma_r', vmin=0.0, vmax=top)
-        axis.set_title(CHANNELS[c], fontsize=10)
+        axis.set_title(names[c], fontsize=10)
         axis.set_xticks(range(len(bands)), bands, rotation=90, fontsize=7)
     spans = discovery.where.spans
     ticks = range(0, len(spans), max(1, len(spans) // 12))
-    axes[0].set_yticks(ticks, [f'{spans[i][1]:.1f}-{spans[i][2]:.1f} s' for i in ticks], fontsize=7)
+    told = [f'{a:.1f}-{b:.1f} s' if of_rig else discovery.workspace.names[i] for i, a, b in spans]
+    axes[0].set_yticks(ticks, [told[i] for i in ticks], fontsize=7)
     figure.colorbar(picture, ax=axes, label='σ above noise')
-    figure.suptitle('where: load case (down) by band in Hz (across) by channel, before')
+    across = ' by band in Hz (across)' if of_rig else ''
+    figure.suptitle(f'where: load case (down){across} by channel, before')
     return figure
 
 
@@ -133,8 +173,15 @@ def _effect_section(effect: NamedEffect) -> str:
         else:
             rows.append((name, v, '', ''))
     out.append(table(('parameter', 'value', '± sd', 'unit'), rows))
+    if effect.rivals:
+        fitted = [(r.active.label, size_of(r), f'{r.delta_bic:+.1f}') for r in effect.rivals]
+        out.append('<p>What explains these recordings nearly as well in its place:</p>')
+        out.append(table(('rival', 'fitted', 'BIC worse by'), fitted))
+    if effect.suggestion is not None:
+        out.append(f'<p>To decide: {html.escape(effect.suggestion.text)}.</p>')
+    out.append('<details><summary>Evidence</summary>')
     out.append(
-        f'<p>Evidence: BIC better by {effect.delta_bic:.1f}; library-wide p {effect.p:.2g}; log-likelihood on unseen '
+        f'<p>BIC better by {effect.delta_bic:.1f}; library-wide p {effect.p:.2g}; log-likelihood on unseen '
         f'load cases {effect.heldout.gain:+.1f} ± {effect.heldout.error:.1f}.</p>'
     )
     if effect.alternatives:
@@ -143,11 +190,7 @@ def _effect_section(effect: NamedEffect) -> str:
             (n, f'{loss:.1f}', f'{bic:.1f}', told[n in effect.equivalent]) for n, loss, bic in effect.alternatives
         ]
         out.append(table(('in its place', 'chi-square lost', 'BIC worse by', 'verdict'), others))
-    if effect.rivals:
-        fitted = [(r.active.label, size_of(r), f'{r.delta_bic:+.1f}') for r in effect.rivals]
-        out.append(table(('rival', 'fitted', 'BIC worse by'), fitted))
-    if effect.suggestion is not None:
-        out.append(f'<p>To decide: {html.escape(effect.suggestion.text)}.</p>')
+    out.append('</details>')
     return ''.join(out)
 
 
@@ -196,8 +239,8 @@ def _law_section(discovery: Discovery, found: FoundLaw) -> str:
     return ''.join(out)
 
 
-def _where_table(discovery: Discovery) -> str:
-    names = [o.name for o in discovery.workspace.observations]
+def _where_table(discovery: Conclusion) -> str:
+    names = discovery.workspace.names
     rows = [
         (
             c.channel,
@@ -216,42 +259,62 @@ def _where_table(discovery: Discovery) -> str:
     return table(('channel', 'recording', 'when', 'band', 'depends on', 'σ', 'p'), rows)
 
 
-def report_html(discovery: Discovery) -> str:
+def report_html(discovery: Conclusion) -> str:
     """The page, pictures inside."""
+    of_rig = discovery if isinstance(discovery, Discovery) else None
     body = ['<h1>What the model lacks</h1>', f'<p class=verdict>{html.escape(sentence(discovery))}</p>']
     body.append(picture(_waterfall_figure(discovery), 'the gap, step by step'))
-    if discovery.setup:
+    if of_rig is not None and of_rig.setup:
         body.append('<h2>Set-up</h2>')
-        wrong = [(f.name, f.where, '' if f.value is None else f'{f.value:.5g}', f.fix) for f in discovery.setup]
+        wrong = [(f.name, f.where, '' if f.value is None else f'{f.value:.5g}', f.fix) for f in of_rig.setup]
         body.append(table(('mistake', 'where', 'value', 'what puts it right'), wrong))
     body.append('<h2>What</h2>')
     body.append(''.join(_effect_section(e) for e in discovery.effects) or '<p>No effect is named.</p>')
+    if discovery.nuisance:
+        body.append('<p>Fitted in every model, and no finding:</p>')
+        fitted = [
+            (a.label, name, f'{a.values[name]:.6g}', f'{sd:.2g}', a.effect.parameter(name).unit)
+            for a, sds in discovery.nuisance
+            for name, sd in sds.items()
+        ]
+        body.append(table(('effect', 'parameter', 'value', '± sd', 'unit'), fitted))
     if discovery.unknown:
         body.append('<h2>Unknown</h2>')
     for u in discovery.unknown:
-        where = 'is not in model.yaml' if u.remains else 'the effects stand in for it in model.yaml'
+        where = 'is not in the model' if u.remains else 'the effects stand in for it in the model'
         body.append(
             f'<p>{html.escape(u.signature)}. It is {100 * u.explains:.0f} % of what was to be explained; {where}.</p>'
         )
-    if discovery.law is not None:
-        body.append(_law_section(discovery, discovery.law))
-    body.append('<h2>Where</h2>')
-    body.append(picture(_where_figure(discovery), 'where simulation and data part'))
-    body.append(_where_table(discovery))
+    if of_rig is not None and of_rig.law is not None:
+        body.append(_law_section(of_rig, of_rig.law))
     body.append('<h2>Before and after</h2>')
     body.append(picture(_residual_figure(discovery), 'residual before and after'))
-    body.append(picture(_spectrum_figure(discovery), 'spectrum before and after'))
+    against = _against_figure(discovery)
+    if against is not None:
+        body.append(picture(against, 'residual before and after against loads and position'))
+    if of_rig is not None:
+        body.append(picture(_spectrum_figure(of_rig), 'spectrum before and after'))
+    factor = 1.0 if of_rig is None else discovery.workspace.scale_shown[0]
+    channels = [
+        (n, *(f'{factor * v:.4g}' for v in (*gaps, discovery.heldout_per_channel[n])), unit)
+        for (n, gaps), unit in zip(discovery.per_channel.items(), discovery.workspace.units_shown, strict=True)
+    ]
+    body.append(table(('gap, rms', 'before', 'after', 'on unseen load cases', 'unit'), channels))
+    body.append('<h2>How it was found</h2><details><summary>Where simulation and data part</summary>')
+    body.append(picture(_where_figure(discovery), 'where simulation and data part'))
+    body.append(_where_table(discovery))
     first: dict[str, Score] = {}
     for score in discovery.search.first_scores:
         first.setdefault(score.candidate.effect.name, score)
     rows = [(n, f'{s.gain:.1f}', s.dof, f'{s.p:.2g}') for n, s in list(first.items())[:10]]
-    body.append('<h2>Candidates at first sight</h2>')
+    body.append('</details><details><summary>Candidates at first sight</summary>')
     body.append('<p class=quiet>Gain in chi-square if added alone, to first order.</p>')
     body.append(table(('effect', 'gain', 'parameters', 'p'), rows))
     trace = '; '.join(discovery.search.trace) or 'nothing passed the screen'
-    body.append(f'<h2>Provenance</h2><p class=quiet>Steps: {html.escape(trace)}.</p>')
+    body.append('</details><details><summary>Steps and provenance</summary>')
+    body.append(f'<p class=quiet>Steps: {html.escape(trace)}.</p>')
     source = html.escape(json.dumps(_plain(provenance(discovery)), indent=1))
-    body.append(f'<pre role="group" tabindex="0" aria-label="provenance">{source}</pre>')
+    body.append(f'<pre role="group" tabindex="0" aria-label="provenance">{source}</pre></details>')
     return page('psd-deflection discover', body)
 
 

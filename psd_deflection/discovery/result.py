@@ -11,8 +11,9 @@ import yaml
 from psd_deflection import __version__
 from psd_deflection.config import Rig
 from psd_deflection.declarations import DESCRIPTION
-from psd_deflection.discovery.discover import Discovery, NamedEffect, Rival
+from psd_deflection.discovery.discover import Discovery
 from psd_deflection.discovery.laws import FoundLaw
+from psd_deflection.discovery.weighing import Conclusion, NamedEffect, Rival
 from psd_deflection.simulation.catalogue import effects_to_values
 from psd_deflection.simulation.declaration import ActiveEffect
 
@@ -26,23 +27,28 @@ def _number(value: float) -> float:
 
 def parameters_of(effect: NamedEffect | Rival) -> dict[str, Any]:
     """Choices as numbers, the rest with standard deviation and unit."""
+    return _fitted(effect.active, effect.sd)
+
+
+def _fitted(active: ActiveEffect, sds: Mapping[str, float]) -> dict[str, Any]:
     out: dict[str, Any] = {}
-    for p in effect.active.effect.parameters:
-        value = effect.active.values[p.name]
+    for p in active.effect.parameters:
+        value = active.values[p.name]
         if p.kind == 'choice':
             out[p.name] = int(value)
         elif math.isfinite(value):
-            sd = effect.sd.get(p.name, 0.0)
-            out[p.name] = {'value': _number(value), 'sd': _number(sd), 'unit': p.unit}
+            out[p.name] = {'value': _number(value), 'sd': _number(sds.get(p.name, 0.0)), 'unit': p.unit}
     return out
 
 
-def result(discovery: Discovery) -> dict[str, Any]:
-    """The tree of result.json."""
+def result(discovery: Conclusion) -> dict[str, Any]:
+    """The tree of result.json: the same for the rig and for another plant, which has neither set-up nor law."""
+    of_rig = discovery if isinstance(discovery, Discovery) else None
+    law = None if of_rig is None else of_rig.law
     where = [
         {
             'channel': c.channel,
-            'recording': discovery.workspace.observations[c.recording].name,
+            'recording': discovery.workspace.names[c.recording],
             'when': [c.when[0], c.when[1]],
             'band_hz': [c.band[0], c.band[1]],
             'depends_on': list(c.depends_on),
@@ -82,7 +88,7 @@ def result(discovery: Discovery) -> dict[str, Any]:
             'depends_on': list(u.depends_on),
             'explains': u.explains,
             'rms': u.rms,
-            'law': None if i or discovery.law is None else law_of(discovery.law),
+            'law': None if i or law is None else law_of(law),
         }
         for i, u in enumerate(discovery.unknown)
     ]
@@ -100,18 +106,23 @@ def result(discovery: Discovery) -> dict[str, Any]:
                 'evidence': _number(f.evidence),
                 'equivalent': list(f.equivalent),
             }
-            for f in discovery.setup
+            for f in (() if of_rig is None else of_rig.setup)
         ],
+        'moves': None if of_rig is None else dict(zip(('dx_m', 'dy_m', 'theta_rad'), of_rig.moves, strict=True)),
         'remaining': {'rms': discovery.gap_after, 'floors': discovery.floors},
         'gap': {
-            'unit': 'm',
+            'unit': discovery.workspace.unit,
             'before': discovery.gap_before,
             'after': discovery.gap_after,
-            'floor': discovery.gap_floor,
+            'floor': discovery.gap_floor if math.isfinite(discovery.gap_floor) else None,
             'heldout_before': discovery.gap_heldout_before,
             'heldout_after': discovery.gap_heldout_after,
-            'per_channel': {k: {'before': a, 'after': b} for k, (a, b) in discovery.per_channel.items()},
+            'per_channel': {
+                k: {'before': a, 'after': b, 'heldout': discovery.heldout_per_channel[k]}
+                for k, (a, b) in discovery.per_channel.items()
+            },
         },
+        'nuisance': [{'name': a.effect.name, 'parameters': _fitted(a, sd)} for a, sd in discovery.nuisance],
         'provenance': provenance(discovery),
     }
 
@@ -142,23 +153,13 @@ def law_of(found: FoundLaw) -> dict[str, Any]:
     }
 
 
-def provenance(discovery: Discovery) -> dict[str, Any]:
+def provenance(discovery: Conclusion) -> dict[str, Any]:
     """Hashes, seed, version and cost."""
     return {
         'version': __version__,
         'seed': discovery.seed,
         'forward_simulations': discovery.simulations,
-        'recordings': [
-            {
-                'name': o.name,
-                'sha256': o.digest or o.hashed(),
-                'seconds': o.duration,
-                'rest_seconds': w.rest_seconds,
-                'noise_v': [float(s) for s in w.sigma],
-                'coloured': list(w.coloured),
-            }
-            for o, w in zip(discovery.workspace.observations, discovery.workspace.noise, strict=True)
-        ],
+        'recordings': discovery.workspace.provenance(),
     }
 
 
@@ -196,10 +197,14 @@ def size_of(effect: NamedEffect | Rival) -> str:
     return ', '.join(out)
 
 
-def _left(discovery: Discovery) -> str:
-    """What remains, in micrometres and floors."""
-    after, floor = 1e6 * discovery.gap_after, 1e6 * discovery.gap_floor
-    return f'{after:.3f} µm, {discovery.floors:.2f} times what noise alone leaves ({floor:.3f} µm)'
+def _left(discovery: Conclusion) -> str:
+    """What remains, and how many floors it is."""
+    after, floor = (
+        discovery.workspace.worded(v, discovery.workspace.digits) for v in (discovery.gap_after, discovery.gap_floor)
+    )
+    if not math.isfinite(discovery.gap_floor):
+        return after
+    return f'{after}, {discovery.floors:.2f} times what noise alone leaves ({floor})'
 
 
 def _setup(discovery: Discovery) -> str:
@@ -208,9 +213,25 @@ def _setup(discovery: Discovery) -> str:
     return f'The set-up is not as the rig file or the recording says: {", ".join(names)}. ' if names else ''
 
 
-def sentence(discovery: Discovery) -> str:
+def sentence(discovery: Conclusion) -> str:
     """The verdict in one sentence, after one about the set-up if that is wrong."""
-    return _setup(discovery) + _missing(discovery) + _law(discovery)
+    if not isinstance(discovery, Discovery):
+        return _missing(discovery)
+    return (
+        _setup(discovery)
+        + _missing(discovery, ' besides' if discovery.setup else '')
+        + _moved(discovery)
+        + _law(discovery)
+    )
+
+
+def _moved(discovery: Discovery) -> str:
+    """What the effects do to an estimate, in a sentence, or nothing."""
+    if not discovery.effects:
+        return ''
+    dx, dy, theta = (1e6 * v for v in discovery.moves)
+    them = 'it' if len(discovery.effects) == 1 else 'them'
+    return f' Without {them} an estimate is wrong by up to ΔX {dx:.3g} µm, ΔY {dy:.3g} µm, θ {theta:.3g} µrad.'
 
 
 def _law(discovery: Discovery) -> str:
@@ -227,10 +248,10 @@ def _law(discovery: Discovery) -> str:
     return f'{words}{also}{with_law}.'
 
 
-def _missing(discovery: Discovery) -> str:
-    before, left = 1e6 * discovery.gap_before, _left(discovery)
+def _missing(discovery: Conclusion, besides: str = '') -> str:
+    ws, left = discovery.workspace, _left(discovery)
+    before = f'{ws.scale_shown[0] * discovery.gap_before:{ws.digits}}'
     if discovery.verdict == 'nothing_missing':
-        besides = ' besides' if discovery.setup else ''
         return f'Nothing is missing{besides}: the gap is {left}.'
     parts = []
     for e in discovery.effects:
@@ -243,15 +264,16 @@ def _missing(discovery: Discovery) -> str:
     named = ' and '.join(parts)
     if discovery.verdict == 'effects_found':
         is_are, them = ('is', 'it') if len(parts) == 1 else ('are', 'them')
-        return (
-            f'{named} {is_are} missing from the model; adding {them} closes the gap from {before:.3f} to {left}.'
-            f'{fitted}'
-        )
+        return f'{named} {is_are} missing from the model; adding {them} closes the gap from {before} to {left}.{fitted}'
     if not any(u.remains for u in discovery.unknown):
         return (
-            f'{named} close the gap from {before:.3f} to {left}, but their sizes '
+            f'{named} close the gap from {before} to {left}, but their sizes '
             f'are tied: one effect that is not in the catalogue is likelier.'
         )
     if named:
-        return f'{named} explains part, but an unknown effect remains: the gap goes from {before:.3f} µm to {left}.'
+        explains = 'explains' if len(parts) == 1 else 'explain'
+        return (
+            f'{named} {explains} part, but an unknown effect remains: the gap goes from {before} '
+            f'{ws.scale_shown[1]} to {left}.{fitted}'
+        )
     return f'An effect that is not in the catalogue: the gap is {left}.'

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2
 
+from psd_deflection.discovery.comparison import Comparison
 from psd_deflection.discovery.signatures import Candidate, Columns
-from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import FloatArray
 
 SEEN = 1e-6
@@ -57,7 +57,7 @@ def solve_seen(fisher: FloatArray, score: FloatArray, original: FloatArray) -> t
 class Screen:
     """All candidates' signatures, whitened, side by side."""
 
-    def __init__(self, workspace: Workspace, found: Sequence[tuple[Candidate, Columns]]) -> None:
+    def __init__(self, workspace: Comparison, found: Sequence[tuple[Candidate, Columns]]) -> None:
         self.candidates: list[Candidate] = []
         self.slices: list[slice] = []
         parts: list[npt.NDArray[np.float32]] = []
@@ -71,7 +71,9 @@ class Screen:
             self.slices.append(slice(at, at + len(white)))
             at += len(white)
             parts += white
-        self.rows = np.stack(parts) if parts else np.empty((0, len(workspace.data)), dtype=np.float32)
+        self.rows = (
+            np.stack(parts) if parts else np.empty((0, sum(m.size for m in workspace.measured)), dtype=np.float32)
+        )
         self.fisher = (self.rows @ self.rows.T).astype(np.float64)
         self.lengths = np.maximum(np.diag(self.fisher).copy(), 1e-300)
 
@@ -99,10 +101,12 @@ class Screen:
         out.sort(key=lambda score: -score.gain)
         return out
 
-    def pairs(self, residual: FloatArray, penalty: float, limit: int) -> list[tuple[Score, Score, float]]:
+    def pairs(
+        self, residual: FloatArray, penalty: float, limit: int, known: FloatArray | None = None
+    ) -> list[tuple[Score, Score, float]]:
         """The ``limit`` best pairs by joint gain minus ``penalty`` per column; greedy steps may miss these."""
-        g, fisher = self._projected(residual, None)
-        singles = self.score(residual)
+        g, fisher = self._projected(residual, known)
+        singles = self.score(residual, known)
         # For each effect and its choices the best shape is enough; thousands of pairs take milliseconds.
         best: dict[tuple[object, ...], Score] = {}
         for score in singles:

@@ -14,11 +14,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.stats import chi2 as chi2_law
 
+from psd_deflection.discovery.comparison import Comparison
 from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.hidden import FIRST, SETUP
 from psd_deflection.discovery.screen import Score, Screen
 from psd_deflection.discovery.trust import gain_beyond
-from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.declaration import ActiveEffect, Effect
 
@@ -35,8 +34,9 @@ NEARLY_ALL = 0.01
 OTHER_RATES = (-0.2, -0.1, -0.04, 0.04, 0.1, 0.25)
 MAX_EFFECTS = 4
 TRIALS = 7
-BUDGET = 500
-"""Forward simulations after which nothing more is added; the alternatives end at twice as many."""
+PAIRS = 5
+PAIRS_OPEN = 15
+"""Pairs that are refitted: more of them if the model of the machine is rough and its signatures are not small."""
 SWAP_REACH = 0.6
 """An alternative is refitted only if it explains this fraction of what the named effect explains."""
 
@@ -68,7 +68,7 @@ def slot(effect: Effect, values: Mapping[str, float]) -> tuple[object, ...]:
     return (effect.name, *(values[p.name] for p in effect.parameters if p.each))
 
 
-def unphysical(workspace: Workspace, fit: Fit, index: int) -> bool:
+def unphysical(workspace: Comparison, fit: Fit, index: int) -> bool:
     """Whether effect ``index`` of ``fit`` has run into a bound: it fits only as something that it is not.
 
     An amplitude may end at the bound at which it is off, as long as another one is on.
@@ -84,11 +84,6 @@ def unphysical(workspace: Workspace, fit: Fit, index: int) -> bool:
         ):
             return True
     return not on
-
-
-def comes_late(effects: Sequence[ActiveEffect]) -> bool:
-    """Whether ``effects`` has one of the catalogue, so that mistakes of ``FIRST`` are no longer looked for."""
-    return any(a.effect.name not in SETUP for a in effects)
 
 
 def far(fit: Fit) -> bool:
@@ -122,8 +117,8 @@ class Search:
 
     def __init__(
         self,
-        workspace: Workspace,
-        screen: Callable[[Workspace, Fit | None], Screen],
+        workspace: Comparison,
+        screen: Callable[[Comparison, Fit | None], Screen],
         progress: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.workspace = workspace
@@ -167,10 +162,12 @@ class Search:
         return min(full, key=self._bic, default=None)
 
     def _passes(self, smaller: Fit, larger: Fit, null: Fit) -> bool:
-        explained = null.residual - smaller.residual
-        gain = gain_beyond(self.workspace, smaller.residual, larger.residual, explained)
+        gain = smaller.chi2 - larger.chi2
+        if not self.workspace.open_level:
+            explained = null.residual - smaller.residual
+            gain = min(gain, gain_beyond(self.workspace, smaller.residual, larger.residual, explained))
         more = self.penalty * (larger.parameters - smaller.parameters)
-        return min(gain, smaller.chi2 - larger.chi2) - more > BIC_ACCEPT
+        return gain - more > BIC_ACCEPT
 
     def library_p(self, gain: float, dof: int) -> float:
         """p of a gain in chi-square, over the whole library (Sidak)."""
@@ -180,16 +177,11 @@ class Search:
 
     def renoise(self, fit: Fit) -> Fit:
         """Estimate the noise again, now that most of the discrepancy is explained; refit if it differs."""
-        before = self.workspace.noise
-        self.workspace.estimate_noise([*self.workspace.base, *fit.effects])
-        now = self.workspace.noise
-        if all(
-            a.coloured == b.coloured and np.allclose(a.innovation, b.innovation, rtol=0.02)
-            for a, b in zip(before, now, strict=True)
-        ):
-            self.workspace.noise = before
+        if not self.workspace.renoise([*self.workspace.base, *fit.whole]):
             return fit
         self._without.clear()
+        if self.workspace.open_level:
+            self.penalty = float(np.log(self.workspace.effective_size()))
         fit = refit(self.workspace, fit.effects, iterations=6)
         self.screen = self._make_screen(self.workspace, fit)
         return fit
@@ -198,44 +190,51 @@ class Search:
         """Search; the answer may be that nothing is missing."""
         ws = self.workspace
         null = refit(ws, ())
-        scores = self.screen.score(null.residual)
+        scores = self.screen.score(null.residual, unbound(null))
         first_scores = scores
         current = self._mistake(null, scores)
         renoised = False
-        while len(current.effects) < MAX_EFFECTS and self.spent < BUDGET:
-            if current.effects:
-                scores = self.screen.score(current.residual, unbound(current))
+        while len(current.effects) < MAX_EFFECTS and self.spent < self.workspace.budget:
+            scores = self.screen.score(current.residual, unbound(current))
             taken = {slot(a.effect, a.values) for a in current.effects}
             scores = [
                 s
                 for s in scores
-                if slot(s.candidate.effect, s.candidate.start) not in taken and s.candidate.effect.name not in FIRST
+                if slot(s.candidate.effect, s.candidate.start) not in taken and s.candidate.effect.name not in ws.first
             ]
-            if not scores or min(s.p for s in scores) > P_ACCEPT:
-                break
-            # From the second effect on, the residual is smaller and the first guess better.
-            tried = promising(scores, self.penalty, 0.3, TRIALS if not current.effects else 4)
-            starts = [[*current.effects, s.candidate.from_coefficients(s.coefficients)] for s in tried]
-            better = self._best_of(starts, 2, 6) if current.effects else self._best_of(starts, 4, 12)
+            better = self._further(current, scores)
             if better is None or not self._passes(current, better, null):
-                break
-            self._say('adding ' + better.effects[-1].label)
+                # Of two causes of a rough machine neither may help alone.
+                better = self._try_pairs(null, current) if ws.open_level and len(current.effects) < 2 else current
+                if better is current or not self._passes(current, better, null):
+                    break
+            else:
+                self._say('adding ' + better.effects[-1].label)
             current = better
-            if not renoised:
+            if not renoised or ws.open_level:
                 renoised = True
                 current = self.renoise(current)
                 null = refit(ws, ())
-            if far(current) and self.spent < BUDGET:
+            if (far(current) or ws.open_level) and self.spent < self.workspace.budget:
                 self.screen = self._make_screen(ws, current)
-            if len(current.effects) == 2 and self.spent < BUDGET:
+            if len(current.effects) == 2 and self.spent < self.workspace.budget:
                 current = self._try_pairs(null, current)
         current = self._drop(null, current)
         if current.effects:
             current = self.renoise(current)
             null = refit(ws, ())
-        current, others = self._swap(null, current)
-        p, delta_bic, delta_chi2 = self._weigh(null, current)
+        current, others = self.swap(null, current)
+        p, delta_bic, delta_chi2 = self.weigh(null, current)
         return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace)
+
+    def _further(self, current: Fit, scores: Sequence[Score]) -> Fit | None:
+        """``current`` with the best further effect."""
+        if not scores or min(s.p for s in scores) > P_ACCEPT:
+            return None
+        # From the second effect on, the residual is smaller and the first guess better.
+        tried = promising(scores, self.penalty, 0.3, TRIALS if not current.effects else 4)
+        starts = [[*current.effects, s.candidate.from_coefficients(s.coefficients)] for s in tried]
+        return self._best_of(starts, 2, 6) if current.effects else self._best_of(starts, 4, 12)
 
     def _mistake(self, null: Fit, scores: Sequence[Score]) -> Fit:
         """One of the mistakes that touch every channel if it explains nearly all by itself, else ``null``."""
@@ -244,7 +243,7 @@ class Search:
         best = max(s.gain for s in scores)
         starts: list[list[ActiveEffect]] = []
         for s in scores:
-            if s.candidate.effect.name not in FIRST:
+            if s.candidate.effect.name not in self.workspace.first:
                 continue
             if s.gain > LIKELY * best:
                 starts.append([s.candidate.from_coefficients(s.coefficients)])
@@ -260,18 +259,18 @@ class Search:
         self._say('the set-up: ' + found.effects[-1].label)
         return found
 
-    def _swap(self, null: Fit, current: Fit) -> tuple[Fit, list[list[Fit]]]:
+    def swap(self, null: Fit, current: Fit) -> tuple[Fit, list[list[Fit]]]:
         """Try to replace each effect by its alternatives and keep the better model; at most two rounds."""
         others: list[list[Fit]] = []
         for swaps in range(3):
             others = []
-            _, _, gains = self._weigh(null, current)
+            _, _, gains = self.weigh(null, current)
             best = current
             for i in range(len(current.effects)):
                 fits = self.alternatives(null, current, i, gains[i])
                 others.append(fits)
                 best = min([best, *fits], key=self._bic)
-            spent = self.spent > 1.5 * BUDGET
+            spent = self.spent > 1.5 * self.workspace.budget
             if swaps == 2 or spent or self._bic(best) > self._bic(current) - 2.0:
                 break
             self._say('swapping to ' + ', '.join(a.label for a in best.effects))
@@ -280,11 +279,13 @@ class Search:
         return current, others
 
     def _try_pairs(self, null: Fit, current: Fit) -> Fit:
-        pairs = self.screen.pairs(null.residual, self.penalty, 5)
+        pairs = self.screen.pairs(
+            null.residual, self.penalty, PAIRS_OPEN if self.workspace.open_level else PAIRS, unbound(null)
+        )
         starts = []
         for a, b, _ in pairs:
             same = slot(a.candidate.effect, a.candidate.start) == slot(b.candidate.effect, b.candidate.start)
-            mistaken = {a.candidate.effect.name, b.candidate.effect.name} & FIRST
+            mistaken = {a.candidate.effect.name, b.candidate.effect.name} & self.workspace.first
             if (
                 not same
                 and not mistaken
@@ -308,7 +309,8 @@ class Search:
             current = best
         return current
 
-    def _weigh(self, null: Fit, current: Fit) -> tuple[list[float], list[float], list[float]]:
+    def weigh(self, null: Fit, current: Fit) -> tuple[list[float], list[float], list[float]]:
+        """For each effect of ``current``: p over the library, loss in BIC and in chi-square if it were dropped."""
         p, delta_bic, delta_chi2 = [], [], []
         for i, without in enumerate(self.without_each(current, null)):
             gain = without.chi2 - current.chi2
@@ -322,31 +324,33 @@ class Search:
 
         ``gain``: what the named effect explains, in chi-square; ``null``: the fit of no effect.
         """
-        if self.spent > 2 * BUDGET:
+        if self.spent > 2 * self.workspace.budget:
             return []
         named = current.effects[index]
         rest = [a for j, a in enumerate(current.effects) if j != index]
         without = self.without_each(current, null)[index]
-        known = unbound(without) if rest else None
-        scores = self.screen.score(without.residual, known)
+        scores = self.screen.score(without.residual, unbound(without))
         # Screening is linear: a candidate that falls short by little needs a full refit.
         bar = min(SWAP_REACH * gain, gain - 60.0) if gain > 100.0 else 0.5 * gain
+        if self.workspace.open_level:
+            # A rough machine is far from linear.
+            bar = 0.0
         best: dict[str, Score] = {}
         for s in scores:
             name = s.candidate.effect.name
-            late = name in FIRST and comes_late(rest)
+            late = name in self.workspace.first and any(a.effect.name not in self.workspace.setup for a in rest)
             if name == named.effect.name or name in {a.effect.name for a in rest} or s.gain < bar or late:
                 continue
             if name not in best:
                 best[name] = s
         # The best eight: an exact confounder scores as high as the named effect itself. If the search was
         # already expensive, the case is complicated; try two only.
-        ranked = sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.spent < BUDGET else 2]
+        ranked = sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.spent < self.workspace.budget else 2]
         fits = []
         for s in ranked:
             start = [*rest, s.candidate.from_coefficients(s.coefficients)]
-            quick = refit(self.workspace, start, iterations=3)
-            if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain) and self.spent < 2 * BUDGET:
+            quick = refit(self.workspace, start, iterations=10 if self.workspace.open_level else 3)
+            if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain) and self.spent < 2 * self.workspace.budget:
                 quick = refit(self.workspace, quick.effects, iterations=8)
             fits.append(quick)
         fits.sort(key=lambda f: f.chi2)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.discovery.comparison import Comparison
+from psd_deflection.discovery.fit import Fit
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import catalogue
 from psd_deflection.simulation.declaration import ActiveEffect, Effect
 from psd_deflection.simulation.physics import Physics
 
@@ -75,18 +75,13 @@ class Candidate:
 
 
 def candidates(
-    physics: Physics,
-    proposals: Mapping[str, Sequence[float]],
-    without: Sequence[str] = (),
-    more: Sequence[Effect] = (),
+    library: Sequence[Effect], physics: Physics | None, proposals: Mapping[str, Sequence[float]]
 ) -> Iterator[Candidate]:
-    """Every candidate of the catalogue and of ``more`` except those named in ``without``.
+    """Every candidate of ``library``.
 
     ``proposals``: the values to try, by the name that a parameter's ``propose`` gives.
     """
-    for effect in (*catalogue().values(), *more):
-        if effect.name in without:
-            continue
+    for effect in library:
         for choice in effect.variants():
             off = effect.off_values(physics, choice)
             shapes: list[list[tuple[str, float]]] = []
@@ -112,7 +107,7 @@ def candidates(
 
 
 def signature_columns(
-    candidate: Candidate, workspace: Workspace, nominal: list[FloatArray], base: Sequence[ActiveEffect]
+    candidate: Candidate, workspace: Comparison, nominal: list[FloatArray], base: Sequence[ActiveEffect]
 ) -> Columns:
     """The candidate's signatures: change of the fine-block volts for one ``scale`` of each parameter.
 
@@ -148,6 +143,13 @@ def signature_columns(
     return out
 
 
+def signatures_beside(workspace: Comparison, listed: Iterable[Candidate], fit: Fit) -> list[tuple[Candidate, Columns]]:
+    """The signatures of the candidates beside what ``fit`` has already."""
+    beside = [*workspace.base, *fit.whole]
+    now = workspace.simulate(beside)
+    return [(c, signature_columns(c, workspace, now, beside)) for c in listed]
+
+
 class SignatureBank:
     """Signatures of one design (rigs, loads, temperatures), kept for the next search on it."""
 
@@ -156,14 +158,14 @@ class SignatureBank:
         self._nominal: list[FloatArray] | None = None
         self._base: tuple[ActiveEffect, ...] = ()
 
-    def nominal(self, workspace: Workspace) -> list[FloatArray]:
+    def nominal(self, workspace: Comparison) -> list[FloatArray]:
         """The simulation without any effect, except those of the rig file."""
         if self._nominal is None:
             self._base = workspace.base
             self._nominal = workspace.simulate(self._base)
         return self._nominal
 
-    def get(self, candidate: Candidate, workspace: Workspace) -> Columns:
+    def get(self, candidate: Candidate, workspace: Comparison) -> Columns:
         """The candidate's columns, simulated once."""
         found = self._kept.get(candidate.key)
         if found is None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.discovery.comparison import Comparison
 from psd_deflection.records import FloatArray
 
 RELATIVE = 0.002
@@ -20,16 +20,16 @@ BANDS = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, 125.0)
 """Edges, Hz; the last band has no upper end."""
 
 
-def energies(workspace: Workspace, vector: FloatArray) -> FloatArray:
+def energies(workspace: Comparison, vector: FloatArray) -> FloatArray:
     """Chi-square of a whitened vector (D,) by recording, channel and band: (recordings, 6, bands)."""
     out = []
-    for part, o, size in zip(workspace.split(vector), workspace.observations, workspace.fine, strict=True):
+    for part, period in zip(workspace.split(vector), workspace.periods, strict=True):
         n = part.shape[1]
         power = np.abs(np.fft.rfft(part, axis=1)) ** 2 * (2.0 / n)
         power[:, 0] *= 0.5
         if n % 2 == 0:
             power[:, -1] *= 0.5
-        starts = np.searchsorted(np.fft.rfftfreq(n, o.period * size), BANDS[:-1])
+        starts = np.searchsorted(np.fft.rfftfreq(n, period), BANDS[:-1])
         padded = np.concatenate((power, np.zeros((len(power), 1))), axis=1)
         band = np.add.reduceat(padded, np.minimum(starts, power.shape[1]), axis=1)
         # reduceat gives the element itself for a band without frequencies.
@@ -37,7 +37,7 @@ def energies(workspace: Workspace, vector: FloatArray) -> FloatArray:
     return np.stack(out)
 
 
-def gain_beyond(workspace: Workspace, smaller: FloatArray, larger: FloatArray, explained: FloatArray) -> float:
+def gain_beyond(workspace: Comparison, smaller: FloatArray, larger: FloatArray, explained: FloatArray) -> float:
     """Chi-square gained from residual ``smaller`` to residual ``larger`` (D,), whitened, beyond the simulation's error.
 
     ``explained`` (D,): what the smaller model explains. A gain in a channel and band in which this error alone may give

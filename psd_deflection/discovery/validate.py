@@ -1,4 +1,4 @@
-"""Tests a model on held-out load cases: whole load cases, never interleaved blocks.
+"""Tests a model on held-out load cases: whole load cases or recordings, never interleaved blocks.
 
 For each group of load cases the model is refitted without it, by one Gauss-Newton step from the
 optimum, and tested on that group. One step is enough because the effects are nearly linear.
@@ -6,56 +6,69 @@ optimum, and tested on that group. One step is enough because the effects are ne
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
+from psd_deflection.discovery.comparison import Comparison
 from psd_deflection.discovery.fit import Fit
-from psd_deflection.discovery.workspace import Workspace
-from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.records import FloatArray
 
-FOLDS = 4
-PIECE_SECONDS = 0.5
 BOOTSTRAPS = 400
 
 
-def fold_of_case(workspace: Workspace) -> IntArray:
-    """The fold of each load case: assigned in turn, so each fold contains several kinds of cases."""
-    count = max(int(c.max()) for c in workspace.case) + 1
-    return np.arange(count) % min(FOLDS, count)
-
-
-def heldout_residual(workspace: Workspace, fit: Fit) -> FloatArray:
-    """Whitened residual (D,), each element predicted by a fit that has not seen its load case."""
-    if not fit.free:
-        return fit.residual
-    folds = fold_of_case(workspace)[workspace.row_cases()]
+def _steps(workspace: Comparison, fit: Fit) -> Iterator[tuple[npt.NDArray[np.bool_], FloatArray]]:
+    """For each fold its elements (D,), and by how much the parameters (p,) move if it is left out of the fit."""
+    folds = workspace.folds()[workspace.row_cases()]
     lengths = np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-150)
     j = fit.jacobian / lengths
     whole_f, whole_g = j.T @ j, j.T @ fit.residual
-    out = fit.residual.copy()
+    # A parameter at its bound stays there: a step knows no bounds.
+    free = np.array([name not in fit.at_bound for name in fit.free])
     for fold in np.unique(folds):
         test = folds == fold
         jt, rt = j[test], fit.residual[test]
         f = whole_f - jt.T @ jt
         # A ridge of one prior standard deviation: parameters that only this fold shows do not move.
         f[np.diag_indices_from(f)] += 1e-6
-        step = np.linalg.lstsq(f, whole_g - jt.T @ rt, rcond=1e-9)[0]
-        out[test] = rt - jt @ step
+        step = np.zeros(len(lengths))
+        step[free] = np.linalg.lstsq(f[np.ix_(free, free)], (whole_g - jt.T @ rt)[free], rcond=1e-9)[0]
+        yield test, step / lengths
+
+
+def heldout_residual(workspace: Comparison, fit: Fit) -> FloatArray:
+    """Whitened residual (D,), each element predicted by a fit that has not seen its load case."""
+    if not fit.free:
+        return fit.residual
+    out = fit.residual.copy()
+    for test, step in _steps(workspace, fit):
+        out[test] -= fit.jacobian[test] @ step
     return out
 
 
-def heldout_gap(workspace: Workspace, fit: Fit) -> float:
-    """Gap, m, on load cases that the fit has not seen."""
+def scatter(workspace: Comparison, fit: Fit) -> FloatArray:
+    """Standard deviation (p,) of the parameters, from their scatter when one fold after the other is left out.
+
+    The jackknife (Tukey 1958). It sees what the noise does not: that the model fits each case a little differently.
+    """
+    steps = np.array([step for _, step in _steps(workspace, fit)])
+    n = len(steps)
+    return np.asarray(np.sqrt((n - 1) / n * np.sum((steps - steps.mean(axis=0)) ** 2, axis=0)))
+
+
+def heldout_tables(workspace: Comparison, fit: Fit) -> list[FloatArray]:
+    """Measured minus simulated on load cases that the fit has not seen."""
     if not fit.free:
-        return workspace.gap(fit.difference)
-    white = heldout_residual(workspace, fit) - fit.residual
-    # The change is slow compared with a fine block, so the inverse of whitening is a scaling per channel.
-    parts = []
-    for part, d, noise in zip(workspace.split(white), fit.difference, workspace.noise, strict=True):
-        gain = noise.innovation / np.maximum(1.0 - noise.ar.sum(axis=1), 0.05)
-        parts.append(d + part * gain[:, None])
-    return workspace.gap(parts)
+        return fit.difference
+    change = workspace.unwhitened(heldout_residual(workspace, fit) - fit.residual)
+    return [d + c for d, c in zip(fit.difference, change, strict=True)]
+
+
+def heldout_gap(workspace: Comparison, fit: Fit) -> float:
+    """Gap on load cases that the fit has not seen."""
+    return workspace.gap(heldout_tables(workspace, fit))
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,20 +84,13 @@ class HeldOut:
         return self.gain > 2.0 * self.error
 
 
-def heldout_gain(workspace: Workspace, without: Fit, fit: Fit, rng: np.random.Generator) -> HeldOut:
+def heldout_gain(workspace: Comparison, without: Fit, fit: Fit, rng: np.random.Generator) -> HeldOut:
     """Gain of ``fit`` over ``without`` on unseen load cases.
 
     The standard error is the smaller of the block bootstrap's and that of the likelihood ratio
     itself, because the former is meaningless for an effect that shows only in a few short intervals.
     """
-    a, b = heldout_residual(workspace, without), heldout_residual(workspace, fit)
-    gains = 0.5 * (a * a - b * b)
-    pieces: list[FloatArray] = []
-    for part, o, size in zip(workspace.split(gains), workspace.observations, workspace.fine, strict=True):
-        length = max(1, round(PIECE_SECONDS / (o.period * size)))
-        total = part.sum(axis=0)
-        pieces.append(np.add.reduceat(total, np.arange(0, len(total), length)))
-    piece = np.concatenate(pieces)
+    piece = workspace.pieces(heldout_residual(workspace, without), heldout_residual(workspace, fit))
     draws = rng.integers(0, len(piece), size=(BOOTSTRAPS, len(piece)))
     spread = float(np.std(piece[draws].sum(axis=1)))
     gain = float(piece.sum())

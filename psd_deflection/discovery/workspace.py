@@ -12,7 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from psd_deflection.discovery.hidden import only_in
+from psd_deflection.discovery.comparison import Comparison
+from psd_deflection.discovery.hidden import FIRST, SETUP, only_in
 from psd_deflection.discovery.noise import NoiseModel, estimate_noise
 from psd_deflection.discovery.observation import Observation, load_cases
 from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
@@ -24,7 +25,10 @@ from psd_deflection.simulation.simulator import ForwardModel
 LEAST_NOISE = 0.05
 """Share of the rig file's noise that is assumed at least."""
 FINE_SECONDS = 0.004
+FOLDS = 4
+PIECE_SECONDS = 0.5
 DOTS = list(DOT_CHANNELS)
+LOADS_SHOWN = ('load_fx / N', 'load_fy / N', 'load_tz / N m')
 MAX_FINE = 60_000
 """Approximate total number of fine blocks; long recordings get longer blocks, which limits memory."""
 
@@ -42,8 +46,13 @@ def fine_means(rows: FloatArray, size: int, present: FloatArray | None = None) -
     return np.asarray((cut * weights).sum(axis=2) / np.maximum(weights.sum(axis=2), 1.0))
 
 
-class Workspace:
-    """All recordings of one call of discover; ``simulations`` counts forward runs of all of them."""
+class Workspace(Comparison):
+    """All recordings of the rig of one call of discover, as means of fine blocks (6, nf), V."""
+
+    physics: Physics
+    first = FIRST
+    setup = SETUP
+    digits = '.3f'
 
     def __init__(self, observations: Sequence[Observation], base: Sequence[ActiveEffect] = ()) -> None:
         self.observations = tuple(observations)
@@ -87,6 +96,33 @@ class Workspace:
             floors = np.maximum(share * o.rig.noises.ravel(), o.rig.converter.volts_per_count / np.sqrt(12.0))
             self.noise.append(estimate_noise(o, o.volts - chunk.volts.T, size, floors))
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the recordings."""
+        return tuple(o.name for o in self.observations)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The dots."""
+        return ('x1', 'y1', 'x2', 'y2')
+
+    @property
+    def periods(self) -> list[float]:
+        """s between the fine blocks of each recording."""
+        return [o.period * size for o, size in zip(self.observations, self.fine, strict=True)]
+
+    def renoise(self, effects: Sequence[ActiveEffect]) -> bool:
+        """Estimate the noise with ``effects`` in the model; False, and nothing changes, if it is the same."""
+        before = self.noise
+        self.estimate_noise(effects)
+        if all(
+            a.coloured == b.coloured and np.allclose(a.innovation, b.innovation, rtol=0.02)
+            for a, b in zip(before, self.noise, strict=True)
+        ):
+            self.noise = before
+            return False
+        return True
+
     def raw_residual(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
         """Measured minus simulated (n, 6) V of each recording, samples, 0 if lost."""
         self.simulations += 1
@@ -110,18 +146,6 @@ class Workspace:
         """One vector of all recordings, white and of unit variance if the noise model holds."""
         parts = [w.whiten(f, c).ravel() for f, w, c in zip(fine, self.noise, self.count, strict=True)]
         return np.concatenate(parts)
-
-    def split(self, vector: FloatArray) -> list[FloatArray]:
-        """The (6, nf) parts of such a vector."""
-        out, at = [], 0
-        for m in self.measured:
-            out.append(vector[at : at + m.size].reshape(m.shape))
-            at += m.size
-        return out
-
-    def row_cases(self) -> IntArray:
-        """The load case of every element of a vector."""
-        return np.concatenate([np.tile(c, 6) for c in self.case])
 
     @property
     def size(self) -> int:
@@ -170,7 +194,77 @@ class Workspace:
             count += int(counted.sum())
         return float(np.sqrt(total / max(count, 1)))
 
-    def residual(self, effects: Sequence[ActiveEffect]) -> tuple[FloatArray, list[FloatArray]]:
-        """Whitened residual vector and fine-block residual in V, measured minus simulated."""
-        difference = [m - s for m, s in zip(self.measured, self.simulate(effects), strict=True)]
-        return self.whiten(difference), difference
+    def pieces(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """Log-likelihood that residual ``b`` gains over ``a`` (D,), in pieces of ``PIECE_SECONDS``."""
+        out: list[FloatArray] = []
+        for part, o, size in zip(self.split(0.5 * (a * a - b * b)), self.observations, self.fine, strict=True):
+            length = max(1, round(PIECE_SECONDS / (o.period * size)))
+            total = part.sum(axis=0)
+            out.append(np.add.reduceat(total, np.arange(0, len(total), length)))
+        return np.concatenate(out)
+
+    def unwhitened(self, white: FloatArray) -> list[FloatArray]:
+        """Fine-block volts of a change that is slow compared with a fine block: a scaling per channel."""
+        return [
+            part * (noise.innovation / np.maximum(1.0 - noise.ar.sum(axis=1), 0.05))[:, None]
+            for part, noise in zip(self.split(white), self.noise, strict=True)
+        ]
+
+    def folds(self) -> IntArray:
+        """Whole recordings if there are enough, else load cases in turn, so that each fold has several kinds."""
+        count = max(int(c.max()) for c in self.case) + 1
+        if len(self.case) < FOLDS:
+            return np.arange(count) % min(FOLDS, count)
+        out = np.zeros(count, dtype=np.int64)
+        for i, cases in enumerate(self.case):
+            out[cases] = i
+        return out
+
+    @property
+    def unit(self) -> str:
+        """Metres."""
+        return 'm'
+
+    @property
+    def scale_shown(self) -> tuple[float, str]:
+        """Micrometres."""
+        return 1e6, 'µm'
+
+    @property
+    def units_shown(self) -> tuple[str, ...]:
+        """Micrometres."""
+        return ('µm',) * 4
+
+    def shown(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
+        """Block means of the dots (4, blocks), µm."""
+        return [1e6 * d for d in self.block_dots(tables)]
+
+    def against(self) -> dict[str, list[FloatArray]]:
+        """Time, loads and the dots as measured, block by block."""
+        out: dict[str, list[FloatArray]] = {'time / s (recordings one after another)': []}
+        start = 0.0
+        for o, dots in zip(self.observations, self.block_dots(self.measured), strict=True):
+            size, n = o.rig.estimator.block_size, dots.shape[1]
+            out['time / s (recordings one after another)'].append(
+                np.asarray(start + (np.arange(n) + 0.5) * size * o.period)
+            )
+            start += o.duration
+            for name, row in zip(LOADS_SHOWN, fine_means(o.loads.T, size), strict=True):
+                out.setdefault(name, []).append(row[:n])
+            for name, row in zip(self.channels, dots, strict=True):
+                out.setdefault(f'{name} / mm', []).append(1e3 * row)
+        return out
+
+    def provenance(self) -> list[dict[str, object]]:
+        """Of each recording: hash, length, noise."""
+        return [
+            {
+                'name': o.name,
+                'sha256': o.digest or o.hashed(),
+                'seconds': o.duration,
+                'rest_seconds': w.rest_seconds,
+                'noise_v': [float(s) for s in w.sigma],
+                'coloured': list(w.coloured),
+            }
+            for o, w in zip(self.observations, self.noise, strict=True)
+        ]

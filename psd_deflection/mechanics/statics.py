@@ -55,6 +55,11 @@ class LinkStatics:
         """(dX m, dY m, theta rad) under a tip force (N) and torque (N m)."""
         return fx * self._force, fy * self._force, tz * self._twist
 
+    def sag(self, weight_per_length: float) -> float:
+        """How far (m) the tip sinks under the link's own weight, N/m, which turns the clamp by its moment w L^2/2."""
+        bent = weight_per_length * self.length**4 / (8.0 * self.bending_stiffness)
+        return bent + self.clamp_bending * weight_per_length * self.length**3 / 2.0
+
     def tip_load(self, dx: float, dy: float, theta: float) -> tuple[float, float, float]:
         """(fx N, fy N, tz N m) at the tip centroid that give this deflection without tip moments."""
         return dx / self._force, dy / self._force, theta / self._twist

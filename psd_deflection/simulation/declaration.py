@@ -84,13 +84,13 @@ class EffectParameter:
             raise ConfigError(f'{source}: {self.name} = {shown(value)}: must be one of {words}')
         return number
 
-    def off(self, physics: Physics) -> float:
+    def off(self, physics: Physics | None) -> float:
         """The nominal value on this rig."""
         return float(getattr(physics, self.of_rig)) if self.of_rig else self.nominal
 
-    def bounds(self, physics: Physics, values: Values) -> tuple[float, float]:
+    def bounds(self, physics: Physics | None, values: Values) -> tuple[float, float]:
         """Least and greatest value that is physical on this rig."""
-        if self.within is None:
+        if self.within is None or physics is None:
             return self.minimum, self.maximum
         low, high = self.within(physics, values)
         return max(low, self.minimum), min(high, self.maximum)
@@ -143,7 +143,7 @@ class Reading:
 class Traced:
     """One block on the way back from the tip's pose to the load. Changed in place.
 
-    ``pose``: [dX m, dY m, theta rad], without the constants' ``static_offset``. ``loads``: [Fx N, Fy N, Tz N m], set
+    ``pose``: [dX m, dY m, theta rad], without the constants' ``at_rest``. ``loads``: [Fx N, Fy N, Tz N m], set
     after the last effect on a pose. ``seconds``: since the last block. ``physics``: the constants with all effects.
     """
 
@@ -231,7 +231,7 @@ class Effect:
         for combination in itertools.product(*(p.choices[:2] if p is PSD else p.choices for p in discrete)):
             yield {p.name: float(c) for p, c in zip(discrete, combination, strict=True)}
 
-    def off_values(self, physics: Physics, choice: Values) -> dict[str, float]:
+    def off_values(self, physics: Physics | None, choice: Values) -> dict[str, float]:
         """All parameters at the value where the effect is off."""
         return {p.name: choice.get(p.name, p.off(physics)) for p in self.parameters}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,7 +18,8 @@ class Physics:
 
     ``bending_stiffness`` EI, ``torsional_stiffness`` GJ, N m^2. ``clamp_bending`` and
     ``clamp_torsion``: clamp rotation per moment, rad/(N m). ``static_offset``: (dX, dY) of the
-    link without load, m. ``slope_ratio``: k of phi = -k dY/L; 0 is the nominal, parallel planes.
+    link without load, m, besides that by ``weight_per_length``, N/m, and by ``constant_force``
+    (x, y), N, at the tip. ``slope_ratio``: k of phi = -k dY/L; 0 is the nominal, parallel planes.
     ``beams``: l_i, on the plate if ``psds_at_base``; ``slopes``: how much each goes sideways along Z.
     ``half_area``: half width and height of the active areas. ``noise`` (3P,), V rms of each channel.
     ``phase``: how long after each sample the quantities are taken, below ``period``, s.
@@ -48,6 +49,8 @@ class Physics:
     full_scale: float
     phase: float = 0.0
     psds_at_base: bool = False
+    weight_per_length: float = 0.0
+    constant_force: FloatArray = field(default_factory=lambda: np.zeros(2))
 
     @classmethod
     def of(cls, rig: Rig) -> Physics:
@@ -86,6 +89,13 @@ class Physics:
         return LinkStatics(
             self.length, self.bending_stiffness, self.torsional_stiffness, self.clamp_bending, self.clamp_torsion
         )
+
+    @property
+    def at_rest(self) -> tuple[float, float]:
+        """(dX, dY) of the link without load, m."""
+        x, y = (self.constant_force * self.force_compliance).tolist()
+        sag = self.statics.sag(self.weight_per_length)
+        return float(self.static_offset[0]) + x, float(self.static_offset[1]) - sag + y
 
     @property
     def force_compliance(self) -> float:

@@ -21,7 +21,7 @@ class SimulatedSamples:
 
     ``t`` (n,): s since the first sample. ``warmer`` (n,): K above the first temperature.
     ``loads`` (3, n): Fx, Fy N, Tz N m. ``static`` (3, n): the pose these loads would settle at,
-    without ``physics.static_offset``. ``pose`` (3, n): dX, dY m, theta rad. ``beams`` (2P, n): l_1,
+    without ``physics.at_rest``. ``pose`` (3, n): dX, dY m, theta rad. ``beams`` (2P, n): l_1,
     l_2 ..., m. ``true_dots`` (2P, n): on the plate from the PSD centres. ``dots`` (2P, n): as the PSDs
     report them. ``sums`` (P, n), ``volts`` (3P, n): V. ``noise`` (3P,): V rms, when ``volts`` are to be the
     mean over a noise that is not on them; 0 when they are samples as they are. ``between``: during an

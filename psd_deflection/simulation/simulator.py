@@ -61,9 +61,10 @@ class ForwardModel:
         p = self.physics
         bending = mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period, phase)
         torsion = mode_coefficients(p.torsion_frequency, p.torsion_damping_ratio, p.period, phase)
+        self._at_rest = p.at_rest
         self._modes = (
-            Filter(bending, float(p.static_offset[0])),
-            Filter(bending, float(p.static_offset[1])),
+            Filter(bending, self._at_rest[0]),
+            Filter(bending, self._at_rest[1]),
             Filter(torsion),
         )
         self._states: list[State] = [{} for _ in self.effects]
@@ -96,7 +97,7 @@ class ForwardModel:
         self._at('static', samples)
         samples.pose = np.empty((3, n))
         for axis, mode in enumerate(self._modes):
-            held = samples.static[axis] + p.static_offset[axis] if axis < 2 else samples.static[axis]
+            held = samples.static[axis] + self._at_rest[axis] if axis < 2 else samples.static[axis]
             samples.pose[axis] = mode(held)
         self._at('pose', samples)
         samples.beams = np.repeat(p.beams.reshape(-1, 1), n, axis=1)

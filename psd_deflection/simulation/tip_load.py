@@ -31,7 +31,7 @@ class TipLoads:
             if active.effect.configure is not None:
                 active.effect.configure(self._physics, active.values)
         self._statics = self._physics.statics
-        self._offset: list[float] = self._physics.static_offset.tolist()
+        self._offset: list[float] = [*self._physics.at_rest]
         traced = [active for active in effects if active.effect.trace_back is not None]
         self._effects = sorted(traced, key=lambda a: (POINTS.index(a.effect.point), a.effect.rank), reverse=True)
         self._last: int | None = None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +10,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from blind import generator, run, score
-from blind.adapter import Model, PlantEffect, discover_in
-from blind.arm import DATA, Arm
 from blind.cases import MISTAKES, Case, all_cases, designs, gap_of, scaled, short_cases
 from blind.mistakes import observed
 from psd_deflection.config import load_rig
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import EffectParameter
 from psd_deflection.simulation.simulator import ForwardModel
 
 
@@ -133,58 +129,3 @@ def test_intervals_are_clopper_and_pearsons() -> None:
     low, high = score.interval(0, 300)
     assert low == 0.0
     assert high == pytest.approx(1 - 0.025 ** (1 / 300))
-
-
-class Spring:
-    """A plant for the adapter: y = k u + c u^3, of which the nominal model has no c."""
-
-    channels = ('y',)
-    cases = ('a', 'b', 'c', 'd')
-    library = (
-        PlantEffect('stiffness', (EffectParameter('scale', '', -0.9, 9.0, 0.1, 'of k'),), {'scale': 0.05}),
-        PlantEffect('cubic', (EffectParameter('c', '', -9.0, 9.0, 0.1, 'of u^3'),), {'c': 0.05}),
-    )
-
-    def __init__(self, c: float) -> None:
-        self._u = [np.linspace(-1, 1, 200) * (1 + 0.2 * i) for i in range(4)]
-        rng = np.random.default_rng(0)
-        self._y = [(u + c * u**3 + 0.01 * rng.standard_normal(200))[None, :] for u in self._u]
-
-    def measured(self) -> list[FloatArray]:
-        return self._y
-
-    def simulate(self, model: Model, cases: Sequence[int]) -> list[FloatArray]:
-        k = 1.0 + (model['stiffness']['scale'] if 'stiffness' in model else 0.0)
-        c = model['cubic']['c'] if 'cubic' in model else 0.0
-        return [(k * self._u[i] + c * self._u[i] ** 3)[None, :] for i in cases]
-
-
-def test_the_adapter_names_what_another_plant_lacks() -> None:
-    found = discover_in(Spring(0.3))
-    assert [s.name for s in found.steps] == ['cubic']
-    assert found.steps[0].values['c'] == pytest.approx(0.3, abs=0.01)
-    assert found.heldout_after[0] == pytest.approx(0.01, rel=0.1)
-    assert found.where[0][0] == 'd'
-
-
-def test_the_adapter_adds_nothing_to_a_plant_that_lacks_nothing() -> None:
-    assert discover_in(Spring(0.0)).steps == ()
-
-
-@pytest.mark.skipif(not DATA.is_dir(), reason='the data that others measured are not here')
-def test_what_was_found_missing_closes_the_gap_on_measured_data() -> None:
-    # The search itself takes minutes (python -m blind.arm); what it ended with is in docs/discover.md.
-    arm = Arm()
-    every = range(len(arm.cases))
-
-    def rms(model: Model) -> FloatArray:
-        apart = [m - s for m, s in zip(arm.measured(), arm.simulate(model, every), strict=True)]
-        return np.asarray(np.sqrt(np.mean(np.concatenate(apart, axis=1) ** 2, axis=1)))
-
-    nominal = rms({})
-    damped = rms({'tip_damping': {'damping': 9.196}})
-    both = rms({'tip_damping': {'damping': 9.196}, 'coulomb_friction': {'torque': 1.472}})
-    np.testing.assert_allclose(nominal, [0.350, 0.01263], rtol=0.01)
-    assert damped[1] < 0.45 * nominal[1]
-    assert both[0] < 0.5 * nominal[0]
-    assert both[1] < 0.4 * nominal[1]

@@ -51,6 +51,17 @@ def test_a_board_is_found_again(settings: CameraSettings, view: str) -> None:
     assert np.all(np.abs(off) < 5.0 * np.sqrt(np.diag(answer.covariance)))
 
 
+def test_an_edge_along_the_rows_of_the_image_is_drawn_where_it_is() -> None:
+    scene = Scene(width=60, height=80, focal=1000.0, centre=(30.0, 40.0), distance=0.25)
+
+    def rows_above(moved: float) -> float:
+        pose = Pose(dy=-moved * scene.distance / scene.focal)
+        return float(np.sum(1.0 - board(scene, pose, np.array([[0.0], [1.0]]), (0.015, 0.015))[15:65, 30]))
+
+    for moved in (0.07, 0.31, 0.5):
+        assert rows_above(moved) - rows_above(0.0) == pytest.approx(moved, abs=0.02)
+
+
 def test_half_a_board_and_none_are_refused() -> None:
     rng = np.random.default_rng(3)
     image = shot(SMALL, BOARD, Pose(), rng)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from blind.render import Pose, Scene, mean_of, over_exposure, photograph
+from blind.render import Pose, Scene, camera_of, mean_of, over_exposure, photograph
 from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import CameraSettings
@@ -101,6 +102,50 @@ def test_the_mean_over_the_exposure_is_what_counts() -> None:
     assert answer.covariance is not None
     still = 1e-6
     assert math.sqrt(answer.covariance[0, 0]) > 2 * still
+
+
+def test_a_lens_that_loses_its_focus_moves_no_plate_seen_from_the_side() -> None:
+    """The blur along a bent rim moves it, more at the ends of an ellipse than at its sides."""
+    scene, rng = Scene(tilt=(0.29, 0.15), blur=0.5, read_noise=0.5), np.random.default_rng(4)
+    reference = CameraReference(replace(settings_of(scene), rest_frames=2), target_of)
+    for number in range(2):
+        reference.take(number, photograph(scene, [Pose()], rng))
+    (answer,) = reference.take(2, photograph(replace(scene, blur=5.5), [Pose(1e-3, 1e-3)], rng))
+    assert answer.status is Status.OK
+    assert math.hypot(answer.dx - 1e-3, answer.dy - 1e-3) < 30e-6
+
+
+def test_a_disc_that_just_saturates_tilts_the_plate_by_no_more_than_is_said() -> None:
+    scene = Scene(focal=1500.0, white=240.0, slope=(0.0, 0.45), tilt=(0.15, 0.06), blur=1.0, read_noise=0.9)
+    rng = np.random.default_rng(6)
+    reference = CameraReference(replace(settings_of(scene), rest_frames=1), target_of)
+    (answer,) = reference.take(0, photograph(scene, [Pose()], rng))
+    assert answer.target is not None
+    off = camera_of(scene)[0].T @ answer.target.rotation
+    tilt, sd = abs(off[2, 1]), math.sqrt(answer.target.covariance[0, 0])
+    assert 1e-3 < tilt < 2.0 * sd
+
+
+def test_of_two_mirrored_tilts_the_right_one_is_taken() -> None:
+    """With weak perspective a plate tilted to the other side looks much the same."""
+    scene = Scene(focal=1200.0, distance=0.49, tilt=(0.0, -0.145), blur=1.8, white=146.0, read_noise=5.9)
+    for seed in range(6):
+        reference = CameraReference(replace(settings_of(scene), rest_frames=1), target_of)
+        reference.take(0, photograph(scene, [Pose()], np.random.default_rng(seed)))
+        assert reference.rest is not None
+        off = camera_of(scene)[0].T @ reference.rest.rotation
+        assert abs(off[0, 2]) < min(0.05, 5.0 * math.sqrt(reference.rest.covariance[1, 1]))
+
+
+def test_a_small_thing_beside_a_disc_is_noticed_in_a_large_image() -> None:
+    scene = SCENES['large']
+    image = photograph(scene, [Pose()], np.random.default_rng(8))
+    rows, columns = np.mgrid[: scene.height, : scene.width]
+    middle = 960 + 100 + 30
+    image[np.hypot(columns - middle, rows - 520) < 24] = 200
+    reference = CameraReference(settings_of(scene), target_of)
+    reference.take(0, image)
+    assert [a.status for a in reference.finish()] == [Status.DOUBLED]
 
 
 @pytest.mark.parametrize(

@@ -158,6 +158,23 @@ def test_what_one_length_cannot_tell_two_can() -> None:
     assert effect.equivalent == ()
 
 
+def test_a_load_cell_with_a_wrong_zero_is_named_from_two_lengths() -> None:
+    history = loads.steps([(0, 0, 0), (5, -20, -9), (0, 0, 0)], 0.5).loads
+    zero = {'effects.e.name': 'tip_force', 'effects.e.x': 0.05, 'effects.e.y': -0.1}
+    seen = []
+    for i, length in enumerate((0.585, 0.4)):
+        own = replace_values(RIG, {'link.length': length})
+        seen.append(observe(replace_values(own, zero), seed=i, known=own, history=history))
+    found = discover(seen, RIG)
+    (effect,) = found.effects
+    assert effect.active.effect.name == 'tip_force'
+    for name, force in (('x', 0.05), ('y', -0.1)):
+        assert abs(effect.active.values[name] - force) < 4.0 * effect.sd[name] < 0.01
+    # 0.1 N bends the link of 0.585 m by 4.5 um.
+    assert found.moves[1] == pytest.approx(0.1 * 0.585**3 / (3.0 * RIG.link.bending_stiffness), rel=0.2)
+    assert 'Without it an estimate is wrong by up to' in sentence(found)
+
+
 @pytest.mark.statistics
 def test_what_is_not_in_the_library_is_unknown_and_not_merged() -> None:
     seen = observe(RIG, seed=3)
@@ -323,7 +340,7 @@ def test_from_simulate_to_model(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert tree['provenance']['forward_simulations'] <= 2000
     page = (out / 'report.html').read_text()
     assert 'http' not in page.replace('http-equiv', '')
-    assert page.count('data:image/png;base64,') == 4
+    assert page.count('data:image/png;base64,') == 5
     model = out / 'model.yaml'
     # Without a file of the user it describes the rig, and not the machine that recorded.
     assert set(read_parameter_file(model)) == {*DESCRIPTION, *(k for k in load_rig(model).flat() if 'effects.' in k)}

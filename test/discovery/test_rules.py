@@ -19,15 +19,23 @@ from scipy.stats import chi2 as chi2_law
 from psd_deflection.config import load_rig
 from psd_deflection.discovery import experiment, planning
 from psd_deflection.discovery.coincidence import coincidences
-from psd_deflection.discovery.discover import _accept, _credible, _named, _tied, _unknown
 from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.localise import Dependence, Localisation, _energies, _layouts, dependences, localise
+from psd_deflection.discovery.localise import (
+    Dependence,
+    Localisation,
+    _energies,
+    _layouts,
+    dependences,
+    localise,
+    regressors,
+)
 from psd_deflection.discovery.noise import NoiseModel, _ar_density, _block_autocovariance, _level, estimate_noise
 from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.screen import Screen
 from psd_deflection.discovery.search import Search, SearchResult
 from psd_deflection.discovery.signatures import Candidate
 from psd_deflection.discovery.validate import HeldOut, heldout_gain, heldout_gap, heldout_residual
+from psd_deflection.discovery.weighing import accept, credible, named_effects, tied, unknown_of
 from psd_deflection.discovery.workspace import Workspace, fine_means
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation import loads
@@ -121,7 +129,7 @@ def search_of(plant: Plant, library: int = 1, penalty: float = 3.0) -> Search:
 
 def result_of(search: Search, effects: Sequence[ActiveEffect], others: Sequence[Sequence[Fit]] = ()) -> SearchResult:
     null, fit = refit(search.workspace, ()), refit(search.workspace, effects)
-    p, bic, gains = search._weigh(null, fit)
+    p, bic, gains = search.weigh(null, fit)
     return SearchResult(null, fit, p, bic, gains, [], [list(o) for o in others])
 
 
@@ -175,9 +183,38 @@ def test_the_sd_of_a_named_effect_is_that_of_least_squares() -> None:
     result = result_of(search, [active('a', x=0.0), active('b', x=0.0)], [[], []])
     matrix = columns(shown, A, B)
     want = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)))
-    named = _named(search, result, result.fit, [HeldOut(9.0, 1.0)] * 2)
+    named = named_effects(search, result, result.fit, [HeldOut(9.0, 1.0)] * 2)
     assert [n.sd['x'] for n in named] == pytest.approx(want.tolist(), rel=1e-6)
     assert [n.active.effect.name for n in named] == ['a', 'b']
+
+
+def test_a_model_that_is_not_exact_has_the_sd_of_its_scatter_over_load_cases() -> None:
+    """Each fold has an effect of another size: the jackknife of least squares tells how sure it is."""
+    shown = pictures(A)
+    plant = Plant(shown, noise())
+    fold = np.tile(plant.case[0] % 4, 6).reshape(6, FINE)
+    plant.measured[0] += np.array([3e-3, 5e-3, 9e-3, 4e-3])[fold] * shown[A]
+    plant.data = plant.whiten(plant.measured)
+    result = result_of(search_of(plant), [active('a', x=0.0)], [[]])
+    sizes = []
+    for k in range(4):
+        rest = fold != k
+        sizes.append(np.sum(plant.measured[0][rest] * shown[A][rest]) / np.sum(shown[A][rest] ** 2))
+    want = math.sqrt(3 / 4 * np.sum((np.array(sizes) - np.mean(sizes)) ** 2))
+    (named,) = named_effects(search_of(plant), result, result.fit, [HeldOut(9.0, 1.0)])
+    assert named.sd['x'] == pytest.approx(want, rel=1e-3)
+    # Nothing but noise: the sd of least squares.
+    exact = Plant(shown, 5e-3 * shown[A] + noise())
+    result = result_of(search_of(exact), [active('a', x=0.0)], [[]])
+    (named,) = named_effects(search_of(exact), result, result.fit, [HeldOut(9.0, 1.0)])
+    assert named.sd['x'] == pytest.approx(SIGMA / np.linalg.norm(shown[A]), rel=1e-6)
+
+
+def test_four_recordings_are_left_out_one_by_one() -> None:
+    plant = Plant(pictures(A), noise())
+    assert plant.folds().tolist() == [0, 1, 2, 3, 0, 1, 2, 3]
+    plant.case = [np.repeat([2 * i, 2 * i + 1], FINE // 2) for i in range(4)]
+    assert plant.folds().tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
 def test_what_an_effect_weighs_is_the_chi_square_that_is_lost_without_it() -> None:
@@ -220,7 +257,7 @@ def test_an_effect_is_named_from_stated_limits_on(gain: float, penalty: float, l
     search = search_of(Plant(shown, without_noise((shown[A], gain))), library, penalty)
     result = result_of(search, [active('a', x=0.0)])
     assert result.delta_chi2 == pytest.approx([gain], rel=1e-6)
-    heldout, fit = _accept(search, result, np.random.default_rng(0))
+    heldout, fit = accept(search, result, np.random.default_rng(0))
     assert [a.effect.name for a in fit.effects] == (['a'] if named else [])
     assert len(heldout) == len(result.p) == len(result.delta_bic) == len(result.delta_chi2) == named
     assert bool(search.trace) == (not named)
@@ -235,7 +272,7 @@ def test_what_does_not_hold_on_unseen_load_cases_is_not_named(cases: Sequence[in
     search = search_of(Plant(shown, without_noise((shown[A], 60.0)) * inside / share))
     result = result_of(search, [active('a', x=0.0)])
     assert result.delta_chi2 == pytest.approx([60.0], rel=1e-3)
-    _, fit = _accept(search, result, np.random.default_rng(0))
+    _, fit = accept(search, result, np.random.default_rng(0))
     assert bool(fit.effects) == named
 
 
@@ -247,7 +284,7 @@ def test_an_effect_with_an_amplitude_at_a_bound_is_not_named_unless_it_is_off_th
         if least == 0.0:
             search = search_of(Plant(shown, 5e-3 * shown['a', 'x'] - 1e-3 * shown['a', 'y'] + noise()))
         start = active('a', least, most, x=0.0, y=0.0)
-        _, fit = _accept(search, result_of(search, [start]), np.random.default_rng(0))
+        _, fit = accept(search, result_of(search, [start]), np.random.default_rng(0))
         assert bool(fit.effects) == named
 
 
@@ -258,7 +295,7 @@ def test_the_weakest_effect_goes_first_and_the_other_is_weighed_again() -> None:
     search = search_of(Plant(shown, without_noise((shown[A], 300.0)) + noise()))
     result = result_of(search, [active('b', x=0.0), active('a', x=0.0)])
     assert max(result.delta_bic) < 10.0
-    heldout, fit = _accept(search, result, np.random.default_rng(0))
+    heldout, fit = accept(search, result, np.random.default_rng(0))
     weakest = int(
         np.argmin([result_of(search, [active('a', x=0.0)]).fit.chi2, result_of(search, [active('b', x=0.0)]).fit.chi2])
     )
@@ -313,9 +350,8 @@ def test_an_alternative_is_equivalent_up_to_a_stated_loss(loss: float, names: tu
     )
     result = result_of(search, [active('a', x=0.0)], [[other]])
     result = dataclasses.replace(result, fit=fit)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr('psd_deflection.discovery.discover.suggest', lambda *_: planning.Suggestion('try this', 1.0))
-        (named,) = _named(search, result, fit, [HeldOut(9.0, 1.0)])
+    suggestion = planning.Suggestion('try this', 1.0)
+    (named,) = named_effects(search, result, fit, [HeldOut(9.0, 1.0)], lambda *_: suggestion)
     assert named.equivalent == (('b',) if equal else ())
     assert (named.suggestion is not None) == equal
     ((name, lost, bic),) = named.alternatives
@@ -555,7 +591,7 @@ def nowhere(**changes: Any) -> Localisation:
     ],
 )
 def test_a_remainder_is_unknown_from_stated_limits_on(p: float, excess: float, explained: float, unknown: bool) -> None:
-    got = _unknown(nowhere(p=p, excess=excess), explained)
+    got = unknown_of(nowhere(p=p, excess=excess), explained)
     assert bool(got) == unknown
     if unknown:
         assert got[0].explains == pytest.approx(excess / (excess + explained))
@@ -565,7 +601,7 @@ def test_a_remainder_is_unknown_from_stated_limits_on(p: float, excess: float, e
 def test_an_unknown_is_described_by_what_it_follows() -> None:
     def words(*d: tuple[str, float]) -> str:
         depends = tuple(Dependence('x2', name, gain, 1e-6) for name, gain in d)
-        (u,) = _unknown(nowhere(p=0.0, excess=100.0, dependences=depends), 0.0)
+        (u,) = unknown_of(nowhere(p=0.0, excess=100.0, dependences=depends), 0.0)
         assert u.depends_on == tuple(name for name, _ in d)
         return u.signature
 
@@ -574,10 +610,10 @@ def test_an_unknown_is_described_by_what_it_follows() -> None:
     assert words(('dot_y', 50.0), ('constant', 40.0)) == 'on x2; follows dot_y, constant; odd and even parts'
     assert 'hysteretic' in words(('history of load_fy', 50.0))
     faint = nowhere(p=0.0, excess=100.0, dependences=(Dependence('x2', 'dot_x', 20.0, 2e-3),))
-    assert _unknown(faint, 0.0)[0].signature == 'on no single channel'
+    assert unknown_of(faint, 0.0)[0].signature == 'on no single channel'
 
 
-def test_effects_weaker_than_the_unknown_remainder_are_taken_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_effects_weaker_than_the_unknown_remainder_are_taken_out() -> None:
     shown = pictures(A, B)
     search = search_of(Plant(shown, without_noise((shown[A], 5000.0), (shown[B], 150.0)) + noise()))
     effects = [active('a', x=0.0), active('b', x=0.0)]
@@ -585,8 +621,8 @@ def test_effects_weaker_than_the_unknown_remainder_are_taken_out(monkeypatch: py
     for p, excess, kept in ((0.0, 140.0, ['a', 'b']), (0.0, 300.0, ['a']), (0.1, 300.0, ['a', 'b'])):
         result = result_of(search, effects)
         left = nowhere(p=p, excess=excess)
-        monkeypatch.setattr('psd_deflection.discovery.discover.localise', lambda *_, found=left, **__: found)
-        fit, heldout, _ = _credible(search, result, result.fit, [HeldOut(1.0, 1.0)] * 2, 0.0, np.random.default_rng(0))
+        unheld = [HeldOut(1.0, 1.0)] * 2
+        fit, heldout, _ = credible(search, result, result.fit, unheld, 0.0, lambda *_, found=left: found)
         assert [a.effect.name for a in fit.effects] == kept
         assert len(heldout) == len(kept) == len(result.delta_chi2)
 
@@ -596,11 +632,11 @@ def test_tied_effects_are_told_with_what_they_explain() -> None:
     size = 200 * SIGMA / np.linalg.norm(shown[A])
     search = search_of(Plant(shown, size * (shown[A] + shown[B])))
     result = result_of(search, [active('a', x=0.0), active('b', x=0.0)])
-    (u,) = _tied(coincidences(result.fit, search.workspace.physics), result.fit, result, nowhere())
+    (u,) = tied(coincidences(result.fit, search.workspace.physics), result.fit, result, nowhere())
     assert not u.remains
     assert u.explains == pytest.approx(min(sum(result.delta_chi2) / (result.null.chi2 - result.fit.chi2), 1.0))
     assert 'a and b agree in size' in u.signature
-    assert _tied([], result.fit, result, nowhere()) == ()
+    assert tied([], result.fit, result, nowhere()) == ()
 
 
 def test_energy_by_band_is_that_of_the_samples() -> None:
@@ -656,7 +692,8 @@ def test_a_dependence_is_the_chi_square_that_a_regressor_explains() -> None:
     dot = fine_means(chunk.dots, size)
     load = fine_means(chunk.loads, size)
     part = workspace.split(residual)
-    gains = {(d.channel, d.regressor): d.gain for d in dependences(workspace, residual, None)}
+    table = regressors(workspace)
+    gains = {(d.channel, d.regressor): d.gain for d in dependences(workspace, table, residual, None)}
     cases = [
         (0, 'x1', 'dot_x^2', dot[0] ** 2),
         (1, 'y1', 'dot_y', dot[1]),
@@ -677,9 +714,9 @@ def test_a_dependence_is_the_chi_square_that_a_regressor_explains() -> None:
     row[0] = dot[0] ** 2
     own = row.ravel()
     own = own - known[:, 0] * (known[:, 0] @ own) / (known[:, 0] @ known[:, 0])
-    gains = {(d.channel, d.regressor): d.gain for d in dependences(workspace, residual, known)}
+    gains = {(d.channel, d.regressor): d.gain for d in dependences(workspace, table, residual, known)}
     assert gains['x1', 'dot_x^2'] == pytest.approx((e @ own) ** 2 / (own @ own), rel=1e-6)
-    best = max(dependences(workspace, residual, None), key=lambda d: d.gain)
+    best = max(dependences(workspace, table, residual, None), key=lambda d: d.gain)
     count = len(gains)
     assert best.p == pytest.approx(1.0 - (1.0 - chi2_law.sf(best.gain, 1)) ** count, rel=0.05)
 

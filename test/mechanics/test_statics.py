@@ -26,6 +26,15 @@ def test_load_to_deflection_and_back() -> None:
     assert LINK.tip_load(*LINK.deflection(*load)) == pytest.approx(load, rel=1e-15)
 
 
+def test_the_weight_of_the_link_bends_it_and_turns_its_clamp() -> None:
+    # Tip deflection by a unit force at x, summed over the weight: x^2 (3 L - x)/(6 EI), and c x L by the clamp.
+    length, stiffness, compliance, weight = 0.585, 1529.0, 3e-5, 12.0
+    x = (np.arange(20_000) + 0.5) * length / 20_000
+    by_unit = x**2 * (3.0 * length - x) / (6.0 * stiffness) + compliance * x * length
+    want = weight * float(by_unit.mean()) * length
+    assert LinkStatics(length, stiffness, 1e3, clamp_bending=compliance).sag(weight) == pytest.approx(want, rel=1e-8)
+
+
 # ---- Cross-section ----
 
 

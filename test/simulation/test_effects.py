@@ -28,6 +28,7 @@ NAMES = {
     *('load_offset', 'load_direction', 'plane_tilt', 'laser_pointing_drift', 'refraction', 'sensor_rotation'),
     *('sensor_position', 'sensor_gain', 'sensor_nonlinearity', 'axis_crosstalk', 'ambient_light', 'thermal_drift'),
     *('spot_clipping', 'mains_interference', 'amplifier_saturation', 'amplifier_lag', 'channel_skew', 'quantisation'),
+    'tip_force',
 }
 
 RIG = load_rig()

@@ -7,14 +7,14 @@ from psd_deflection.simulation.physics import Physics
 
 
 def _configure(physics: Physics, values: Values) -> None:
-    physics.static_offset[1] -= values['weight_per_length'] * physics.length**4 / (8.0 * physics.bending_stiffness)
+    physics.weight_per_length += values['weight_per_length']
 
 
 EFFECT = Effect(
     name='self_weight',
     stage='link',
     summary='the link bends under its own weight',
-    equation='ΔY -= w L^4/(8 EI)',
+    equation='ΔY -= w L^4/(8 EI) + c w L^3/2, c the compliance of the clamp',
     source='beam theory',
     needs='recordings at two lengths, zeroed at one',
     parameters=(EffectParameter('weight_per_length', 'N/m', 0.0, 1e3, 1e-2, 'weight of the link per length'),),

@@ -1,0 +1,75 @@
+"""discover_in on machines that others measured. ``python -m blind.foreign [boom|emps|arm]``.
+
+The boom lacks gravity and gives way at its root; the drive lacks its Coulomb friction and its offset; the arm is its
+maker's model. ``--null`` gives each model what is published. result.json and report.html go to ``--out``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from blind.arm import Arm
+from blind.boom import Boom
+from blind.emps import Emps
+from blind.measured import DATA
+from psd_deflection.discovery.plants import Plant, PlantDiscovery, discover_in
+from psd_deflection.discovery.report import report_html
+from psd_deflection.discovery.result import result, sentence, size_of
+
+MACHINES: Mapping[str, tuple[Callable[[Path], Plant], Callable[[Path], Plant] | None]] = {
+    'boom': (lambda folder: Boom(folder), lambda folder: Boom(folder, weighed=True)),
+    'emps': (lambda folder: Emps(('coulomb_friction', 'force_offset'), folder), lambda folder: Emps((), folder)),
+    'arm': (lambda folder: Arm(folder), None),
+}
+FOLDERS = {'boom': 'boom', 'emps': 'emps', 'arm': 'two_link_arm'}
+
+
+def lines(found: PlantDiscovery) -> list[str]:
+    """The answer in words."""
+    out = [sentence(found)]
+    for e in found.effects:
+        unseen = f'unseen cases {e.heldout.gain:+.1f} ± {e.heldout.error:.1f}'
+        out.append(f'  {e.active.label} ({size_of(e)}): BIC better by {e.delta_bic:.1f}, {unseen}')
+        out += [f'    or {r.active.label} ({size_of(r)}), BIC worse by {r.delta_bic:.1f}' for r in e.rivals]
+    out += [f'  beside it {a.label}: {dict(a.values)} ± {dict(sd)}' for a, sd in found.nuisance]
+    for name, (before, after) in found.per_channel.items():
+        out.append(f'  {name}: {before:.4g} -> {after:.4g}, on unseen cases {found.heldout_per_channel[name]:.4g}')
+    return [*out, f'  {found.simulations} simulations']
+
+
+def main() -> int:
+    """Search, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument('machines', nargs='*', help='boom, emps, arm (default: all)')
+    parser.add_argument('--data', type=Path, default=DATA, help='folder with a folder of each (default: %(default)s)')
+    parser.add_argument('--null', action='store_true', help='with the published terms in the model')
+    parser.add_argument('--out', type=Path, help='folder for result.json and report.html of each')
+    args = parser.parse_args()
+    for name in args.machines or MACHINES:
+        if name not in MACHINES:
+            parser.error(f'{name}: must be one of {", ".join(MACHINES)}')
+        make = MACHINES[name][int(args.null)]
+        if make is None:
+            continue
+        try:
+            plant = make(args.data / FOLDERS[name])
+        except OSError as error:
+            print(f'{error.filename}: {error.strerror}', file=sys.stderr)
+            return 3
+        found = discover_in(plant, progress=lambda words: print(f'... {words}', file=sys.stderr))
+        print('\n'.join([f'{name}: {lines(found)[0]}', *lines(found)[1:]]))
+        if args.out is not None:
+            folder = args.out / name
+            folder.mkdir(parents=True, exist_ok=True)
+            tree = json.dumps(result(found), indent=1, allow_nan=False)
+            (folder / 'result.json').write_text(tree + '\n', encoding='utf-8')
+            (folder / 'report.html').write_text(report_html(found), encoding='utf-8')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

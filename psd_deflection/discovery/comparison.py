@@ -1,0 +1,161 @@
+"""Measured against simulated, as whitened vectors of one likelihood: what the search asks of a rig or of another plant.
+
+:class:`~psd_deflection.discovery.workspace.Workspace` is the rig with its recordings,
+:class:`~psd_deflection.discovery.plants.PlantComparison` any machine that simulates itself. Search, refit, hold-out and
+verdict know neither.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.simulation.physics import Physics
+
+
+class Comparison(ABC):
+    """One or several recordings (or cases), each a table ``measured`` (channels, n); a *vector* (D,) joins all of them.
+
+    ``simulations`` counts forward runs of all recordings. ``base``: effects that every model has, with fixed values.
+    ``nuisance``: effects that every model has and that every refit adjusts; they are never named. ``case``: the load
+    case of each column, counted over all recordings. ``first``: names of effects that are only looked for before any
+    other is found; ``setup``: of those that are mistakes of the set-up. ``open_level``: the level of what remains is
+    fitted too, because nobody knows how exact the model of the machine is. ``budget``: forward simulations after which
+    nothing more is added; the alternatives end at twice as many. ``digits``: format of a gap in the sentence.
+    """
+
+    physics: Physics | None
+    simulations: int
+    base: tuple[ActiveEffect, ...]
+    nuisance: tuple[ActiveEffect, ...] = ()
+    measured: list[FloatArray]
+    case: list[IntArray]
+    first: frozenset[str] = frozenset()
+    setup: frozenset[str] = frozenset()
+    open_level: bool = False
+    budget: int = 500
+    digits: str = '.4g'
+
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """Of the recordings or cases."""
+
+    @property
+    @abstractmethod
+    def channels(self) -> tuple[str, ...]:
+        """Of the gap."""
+
+    @property
+    @abstractmethod
+    def periods(self) -> list[float]:
+        """s between the columns of each recording."""
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """Elements of a vector that carry data."""
+
+    @abstractmethod
+    def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
+        """What would have been measured, without noise, in the form of ``measured``."""
+
+    @abstractmethod
+    def whiten(self, tables: Sequence[FloatArray]) -> FloatArray:
+        """One vector, of unit variance if the noise model holds; 0 where nothing was measured."""
+
+    @abstractmethod
+    def renoise(self, effects: Sequence[ActiveEffect]) -> bool:
+        """Estimate the noise with ``effects`` in the model; False, and nothing changes, if it is the same."""
+
+    @abstractmethod
+    def effective_size(self) -> float:
+        """Sample size for BIC: values over correlation time."""
+
+    @abstractmethod
+    def gap_per_channel(self, residual: Sequence[FloatArray]) -> FloatArray:
+        """rms of a residual, of each of ``channels``."""
+
+    @abstractmethod
+    def gap(self, residual: Sequence[FloatArray]) -> float:
+        """rms over all channels."""
+
+    @abstractmethod
+    def floor(self) -> float:
+        """The gap from noise alone; NaN if nobody knows the noise."""
+
+    @abstractmethod
+    def pieces(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """Log-likelihood that residual ``b`` gains over ``a`` (D,) on unseen cases, piece by piece."""
+
+    @abstractmethod
+    def unwhitened(self, white: FloatArray) -> list[FloatArray]:
+        """The tables of a slow change of a vector (D,)."""
+
+    @abstractmethod
+    def folds(self) -> IntArray:
+        """The fold of each load case, for the hold-out."""
+
+    @property
+    @abstractmethod
+    def unit(self) -> str:
+        """Of the gap over all channels."""
+
+    @property
+    @abstractmethod
+    def scale_shown(self) -> tuple[float, str]:
+        """By what a gap is multiplied for people, and the unit that it has then."""
+
+    @property
+    @abstractmethod
+    def units_shown(self) -> tuple[str, ...]:
+        """Of the rows of ``shown``."""
+
+    @abstractmethod
+    def shown(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
+        """A residual by ``channels``, as the gap counts it, for pictures; NaN where nothing was measured."""
+
+    @abstractmethod
+    def against(self) -> dict[str, list[FloatArray]]:
+        """What ``shown`` may be held against in a picture, by name with unit; the first is the time or the number."""
+
+    @abstractmethod
+    def provenance(self) -> list[dict[str, object]]:
+        """Of each recording, for result.json."""
+
+    def worded(self, size: float, digits: str = '.3g') -> str:
+        """A gap with its unit, for people."""
+        scale, unit = self.scale_shown
+        return f'{scale * size:{digits}} {unit}'.rstrip() if np.isfinite(size) else 'not known'
+
+    def loss(self, residual: FloatArray) -> float:
+        """Twice the negative log-likelihood of a vector (D,), up to a constant: chi-square if the noise is known."""
+        return float(residual @ residual)
+
+    def row(self, channel: int, values: Sequence[FloatArray]) -> FloatArray:
+        """Whitened: ``values`` (n,) of each recording as those of one channel."""
+        tables = [np.zeros_like(m) for m in self.measured]
+        for table, v in zip(tables, values, strict=True):
+            table[channel] = v
+        return np.concatenate([part[channel] for part in self.split(self.whiten(tables))])
+
+    def split(self, vector: FloatArray) -> list[FloatArray]:
+        """The tables of a vector."""
+        out, at = [], 0
+        for m in self.measured:
+            out.append(vector[at : at + m.size].reshape(m.shape))
+            at += m.size
+        return out
+
+    def row_cases(self) -> IntArray:
+        """The load case of every element of a vector."""
+        return np.concatenate([np.tile(c, len(m)) for c, m in zip(self.case, self.measured, strict=True)])
+
+    def residual(self, effects: Sequence[ActiveEffect]) -> tuple[FloatArray, list[FloatArray]]:
+        """Whitened residual vector, and measured minus simulated."""
+        difference = [m - s for m, s in zip(self.measured, self.simulate(effects), strict=True)]
+        return self.whiten(difference), difference

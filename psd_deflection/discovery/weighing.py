@@ -1,0 +1,320 @@
+"""The verdict: which effects of a search hold, with their uncertainty and their rivals, and what remains unknown.
+
+An effect is named only if all of these hold: library-wide p <= 0.01, a BIC better by more than 10, a gain of more than
+two standard errors on held-out load cases, and parameters within their bounds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from psd_deflection.discovery.coincidence import Coincidence
+from psd_deflection.discovery.comparison import Comparison
+from psd_deflection.discovery.fit import Fit, refit
+from psd_deflection.discovery.localise import Localisation
+from psd_deflection.discovery.planning import Suggestion
+from psd_deflection.discovery.search import BIC_ACCEPT, P_ACCEPT, Search, SearchResult, unphysical
+from psd_deflection.discovery.validate import HeldOut, heldout_gain, scatter
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.declaration import ActiveEffect
+
+EQUIVALENT = 21.6
+"""Loss in chi-square below which an alternative of no more parameters counts as equivalent: at
+lambda sin^2(theta/2) = 5.4 one in a hundred would be misnamed, and sin^2(theta) is four times that."""
+EQUIVALENT_BIC = 6.0
+"""An alternative with more parameters must also be this close in BIC, because a more flexible effect always
+fits as well.
+"""
+UNKNOWN_P = 1e-4
+UNKNOWN_EXCESS = 60.0
+STEPS_SHARE = 0.02
+"""Coarse steps cause noise that varies with the signal; up to this share of what they explain it is nothing else."""
+UNSAID = 1.5
+"""A gap of more floors than this never remains without being reported as unknown."""
+RIVAL_BIC = 10.0
+"""An effect in place of the named one counts as its rival up to this loss in BIC."""
+Look = Callable[[Fit, Fit], Localisation]
+"""Where what a fit leaves has structure, given the fit without any effect."""
+Suggest = Callable[[Fit, Sequence[Fit]], Suggestion | None]
+"""The experiment that tells a fit from others that are as good."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rival:
+    """An effect in place of a named one, with its fitted values; ``delta_bic``: how much worse, below 0 better.
+    ``fit``: the whole model with it.
+    """
+
+    active: ActiveEffect
+    sd: Mapping[str, float]
+    delta_bic: float
+    fit: Fit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NamedEffect:
+    """One effect of the answer. ``sd``: per fitted parameter. ``alternatives``: (name, loss in
+    chi-square, difference of BIC), the closest first; ``equivalent``: those that this data cannot exclude;
+    ``rivals``: those and what else comes close in BIC.
+    """
+
+    active: ActiveEffect
+    sd: Mapping[str, float]
+    p: float
+    delta_bic: float
+    heldout: HeldOut
+    equivalent: tuple[str, ...]
+    rivals: tuple[Rival, ...]
+    alternatives: tuple[tuple[str, float, float], ...]
+    suggestion: Suggestion | None
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """A discrepancy that no effect explains, or only several tied effects: ``signature`` in words,
+    ``explains``: its fraction of the gap's energy. ``remains``: whether it is still present with all effects added.
+    ``rms``: its size, as the gap counts it, without noise.
+    """
+
+    signature: str
+    depends_on: tuple[str, ...]
+    explains: float
+    remains: bool = True
+    rms: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Conclusion:
+    """The answer of a search. Gaps are rms values of measured minus simulated in the unit of ``workspace``.
+
+    ``per_channel``: before and after; ``heldout_per_channel``: after, on load cases that the fit has not seen.
+    ``nuisance``: what every model has, each with the standard deviations of its parameters.
+    """
+
+    verdict: str
+    effects: tuple[NamedEffect, ...]
+    unknown: tuple[Unknown, ...]
+    where: Localisation
+    left: Localisation
+    gap_before: float
+    gap_after: float
+    gap_floor: float
+    gap_heldout_before: float
+    gap_heldout_after: float
+    per_channel: Mapping[str, tuple[float, float]]
+    heldout_per_channel: Mapping[str, float]
+    waterfall: tuple[tuple[str, float], ...]
+    simulations: int
+    search: SearchResult
+    fit: Fit
+    workspace: Comparison
+    seed: int
+    nuisance: tuple[tuple[ActiveEffect, Mapping[str, float]], ...]
+
+    @property
+    def floors(self) -> float:
+        """The gap that remains, in units of the gap that noise alone leaves; 0 if nobody knows the noise."""
+        return self.gap_after / self.gap_floor if self.gap_floor > 0.0 else 0.0
+
+    def __repr__(self) -> str:
+        named = ', '.join(e.active.label for e in self.effects) or 'no effect'
+        before, after, floor = (self.workspace.worded(v) for v in (self.gap_before, self.gap_after, self.gap_floor))
+        return f'<{type(self).__name__} {self.verdict}: {named}; gap {before} → {after} (noise alone: {floor})>'
+
+
+def credible(
+    search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut], seen: float, look: Look
+) -> tuple[Fit, list[HeldOut], Localisation]:
+    """Remove effects that explain less than the unknown remainder: they probably stand in for it."""
+    while True:
+        left = look(fit, result.null)
+        if not fit.effects or not unknown_of(left, max(result.null.chi2 - fit.chi2, 0.0) + seen, steps=seen):
+            break
+        weakest = int(np.argmin(result.delta_chi2))
+        if result.delta_chi2[weakest] >= left.excess:
+            break
+        search.trace.append(f'{fit.effects[weakest].label} explains less than what remains unknown')
+        fit = without_one(search, result, fit, weakest)
+        heldout = [h for j, h in enumerate(heldout) if j != weakest]
+    return fit, heldout, left
+
+
+def accept(search: Search, result: SearchResult, rng: np.random.Generator) -> tuple[list[HeldOut], Fit]:
+    """The joint rule: remove the effects that fail it, the weakest first, and refit the rest."""
+    ws, fit = search.workspace, result.fit
+    while True:
+        heldout = []
+        fails: list[tuple[float, int]] = []
+        for i, without in enumerate(search.without_each(fit, result.null)):
+            gain = heldout_gain(ws, without, fit, rng)
+            heldout.append(gain)
+            columns = fit.columns_of(i)
+            chi2 = without.chi2 - fit.chi2
+            bic = chi2 - search.penalty * len(columns)
+            if (
+                not gain.holds
+                or unphysical(ws, fit, i)
+                or search.library_p(chi2, len(columns)) > P_ACCEPT
+                or bic <= BIC_ACCEPT
+            ):
+                fails.append((bic, i))
+        if not fails:
+            break
+        _, worst = min(fails)
+        search.trace.append(f'{fit.effects[worst].label} fails the joint rule')
+        fit = without_one(search, result, fit, worst)
+    return heldout, fit
+
+
+def without_one(search: Search, result: SearchResult, fit: Fit, index: int) -> Fit:
+    """``fit`` refitted without one effect; ``result`` weighs the rest anew."""
+    rest = [a for j, a in enumerate(fit.effects) if j != index]
+    left = refit(search.workspace, rest, iterations=6) if rest else result.null
+    result.p[:], result.delta_bic[:], result.delta_chi2[:] = search.weigh(result.null, left)
+    return left
+
+
+def named_effects(
+    search: Search, result: SearchResult, fit: Fit, heldout: Sequence[HeldOut], suggestion: Suggest | None = None
+) -> list[NamedEffect]:
+    """The effects of ``fit`` with their standard deviations and the equally good alternatives."""
+    ws = search.workspace
+    # If the joint rule has removed effects, their alternatives are no longer comparable.
+    as_found = fit is result.fit
+    named: list[NamedEffect] = []
+    for i, active in enumerate(fit.effects):
+        fits = result.alternatives[i] if as_found else search.alternatives(result.null, fit, i, result.delta_chi2[i])
+        rows, equal, rivals = [], [], []
+        for f in fits:
+            loss = f.chi2 - fit.chi2
+            bic = loss + search.penalty * (f.parameters - fit.parameters)
+            rows.append((f.effects[-1].effect.name, loss, bic))
+            if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < EQUIVALENT_BIC):
+                equal.append(f)
+            if (bic < RIVAL_BIC or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
+                rivals.append(Rival(f.effects[-1], sd_of(ws, f, len(f.effects) - 1), bic, f))
+        names = tuple(dict.fromkeys(f.effects[-1].effect.name for f in equal))
+        named.append(
+            NamedEffect(
+                active,
+                sd_of(ws, fit, i),
+                result.p[i],
+                result.delta_bic[i],
+                heldout[i],
+                names,
+                tuple(sorted(rivals, key=lambda r: r.delta_bic)),
+                tuple(rows),
+                suggestion(fit, equal) if equal and suggestion is not None else None,
+            )
+        )
+    return named
+
+
+def sd_of(workspace: Comparison, fit: Fit, index: int) -> dict[str, float]:
+    """Standard deviation of each fitted parameter of effect ``index`` (below 0: of the nuisance).
+
+    From the noise. If more than noise remains, the model is not exact, and the scatter over load cases or recordings
+    tells how far it is off; the larger of the two is taken.
+    """
+    sd = np.sqrt(np.maximum(np.diag(fit.covariance()), 0.0))
+    if workspace.open_level or workspace.gap(fit.difference) > UNSAID * workspace.floor():
+        sd = np.maximum(sd, scatter(workspace, fit))
+    return {fit.free[j][1]: float(sd[j]) for j in fit.columns_of(index)}
+
+
+def per_channel_of(
+    workspace: Comparison, before: Sequence[FloatArray], after: Sequence[FloatArray]
+) -> dict[str, tuple[float, float]]:
+    """Gap of each channel before and after."""
+    gaps = workspace.gap_per_channel(before), workspace.gap_per_channel(after)
+    return {n: (float(a), float(b)) for n, a, b in zip(workspace.channels, *gaps, strict=True)}
+
+
+def heldout_per_channel_of(workspace: Comparison, held: Sequence[FloatArray]) -> dict[str, float]:
+    """Gap of each channel on load cases that the fit has not seen."""
+    return {n: float(v) for n, v in zip(workspace.channels, workspace.gap_per_channel(held), strict=True)}
+
+
+def waterfall_of(ws: Comparison, fit: Fit, gap_before: float, gap_after: float) -> tuple[tuple[str, float], ...]:
+    """The gap after each effect is added, and the gap from noise alone."""
+    steps = [('as described', gap_before)]
+    for i in range(len(fit.effects) - 1):
+        _, difference = ws.residual([*ws.base, *fit.nuisance, *fit.effects[: i + 1]])
+        steps.append(('+ ' + fit.effects[i].effect.name, ws.gap(difference)))
+    if fit.effects:
+        steps.append(('+ ' + fit.effects[-1].effect.name, gap_after))
+    return (*steps, ('noise alone', ws.floor()))
+
+
+def _beyond(gap: float, floor: float) -> float:
+    """The part of a gap that noise does not explain; all of it if nobody knows the noise."""
+    return float(np.sqrt(max(gap**2 - floor**2, 0.0))) if np.isfinite(floor) else gap
+
+
+def unsaid(workspace: Comparison, before: float, after: float) -> tuple[Unknown, ...]:
+    """What remains although no place of it stands out: several small differences, or the simulation's own error."""
+    floor = workspace.floor()
+    if not after > UNSAID * floor:
+        return ()
+    size = _beyond(after, floor)
+    words = f'{workspace.worded(size)} remain, {after / floor:.1f} times the noise, in no single place or band'
+    return (Unknown(words, (), float(min((after / before) ** 2, 1.0)), rms=size),)
+
+
+def unknown_of(
+    left: Localisation,
+    explained: float,
+    gap: float = 0.0,
+    floor: float = 0.0,
+    steps: float = 0.0,
+    worded: Callable[[float], str] = str,
+) -> tuple[Unknown, ...]:
+    """``gap``, ``floor``: what remains and what noise leaves. ``steps``: chi-square that coarse steps explain.
+    ``worded``: a gap with its unit.
+    """
+    if left.p > UNKNOWN_P or left.excess < max(UNKNOWN_EXCESS, STEPS_SHARE * steps):
+        return ()
+    strong = [d for d in left.dependences if d.p < 1e-3][:6]
+    channels = list(dict.fromkeys([*(c.channel for c in left.cells if c.p < 0.01), *(d.channel for d in strong)]))
+    names = tuple(dict.fromkeys(d.regressor for d in strong))
+    even = sum(d.gain for d in strong if _even(d.regressor))
+    odd = sum(d.gain for d in strong if not _even(d.regressor))
+    lagging = any('history' in d.regressor for d in strong[:2])
+    size = _beyond(gap, floor)
+    words = [f'on {", ".join(channels) or "no single channel"}']
+    if size > 0.0:
+        times = f' ({gap / floor:.1f} times the noise remain)' if floor > 0.0 else ''
+        words.append(f'{worded(size)} rms{times}')
+    if strong:
+        words.append(f'follows {", ".join(names[:3])}')
+        words.append('mostly even' if even > 2.0 * odd else 'mostly odd' if odd > 2.0 * even else 'odd and even parts')
+    if lagging:
+        words.append('hysteretic: it depends on which way the load last changed')
+    if left.cells:
+        c = left.cells[0]
+        words.append(f'strongest at {c.when[0]:.1f} to {c.when[1]:.1f} s, {c.band[0]:g} to {c.band[1]:g} Hz')
+    share = left.excess / max(left.excess + explained, 1e-300)
+    return (Unknown('; '.join(words), names, float(min(max(share, 0.0), 1.0)), rms=size),)
+
+
+def tied(ties: Sequence[Coincidence], fit: Fit, result: SearchResult, before: Localisation) -> tuple[Unknown, ...]:
+    """Effects whose sizes agree beyond chance are reported as one unknown cause."""
+    if not ties:
+        return ()
+    tie = ties[0]
+    (i, first), (j, second) = tie.first, tie.second
+    (a, b), unit = tie.sizes, f' {tie.unit}' if tie.unit else ''
+    words = (
+        f'{fit.effects[i].label} and {fit.effects[j].label} agree in size ({first} {a:.4g}, {second} {b:.4g}{unit}) as '
+        f'independent effects hardly would (odds {tie.odds:.0f} to 1): one cause that is not in the catalogue'
+    )
+    names = tuple(dict.fromkeys(d.regressor for d in before.dependences[:6] if d.p < 1e-3))
+    share = (result.delta_chi2[i] + result.delta_chi2[j]) / max(result.null.chi2 - fit.chi2, 1e-300)
+    return (Unknown(words, names, float(min(max(share, 0.0), 1.0)), remains=False),)
+
+
+def _even(regressor: str) -> bool:
+    return '^2' in regressor or '|' in regressor or regressor in ('constant', 'dot_x dot_y')

@@ -1,0 +1,191 @@
+"""The search on a machine of one's own: a spring that is not straight."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pytest
+
+import psd_deflection
+from psd_deflection.discovery.plants import Model, Plant, PlantComparison, plant_effect
+from psd_deflection.discovery.report import report_html
+from psd_deflection.discovery.result import result, sentence
+from psd_deflection.errors import ConfigError
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.declaration import Effect, EffectParameter
+
+STIFFNESS = plant_effect('stiffness', EffectParameter('scale', '', -0.9, 9.0, 0.1, 'of k'))
+CUBIC = plant_effect('cubic', EffectParameter('c', 'N/mm^3', -9.0, 9.0, 0.1, 'of u^3'), equation='F += c u^3')
+SQUARE = plant_effect('square', EffectParameter('c', 'N/mm^2', -9.0, 9.0, 0.1, 'of u^2'))
+LIMIT = plant_effect(
+    'limit', EffectParameter('force', 'N', 0.1, 99.0, 0.5, 'greatest', nominal=99.0, grid=(0.5, 1.0)), finite=True
+)
+NOISE = 0.01
+
+
+class Spring(Plant):
+    """F = k u + c u^3, of which the model has no c, and a temperature that rises with F; six pulls."""
+
+    channels: tuple[str, ...] = ('force',)
+    units: tuple[str, ...] = ('N',)
+    cases = tuple('abcdef')
+    library: tuple[Effect, ...] = (STIFFNESS, CUBIC, SQUARE, LIMIT)
+
+    def __init__(self, c: float, k: float = 1.0, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        self.u = [np.linspace(-1, 1, 50) * (1 + 0.2 * i) for i in range(6)]
+        self.seen = [(k * u + c * u**3 + NOISE * rng.standard_normal(50))[None, :] for u in self.u]
+
+    def measured(self) -> list[FloatArray]:
+        return self.seen
+
+    def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
+        return {'u': self.u}
+
+    def simulate(self, model: Model) -> list[FloatArray]:
+        k = 1.0 + model.get('stiffness', {'scale': 0.0})['scale']
+        c = model.get('cubic', {'c': 0.0})['c']
+        square = model.get('square', {'c': 0.0})['c']
+        limit = model.get('limit', {'force': 99.0})['force']
+        return [np.clip(k * u + c * u**3 + square * u**2, -limit, limit)[None, :] for u in self.u]
+
+
+def test_what_the_spring_lacks_is_named_with_its_size() -> None:
+    found = psd_deflection.discover_in(Spring(0.3))
+    (cubic,) = found.effects
+    assert cubic.active.effect is CUBIC
+    assert found.verdict == 'effects_found'
+    assert abs(cubic.active.values['c'] - 0.3) < 4.0 * cubic.sd['c']
+    assert 1e-4 < cubic.sd['c'] < 1e-2
+    assert found.gap_heldout_after == pytest.approx(NOISE, rel=0.1)
+    assert found.where.cells[0].recording == 5
+    assert sentence(found).startswith('cubic is missing from the model; adding it closes the gap from')
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_nothing_is_named_where_nothing_is_missing(seed: int) -> None:
+    found = psd_deflection.discover_in(Spring(0.0, seed=seed))
+    assert (found.verdict, found.effects) == ('nothing_missing', ())
+
+
+def test_a_limit_that_is_not_reached_at_first_is_found() -> None:
+    plant = Spring(0.0)
+    plant.seen = [np.clip(rows, -1.3, 1.3) for rows in plant.seen]
+    (limit,) = psd_deflection.discover_in(plant).effects
+    assert limit.active.values['force'] == pytest.approx(1.3, abs=0.01)
+
+
+def test_nuisance_is_fitted_and_never_named() -> None:
+    plant = Spring(0.3, k=1.7)
+    plant.library, plant.nuisance = (CUBIC, SQUARE), (STIFFNESS,)
+    found = psd_deflection.discover_in(plant)
+    assert [e.active.effect for e in found.effects] == [CUBIC]
+    ((stiffness, sd),) = found.nuisance
+    assert abs(stiffness.values['scale'] - 0.7) < 4.0 * sd['scale']
+    # A straight spring of any stiffness lacks nothing.
+    straight = Spring(0.0, k=1.7)
+    straight.library, straight.nuisance = (CUBIC, SQUARE), (STIFFNESS,)
+    assert psd_deflection.discover_in(straight).verdict == 'nothing_missing'
+
+
+def test_lost_values_cost_precision_and_nothing_else() -> None:
+    plant = Spring(0.3)
+    lost = np.random.default_rng(1)
+    plant.seen = [np.where(lost.random(rows.shape) < 0.3, math.nan, rows) for rows in plant.seen]
+    found = psd_deflection.discover_in(plant)
+    (cubic,) = found.effects
+    assert abs(cubic.active.values['c'] - 0.3) < 4.0 * cubic.sd['c']
+    assert sum(r['lost'] for r in result(found)['provenance']['recordings']) == pytest.approx(90, abs=30)
+    assert '<img' in report_html(found)
+
+
+def test_what_remains_is_unknown_if_it_follows_something() -> None:
+    plant = Spring(0.3)
+    plant.library = (STIFFNESS,)
+    found = psd_deflection.discover_in(plant)
+    assert found.verdict == 'unknown_effect'
+    (unknown,) = found.unknown
+    assert 'u^3' in unknown.depends_on
+
+
+def test_a_stated_noise_is_the_floor() -> None:
+    plant = Spring(0.3)
+    plant.noise = (NOISE,)
+    found = psd_deflection.discover_in(plant)
+    assert found.gap_floor == NOISE
+    assert found.floors == pytest.approx(1.0, abs=0.1)
+    # The same as coarse noise: what is less than it is no discovery.
+    coarse = Spring(0.002)
+    coarse.noise = (0.1,)
+    assert psd_deflection.discover_in(coarse).verdict == 'nothing_missing'
+
+
+class Warm(Spring):
+    channels = ('force', 'temperature')
+    units = ('N', 'K')
+
+    def __init__(self, c: float) -> None:
+        super().__init__(c)
+        rng = np.random.default_rng(9)
+        self.seen = [np.vstack([rows, 1e3 * np.abs(rows) + rng.standard_normal(rows.shape)]) for rows in self.seen]
+
+    def simulate(self, model: Model) -> list[FloatArray]:
+        return [np.vstack([rows, 1e3 * np.abs(rows)]) for rows in super().simulate(model)]
+
+
+def test_channels_with_units_of_their_own() -> None:
+    found = psd_deflection.discover_in(Warm(0.3))
+    assert [e.active.effect for e in found.effects] == [CUBIC]
+    assert found.gap_before == pytest.approx(1.0)
+    tree = json.loads(json.dumps(result(found), allow_nan=False))
+    assert tree['gap']['unit'] == 'share of the gap before'
+    assert tree['gap']['floor'] is None
+    assert set(tree['gap']['per_channel']) == {'force', 'temperature'}
+    for gaps in tree['gap']['per_channel'].values():
+        assert gaps['after'] <= gaps['heldout'] < 0.2 * gaps['before']
+    assert tree['effects'][0]['parameters']['c']['unit'] == 'N/mm^3'
+
+
+def test_the_answer_is_the_same_again() -> None:
+    assert result(psd_deflection.discover_in(Spring(0.1), seed=3)) == result(
+        psd_deflection.discover_in(Spring(0.1), seed=3)
+    )
+
+
+def test_few_cases_are_cut_into_pieces() -> None:
+    plant = Spring(0.3)
+    plant.cases, plant.seen, plant.u = ('a',), plant.seen[:1], plant.u[:1]
+    assert PlantComparison(plant).folds().tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ('change', 'words'),
+    [
+        ({'cases': ()}, 'cases: there is none'),
+        ({'units': ()}, 'units: 0 of them for 1 channels'),
+        ({'noise': (0.0,)}, r'noise = \(0.0,\): must be one number above 0'),
+        ({'library': (CUBIC, CUBIC)}, 'cubic is there twice'),
+        ({'nuisance': (CUBIC,)}, 'cubic is there twice'),
+        ({'seen': [np.zeros((2, 5))] * 6}, r'measured, a: has the shape \(2, 5\): must be \(1, n\)'),
+        ({'seen': [np.full((1, 5), math.nan)] * 6}, 'force has 0 values in all'),
+        ({'seen': [np.zeros((1, 5))] * 6}, r'simulate, a: has the shape \(1, 50\): must be that of measured'),
+        ({'u': [np.full(50, math.nan)] * 6}, 'simulate, a: not finite with'),
+        ({'seen': [np.zeros((1, 50))] * 5}, 'measured: 5 tables for 6 cases'),
+    ],
+)
+def test_a_plant_that_contradicts_itself_is_refused(change: Mapping[str, object], words: str) -> None:
+    plant = Spring(0.3)
+    for name, value in change.items():
+        setattr(plant, name, value)
+    if change.get('cases') == ():
+        plant.seen = []
+    with pytest.raises(ConfigError, match=words):
+        psd_deflection.discover_in(plant)
+
+
+def test_an_effect_of_a_plant_has_no_bounds_of_a_rig() -> None:
+    with pytest.raises(ConfigError, match='of_rig'):
+        plant_effect('stiff', EffectParameter('ei', '', 0.0, 9.0, 1.0, '', of_rig='bending_stiffness'))
