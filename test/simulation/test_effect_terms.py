@@ -250,7 +250,7 @@ def test_more_light_than_there_is_leaves_a_thousandth() -> None:
     np.testing.assert_allclose(reading.dots[2:, 0], [(2e-4 - 3e-3) / 2e-3, (2e-4 + 3e-3) / 2e-3], rtol=1e-12)
 
 
-L, EI, GJ = 0.585, RIG.link.bending_stiffness, RIG.link.torsional_stiffness
+L, EI = 0.585, RIG.link.bending_stiffness
 
 
 def stiffer(scale: float, name: str) -> Callable[[Physics, Values], dict[str, Any]]:
@@ -293,12 +293,7 @@ CONFIGURED: list[tuple[str, Values, Callable[[Physics, Values], dict[str, Any]]]
         lambda p, v: {'static_offset': p.static_offset + np.array([2e-3, -3e-3]) * L},
     ),
     ('plane_tilt', {'slope_ratio': 1.7}, lambda p, v: {'slope_ratio': 1.7}),
-    # The uniform load w of a cantilever sags its end by w L^4/(8 EI).
-    (
-        'self_weight',
-        {'weight_per_length': 12.0},
-        lambda p, v: {'static_offset': p.static_offset - (0.0, 12.0 * L**4 / (8.0 * EI))},
-    ),
+    ('self_weight', {'weight_per_length': 12.0}, lambda p, v: {'weight_per_length': p.weight_per_length + 12.0}),
     *(
         ('sensor_position', {'psd': psd, 'x': 1e-3, 'y': -2e-3, 'aimed': aimed}, moved_center)
         for psd in (1.0, 2.0)
@@ -710,3 +705,12 @@ def test_the_clamp_adds_to_what_another_effect_gave_it() -> None:
     ]
     still, moved = (ForwardModel(RIG, effects).run(history).static[:, -1] for effects in ([], active))
     np.testing.assert_allclose(moved - still, [1e-4 * 2.0 * L**2, -1e-4 * 3.0 * L**2, 2e-4 * 4.0], rtol=1e-9)
+
+
+def test_a_link_sags_by_its_own_weight() -> None:
+    """w L^4/(8 EI) of the beam, and at a clamp that gives way c w L^2/2 of turn, times L."""
+    p = physics()
+    p.static_offset += (1e-4, 2e-4)
+    p.weight_per_length, p.clamp_bending = 12.0, 3e-5
+    sag = 12.0 * L**4 / (8.0 * EI) + 3e-5 * 12.0 * L**3 / 2.0
+    assert p.at_rest == pytest.approx((1e-4, 2e-4 - sag), rel=1e-12)
