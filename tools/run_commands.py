@@ -135,9 +135,12 @@ ADMINISTRATION = re.compile(r'/opt/psd_deflection|^(apt|install|journalctl|ssh|s
 HOURS = re.compile(r'^make mutants\b')
 """Campaigns whose shortest form says nothing: never run here."""
 
+FOREIGN = re.compile(r'^python -m blind\.foreign\b')
+"""Reads data of others, which are not in the repository: test/blind/test_foreign.py does, if they are there."""
+
 NO_CAMPAIGNS = '--no-campaigns'
 
-NEVER_HERE = ('a machine to administer', 'ros2', 'two hours')
+NEVER_HERE = ('a machine to administer', 'ros2', 'two hours', 'the data of others')
 """Needs that NEED_TOOLS=1 (any other missing program is a failure) does not ask for."""
 
 QUICK = re.compile(
@@ -263,6 +266,8 @@ def what_is_missing(line: str) -> str:
         return NEVER_HERE[0]
     if HOURS.search(line):
         return NEVER_HERE[2]
+    if FOREIGN.search(line):
+        return NEVER_HERE[3]
     return ', '.join(t for p, tools in TOOLS.items() if re.search(p, line) for t in tools if not shutil.which(t))
 
 
@@ -270,7 +275,7 @@ def stale() -> list[str]:
     """Entries of the tables that no command of the documents needs any more."""
     lines = [c.line for c in commands()]
     patterns = [p for p, *_ in CI_RUNS] + [f'^make {name}\\b' for name in SHORTEST]
-    patterns += [*TOOLS, *SHORTER, ADMINISTRATION.pattern, HOURS.pattern]
+    patterns += [*TOOLS, *SHORTER, ADMINISTRATION.pattern, HOURS.pattern, FOREIGN.pattern]
     return [p for p in patterns if not any(re.search(p, line) for line in lines)]
 
 
