@@ -80,7 +80,9 @@ def test_without_a_lens_the_spacing_is_the_scale() -> None:
     poses = [*STILL, Pose(2e-3, -1e-3, 0.1)]
     settings = CameraSettings(spacing=0.025, radius=0.008)
     answer = measured(Scene(turn=0.2), poses, settings)[-1]
-    assert [answer.dx, answer.dy, answer.theta] == pytest.approx([2e-3, -1e-3, 0.1], abs=20e-6)
+    assert [answer.dx, answer.dy] == pytest.approx([2e-3, -1e-3], abs=5e-6)
+    # The image of one turn says no more of the angle: over other noise its error is 1e-4.
+    assert answer.theta == pytest.approx(0.1, abs=2e-4)
 
 
 def test_the_mean_over_the_exposure_is_what_counts() -> None:
