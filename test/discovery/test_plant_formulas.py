@@ -1,0 +1,522 @@
+"""A plant's cases as vectors of one likelihood, and its answer: against sums, loops and least squares written here."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from scipy.stats import chi2 as chi2_law
+from scipy.stats import norm
+
+from psd_deflection.discovery import plants
+from psd_deflection.discovery.fit import refit
+from psd_deflection.discovery.plants import Model, Plant, PlantComparison, discover_in, plant_effect
+from psd_deflection.discovery.result import sentence
+from psd_deflection.errors import ConfigError
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter
+from psd_deflection.simulation.physics import Physics
+
+LENGTHS = (10, 7, 13)
+
+
+def size_of(name: str, nominal: float = 0.0) -> Effect:
+    return plant_effect(name, EffectParameter('size', '', -90.0, 90.0, 0.1, '', nominal=nominal))
+
+
+def on(name: str, size: float) -> ActiveEffect:
+    return ActiveEffect(size_of(name), {'size': size})
+
+
+class Pictures(Plant):
+    """Shows the sum of its effects' pictures, each times its size."""
+
+    channels: tuple[str, ...] = ('force', 'turn')
+    units: tuple[str, ...] = ('N', 'rad')
+    cases: tuple[str, ...] = ('a', 'b', 'c')
+
+    def __init__(self, seen: Sequence[FloatArray], shown: Mapping[str, Sequence[FloatArray]], **given: Any) -> None:
+        self.seen, self.shown, self.asked = list(seen), shown, list[dict[str, dict[str, float]]]()
+        self.library = tuple(size_of(name) for name in shown)
+        self.done: dict[str, list[FloatArray]] = {}
+        for name, value in given.items():
+            setattr(self, name, value)
+
+    def measured(self) -> Sequence[FloatArray]:
+        return self.seen
+
+    def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
+        return self.done
+
+    def simulate(self, model: Model) -> Sequence[FloatArray]:
+        self.asked.append({name: dict(values) for name, values in model.items()})
+        out = [np.zeros(np.shape(rows)) for rows in self.seen]
+        for name, values in model.items():
+            for total, picture in zip(out, self.shown[name], strict=True):
+                total += values['size'] * picture
+        return out
+
+
+def tables(seed: int, channels: int = 2, lengths: Sequence[int] = LENGTHS) -> list[FloatArray]:
+    rng = np.random.default_rng(seed)
+    return [rng.standard_normal((channels, n)) * [[3.0], [0.2]][:channels] for n in lengths]
+
+
+def holed(seed: int = 0) -> list[FloatArray]:
+    """With lost values; of the second case all of the second channel."""
+    out = tables(seed)
+    out[0][0, [2, 3]] = math.nan
+    out[1][1] = math.nan
+    out[2][1, -1] = math.nan
+    return out
+
+
+def whole(values: Sequence[FloatArray], channel: int) -> FloatArray:
+    """The values of a channel in all cases that are there."""
+    row = np.concatenate([v[channel] for v in values])
+    return np.asarray(row[np.isfinite(row)])
+
+
+def rms(values: FloatArray) -> float:
+    return math.sqrt(sum(float(v) ** 2 for v in values) / len(values))
+
+
+def test_a_plant_is_measured_by_its_own_level() -> None:
+    seen = holed()
+    ws = PlantComparison(Pictures(seen, {}))
+    counts = [28, 22]
+    assert ws.total.tolist() == counts
+    assert (ws.size, ws.effective_size(), ws.simulations) == (50, 50.0, 1)
+    assert (ws.names, ws.channels, ws.periods) == (('a', 'b', 'c'), ('force', 'turn'), [1.0] * 3)
+    assert (ws.base, ws.nuisance, ws.open_level, ws.budget, ws.physics) == ((), (), True, 4000, None)
+    levels = [rms(whole(seen, c)) for c in range(2)]
+    assert ws.level == pytest.approx(levels)
+    vector = ws.whiten(seen)
+    want = [np.nan_to_num(rows / np.array(levels)[:, None]).ravel() for rows in seen]
+    np.testing.assert_allclose(vector, np.concatenate(want), rtol=1e-12)
+    assert float(vector @ vector) == pytest.approx(50.0)
+    for part, rows in zip(ws.unwhitened(vector), seen, strict=True):
+        np.testing.assert_allclose(part, np.nan_to_num(rows), rtol=1e-12)
+    for part, rows in zip(ws.shown(seen), seen, strict=True):
+        np.testing.assert_array_equal(part, rows)
+    # What is simulated where nothing was measured is not shown.
+    assert np.isnan(ws.shown([np.zeros_like(rows) for rows in seen])[1][1]).all()
+    assert ws.provenance() == [
+        {'name': 'a', 'values': 18, 'lost': 2},
+        {'name': 'b', 'values': 7, 'lost': 7},
+        {'name': 'c', 'values': 25, 'lost': 1},
+    ]
+    own = [np.arange(n, dtype=np.float64) for n in LENGTHS]
+    there = [np.isfinite(rows[1]) for rows in seen]
+    np.testing.assert_allclose(
+        ws.row(1, own), np.concatenate([np.where(t, v, 0.0) for t, v in zip(there, own, strict=True)]) / levels[1]
+    )
+    residual, difference = ws.residual([])
+    np.testing.assert_allclose(residual, vector)
+    assert all(np.array_equal(d, rows, equal_nan=True) for d, rows in zip(difference, seen, strict=True))
+
+
+def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
+    seen = holed()
+    left = [0.5 * rows for rows in seen]
+    forces, turns = whole(seen, 0), whole(seen, 1)
+    ws = PlantComparison(Pictures(seen, {}))
+    assert ws.gap_per_channel(left) == pytest.approx([0.5 * rms(forces), 0.5 * rms(turns)])
+    assert math.isnan(ws.floor())
+    ws.beginning(refit(ws, ()))
+    # Newtons and radians have no sum: each is a share of its gap before.
+    assert ws.gap(seen) == pytest.approx(1.0)
+    assert ws.gap(left) == pytest.approx(0.5)
+    mixed = [rows * [[1.0], [0.5]] for rows in seen]
+    assert ws.gap(mixed) == pytest.approx(math.sqrt((1.0 + 0.25) / 2.0))
+    assert (ws.unit, ws.scale_shown, ws.units_shown) == (
+        'share of the gap before',
+        (100.0, '% of the gap before'),
+        ('N', 'rad'),
+    )
+    assert ws.worded(0.1234) == '12.3 % of the gap before'
+    assert ws.worded(0.1234, '.1f') == '12.3 % of the gap before'
+    assert ws.worded(math.nan) == 'not known'
+    same = PlantComparison(Pictures(seen, {}, units=('N', 'N'), noise=(0.3, 0.1)))
+    both = np.concatenate((forces, turns))
+    assert same.gap(seen) == pytest.approx(rms(both))
+    assert same.floor() == pytest.approx(math.sqrt((28 * 0.3**2 + 22 * 0.1**2) / 50))
+    assert (same.unit, same.scale_shown, same.worded(0.1234)) == ('N', (1.0, 'N'), '0.123 N')
+    # A number without a unit has none behind it.
+    assert PlantComparison(Pictures(seen, {}, units=('', ''))).worded(0.5) == '0.5'
+
+
+def test_the_likelihood_of_a_plant_has_the_level_that_fits_best() -> None:
+    """n ln s^2 + n for each channel, s its rms over the level before; never below a stated noise."""
+    seen = holed()
+    other = [rows * [[0.4], [2.5]] for rows in seen]
+    for noise in ((), (2.0, 1e-3)):
+        ws = PlantComparison(Pictures(seen, {}, noise=noise))
+        want = 0.0
+        for c in range(2):
+            level = max(rms(whole(seen, c)), noise[c] if noise else 0.0)
+            square = (rms(whole(other, c)) / level) ** 2
+            least = (noise[c] / level) ** 2 if noise else 0.0
+            want += len(whole(seen, c)) * (math.log(max(square, least)) + square / max(square, least))
+        assert ws.loss(ws.whiten(other)) == pytest.approx(want)
+    assert ws.loss(ws.whiten(other)) != pytest.approx(28 * (math.log(0.16) + 1.0) + 22 * (math.log(6.25) + 1.0))
+    # A level below the noise is the noise.
+    loud = PlantComparison(Pictures(seen, {}, noise=(9.0, 9.0)))
+    assert loud.level.tolist() == [9.0, 9.0]
+
+
+@pytest.mark.parametrize('period', [0.0, 0.01])
+def test_what_is_gained_on_a_fold_has_a_level_of_its_own(period: float) -> None:
+    """Half of what the likelihood of each fold and channel differs by, its values weighed as independent ones."""
+    seen, first, second = holed(), holed(1), [0.7 * rows for rows in holed(2)]
+    ws = PlantComparison(Pictures(seen, {}, period=period, noise=(0.5, 1e-3)))
+    # Two pieces of each of three cases, four being wanted.
+    cases = [i * 2 + np.arange(n) * 2 // n for i, n in enumerate(LENGTHS)]
+    assert [c.tolist() for c in ws.case] == [c.tolist() for c in cases]
+    assert ws.folds().tolist() == list(range(6))
+    np.testing.assert_array_equal(ws.row_cases(), np.concatenate([np.tile(c, 2) for c in cases]))
+    want = np.zeros(6)
+    least = (np.array([0.5, 1e-3]) / ws.level) ** 2
+    for fold, channel in itertools.product(range(6), range(2)):
+        sides = []
+        for tables_of in (first, second):
+            x = [v[channel][np.isfinite(v[channel]) & (c == fold)] for v, c in zip(tables_of, cases, strict=True)]
+            x = [float(v) / float(ws.level[channel]) for v in np.concatenate(x)]
+            if x:
+                square = sum(v * v for v in x) / len(x)
+                level = max(square, float(least[channel]))
+                weight = len(x) * float(ws.independent[channel]) / len(whole(seen, channel))
+                sides.append(0.5 * weight * (math.log(level) + square / level))
+        want[fold] += sides[0] - sides[1] if sides else 0.0
+    np.testing.assert_allclose(ws.pieces(ws.whiten(first), ws.whiten(second)), want, rtol=1e-9)
+    if period:
+        assert (ws.independent < ws.total).any()
+
+
+def test_neighbours_that_follow_each_other_are_fewer_values() -> None:
+    """n / (1 + 2 sum of correlations up to the first that is negative), case by case, two at least."""
+    n = 60
+    slow = [np.vstack((np.sin(np.arange(n) / (4.0 + i)), np.cos(np.arange(n) ** 1.5))) for i in range(3)]
+    slow[1][0, 5:9] = math.nan
+    slow[2][0] = math.nan
+    ws = PlantComparison(Pictures(slow, {}, period=0.5))
+    want = []
+    for c in range(2):
+        count = 0.0
+        for rows in slow:
+            there = np.isfinite(rows[c])
+            if there.any():
+                x = np.where(there, rows[c] - rows[c][there].mean(), 0.0)
+                total = 1.0
+                for lag in range(1, n):
+                    correlation = float(x[lag:] @ x[: n - lag]) / float(x @ x)
+                    if correlation < 0.0:
+                        break
+                    total += 2.0 * correlation
+                count += there.sum() / total
+        want.append(max(count, 2.0))
+    assert ws.independent == pytest.approx(want)
+    assert want[0] < 0.3 * ws.total[0]
+    assert ws.effective_size() == pytest.approx(sum(want))
+    # The squares of a residual add up to these.
+    vector = ws.whiten(slow)
+    assert float(vector @ vector) == pytest.approx(sum(want))
+    np.testing.assert_allclose(ws.scale, ws.level * np.sqrt(ws.total / np.array(want)))
+    assert ws.periods == [0.5] * 3
+    ever = [np.ones((2, n)) * np.linspace(0.0, 1.0, n) for _ in range(3)]
+    assert (PlantComparison(Pictures(ever, {}, period=0.5)).independent >= 2.0).all()
+    still = [np.ones((2, 2)) for _ in range(3)]
+    assert PlantComparison(Pictures(still, {}, period=0.5)).independent.tolist() == [6.0, 6.0]
+    alone = [np.full((2, 3), math.nan) for _ in range(3)]
+    for rows in alone:
+        rows[:, 0] = 1.0
+    assert PlantComparison(Pictures(alone, {}, period=0.5)).independent.tolist() == [3.0, 3.0]
+    # Each column a reading by itself: every one counts, however alike they are.
+    assert PlantComparison(Pictures(slow, {})).independent.tolist() == [116.0, 180.0]
+
+
+@pytest.mark.parametrize('scale', [1.0, 1e-10])
+def test_a_level_is_the_same_within_two_per_cent(scale: float) -> None:
+    """In whatever unit; and it is another one if only its neighbours follow each other otherwise."""
+    rng = np.random.default_rng(3)
+    shown = [scale * rng.standard_normal((1, 40)) for _ in range(3)]
+    smooth = [np.cumsum(rows, axis=1) for rows in shown]
+    size = rms(whole(shown, 0)) / rms(whole(smooth, 0))
+    other = [rows - size * s for rows, s in zip(shown, smooth, strict=True)]
+    given = {'channels': ('force',), 'units': ('N',), 'period': 0.1}
+    for change, again in ((0.019, False), (0.021, True), (-0.019, False), (-0.021, True)):
+        ws = PlantComparison(Pictures(shown, {'a': shown, 'b': other}, **given))
+        level, independent = ws.level, ws.independent
+        assert ws.renoise([on('a', change)]) == again
+        assert (ws.level is level) == (ws.independent is independent) == (not again)
+        if again:
+            assert ws.level == pytest.approx(abs(1.0 - change) * level)
+    assert ws.renoise([on('b', 1.0)])
+    assert ws.level == pytest.approx(level)
+    assert ws.independent[0] < 0.7 * independent[0]
+
+
+def test_what_a_plant_simulates_is_what_the_model_says() -> None:
+    seen = holed()
+    plant = Pictures(seen, {'a': tables(4), 'b': tables(5)}, nuisance=(size_of('b', nominal=2.0),))
+    plant.library = (size_of('a'),)
+    ws = PlantComparison(plant)
+    assert [(a.effect.name, dict(a.values)) for a in ws.nuisance] == [('b', {'size': 2.0})]
+    # The first level is that beside the nuisance as it is declared.
+    assert plant.asked == [{'b': {'size': 2.0}}]
+    assert ws.level == pytest.approx(
+        [rms(whole([m - 2.0 * b for m, b in zip(seen, tables(5), strict=True)], c)) for c in range(2)]
+    )
+    got = ws.simulate([on('a', 3.0), *ws.nuisance])
+    for rows, a, b in zip(got, tables(4), tables(5), strict=True):
+        np.testing.assert_allclose(rows, 3.0 * a + 2.0 * b)
+    assert ws.simulations == len(plant.asked) == 2
+    # Where nothing was measured it may be anything.
+    plant.shown = {'a': [np.where(np.isfinite(rows), 1.0, math.inf) for rows in seen], 'b': tables(5)}
+    ws.simulate([on('a', 1.0)])
+    plant.shown = {'a': [np.where(np.isfinite(rows), math.inf, 1.0) for rows in seen], 'b': tables(5)}
+    with pytest.raises(ConfigError, match=r'simulate, a: not finite with .*narrow the bounds'):
+        ws.simulate([on('a', 1.0)])
+    plant.seen = seen[:2]
+    plant.shown = {'a': tables(4)[:2]}
+    with pytest.raises(ConfigError, match='simulate: 2 tables for 3 cases'):
+        ws.simulate([on('a', 1.0)])
+
+
+@pytest.mark.parametrize(
+    ('change', 'words'),
+    [
+        ({'seen': [np.zeros((2, 3, 1))] * 3}, r'measured, a: has the shape \(2, 3, 1\): must be \(2, n\)'),
+        ({'seen': [np.zeros((2, 0))] * 3}, r'measured, a: has the shape \(2, 0\)'),
+        ({'seen': [[['x']]] * 3}, r'measured, a: must be numbers, \(channels, n\)'),
+        ({'seen': [[[1.0], [2.0, 3.0]]] * 3}, r'measured, a: must be numbers'),
+        ({'seen': [np.zeros((2, 1)), *[np.full((2, 1), math.nan)] * 2]}, 'force has 1 values in all'),
+        ({'noise': (1.0,)}, 'one number above 0 for each channel'),
+        ({'noise': (1.0, 0.0)}, 'one number above 0 for each channel'),
+        ({'units': ('N',)}, 'units: 1 of them for 2 channels'),
+        ({'library': (size_of('a'), size_of('b'), size_of('b'), size_of('a'))}, 'library: a, b is there twice'),
+    ],
+)
+def test_tables_that_do_not_fit_are_refused(change: Mapping[str, object], words: str) -> None:
+    plant = Pictures(tables(0), {})
+    for name, value in change.items():
+        setattr(plant, name, value)
+    with pytest.raises(ConfigError, match=words):
+        PlantComparison(plant)
+    # Two values of each channel are enough, one column is a case.
+    assert PlantComparison(Pictures([np.ones((2, 1))] * 3, {}, noise=(1e-9, 1e-9))).total.tolist() == [3, 3]
+    assert PlantComparison(Pictures([np.ones((2, 1))] * 2, {}, cases=('a', 'b'))).total.tolist() == [2, 2]
+
+
+@pytest.mark.parametrize('cases', [1, 2, 3, 4, 5])
+def test_there_are_four_folds_at_least(cases: int) -> None:
+    plant = Pictures([np.ones((2, 20))] * cases, {}, cases=tuple('abcde'[:cases]))
+    ws = PlantComparison(plant)
+    pieces = {1: 4, 2: 2, 3: 2, 4: 1, 5: 1}[cases]
+    assert ws.folds().tolist() == list(range(cases * pieces))
+    for i, case in enumerate(ws.case):
+        assert np.bincount(case - i * pieces).tolist() == [20 // pieces] * pieces
+
+
+def test_an_effect_of_a_plant_is_declared_without_a_rig() -> None:
+    size = EffectParameter('size', 'N', 0.0, 9.0, 1.0, '', grid=(1.0, 2.0))
+    limit = plant_effect('limit', size, summary='s', equation='e', source='o', finite=True)
+    assert (limit.summary, limit.equation, limit.source, limit.finite, limit.needs) == ('s', 'e', 'o', True, '')
+    assert not plant_effect('limit', size).finite
+    assert limit.configure is not None
+    with pytest.raises(TypeError, match='simulated by its plant'):
+        limit.configure(cast(Physics, None), {})
+    changes: list[dict[str, Any]] = [{'of_rig': 'x'}, {'within': 'half_area'}, {'propose': 'line'}]
+    for change in changes:
+        with pytest.raises(ConfigError, match='limit: size: of_rig, within and propose'):
+            plant_effect('limit', dataclasses.replace(size, **change))
+
+
+@pytest.mark.parametrize('period', [0.0, 0.25])
+def test_what_remains_of_a_plant_is_held_against_its_inputs(period: float) -> None:
+    seen = holed()
+    given = [np.arange(n, dtype=np.float64) for n in LENGTHS]
+    plant = Pictures(seen, {'a': tables(4)}, period=period)
+    plant.done = {'u': given}
+    ws = PlantComparison(plant)
+    beside = ws.against()
+    times = [(start + np.arange(n)) * (period or 1.0) for start, n in zip((0, 10, 17), LENGTHS, strict=True)]
+    first = 'time / s (cases one after another)' if period else 'number of the reading'
+    assert list(beside) == [first, 'u', 'force / N', 'turn / rad']
+    for got, want in zip(beside[first], times, strict=True):
+        np.testing.assert_allclose(got, want)
+    assert all(np.array_equal(a, b) for a, b in zip(beside['u'], given, strict=True))
+    assert all(np.array_equal(a, b[1], equal_nan=True) for a, b in zip(beside['turn / rad'], seen, strict=True))
+    plant.units = ('', '')
+    assert list(ws.against())[2:] == ['force', 'turn']
+    fit = refit(ws, [on('a', 0.5)], iterations=0)
+    named = plants._regressors(ws, fit)
+    assert [channel for channel, _ in named] == ['force', 'turn']
+    for c, (channel, of) in enumerate(named):
+        for i, n in enumerate(LENGTHS):
+            own = 0.5 * tables(4)[i][c] * np.isfinite(seen[i][c])
+            want = {'constant': np.ones(n), 'u': given[i], 'u^2': given[i] ** 2, 'u^3': given[i] ** 3}
+            want.update({channel: own, f'{channel}^2': own**2, f'{channel}^3': own**3, f'|{channel}|': abs(own)})
+            if period:
+                t, rate = 2.0 * np.arange(n) / (n - 1) - 1.0, np.gradient(own)
+                want.update({'time': t, 'time^2': t * t})
+                want.update({f'rate of {channel}': rate, f'sign of rate of {channel}': np.sign(rate)})
+            assert set(of) == set(want)
+            for name, values in want.items():
+                np.testing.assert_allclose(of[name][i], values, atol=1e-12, err_msg=name)
+    short = PlantComparison(Pictures([rows[:, :1] for rows in tables(0)], {}, period=1.0))
+    assert not any('rate' in name for name in plants._regressors(short, refit(short, ()))[0][1])
+    two = PlantComparison(Pictures([rows[:, :2] for rows in tables(0)], {}, period=1.0))
+    assert 'rate of force' in plants._regressors(two, refit(two, ()))[0][1]
+
+
+@pytest.mark.parametrize('period', [0.0, 0.25])
+def test_a_case_is_a_cell_of_each_channel(period: float) -> None:
+    """Energy beyond its share of independent values, as a normal deviate; by the chi-square law itself."""
+    seen = holed()
+    seen[1][0] *= 3.0
+    seen[2][1] += 0.3 * np.arange(13) / 13
+    plant = Pictures(seen, {}, period=period)
+    plant.done = {'u': [np.arange(n) / n for n in LENGTHS]}
+    ws = PlantComparison(plant)
+    fit = refit(ws, ())
+    found = plants._where(ws, fit, None)
+    cells = {(c.channel, c.recording): c for c in found.cells}
+    assert set(cells) == {('force', 0), ('force', 1), ('force', 2), ('turn', 0), ('turn', 2)}
+    for (channel, case), cell in cells.items():
+        c = ws.channels.index(channel)
+        there = int(np.isfinite(seen[case][c]).sum())
+        dof = float(ws.independent[c]) * there / float(ws.total[c])
+        energy = float(np.nansum((seen[case][c] / ws.scale[c]) ** 2))
+        assert cell.energy == pytest.approx(energy - dof)
+        p = float(chi2_law.sf(energy, dof))
+        # Six cells were tried, one of which is empty.
+        assert cell.p == pytest.approx(1.0 - (1.0 - p) ** 6, abs=1e-12)
+        assert cell.statistic == pytest.approx(float(norm.isf(p)), abs=0.35)
+        assert found.map[case, c, 0] == cell.statistic
+        assert cell.when == (0.0, LENGTHS[case] * period)
+        assert cell.band == (0.0, 0.5 / period if period else 0.0)
+        names = [d.regressor for d in found.dependences if d.channel == channel and d.p < 0.01]
+        assert cell.depends_on == tuple(names[:2])
+    assert found.map.shape == (3, 2, 1)
+    assert found.map[1, 1, 0] == 0.0
+    assert [c.statistic for c in found.cells] == sorted((c.statistic for c in found.cells), reverse=True)
+    assert found.spans == tuple((i, 0.0, n * period) for i, n in enumerate(LENGTHS))
+    assert (found.excess, found.p) == (found.dependences[0].gain, found.dependences[0].p)
+
+
+def test_words_for_a_channel_are_those_of_its_own_strongest_dependences(monkeypatch: pytest.MonkeyPatch) -> None:
+    depends = [
+        SimpleNamespace(channel=channel, regressor=name, gain=gain, p=p)
+        for channel, name, gain, p in (
+            ('force', 'u', 90.0, 1e-9),
+            ('force', 'u^2', 80.0, 0.009),
+            ('turn', 'time', 70.0, 1e-9),
+            ('force', 'u^3', 60.0, 1e-9),
+            ('turn', 'u', 50.0, 0.011),
+        )
+    ]
+    monkeypatch.setattr(plants, 'dependences', lambda *_: depends)
+    ws = PlantComparison(Pictures(tables(0), {}))
+    words = {c.channel: c.depends_on for c in plants._where(ws, refit(ws, ()), None).cells}
+    assert words == {'force': ('u', 'u^2'), 'turn': ('time',)}
+    monkeypatch.setattr(plants, 'dependences', lambda *_: [])
+    found = plants._where(ws, refit(ws, ()), None)
+    assert (found.excess, found.p, found.dependences) == (0.0, 1.0, ())
+
+
+# Whole answers.
+
+
+def steel(size: float, seed: int = 0, **given: Any) -> Pictures:
+    """Two pictures, of which the second has ``size``, in noise of 0.02; a third is the nuisance's, of size 1.5."""
+    rng = np.random.default_rng(seed)
+    shown = {name: [rng.standard_normal((2, 30)) for _ in range(4)] for name in 'abc'}
+    noise = [0.02 * rng.standard_normal((2, 30)) for _ in range(4)]
+    seen = [size * b + 1.5 * c + e for b, c, e in zip(shown['b'], shown['c'], noise, strict=True)]
+    plant = Pictures(seen, shown, cases=tuple('abcd'), units=('N', 'N'), nuisance=(size_of('c'),), **given)
+    plant.library = (size_of('a'), size_of('b'))
+    return plant
+
+
+def least_squares(plant: Pictures, *names: str) -> tuple[FloatArray, list[FloatArray], FloatArray]:
+    """Sizes of the pictures, what they leave, and the inverse of their products."""
+    matrix = np.stack([np.concatenate([p.ravel() for p in plant.shown[n]]) for n in names], axis=1)
+    data = np.concatenate([s.ravel() for s in plant.seen])
+    sizes = np.linalg.lstsq(matrix, data, rcond=None)[0]
+    left = (data - matrix @ sizes).reshape(4, 2, 30)
+    return sizes, list(left), np.linalg.inv(matrix.T @ matrix)
+
+
+def test_the_answer_for_a_plant_is_that_of_least_squares() -> None:
+    said: list[str] = []
+    plant = steel(0.4, noise=(0.02, 0.02))
+    found = discover_in(plant, seed=5, progress=said.append)
+    (named,) = found.effects
+    (size, other), left, inverse = least_squares(plant, 'b', 'c')
+    _, before, _ = least_squares(plant, 'c')
+    assert (found.verdict, found.unknown, found.seed) == ('effects_found', (), 5)
+    assert named.active.effect.name == 'b'
+    assert named.active.values['size'] == pytest.approx(size, abs=1e-3)
+    ((nuisance, sd),) = found.nuisance
+    assert nuisance.values['size'] == pytest.approx(other, abs=1e-3)
+    # From the noise, or from the scatter over the folds, whichever is greater.
+    assert named.sd['size'] >= 0.9 * 0.02 * math.sqrt(inverse[0, 0])
+    assert sd['size'] >= 0.9 * 0.02 * math.sqrt(inverse[1, 1])
+    assert max(named.sd['size'], sd['size']) < 3.0 * 0.02 * math.sqrt(inverse.max())
+    gaps = [rms(np.concatenate([rows.ravel() for rows in tables_of])) for tables_of in (before, left)]
+    assert (found.gap_before, found.gap_after) == pytest.approx(tuple(gaps), rel=1e-3)
+    assert found.gap_floor == pytest.approx(0.02)
+    assert found.floors == pytest.approx(gaps[1] / 0.02, rel=1e-3)
+    assert gaps[1] < found.gap_heldout_after < 1.1 * gaps[1]
+    assert gaps[0] < found.gap_heldout_before < 1.1 * gaps[0]
+    for i, channel in enumerate(('force', 'turn')):
+        pair = tuple(rms(np.concatenate([rows[i] for rows in tables_of])) for tables_of in (before, left))
+        assert found.per_channel[channel] == pytest.approx(pair, rel=1e-3)
+        assert found.heldout_per_channel[channel] == pytest.approx(pair[1], rel=0.1)
+    assert found.waterfall == (('as described', found.gap_before), ('+ b', found.gap_after), ('noise alone', 0.02))
+    assert found.simulations == len(plant.asked)
+    assert said[0] == 'simulating the plant as it is described'
+    assert [s for s in said if s in ('signatures of every effect', 'weighing', 'alternatives', 'where')] == [
+        'signatures of every effect',
+        'weighing',
+        'alternatives',
+        'where',
+    ]
+    # Where it was before the effect, and where nothing is left after it.
+    assert max(c.statistic for c in found.where.cells) > 8.0 > max(c.statistic for c in found.left.cells)
+    assert found.left.p > 1e-4
+    assert sentence(found).startswith('b is missing from the model; adding it closes the gap from')
+    assert repr(found) == (
+        f'<PlantDiscovery effects_found: b; gap {found.gap_before:.3g} N → {found.gap_after:.3g} N '
+        '(noise alone: 0.02 N)>'
+    )
+
+
+def test_noise_of_a_plant_is_nothing_missing() -> None:
+    found = discover_in(steel(0.0))
+    assert (found.verdict, found.effects, found.unknown) == ('nothing_missing', (), ())
+    assert found.gap_before == found.gap_after
+    # Nobody said how much noise there is.
+    assert math.isnan(found.gap_floor)
+    assert found.floors == 0.0
+    assert '(noise alone: not known)' in repr(found)
+    assert 'no effect' in repr(found)
+
+
+def test_what_no_effect_of_a_plant_explains_is_unknown() -> None:
+    plant = steel(0.4)
+    plant.library = (size_of('a'),)
+    plant.done = {'load': [np.mean(rows, axis=0) for rows in plant.shown['b']]}
+    found = discover_in(plant)
+    assert (found.verdict, found.effects) == ('unknown_effect', ())
+    (unknown,) = found.unknown
+    assert unknown.depends_on[0] == 'load'
+    assert unknown.remains
+    assert unknown.rms == pytest.approx(found.gap_after)
