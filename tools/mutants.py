@@ -112,7 +112,13 @@ ROOMS: Mapping[str, Room] = {
     'discovery': Room(
         ('psd_deflection/discovery',),
         (
-            *(f'test/discovery/test_{n}.py' for n in ('formulas', 'law_formulas', 'answers', 'rules', 'steps')),
+            *(
+                f'test/discovery/test_{n}.py'
+                for n in (
+                    *('formulas', 'law_formulas', 'plant_formulas', 'answers', 'rules', 'steps', 'parts'),
+                    'discover_parts',
+                )
+            ),
             # Their pieces: a whole discovery of the catalogue takes seconds.
             'test/discovery/test_discover.py -k known or stripped or refined or coarse or imagined or floor',
             'test/discovery/test_planning.py -k planned or tells or adds or within_the or loop or words',

@@ -214,8 +214,7 @@ class PlantComparison(Comparison):
         independent = np.array([self._independent(difference, c) for c in range(len(self.channels))])
         # Relative alone: a level in metres may be far below the 1e-8 that allclose lets pass.
         if all(
-            np.allclose(a, b, rtol=SAME, atol=0.0)
-            for a, b in ((level, self.level), (independent, self.independent))
+            np.allclose(a, b, rtol=SAME, atol=0.0) for a, b in ((level, self.level), (independent, self.independent))
         ):
             return False
         self.level, self.independent = level, independent
