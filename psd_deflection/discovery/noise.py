@@ -176,8 +176,7 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
         rest = [strip_lines(detrend(filled[w])) * there[w] for w in long]
         seen = [there[w].astype(np.float64) for w in long]
         count = int(sum(s.sum() for s in seen))
-        lags = 4 * max(block, fine) * 3
-        acov = np.zeros(lags)
+        acov = np.zeros(max(block, (ORDER + 1) * fine))
         acov[0] = white**2
         memory = False
         if count > 400:
@@ -188,7 +187,7 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
             phi = solve_toeplitz(pooled[:-1], pooled[1:])
             scale = _level(power[upper] / _ar_density(phi, frequency[upper]))
             density = scale * _ar_density(phi, np.linspace(0.0, 1.0, 4096, endpoint=False))
-            acov = np.real(np.fft.ifft(density))[:lags]
+            acov = np.real(np.fft.ifft(density))[: len(acov)]
         sigma[c] = np.sqrt(acov[0])
         of_fine = _block_autocovariance(acov, fine, ORDER + 1)
         if memory:

@@ -36,9 +36,8 @@ def spectral_peaks(
         t = np.arange(n, dtype=np.float64) * period
         for _ in range(limit):
             k = int(np.argmax(power))
-            if power[k] < PEAK * median or k < 2:
+            if not power[k] > PEAK * median:
                 break
-
             strongest = np.ascontiguousarray(scaled[:, int(np.argmax(each[k]))] * window)
 
             def loss(f: float, t: FloatArray = t, x: FloatArray = strongest) -> float:
