@@ -173,9 +173,10 @@ def test_signatures_are_kept_for_recordings_as_they_were(monkeypatch: pytest.Mon
         assert (bank._nominal is not None) == kept
         # The last moments' loads are noted after the end: one sample more than the longest delay.
         ended = 11 if max(delays, default=0.0) > 0.0 else seen.unknown_load[1]
-        gone = np.isnan(got.workspace.observations[0].volts).all(axis=1)
+        cut = got.workspace.observations[0].volts
         first = seen.unknown_load[0]
-        assert np.flatnonzero(gone).tolist() == [*range(first), *range(len(gone) - ended, len(gone))]
+        gone = np.flatnonzero(np.isnan(cut).all(axis=1)).tolist()
+        assert gone == [*range(first), *range(len(cut) - ended, len(cut))]
 
 
 def test_how_a_recording_began_is_adjusted_and_not_told() -> None:

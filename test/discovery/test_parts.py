@@ -65,7 +65,7 @@ def test_an_outlier_is_eight_deviations_off(size: float, found: bool) -> None:
     assert cleaning.outliers(x, 1e-3).any() == found
     # A zigzag of +-d is 8/3 d from its cubics, which predict -5/3 d where it is d.
     d = 1e-3 / 1.4826 * 3 / 8
-    zigzag = np.tile([d, -d], 100)[:, None]
+    zigzag = np.tile(np.array([d, -d], np.float64), 100)[:, None]
     zigzag[100] = size - 5 / 3 * d
     got = np.flatnonzero(cleaning.outliers(zigzag, 1e-9)[:, 0])
     assert got.tolist() == ([100] if found else [])
@@ -273,7 +273,9 @@ def test_what_is_shown_of_a_workspace_is_in_micrometres(gappy: Workspace) -> Non
 
 
 def test_a_row_of_a_channel_is_whitened_as_the_readings_are(gappy: Workspace) -> None:
-    values = [np.random.default_rng(k).standard_normal(m.shape[1]) for k, m in enumerate(gappy.measured)]
+    values: list[FloatArray] = [
+        np.asarray(np.random.default_rng(k).standard_normal(m.shape[1])) for k, m in enumerate(gappy.measured)
+    ]
     tables = [np.zeros_like(m) for m in gappy.measured]
     for table, v in zip(tables, values, strict=True):
         table[3] = v
@@ -683,11 +685,9 @@ def test_a_load_case_of_eight_blocks_is_looked_at() -> None:
     spectrum = np.abs(np.fft.rfft(noise()[:, 7:15] / SIGMA, axis=1)) ** 2 / 8
     np.testing.assert_allclose(excess[0, :, 0], spectrum[:, 0] - 1.0)
     np.testing.assert_allclose(excess[0, :, 5], 2.0 * spectrum[:, 2:4].sum(axis=1) + spectrum[:, 4] - 5.0)
-    for index, dof, energy in ((0, 1.0, spectrum[:, 0]), (4, 2.0, 2.0 * spectrum[:, 1])):
-        at = 0 if index == 0 else 4
+    for at, dof, energy in ((0, 1.0, spectrum[:, 0]), (4, 2.0, 2.0 * spectrum[:, 1])):
         spread = 2.0 / (9.0 * dof)
-        want = (np.cbrt(energy / dof) - 1.0 + spread) / math.sqrt(spread)
-        np.testing.assert_allclose(z[0, :, at], want)
+        np.testing.assert_allclose(z[0, :, at], (np.cbrt(energy / dof) - 1.0 + spread) / math.sqrt(spread))
 
 
 # Plans.
@@ -756,7 +756,7 @@ def test_what_is_possible_is_what_the_longest_recording_shows(monkeypatch: pytes
     first, second = plan.told
     assert (first.rival, first.separation, first.reverse) == ('b', 4.0 * len(plan.pieces), 3.0 * len(plan.pieces))
     assert (second.rival, second.separation, second.reverse) == ('c', 1.0 * len(plan.pieces), 0.5 * len(plan.pieces))
-    assert (first.possible, second.possible) == (pytest.approx(4.0 * times), pytest.approx(1.0 * times))
+    assert [first.possible, second.possible] == pytest.approx([4.0 * times, 1.0 * times])
     assert 1 <= len(plan.pieces) <= times
     found = planning.suggest(ws, fits[0], fits[1:], Limits(seconds=seconds))
     assert found is not None

@@ -349,8 +349,8 @@ def test_what_remains_of_a_plant_is_held_against_its_inputs(period: float) -> No
     times = [(start + np.arange(n)) * (period or 1.0) for start, n in zip((0, 10, 17), LENGTHS, strict=True)]
     first = 'time / s (cases one after another)' if period else 'number of the reading'
     assert list(beside) == [first, 'u', 'force / N', 'turn / rad']
-    for got, want in zip(beside[first], times, strict=True):
-        np.testing.assert_allclose(got, want)
+    for got, along in zip(beside[first], times, strict=True):
+        np.testing.assert_allclose(got, along)
     assert all(np.array_equal(a, b) for a, b in zip(beside['u'], given, strict=True))
     assert all(np.array_equal(a, b[1], equal_nan=True) for a, b in zip(beside['turn / rad'], seen, strict=True))
     plant.units = ('', '')
