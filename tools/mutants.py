@@ -116,7 +116,7 @@ ROOMS: Mapping[str, Room] = {
                 f'test/discovery/test_{n}.py'
                 for n in (
                     *('formulas', 'law_formulas', 'plant_formulas', 'answers', 'rules', 'steps', 'parts'),
-                    'discover_parts',
+                    *('discover_parts', 'search_parts'),
                 )
             ),
             # Their pieces: a whole discovery of the catalogue takes seconds.
