@@ -641,3 +641,116 @@ def test_choices_are_not_fitted_and_the_nuisance_is() -> None:
     assert given.nuisance[0].values['x'] == 0.25
     at_bound = refit(plant, (), nuisance=(active('b', -1e-3, 1.0, x=0.0),))
     assert at_bound.at_bound == ((-1, 'x'),)
+
+
+# The way of a whole search.
+
+
+class Steps:
+    """A search whose steps are given: names of effects that are added, and of pairs, '' for none better."""
+
+    def __init__(
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        further: Sequence[str],
+        pairs: Sequence[str],
+        refused: str = '',
+        **ws: Any,
+    ) -> None:
+        self.search, self.done = nothing_found(), list[str]()
+        self.said: list[str] = []
+        for name, value in ws.items():
+            monkeypatch.setattr(self.search.workspace, name, value)
+        adding, pairing, asked = iter(further), iter(pairs), Asked(monkeypatch, steps, self.search)
+        search, done = self.search, self.done
+
+        def fit_of(names: str) -> Fit:
+            return asked.fit(*(active(n, x=0.1) for n in names))
+
+        def further_of(current: Fit, scores: Sequence[Score]) -> Fit | None:
+            done.append('further ' + ','.join(s.candidate.effect.name for s in scores))
+            names = next(adding, '')
+            return fit_of(names) if names else None
+
+        def pair(null: Fit, current: Fit) -> Fit:
+            done.append('pairs')
+            names = next(pairing, '')
+            return fit_of(names) if names else current
+
+        def renoise(fit: Fit) -> Fit:
+            done.append('renoise ' + ''.join(named(fit)))
+            return fit
+
+        def screen(ws: object, current: Fit | None) -> Any:
+            done.append('screen ' + ''.join(named(cast(Fit, current))))
+            return search.screen
+
+        given_scores(search, *(scored(n, 9.0) for n in 'abcd'), scored('link_length', 9.0))
+        search._make_screen, search._progress = screen, self.said.append
+        for name, step in (
+            ('_further', further_of),
+            ('_try_pairs', pair),
+            ('renoise', renoise),
+            ('_mistake', lambda null, scores: null),
+            ('_drop', lambda null, fit: fit),
+            ('swap', lambda null, fit: (fit, [])),
+            ('weigh', lambda null, fit: ([], [], [])),
+            ('_passes', lambda smaller, larger, null: ''.join(named(larger)) != refused),
+        ):
+            monkeypatch.setattr(search, name, step)
+        self.found = ''.join(named(search.run().fit))
+
+
+def test_effects_are_added_one_by_one_and_noise_estimated_after_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And at the end; none is added twice, nor a mistake of all channels; from the second on pairs are tried."""
+    way = Steps(monkeypatch, ['a', 'ab', ''], [])
+    assert way.found == 'ab'
+    assert way.said == ['adding a', 'adding b']
+    assert way.done == [
+        'further a,b,c,d',
+        'renoise a',
+        'screen a',
+        'further b,c,d',
+        'screen ab',
+        'pairs',
+        'further c,d',
+        'renoise ab',
+    ]
+    # Another pair takes its place; what does not pass is not added.
+    assert Steps(monkeypatch, ['a', 'ab', ''], ['cd']).found == 'cd'
+    assert Steps(monkeypatch, ['a', 'ab'], [], 'ab').found == 'a'
+    nothing = Steps(monkeypatch, [''], ['ab'])
+    assert (nothing.found, nothing.done) == ('', ['further a,b,c,d'])
+    four = Steps(monkeypatch, ['a', 'ab', 'abc', 'abcd', 'abcde'], [])
+    assert four.found == 'abcd'
+    # Close enough to noise the signatures stay as they were.
+    monkeypatch.setattr(steps, 'far', lambda _: False)
+    assert Steps(monkeypatch, ['a', ''], []).done == ['further a,b,c,d', 'renoise a', 'further b,c,d', 'renoise a']
+
+
+def test_of_two_causes_of_a_rough_machine_neither_may_help_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    way = Steps(monkeypatch, ['', ''], ['ab'], open_level=True)
+    assert way.found == 'ab'
+    assert way.said == []
+    assert way.done == [
+        'further a,b,c,d',
+        'pairs',
+        'renoise ab',
+        'screen ab',
+        'pairs',
+        'further c,d',
+        'renoise ab',
+    ]
+    # Noise is estimated after each step there.
+    again = Steps(monkeypatch, ['a', 'ab', ''], [], open_level=True)
+    assert [d for d in again.done if d.startswith('renoise')] == ['renoise a', 'renoise ab', 'renoise ab']
+    for pairs, refused in (([''], ''), (['ab'], 'ab')):
+        none = Steps(monkeypatch, [''], pairs, refused, open_level=True)
+        assert (none.found, none.done) == ('', ['further a,b,c,d', 'pairs'])
+    # A pair instead of the one that is there; one that does not pass is not taken.
+    assert Steps(monkeypatch, ['a', ''], ['bc'], open_level=True).found == 'bc'
+    assert Steps(monkeypatch, ['a', 'ab', ''], ['', 'cd'], 'ab', open_level=True).found == 'a'
+
+
+def test_beyond_the_budget_nothing_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Steps(monkeypatch, ['a', 'ab'], [], budget=0).found == ''
