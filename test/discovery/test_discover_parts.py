@@ -23,6 +23,7 @@ from psd_deflection.discovery.laws import FoundLaw
 from psd_deflection.discovery.localise import Dependence, Localisation
 from psd_deflection.discovery.noise import NoiseModel
 from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.result import result
 from psd_deflection.discovery.screen import Screen
 from psd_deflection.discovery.search import Search, SearchResult
 from psd_deflection.discovery.signatures import SignatureBank
@@ -325,6 +326,15 @@ def test_starting_values_come_from_the_residual_and_the_readings(monkeypatch: py
     assert found['highest'] == proposals.highest_voltages(ws.observations, True, noise)
     assert found['highest_dots'] == proposals.highest_voltages(ws.observations, False, noise)
     assert found['highest'] != found['highest_dots']
+
+
+def test_the_same_seed_gives_the_same_answer_whatever_is_kept() -> None:
+    seen, bank, few = observed(9, (ROTATION,), warm=None), SignatureBank(), without('sensor_rotation')
+    answers = [result(discover([seen], RIG, without=few, bank=b)) for b in (None, bank, bank)]
+    costs = [a.pop('provenance')['forward_simulations'] for a in answers]
+    assert answers[0] == answers[1] == answers[2]
+    # The second time nothing need be simulated anew.
+    assert costs[0] == costs[1] > costs[2]
 
 
 # What is made of the answer of a search.

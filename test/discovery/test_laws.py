@@ -22,6 +22,8 @@ from psd_deflection.simulation.declaration import ActiveEffect
 from psd_deflection.simulation.laws import Law, Term, effect_of, law_text, read_law, values_of
 from psd_deflection.simulation.simulator import ForwardModel
 
+from .test_formulas import observed
+
 RIG = load_rig()
 HISTORY = loads.identification().loads
 WARM = 21.0 + 2.0 * np.sin(np.linspace(0.0, 5.0, len(HISTORY)))
@@ -62,7 +64,7 @@ def test_times_of_switching_are_found_to_a_sample_or_two() -> None:
 
 
 def test_there_is_no_law_in_noise() -> None:
-    ws = workspace(None, seed=3)
+    ws = Workspace([observed(3)])
     null = refit(ws, ())
     assert find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print) is None
     assert find_jitter(ws, null, float(np.log(ws.effective_size()))) is None

@@ -21,6 +21,7 @@ from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.recordings.observations import read_observation
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation import loads
+from psd_deflection.simulation.catalogue import effect_names
 from psd_deflection.simulation.simulator import RigSimulator
 
 RIG = load_rig()
@@ -106,8 +107,15 @@ def test_a_soft_or_stiff_link_is_no_other_unit() -> None:
         assert findings == []
 
 
-def found_in(*observations: Observation) -> Discovery:
-    found = discover(observations, RIG)
+NEAR = (
+    *('load_direction', 'bending_stiffness', 'torsional_stiffness', 'damping', 'creep', 'sensor_rotation'),
+    *('sensor_gain', 'sensor_position', 'amplifier_lag', 'channel_skew'),
+)
+"""What might stand in for a mistake of the set-up. The rest of the catalogue takes time and tells nothing more."""
+
+
+def found_in(*observations: Observation, whole: bool = False) -> Discovery:
+    found = discover(observations, RIG, without=() if whole else [n for n in effect_names() if n not in NEAR])
     tree = result(found)
     assert json.loads(json.dumps(tree, allow_nan=False)) == tree
     return found
@@ -115,7 +123,7 @@ def found_in(*observations: Observation) -> Discovery:
 
 def test_a_setup_that_explains_all_leaves_nothing_missing() -> None:
     """A longer link makes EI and GJ look wrong by a cube and by itself: one length explains both."""
-    found = found_in(recorded(link__length=0.585 * 1.02))
+    found = found_in(recorded(link__length=0.585 * 1.02), whole=True)
     assert (found.verdict, found.effects) == ('nothing_missing', ())
     (mistake,) = found.setup
     assert (mistake.name, mistake.where) == ('link_length', 'link.length')
@@ -216,10 +224,9 @@ def test_a_recording_may_start_under_load_and_in_motion() -> None:
     assert found.floors < 1.05
 
 
-@pytest.mark.parametrize('share', [0.3, 0.6])
-def test_lost_samples_cost_precision_and_nothing_else(share: float) -> None:
+def test_lost_samples_cost_precision_and_nothing_else() -> None:
     o = recorded(effects__e__name='sensor_rotation', effects__e__psd=2, effects__e__angle=0.004)
-    o.volts[np.random.default_rng(1).random(len(o.volts)) < share] = np.nan
+    o.volts[np.random.default_rng(1).random(len(o.volts)) < 0.6] = np.nan
     found = found_in(o)
     assert found.setup == ()
     (named,) = found.effects
