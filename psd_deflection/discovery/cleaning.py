@@ -96,11 +96,9 @@ def stuck(volts: FloatArray, period: float, noise: FloatArray, step: float) -> B
         if long.all() and len(lengths) == 1:
             out[:, c] = True
             continue
-        if not long.any():
-            continue
         low, high = float(finite.min()), float(finite.max())
         for a, n in zip(edges[:-1][long].tolist(), lengths[long].tolist(), strict=True):
-            if np.isfinite(values[a]) and low < values[a] < high:
+            if low < values[a] < high:
                 out[a : a + n, c] = True
     return out
 
@@ -139,21 +137,20 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
         fix = line('converter.sample_rate_hz', rate)
         findings.append(Finding('sample_rate', 'converter.sample_rate_hz', factor, fix, abs(math.log(factor))))
     before, after = o.unknown_load
-    if before or after:
-        volts[:before] = np.nan
-        volts[len(volts) - after :] = np.nan
-        share = (before + after) / len(volts)
-        if share > UNKNOWN_SHARE:
-            findings.append(
-                Finding(
-                    'load_coverage',
-                    'load_fx load_fy load_tz',
-                    share,
-                    f'{o.name}: no load is noted in its first {before * o.period:.2f} s and its last '
-                    f'{after * o.period:.2f} s: note it all the time; these samples are left out',
-                    share,
-                )
+    volts[:before] = np.nan
+    volts[len(volts) - after :] = np.nan
+    share = (before + after) / len(volts)
+    if share > UNKNOWN_SHARE:
+        findings.append(
+            Finding(
+                'load_coverage',
+                'load_fx load_fy load_tz',
+                share,
+                f'{o.name}: no load is noted in its first {before * o.period:.2f} s and its last '
+                f'{after * o.period:.2f} s: note it all the time; these samples are left out',
+                share,
             )
+        )
     if np.array_equal(volts, o.volts, equal_nan=True):
         return o, findings
     return dataclasses.replace(o, volts=volts, digest=o.digest or o.hashed()), findings

@@ -146,8 +146,7 @@ def known_fine(ws: Workspace, effects: Sequence[ActiveEffect], name: str) -> lis
 
 
 def _spread(parts: Sequence[FloatArray]) -> float:
-    whole = np.concatenate(parts)
-    return float(np.max(np.abs(whole))) if len(whole) else 0.0
+    return float(np.max(np.abs(np.concatenate(parts))))
 
 
 def _levels(parts: Sequence[FloatArray], count: int) -> list[float]:

@@ -176,9 +176,7 @@ class _Seeker:
         picked: list[Scored] = []
         for s in scored:
             key = (s.target, s.term.form, s.term.of)
-            if s.gain < 0.3 * scored[0].gain or len(picked) >= TRIED:
-                break
-            if key not in seen:
+            if key not in seen and s.gain >= 0.3 * scored[0].gain and len(picked) < TRIED:
                 seen.add(key)
                 picked.append(s)
         quick = [self.trial([_on(s.target, s.term)], self.start.effects, 3) for s in picked]
@@ -317,7 +315,7 @@ def _law_of_the_mean(
     chosen = sum(len(t.times) for law in best.laws for t in law.terms)
     # Every term on every target might have been taken, and every block as a time of a switching.
     chances = best.terms * math.log(seeker.tried) + chosen * math.log(max(ws.size / 6.0, 2.0))
-    p = math.exp(min(chances + float(chi2_law.logsf(max(gain, 0.0), max(parameters, 1))), 0.0))
+    p = math.exp(chances + float(chi2_law.logsf(gain, max(parameters, 1))))
     bic = gain - (best.cost - found.chi2 - penalty * without.parameters)
     held = heldout_gain(ws, without, found, rng)
     enough = fit.chi2 - found.chi2 > EXPLAINS * excess
@@ -373,7 +371,7 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
         flat = float(squares[other].mean())
         held.append(_likelihood(squares[own], a + b * v2[own]) - _likelihood(squares[own], flat))
     heldout = HeldOut(0.5 * float(sum(held)), math.sqrt(max(gain, 1.0)))
-    p = min(1.0, tried * float(chi2_law.sf(max(gain, 0.0), 1)))
+    p = tried * float(chi2_law.sf(gain, 1))
     if p > P_ACCEPT or gain - penalty <= BIC_ACCEPT or not heldout.holds or slope <= 0.0:
         return None
     scale = float(np.mean([n.innovation[c] * math.sqrt(s) for n, s in zip(ws.noise, ws.fine, strict=True)]))
@@ -381,7 +379,7 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
         scale *= float(ws.physics.sensitivity.ravel()[DOTS.index(channel)])
     coefficient = math.sqrt(slope) * scale
     # The curvature of the likelihood of a single parameter, to first order.
-    term = Term('jitter', (name,), coefficient, sd={'coefficient': coefficient / math.sqrt(max(gain, 1.0))})
+    term = Term('jitter', (name,), coefficient, sd={'coefficient': coefficient / math.sqrt(gain)})
     law = Law(f'law_{channel}', 'electronics', channel, (term,))
     # What this noise adds to block means is no gap any more.
     added = sum(float(np.sum((coefficient * v) ** 2)) for v in known[name]) / sum(len(v) for v in known[name])

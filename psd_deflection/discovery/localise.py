@@ -208,7 +208,7 @@ def dependences(
         for k, name in enumerate(names):
             if lengths[k] > 0.0 and f[k] > 1e-6 * lengths[k]:
                 found.append((channel, name, float(g[k] ** 2 / f[k])))
-    count = max(1, len(found))
+    count = len(found)
     out = [
         Dependence(ch, name, gain, float(-np.expm1(count * np.log1p(-min(float(chi2_law.sf(gain, 1)), 1 - 1e-16)))))
         for ch, name, gain in found
@@ -272,8 +272,8 @@ def localise(
             Cell(CHANNELS[int(c)], layout.recording, when, band, names, shown, p_of(value), float(raw_excess[i, c, b]))
         )
     cells.sort(key=lambda cell: -cell.statistic)
-    significant = np.array([[p_of(v) < 0.01 for v in row] for row in z.reshape(len(layouts), -1)])
-    total = float(raw_excess.reshape(len(layouts), -1)[significant].sum()) if significant.any() else 0.0
+    significant = np.array([p_of(v) < 0.01 for v in z.ravel()])
+    total = float(raw_excess.ravel()[significant].sum())
     total = max(total, depends[0].gain if depends and depends[0].p < 0.01 else 0.0)
     p = min(1.0, 2.0 * min(p_of(float(z.max())), depends[0].p if depends else 1.0))
     spans = tuple((x.recording, x.start * x.period, x.stop * x.period) for x in layouts)

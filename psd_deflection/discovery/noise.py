@@ -92,7 +92,7 @@ def strip_lines(residual: FloatArray, limit: int = 4) -> FloatArray:
         if ratio[peak] < 60.0:
             break
         spectrum = np.fft.rfft(out)
-        spectrum[max(0, peak - 3) : peak + 4] = 0.0
+        spectrum[peak - 3 : peak + 4] = 0.0
         out = np.fft.irfft(spectrum, n)
     return np.asarray(out, dtype=np.float64)
 

@@ -117,7 +117,7 @@ def coarse_step(observation: Observation) -> tuple[float, float] | None:
             break
         reach *= 2.0
     off = np.abs(values - np.rint(values / gap) * gap)
-    if gap < 1.8 or np.mean(off <= 0.75) < 0.995 or len(values) < 3:
+    if np.mean(off <= 0.75) < 0.995:
         return None
     # Chance: a value lies within 0.75 counts of a multiple with probability 1.5/gap.
     expected = min(1.0, 2.0 / gap)

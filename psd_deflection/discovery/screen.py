@@ -90,7 +90,7 @@ class Screen:
     def score(self, residual: FloatArray, known: FloatArray | None = None) -> list[Score]:
         """Every candidate on ``residual`` (D,), the best first; ``known`` (D, p): columns in the model."""
         g, fisher = self._projected(residual, known)
-        count = max(1, len(self.candidates))
+        count = len(self.candidates)
         out = []
         for candidate, s in zip(self.candidates, self.slices, strict=True):
             gain, dof, c = solve_seen(fisher[s, s], g[s], self.lengths[s])

@@ -172,7 +172,7 @@ class Search:
     def library_p(self, gain: float, dof: int) -> float:
         """p of a gain in chi-square, over the whole library (Sidak)."""
         count = max(1, len(self.screen.candidates))
-        local = float(chi2_law.sf(max(gain, 0.0), max(dof, 1)))
+        local = float(chi2_law.sf(gain, max(dof, 1)))
         return float(-np.expm1(count * np.log1p(-min(local, 1.0 - 1e-16))))
 
     def renoise(self, fit: Fit) -> Fit:

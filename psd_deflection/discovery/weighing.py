@@ -296,8 +296,8 @@ def unknown_of(
     if left.cells:
         c = left.cells[0]
         words.append(f'strongest at {c.when[0]:.1f} to {c.when[1]:.1f} s, {c.band[0]:g} to {c.band[1]:g} Hz')
-    share = left.excess / max(left.excess + explained, 1e-300)
-    return (Unknown('; '.join(words), names, float(min(max(share, 0.0), 1.0)), rms=size),)
+    share = left.excess / (left.excess + explained)
+    return (Unknown('; '.join(words), names, share, rms=size),)
 
 
 def tied(ties: Sequence[Coincidence], fit: Fit, result: SearchResult, before: Localisation) -> tuple[Unknown, ...]:

@@ -26,6 +26,7 @@ from psd_deflection.discovery.observation import Observation
 from psd_deflection.discovery.result import result
 from psd_deflection.discovery.screen import Screen
 from psd_deflection.discovery.search import Search, SearchResult
+from psd_deflection.discovery.setup import said
 from psd_deflection.discovery.signatures import SignatureBank
 from psd_deflection.discovery.validate import HeldOut
 from psd_deflection.discovery.weighing import NamedEffect, Rival, Unknown
@@ -328,9 +329,9 @@ def test_starting_values_come_from_the_residual_and_the_readings(monkeypatch: py
     assert found['highest'] != found['highest_dots']
 
 
-def test_the_same_seed_gives_the_same_answer_whatever_is_kept() -> None:
+def test_the_same_seed_gives_the_same_answer_whatever_is_kept(named: Discovery) -> None:
     seen, bank, few = observed(9, (ROTATION,), warm=None), SignatureBank(), without('sensor_rotation')
-    answers = [result(discover([seen], RIG, without=few, bank=b)) for b in (None, bank, bank)]
+    answers = [result(named), *(result(discover([seen], RIG, without=few, bank=bank)) for _ in range(2))]
     costs = [a.pop('provenance')['forward_simulations'] for a in answers]
     assert answers[0] == answers[1] == answers[2]
     # The second time nothing need be simulated anew.
@@ -504,3 +505,37 @@ def test_mistakes_of_the_setup_are_told_apart_from_effects(monkeypatch: pytest.M
     entries[:] = entries[:1]
     only = answered(named, fit=bare)
     assert (only.effects, only.moves, only.verdict) == ((), (0.0, 0.0, 0.0), 'nothing_missing')
+
+
+def test_an_experiment_is_planned_for_the_three_that_are_nearest(
+    monkeypatch: pytest.MonkeyPatch, named: Discovery
+) -> None:
+    """For one alone once the budget is spent."""
+    monkeypatch.setattr(answer, 'localise', lambda *a, **k: NOWHERE)
+    asked_for: list[tuple[object, list[int]]] = []
+    monkeypatch.setattr(answer, 'suggest', lambda ws, best, equal: asked_for.append((best, equal)))
+
+    def named_effects(*given: Any) -> list[NamedEffect]:
+        given[-1]('best', [1, 2, 3, 4, 5])
+        return []
+
+    monkeypatch.setattr(answer, 'named_effects', named_effects)
+    for spent, count in ((named.workspace.budget - 100, 3), (named.workspace.budget, 1)):
+        monkeypatch.setattr(named.workspace, 'simulations', spent)
+        answered(named)
+        assert asked_for[-1] == ('best', [1, 2, 3, 4, 5][:count])
+
+
+def test_lines_are_those_of_the_first_recordings_rig() -> None:
+    o = observed(warm=None)
+    other = replace_values(RIG, {'link.length': 0.4, 'amplifier.sensitivity': 1e-3})
+    ws = cast(Workspace, SimpleNamespace(observations=[o, dataclasses.replace(o, rig=other)]))
+    length = next(e for e in mistakes(2, [], []) if e.name == 'link_length')
+    fit = cast(Fit, SimpleNamespace(effects=(ActiveEffect(length, {'error': 0.02}),)))
+    assert said(ws, fit, 0, 1.0)[1] == {'link.length': pytest.approx(0.5967)}
+    zero = next(e for e in mistakes(2, [], []) if e.name == 'zero')
+    for recording, name in ((1.0, 'seen'), (2.0, 'other')):
+        ws = cast(Workspace, SimpleNamespace(observations=[o, dataclasses.replace(o, name='other')]))
+        values = {'recording': recording, 'of_reading': 0.0, 'x1': 1e-3, 'y1': 0.0, 'x2': 0.0, 'y2': 0.0}
+        fit = cast(Fit, SimpleNamespace(effects=(ActiveEffect(zero, values),)))
+        assert said(ws, fit, 0, 1.0)[0][0].where == name

@@ -423,6 +423,10 @@ def test_of_many_lines_the_strongest_four_are_stripped() -> None:
     left = strip_lines(noise + sum(lines[:4]) + 3.0)
     assert left.std() == pytest.approx(1.0, abs=0.05)
     assert left.mean() == pytest.approx(0.0, abs=1e-9)
+    # A line leaves nothing at its frequency and the next three on either side.
+    spectrum = np.abs(np.fft.rfft(strip_lines(noise + lines[0], 1)))
+    assert spectrum[[*range(1, 197), *range(204, 2000)]].min() > 1e-6
+    assert spectrum[197:204].max() < 1e-9
     # A channel that reads 0 has none.
     assert not strip_lines(np.zeros(1000)).any()
     # The fifth, 5 sin, stays: variance 12.5 more.

@@ -224,6 +224,9 @@ def test_two_levels_are_told_apart_from_a_stated_gain_on() -> None:
     assert law_features._two_levels(box, ones * 0.8 * 48.0 / 50.0, ones) == []
     assert law_features._two_levels(box, ones * 0.4 * 48.0 / 50.0, ones) == []
     assert law_features._two_levels(np.zeros(n), ones, ones) == []
+    # However little each block weighs: 50 of 0.01, of a level of 7, gain 24.5.
+    assert law_features._two_levels(np.full(50, 7.0), np.full(50, 0.01), np.ones(50)) == [0]
+    assert law_features._two_levels(np.full(50, 6.9), np.full(50, 0.01), np.ones(50)) == []
     # To the end of the recording one change is enough.
     late = np.zeros(n)
     late[150:] = -1.0

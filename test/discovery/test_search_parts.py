@@ -15,20 +15,23 @@ from scipy.stats import chi2 as chi2_law
 from psd_deflection.calibration import Wiring
 from psd_deflection.discovery import law_features, laws, setup
 from psd_deflection.discovery import search as steps
+from psd_deflection.discovery.coincidence import coincidences
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.law_features import Response, Scored
 from psd_deflection.discovery.screen import Score, Screen
 from psd_deflection.discovery.search import Search
 from psd_deflection.discovery.signatures import Candidate
 from psd_deflection.discovery.validate import HeldOut
+from psd_deflection.discovery.weighing import named_effects
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter
 from psd_deflection.simulation.laws import Law, Term, effect_of, values_of
+from psd_deflection.simulation.physics import Physics
 
 from .test_formulas import RIG, observed
 from .test_rules import SIGMA, N, Plant, active, candidate, effect, noise, pictures, search_of, without_noise
-from .test_steps import A, B, across, named, searching
+from .test_steps import A, B, across, amplitudes, named, searching
 
 
 def scored(name: str, gain: float, p: float = 0.0, **given: Any) -> Score:
@@ -754,3 +757,45 @@ def test_of_two_causes_of_a_rough_machine_neither_may_help_alone(monkeypatch: py
 
 def test_beyond_the_budget_nothing_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
     assert Steps(monkeypatch, ['a', 'ab'], [], budget=0).found == ''
+
+
+@pytest.mark.parametrize(('odds', 'told'), [(20.2, True), (19.8, False)])
+def test_sizes_are_tied_from_odds_of_twenty_on(odds: float, told: bool) -> None:
+    """Of the ratio's density at what it is, against a flat one over two decades."""
+    a = b = 0.5
+    for _ in range(20):
+        spread = math.sqrt(1e-6 / a**2 + 1e-6 / b**2 + 0.003**2)
+        height = 2.0 * math.log(10.0) / (spread * math.sqrt(2.0 * math.pi))
+        b = a * math.exp(spread * math.sqrt(2.0 * math.log(height / odds)))
+    ties = coincidences(amplitudes(('x', 'V', a), ('y', 'V', b)), Physics.of(RIG))
+    assert [t.odds for t in ties] == ([pytest.approx(odds, rel=1e-6)] if told else [])
+
+
+def test_at_its_limit_an_alternative_is_not_equivalent() -> None:
+    shown = pictures(A)
+    search = search_of(Plant(shown, without_noise((shown[A], 500.0))))
+    fit = dataclasses.replace(refit(search.workspace, [active('a', x=0.0)]), chi2=0.0)
+    null = refit(search.workspace, ())
+    for loss, equal in ((21.6, False), (math.nextafter(21.6, 0.0), True)):
+        other = dataclasses.replace(fit, effects=(active('b', x=0.1),), chi2=loss)
+        result = steps.SearchResult(null, fit, [0.0], [99.0], [500.0], [], [[other]])
+        (found,) = named_effects(search, result, fit, [HeldOut(9.0, 1.0)])
+        assert found.equivalent == ('b',) * equal
+        # What cannot be excluded is a rival, however much worse it is in BIC.
+        assert len(found.rivals) == equal
+
+
+def test_limits_themselves_do_not_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gain in BIC of just ten; a gain of just two errors; a chi-square of just ten a value."""
+    search = nothing_found()
+    null = refit(search.workspace, ())
+    smaller, larger = dataclasses.replace(null, chi2=100.0), dataclasses.replace(null, chi2=87.0, free=((0, 'x'),))
+    monkeypatch.setattr(search.workspace, 'open_level', True)
+    assert not search._passes(smaller, larger, null)
+    assert search._passes(smaller, dataclasses.replace(larger, chi2=86.9), null)
+    assert not HeldOut(2.0, 1.0).holds
+    assert not steps.far(dataclasses.replace(null, chi2=10.0 * null.residual.size))
+    assert [steps.far(dataclasses.replace(null, chi2=10.0 * null.residual.size + d)) for d in (-1.0, 1.0)] == [
+        False,
+        True,
+    ]

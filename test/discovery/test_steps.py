@@ -349,6 +349,7 @@ def test_only_sizes_of_one_kind_and_of_different_effects_are_compared() -> None:
 def test_turned_loads_are_changes_as_wirings_are() -> None:
     file = Wiring.from_rig(RIG)
     assert _changes(file, file, np.array([0.5, -1.0, math.nan])) == 1
+    assert _changes(file, file, np.zeros(3)) == 0
     assert _changes(file, file, np.array([-0.5, -1.0, -2.0])) == 3
     other = dataclasses.replace(file, axes=(('-x', 'y'), *file.axes[1:]))
     assert _changes(other, file, np.array([1.0, 1.0, -1.0])) == 2
