@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.config import replace_values
-from psd_deflection.discovery import cleaning, experiment, localise, planning, proposals, validate, weighing
+from psd_deflection.discovery import cleaning, experiment, laws, localise, planning, proposals, validate, weighing
 from psd_deflection.discovery import workspace as whitened
 from psd_deflection.discovery.coincidence import Coincidence
 from psd_deflection.discovery.comparison import Comparison
@@ -762,3 +762,73 @@ def test_what_is_possible_is_what_the_longest_recording_shows(monkeypatch: pytes
     assert found is not None
     assert found.separation == min(4.0, 1.0) * len(plan.pieces)
     assert plan.limits.seconds == seconds
+
+
+# Coarse steps.
+
+
+@pytest.mark.parametrize('gap', [10.4, 17.3, 33.7, 128.9])
+def test_a_step_is_that_of_least_squares_through_all_readings(gap: float) -> None:
+    """Each of 513 multiples was rounded to counts."""
+    lsb = RIG.converter.volts_per_count
+    k = np.resize(np.arange(-256.0, 257.0), (2052, 6))
+    counts = np.rint(k * gap)
+    o = dataclasses.replace(observed(warm=None), volts=counts * lsb, loads=np.zeros((2052, 3)))
+    found = proposals.coarse_step(o)
+    assert found is not None
+    values, of = np.rint(np.arange(-256.0, 257.0) * gap), np.arange(-256.0, 257.0)
+    assert found[0] / lsb == pytest.approx(float(of @ values) / float(of @ of), rel=1e-12)
+    assert found[1] / lsb == pytest.approx(1.0 / math.sqrt(12.0 * float(of @ of)), rel=1e-12)
+
+
+@pytest.mark.parametrize(('gap', 'seen'), [(255, False), (300, True)])
+def test_four_values_lie_on_a_step_by_chance_unless_it_is_very_coarse(gap: int, seen: bool) -> None:
+    """Each with the chance of 2 counts in a step: their logarithms must add up to 20."""
+    lsb = RIG.converter.volts_per_count
+    volts = np.resize(np.arange(4.0) * gap * lsb, (1200, 6))
+    assert (proposals.coarse_step(dataclasses.replace(observed(warm=None), volts=volts)) is not None) == seen
+
+
+def test_half_a_per_cent_of_readings_may_be_off_the_steps() -> None:
+    lsb = RIG.converter.volts_per_count
+    for off, seen in ((4, True), (6, False)):
+        # Of a thousand values.
+        counts = np.arange(1000.0) * 50.0
+        counts[100 : 100 + 10 * off : 10] += 20.0
+        volts = np.tile(counts[:, None] * lsb, (2, 6))
+        o = dataclasses.replace(observed(warm=None), volts=volts, loads=np.zeros((2000, 3)), temperature=None)
+        assert (proposals.coarse_step(o) is not None) == seen
+
+
+def test_at_its_limit_nothing_stands_out() -> None:
+    x = np.zeros((60, 1))
+    x[30] = cleaning.FAR * 1e-3
+    assert not cleaning.outliers(x, 1e-3).any()
+    x[30] = np.nextafter(cleaning.FAR * 1e-3, 1.0)
+    assert cleaning.outliers(x, 1e-3).any()
+
+
+# Noise that grows.
+
+
+@pytest.mark.parametrize('size', [1e-6, 1.0, 1e4])
+def test_what_noise_grows_with_may_have_any_size(monkeypatch: pytest.MonkeyPatch, size: float) -> None:
+    ws = Workspace([observed(warm=None)])
+    rng = np.random.default_rng(2)
+    v = rng.uniform(-1.0, 1.0, 300)
+    known = {'dx': size * v, 'load_fx': 0.2 * size * rng.uniform(-1.0, 1.0, 300)}
+    monkeypatch.setattr(laws, 'known_fine', lambda _, __, name: [known.get(name, np.zeros(300))])
+    fit = refit(ws, ())
+    residual = rng.standard_normal((6, 300))
+    residual[1] *= np.sqrt(0.2 + 8.0 * v**2)
+    found = laws.find_jitter(ws, dataclasses.replace(fit, residual=residual.ravel()), 3.0)
+    assert found is not None
+    assert (found.law.acts_on, found.law.terms[0].of) == ('y1', ('dx',))
+    squares, v2 = residual[1] ** 2, v**2 / float((v**2).max())
+    a, b = laws._variance(squares, v2)
+    gain = laws._likelihood(squares, a + b * v2) - laws._likelihood(squares, squares.mean())
+    assert found.delta_bic == pytest.approx(gain - 3.0)
+    # Two variables that change, on each of six channels.
+    assert found.p == pytest.approx(12.0 * math.erfc(math.sqrt(gain / 2.0)), rel=1e-6)
+    per = ws.noise[0].innovation[1] * 2.0 * float(RIG.sensitivities.ravel()[1])
+    assert found.law.terms[0].coefficient == pytest.approx(math.sqrt(b / float((v**2).max())) / size * per)

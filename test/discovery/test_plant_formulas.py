@@ -233,6 +233,8 @@ def test_neighbours_that_follow_each_other_are_fewer_values() -> None:
     assert (PlantComparison(Pictures(ever, {}, period=0.5)).independent >= 2.0).all()
     still = [np.ones((2, 2)) for _ in range(3)]
     assert PlantComparison(Pictures(still, {}, period=0.5)).independent.tolist() == [6.0, 6.0]
+    pair = Pictures([np.array([[1.0, 2.0], [5.0, 3.0]])], {}, cases=('a',), period=0.5)
+    assert PlantComparison(pair).independent.tolist() == [2.0, 2.0]
     alone = [np.full((2, 3), math.nan) for _ in range(3)]
     for rows in alone:
         rows[:, 0] = 1.0
