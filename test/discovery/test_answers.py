@@ -587,6 +587,8 @@ def test_what_remains_is_told_in_words() -> None:
     # Twice as much of one kind is most of it.
     for even, word in (
         (20.1, 'mostly even'),
+        (20.0, 'odd and even parts'),
+        (5.0, 'odd and even parts'),
         (19.9, 'odd and even parts'),
         (5.1, 'odd and even parts'),
         (4.9, 'mostly odd'),

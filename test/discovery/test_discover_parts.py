@@ -457,6 +457,7 @@ def test_what_remains_is_unknown_by_three_rules(monkeypatch: pytest.MonkeyPatch,
     nowhere = answered(named, fit=named.search.null)
     assert nowhere.unknown[0].signature.endswith('in no single place or band')
     assert nowhere.unknown[0].explains == 1.0
+    assert answered(named, fit=named.search.null, left=FOLLOWS).unknown[0].explains == 1.0
     monkeypatch.setattr(answer, 'tied', lambda *a: (Unknown('tied', (), 1.0, remains=False),))
     assert answered(named).verdict == 'unknown_effect'
     monkeypatch.setattr(answer, 'tied', lambda *a: ())

@@ -21,7 +21,9 @@ from psd_deflection.discovery.hidden import beginning, mistakes
 from psd_deflection.discovery.localise import Dependence
 from psd_deflection.discovery.noise import NoiseModel, _filled, _kept, _level, estimate_noise
 from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.screen import Screen
 from psd_deflection.discovery.search import SearchResult
+from psd_deflection.discovery.setup import likely_delays
 from psd_deflection.discovery.signatures import Candidate, SignatureBank, signatures_beside
 from psd_deflection.discovery.trust import energies
 from psd_deflection.discovery.validate import HeldOut
@@ -817,6 +819,7 @@ def test_what_noise_grows_with_may_have_any_size(monkeypatch: pytest.MonkeyPatch
     rng = np.random.default_rng(2)
     v = rng.uniform(-1.0, 1.0, 300)
     known = {'dx': size * v, 'load_fx': 0.2 * size * rng.uniform(-1.0, 1.0, 300)}
+    monkeypatch.setattr(laws, 'heldout_gap', lambda *_: 0.0)
     monkeypatch.setattr(laws, 'known_fine', lambda _, __, name: [known.get(name, np.zeros(300))])
     fit = refit(ws, ())
     residual = rng.standard_normal((6, 300))
@@ -830,5 +833,65 @@ def test_what_noise_grows_with_may_have_any_size(monkeypatch: pytest.MonkeyPatch
     assert found.delta_bic == pytest.approx(gain - 3.0)
     # Two variables that change, on each of six channels.
     assert found.p == pytest.approx(12.0 * math.erfc(math.sqrt(gain / 2.0)), rel=1e-6)
+    # What this noise adds is no gap any more, nor less than none.
+    assert found.heldout_gap == 0.0
     per = ws.noise[0].innovation[1] * 2.0 * float(RIG.sensitivities.ravel()[1])
     assert found.law.terms[0].coefficient == pytest.approx(math.sqrt(b / float((v**2).max())) / size * per)
+
+
+def test_wild_values_count_as_six_deviations() -> None:
+    """Their energy is that of a flat spectrum, 36, of which each band has its part; nothing else is there."""
+    residual = np.zeros((6, FINE))
+    residual[0, 10] = 60.0
+    found = localise.localise(Plant({}, noise()), residual.ravel(), None, np.random.default_rng(0), limit=6)
+    for cell in found.cells:
+        low, high = cell.band
+        f = np.abs(np.fft.fftfreq(50, 0.004))
+        dof = int(((f >= low) & (f < (high if high < 125.0 else math.inf))).sum())
+        spread = 2.0 / (9.0 * dof)
+        assert (cell.channel, cell.when[0]) == ('x1', 0.0)
+        assert cell.statistic == pytest.approx(((36.0 / 50.0) ** (1 / 3) - 1.0 + spread) / math.sqrt(spread))
+        assert cell.energy == pytest.approx(3600.0 * dof / 50.0 - dof)
+
+
+def test_long_recordings_are_looked_at_in_part() -> None:
+    """For coarse steps, 20 000 readings: of 40 000 every second one."""
+    lsb = RIG.converter.volts_per_count
+    counts = np.resize(np.arange(-50.0, 50.0) * 40.0, 40_000)
+    for off, seen in ((1, True), (0, False)):
+        wrong = counts.copy()
+        wrong[off::2] += np.resize(np.arange(1.0, 40.0), 20_000)
+        o = Observation('long', RIG, np.tile(wrong[:, None] * lsb, (1, 6)), np.zeros((40_000, 3)))
+        assert (proposals.coarse_step(o) is not None) == seen
+
+
+def test_a_candidate_that_is_in_the_model_already_has_nothing_to_explain() -> None:
+    shown = pictures(A, B)
+    plant = Plant(shown, noise())
+    found = [
+        (Candidate(active(n, x=0.0).effect, {'x': 0.0}, ('x',), {'x': 0.0}), [[1e-3 * shown[n, 'x']]]) for n in 'ab'
+    ]
+    data = plant.measured[0].ravel() / SIGMA
+    second, first = sorted(Screen(plant, found).score(data, columns(shown, A)), key=lambda s: s.candidate.effect.name)
+    assert (second.gain, second.dof, second.p) == (0.0, 0, 1.0)
+    assert first.dof == 1
+
+
+def test_a_plan_names_the_effect_of_the_first_rival_that_can_be_told() -> None:
+    told = tuple(
+        planning.Told(rival, name, 30.0, 40.0, p)
+        for rival, name, p in (('x', 'a', 1.0), ('y', 'b', 50.0), ('z', 'c', 60.0))
+    )
+    plan = planning.Plan(Setting(), (Piece('push', ('constant:0,-5,0:3',)),), told, Limits(), 1000.0)
+    assert 'It tells b from y, z' in plan.sentence
+    assert 'nothing within the limits tells x apart' in plan.sentence
+    idle = dataclasses.replace(plan, told=tuple(dataclasses.replace(t, possible=1.0) for t in told))
+    assert idle.sentence == 'No recording within the limits would tell a from x, y, z.'
+
+
+@pytest.mark.parametrize('shift', [1000, -1000])
+def test_loads_may_be_a_second_late_or_early(shift: int) -> None:
+    history = np.repeat(np.random.default_rng(3).uniform(-20, 20, (12, 3)), 400, axis=0)
+    o = observed(history=history, warm=None)
+    late = Workspace([dataclasses.replace(o, loads=np.roll(o.loads, shift, axis=0))])
+    assert likely_delays(late) == pytest.approx(sorted(shift / 1000.0 + s for s in (-0.004, 0.0, 0.004)))

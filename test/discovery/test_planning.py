@@ -202,6 +202,9 @@ def test_the_loop_ends_when_nothing_would_help_or_no_more_is_allowed(monkeypatch
     done = Searches(monkeypatch, 9).settle(most=1)
     assert (done.outcome, len(done.plans)) == ('recordings', 1)
     assert done.sentence == 'The answer is not unique after 1 more recording, and no more were allowed.'
+    # Three more are allowed if nobody says otherwise.
+    first = cast(Observation, object())
+    assert len(loop.settle([first], RIG, lambda plan, number: first).plans) == 3
 
 
 @pytest.fixture(scope='module')

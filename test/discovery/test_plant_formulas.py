@@ -525,3 +525,4 @@ def test_what_no_effect_of_a_plant_explains_is_unknown() -> None:
     assert unknown.depends_on[0] == 'load'
     assert unknown.remains
     assert unknown.rms == pytest.approx(found.gap_after)
+    assert unknown.explains == 1.0
