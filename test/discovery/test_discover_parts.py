@@ -540,3 +540,37 @@ def test_lines_are_those_of_the_first_recordings_rig() -> None:
         values = {'recording': recording, 'of_reading': 0.0, 'x1': 1e-3, 'y1': 0.0, 'x2': 0.0, 'y2': 0.0}
         fit = cast(Fit, SimpleNamespace(effects=(ActiveEffect(zero, values),)))
         assert said(ws, fit, 0, 1.0)[0][0].where == name
+
+
+@pytest.mark.parametrize(('beside', 'left_after'), [(True, FOLLOWS), (True, NOWHERE), (False, FOLLOWS)])
+def test_beside_a_law_only_those_effects_stay_that_belong_to_it(
+    monkeypatch: pytest.MonkeyPatch, named: Discovery, beside: bool, left_after: Localisation
+) -> None:
+    """What is left is looked at again beside them. The law is told if it is unknown what remains."""
+    (effect,) = named.fit.effects
+    law = SimpleNamespace(beside=(effect,) if beside else ())
+    null = named.search.null
+    looked: list[tuple[Any, ...]] = []
+
+    def localise(ws: object, residual: object, known: object, rng: object, explained: object = None) -> Localisation:
+        looked.append((residual, known, explained))
+        return left_after
+
+    monkeypatch.setattr(answer, 'find_law', lambda *_: law)
+    monkeypatch.setattr(answer, 'localise', localise)
+    monkeypatch.setattr(answer, 'without_one', lambda search, result, fit, index: null)
+    got = answered(named, left=FOLLOWS)
+    residual, known, explained = looked[0]
+    if beside:
+        assert residual is named.fit.residual
+        assert known is named.fit.jacobian
+        np.testing.assert_array_equal(explained, null.residual - named.fit.residual)
+        assert got.fit is named.fit
+    else:
+        assert residual is null.residual
+        assert (known, explained) == (None, None)
+        assert got.fit is null
+    assert [e.active.effect.name for e in got.effects] == ['sensor_rotation'] * beside
+    told = left_after is FOLLOWS
+    assert (got.law is not None, got.verdict) == (told, 'unknown_effect' if told else 'effects_found')
+    assert got.left is left_after
