@@ -245,7 +245,7 @@ def given_scores(search: Search, *scores: Score) -> None:
 def test_alternatives_are_the_best_of_each_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """Eight of them, or two once the budget is spent; a mistake of all channels only beside other mistakes."""
     search = nothing_found()
-    asked = Asked(monkeypatch, steps, search, a=0.0, za=0.0)
+    asked = Asked(monkeypatch, steps, search, a=0.0, za=500.0)
     one = asked.fit(active('a', x=0.1))
     names = 'bcdefghij'
     given_scores(search, scored('a', 99.0), *(scored(n, 90.0 - i) for i, n in enumerate(names)), scored('b', 60.0))
@@ -262,7 +262,7 @@ def test_alternatives_are_the_best_of_each_name(monkeypatch: pytest.MonkeyPatch)
     search._begun = search.workspace.simulations
     # The closest first; those that come close are refitted in full, beside the rest.
     two = asked.fit(active('z', x=0.1), active('a', x=0.1))
-    asked.chi2.update(zb=59.0, zc=10.0, zd=61.0)
+    asked.chi2.update(zb=559.0, zc=510.0, zd=561.0)
     asked.seen.clear()
     given_scores(search, scored('z', 99.0), scored('b', 30.0), scored('c', 26.0), scored('d', 25.1), scored('e', 24.9))
     fits = search.alternatives(asked.plain, two, 1, 50.0)
@@ -799,3 +799,27 @@ def test_limits_themselves_do_not_pass(monkeypatch: pytest.MonkeyPatch) -> None:
         False,
         True,
     ]
+
+
+def test_further_terms_are_those_without_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The times that show beside a law are looked for anew."""
+    offered: list[Sequence[Term]] = []
+    straight, bump = STRAIGHT.terms[0], BUMP.terms[0]
+
+    class Seeker(laws._Seeker):
+        def __init__(self) -> None:
+            self.ws, self.listed = cast(Any, None), [bump, straight, bump]
+
+        def done(self, _: laws._Trial) -> bool:
+            return False
+
+    monkeypatch.setattr(laws, 'responses', lambda ws, fit: fit)
+
+    def score(more: object, listed: Sequence[Term]) -> list[Scored]:
+        offered.append(listed)
+        return []
+
+    monkeypatch.setattr(laws, 'score', score)
+    start = trial(STRAIGHT, 100.0, 100.0)
+    assert Seeker().grown(start) is start
+    assert offered == [[straight]]
