@@ -291,7 +291,7 @@ def test_a_mistake_is_refitted_from_where_it_may_be(monkeypatch: pytest.MonkeyPa
     rate = Candidate(effect('sample_rate', 'error'), {'error': 0.0}, ('error',), {'error': 0.0})
     scores = [
         scored('a', 100.0),
-        dataclasses.replace(scored('sample_rate', 29.9), candidate=rate),
+        dataclasses.replace(scored('sample_rate', 30.0), candidate=rate),
         scored('sensitivity', 30.1),
     ]
     assert search._mistake(null, scores) is null
