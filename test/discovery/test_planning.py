@@ -169,7 +169,8 @@ class Searches:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, equivalents: int, useful: bool = True) -> None:
         self.seen: list[int] = []
 
-        def discover(known: list[object], rig: Rig, **_: object) -> object:
+        def discover(known: list[object], rig: Rig, seed: int, **_: object) -> object:
+            assert seed == 0
             self.seen.append(len(known))
             left = ('other',) * max(equivalents - len(known) + 1, 0)
             return SimpleNamespace(unsettled=left)

@@ -22,7 +22,7 @@ from psd_deflection.discovery.screen import Score, Screen
 from psd_deflection.discovery.search import Search
 from psd_deflection.discovery.signatures import Candidate
 from psd_deflection.discovery.validate import HeldOut
-from psd_deflection.discovery.weighing import named_effects
+from psd_deflection.discovery.weighing import accept, named_effects
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter
@@ -30,7 +30,7 @@ from psd_deflection.simulation.laws import Law, Term, effect_of, values_of
 from psd_deflection.simulation.physics import Physics
 
 from .test_formulas import RIG, observed
-from .test_rules import SIGMA, N, Plant, active, candidate, effect, noise, pictures, search_of, without_noise
+from .test_rules import SIGMA, N, Plant, active, candidate, effect, noise, pictures, result_of, search_of, without_noise
 from .test_steps import A, B, across, amplitudes, named, searching
 
 
@@ -823,3 +823,13 @@ def test_further_terms_are_those_without_times(monkeypatch: pytest.MonkeyPatch) 
     start = trial(STRAIGHT, 100.0, 100.0)
     assert Seeker().grown(start) is start
     assert offered == [[straight]]
+
+
+@pytest.mark.parametrize(('gain', 'is_named'), [(18.2, True), (17.8, False)])
+def test_every_size_of_an_effect_costs_the_penalty(gain: float, is_named: bool) -> None:
+    """Two of 4 each, and ten to be better by."""
+    shown = pictures(A, ('a', 'y'))
+    search = search_of(Plant(shown, without_noise((shown[A], gain))), penalty=4.0)
+    heldout, fit = accept(search, result_of(search, [active('a', x=0.0, y=0.0)]), np.random.default_rng(0))
+    assert bool(fit.effects) == is_named
+    assert len(heldout) == is_named

@@ -268,7 +268,7 @@ def test_what_a_channel_follows_is_named_where_it_is_slow(monkeypatch: pytest.Mo
         Dependence('x2', 'history of load_fx', 80.0, 1e-9),
         Dependence('x2', 'dot_x', 70.0, 0.009),
         Dependence('x2', 'time', 60.0, 1e-9),
-        Dependence('y1', 'time^2', 50.0, 0.011),
+        Dependence('y1', 'time^2', 50.0, 0.01),
     ]
     monkeypatch.setattr('psd_deflection.discovery.localise.dependences', lambda *_: depends)
     residual = noise(6) / SIGMA
