@@ -501,7 +501,7 @@ def test_evidence_is_what_the_file_leaves_over_what_is_left() -> None:
     assert sign.evidence == pytest.approx((m.squared + energy) / (_sizes(m, right)[0] + energy))
 
 
-@pytest.mark.parametrize(('efforts', 'taken'), [((0.0, 0.05), 'first'), ((0.05, 0.0), 'second')])
+@pytest.mark.parametrize(('efforts', 'taken'), [((0.0, 0.05), 'first'), ((0.05, 0.0), 'second'), ((0.0, 0.0), 'first')])
 def test_of_recordings_of_the_same_value_the_easier_one_is_planned(
     monkeypatch: pytest.MonkeyPatch, efforts: tuple[float, float], taken: str
 ) -> None:
