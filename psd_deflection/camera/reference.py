@@ -139,17 +139,16 @@ def relative(rest: TargetPose, pose: TargetPose) -> FloatArray:
 def relative_covariance(rest: TargetPose, pose: TargetPose) -> FloatArray:
     """Covariance (3, 3) of (dX, dY, theta) from those of both poses."""
     r = rest.rotation.T @ pose.rotation
+    moved, onto, far = rest.rotation.T @ (pose.place - rest.place), rest.rotation.T[:2], 1.0
     if pose.planar:
-        # As seen from the plane of the rest: no distance, no tilt.
-        place = np.diag([1.0, 1.0, 0.0]) @ rest.rotation.T
-        moved = np.zeros(3)
-    else:
-        place = rest.rotation.T
-        moved = rest.rotation.T @ (pose.place - rest.place)
+        # The ray of ``pose`` meets the plane of the rest: rest.place + rotation @ moved = far * pose.place.
+        across = np.column_stack([rest.rotation[:, :2], -pose.place])
+        *moved[:2], far = np.linalg.solve(across, -rest.place)
+        moved[2], onto = 0.0, np.linalg.inv(across)[:2]
     of_rest, of_pose = np.zeros((3, 6)), np.zeros((3, 6))
-    of_pose[:2, 3:], of_rest[:2, 3:] = place[:2], -place[:2]
-    # A small turn a of the rest's axes takes R0^T v to R0^T v - a x (R0^T v).
-    of_rest[:2, :3] = _cross(moved)[:2]
+    of_pose[:2, 3:], of_rest[:2, 3:] = far * onto, -onto
+    # A small turn a of the rest's axes takes ``moved`` to moved - a x moved.
+    of_rest[:2, :3] = onto @ rest.rotation @ _cross(moved)
     # theta = atan2(r10, r11); r goes to r (1 + [b]x), or to (1 - [a]x) r.
     scale = 1.0 / (r[1, 0] ** 2 + r[1, 1] ** 2)
     by = np.array([r[1, 1], -r[1, 0], 0.0]) * scale
