@@ -301,8 +301,7 @@ def board_picture(settings: CameraSettings) -> Any:
     texture = board_of(settings).generateImage((round(size[0] * 2e4), round(size[1] * 2e4)), None, 0, 1) / 255.0
 
     def picture(scene: render.Scene, pose: render.Pose) -> Any:
-        share = gaussian_filter(render.board(scene, pose, texture, size), scene.blur, mode='nearest')
-        return scene.black + (scene.white - scene.black) * share
+        return render.board(scene, pose, texture, size)
 
     return picture
 

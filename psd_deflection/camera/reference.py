@@ -29,8 +29,8 @@ class Target(Protocol):
     def locate(self, image: Any, grey: Any, lens: Lens, full_scale: float) -> TargetPose:
         """The target in one image. Raises RefusedError."""
 
-    def set_rest(self, rotation: FloatArray) -> None:
-        """What the target's rotation is at rest."""
+    def set_rest(self, rest: TargetPose) -> None:
+        """Where the target is at rest."""
 
 
 class CameraReference:
@@ -110,7 +110,7 @@ class CameraReference:
 
     def _decide(self, good: list[TargetPose]) -> list[FrameAnswer]:
         self._rest = mean_pose(good)
-        self._target.set_rest(self._rest.rotation)
+        self._target.set_rest(self._rest)
         waiting, self._waiting = self._waiting, []
         return [self._answer(t_ns, found) for t_ns, found in waiting]
 
@@ -126,12 +126,12 @@ class CameraReference:
 def relative(rest: TargetPose, pose: TargetPose) -> FloatArray:
     """(dX m, dY m, theta, phi, omega rad) of ``pose`` against ``rest``: R = Ry(omega) Rx(phi) Rz(theta)."""
     r = rest.rotation.T @ pose.rotation
-    place = pose.place
     if pose.planar:
         # Where the ray meets the plane of the rest: an unknown distance must not become a displacement.
-        normal = rest.rotation[:, 2]
-        place = place * (float(normal @ rest.place) / float(normal @ place))
-    moved = rest.rotation.T @ (place - rest.place)
+        moved: FloatArray = np.linalg.solve(rest.plane, pose.place)
+        moved = np.asarray(moved / moved[2])
+    else:
+        moved = rest.rotation.T @ (pose.place - rest.place)
     theta, phi = math.atan2(r[1, 0], r[1, 1]), -math.asin(min(max(r[1, 2], -1.0), 1.0))
     return np.array([moved[0], moved[1], theta, phi, math.atan2(r[0, 2], r[2, 2])])
 
@@ -140,13 +140,15 @@ def relative_covariance(rest: TargetPose, pose: TargetPose) -> FloatArray:
     """Covariance (3, 3) of (dX, dY, theta) from those of both poses."""
     r = rest.rotation.T @ pose.rotation
     moved, onto, far = rest.rotation.T @ (pose.place - rest.place), rest.rotation.T[:2], 1.0
+    size = 6 + rest.keystone.size
+    of_rest, of_pose = np.zeros((3, size)), np.zeros((3, size))
     if pose.planar:
-        # The ray of ``pose`` meets the plane of the rest: rest.place + rotation @ moved = far * pose.place.
-        across = np.column_stack([rest.rotation[:, :2], -pose.place])
+        # The ray of ``pose`` meets the plane of the rest: rest.plane @ (x, y, 1) = far * pose.place.
+        across = np.column_stack([rest.plane[:, :2], -pose.place])
         *moved[:2], far = np.linalg.solve(across, -rest.place)
         moved[2], onto = 0.0, np.linalg.inv(across)[:2]
-    of_rest, of_pose = np.zeros((3, 6)), np.zeros((3, 6))
-    of_pose[:2, 3:], of_rest[:2, 3:] = far * onto, -onto
+        of_rest[:2, 6:] = -np.outer(onto[:, 2], moved[: size - 6]) * rest.place[2]
+    of_pose[:2, 3:6], of_rest[:2, 3:6] = far * onto, -onto
     # A small turn a of the rest's axes takes ``moved`` to moved - a x moved.
     of_rest[:2, :3] = onto @ rest.rotation @ _cross(moved)
     # theta = atan2(r10, r11); r goes to r (1 + [b]x), or to (1 - [a]x) r.
@@ -169,7 +171,8 @@ def mean_pose(poses: list[TargetPose]) -> TargetPose:
     u, _, vt = np.linalg.svd(summed)
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     covariance = np.mean([p.covariance for p in poses], axis=0) / len(poses)
-    return poses[0]._replace(rotation=rotation, place=np.mean([p.place for p in poses], axis=0), covariance=covariance)
+    place, keystone = (np.mean([getattr(p, of) for p in poses], axis=0) for of in ('place', 'keystone'))
+    return poses[0]._replace(rotation=rotation, place=place, keystone=keystone, covariance=covariance)
 
 
 def _still(before: list[TargetPose], pose: TargetPose) -> bool:
