@@ -112,12 +112,12 @@ def undistort(x: Array, y: Array, distortion: Sequence[float]) -> tuple[Array, A
     return a, b
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=64)
 def rays(
-    width: int, height: int, focal: float, centre: tuple[float, float], distortion: tuple[float, ...]
+    box: tuple[int, int, int, int], focal: float, centre: tuple[float, float], distortion: tuple[float, ...]
 ) -> tuple[Array, Array, Array]:
-    """Rays x and y (rows, columns) of all pixels, and d (x, y) / d (u, v) (4, rows, columns)."""
-    v, u = np.mgrid[:height, :width].astype(float)
+    """Rays x and y (rows, columns) of the pixels in ``box`` (left, top, right, bottom), and d (x, y) / d (u, v)."""
+    v, u = np.mgrid[box[1] : box[3], box[0] : box[2]].astype(float)
     x, y = undistort((u - centre[0]) / focal, (v - centre[1]) / focal, distortion)
     return (
         x,
@@ -164,7 +164,6 @@ def centres_of(scene: Scene) -> list[tuple[float, float]]:
 def coverage(scene: Scene, pose: Pose, parts: int = PARTS) -> Array:
     """The share (rows, columns) of each pixel that is white; rims are cut in ``parts`` x ``parts``."""
     out = np.zeros((scene.height, scene.width))
-    everywhere = rays(scene.width, scene.height, scene.focal, tuple(scene.centre), tuple(scene.distortion))
     offsets = (np.arange(parts) + 0.5) / parts - 0.5
     du, dv = np.meshgrid(offsets, offsets)
     for cx, cy in centres_of(scene):
@@ -175,7 +174,10 @@ def coverage(scene: Scene, pose: Pose, parts: int = PARTS) -> Array:
         u1, v1 = min(u1, scene.width), min(v1, scene.height)
         if u1 <= u0 or v1 <= v0:
             continue
-        ray_x, ray_y, slope = (a[..., v0:v1, u0:u1] for a in everywhere)
+        # Boxes of a coarse grid: the discs of the next pose are mostly in the same.
+        left, top, right, bottom = 48 * (u0 // 48), 48 * (v0 // 48), 48 * (u1 // 48 + 1), 48 * (v1 // 48 + 1)
+        around = rays((left, top, right, bottom), scene.focal, tuple(scene.centre), tuple(scene.distortion))
+        ray_x, ray_y, slope = (a[..., v0 - top : v1 - top, u0 - left : u1 - left] for a in around)
         x, y = on_plate(scene, pose, ray_x, ray_y)
         away = np.hypot(x - cx, y - cy) - scene.radius
         pixel = scene.radius * 2 * math.pi / float(np.sum(np.hypot(*np.diff(rim, axis=0).T)))
@@ -207,8 +209,18 @@ def cut(scene: Scene) -> Scene:
 
 def together(fine: Array, scene: Scene) -> Array:
     """The share that is white of each pixel of ``scene``, blurred, from that of the pixels of ``cut(scene)``."""
-    blurred = gaussian_filter(fine.astype(np.float32), CUTS * scene.blur, mode='nearest', truncate=5.0)
-    return np.asarray(blurred.reshape(scene.height, CUTS, scene.width, CUTS).mean(axis=(1, 3), dtype=float))
+    out = np.zeros((scene.height, scene.width))
+    lit = [np.flatnonzero(fine.any(axis=axis)) for axis in (1, 0)]
+    if not lit[0].size:
+        return out
+    reach = math.ceil(5.0 * scene.blur) + 1
+    (top, bottom), (left, right) = ((max(a[0] // CUTS - reach, 0), a[-1] // CUTS + 1 + reach) for a in lit)
+    part = fine[CUTS * top : CUTS * bottom, CUTS * left : CUTS * right].astype(np.float32)
+    blurred = gaussian_filter(part, CUTS * scene.blur, mode='nearest', truncate=5.0)
+    rows, columns = (n // CUTS for n in part.shape)
+    small = blurred.reshape(rows, CUTS, columns, CUTS).mean(axis=(1, 3), dtype=float)
+    out[top : top + rows, left : left + columns] = small
+    return out
 
 
 def clean(scene: Scene, poses: Sequence[Pose]) -> Array:
@@ -239,7 +251,8 @@ def board(scene: Scene, pose: Pose, texture: Array, size: tuple[float, float]) -
     A pixel whose corners and middle are not all alike is sampled at the 21 places of a Fibonacci lattice in each of its
     parts, no two of which are in a row or a column: an edge along the rows of the image is then as fine as any other.
     """
-    ray_x, ray_y, k = rays(scene.width, scene.height, scene.focal, tuple(scene.centre), tuple(scene.distortion))
+    box = (0, 0, scene.width, scene.height)
+    ray_x, ray_y, k = rays(box, scene.focal, tuple(scene.centre), tuple(scene.distortion))
     sign = 1.0 if scene.view == 'outside' else -1.0
     high, wide = texture.shape
 

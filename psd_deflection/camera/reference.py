@@ -128,8 +128,8 @@ def relative(rest: TargetPose, pose: TargetPose) -> FloatArray:
     r = rest.rotation.T @ pose.rotation
     if pose.planar:
         # Where the ray meets the plane of the rest: an unknown distance must not become a displacement.
-        moved: FloatArray = np.linalg.solve(rest.plane, pose.place)
-        moved = np.asarray(moved / moved[2])
+        met = np.linalg.solve(rest.plane, pose.place)
+        moved = met / met[2]
     else:
         moved = rest.rotation.T @ (pose.place - rest.place)
     theta, phi = math.atan2(r[1, 0], r[1, 1]), -math.asin(min(max(r[1, 2], -1.0), 1.0))
@@ -139,14 +139,15 @@ def relative(rest: TargetPose, pose: TargetPose) -> FloatArray:
 def relative_covariance(rest: TargetPose, pose: TargetPose) -> FloatArray:
     """Covariance (3, 3) of (dX, dY, theta) from those of both poses."""
     r = rest.rotation.T @ pose.rotation
-    moved, onto, far = rest.rotation.T @ (pose.place - rest.place), rest.rotation.T[:2], 1.0
+    moved: FloatArray = rest.rotation.T @ (pose.place - rest.place)
+    onto, far = rest.rotation.T[:2], 1.0
     size = 6 + rest.keystone.size
     of_rest, of_pose = np.zeros((3, size)), np.zeros((3, size))
     if pose.planar:
         # The ray of ``pose`` meets the plane of the rest: rest.plane @ (x, y, 1) = far * pose.place.
         across = np.column_stack([rest.plane[:, :2], -pose.place])
         *moved[:2], far = np.linalg.solve(across, -rest.place)
-        moved[2], onto = 0.0, np.linalg.inv(across)[:2]
+        moved[2], onto = 0.0, np.asarray(np.linalg.inv(across))[:2]
         of_rest[:2, 6:] = -np.outer(onto[:, 2], moved[: size - 6]) * rest.place[2]
     of_pose[:2, 3:6], of_rest[:2, 3:6] = far * onto, -onto
     # A small turn a of the rest's axes takes ``moved`` to moved - a x moved.
