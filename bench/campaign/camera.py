@@ -38,11 +38,11 @@ RUN = 20
 SIGMAS = 5.0
 
 
-def settings_of(scene: render.Scene, rest: int = 0) -> CameraSettings:
+def settings_of(scene: render.Scene, rest: int = 0, *, lens: bool = True) -> CameraSettings:
     return CameraSettings(
         rest_frames=rest,
-        matrix=tuple(scene.matrix),
-        distortion=tuple(scene.distortion),
+        matrix=tuple(scene.matrix) if lens else (),
+        distortion=tuple(scene.distortion) if lens else (),
         view=scene.view,
         spacing=scene.spacing,
         radius=scene.radius,
@@ -189,15 +189,20 @@ def adverse(
 
 
 def runs(
-    frames: int, seed: int, hurts: Sequence[str] = HURTS
+    frames: int, seed: int, hurts: Sequence[str] = HURTS, *, first: int = 1, lens: bool = True
 ) -> Iterator[tuple[str, FrameAnswer, tuple[float, float, float]]]:
-    """What was done to a frame, its answer, the truth."""
-    number = done = 0
+    """What was done to a frame, its answer, the truth, from rig ``first`` on.
+
+    Without ``lens`` the camera is not told its matrix, and the lens has no distortion, which it could not correct.
+    """
+    number, done = first - 1, 0
     while done < frames:
         number += 1
         rng = np.random.default_rng([seed, number])
         scene, motion = random_scene(rng), random_motion(rng)
-        reference = CameraReference(settings_of(scene, REST), target_of)
+        if not lens:
+            scene = replace(scene, distortion=())
+        reference = CameraReference(settings_of(scene, REST, lens=lens), target_of)
         for _ in range(REST):
             reference.take(0, render.photograph(scene, [render.Pose()], rng))
         if reference.rest is None:
@@ -217,13 +222,13 @@ def off_by(answer: FrameAnswer, truth: tuple[float, float, float]) -> float:
     return float(np.max(np.abs(off) / np.sqrt(np.diag(answer.covariance))))
 
 
-def adverse_table(frames: int, seed: int, hurts: Sequence[str] = HURTS) -> bool:
+def adverse_table(frames: int, seed: int, hurts: Sequence[str] = HURTS, *, first: int = 1, lens: bool = True) -> bool:
     """Print what became of each kind of frame; True if no answer is wrong."""
     refused: Counter[str] = Counter()
     reasons: dict[str, Counter[str]] = {}
     sigmas: dict[str, list[float]] = {}
     sds: dict[str, list[float]] = {}
-    for hurt, answer, truth in runs(frames, seed, hurts):
+    for hurt, answer, truth in runs(frames, seed, hurts, first=first, lens=lens):
         sigmas.setdefault(hurt, [])
         if answer.status is not Status.OK:
             refused[hurt] += 1
@@ -406,6 +411,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--frames', type=int, default=10_000)
     parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--first', type=int, default=1, metavar='RIG', help='of the adverse frames: where to go on')
+    parser.add_argument('--no-lens', action='store_true', help='adverse frames of a camera that knows no lens')
     parser.add_argument('--hurts', nargs='+', choices=HURTS, default=HURTS, metavar='NAME')
     parser.add_argument('--only', choices=('adverse', 'accuracy', 'boards', 'cost'))
     args = parser.parse_args()
@@ -419,7 +426,7 @@ def main() -> int:
     if args.only in (None, 'cost'):
         cost_table(min(40, args.frames // 10 + 3), args.seed)
     if args.only in (None, 'adverse'):
-        fine &= adverse_table(args.frames, args.seed, args.hurts)
+        fine &= adverse_table(args.frames, args.seed, args.hurts, first=args.first, lens=not args.no_lens)
     print(f'{time.perf_counter() - began:.0f} s')
     return 0 if fine else 1
 

@@ -14,13 +14,16 @@ from typing import Any, Protocol
 import numpy as np
 
 from psd_deflection.camera.answer import FrameAnswer, RefusedError, Status, TargetPose
-from psd_deflection.camera.lens import Lens
+from psd_deflection.camera.lens import AFFINE_FOCAL, Lens
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.records import FloatArray
 
 MOST_REST = 20
 _STILL = 4.0
 """A frame belongs to the rest if each of dX, dY and theta is within so many sd of it."""
+
+_MIDDLE = 0.1
+"""How far the axis of a lens that is not known may pass from the middle of the image, in image widths."""
 
 
 class Target(Protocol):
@@ -159,6 +162,11 @@ def relative_covariance(rest: TargetPose, pose: TargetPose) -> FloatArray:
     of_rest[2, :3] = [-by @ r[2], 0.0, by @ r[0]]
     of_rest[2, [0, 2]] *= -1.0
     total = of_rest @ rest.covariance @ of_rest.T + of_pose @ pose.covariance @ of_pose.T
+    if pose.planar:
+        # A plate that left the plane of the rest moves in the image by that share of its distance from the middle.
+        sd = math.sqrt(rest.covariance[5, 5] + pose.covariance[5, 5]) / float(pose.place[2])
+        wide = float(np.linalg.norm(pose.place[:2])) + _MIDDLE * float(pose.place[2]) / AFFINE_FOCAL
+        total[:2, :2] += np.eye(2) * (max(abs(far - 1.0) - _STILL * sd, 0.0) * wide) ** 2
     return np.asarray((total + total.T) / 2)
 
 

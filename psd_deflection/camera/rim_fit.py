@@ -33,7 +33,7 @@ from psd_deflection.camera.lens import AFFINE_FOCAL, Lens
 from psd_deflection.records import FloatArray, IntArray
 
 _STEPS = 15
-_SETTLED = 5.0
+_SETTLED = 10.0
 """A step of fewer standard deviations is the last once the picture fits: over it the model is linear."""
 _THINNED = 4
 _LIGHTS = 6
@@ -260,7 +260,7 @@ class Fitter:
         for _ in range(_STEPS):
             normal = self._linearise(rims, shape, None)
             shape, step, deviation = self._stepped(normal, shape, prior, len(rims.level))
-            if np.all(np.abs(step) < deviation):
+            if np.all(np.abs(step) < 3.0 * deviation):
                 break
         return shape, self._noise(normal)
 
