@@ -361,7 +361,7 @@ def theta_error(scene: render.Scene, settings: CameraSettings, picture: Any, fra
 
 
 def boards_table(frames: int, seed: int, *, short: bool = False) -> bool:
-    """Print theta by a ChArUco board beside theta by discs in the same view; True if the board's is good to a tenth of 0.03."""
+    """Print theta by a ChArUco board beside theta by discs in the same view; True if the board's is good."""
     fine = True
     print('theta, degrees         by discs           by a ChArUco board                  better than discs')
     print('images       tilt      rms     bound      rms     of corners  of all pixels   rms    bound  all pixels')
