@@ -161,9 +161,8 @@ def centres_of(scene: Scene) -> list[tuple[float, float]]:
     return [(0.0, (half - i) * scene.spacing) for i in range(scene.discs)]
 
 
-def coverage(scene: Scene, pose: Pose, parts: int = PARTS) -> Array:
-    """The share (rows, columns) of each pixel that is white; rims are cut in ``parts`` x ``parts``."""
-    out = np.zeros((scene.height, scene.width))
+def cover(out: Array, scene: Scene, pose: Pose, parts: int) -> None:
+    """Add to ``out`` (rows, columns) the share of each pixel that is white; rims are cut in ``parts`` x ``parts``."""
     offsets = (np.arange(parts) + 0.5) / parts - 0.5
     du, dv = np.meshgrid(offsets, offsets)
     for cx, cy in centres_of(scene):
@@ -192,7 +191,6 @@ def coverage(scene: Scene, pose: Pose, parts: int = PARTS) -> Array:
         out[v0:v1, u0:u1] += part
     for left, top, right, bottom in scene.hide:
         out[int(top) : int(bottom), int(left) : int(right)] = 0.0
-    return out
 
 
 def cut(scene: Scene) -> Scene:
@@ -227,7 +225,10 @@ def clean(scene: Scene, poses: Sequence[Pose]) -> Array:
     """Grey levels without noise: the mean over ``poses``, which are equal parts of the exposure."""
     parts = max(round(PARTS / math.sqrt(len(poses))), 2)
     fine = cut(scene)
-    part = together(np.mean([coverage(fine, p, parts) for p in poses], axis=0), scene)
+    exposed = np.zeros((fine.height, fine.width))
+    for pose in poses:
+        cover(exposed, fine, pose, parts)
+    part = together(exposed / len(poses), scene)
     v, u = np.mgrid[: scene.height, : scene.width]
     light = 1 + scene.slope[0] * (u / scene.width - 0.5) + scene.slope[1] * (v / scene.height - 0.5)
     return np.asarray(light * (scene.black + (scene.white - scene.black) * part))
