@@ -240,6 +240,8 @@ class BlockFit:
         tau: FloatArray = np.maximum(self._squares / np.maximum(self._weight, 1e-3) - self._bias, self._least)
         usual = tau[:, :told]
         sudden = square > _SUDDEN * (v + usual)
+        # What does not move with the link has no sudden motion: that would be noise, chosen for being large.
+        sudden[self._combinations.moving :] = False
         if sudden.any():
             np.maximum(excess, usual, out=usual, where=sudden)
         return tau
