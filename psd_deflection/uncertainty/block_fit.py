@@ -31,7 +31,7 @@ from psd_deflection.uncertainty.combinations import combinations_of
 ORDER = 4
 """Highest order: it follows a quarter period inside a block to 1e-4 of the amplitude."""
 
-_FORGET = 1.0 / 11.0
+_FORGET = 1.0 / 12.0
 """Share of the newest block in the running mean of c_k^2. A mode of 14 Hz with 2 % of damping loses as much of its energy
 in 14 blocks: a longer memory would weigh, and state, motion that is over."""
 
