@@ -32,8 +32,8 @@ ORDER = 4
 """Highest order: it follows a quarter period inside a block to 1e-4 of the amplitude."""
 
 _FORGET = 1.0 / 12.0
-"""Share of the newest block in the running mean of c_k^2. A mode of 14 Hz with 2 % of damping loses as much of its energy
-in 14 blocks: a longer memory would weigh, and state, motion that is over."""
+"""Share of the newest block in the running mean of c_k^2. The energy of a mode of 14 Hz with 2 % of damping falls to
+1/e in 14 blocks: a longer memory would weigh, and state, motion that is over."""
 
 _BIAS = 0.5
 """Times v_k, taken off tau_k^2: a mean that cannot be negative is too large by about that where there is no motion."""
