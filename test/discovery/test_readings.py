@@ -67,9 +67,8 @@ def test_a_table_names_what_the_rig_lacks_and_model_yaml_repairs_it(
     # One length of the link does not tell stiffness from the clamp.
     assert {effect['name'], *effect['equivalent']} == {'bending_stiffness', 'clamp_bending_compliance'}
     assert found['gap']['heldout_after'] < 1.5 * 1e6 * NOISE < 10.0 < found['gap']['before']
-    model = str(tmp_path / 'found' / 'model.yaml')
-    assert main(['discover', str(table), '--params-file', model, '--out', str(tmp_path / 'again'), '--json']) == 0
-    assert json.loads(capsys.readouterr().out)['verdict'] == 'nothing_missing'
+    repaired = load_rig(tmp_path / 'found' / 'model.yaml')
+    assert discover_in(ReadingsPlant(read_tables([table], repaired))).verdict == 'nothing_missing'
 
 
 def test_tables_of_two_lengths_tell_stiffness_from_the_clamp() -> None:
