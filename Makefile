@@ -40,6 +40,9 @@ ARGS ?=
 # writes it for all that come after, whatever the environment says of it: the tests and the documents start Python hundreds of times.
 export PIP_COMPILE := 0
 unexport PYTHONDONTWRITEBYTECODE
+# uv installs the same packages with a tenth of the work. It is used if it is there; `make UV= run` takes pip all the same.
+UV ?= $(shell command -v uv)
+INSTALL = $(if $(UV),$(UV) pip install --python $(1)/bin/python,$(1)/bin/python -m pip install --disable-pip-version-check) --quiet
 # Further words for pytest, e.g. PYTEST='-m "not browser"'.
 PYTEST ?=
 # Tests that run at a time; many of them wait.
@@ -59,12 +62,12 @@ $(VENV)/.requirements: setup.cfg
 	$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info[:2] <= (3, 14) else f"Python 3.11 to 3.14 is needed, this is {sys.version.split()[0]}: make PYTHON=python3.12")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo 'setting up $(VENV), once: a minute or so, 0.6 GB'
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[ros,monitor]' $(if $(WITH),'$(WITH)')
+	$(call INSTALL,$(VENV)) '.[ros,monitor]' $(if $(WITH),'$(WITH)')
 	touch $@
 
 # Installed as a user has it (a wheel, not a link to the checkout), so that `ros2 run` finds it.
 $(VENV)/.installed: $(VENV)/.requirements setup.py setup.cfg $(SOURCES)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall .
+	$(call INSTALL,$(VENV)) --no-deps --force-reinstall .
 	touch $@
 
 # What tests, campaigns and documents need besides, without another build of the package. Later than the package, so that
@@ -72,7 +75,7 @@ $(VENV)/.installed: $(VENV)/.requirements setup.py setup.cfg $(SOURCES)
 $(VENV)/.for_tests: $(VENV)/.requirements | $(VENV)/.installed
 	@echo 'the tools of the tests into $(VENV), once: a minute or so, 0.9 GB more'
 	$(BIN)/python -c 'import configparser; c = configparser.ConfigParser(); c.read("setup.cfg"); print(c["options.extras_require"]["test"])' > $(VENV)/test_tools
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r $(VENV)/test_tools $(if $(WITH),'$(WITH)')
+	$(call INSTALL,$(VENV)) -r $(VENV)/test_tools $(if $(WITH),'$(WITH)')
 	touch $@
 
 setup: $(READY)
@@ -124,7 +127,7 @@ FUZZ_SECONDS ?= 600
 FUZZ_FRAMES ?= 10000000
 FUZZ_HELLOS ?= 1000000
 fuzz: $(READY)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check atheris
+	$(call INSTALL,$(VENV)) atheris
 	$(BIN)/python -m bench.campaign.fuzz corrupted $(FUZZ_FRAMES)
 	$(BIN)/python -m bench.campaign.hellos $(FUZZ_HELLOS)
 	for target in frames hello bag records csv parameters yaml; do $(BIN)/python -m bench.campaign.fuzz $$target -max_total_time=$(FUZZ_SECONDS) || exit 1; done
@@ -152,14 +155,14 @@ firmware: $(READY)
 
 mutants: $(READY)
 	test -x build/mutants/bin/python || $(PYTHON) -m venv build/mutants
-	build/mutants/bin/python -m pip install --quiet --disable-pip-version-check 'cosmic-ray>=8.4,<9'
+	$(call INSTALL,build/mutants) 'cosmic-ray>=8.4,<9'
 	build/mutants/bin/python -m tools.mutants --python $(abspath $(BIN)/python) $(MUTANTS)
 
 golden: $(READY)
 	$(BIN)/python bags/make.py
 
 docs: $(READY)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[docs]'
+	$(call INSTALL,$(VENV)) '.[docs]'
 	$(BIN)/python -m mkdocs build --strict --quiet --site-dir build/site
 	@echo 'open build/site/index.html (its search needs a server: python -m http.server --directory build/site)'
 
@@ -184,19 +187,19 @@ doc-commands: $(READY)
 # In an environment of its own, without ROS: the wheel made from the sdist, as `pip install dist/*.whl` has it.
 wheel: $(READY)
 	rm -rf dist build/wheel && mkdir -p build/wheel
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check build
+	$(call INSTALL,$(VENV)) build
 	$(BIN)/python -m build --outdir dist . > build/wheel/log
 	$(PYTHON) -m venv build/wheel/use && build/wheel/use/bin/pip install --quiet --disable-pip-version-check dist/*.whl
 	cd build/wheel && use/bin/psd-deflection --help && use/bin/psd-deflection info ../../bags/clean
-	build/wheel/use/bin/pip install --quiet --disable-pip-version-check 'psd_deflection[monitor]' 'psd_deflection[ros]' 'psd_deflection[pandas]' 'psd_deflection[camera]' 'psd_deflection[foxglove]' 'psd_deflection[dask]' 'psd_deflection[parquet]'
+	$(call INSTALL,build/wheel/use) 'psd_deflection[monitor]' 'psd_deflection[ros]' 'psd_deflection[pandas]' 'psd_deflection[camera]' 'psd_deflection[foxglove]' 'psd_deflection[dask]' 'psd_deflection[parquet]'
 	build/wheel/use/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/*.tar.gz
 	cd build/wheel && use/bin/psd-deflection --version && use/lib/psd_deflection/replay --help > log
 
 # An environment of its own below build/, which is kept. The picture, where Xvfb is: build/rerun/shot.png.
 RERUN ?=
 rerun:
-	test -x build/rerun/use/bin/rerun || ($(PYTHON) -m venv build/rerun/use && build/rerun/use/bin/pip install --quiet --disable-pip-version-check '.[rerun]')
-	build/rerun/use/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall .
+	test -x build/rerun/use/bin/rerun || ($(PYTHON) -m venv build/rerun/use && $(call INSTALL,build/rerun/use) '.[rerun]')
+	$(call INSTALL,build/rerun/use) --no-deps --force-reinstall .
 	build/rerun/use/bin/python -m tools.check_rerun bags/clean bags/laser_off bags/lost_samples --out build/rerun $(RERUN)
 
 # Truth hidden by a second generator: fresh seeds, both cores with JOBS=2; a run that was stopped goes on.
@@ -242,7 +245,7 @@ demo-thesis: $(READY)
 
 # colcon from PyPI wants an older setuptools than ours: a virtual environment of its own.
 colcon:
-	test -x $(VENV)-colcon/bin/colcon || ($(PYTHON) -m venv $(VENV)-colcon && $(VENV)-colcon/bin/python -m pip install --quiet --disable-pip-version-check colcon-core colcon-ros colcon-python-setup-py colcon-package-information colcon-recursive-crawl colcon-package-selection colcon-output colcon-defaults colcon-library-path)
+	test -x $(VENV)-colcon/bin/colcon || ($(PYTHON) -m venv $(VENV)-colcon && $(call INSTALL,$(VENV)-colcon) colcon-core colcon-ros colcon-python-setup-py colcon-package-information colcon-recursive-crawl colcon-package-selection colcon-output colcon-defaults colcon-library-path)
 	rm -rf build/colcon && mkdir -p build/colcon
 	cd build/colcon && ../../$(VENV)-colcon/bin/colcon --log-base log build --base-paths ../.. --build-base build --install-base install
 	test -x build/colcon/install/psd_deflection/lib/psd_deflection/estimator
