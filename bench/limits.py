@@ -330,7 +330,7 @@ SEARCHES: tuple[tuple[str, tuple[str, ...], tuple[str, ...], float | None], ...]
         'four effects',
         (
             *('sensor_rotation,psd=2,angle=0.01', 'load_direction,angle=0.004', 'amplifier_lag,time_constant=0.0005'),
-            'bending_stiffness,scale=-0.01',
+            'bending_stiffness,scale=-0.013',
         ),
         (),
         None,
