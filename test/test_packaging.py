@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from psd_deflection import __version__
-from psd_deflection.cli.main import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 BESIDE_THE_PACKAGE = {'bench', 'blind', 'data', 'docs'}
@@ -24,21 +23,12 @@ TESTED_ELSEWHERE = {'correction', 'errors', 'files', 'pages', 'parameters', 'rec
 """Rooms without a test file of their own: declarations; the correction, of which the effects' tests are; and the pages,
 which the tests of the reports open in a browser."""
 
-EXECUTABLES = (
-    'estimator',
-    'chain',
-    'compensator',
-    'shaper',
-    'replay',
-    'simulate',
-    'discover',
-    'calibrate',
-    'camera',
-    'check',
-    'effects',
-    'validate',
-    'identify',
+EXECUTABLES: tuple[str, ...] = next(
+    ast.literal_eval(line.value)
+    for line in ast.parse((ROOT / 'setup.py').read_text()).body
+    if isinstance(line, ast.Assign) and ast.unparse(line.targets[0]) == 'EXECUTABLES'
 )
+"""What `ros2 run psd_deflection` starts."""
 
 
 def installed_files() -> dict[str, Path]:
@@ -67,7 +57,7 @@ def test_a_wheel_carries_what_ros2_run_looks_for() -> None:
 def test_the_executables_that_ros2_run_starts_run(tmp_path: Path) -> None:
     """One is run; the others are the same, but for the command that they name."""
     # `ros2 run` takes the package's prefix from the ament index and starts lib/PACKAGE/EXECUTABLE.
-    programs = {name: installed_files()[f'lib/psd_deflection/{name}'] for name in EXECUTABLES if name in COMMANDS}
+    programs = {name: installed_files()[f'lib/psd_deflection/{name}'] for name in EXECUTABLES}
     done = subprocess.run([programs['replay'], '--help'], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert 'usage: psd-deflection replay' in done.stdout

@@ -288,40 +288,8 @@ def _split_ros_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
     return own, for_ros
 
 
-def _executable(command: str) -> Callable[[], int]:
-    """Console script of ``ros2 run psd_deflection COMMAND`` (colcon)."""
-    return lambda: main([command, *sys.argv[1:]])
-
-
-(
-    estimator,
-    chain,
-    compensator,
-    shaper,
-    replay,
-    simulate,
-    discover,
-    calibrate,
-    camera,
-    check,
-    effects,
-    validate,
-    identify,
-) = map(
-    _executable,
-    (
-        'estimator',
-        'chain',
-        'compensator',
-        'shaper',
-        'replay',
-        'simulate',
-        'discover',
-        'calibrate',
-        'camera',
-        'check',
-        'effects',
-        'validate',
-        'identify',
-    ),
-)
+def __getattr__(name: str) -> Callable[[], int]:
+    """The console script ``psd_deflection.cli.main:NAME`` of a colcon build, for `ros2 run psd_deflection NAME`."""
+    if name in COMMANDS:
+        return lambda: main([name, *sys.argv[1:]])
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
