@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
 
@@ -179,6 +179,32 @@ def score(row: Row, loss: str, *, rest_s: int = 100, steps: int = 16, seed: int 
     )
 
 
+def alarms(row: Row, seed: int) -> tuple[int, int]:
+    """Blocks of a faultless recording whose readings are said to contradict each other, and all its blocks.
+
+    Sixty seconds at rest and twelve steps, no loss.
+    """
+    clean, _ = motion(60, 12)
+    # Before a zero the readings of a rig with offsets do contradict each other.
+    own = replace(row, offsets=())
+    pipeline = Pipeline(rig(own))
+    got = estimates(pipeline, volts_of(own, clean, seed), np.ones(len(clean), bool))
+    return pipeline.stamped.contradictions, len(got)
+
+
+def false_alarms(seeds: int, rows: int | None = None) -> int:
+    """Print the share of blocks that :func:`alarms` finds, of each row by so many seeds."""
+    counted, blocks = 0, 0
+    print('| noise | blocks | contradict |\n|---|---|---|')
+    for row in ROWS[:rows]:
+        found = [alarms(row, seed) for seed in range(2, seeds + 2)]
+        there, of = (sum(column) for column in zip(*found, strict=True))
+        print(f'| {row.label} | {of} | {there} |', flush=True)
+        counted, blocks = counted + there, blocks + of
+    print(f'{counted} of {blocks} blocks: {counted / blocks:.1e}')
+    return 0
+
+
 def coarse(poses: int = 150, seed: int = 1) -> Inside:
     """A 10 bit converter, whose step is ten times the noise: the last 20 blocks of 120 in each of many poses."""
     rng = np.random.default_rng(seed)
@@ -291,7 +317,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument('--losses', type=int, default=len(LOSSES), help='only the first kinds of loss')
     parser.add_argument('--faults', action='store_true', help='instead: each reading wrong in turn')
+    parser.add_argument(
+        '--alarms', type=int, metavar='SEEDS', help='instead: false alarms of faultless rigs, each by so many seeds'
+    )
     args = parser.parse_args(argv)
+    if args.alarms:
+        return false_alarms(args.alarms, args.rows)
     if args.faults:
         return faults(args.rows)
     print(HEAD)

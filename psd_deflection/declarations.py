@@ -288,6 +288,14 @@ class EstimatorConfig:
     filter_coast: float = parameter(
         0.5, 's', 'the filter goes on without samples for at most so long', minimum=0.0, maximum=60.0
     )
+    filter_growth: str = parameter(
+        'seen',
+        '',
+        'how the covariance of the filter grows without samples: also by what loads were seen to do in the last half '
+        'minute (seen), or by the process noise alone (model)',
+        choices=('seen', 'model'),
+        before='model',
+    )
     filter_load_walk: tuple[float, float, float] = parameter(
         (0.0, 0.0, 0.0),
         '',

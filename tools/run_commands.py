@@ -100,6 +100,7 @@ SHORTEST = {
 SHORTER = {
     r'^python -m blind\.coverage$': '--rows 1 --losses 1',
     r'^python -m blind\.coverage --faults$': '--rows 1',
+    r'^python -m blind\.coverage --alarms \d+$': '--alarms 1 --rows 1',
     r'^python -m blind\.thesis$': '--parts 1',
     r'^python -m blind\.clock$': '--runs 5',
     r'^python -m blind\.watch\b': '--runs 1 --hours 0',

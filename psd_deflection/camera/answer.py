@@ -5,6 +5,8 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import NamedTuple
 
+import numpy as np
+
 from psd_deflection.records import FloatArray, ReferenceWithCovariance
 
 
@@ -38,12 +40,15 @@ class RefusedError(Exception):
 class TargetPose(NamedTuple):
     """Where the target is in the camera's axes: a point P of the target lies at ``rotation @ P + place``, m.
 
-    ``covariance`` (6, 6) of a small turn about the target's own axes (rad) and of ``place`` (m).
+    ``covariance`` (6, 6) of a small turn about the target's own axes (rad) and of ``place`` (m), (8, 8) with
+    ``keystone``.
     ``cost``: minus twice the log likelihood for each of the ``residuals``, to compare two poses of one image.
     ``points`` (n, 2): pixels of what was found (centres of discs, corners). ``blur``: length of the motion blur, px.
     ``scale``: apparent radius of the discs, in units of what the spacing makes it (1.0 for other targets).
     ``noise``: rms of the residuals, grey levels or px. ``planar``: the distance is not known (no camera matrix).
     ``misfit``: difference between picture and model beyond noise, rms in units of the contrast.
+    ``keystone`` (0 or 2): perspective of a lens that is not known, 1/m: a point (x, y) of the target is 1 + keystone
+    (x, y) times as far as the rotation says.
     """
 
     rotation: FloatArray
@@ -57,6 +62,20 @@ class TargetPose(NamedTuple):
     noise: float = 0.0
     planar: bool = False
     misfit: float = 0.0
+    keystone: FloatArray = np.zeros(0)
+
+    @property
+    def plane(self) -> FloatArray:
+        """(3, 3): (x, y, 1) on the target to its ray."""
+        return plane_of(self.rotation, self.place, self.keystone)
+
+
+def plane_of(rotation: FloatArray, place: FloatArray, keystone: FloatArray) -> FloatArray:
+    """(3, 3): (x, y, 1) on a target to its ray, in the camera's axes."""
+    plane = np.column_stack([rotation[:, 0], rotation[:, 1], place])
+    if keystone.size:
+        plane[2, :2] += place[2] * keystone
+    return plane
 
 
 class FrameAnswer(NamedTuple):

@@ -64,7 +64,7 @@ class Board:
         self._inwards[:, 0] *= self._mirror
         self._spread = np.array([wide, high]) / math.sqrt(12.0)
 
-    def set_rest(self, rotation: FloatArray) -> None:
+    def set_rest(self, rest: TargetPose) -> None:
         """Nothing to remember: the numbers of the markers say it all."""
 
     def locate(self, image: Any, grey: Any, lens: Lens, full_scale: float) -> TargetPose:

@@ -39,12 +39,13 @@ class Discs:
         self._centres = np.array([[0.0, settings.spacing], [0.0, 0.0], [0.0, -settings.spacing]])
         self._up = np.array([math.sin(settings.turn), -math.cos(settings.turn)])
         self._answered = False
-        self._rest: FloatArray | None = None
+        self._rest: TargetPose | None = None
+        self._plate: FloatArray | None = None
         self._fitter: Fitter | None = None
 
-    def set_rest(self, rotation: FloatArray) -> None:
-        """From now on the plate's tilt is expected near that of ``rotation``, its rest."""
-        self._rest = rotation
+    def set_rest(self, rest: TargetPose) -> None:
+        """From now on the plate's tilt is expected near that of its rest."""
+        self._rest, self._plate = rest, rest.rotation
 
     def locate(self, image: Any, grey: Any, lens: Lens, full_scale: float) -> TargetPose:
         """The target in one image; ``grey`` is its 8-bit form. Raises RefusedError."""
@@ -69,14 +70,16 @@ class Discs:
         rays = lens.rays(np.array([r.centre for r in regions]))
         frontal = self._frontal(rays)
         if self._rest is None:
-            prior = Prior(frontal, FIRST_TILT_SD if lens.known else AFFINE_TILT_SD)
+            prior = Prior(frontal, FIRST_TILT_SD if lens.known else AFFINE_TILT_SD, np.zeros(2))
+        else:
+            prior = Prior(self._rest.rotation, MOTION_TILT_SD, self._rest.keystone)
+        if self._plate is None:
             guesses = [frontal @ turned(sign * self._tilt(regions[1], frontal)) for sign in (1.0, -1.0)]
         else:
-            prior = Prior(self._rest, MOTION_TILT_SD)
-            # The plate of the rest, turned in its own plane to where the line of discs is now.
-            line = self._rest.T @ frontal[:, 1]
+            # The plate as it was, turned in its own plane to where the line of discs is now.
+            line = self._plate.T @ frontal[:, 1]
             angle = math.atan2(-line[0], line[1])
-            guesses = [self._rest @ turned(np.array([0.0, 0.0, angle]))]
+            guesses = [self._plate @ turned(np.array([0.0, 0.0, angle]))]
         if self._fitter is None:
             self._fitter = Fitter(lens, image.shape, self._centres, self._radius)
         fits, reason = [], RefusedError(Status.MISFIT)
@@ -89,6 +92,9 @@ class Discs:
         if not fits:
             raise reason
         best, *others = sorted(fits, key=lambda f: f.cost)
+        if not lens.known:
+            # Mirrored tilts have the same dX, dY and theta. Of two of them the mean has not: stay with the one.
+            self._plate, others = best.rotation if self._plate is None else self._plate, []
         for other in others:
             if (other.cost - best.cost) * best.residuals < ALIKE:
                 turn = best.rotation.T @ other.rotation

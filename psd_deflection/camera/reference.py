@@ -14,13 +14,16 @@ from typing import Any, Protocol
 import numpy as np
 
 from psd_deflection.camera.answer import FrameAnswer, RefusedError, Status, TargetPose
-from psd_deflection.camera.lens import Lens
+from psd_deflection.camera.lens import AFFINE_FOCAL, Lens
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.records import FloatArray
 
 MOST_REST = 20
 _STILL = 4.0
 """A frame belongs to the rest if each of dX, dY and theta is within so many sd of it."""
+
+_MIDDLE = 0.1
+"""How far the axis of a lens that is not known may pass from the middle of the image, in image widths."""
 
 
 class Target(Protocol):
@@ -29,8 +32,8 @@ class Target(Protocol):
     def locate(self, image: Any, grey: Any, lens: Lens, full_scale: float) -> TargetPose:
         """The target in one image. Raises RefusedError."""
 
-    def set_rest(self, rotation: FloatArray) -> None:
-        """What the target's rotation is at rest."""
+    def set_rest(self, rest: TargetPose) -> None:
+        """Where the target is at rest."""
 
 
 class CameraReference:
@@ -110,7 +113,7 @@ class CameraReference:
 
     def _decide(self, good: list[TargetPose]) -> list[FrameAnswer]:
         self._rest = mean_pose(good)
-        self._target.set_rest(self._rest.rotation)
+        self._target.set_rest(self._rest)
         waiting, self._waiting = self._waiting, []
         return [self._answer(t_ns, found) for t_ns, found in waiting]
 
@@ -126,12 +129,12 @@ class CameraReference:
 def relative(rest: TargetPose, pose: TargetPose) -> FloatArray:
     """(dX m, dY m, theta, phi, omega rad) of ``pose`` against ``rest``: R = Ry(omega) Rx(phi) Rz(theta)."""
     r = rest.rotation.T @ pose.rotation
-    place = pose.place
     if pose.planar:
         # Where the ray meets the plane of the rest: an unknown distance must not become a displacement.
-        normal = rest.rotation[:, 2]
-        place = place * (float(normal @ rest.place) / float(normal @ place))
-    moved = rest.rotation.T @ (place - rest.place)
+        met = np.linalg.solve(rest.plane, pose.place)
+        moved = met / met[2]
+    else:
+        moved = rest.rotation.T @ (pose.place - rest.place)
     theta, phi = math.atan2(r[1, 0], r[1, 1]), -math.asin(min(max(r[1, 2], -1.0), 1.0))
     return np.array([moved[0], moved[1], theta, phi, math.atan2(r[0, 2], r[2, 2])])
 
@@ -139,17 +142,19 @@ def relative(rest: TargetPose, pose: TargetPose) -> FloatArray:
 def relative_covariance(rest: TargetPose, pose: TargetPose) -> FloatArray:
     """Covariance (3, 3) of (dX, dY, theta) from those of both poses."""
     r = rest.rotation.T @ pose.rotation
+    moved: FloatArray = rest.rotation.T @ (pose.place - rest.place)
+    onto, far = rest.rotation.T[:2], 1.0
+    size = 6 + rest.keystone.size
+    of_rest, of_pose = np.zeros((3, size)), np.zeros((3, size))
     if pose.planar:
-        # As seen from the plane of the rest: no distance, no tilt.
-        place = np.diag([1.0, 1.0, 0.0]) @ rest.rotation.T
-        moved = np.zeros(3)
-    else:
-        place = rest.rotation.T
-        moved = rest.rotation.T @ (pose.place - rest.place)
-    of_rest, of_pose = np.zeros((3, 6)), np.zeros((3, 6))
-    of_pose[:2, 3:], of_rest[:2, 3:] = place[:2], -place[:2]
-    # A small turn a of the rest's axes takes R0^T v to R0^T v - a x (R0^T v).
-    of_rest[:2, :3] = _cross(moved)[:2]
+        # The ray of ``pose`` meets the plane of the rest: rest.plane @ (x, y, 1) = far * pose.place.
+        across = np.column_stack([rest.plane[:, :2], -pose.place])
+        *moved[:2], far = np.linalg.solve(across, -rest.place)
+        moved[2], onto = 0.0, np.asarray(np.linalg.inv(across))[:2]
+        of_rest[:2, 6:] = -np.outer(onto[:, 2], moved[: size - 6]) * rest.place[2]
+    of_pose[:2, 3:6], of_rest[:2, 3:6] = far * onto, -onto
+    # A small turn a of the rest's axes takes ``moved`` to moved - a x moved.
+    of_rest[:2, :3] = onto @ rest.rotation @ _cross(moved)
     # theta = atan2(r10, r11); r goes to r (1 + [b]x), or to (1 - [a]x) r.
     scale = 1.0 / (r[1, 0] ** 2 + r[1, 1] ** 2)
     by = np.array([r[1, 1], -r[1, 0], 0.0]) * scale
@@ -157,6 +162,11 @@ def relative_covariance(rest: TargetPose, pose: TargetPose) -> FloatArray:
     of_rest[2, :3] = [-by @ r[2], 0.0, by @ r[0]]
     of_rest[2, [0, 2]] *= -1.0
     total = of_rest @ rest.covariance @ of_rest.T + of_pose @ pose.covariance @ of_pose.T
+    if pose.planar:
+        # A plate that left the plane of the rest moves in the image by that share of its distance from the middle.
+        sd = math.sqrt(rest.covariance[5, 5] + pose.covariance[5, 5]) / float(pose.place[2])
+        wide = float(np.linalg.norm(pose.place[:2])) + _MIDDLE * float(pose.place[2]) / AFFINE_FOCAL
+        total[:2, :2] += np.eye(2) * (max(abs(far - 1.0) - _STILL * sd, 0.0) * wide) ** 2
     return np.asarray((total + total.T) / 2)
 
 
@@ -170,7 +180,8 @@ def mean_pose(poses: list[TargetPose]) -> TargetPose:
     u, _, vt = np.linalg.svd(summed)
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     covariance = np.mean([p.covariance for p in poses], axis=0) / len(poses)
-    return poses[0]._replace(rotation=rotation, place=np.mean([p.place for p in poses], axis=0), covariance=covariance)
+    place, keystone = (np.mean([getattr(p, of) for p in poses], axis=0) for of in ('place', 'keystone'))
+    return poses[0]._replace(rotation=rotation, place=place, keystone=keystone, covariance=covariance)
 
 
 def _still(before: list[TargetPose], pose: TargetPose) -> bool:

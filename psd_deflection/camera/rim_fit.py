@@ -14,6 +14,9 @@ for each disc, which takes uneven light; they are eliminated from the normal equ
 not interpolated: their noise stays independent, and the fit reaches the Cramer-Rao bound. The first steps use each
 fourth pixel. Pixels are kept as float32, which is good to 1e-5 px here and twice as fast; the normal equations are in
 float64.
+
+If the lens is not known, perspective is fitted as two numbers of its own ("keystone", 1/m): a point (x, y) of the
+target is then farther by the factor 1 + keystone (x, y), whatever the focal length.
 """
 
 from __future__ import annotations
@@ -25,12 +28,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from psd_deflection.camera.answer import RefusedError, Status, TargetPose
-from psd_deflection.camera.lens import Lens
+from psd_deflection.camera.answer import RefusedError, Status, TargetPose, plane_of
+from psd_deflection.camera.lens import AFFINE_FOCAL, Lens
 from psd_deflection.records import FloatArray, IntArray
 
 _STEPS = 15
-_SETTLED = 5.0
+_SETTLED = 10.0
 """A step of fewer standard deviations is the last once the picture fits: over it the model is linear."""
 _THINNED = 4
 _LIGHTS = 6
@@ -86,10 +89,14 @@ Pixels = npt.NDArray[np.float32]
 
 
 class Prior(NamedTuple):
-    """What is known of the pose beforehand: tilts about the target's X and Y against ``rotation``, one ``sd``, rad."""
+    """What is known of the pose beforehand: tilts about the target's X and Y against ``rotation``, one ``sd``, rad.
+
+    ``keystone``: what is expected of it, in the axes of ``rotation``, if the lens is not known.
+    """
 
     rotation: FloatArray
     sd: float
+    keystone: FloatArray
 
 
 class _Rims(NamedTuple):
@@ -121,6 +128,12 @@ class _Shape(NamedTuple):
     blur: FloatArray
     skew: FloatArray
     light: FloatArray
+    keystone: FloatArray
+
+    @property
+    def plane(self) -> FloatArray:
+        """(3, 3): (x, y, 1) on the target to its ray."""
+        return plane_of(self.rotation, self.place, self.keystone)
 
 
 class _Normal(NamedTuple):
@@ -148,7 +161,7 @@ class Fitter:
         self._rows, self._columns = image_shape
         self._rays = np.ones((3, grid[..., 0].size), dtype=np.float32)
         self._rays[:2] = grid.reshape(-1, 2).T
-        self._points = np.column_stack([centres, np.zeros(len(centres))])
+        self._points = np.column_stack([centres, np.ones(len(centres))])
         self._blur = np.eye(2)
 
     def fit(self, image: Any, rotation: FloatArray, place: FloatArray, prior: Prior, full_scale: float) -> TargetPose:
@@ -156,7 +169,10 @@ class Fitter:
 
         ``image`` (rows, columns): grey levels; ``full_scale``: where the camera saturates. Raises RefusedError.
         """
-        shape = _Shape(rotation, place, 1.0, self._blur, np.zeros(0), np.zeros((len(self._centres), _LIGHTS)))
+        light = np.zeros((len(self._centres), _LIGHTS))
+        shape = _Shape(rotation, place, 1.0, self._blur, np.zeros(0), light, np.zeros(0))
+        if not self._lens.known:
+            shape = shape._replace(keystone=_expected(prior, rotation))
         pixel_radius = self._radius * self._lens.focal / float(place[2])
         half = min(_width(self._blur), 0.6 * pixel_radius)
         rims, light = self._gather(image, shape, half)
@@ -184,10 +200,11 @@ class Fitter:
     def _gather(self, image: Any, shape: _Shape, half: float) -> tuple[_Rims, FloatArray]:
         """The pixels nearer than ``half`` to a rim, and first lights by the means in and out of it."""
         rows, columns = self._rows, self._columns
-        middles = self._lens.project(self._points @ shape.rotation.T + shape.place)
+        middles = self._lens.project(self._points @ shape.plane.T)
         bends = self._bends(middles)
         # Over a disc the way from the image to the plane is nearly affine: good enough to choose pixels.
-        slopes = self._slopes(_to_plane(shape), shape, bends)
+        plane = shape.plane
+        slopes = self._slopes(plane, bends)
         squares = slopes.transpose(0, 2, 1) @ slopes
         reach = self._radius * np.sqrt(np.linalg.inv(squares)[:, (0, 1), (0, 1)])
         if (middles - reach).min() < half + 2 or (middles + reach > (columns - half - 3, rows - half - 3)).any():
@@ -232,9 +249,9 @@ class Fitter:
         ends = self._lens.rays(pixels[:, None] + offsets)
         return np.stack([ends[:, 0] - ends[:, 1], ends[:, 2] - ends[:, 3]], axis=-1)
 
-    def _slopes(self, inverse: FloatArray, shape: _Shape, bends: FloatArray) -> FloatArray:
+    def _slopes(self, plane: FloatArray, bends: FloatArray) -> FloatArray:
         """d plane point / d pixel (n, 2, 2) at the discs' centres; it changes little over a disc."""
-        far = self._centres @ shape.rotation[2, :2] + shape.place[2]
+        far, inverse = self._points @ plane[2], np.linalg.inv(plane)
         forward = inverse[:2, :2] - self._centres[:, :, None] * inverse[2, :2]
         return np.asarray((forward * far[:, None, None]) @ bends)
 
@@ -243,7 +260,7 @@ class Fitter:
         for _ in range(_STEPS):
             normal = self._linearise(rims, shape, None)
             shape, step, deviation = self._stepped(normal, shape, prior, len(rims.level))
-            if np.all(np.abs(step) < deviation):
+            if np.all(np.abs(step) < 3.0 * deviation):
                 break
         return shape, self._noise(normal)
 
@@ -269,8 +286,9 @@ class Fitter:
 
     def _linearise(self, rims: _Rims, shape: _Shape, noise: tuple[float, float] | None) -> _Normal:
         """Normal equations at ``shape``; ``noise``: variances outside and inside, None: equal."""
-        inverse = _to_plane(shape)
-        slopes = self._slopes(inverse, shape, rims.bend)
+        plane = shape.plane
+        inverse = np.linalg.inv(plane)
+        slopes = self._slopes(plane, rims.bend)
         curved = (slopes[:, 0, 0] * slopes[:, 1, 1] - slopes[:, 0, 1] * slopes[:, 1, 0]) ** 2 * (0.5 / self._radius)
         discs = np.column_stack([self._centres, slopes.reshape(-1, 4), curved]).astype(np.float32)
         # One number a disc to one a pixel.
@@ -302,7 +320,7 @@ class Fitter:
         bell = np.exp(-0.5 * z * z)
         bell *= 1.0 / _ROOT_2PI
         level = ndtr(z)
-        rows = np.empty((_LIGHTS + 11 + shape.skew.size, len(z)), dtype=np.float32)
+        rows = np.empty((_LIGHTS + 11 + shape.skew.size + shape.keystone.size, len(z)), dtype=np.float32)
         parameters = rows[_LIGHTS:-1]
         contrast = np.empty_like(z)
         begin = rims.begin.tolist()
@@ -316,7 +334,7 @@ class Fitter:
             zz = z * z
             level = level - skew * (zz - 1) * bell * (1 / 6)
             rise = (1 - skew * z * (3 - zz) * (1 / 6)) * (bell * per_sigma * contrast)
-            parameters[10:] = cubes * ((1 - zz) * bell * contrast * (1 / 6))
+            parameters[10 : 10 + len(cubes)] = cubes * ((1 - zz) * bell * contrast * (1 / 6))
         else:
             rise = bell * per_sigma
             rise *= contrast
@@ -324,21 +342,25 @@ class Fitter:
         np.subtract(rims.flat, rows[3:6], out=rows[:3])
         rows[-1] += contrast * level
         np.subtract(rims.level, rows[-1], out=rows[-1])
-        # A small turn or shift moves the target's point along the normal. The ray that meets it comes from the camera.
-        r = shape.rotation
-        camera = (-shape.place @ r).tolist()
+        # If a point (x, y, 1) of the target moves by v, its ray meets the old target at (x, y) + q - (x, y) q_z with
+        # q = inverse v.
         by_rho = rise * flat
-        ways = np.empty((3, len(z)), dtype=np.float32)
-        np.multiply(ox, by_rho, out=ways[0])
-        np.multiply(oy, by_rho, out=ways[1])
-        np.multiply(ways[0], px - camera[0], out=ways[2])
-        ways[2] += ways[1] * (py - camera[1])
-        ways[2] *= 1.0 / camera[2]
+        inwards = np.empty((3, len(z)), dtype=np.float32)
+        np.multiply(ox, by_rho, out=inwards[0])
+        np.multiply(oy, by_rho, out=inwards[1])
+        np.multiply(inwards[0], px, out=inwards[2])
+        inwards[2] += inwards[1] * py
+        np.negative(inwards[2], out=inwards[2])
+        np.matmul(inverse.T.astype(np.float32), inwards, out=parameters[3:6])
+        ways = (inverse @ shape.rotation).T.astype(np.float32) @ inwards
+        if shape.keystone.size:
+            far = parameters[5] * float(shape.place[2])
+            np.multiply(far, px, out=parameters[-2])
+            np.multiply(far, py, out=parameters[-1])
         np.multiply(py, ways[2], out=parameters[0])
         np.multiply(px, -ways[2], out=parameters[1])
         np.multiply(ways[1], px, out=parameters[2])
         parameters[2] -= ways[0] * py
-        np.matmul(r.astype(np.float32), ways, out=parameters[3:6])
         np.multiply(by_rho, self._radius, out=parameters[6])
         rise *= z
         rise *= per_sigma
@@ -421,16 +443,18 @@ class Fitter:
         bent[:, :6] *= math.hypot(CENTRE_FLOOR, wrong)
         bent[:, 6:] *= 0.5 * wrong
         # Pixels may be wrong together: along a rim, or along the rows or columns in which a camera is read.
-        pulls = (inverse[:6].astype(np.float32) @ scored) * (residual / chi_square)
+        pose = [*range(6), *range(len(inverse) - shape.keystone.size, len(inverse))]
+        pulls = (inverse[pose].astype(np.float32) @ scored) * (residual / chi_square)
         line, column = np.divmod(rims.pixel, self._columns)
-        wider = np.ones(6)
+        inverse = inverse[np.ix_(pose, pose)]
+        wider = np.ones(len(pose))
         for group in (sector, line - int(line.min()), column - int(column.min())):
             squares = [float(total @ total) for total in (np.bincount(group, pull) for pull in pulls)]
-            wider = np.maximum(wider, np.sqrt(np.divide(squares, np.diag(inverse)[:6])))
-        covariance = inverse[:6, :6] * np.outer(wider, wider)
-        covariance += bent[:6] @ bent[:6].T
+            wider = np.maximum(wider, np.sqrt(np.divide(squares, np.diag(inverse))))
+        covariance = inverse * np.outer(wider, wider)
+        covariance += bent[pose] @ bent[pose].T
         # What the first three moments of the motion do not say of its mean.
-        covariance += self._moved_centres(shape, MEAN_OF_BLUR * max(motion - 0.15, 0.0))
+        covariance[:6, :6] += self._moved_centres(shape, MEAN_OF_BLUR * max(motion - 0.15, 0.0))
         noise = float(np.sqrt(np.mean(raw * raw)))
         return TargetPose(
             shape.rotation,
@@ -438,12 +462,13 @@ class Fitter:
             covariance,
             2 * math.log(max(noise, 1e-3)) + float(np.sum(stiff * pull**2)) / count,
             count,
-            self._lens.project(self._points @ shape.rotation.T + shape.place),
+            self._lens.project(self._points @ shape.plane.T),
             math.sqrt(12.0) * motion,
             shape.swell,
             noise,
             planar=not self._lens.known,
             misfit=misfit,
+            keystone=shape.keystone,
         )
 
     def _moved_centres(self, shape: _Shape, pixels: float) -> FloatArray:
@@ -535,20 +560,25 @@ def _of_bent_rims(normal: _Normal, rims: _Rims, scored: Pixels) -> FloatArray:
     return np.hstack(moved + bent)
 
 
-def _to_plane(shape: _Shape) -> FloatArray:
-    """The homography (3, 3) from rays to the target's plane."""
-    return np.asarray(np.linalg.inv(np.column_stack([shape.rotation[:, 0], shape.rotation[:, 1], shape.place])))
+def _expected(prior: Prior, rotation: FloatArray) -> FloatArray:
+    """The keystone that ``prior`` expects, in the axes of ``rotation``."""
+    return np.asarray((rotation.T @ prior.rotation)[:2, :2] @ prior.keystone)
 
 
 def _beforehand(shape: _Shape, prior: Prior) -> tuple[FloatArray, FloatArray]:
     """What is known without this image: inverse variances of the parameters; how far each is from what is expected."""
-    stiff, pull = np.zeros(10 + shape.skew.size), np.zeros(10 + shape.skew.size)
+    size = 10 + shape.skew.size
+    stiff, pull = np.zeros(size + shape.keystone.size), np.zeros(size + shape.keystone.size)
     # The tilt against the prior's plane in the target's own axes: a turn in the plane does not change it.
     off = prior.rotation.T @ shape.rotation
     stiff[:2], pull[:2] = prior.sd**-2, (-off[2, 1], off[2, 0])
     stiff[6], pull[6] = RADIUS_SD**-2, 1.0 - shape.swell
     # No motion is skewed by more than about one.
-    stiff[10:], pull[10:] = 1.0, -shape.skew
+    stiff[10:size], pull[10:size] = 1.0, -shape.skew
+    if shape.keystone.size:
+        # That of a tilt of one sd, seen by a focal length of one image width.
+        stiff[size:] = (prior.sd * AFFINE_FOCAL / float(shape.place[2])) ** -2
+        pull[size:] = _expected(prior, shape.rotation) - shape.keystone
     return stiff, pull
 
 
@@ -563,8 +593,9 @@ def _moved(shape: _Shape, step: FloatArray, light: FloatArray) -> _Shape:
         shape.place + step[3:6],
         float(np.clip(shape.swell + step[6], 0.7, 1.4)),
         blur,
-        np.clip(shape.skew + step[10:], -1.5, 1.5),
+        np.clip(shape.skew + step[10 : 10 + shape.skew.size], -1.5, 1.5),
         light,
+        shape.keystone + step[10 + shape.skew.size :],
     )
 
 

@@ -257,6 +257,6 @@ def _tell(
             show(f'the discs look {100 * (rest.scale - 1):+.2f} % larger than target.spacing and target.radius say')
     if not settings.matrix:
         warn(
-            'camera.matrix is not given: the scale is that of target.spacing, lens distortion and perspective are not '
-            'corrected; `psd-deflection camera intrinsics` finds both'
+            'camera.matrix is not given: the scale is that of target.spacing, lens distortion is not corrected; '
+            '`psd-deflection camera intrinsics` finds both'
         )

@@ -20,6 +20,7 @@ import numpy as np
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError
 from psd_deflection.filtering.modal import BlockTables, Oscillator
+from psd_deflection.filtering.unseen import UnseenLoads
 from psd_deflection.records import AppliedLoad, FloatArray, IntArray
 from psd_deflection.uncertainty.block_fit import LARGEST, inverse
 
@@ -114,6 +115,11 @@ class ModalFilter:
         self._later = np.stack([mode.step(self._ahead) for mode in self._modes])
         self._later_spread = np.stack([mode.spreads(np.array([self._ahead]))[0] for mode in self._modes])
         self._longest = config.filter_coast
+        self._unseen = (
+            UnseenLoads(self._modes, size * self._period, self._longest + self._ahead)
+            if config.filter_growth == 'seen' and not any(config.filter_load_walk)
+            else None
+        )
         self._compliance = np.array(compliance)
         self._gain = gain
         stated = np.array(config.filter_load_walk) * self._compliance
@@ -140,6 +146,8 @@ class ModalFilter:
         self._index: int | None = None
         self._t_ns = 0
         self.coasted = 0.0
+        if self._unseen is not None:
+            self._unseen.forget()
 
     def set_noise(self, gamma: FloatArray) -> None:
         """``gamma`` (C, C, N), m^2: covariance of reading c with reading d, so many samples later."""
@@ -202,6 +210,8 @@ class ModalFilter:
     def _coast(self, seconds: float) -> None:
         if self.coasted == 0.0:
             self.coasts += 1
+            if self._unseen is not None:
+                self._unseen.begin()
         self.coasted += seconds
         phi = self._tables.phi
         self._x = np.einsum('aij,aj->ai', phi, self._x)
@@ -237,7 +247,7 @@ class ModalFilter:
         says = self._tables.says(slots)
         foretold = np.einsum('ani,ai->an', says.observed, self._x)
         after = np.einsum('aij,aj->ai', self._tables.phi, self._x)
-        p = self._p
+        p = self._p + self._unforeseen(self.coasted) if self.coasted > 0.0 else self._p
         if pushed is not None:
             foretold = foretold + pushed[0][:, slots]
             after = after + pushed[1]
@@ -274,16 +284,32 @@ class ModalFilter:
         self._shared += np.einsum('pim,pjm->pij', both, mean[_SECOND])
         self._weights = weights
         self.coasted = 0.0
+        if self._unseen is not None:
+            if pushed is not None:
+                # What a known load did was foreseen.
+                self._unseen.begin()
+            self._unseen.add(self._x, self._p, self._rate())
         taken = np.einsum('ak,ak->a', weights, squares).tolist()
         so_far = zip(self.innovations.squares, taken, strict=True)
         self.innovations = Innovations(tuple(a + b for a, b in so_far), self.innovations.samples + len(slots))
 
+    def _rate(self) -> FloatArray:
+        """Process noise (A, 2) by what was seen last."""
+        return np.asarray(np.einsum('ak,akc->ac', self._weights, self._rates))
+
+    def _unforeseen(self, seconds: float) -> FloatArray:
+        """What a load that nobody sees adds to the covariance (A, 4, 4) so long after the last sample."""
+        out = np.zeros((3, 4, 4))
+        if self._unseen is not None and seconds > 0.0:
+            out[:, range(4), range(4)] = self._unseen.after(seconds)
+        return out
+
     def _moved(self) -> Moved:
         """Of the end of the block, ``filter_ahead`` later."""
         x = np.einsum('aij,aj->ai', self._later, self._x)
-        rate = np.einsum('ak,akc->ac', self._weights, self._rates)
         p = np.einsum('aij,ajl,aml->aim', self._later, self._p, self._later)
-        p += np.einsum('ac,acij->aij', rate, self._later_spread)
+        p += np.einsum('ac,acij->aij', self._rate(), self._later_spread)
+        p += self._unforeseen(self.coasted + self._ahead)
         shared = np.einsum('pij,pjl,pml->pim', self._later[_FIRST], self._shared, self._later[_SECOND])
         t_ns = self._t_ns + round(1e9 * (0.5 * (self._size - 1) * self._period + self._ahead))
         pose, velocity = np.diag(p[:, 0, 0]), np.diag(self._w**2 * p[:, 1, 1])
@@ -294,40 +320,50 @@ class ModalFilter:
 
     def predicted(self, seconds: FloatArray) -> Predicted:
         """The motion so long (n,) after the last block's last sample."""
-        rate = np.einsum('ak,akc->ac', self._weights, self._rates)
         steps = np.stack([[mode.step(s) for s in seconds.tolist()] for mode in self._modes])
         added = np.stack([mode.spreads(seconds) for mode in self._modes])
         x = np.einsum('anij,aj->nai', steps, self._x)
-        p = np.einsum('anij,ajl,anml->naim', steps, self._p, steps) + np.einsum('ac,ancij->naij', rate, added)
+        p = np.einsum('anij,ajl,anml->naim', steps, self._p, steps)
+        p += np.einsum('ac,ancij->naij', self._rate(), added)
+        p += np.stack([self._unforeseen(self.coasted + s) for s in seconds.tolist()])
         return Predicted(x[..., 0], self._w * x[..., 1], p[..., 0, 0], self._w**2 * p[..., 1, 1])
 
     def load_walk(self) -> tuple[float, ...]:
         """How far the load wanders in a second by what was seen last, by its steps alone: N, N, N m."""
-        rate = np.einsum('ak,akc->ac', self._weights, self._rates)
-        return tuple((np.sqrt(rate[:, 0]) / self._compliance).tolist())
+        return tuple((np.sqrt(self._rate()[:, 0]) / self._compliance).tolist())
 
     def memory(self) -> tuple[float, ...]:
-        """What the next block depends on, besides the noise; () if nothing is known."""
+        """What the next block depends on, besides the noise; () if nothing is known.
+
+        What a load does unseen is gathered anew from here on, as where it is restored.
+        """
         if self._index is None:
             return ()
         held = (1.0, *self._held.tolist()) if self._held is not None else (0.0,) * 4
         times = (float(self._index), *split_ns(self._t_ns), self.coasted)
-        arrays = (self._x, self._p, self._shared, self._weights)
+        arrays = [self._x, self._p, self._shared, self._weights]
+        if self._unseen is not None:
+            self._unseen.begin()
+            arrays.append(self._unseen.variances)
         waiting = [v for load in self._loads for v in (*split_ns(load.t_ns), *load[1:])]
         return (*times, *held, *(v for array in arrays for v in array.ravel().tolist()), *waiting)
 
     def restore(self, values: tuple[float, ...]) -> None:
         """Go on from another one's :meth:`memory`. Raises ValueError if it had another number of rates."""
-        numbers = 8 + 12 + 48 + 48 + 3 * self.levels
+        known = 8 + 12 + 48 + 48 + 3 * self.levels
+        numbers = known + (self._unseen.variances.size if self._unseen is not None else 0)
         if len(values) < numbers or (len(values) - numbers) % 5:
             raise ValueError(f'{STATE}: {len(values)} numbers do not tell a filter with {self.levels} rates')
         self._index = int(values[0])
         self._t_ns = joined_ns(*values[1:3])
         self.coasted = values[3]
         self._held = np.array(values[5:8]) if values[4] else None
-        x, p, shared, weights = np.split(np.array(values[8:numbers]), (12, 60, 108))
+        x, p, shared, weights = np.split(np.array(values[8:known]), (12, 60, 108))
         self._x, self._p, self._shared = x.reshape(3, 4), p.reshape(3, 4, 4), shared.reshape(3, 4, 4)
         self._weights = weights.reshape(3, self.levels)
+        if self._unseen is not None:
+            self._unseen.begin()
+            self._unseen.variances[:] = np.reshape(values[known:numbers], self._unseen.variances.shape)
         waiting = np.reshape(values[numbers:], (-1, 5)).tolist()
         self._loads = [AppliedLoad(joined_ns(s, ns), fx, fy, tz) for s, ns, fx, fy, tz in waiting]
 

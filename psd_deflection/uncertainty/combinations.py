@@ -21,10 +21,14 @@ Left = Callable[[FloatArray], FloatArray]
 
 
 class Combinations(abc.ABC):
-    """``turn`` (C, C): one combination of the C readings a row. ``moving``: how many of them move with the link."""
+    """``turn`` (C, C): one combination of the C readings a row. ``moving``: how many of them move with the link.
+
+    ``still``: the first one that does not move to any order.
+    """
 
     turn: FloatArray
     moving: int
+    still: int
 
     @abc.abstractmethod
     def of(self, dots: FloatArray) -> FloatArray:
@@ -42,7 +46,7 @@ class Combinations(abc.ABC):
 class _BaseLine(Combinations):
     """Of two PSDs."""
 
-    moving = 3
+    moving = still = 3
 
     def __init__(self, centers: FloatArray, beams: FloatArray) -> None:
         self.turn = combinations(beams)
@@ -86,6 +90,7 @@ class _Several(Combinations):
         self._left = left
         self.turn = _completed(slopes)
         self.moving = slopes.shape[1]
+        self.still = len(slopes)
 
     def of(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""

@@ -102,6 +102,7 @@ class StreamNoise:
         self._mean_of = _mean_weights(size)
         self._q = basis(size)
         self._average: FloatArray | None = None
+        self._sure = np.ones(size)
         self._count = 0
         self._seen = 0
         self._louder = 0
@@ -152,15 +153,18 @@ class StreamNoise:
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""
         head = (float(self._seen), float(self._count), float(self._louder), float(self.at_rest))
-        return head if self._average is None else (*head, *self._average.ravel().tolist())
+        return head if self._average is None else (*head, *self._average.ravel().tolist(), *self._sure.tolist())
 
     def set_state(self, values: tuple[float, ...]) -> None:
         """Go on from :meth:`state` of another one. Raises ValueError where it is not of this block size."""
-        if len(values) not in (4, self._wanted):
+        # Recordings from before averages were as measured have no more.
+        if len(values) not in (4, self._wanted, self._wanted + self._size):
             raise ValueError(f'noise of {self._size} samples a block has {self._wanted} values, not {len(values)}')
         self._seen, self._count, self._louder = (int(v) for v in values[:3])
         self.at_rest = bool(values[3])
-        self._average = np.array(values[4:]).reshape(self._readings, self._readings, -1) if len(values) > 4 else None
+        average = np.array(values[4 : self._wanted])
+        self._average = average.reshape(self._readings, self._readings, -1) if len(values) > 4 else None
+        self._sure = np.array(values[self._wanted :]) if len(values) > self._wanted else np.ones(self._size)
         self.gamma = self._in_use()
 
     def _from_file(self) -> FloatArray:
@@ -172,7 +176,8 @@ class StreamNoise:
     def _in_use(self) -> FloatArray:
         if self._average is None or not self.measured:
             return self._from_file()
-        return self._with_steps(self._average)
+        # Of the average: each segment alone is so uncertain that much would be taken off its colour.
+        return self._with_steps(_covariance(self._average, self._sure))
 
     def _with_steps(self, gamma: FloatArray) -> FloatArray:
         out = gamma.copy()
@@ -195,18 +200,22 @@ class StreamNoise:
         places = np.concatenate([(index - start) * size + slots for index, slots, _ in blocks])
         dots = np.concatenate([d for _, _, d in blocks])
         series = np.column_stack((dots, self._combinations.fixed(dots)))
-        lags = _autocovariance(places, series, SEGMENT_BLOCKS * size, size)
+        lags, sure = _autocovariance(places, series, SEGMENT_BLOCKS * size, size)
         self._seen += 1
         rough = _roughness(places, np.column_stack((np.einsum('sc,ac->sa', dots, self._moving), series)), self._q)
         count = self._readings
-        self._judge(lags[:count, :count], lags[count, count], rough + (self._step**2 / 12.0 + _LEAST))
+        fixed = _covariance(lags[count:, count:], sure)[0, 0]
+        self._judge(lags[:count, :count], sure, fixed, rough + (self._step**2 / 12.0 + _LEAST))
         self.gamma = self._in_use()
         return True
 
-    def _judge(self, gamma: FloatArray, fixed: FloatArray, rough: FloatArray) -> None:
-        """``rough``: of the combinations that move, the readings and the combination that does not, m^2."""
+    def _judge(self, gamma: FloatArray, sure: FloatArray, fixed: FloatArray, rough: FloatArray) -> None:
+        """``gamma``, ``sure``: as measured, of a segment. ``fixed`` (N,): of the combination that does not move.
+
+        ``rough``: of the combinations that move, the readings and the combination that does not, m^2.
+        """
         moving = self._moving
-        turned = np.einsum('ac,cdl,ad->al', moving, gamma, moving)
+        turned = np.einsum('ac,cdl,ad->al', moving, _covariance(gamma, sure), moving)
         least = self._step**2 / 12.0 + _LEAST
         means = turned @ self._mean_of + least / self._size
         fixed_mean = float(fixed @ self._mean_of) + least / self._size
@@ -214,10 +223,10 @@ class StreamNoise:
         still = bool((means * fixed_rough <= _MOTION * rough[: len(moving)] * fixed_mean).all())
         if not self.at_rest:
             if still:
-                self._restart(gamma)
+                self._restart(gamma, sure)
                 self.at_rest = True
             else:
-                self._into_average(_guess(fixed, rough[len(moving) : -1] / fixed_rough))
+                self._into_average(_guess(fixed, rough[len(moving) : -1] / fixed_rough), np.ones(self._size))
             return
         before = self._average if self._average is not None else gamma
         known = np.einsum('ac,cdl,ad,l->a', moving, before, moving, self._mean_of) + least / self._size
@@ -225,20 +234,21 @@ class StreamNoise:
         if (ratio > _RISEN).any():
             self._louder = self._louder + 1 if still else 0
             if self._louder >= _PATIENCE:
-                self._restart(gamma)
+                self._restart(gamma, sure)
         elif (ratio < _FALLEN).any():
-            self._restart(gamma)
+            self._restart(gamma, sure)
         else:
-            self._into_average(gamma)
+            self._into_average(gamma, sure)
 
-    def _restart(self, gamma: FloatArray) -> None:
-        self._average, self._count, self._louder = gamma, 1, 0
+    def _restart(self, gamma: FloatArray, sure: FloatArray) -> None:
+        self._average, self._sure, self._count, self._louder = gamma, sure, 1, 0
 
-    def _into_average(self, gamma: FloatArray) -> None:
+    def _into_average(self, gamma: FloatArray, sure: FloatArray) -> None:
         self._louder = 0
         self._count = min(self._count + 1, _LONGEST)
         before = self._average if self._average is not None else gamma
         self._average = before + (gamma - before) / self._count
+        self._sure = self._sure + (sure - self._sure) / self._count
 
 
 def _guess(fixed: FloatArray, size: FloatArray) -> FloatArray:
@@ -277,10 +287,10 @@ def _roughness(places: IntArray, series: FloatArray, q: FloatArray) -> FloatArra
     return np.asarray(np.median(left / (count - orders)[:, None], axis=0))
 
 
-def _autocovariance(places: IntArray, series: FloatArray, length: int, lags: int) -> FloatArray:
+def _autocovariance(places: IntArray, series: FloatArray, length: int, lags: int) -> tuple[FloatArray, FloatArray]:
     """(c, c, lags) of ``series`` (n, c) at ``places`` (n,) below ``length``, less mean and slope; gaps are left out.
 
-    It is that of the first c - 1 together and that of the last: neither gives a weighted sum a negative variance.
+    It need not be a covariance. The second is for :func:`_covariance`.
     """
     at = places - places.sum() / len(places)
     centred = series - series.sum(axis=0) / len(series)
@@ -298,23 +308,22 @@ def _autocovariance(places: IntArray, series: FloatArray, length: int, lags: int
     # Mean and slope were taken off: 2 of length / far degrees of freedom of what is slower than that.
     slow = np.einsum('cdl,l->cd', each, _mean_weights(far))
     taken = (slow + slow.T)[:, :, None] / (length / far - 2)
-    each, pairs, present = each[:, :, :lags] + taken, pairs[:, :, :lags], present[:lags]
     # Products with 0 for what is absent are those of a covariance whatever the samples are, and stay so over one
     # divisor: that of the lag at which gaps cost most, so that none is too small.
+    present = present[:lags]
     whole = present / (1.0 - np.arange(lags) / length)
-    sure = pairs / max(float(whole.min()), _PAIRS * float(whole[0])) + taken
-    out = np.zeros_like(pairs)
-    for part in (slice(0, count - 1), slice(count - 1, count)):
-        out[part, part] = _covariance(each[part, part], sure[part, part])
-    return out
+    return each[:, :, :lags] + taken, present / max(float(whole.min()), _PAIRS * float(whole[0]))
 
 
 def _covariance(each: FloatArray, sure: FloatArray) -> FloatArray:
-    """The autocovariance (c, c, N) ``each``, and as much of ``sure`` as makes the covariance of N samples of it."""
+    """The autocovariance (c, c, N) ``each`` as the covariance of N samples.
+
+    ``sure`` (N,): times it, it is one. As little of that is taken as makes it one.
+    """
     count, _, size = each.shape
     own = _OWN_SHARE * float(each[range(count), range(count), 0].max()) + _LEAST
     for share in _SHARES if size <= LARGEST else (1.0,):
-        mixed = each + share * (sure - each)
+        mixed = each * (1.0 + share * (sure - 1.0))
         mixed[range(count), range(count), 0] += own
         if share == 1.0 or _positive(mixed):
             break

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from blind.render import Pose, Scene, board, photograph_of
+from blind.render import Pose, Scene, board, developed
 from psd_deflection.camera.answer import Status
 from psd_deflection.camera.boards import board_of, board_size
 from psd_deflection.camera.intrinsics import calibrated
@@ -32,7 +32,7 @@ def shot(scene: Scene, settings: CameraSettings, pose: Pose, rng: np.random.Gene
     size = board_size(settings)
     pixels = (round(size[0] * 2e4), round(size[1] * 2e4))
     texture = board_of(settings).generateImage(pixels, None, 0, 1) / 255.0
-    return photograph_of(scene, board(scene, pose, texture, size), rng)
+    return developed(scene, board(scene, pose, texture, size), rng)
 
 
 @pytest.mark.parametrize('view', ['outside', 'base'])
@@ -52,7 +52,7 @@ def test_a_board_is_found_again(settings: CameraSettings, view: str) -> None:
 
 
 def test_an_edge_along_the_rows_of_the_image_is_drawn_where_it_is() -> None:
-    scene = Scene(width=60, height=80, focal=1000.0, centre=(30.0, 40.0), distance=0.25)
+    scene = Scene(width=60, height=80, focal=1000.0, centre=(30.0, 40.0), distance=0.25, black=0.0, white=1.0)
 
     def rows_above(moved: float) -> float:
         pose = Pose(dy=-moved * scene.distance / scene.focal)

@@ -76,13 +76,28 @@ def test_a_tilt_of_the_plate_is_seen_and_does_not_turn_theta() -> None:
     assert [answer.phi, answer.omega] == pytest.approx([0.12, -0.1], abs=0.01)
 
 
-def test_without_a_lens_the_spacing_is_the_scale() -> None:
-    poses = [*STILL, Pose(2e-3, -1e-3, 0.1)]
-    settings = CameraSettings(spacing=0.025, radius=0.008)
-    answer = measured(Scene(turn=0.2), poses, settings)[-1]
-    assert [answer.dx, answer.dy] == pytest.approx([2e-3, -1e-3], abs=5e-6)
-    # The image of one turn says no more of the angle: over other noise its error is 1e-4.
-    assert answer.theta == pytest.approx(0.1, abs=2e-4)
+@pytest.mark.parametrize('tilt', [(0.0, 0.0), (0.1, -0.08)], ids=['frontal', 'from the side'])
+def test_without_a_lens_what_is_said_of_the_error_is_its_size(tilt: tuple[float, float]) -> None:
+    """The mirrored tilt is no error of dX, dY or theta, and perspective is seen without knowing the focal length."""
+    rng = np.random.default_rng(8)
+    shifts = rng.uniform(-3e-3, 3e-3, (10, 2)).tolist()
+    moved = [Pose(x, y, rng.uniform(-0.05, 0.05), -2.6 * y, 2.6 * x) for x, y in shifts]
+    settings = CameraSettings(spacing=0.025, radius=0.008, rest_frames=2)
+    answers = measured(Scene(turn=0.2, tilt=tilt), STILL + moved, settings)[2:]
+    assert_within(answers, moved, 4.0)
+    sd = np.sqrt(np.diagonal(np.array([a.covariance for a in answers]), axis1=1, axis2=2))
+    off = np.array([[a.dx - p.dx, a.dy - p.dy, a.theta - p.theta] for a, p in zip(answers, moved, strict=True)])
+    assert 0.4 < np.sqrt(np.mean((off / sd) ** 2)) < 1.6
+    assert np.all(np.median(sd, axis=0) < [1.5e-6, 1.5e-6, math.radians(0.01)]), sd
+
+
+def test_without_a_lens_a_plate_that_came_nearer_is_not_known_to_a_micrometre() -> None:
+    """Its picture away from the middle of the image moves as that of a displacement does."""
+    scene, near = Scene(aim=(0.01, 0.0)), Pose(z=0.04)
+    settings = CameraSettings(spacing=0.025, radius=0.008, rest_frames=2)
+    answer = measured(scene, [*STILL, near], settings)[-1]
+    assert answer.covariance is not None
+    assert 0.5e-3 < abs(answer.dx) < 3.0 * math.sqrt(answer.covariance[0, 0])
 
 
 def test_the_mean_over_the_exposure_is_what_counts() -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from blind.modes import RATE, Link, driven, rung, scored
+from blind.modes import RATE, Link, bound, driven, rung, scored
 from psd_deflection.identification.modes import modes_of
+from psd_deflection.records import FloatArray
 
 
 @pytest.mark.statistics
@@ -86,3 +89,20 @@ def test_noise_has_no_mode() -> None:
 def test_too_little_has_no_mode() -> None:
     assert modes_of(np.full(5000, np.nan), RATE).modes == ()
     assert modes_of(np.zeros(50), RATE).modes == ()
+
+
+def test_the_bound_of_a_record_is_that_of_its_spectrum() -> None:
+    """By differences of the logarithm on an even grid."""
+    hertz, zeta, seconds = 14.0, 0.02, 60.0
+    f = np.arange(1, 120_000) / 240.0
+
+    def log_spectrum(p: FloatArray) -> FloatArray:
+        x = (f / hertz) ** 2 * math.exp(-2.0 * p[0])
+        sharp = 4.0 * (zeta * math.exp(p[1])) ** 2 * x
+        mode = 4e-8 * 4.0 * zeta / (math.pi * hertz) * math.exp(p[2]) / ((1.0 - x) ** 2 + sharp)
+        return np.asarray(np.log(mode + 4e-12 / 500.0 * math.exp(p[3])))
+
+    slopes = np.stack([(log_spectrum(1e-5 * e) - log_spectrum(-1e-5 * e)) / 2e-5 for e in np.eye(4)])
+    information = seconds * (slopes @ slopes.T) / 240.0
+    expected = np.sqrt(np.linalg.inv(information).diagonal())[:2]
+    np.testing.assert_allclose(bound(Link(((hertz, zeta, 1.0),)), seconds), expected, rtol=2e-3)

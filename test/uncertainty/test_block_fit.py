@@ -119,11 +119,39 @@ def test_a_load_that_is_switched_inside_the_block_widens_it() -> None:
         fit.fit(ALL, rng.normal(0.0, SIGMA, (SIZE, 4)))
     t = np.maximum(ALL - 6, 0) * 1e-3
     dots = rng.normal(0.0, SIGMA, (SIZE, 4))
-    dots[:, 1] += 8.5 * t**2
+    dots[:, 1::2] += 8.5 * t[:, None] ** 2
     fitted = fit.fit(ALL, dots)
     assert fitted.misfit
     error = fitted.dots[1] - 8.5 * 3.5e-3**2
     assert abs(error) < 3.0 * fitted.covariance[1, 1] ** 0.5
+
+
+@pytest.mark.parametrize('combination', range(4))
+def test_what_bends_in_one_block_is_motion_but_not_of_the_base_line(combination: int) -> None:
+    """Five standard deviations of order 2: the link may do that, the base line between the dots cannot."""
+    fit, turn, q = fitter(), combinations(PLACES), basis(SIZE)
+    fitted = fit.fit(ALL, 5.0 * SIGMA * q[:, 2:3] * turn[combination])
+    at_the_stamp = float(turn[combination] @ fitted.dots)
+    followed = 5.0 * SIGMA * float(np.interp(9.5, ALL, q[:, 2]))
+    assert at_the_stamp / followed == pytest.approx(0.0 if combination == 3 else 0.96, abs=0.03)
+
+
+@pytest.mark.statistics
+def test_what_is_stated_of_a_dying_motion_is_its_error() -> None:
+    """A mode of 14 Hz with 2 % of damping, from 0.1 mm to nothing: motion that is over is stated no longer."""
+    rng = np.random.default_rng(4)
+    squares = []
+    for _ in range(24):
+        fit, phase = fitter(), rng.uniform(0.0, 6.28)
+        for block in range(180):
+            t = 0.02 * block + (ALL - 9.5) * 1e-3
+            where, truth = (
+                1e-4 * np.exp(-1.76 * at) * np.cos(88.0 * at + phase) for at in (t, np.array([0.02 * block]))
+            )
+            fitted = fit.fit(ALL, rng.normal(0.0, SIGMA, (SIZE, 4)) + where[:, None] * [1.0, 0.0, 1.0, 0.0])
+            if block >= 60:
+                squares.append((fitted.dots[0] - truth[0]) ** 2 / fitted.covariance[0, 0])
+    assert 0.85 < np.mean(squares) < 1.05
 
 
 def test_another_fit_goes_on_from_the_state_to_the_bit() -> None:

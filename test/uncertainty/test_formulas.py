@@ -46,15 +46,13 @@ def test_an_autocovariance_is_the_mean_product_of_what_is_left_of_a_line() -> No
     series = e[1:] + 0.5 * e[:-1] + np.outer(np.arange(n), [1e-2, -2e-2, 0.0]) + [5.0, 0.0, -3.0]
     series[:, 1] += 0.3 * series[:, 0]
     left = series - np.column_stack([np.polyval(np.polyfit(np.arange(n), s, 1), np.arange(n)) for s in series.T])
-    got = noise._autocovariance(np.arange(n), series, n, SIZE)
+    got, sure = noise._autocovariance(np.arange(n), series, n, SIZE)
     every = np.array([left[: n - lag].T @ left[lag:] / (n - lag) for lag in range(100)])
     for lag in (0, 1, 7, 19):
         want = every[lag] + put_back(every)
-        np.testing.assert_allclose(got[:2, :2, lag], want[:2, :2], atol=2e-3 * want[1, 1] if lag == 0 else 1e-9)
-        assert got[2, 2, lag] == pytest.approx(want[2, 2], rel=2e-3, abs=1e-9)
-    # The last has no covariance with the others.
-    assert not got[2, :2].any()
-    assert not got[:2, 2].any()
+        np.testing.assert_allclose(got[:, :, lag], want, atol=1e-9)
+    # Without gaps all but what the ends cost is sure.
+    np.testing.assert_allclose(sure, 1.0 - np.arange(SIZE) / n)
 
 
 def test_an_autocovariance_leaves_gaps_out() -> None:
@@ -63,13 +61,30 @@ def test_an_autocovariance_leaves_gaps_out() -> None:
     keep = np.sort(rng.choice(n, 7 * n // 10, replace=False))
     e = rng.normal(size=(n + 1, 1))
     series = np.tile(e[1:] + 0.5 * e[:-1], (1, 2))[keep]
-    got = noise._autocovariance(keep, series, n, SIZE)
+    got, sure = noise._autocovariance(keep, series, n, SIZE)
     line = np.polyval(np.polyfit(keep, series[:, 0], 1), keep)
     here = np.full(n, np.nan)
     here[keep] = series[:, 0] - line
     every = np.array([np.nanmean(here[: n - lag] * here[lag:]) for lag in range(100)])
-    for lag in (1, 2, 13):
+    for lag in (0, 1, 2, 13):
         assert got[0, 0, lag] == pytest.approx(every[lag] + put_back(every[:, None, None]).item(), abs=1e-9)
+    # Times the share of pairs that are there, over the least of them.
+    pairs = np.array([np.isin(keep + lag, keep).sum() / (n - lag) for lag in range(SIZE)])
+    np.testing.assert_allclose(sure / (1.0 - np.arange(SIZE) / n), pairs / pairs.min(), rtol=1e-9)
+
+
+def test_of_what_is_no_covariance_as_little_as_makes_it_one_is_taken_off() -> None:
+    """A correlation of 0.8 with the next of three samples and none with the last: 0.707 is the most there may be."""
+    each, sure = np.zeros((1, 1, 3)), np.array([1.0, 0.5, 1.0])
+    each[0, 0, :2] = 1.0, 0.8
+    root_half = 0.5**0.5
+    made = noise._covariance(each, sure)[0, 0]
+    # Three tenths of what is taken off if all is made sure.
+    np.testing.assert_allclose(made, [1.001, 0.8 * 0.85, 0.0], rtol=1e-9)
+    assert made[1] < root_half < 0.8 * 0.95
+    # What is one is left as it is, but for a thousandth of its own.
+    each[0, 0, 1] = 0.7
+    np.testing.assert_allclose(noise._covariance(each, sure)[0, 0], [1.001, 0.7, 0.0], rtol=1e-9)
 
 
 @pytest.mark.parametrize('hum', [0.0, 3.0])
@@ -79,7 +94,10 @@ def test_hum_is_not_taken_for_what_a_line_takes_off(hum: float) -> None:
     t = np.arange(100 * n).reshape(100, n)
     lines = hum * np.sin(2.0 * np.pi * 0.06 * t)
     found = np.mean(
-        [noise._autocovariance(t[0], np.column_stack((r, r)), n, SIZE)[0, 0] for r in rng.normal(size=t.shape) + lines],
+        [
+            noise._autocovariance(t[0], np.column_stack((r, r)), n, SIZE)[0][0, 0]
+            for r in rng.normal(size=t.shape) + lines
+        ],
         axis=0,
     )
     lags = np.arange(SIZE)
@@ -122,21 +140,22 @@ def test_what_noise_does_not_dither_stays_as_an_error_of_rounding(sigma: float) 
 
 def stream() -> StreamNoise:
     out = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0)
-    out._judge(white(1.0), white(1.0)[0, 0], np.full(8, SIGMA**2))
+    out._judge(white(1.0), np.ones(SIZE), white(1.0)[0, 0], np.full(8, SIGMA**2))
     out._seen = 5
     out.gamma = out._in_use()
     return out
 
 
 def level(of: StreamNoise) -> float:
-    return float(of._in_use()[0, 0, 0]) / SIGMA**2
+    # A thousandth is added as a reading's own.
+    return float(of._in_use()[0, 0, 0]) / 1.001 / SIGMA**2
 
 
 def judge(of: StreamNoise, times: float, rough: float | None = None) -> None:
     """A segment at rest with so much variance; ``rough``: of the combinations that move, if it is not that."""
     roughness = np.full(8, times * SIGMA**2)
     roughness[:3] *= 1.0 if rough is None else rough
-    of._judge(white(times), white(times)[0, 0], roughness)
+    of._judge(white(times), np.ones(SIZE), white(times)[0, 0], roughness)
 
 
 def test_a_segment_joins_the_mean_of_the_last_twenty() -> None:
