@@ -14,6 +14,9 @@ With --next, DIR also gets next_loads.csv: the loads of the recording that best 
 explain these recordings equally well; simulate --loads takes it. With --run that recording is made on the
 simulated rig and searched, and so on, until the answer is unique or no recording within the limits would help.
 
+REC may also be a table of readings: a .csv with one row for each load that was hung on the link, and no times. Such
+tables have no set-up check, law or --next.
+
 All REC together are one experiment. With --each every REC, or .yaml list, is one for itself: DIR/REC gets its files, or
 X.parquet a row. REC may then be a pattern, or a .txt file that lists recordings and patterns.
 
@@ -55,12 +58,14 @@ from psd_deflection.config import Rig, load_rig
 from psd_deflection.discovery.discover import Discovery, discover
 from psd_deflection.discovery.loop import Settled, next_of, settle
 from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.plants import discover_in
+from psd_deflection.discovery.readings import Readings, ReadingsPlant
 from psd_deflection.discovery.report import report_html
 from psd_deflection.discovery.result import model_yaml, result, sentence
 from psd_deflection.errors import UsageError
 from psd_deflection.fleet.parquet import Field
 from psd_deflection.parameter_files import with_effects_section, with_values
-from psd_deflection.recordings.observations import read_observations
+from psd_deflection.recordings.observations import read_observations, read_tables
 from psd_deflection.simulation.catalogue import FOLDERS, effect_folders, effect_names, effects_to_values
 from psd_deflection.simulation.declaration import ActiveEffect
 from psd_deflection.simulation.laws import Law, effect_of, law_text, values_of
@@ -141,6 +146,9 @@ def run(args: argparse.Namespace) -> int:
     if not args.make_it:
         refuse(args, {'effect': [], 'world': [], 'at_most': 3}, 'is for the simulated rig of --next --run')
     out = Path(args.out)
+    tables = asked.tables(args.recordings, warn)
+    if tables:
+        return _tables(args, asked, tables)
     with told('reading', quiet=args.quiet or args.json):
         observations = asked.read(args.recordings, warn)
     make_writable(args.out)
@@ -243,6 +251,11 @@ class Asked:
         given = None if self.params_file is None else load_rig(self.params_file)
         return read_observations(recordings, given, namespace=self.namespace, warn=tell, any_rate=True)
 
+    def tables(self, recordings: Sequence[str], tell: Callable[[str], None]) -> list[Readings]:
+        """The tables of readings; none if ``recordings`` are none."""
+        given = None if self.params_file is None else load_rig(self.params_file)
+        return read_tables(recordings, given, tell)
+
     def rig(self, observations: Sequence[Observation]) -> Rig:
         """The known rig."""
         return observations[0].rig if self.params_file is None else load_rig(self.params_file)
@@ -262,7 +275,7 @@ class Asked:
         laws = self.laws(found)
         effects = _with_law(found, laws) if self.adopt is not None and laws else found.active_effects
         return {
-            'model.yaml': _model(self.params_file, self.rig(observations), found, effects),
+            'model.yaml': _model(self.params_file, self.rig(observations), effects, found.lines),
             'result.json': json.dumps(result(found), indent=1, allow_nan=False) + '\n',
             'report.html': page,
             **{
@@ -270,6 +283,32 @@ class Asked:
                 for law in laws
             },
         }
+
+
+def _tables(args: argparse.Namespace, asked: Asked, tables: Sequence[Readings]) -> int:
+    """The search in tables of readings."""
+    refuse(args, {'next': False, 'adopt': None}, 'is for recordings: a table of readings has no times')
+    make_writable(args.out)
+    plant = ReadingsPlant(tables, asked.without)
+    with told('searching', quiet=args.quiet or args.json):
+        found = discover_in(plant, seed=asked.seed)
+    rig = tables[0].rig if asked.params_file is None else load_rig(asked.params_file)
+    effects = [*plant.known, *(e.active for e in found.effects)]
+    files = {
+        'model.yaml': _model(asked.params_file, rig, effects),
+        'result.json': json.dumps(result(found), indent=1, allow_nan=False) + '\n',
+        'report.html': report_html(found),
+    }
+    out = Path(args.out)
+    save_all(files, out)
+    if args.json:
+        print(files['result.json'].removesuffix('\n'))  # noqa: T201 - no control characters, and its lines may be long
+        return 0
+    show(sentence(found))
+    for unknown in found.unknown:
+        show(f'unknown: {unknown.signature}')
+    show(f'{found.simulations} forward simulations; see {out / "report.html"}')
+    return 0
 
 
 def answer_of(path: str, asked: Asked) -> Answer:
@@ -333,16 +372,21 @@ def _with_law(found: Discovery, laws: Sequence[Law]) -> list[ActiveEffect]:
     return [*found.known, *beside, *(ActiveEffect(effect_of(law), values_of(law)) for law in laws)]
 
 
-def _model(params_file: str | None, rig: Rig, found: Discovery, effects: Sequence[ActiveEffect]) -> str:
+def _model(
+    params_file: str | None,
+    rig: Rig,
+    effects: Sequence[ActiveEffect],
+    lines: Mapping[str, object] | None = None,
+) -> str:
     """The user's parameter file with the effects, comments kept; without one what describes the rig.
 
-    What was wrong in the rig file is right in the model.
+    ``lines``: what was wrong in the rig file, put right.
     """
 
     def edit(text: str, path: Path) -> str:
         text = with_effects_section(text, effects_to_values(effects), path)
-        if not found.lines:
+        if not lines:
             return text
-        return with_values(text, found.lines, f'Put right by psd-deflection {__version__}', path)
+        return with_values(text, lines, f'Put right by psd-deflection {__version__}', path)
 
     return rig_file(params_file, 'model.yaml', lambda: model_yaml(rig, effects), edit)

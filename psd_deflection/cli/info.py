@@ -1,7 +1,7 @@
 """Summarise a recording: duration, samples, losses, topics, device and changed parameters.
 
 The whole recording is read, so that damage anywhere is found. Of several recordings you get a table. REC may also be
-a pattern, or a .txt file that lists recordings and patterns.
+a pattern, or a .txt file that lists recordings and patterns. A table of readings (a CSV without times) is told as one.
 
   psd-deflection info bags/clean
   psd-deflection info recordings/psd_20260101_120000 --json
@@ -34,6 +34,7 @@ from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show
 from psd_deflection.fleet.parquet import Field, ParquetFile
 from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.readings_table import described, is_table
 from psd_deflection.recordings.summary import summary
 
 _EPOCH_FROM_NS = 10**18
@@ -79,7 +80,15 @@ def run(args: argparse.Namespace) -> int:
     names = several(args)
     if names is not None:
         return _many(args, names)
-    recording = open_recording(Path(args.recordings[0]), namespace=args.namespace)
+    path = Path(args.recordings[0])
+    if is_table(path):
+        told_of = described(path)
+        if args.json:
+            print_json({'path': str(path), 'table': told_of}, indent=2)
+        else:
+            show(f'{path}: a table of readings', *(f'  {name:<12} {text}' for name, text in told_of))
+        return 0
+    recording = open_recording(path, namespace=args.namespace)
     with told('counting messages', quiet=args.json):
         topics = recording.topics()
     found = summary(recording, topics, progress_of(recording.blocks(), topics.get(SAMPLES), quiet=args.json))

@@ -28,6 +28,8 @@ independent effects reach odds of N at most once in N searches.
 """
 EXACT = 0.003
 """Relative; no ratio is trusted to better, because a stand-in matches the true cause only approximately."""
+STIFFNESSES = frozenset(('bending_stiffness', 'torsional_stiffness'))
+"""What one radius ties; :mod:`.ties` tells that cause."""
 _SAME_UNIT: Mapping[str, str] = {'rad': ''}
 
 
@@ -60,8 +62,12 @@ def coincidences(fit: Fit, physics: Physics | None) -> list[Coincidence]:
     """The ties between amplitudes of different effects of ``fit`` that are beyond chance, the strongest first."""
     covariance = fit.covariance()
     sizes = _amplitudes(fit, physics, covariance)
+    of = [fit.effects[fit.free[size[0]][0]].effect.name for size in sizes]
     compared = [
-        (a, b) for a, b in itertools.combinations(sizes, 2) if fit.free[a[0]][0] != fit.free[b[0]][0] and a[2] == b[2]
+        (a, b)
+        for (a, first), (b, second) in itertools.combinations(zip(sizes, of, strict=True), 2)
+        # Of the two stiffnesses the common cause is known.
+        if fit.free[a[0]][0] != fit.free[b[0]][0] and a[2] == b[2] and {first, second} != STIFFNESSES
     ]
     out = []
     for (j, a, unit), (k, b, _) in compared:

@@ -24,8 +24,9 @@ class Comparison(ABC):
     ``nuisance``: effects that every model has and that every refit adjusts; they are never named. ``case``: the load
     case of each column, counted over all recordings. ``first``: names of effects that are only looked for before any
     other is found; ``setup``: of those that are mistakes of the set-up. ``open_level``: the level of what remains is
-    fitted too, because nobody knows how exact the model of the machine is. ``budget``: forward simulations after which
-    nothing more is added; the alternatives end at twice as many. ``digits``: format of a gap in the sentence.
+    fitted too, because nobody knows how exact the model of the machine is. ``budget``: forward simulations for each
+    effect of the model after which nothing more is added; the alternatives end at twice as many. ``digits``: format of
+    a gap in the sentence.
     """
 
     physics: Physics | None

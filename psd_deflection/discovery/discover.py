@@ -78,8 +78,8 @@ class Discovery(Conclusion):
         return [*self.known, *(e.active for e in self.effects)]
 
 
-def _proposals(workspace: Workspace) -> dict[str, list[float]]:
-    raw = workspace.raw_residual(workspace.base)
+def _proposals(workspace: Workspace, effects: Sequence[ActiveEffect] = ()) -> dict[str, list[float]]:
+    raw = workspace.raw_residual([*workspace.base, *effects])
     observations = workspace.observations
     noise = float(observations[0].rig.noises.max())
     sigmas, periods = [n.sigma for n in workspace.noise], [o.period for o in observations]
@@ -153,7 +153,12 @@ def discover(
         more = mistakes(len(observations), delays, likely_jumps(ws, residual))
         more = [e for e in more if e.name not in FIRST or e.name in looked_for]
         library = [e for e in catalogue().values() if e.name not in without and not e.lattice]
-        listed = candidates([*library, *more], physics, found)
+        values: Mapping[str, list[float]] = found
+        if current is not None and current.effects:
+            # A large effect hides the spectral lines of a small one.
+            beside = _proposals(workspace, current.effects)
+            values = {name: [*seen, *(v for v in beside[name] if v not in seen)] for name, seen in found.items()}
+        listed = candidates([*library, *more], physics, values)
         if current is None or not far(current):
             return Screen(ws, [(c, kept.get(c, ws)) for c in listed])
         # A large effect changes the signatures of the others.

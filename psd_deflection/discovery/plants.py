@@ -81,6 +81,7 @@ class Plant(ABC):
     left out of the fit in one piece to test it (a length, a trajectory). ``library``: the effects that may be missing;
     ``nuisance``: those whose size is not known, which every model has and which are never named. ``noise``: of each
     channel, rms; empty if not known. ``period``: s between the columns; 0: every column is a reading by itself.
+    ``physics``: of a PSD rig, whose effects have bounds that depend on it.
     """
 
     channels: tuple[str, ...]
@@ -90,6 +91,7 @@ class Plant(ABC):
     nuisance: tuple[Effect, ...] = ()
     noise: tuple[float, ...] = ()
     period: float = 0.0
+    physics: Physics | None = None
 
     @abstractmethod
     def measured(self) -> Sequence[FloatArray]:
@@ -103,6 +105,18 @@ class Plant(ABC):
         """What was done to the machine, by name: of each case (n,). What remains is held against it."""
         return {}
 
+    def simulate_effects(self, effects: Sequence[ActiveEffect]) -> Sequence[FloatArray]:
+        """What the search calls: :meth:`simulate`, unless a plant may have one effect several times."""
+        return self.simulate({a.effect.name: dict(a.values) for a in effects})
+
+    def parts(self) -> Sequence[IntArray]:
+        """Of each case, the part (n,), from 0, that each column is in. A part is left out of the fit in one piece to
+        test it: by default the whole case, or a piece of it where there are few cases.
+        """
+        pieces = -(-FOLDS // len(self.cases))
+        counts = [np.shape(m)[1] for m in self.measured()]
+        return [np.arange(n) * pieces // n for n in counts]
+
 
 def _table(rows: object, source: str) -> FloatArray:
     try:
@@ -115,16 +129,15 @@ def _table(rows: object, source: str) -> FloatArray:
 class PlantComparison(Comparison):
     """A plant's cases, measured and simulated. Raises ConfigError if its tables do not fit each other."""
 
-    physics: None
     open_level = True
     budget = BUDGET
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
-        self.physics = None
+        self.physics = plant.physics
         self.simulations = 0
         self.base = ()
-        self.nuisance = tuple(ActiveEffect(e, e.off_values(None, next(e.variants()))) for e in plant.nuisance)
+        self.nuisance = tuple(ActiveEffect(e, e.off_values(plant.physics, next(e.variants()))) for e in plant.nuisance)
         tables = plant.measured()
         if len(tables) != len(plant.cases):
             raise ConfigError(f'measured: {len(tables)} tables for {len(plant.cases)} cases')
@@ -148,9 +161,8 @@ class PlantComparison(Comparison):
             if count < 2:
                 raise ConfigError(f'measured: {name} has {count} values in all: must be at least 2')
         self.case: list[IntArray] = []
-        pieces = -(-FOLDS // len(self.measured))
-        for i, m in enumerate(self.measured):
-            self.case.append(i * pieces + np.arange(m.shape[1]) * pieces // m.shape[1])
+        for part in plant.parts():
+            self.case.append(part + (int(self.case[-1].max()) + 1 if self.case else 0))
         self.known = np.array(plant.noise or (0.0,) * len(plant.channels))
         self.shares = len(set(plant.units)) > 1
         self.whole = np.ones(len(plant.channels))
@@ -186,8 +198,7 @@ class PlantComparison(Comparison):
     def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
         """The plant's own simulation. Raises ConfigError if it does not fit what was measured or is not finite."""
         self.simulations += 1
-        model = {a.effect.name: dict(a.values) for a in effects}
-        simulated = self.plant.simulate(model)
+        simulated = self.plant.simulate_effects(effects)
         if len(simulated) != len(self.measured):
             raise ConfigError(f'simulate: {len(simulated)} tables for {len(self.measured)} cases')
         out = []
@@ -196,6 +207,7 @@ class PlantComparison(Comparison):
             if table.shape != m.shape:
                 raise ConfigError(f'simulate, {name}: has the shape {table.shape}: must be that of measured, {m.shape}')
             if not np.isfinite(table[there]).all():
+                model = {a.effect.name: dict(a.values) for a in effects}
                 raise ConfigError(f'simulate, {name}: not finite with {model}: narrow the bounds of these parameters')
             out.append(table)
         return out
@@ -415,7 +427,7 @@ def discover_in(plant: Plant, *, seed: int = 0, progress: Callable[[str], None] 
 
     def screen(_: Comparison, current: Fit | None) -> Screen:
         beside = refit(ws, (), nuisance=null.nuisance) if current is None else current
-        return Screen(ws, signatures_beside(ws, candidates(plant.library, None, {}), beside))
+        return Screen(ws, signatures_beside(ws, candidates(plant.library, plant.physics, {}), beside))
 
     def look(fit: Fit, _: Fit) -> Localisation:
         return _where(ws, fit, fit.jacobian if fit.free else None)
@@ -444,7 +456,7 @@ def discover_in(plant: Plant, *, seed: int = 0, progress: Callable[[str], None] 
     unknown = (
         unknown_of(left, explained, after, ws.floor(), worded=ws.worded)
         or unsaid(ws, before, after)
-        or tied(coincidences(fit, None), fit, result, first)
+        or tied(coincidences(fit, plant.physics), fit, result, first)
     )
     held = heldout_tables(ws, fit)
     return PlantDiscovery(

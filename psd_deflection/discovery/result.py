@@ -13,6 +13,7 @@ from psd_deflection.config import Rig
 from psd_deflection.declarations import DESCRIPTION
 from psd_deflection.discovery.discover import Discovery
 from psd_deflection.discovery.laws import FoundLaw
+from psd_deflection.discovery.ties import ties
 from psd_deflection.discovery.weighing import Conclusion, NamedEffect, Rival
 from psd_deflection.simulation.catalogue import effects_to_values
 from psd_deflection.simulation.declaration import ActiveEffect
@@ -97,6 +98,15 @@ def result(discovery: Conclusion) -> dict[str, Any]:
         'where': where,
         'effects': effects,
         'unknown': unknown,
+        'ties': [
+            {
+                'share': {'value': t.share, 'sd': t.sd},
+                'moves_frequency': t.moves,
+                'causes': [{'name': c.name, 'factor': {'value': c.factor, 'sd': c.sd}} for c in t.causes],
+                'sentence': t.sentence,
+            }
+            for t in ties(discovery.effects)
+        ],
         'setup': [
             {
                 'name': f.name,
@@ -216,13 +226,19 @@ def _setup(discovery: Discovery) -> str:
 def sentence(discovery: Conclusion) -> str:
     """The verdict in one sentence, after one about the set-up if that is wrong."""
     if not isinstance(discovery, Discovery):
-        return _missing(discovery)
+        return _missing(discovery) + _tied(discovery)
     return (
         _setup(discovery)
         + _missing(discovery, ' besides' if discovery.setup else '')
+        + _tied(discovery)
         + _moved(discovery)
         + _law(discovery)
     )
+
+
+def _tied(discovery: Conclusion) -> str:
+    """The one cause that two effects may have, in two sentences, or nothing."""
+    return ''.join(' ' + t.sentence for t in ties(discovery.effects))
 
 
 def _moved(discovery: Discovery) -> str:

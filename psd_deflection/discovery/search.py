@@ -33,6 +33,8 @@ NEARLY_ALL = 0.01
 """It is taken before any effect if it alone leaves less than this share of the chi-square beyond noise."""
 OTHER_RATES = (-0.2, -0.1, -0.04, 0.04, 0.1, 0.25)
 MAX_EFFECTS = 4
+ROUNDS = 3
+"""How often effects are added: again only if the noise beside those found is another than before."""
 TRIALS = 7
 PAIRS = 5
 PAIRS_OPEN = 15
@@ -135,6 +137,10 @@ class Search:
         """Forward simulations of this search."""
         return self.workspace.simulations - self._begun
 
+    def _budget(self, fit: Fit) -> int:
+        """Forward simulations that a model of this many effects may cost."""
+        return self.workspace.budget * max(1, len(fit.effects))
+
     def without_each(self, fit: Fit, null: Fit) -> list[Fit]:
         """``fit`` refitted without each of its effects in turn; ``null``: the fit of no effect."""
         kept = self._without.get(id(fit))
@@ -193,8 +199,26 @@ class Search:
         scores = self.screen.score(null.residual, unbound(null))
         first_scores = scores
         current = self._mistake(null, scores)
-        renoised = False
-        while len(current.effects) < MAX_EFFECTS and self.spent < self.workspace.budget:
+        for _ in range(ROUNDS):
+            null, current = self._grown(null, current)
+            current = self._drop(null, current)
+            if not current.effects:
+                break
+            calmer = self.renoise(current)
+            null = refit(ws, ())
+            if calmer is current:
+                break
+            # Noise that was estimated beside a large discrepancy may have hidden what is small.
+            current = calmer
+        current, others = self.swap(null, current)
+        p, delta_bic, delta_chi2 = self.weigh(null, current)
+        return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace)
+
+    def _grown(self, null: Fit, current: Fit) -> tuple[Fit, Fit]:
+        """The fit of no effect, and ``current`` with all that passes added."""
+        ws = self.workspace
+        renoised = bool(current.effects)
+        while len(current.effects) < MAX_EFFECTS and self.spent < self._budget(current):
             scores = self.screen.score(current.residual, unbound(current))
             taken = {slot(a.effect, a.values) for a in current.effects}
             scores = [
@@ -215,17 +239,11 @@ class Search:
                 renoised = True
                 current = self.renoise(current)
                 null = refit(ws, ())
-            if (far(current) or ws.open_level) and self.spent < self.workspace.budget:
+            if (far(current) or ws.open_level) and self.spent < self._budget(current):
                 self.screen = self._make_screen(ws, current)
-            if len(current.effects) == 2 and self.spent < self.workspace.budget:
+            if len(current.effects) == 2 and self.spent < self._budget(current):
                 current = self._try_pairs(null, current)
-        current = self._drop(null, current)
-        if current.effects:
-            current = self.renoise(current)
-            null = refit(ws, ())
-        current, others = self.swap(null, current)
-        p, delta_bic, delta_chi2 = self.weigh(null, current)
-        return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace)
+        return null, current
 
     def _further(self, current: Fit, scores: Sequence[Score]) -> Fit | None:
         """``current`` with the best further effect."""
@@ -270,7 +288,7 @@ class Search:
                 fits = self.alternatives(null, current, i, gains[i])
                 others.append(fits)
                 best = min([best, *fits], key=self._bic)
-            spent = self.spent > 1.5 * self.workspace.budget
+            spent = self.spent > 1.5 * self._budget(current)
             if swaps == 2 or spent or self._bic(best) > self._bic(current) - 2.0:
                 break
             self._say('swapping to ' + ', '.join(a.label for a in best.effects))
@@ -324,7 +342,7 @@ class Search:
 
         ``gain``: what the named effect explains, in chi-square; ``null``: the fit of no effect.
         """
-        if self.spent > 2 * self.workspace.budget:
+        if self.spent > 2 * self._budget(current):
             return []
         named = current.effects[index]
         rest = [a for j, a in enumerate(current.effects) if j != index]
@@ -345,12 +363,12 @@ class Search:
                 best[name] = s
         # The best eight: an exact confounder scores as high as the named effect itself. If the search was
         # already expensive, the case is complicated; try two only.
-        ranked = sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.spent < self.workspace.budget else 2]
+        ranked = sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.spent < self._budget(current) else 2]
         fits = []
         for s in ranked:
             start = [*rest, s.candidate.from_coefficients(s.coefficients)]
             quick = refit(self.workspace, start, iterations=10 if self.workspace.open_level else 3)
-            if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain) and self.spent < 2 * self.workspace.budget:
+            if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain) and self.spent < 2 * self._budget(current):
                 quick = refit(self.workspace, quick.effects, iterations=8)
             fits.append(quick)
         fits.sort(key=lambda f: f.chi2)

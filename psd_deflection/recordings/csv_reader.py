@@ -125,6 +125,8 @@ class CsvRecording(Recording):
             missing = [n for n in REQUIRED if n not in columns]
             if missing:
                 hint = ', between commas' if len(names) == 1 else ''
+                if 't' in missing and ('mass' in columns or LOAD_COLUMNS[0] in columns):
+                    hint += '; discover and info take a table of readings without times'
                 raise self._refuse(
                     f'the header lacks {", ".join(missing)}; a recording begins with {",".join(REQUIRED)}{hint}', number
                 )

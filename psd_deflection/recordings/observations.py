@@ -1,24 +1,28 @@
-"""Reads recordings for discover into arrays on a sample grid without gaps; loads and temperatures are held."""
+"""Reads recordings for discover into arrays on a sample grid without gaps, loads and temperatures held; and tables of
+readings.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from psd_deflection.calibration import Wiring
-from psd_deflection.config import Rig, check_two_psds, replace_values
+from psd_deflection.config import Rig, check_two_psds, load_rig, replace_values
 from psd_deflection.discovery.observation import Observation
+from psd_deflection.discovery.readings import Readings
 from psd_deflection.errors import ConfigError, RecordingError
 from psd_deflection.foreign_yaml import tree_of_file
 from psd_deflection.recordings.csv_reader import CsvRecording
 from psd_deflection.recordings.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.readings_table import KINDS, KNOWN, MILLIMETRES, ReadingsTable, is_table
+from psd_deflection.recordings.recording import TEMPERATURE_COLUMN, Recording
 from psd_deflection.recordings.replay_engine import check_psds, nominal_rig, rig_at_end
 from psd_deflection.recordings.simulated_recording import SimulatedRecording
-from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 
 
 def read_observation(
@@ -131,23 +135,28 @@ def read_observations(
 
     Raises ConfigError and RecordingError naming file and key.
     """
-    out: list[Observation] = []
+    return [
+        read_observation(source, rig, overrides, where, namespace=namespace, warn=warn, any_rate=any_rate)
+        for source, overrides, where in entries(sources)
+    ]
+
+
+def entries(
+    sources: Sequence[Recording | str | Path],
+) -> Iterator[tuple[Recording | Path, Mapping[str, object] | None, str]]:
+    """Each recording, or its path, that ``sources`` name, also in ``.yaml`` lists; with its overrides and where those
+    are from.
+    """
     for source in sources:
         if isinstance(source, Recording):
-            out.append(read_observation(source, rig, namespace=namespace, warn=warn, any_rate=any_rate))
+            yield source, None, ''
             continue
         path = Path(source)
         if path.suffix.lower() not in ('.yaml', '.yml') or path.name == 'metadata.yaml':
-            out.append(read_observation(path, rig, namespace=namespace, warn=warn, any_rate=any_rate))
+            yield path, None, ''
             continue
         for i, (name, overrides) in enumerate(_listed(path)):
-            entry = f'{path}: entry {i + 1}'
-            out.append(
-                read_observation(
-                    path.parent / name, rig, overrides, entry, namespace=namespace, warn=warn, any_rate=any_rate
-                )
-            )
-    return out
+            yield path.parent / name, overrides, f'{path}: entry {i + 1}'
 
 
 def _listed(path: Path) -> list[tuple[str, dict[str, object]]]:
@@ -174,3 +183,61 @@ def _listed(path: Path) -> list[tuple[str, dict[str, object]]]:
                 flat[str(key)] = value
         out.append((entry['recording'], flat))
     return out
+
+
+def read_readings(
+    path: Path,
+    rig: Rig | None = None,
+    overrides: Mapping[str, object] | None = None,
+    where: str = 'overrides',
+    warn: Callable[[str], None] | None = None,
+) -> Readings:
+    """One table with its rig (by default the nominal one), changed by ``overrides``, which are from ``where``.
+
+    ``warn`` is told what is not read. Raises RecordingError naming file, line, column and value, ConfigError for a bad
+    override.
+    """
+    table = ReadingsTable(path)
+    loads, names = table.loads(), table.values()
+    if rig is None:
+        rig = load_rig()
+    if overrides:
+        rig = replace_values(rig, overrides, where)
+    check_two_psds(rig, 'a comparison with the simulation')
+    values = table.columns(names, empty=True)
+    kind = KINDS[names]
+    if kind == 'dots':
+        channels = np.zeros((len(values), 6))
+        channels[:, list(DOT_CHANNELS)] = values
+        scale = 1e-3 if names == MILLIMETRES else rig.sensitivities.ravel()
+        values = Wiring.from_rig(rig).to_psds(channels)[:, list(DOT_CHANNELS)] * scale
+    for name, column in zip(names, values.T, strict=True):
+        if np.count_nonzero(np.isfinite(column)) < 2:
+            raise RecordingError(f'{path}: column {name} has less than 2 readings')
+    unknown = [n for n in table.names if n not in KNOWN]
+    if unknown and warn is not None:
+        warn(f'{path}:{table.head}: columns that are not read: {", ".join(unknown)}')
+    warm = table.column(TEMPERATURE_COLUMN) if TEMPERATURE_COLUMN in table.names else None
+    return Readings(str(path), rig, kind, loads, values, warm, digest_of(path))
+
+
+def read_tables(
+    sources: Sequence[Recording | str | Path],
+    rig: Rig | None = None,
+    warn: Callable[[str], None] | None = None,
+) -> list[Readings]:
+    """The tables among ``sources``, which may be ``.yaml`` lists; none if all are recordings.
+
+    Raises RecordingError if some are tables and some are recordings.
+    """
+    listed = list(entries(sources))
+    kinds = [is_table(source) for source, _, _ in listed]
+    if not any(kinds):
+        return []
+    if not all(kinds):
+        other = next(s for (s, _, _), table in zip(listed, kinds, strict=True) if not table)
+        name = other.path if isinstance(other, Recording) else other
+        raise RecordingError(f'{name}: is no table of readings, but others are: search them one by one')
+    if rig is None and warn is not None:
+        warn('a table of readings says nothing of its rig: the nominal rig is taken; give --params-file')
+    return [read_readings(Path(str(s)), rig, overrides, where, warn) for s, overrides, where in listed]

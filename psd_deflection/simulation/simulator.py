@@ -45,10 +45,12 @@ class ForwardModel:
     """The stages without noise and converter; keeps its state between calls.
 
     ``effects``: the active effects; by default those of the rig file. ``phase``: quantities are taken this
-    long after each sample, s.
+    long after each sample, s. ``settled``: the link comes to rest under each load before it is read.
     """
 
-    def __init__(self, rig: Rig, effects: Sequence[ActiveEffect] | None = None, phase: float = 0.0) -> None:
+    def __init__(
+        self, rig: Rig, effects: Sequence[ActiveEffect] | None = None, phase: float = 0.0, *, settled: bool = False
+    ) -> None:
         self.effects = tuple(effects_of_rig(rig) if effects is None else effects)
         self.physics = Physics.of(rig)
         self.physics.phase = phase
@@ -67,6 +69,7 @@ class ForwardModel:
             Filter(bending, self._at_rest[1]),
             Filter(torsion),
         )
+        self._settled = settled
         self._states: list[State] = [{} for _ in self.effects]
         self._count = 0
         self._first_temperature: float | None = None
@@ -98,7 +101,7 @@ class ForwardModel:
         samples.pose = np.empty((3, n))
         for axis, mode in enumerate(self._modes):
             held = samples.static[axis] + self._at_rest[axis] if axis < 2 else samples.static[axis]
-            samples.pose[axis] = mode(held)
+            samples.pose[axis] = held if self._settled else mode(held)
         self._at('pose', samples)
         samples.beams = np.repeat(p.beams.reshape(-1, 1), n, axis=1)
         self._at('beam', samples)
@@ -126,7 +129,7 @@ class ForwardModel:
             return samples.volts.copy()
         key = (before, phase)
         if key not in self._between:
-            self._between[key] = ForwardModel(self._rig, self.effects[:before], phase)
+            self._between[key] = ForwardModel(self._rig, self.effects[:before], phase, settled=self._settled)
         if key not in self._asked:
             self._asked[key] = self._between[key].run(loads, temperature).volts
         return self._asked[key].copy()

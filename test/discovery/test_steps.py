@@ -147,6 +147,36 @@ def test_at_most_four_effects_are_added_and_none_beyond_the_budget(monkeypatch: 
         assert len(searching(plant, shown, names).run().fit.effects) == effects
 
 
+def test_a_model_of_two_effects_may_cost_twice_as_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = pictures(A, B, C)
+    plant = Plant(shown, without_noise(*((shown[n], 900.0) for n in (A, B, C))) + noise())
+    trace = searching(plant, shown, 'abc').run().trace
+    first, second, third = (int(line.split('[')[1].rstrip(']')) for line in trace if line.startswith('adding'))
+    budget = third // 2 + 1
+    assert first < budget <= second
+    plant.simulations = 0
+    monkeypatch.setattr(plant, 'budget', budget)
+    assert named(searching(plant, shown, 'abc').run().fit) == ['a', 'b', 'c']
+
+
+def test_noise_estimated_beside_a_large_effect_hides_no_small_one() -> None:
+    shown = pictures(A, B)
+    shown[B] = across(shown[B], shown[A])
+
+    class Rough(Plant):
+        estimates = 0
+
+        def estimate_noise(self, effects: Sequence[ActiveEffect]) -> None:
+            # The first estimate takes what is left for noise, the next ones are right.
+            self.estimates += 1
+            level = np.full(6, SIGMA * (30.0 if self.estimates == 1 else 1.0))
+            self.noise = [dataclasses.replace(self.noise[0], innovation=level)]
+
+    plant = Rough(shown, without_noise((shown[A], 9e6), (shown[B], 900.0)) + noise())
+    assert named(searching(plant, shown, 'ab').run().fit) == ['a', 'b']
+    assert plant.estimates >= 2
+
+
 def test_of_two_that_explain_alike_the_better_one_stays_and_the_other_is_its_alternative() -> None:
     shown = pictures(A, B)
     shown[B] = shown[A] + 0.3 * across(shown[B], shown[A])

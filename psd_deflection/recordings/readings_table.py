@@ -1,0 +1,160 @@
+"""Reads a table of readings: a CSV with one row for each load that was hung on the link (docs/recording.md).
+
+It has no column ``t``, by which it is told from a recording.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from psd_deflection.errors import RecordingError
+from psd_deflection.recordings.recording import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN, Recording
+from psd_deflection.records import FloatArray
+
+GRAVITY = 9.80665
+"""m/s^2, standard."""
+MASS, ARM = 'mass', 'arm'
+VOLTS = ('x1', 'y1', 'x2', 'y2')
+MILLIMETRES = tuple(f'{name}_mm' for name in VOLTS)
+ESTIMATES = ('dx', 'dy', 'theta')
+KINDS: Mapping[tuple[str, ...], str] = {
+    VOLTS: 'dots',
+    MILLIMETRES: 'dots',
+    ESTIMATES: 'estimates',
+    REFERENCE_COLUMNS: 'poses',
+}
+"""The columns of each kind of readings."""
+KNOWN = frozenset((*LOAD_COLUMNS, MASS, ARM, TEMPERATURE_COLUMN, *(c for group in KINDS for c in group)))
+MAX_BYTES = 10_000_000
+FORM = (
+    'a table of readings has load_fx,load_fy,load_tz (N, N, N m) or mass (kg), and one of x1,y1,x2,y2 (V), '
+    'x1_mm,y1_mm,x2_mm,y2_mm, dx,dy,theta (m, m, rad) and ref_dx,ref_dy,ref_theta'
+)
+
+
+def is_table(source: Recording | str | Path) -> bool:
+    """Whether ``source`` is a CSV that says loads and no times. What cannot be read is none."""
+    if isinstance(source, Recording):
+        return False
+    path = Path(source)
+    if path.suffix.lower() != '.csv' or not path.is_file():
+        return False
+    try:
+        with path.open(encoding='utf-8-sig', newline='') as stream:
+            names = _names(next(csv.reader([stream.readline(10_000)], skipinitialspace=True), []))
+    except (OSError, UnicodeDecodeError, csv.Error):
+        return False
+    return 't' not in names and (MASS in names or bool(set(LOAD_COLUMNS) & set(names)))
+
+
+def _names(cells: Sequence[str]) -> list[str]:
+    return [c.strip() for c in cells]
+
+
+class ReadingsTable:
+    """The cells of one file by column. Raises RecordingError naming file and line if it is none."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            if path.stat().st_size > MAX_BYTES:
+                raise RecordingError(f'{path}: is larger than {MAX_BYTES // 1_000_000} MB: no table of readings')
+            text = path.read_text(encoding='utf-8-sig')
+        except OSError as error:
+            raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
+        except UnicodeDecodeError:
+            raise RecordingError(f'{path}: is not text in UTF-8') from None
+        reader = csv.reader(text.splitlines(), strict=True, skipinitialspace=True)
+        try:
+            rows = [(reader.line_num, cells) for cells in reader if any(c.strip() for c in cells)]
+        except csv.Error as error:
+            raise RecordingError(f'{path}:{reader.line_num}: is no row of a CSV ({error})') from None
+        if len(rows) < 2:
+            raise RecordingError(f'{path}: holds no row of readings')
+        (self.head, cells), *rows = rows
+        self.names = _names(cells)
+        for name in self.names:
+            if self.names.count(name) > 1 and name in KNOWN:
+                raise self.refuse(self.head, f'column {name} is there twice')
+        for line, cells in rows:
+            if len(cells) != len(self.names):
+                raise self.refuse(line, f'has {len(cells)} cells, the header has {len(self.names)}')
+        self.rows = rows
+
+    def refuse(self, line: int, why: str) -> RecordingError:
+        """The error for a line."""
+        return RecordingError(f'{self.path}:{line}: {why}')
+
+    def column(self, name: str, *, empty: bool = False) -> FloatArray:
+        """The numbers of a column; ``empty``: a cell without one is NaN, else an error."""
+        at = self.names.index(name)
+        out = []
+        for line, cells in self.rows:
+            cell = cells[at].strip()
+            if not cell and empty:
+                out.append(math.nan)
+                continue
+            try:
+                # Python takes `1_000` and digits of every script; in a table they are typing errors.
+                value = float(cell) if cell.isascii() and '_' not in cell else math.nan
+            except ValueError:
+                value = math.nan
+            if not math.isfinite(value):
+                raise self.refuse(line, f'column {name} holds {cell!r}, which is not a finite number')
+            out.append(value)
+        return np.array(out)
+
+    def columns(self, names: Sequence[str], *, empty: bool = False) -> FloatArray:
+        """The same of several columns (n, columns)."""
+        return np.column_stack([self.column(name, empty=empty) for name in names])
+
+    def loads(self) -> FloatArray:
+        """(n, 3) N, N, N m. A mass hangs ``arm`` m beside the link, towards +X."""
+        there = [n for n in LOAD_COLUMNS if n in self.names]
+        if there and MASS in self.names:
+            raise self.refuse(self.head, f'has {MASS} and {", ".join(there)}: only one of them says the load')
+        if MASS in self.names:
+            weight = GRAVITY * self.column(MASS)
+            arm = self.column(ARM) if ARM in self.names else np.zeros(len(weight))
+            return np.column_stack((np.zeros(len(weight)), -weight, -weight * arm))
+        lacking = [n for n in LOAD_COLUMNS if n not in self.names]
+        if lacking:
+            raise self.refuse(self.head, f'the header lacks {", ".join(lacking)}; {FORM}')
+        return self.columns(LOAD_COLUMNS)
+
+    def values(self) -> tuple[str, ...]:
+        """The names of the columns that hold readings."""
+        there = [group for group in KINDS if set(group) & set(self.names)]
+        if not there:
+            raise self.refuse(self.head, f'the header has no readings; {FORM}')
+        if len(there) > 1:
+            raise self.refuse(self.head, f'has {" and ".join(",".join(g) for g in there)}: leave one of them')
+        lacking = [n for n in there[0] if n not in self.names]
+        if lacking:
+            raise self.refuse(self.head, f'the header lacks {", ".join(lacking)} beside the other readings; {FORM}')
+        return there[0]
+
+
+def described(path: Path) -> list[tuple[str, str]]:
+    """What is in a table, by name, for people: rows, loads, readings, what is missing. Raises as read_readings does."""
+    table = ReadingsTable(path)
+    loads, names = table.loads(), table.values()
+    values = table.columns(names, empty=True)
+    distinct = np.unique(loads, axis=0)
+    out = [('rows', f'{len(loads)}, of {len(distinct)} different loads')]
+    for name, unit, column in zip(LOAD_COLUMNS, ('N', 'N', 'N m'), loads.T, strict=True):
+        out.append((name, f'{column.min():g} to {column.max():g} {unit}'))
+    out.append(('readings', f'{",".join(names)}; {np.count_nonzero(np.isnan(values))} of {values.size} are empty'))
+    if len(distinct) == len(loads):
+        out.append(('lacks', 'a load that is there twice: it would show how well readings repeat'))
+    if TEMPERATURE_COLUMN in table.names:
+        warm = table.column(TEMPERATURE_COLUMN)
+        out.append((TEMPERATURE_COLUMN, f'{warm.min():g} to {warm.max():g} °C'))
+    else:
+        out.append(('lacks', f'{TEMPERATURE_COLUMN}: thermal effects cannot be found'))
+    return out

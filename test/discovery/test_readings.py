@@ -1,0 +1,213 @@
+"""Tables of readings: one row for each load that was hung on the link."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psd_deflection.cli.main import main
+from psd_deflection.config import load_rig, replace_values
+from psd_deflection.discovery.plants import discover_in
+from psd_deflection.discovery.readings import CHANNELS, Readings, ReadingsPlant
+from psd_deflection.errors import ConfigError, RecordingError
+from psd_deflection.recordings.observations import read_tables
+from psd_deflection.recordings.readings_table import is_table
+from psd_deflection.records import FloatArray
+from psd_deflection.simulation.catalogue import make_active
+from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.simulation.simulator import ForwardModel
+
+RIG = load_rig()
+LOADS = np.array(
+    [
+        *((0, 0, 0), (0, -5, 0), (0, -10, 0), (0, -20, 0), (0, -30, 0), (0, -40, 0), (0, -10, -5.85)),
+        *((0, -30, -17.55), (0, -50, -29.25), (20, 0, 0), (-20, 0, 0), (0, 0, 0)),
+    ],
+    dtype=np.float64,
+)
+NOISE = 1e-6
+"""m or rad, of one reading."""
+
+
+def read(
+    effects: Sequence[ActiveEffect], kind: str = 'dots', length: float = RIG.link.length, seed: int = 0
+) -> Readings:
+    """What a rig with ``effects`` shows."""
+    rig = replace_values(RIG, {'link.length': length})
+    table = Readings('table', rig, kind, LOADS, np.zeros((len(LOADS), len(CHANNELS[kind]))))
+    values = 1e-6 * ReadingsPlant([table]).simulate_effects(effects)[0].T
+    return Readings(table.name, rig, kind, LOADS, values + np.random.default_rng(seed).normal(0.0, NOISE, values.shape))
+
+
+def written(path: Path, readings: FloatArray, header: str = 'x1_mm,y1_mm,x2_mm,y2_mm') -> Path:
+    """A table of millimetres."""
+    rows = [','.join(f'{v:.6g}' for v in (*load, *row)) for load, row in zip(LOADS, readings, strict=True)]
+    path.write_text('\n'.join((f'load_fx,load_fy,load_tz,{header}', *rows)) + '\n')
+    return path
+
+
+SOFT = make_active('bending_stiffness', {'scale': -0.05}, 'test')
+TURNED = make_active('sensor_rotation', {'psd': 2, 'angle': 0.02}, 'test')
+
+
+def test_a_table_names_what_the_rig_lacks_and_model_yaml_repairs_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = written(tmp_path / 'hung.csv', 1e3 * read([SOFT]).values)
+    assert main(['discover', str(table), '--out', str(tmp_path / 'found')]) == 0
+    answer = capsys.readouterr()
+    assert 'the nominal rig is taken; give --params-file' in answer.err
+    assert 'bending_stiffness' in answer.out
+    found = json.loads((tmp_path / 'found' / 'result.json').read_text())
+    (effect,) = found['effects']
+    # One length of the link does not tell stiffness from the clamp.
+    assert {effect['name'], *effect['equivalent']} == {'bending_stiffness', 'clamp_bending_compliance'}
+    assert found['gap']['heldout_after'] < 1.5 * 1e6 * NOISE < 10.0 < found['gap']['before']
+    repaired = load_rig(tmp_path / 'found' / 'model.yaml')
+    assert discover_in(ReadingsPlant(read_tables([table], repaired))).verdict == 'nothing_missing'
+
+
+def test_tables_of_two_lengths_tell_stiffness_from_the_clamp() -> None:
+    found = discover_in(ReadingsPlant([read([SOFT]), read([SOFT], length=0.4, seed=1)]))
+    (effect,) = found.effects
+    assert (effect.active.effect.name, effect.equivalent) == ('bending_stiffness', ())
+    assert effect.active.values['scale'] == pytest.approx(-0.05, abs=0.002)
+
+
+def test_estimates_show_a_turned_sensor_and_poses_of_another_device_do_not() -> None:
+    found = discover_in(ReadingsPlant([read([TURNED], 'estimates')], without=['axis_crosstalk']))
+    assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 2)']
+    assert discover_in(ReadingsPlant([read([TURNED], 'poses')])).verdict == 'nothing_missing'
+
+
+def test_one_effect_on_both_psds_is_simulated_for_both() -> None:
+    gains = [make_active('sensor_gain', {'psd': psd, 'y': 0.01}, 'test') for psd in (1, 2)]
+    plant = ReadingsPlant([read([])])
+    (both,), (first,), (none,) = (plant.simulate_effects(e) for e in (gains, gains[:1], []))
+    assert np.abs(both[3] - none[3]).max() > 10.0
+    np.testing.assert_array_equal(first[3], none[3])
+    (by_model,) = plant.simulate({'sensor_gain': gains[0].values})
+    np.testing.assert_array_equal(by_model, first)
+
+
+def test_what_depends_on_time_or_on_the_row_before_takes_no_part() -> None:
+    names = {e.name: e for e in ReadingsPlant([read([])], without=['refraction']).library}
+    assert not {'creep', 'clamp_friction', 'amplifier_lag', 'channel_skew', 'laser_pointing_drift', 'refraction'} & set(
+        names
+    )
+    assert {'bending_stiffness', 'sensor_gain', 'tip_force', 'thermal_drift'} <= set(names)
+    # Whether the mode moves with the stiffness makes no difference at rest.
+    assert len(list(names['bending_stiffness'].variants())) == 1
+
+
+def test_a_settled_reading_is_what_a_long_hold_ends_with() -> None:
+    effects = [make_active('self_weight', {'weight_per_length': 20.0}, 'test'), SOFT]
+    held = ForwardModel(RIG, effects).expect(np.tile(LOADS[8], (20_000, 1))).volts[:, -1]
+    settled = ForwardModel(RIG, effects, settled=True).expect(LOADS[8:9]).volts[:, 0]
+    np.testing.assert_allclose(settled, held, rtol=1e-9, atol=1e-9)
+
+
+def test_rows_of_one_load_are_left_out_together() -> None:
+    (parts,) = ReadingsPlant([read([])]).parts()
+    assert parts[0] == parts[-1]
+    assert sorted(set(parts.tolist())) == [0, 1, 2, 3, 4, 5]
+
+
+def test_the_rig_files_effects_are_in_the_model() -> None:
+    turned = {f'effects.turned.{k}': v for k, v in (('name', 'sensor_rotation'), ('psd', 2), ('angle', 0.02))}
+    table = read([TURNED])
+    known = Readings(table.name, replace_values(RIG, turned), 'dots', LOADS, table.values)
+    plant = ReadingsPlant([known])
+    assert [a.label for a in plant.known] == ['sensor_rotation (psd 2)']
+    (rows,) = plant.simulate_effects([])
+    assert np.std(rows - 1e6 * table.values.T) < 1.2e6 * NOISE
+
+
+def test_a_mass_is_a_weight_and_an_arm_its_torque(tmp_path: Path) -> None:
+    path = tmp_path / 'hung.csv'
+    path.write_text(
+        'mass,arm,x1,y1,x2,y2,temperature,by\n'
+        '0,0,0,0,0,0,20,me\n1,0,0.1,,0.3,0.4,21,me\n2,0.5,0,1,0,1,22,me\n3,0.5,0,1,0,1,22,me\n'
+    )
+    said: list[str] = []
+    (table,) = read_tables([path], warn=said.append)
+    np.testing.assert_allclose(table.loads[2], (0.0, -2.0 * 9.80665, -9.80665))
+    sensitivity = RIG.sensitivities.ravel()
+    np.testing.assert_allclose(table.values[1], np.array([0.1, np.nan, 0.3, 0.4]) * sensitivity)
+    assert table.temperature is not None
+    assert table.temperature.tolist() == [20.0, 21.0, 22.0, 22.0]
+    assert 'columns that are not read: by' in said[1]
+
+
+def test_a_table_has_the_wiring_of_the_rig(tmp_path: Path) -> None:
+    readings = np.arange(4.0 * len(LOADS)).reshape(-1, 4)
+    path = written(tmp_path / 'hung.csv', readings)
+    (table,) = read_tables([path], replace_values(RIG, {'psds_exchanged': True}))
+    np.testing.assert_allclose(table.values, 1e-3 * readings[:, [2, 3, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('mass,x1,y1,x2\n1,1,1,1\n', r':1: the header lacks y2 beside the other readings'),
+        ('mass,a\n1,1\n', r':1: the header has no readings; a table of readings has load_fx'),
+        ('load_fx,x1,y1,x2,y2\n1,1,1,1,1\n', r':1: the header lacks load_fy, load_tz; a table'),
+        ('mass,load_fx,x1,y1,x2,y2\n1,1,1,1,1,1\n', r':1: has mass and load_fx: only one'),
+        ('mass,x1,y1,x2,y2,dx,dy,theta\n1,1,1,1,1,1,1,1\n', r':1: has x1,y1,x2,y2 and dx,dy,theta: leave one'),
+        ('mass,mass,dx,dy,theta\n1,1,1,1,1\n', r':1: column mass is there twice'),
+        ('mass,dx,dy,theta\n1,1,1\n', r':2: has 3 cells, the header has 4'),
+        ('mass,dx,dy,theta\n1,1,1,1_0\n', r":2: column theta holds '1_0', which is not a finite number"),
+        ('mass,dx,dy,theta\n,1,1,1\n', r":2: column mass holds '', which is not"),
+        ('mass,dx,dy,theta\n1,1,1,inf\n', r":2: column theta holds 'inf', which is not"),
+        ('mass,dx,dy,theta\n1,1,1,1\n2,1,1,\n', r'column theta has less than 2 readings'),
+        ('mass,dx,dy,theta\n1,1,1,1\n2,1,1,1\n3,1,1,1\n', r'3 different loads: discover needs at least 4'),
+        ('mass,dx,dy,theta\n', r'holds no row of readings'),
+        ('mass,dx,dy,theta\n"1,1,1,1\n', r'is no row of a CSV'),
+    ],
+)
+def test_a_table_that_lacks_something_says_what(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / 'hung.csv'
+    path.write_text(text)
+    with pytest.raises(RecordingError, match=rf'hung\.csv.*{words}' if words.startswith(':') else words):
+        read_tables([path])
+
+
+def test_recordings_and_tables_of_two_kinds_are_searched_one_by_one(tmp_path: Path) -> None:
+    table = written(tmp_path / 'hung.csv', 1e3 * read([]).values)
+    (tmp_path / 'list.yaml').write_text('- hung.csv\n- recording: run.csv\n')
+    (tmp_path / 'run.csv').write_text('t,x1\n')
+    with pytest.raises(RecordingError, match=r'run\.csv: is no table of readings, but others are'):
+        read_tables([tmp_path / 'list.yaml'])
+    (tmp_path / 'list.yaml').write_text('- recording: hung.csv\n  overrides: {link.length: -1.0}\n')
+    with pytest.raises(ConfigError, match=r'list\.yaml: entry 1: link.length = -1'):
+        read_tables([tmp_path / 'list.yaml'])
+    with pytest.raises(RecordingError, match='one has x1,y1,x2,y2 and dx,dy,theta: search them one by one'):
+        ReadingsPlant([read([]), Readings('b', RIG, 'estimates', LOADS, np.zeros((len(LOADS), 3)))])
+    assert is_table(table)
+    assert not is_table(tmp_path / 'run.csv')
+    assert not is_table(tmp_path / 'none.csv')
+
+
+def test_options_for_recordings_are_refused_and_other_commands_say_who_takes_a_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = written(tmp_path / 'hung.csv', 1e3 * read([]).values)
+    assert main(['discover', str(table), '--out', str(tmp_path / 'found'), '--next']) == 2
+    assert '--next is for recordings: a table of readings has no times' in capsys.readouterr().err
+    assert main(['replay', str(table)]) != 0
+    assert 'discover and info take a table of readings without times' in capsys.readouterr().err
+
+
+def test_info_tells_of_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    readings = 1e3 * read([]).values
+    table = written(tmp_path / 'hung.csv', readings)
+    assert main(['info', str(table)]) == 0
+    text = capsys.readouterr().out
+    for part in ('a table of readings', '12, of 11 different loads', '-50 to 0 N', '0 of 48 are empty', 'temperature:'):
+        assert part in text
+    assert main(['info', str(table), '--json']) == 0
+    assert dict(json.loads(capsys.readouterr().out)['table'])['rows'] == '12, of 11 different loads'
