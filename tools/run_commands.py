@@ -56,7 +56,7 @@ CI_RUNS = (
     (
         r"^pip install 'psd_deflection\[(ros|monitor|pandas|camera|foxglove|dask|parquet)\]'$",
         'Makefile',
-        "pip install --quiet --disable-pip-version-check 'psd_deflection[",
+        "INSTALL,build/wheel/use) 'psd_deflection[",
     ),
     (r'^make doc-commands\b', '.ci/run', 'make doc-commands '),
     (r'^make wheel$|^pip install dist/\*\.whl', '.ci/run', 'make wheel '),
@@ -66,7 +66,7 @@ CI_RUNS = (
     (
         r"^pip install '\.\[ros,monitor\]'$",
         'Makefile',
-        "pip install --quiet --disable-pip-version-check '.[ros,monitor]'",
+        "INSTALL,$(VENV)) '.[ros,monitor]'",
     ),
     (r'^python -m bench\.live$', 'Makefile', 'python -m bench.live'),
     (r'^python bench/solvers\.py$', 'Makefile', 'python bench/solvers.py'),
