@@ -10,7 +10,7 @@ cost more than a few standard deviations.
 If one reading i alone is wrong, it is wrong by e_i = r/a_i. Which one, a single block cannot tell; so
 ``widen`` adds the errors that each of them would cause, sum_i (K_i e_i)(K_i e_i)^T with the solver's
 gain K and half as much again, and the truth stays inside. While the link rings, two wrong readings may
-cancel in r for a block; so r is held and forgotten over a second. Over many blocks and poses the wrong one
+cancel in r for a block; so r is held and forgotten over a second. An r that lasts is widened for at a smaller size than one of a single block. Over many blocks and poses the wrong one
 can often be told:
 the true reading of i is m_i - r/a_i if the others are right, and what i says of it must then follow
 one law: nothing (dead or stuck), or the opposite (inverted). If two readings would do, none is named.
@@ -36,6 +36,13 @@ UNMEASURED = 16.0
 WIDEN = 6.635
 """Chi-square from which one block is widened: 1 % of sound blocks, by less than their own errors."""
 
+LASTING = 2.5
+"""The same for the mean r of the last blocks, over the variance of one block. Hum of constant phase, which is in that
+variance, has at most 2."""
+
+_SLOWLY = 1.0 / 8.0
+"""Share of the newest block in that mean."""
+
 _MORE = 1.5
 """Times the error of one reading alone: the errors of two exchanged readings cancel in part in r."""
 
@@ -60,7 +67,7 @@ class Checked(NamedTuple):
 
     ``chi_square`` of this block. ``contradict``: this block or one shortly before is beyond ``LIMIT``.
     ``errors`` (4,): of each reading if it alone is wrong, m. ``possible`` (4,): what the covariance is to
-    allow for, m: the same from ``WIDEN`` on, or with the r that is held. Of more than two PSDs ``errors`` and
+    allow for, m: the same from ``WIDEN`` on, or with the r that is held or lasts. Of more than two PSDs ``errors`` and
     ``possible`` are (2P,), ``freedom`` counts the redundant readings, and ``wrong`` is the PSD (from 1) to leave out,
     0: none.
     """
@@ -74,10 +81,16 @@ class Checked(NamedTuple):
 
 
 class Consistency:
-    """Holds the readings of each block against each other; it remembers the r of the last second."""
+    """Holds the readings of each block against each other; it remembers the r of the last second.
+
+    ``held``: r^2 of a contradiction, m^2, or 0. ``mean``: of r over the last blocks, m. ``lasting``: r^2 of one that
+    lasts, m^2, or 0.
+    """
 
     def __init__(self) -> None:
         self.held = 0.0
+        self.mean = 0.0
+        self.lasting = 0.0
 
     def check(
         self, apart: tuple[float, float], residual: tuple[float, ...], covariance: FloatArray, *, limit: float = LIMIT
@@ -101,9 +114,15 @@ class Consistency:
         held = max(_FADE * self.held, r * r if contradict else 0.0)
         self.held = held if held > limit * variance else 0.0
         one_x, one_y = [1.0 / p if abs(p) > _UNSEEN else 0.0 for p in (ax, ay)]
+        self.mean += _SLOWLY * (r - self.mean)
+        square = self.mean * self.mean
+        # Chance takes the mean of an r that lasts below the limit for some blocks.
+        lasts = square * LIMIT > LASTING * limit * variance
+        lasting = max(_FADE * self.lasting, square if lasts else 0.0)
+        self.lasting = lasting if lasting > variance else 0.0
         # The limit's share: below it an error is not sure enough to be held, and may still be many standard deviations.
         doubtful = chi_square * LIMIT > WIDEN * limit
-        root = _MORE * max(self.held, r * r if doubtful else 0.0) ** 0.5
+        root = _MORE * max(self.held, self.lasting, r * r if doubtful else 0.0) ** 0.5
         errors = (r * one_x, r * one_y, -r * one_x, -r * one_y)
         possible = (root * one_x, root * one_y, -root * one_x, -root * one_y)
         return Checked(chi_square, self.held > 0.0, errors, possible)

@@ -347,8 +347,8 @@ class StampedDots:
             out[NOISE] = self.noise.state()
         if self.active:
             out[FIT] = self._fit.state()
-        if self._consistency.held > 0.0:
-            out[HELD_RESIDUAL] = (self._consistency.held,)
+        if self._consistency.held > 0.0 or self._consistency.mean != 0.0:
+            out[HELD_RESIDUAL] = (self._consistency.held, self._consistency.mean, self._consistency.lasting)
         if self._redundancy is not None and any(state := self._redundancy.state()):
             out[REDUNDANCY] = state
         for kept, state in {**self._told, **{kept: some.state() for kept, some in self._some.items()}}.items():
@@ -363,7 +363,9 @@ class StampedDots:
         if FIT in values:
             self._fit.set_state(values[FIT])
         if HELD_RESIDUAL in values:
-            (self._consistency.held,) = values[HELD_RESIDUAL]
+            # Recordings from before the mean was kept have the first alone.
+            held, mean, lasting = (*values[HELD_RESIDUAL], 0.0, 0.0)[:3]
+            self._consistency.held, self._consistency.mean, self._consistency.lasting = held, mean, lasting
         if REDUNDANCY in values and self._redundancy is not None:
             self._redundancy.set_state(values[REDUNDANCY])
         for name, state in values.items():

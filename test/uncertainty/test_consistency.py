@@ -89,6 +89,23 @@ def test_a_contradiction_is_held_and_forgotten_by_a_fiftieth_a_block() -> None:
     assert got.possible == (0.0, 0.0, 0.0, 0.0)
 
 
+def test_an_error_that_lasts_is_widened_for_though_no_block_alone_shows_it() -> None:
+    """Two sd in every block; half of that, and hum of the worst constant phase, which its own variance explains, are not."""
+    small, hum, large = (scaled_to(chi_square) for chi_square in (1.0, 2.0, 4.0))
+    for readings, widens in ((small, False), (hum, False), (large, True)):
+        of = Consistency()
+        got = [check(readings, of) for _ in range(60)]
+        assert not any(c.contradict for c in got)
+        assert not any(got[0].possible)
+        assert all(any(c.possible) == widens for c in got[20:])
+    # By half as much again as the error of each reading.
+    np.testing.assert_allclose(np.abs(got[-1].possible), 1.5 * np.abs(got[-1].errors), rtol=1e-2)
+    # What was wrong and is not any more is forgotten in about a second.
+    after = [check(0.0 * large, of) for _ in range(120)]
+    assert any(after[10].possible)
+    assert not any(after[-1].possible)
+
+
 def test_what_has_next_to_no_part_in_the_base_line_is_not_accused() -> None:
     """Along a base line in x a wrong y changes its length to second order only."""
     for y, seen in ((0.0, False), (0.0028 * 2**0.5 * 1.05, True), (0.0028 * 2**0.5 * 0.95, False)):
