@@ -101,7 +101,7 @@ def result(discovery: Conclusion) -> dict[str, Any]:
         'ties': [
             {
                 'share': {'value': t.share, 'sd': t.sd},
-                'moves_frequency': t.moves,
+                'frequencies_moved': t.moves,
                 'causes': [{'name': c.name, 'factor': {'value': c.factor, 'sd': c.sd}} for c in t.causes],
                 'sentence': t.sentence,
             }

@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from psd_deflection.discovery.weighing import NamedEffect, Rival
 
 BENDING, TORSION = 'bending_stiffness', 'torsional_stiffness'
-SCALE, MOVES = 'scale', 'moves_frequency'
 SAME = 3.0
 """Standard deviations of their difference up to which two shares count as the same."""
 EXACT = 0.003
 """Relative; a stand-in such as a clamp matches only approximately."""
+_KINDS = 'amplitude', 'choice'
+"""Of the parameters of both effects: the relative change, and whether the mode moves with it."""
 CLEAR = 5.0
 """Standard deviations that a share is away from none."""
 
@@ -77,9 +78,12 @@ def _shares(effects: Sequence[NamedEffect], name: str) -> Iterator[tuple[float, 
     for named in effects:
         either: tuple[NamedEffect | Rival, ...] = (named, *named.rivals)
         for e in either:
-            sd = e.sd.get(SCALE, 0.0)
-            if e.active.effect.name == name and sd > 0.0:
-                yield e.active.values[SCALE], sd, bool(e.active.values[MOVES])
+            if e.active.effect.name != name:
+                continue
+            scale, moves = (next(p.name for p in e.active.effect.parameters if p.kind == k) for k in _KINDS)
+            sd = e.sd.get(scale, 0.0)
+            if sd > 0.0:
+                yield e.active.values[scale], sd, bool(e.active.values[moves])
 
 
 def _tie(a: float, sd_a: float, b: float, sd_b: float, moves: bool) -> Tie:

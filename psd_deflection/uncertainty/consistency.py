@@ -10,8 +10,8 @@ cost more than a few standard deviations.
 If one reading i alone is wrong, it is wrong by e_i = r/a_i. Which one, a single block cannot tell; so
 ``widen`` adds the errors that each of them would cause, sum_i (K_i e_i)(K_i e_i)^T with the solver's
 gain K and half as much again, and the truth stays inside. While the link rings, two wrong readings may
-cancel in r for a block; so r is held and forgotten over a second. An r that lasts is widened for at a smaller size than one of a single block. Over many blocks and poses the wrong one
-can often be told:
+cancel in r for a block; so r is held and forgotten over a second. An r that lasts is widened for at a
+smaller size than one of a single block. Over many blocks and poses the wrong one can often be told:
 the true reading of i is m_i - r/a_i if the others are right, and what i says of it must then follow
 one law: nothing (dead or stuck), or the opposite (inverted). If two readings would do, none is named.
 """

@@ -90,7 +90,7 @@ def test_a_contradiction_is_held_and_forgotten_by_a_fiftieth_a_block() -> None:
 
 
 def test_an_error_that_lasts_is_widened_for_though_no_block_alone_shows_it() -> None:
-    """Two sd in every block; half of that, and hum of the worst constant phase, which its own variance explains, are not."""
+    """Two sd in every block; not one, and not hum of the worst constant phase, which its own variance explains."""
     small, hum, large = (scaled_to(chi_square) for chi_square in (1.0, 2.0, 4.0))
     for readings, widens in ((small, False), (hum, False), (large, True)):
         of = Consistency()
