@@ -347,8 +347,10 @@ class StampedDots:
             out[NOISE] = self.noise.state()
         if self.active:
             out[FIT] = self._fit.state()
-        if self._consistency.held > 0.0 or self._consistency.mean != 0.0:
-            out[HELD_RESIDUAL] = (self._consistency.held, self._consistency.mean, self._consistency.lasting)
+        said = self._consistency
+        residual = (said.held, said.mean, said.lasting) if self._rig.estimator.consistency == 'widen' else (said.held,)
+        if any(residual):
+            out[HELD_RESIDUAL] = residual
         if self._redundancy is not None and any(state := self._redundancy.state()):
             out[REDUNDANCY] = state
         for kept, state in {**self._told, **{kept: some.state() for kept, some in self._some.items()}}.items():
