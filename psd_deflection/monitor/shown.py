@@ -171,6 +171,7 @@ class ShownRecording:
         self._start_ns: int | None = None
         self._last: SpotMeans | None = None
         self._seen = (0, 0, 0)
+        self._seen_ns = time.time_ns()
         self._thread = threading.Thread(target=self._run, name='replay', daemon=True)
 
     @property
@@ -210,13 +211,15 @@ class ShownRecording:
         }
 
     def health(self, t_ns: int) -> DiagnosticReport:
-        """Counts of the part played so far, and why blocks have no estimate."""
+        """Counts of the part played so far, rates since the last report, why blocks have no estimate; ``t_ns``: now."""
         counters = self._pipeline.counters
         samples, estimates, lost = counters.samples, counters.estimates, self._lost
         new_samples = max(samples - self._seen[0], 0)
         new_estimates = max(estimates - self._seen[1], 0)
         new_lost = max(lost - self._seen[2], 0)
-        self._seen = (samples, estimates, lost)
+        seconds = (t_ns - self._seen_ns) / 1e9
+        self._seen, self._seen_ns = (samples, estimates, lost), t_ns
+        rates = [round(new / seconds) if seconds > 0.0 else 0 for new in (new_samples, new_estimates)]
         spots = self._last
         pace = 'as fast as recorded' if self._speed == 1.0 else f'{self._speed:g} times as fast as recorded'
         level, message = OK, f'playing {pace}'
@@ -231,7 +234,7 @@ class ShownRecording:
                 'psd_deflection: replay',
                 level,
                 message,
-                (('rate (samples/s)', str(new_samples)), ('samples', str(samples)), ('lost', str(lost))),
+                (('rate (samples/s)', str(rates[0])), ('samples', str(samples)), ('lost', str(lost))),
             )
         ]
         refused = tuple((f'refused: {cause}', str(count)) for cause, count in sorted(counters.refused.items()))
@@ -244,7 +247,7 @@ class ShownRecording:
                 level,
                 message,
                 (
-                    ('rate (estimates/s)', str(new_estimates)),
+                    ('rate (estimates/s)', str(rates[1])),
                     ('estimates', str(estimates)),
                     *refused,
                     *self._pipeline.stamped.words(),

@@ -35,6 +35,19 @@ def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event, sp
     return ShownRecording(name, open_steps, feed, say, speed=speed, inputs=inputs)
 
 
+def test_rates_are_of_a_second_however_long_ago_the_last_report_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('psd_deflection.monitor.shown.time.time_ns', lambda: 0)
+    ended = threading.Event()
+    source = source_of('clean', Feed(), list[str](), ended)
+    source.start()
+    assert ended.wait(60.0)
+    source.close()
+    replay, estimates = source.health(2_000_000_000).entries
+    assert ('rate (samples/s)', '2000') in replay.values
+    assert ('rate (estimates/s)', '100') in estimates.values
+    assert ('rate (samples/s)', '0') in source.health(3_000_000_000).entries[0].values
+
+
 def test_a_recording_is_shown_as_it_is_with_its_losses() -> None:
     feed, said, ended = Feed(), list[str](), threading.Event()
     source = source_of('lost_samples', feed, said, ended)
