@@ -40,6 +40,8 @@ ARGS ?=
 # writes it for all that come after, whatever the environment says of it: the tests and the documents start Python hundreds of times.
 export PIP_COMPILE := 0
 unexport PYTHONDONTWRITEBYTECODE
+# As psd-deflection has it: our matrices are small or narrow, and more threads spin more than they compute.
+export OMP_NUM_THREADS ?= 1
 # uv installs the same packages with a tenth of the work. It is used if it is there; `make UV= run` takes pip all the same.
 UV ?= $(shell command -v uv)
 INSTALL = $(if $(UV),$(UV) pip install --python $(1)/bin/python,$(1)/bin/python -m pip install --disable-pip-version-check) --quiet
@@ -108,7 +110,7 @@ BENCH_ACCURACY ?=
 bench: $(READY)
 	rm -f bench/results.json
 	$(BIN)/python -m bench.live $(BENCH_LIVE)
-	OMP_NUM_THREADS=1 $(BIN)/python -m bench.limits $(BENCH_LIMITS)
+	$(BIN)/python -m bench.limits $(BENCH_LIMITS)
 	$(BIN)/python -m bench.rigs $(BENCH_RIGS)
 	$(BIN)/python -m bench.page
 	$(BIN)/python bench/solvers.py $(BENCH_SOLVERS)
@@ -144,7 +146,7 @@ compensate-faults: $(READY)
 
 FLEET_RECORDINGS ?= 1000
 fleet: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/python -m bench.campaign.fleet --recordings $(FLEET_RECORDINGS) $(FLEET)
+	$(BIN)/python -m bench.campaign.fleet --recordings $(FLEET_RECORDINGS) $(FLEET)
 
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 
@@ -209,19 +211,19 @@ blind: $(READY)
 
 RIGS ?= 200
 blind-calibration: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/python -m blind.calibration --rigs $(RIGS) --jobs $(JOBS)
+	$(BIN)/python -m blind.calibration --rigs $(RIGS) --jobs $(JOBS)
 
 LAWS ?=
 blind-laws: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/python -m blind.laws --jobs $(JOBS) $(LAWS)
+	$(BIN)/python -m blind.laws --jobs $(JOBS) $(LAWS)
 
 NEXT ?=
 blind-next: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/python -m blind.next --jobs $(JOBS) $(NEXT)
+	$(BIN)/python -m blind.next --jobs $(JOBS) $(NEXT)
 
 WATCH ?=
 blind-watch: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/python -m blind.watch --jobs $(JOBS) $(WATCH)
+	$(BIN)/python -m blind.watch --jobs $(JOBS) $(WATCH)
 
 # Rendered frames: errors, cost, and adverse frames, of which no answer may be wrong (two hours on an idle core).
 CAMERA_FRAMES ?= 10000
@@ -229,7 +231,7 @@ camera-campaign: $(READY)
 	$(BIN)/python -m bench.campaign.camera --frames $(CAMERA_FRAMES)
 
 demo-compensate: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/python -m bench.compensate
+	$(BIN)/python -m bench.compensate
 
 demo-discover: $(VENV)/.installed
 	rm -rf build/demo && mkdir -p build/demo
@@ -241,7 +243,7 @@ demo-discover: $(VENV)/.installed
 THESIS ?=
 demo-thesis: $(READY)
 	rm -rf build/thesis
-	OMP_NUM_THREADS=1 $(BIN)/python -m blind.redone --out build/thesis $(THESIS)
+	$(BIN)/python -m blind.redone --out build/thesis $(THESIS)
 
 # colcon from PyPI wants an older setuptools than ours: a virtual environment of its own.
 colcon:

@@ -34,6 +34,9 @@ from psd_deflection.errors import (
     printable,
 )
 
+# Our matrices are small, or tall and narrow: more threads spin more than they compute. Before numpy is imported.
+os.environ.setdefault('OMP_NUM_THREADS', '1')
+
 COMMANDS: dict[str, str] = {
     'estimator': 'acquire, estimate, publish on ROS 2 and record (the daemon)',
     'chain': 'several links in series: the deflection of the end effector',
