@@ -12,8 +12,8 @@ from psd_deflection.calibration.wiring import Wiring
 from psd_deflection.config import Rig
 from psd_deflection.records import Counts, FloatArray, dot_channels
 
-LEAST_LASER = 1e-3
-"""Least light of a laser, as a share of the other light: a laser that is off gives numbers that mean nothing."""
+LEAST_LASER = 0.1
+"""Least light of a laser, as a share of the other light: with the laser off noise must not be divided by noise."""
 
 
 def counts_to_volts(counts: Counts, volts_per_count: float) -> npt.NDArray[np.float32]:

@@ -184,5 +184,9 @@ def test_a_rig_without_dark_levels_reads_as_before_and_one_without_laser_stays_f
     np.testing.assert_array_equal(no_light.dots(some), Calibration.from_rig(nominal).dots(some))
     one = Calibration.from_rig(replace_values(nominal, {'psd_2.dark': [1.0, -1.0, 0.1]}))
     np.testing.assert_array_equal(one.dots(some)[:, :2], Calibration.from_rig(nominal).dots(some)[:, :2])
-    off = one.dots(volts(0.0, 0.0, 0.0, 1.0, -1.0, 0.1))
-    assert np.isfinite(off).all()
+    # With the laser off what is left is noise, 2 mV of the sum and of x: no dot outside the active area.
+    for noise in (-2e-3, 0.0, 2e-3):
+        assert np.abs(one.dots(volts(0.0, 0.0, 0.0, 1.0 - noise, -1.0, 0.1 + noise))).max() < 1e-3
+    # The least light that is believed: a tenth of the other light.
+    np.testing.assert_allclose(one.dots(volts(0.0, 0.0, 0.0, 1.0, 0.0, 0.11))[0, 2:], [0.5e-3, 5e-3], rtol=1e-5)
+    assert np.isfinite(one.dots(np.zeros((1, 6), dtype=np.float32))).all()
