@@ -20,7 +20,7 @@
 # make rerun    recordings converted for the Rerun viewer (170 MB, in an environment of its own) and looked at in it
 # make shots    the pictures of the live page in docs/figures anew (needs Chromium)
 # make blind    hide effects with a second generator and see whether discover names them (an hour or two on two cores; JOBS=1 for one)
-# make blind-calibration  200 rigs of the second generator, misaligned by chance, calibrated and checked (half an hour on two idle cores; RIGS=20 for a look)
+# make blind-calibration  200 rigs of the second generator, misaligned by chance, calibrated and checked (half an hour on two idle cores; RIGS=20 for a look, LIGHT=--light in the light of a room)
 # make blind-laws  laws that no catalogue has, drawn by chance: does discover find where they act and on what they depend (a quarter of an hour on an idle core; LAWS='--first 500' for fresh ones)
 # make blind-next  one recording leaves several effects open: do the recordings that discover --next plans settle it (half an hour on an idle core; NEXT='--only clamp' for a look)
 # make blind-watch  bumps, gains, slips and 24 quiet hours: what the watch sees, and when it is silent (half an hour on an idle core; WATCH='--runs 5 --hours 1' for a look)
@@ -210,8 +210,9 @@ blind: $(READY)
 	$(BIN)/python -m blind.run --jobs $(JOBS) $(BLIND)
 
 RIGS ?= 200
+LIGHT ?=
 blind-calibration: $(READY)
-	$(BIN)/python -m blind.calibration --rigs $(RIGS) --jobs $(JOBS)
+	$(BIN)/python -m blind.calibration --rigs $(RIGS) --jobs $(JOBS) $(LIGHT)
 
 LAWS ?=
 blind-laws: $(READY)

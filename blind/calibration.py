@@ -1,6 +1,7 @@
 """Whether calibrate tells the truth: rigs with random misalignments, made by :mod:`blind.misaligned`.
 
     python -m blind.calibration --rigs 200 --jobs 2
+    python -m blind.calibration --rigs 40 --light
 
 Each rig is recorded with a reference (a camera of 30 frames a second), calibrated from the nominal rig file, and then
 measures another motion without a reference, with the zero taken anew. Compared with the truth: every parameter and
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +26,7 @@ from blind import generator, misaligned
 from blind.generator import Array
 from psd_deflection.calibrating.calibrate import OPEN, Calibration, calibrate
 from psd_deflection.calibrating.check import check
+from psd_deflection.calibrating.dark import dark_levels, values_of_levels
 from psd_deflection.calibrating.fit import NAMES
 from psd_deflection.calibrating.observation import Run
 from psd_deflection.calibrating.result import values_of
@@ -82,6 +85,13 @@ def run_of(recorded: misaligned.Recorded) -> Run:
     """As calibrate takes it."""
     t = np.arange(len(recorded.volts)) / generator.RATE
     return Run('blind', t, recorded.volts, t[recorded.frames], recorded.reference)
+
+
+def darkened(rig: Rig, light: tuple[misaligned.Light, misaligned.Light], rng: np.random.Generator) -> Rig:
+    """The rig file's content after a recording of ten seconds with both lasers off."""
+    volts = misaligned.darkness(light, 10.0, rng)
+    run = Run('dark', np.arange(len(volts)) / generator.RATE, volts, np.zeros(0), np.zeros((0, 3)))
+    return replace_values(rig, values_of_levels(dark_levels([run], rig)))
 
 
 def calibrated_rig(rig: Rig, run: Run) -> tuple[Rig, Calibration]:
@@ -160,18 +170,22 @@ def shifted(truth: Mapping[str, float], group: str, rng: np.random.Generator) ->
     return out
 
 
-def score(seed: int) -> Score:
-    """One rig."""
+def score(seed: int, lit: bool = False) -> Score:
+    """One rig. ``lit``: in the light of a room, which is another one after the calibration; --dark is done in both."""
     rng = np.random.default_rng([20, seed])
     truth = misaligned.draw(rng)
     pose = misaligned.poses(misaligned.pushes(rng, HOLDS, SECONDS))
-    recorded = misaligned.record(truth, pose, rng, outliers=0.01)
+    first = misaligned.draw_light(rng) if lit else None
+    recorded = misaligned.record(truth, pose, rng, outliers=0.01, light=first)
     nominal = rig_from_values({})
-    rig, found = calibrated_rig(nominal, run_of(recorded))
+    rig, found = calibrated_rig(nominal if first is None else darkened(nominal, first, rng), run_of(recorded))
+    light = None if first is None else misaligned.relit(first, rng)
+    if light is not None:
+        rig = darkened(rig, light, rng)
     sd = found.sd
     z = {n: float((found.values[i] - truth[n]) / sd[i]) for i, n in enumerate(NAMES) if n in truth}
     later = misaligned.poses(misaligned.pushes(rng, AFTER, AFTER_SECONDS))
-    volts = misaligned.record(truth, later, rng).volts
+    volts = misaligned.record(truth, later, rng, light=light).volts
     # Between two samples, by the cubic through four.
     a, b, c, d = (later[SIZE // 2 + i :: SIZE] for i in (-2, -1, 0, 1))
     middle = (9.0 * (b + c) - a - d) / 16.0
@@ -191,7 +205,9 @@ def score(seed: int) -> Score:
     unsaid = [n for n, s in own.items() if s > OPEN + BORDER and n not in every]
     said = [n for n in told & alone if own.get(n, 1.0) < OPEN - BORDER]
     group = GROUPS[seed // 2 % len(GROUPS)] if seed % 2 else ''
-    again = misaligned.record(shifted(truth, group, rng) if group else truth, later_motion(rng), rng, outliers=0.01)
+    again = misaligned.record(
+        shifted(truth, group, rng) if group else truth, later_motion(rng), rng, outliers=0.01, light=light
+    )
     checked = check([run_of(again)], rig)
     axes = np.abs(error) <= Z95 * np.sqrt(np.einsum('nii->ni', covariance))
     return Score(
@@ -275,9 +291,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--rigs', type=int, default=200)
     parser.add_argument('--jobs', type=int, default=2, help='processes at once')
+    parser.add_argument('--light', action='store_true', help='1 to 4 %% of other light, which changes; --dark is used')
     args = parser.parse_args(argv)
     with ProcessPoolExecutor(args.jobs) as pool:
-        scores = list(tqdm(pool.map(score, range(args.rigs)), total=args.rigs, unit=' rigs'))
+        every = pool.map(partial(score, lit=args.light), range(args.rigs))
+        scores = list(tqdm(every, total=args.rigs, unit=' rigs'))
     for line in table(scores):
         print(line)
     for number, s in enumerate(scores):

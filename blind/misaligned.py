@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
 from blind import generator
 from blind.generator import Array
@@ -30,6 +32,9 @@ SPREADS: Mapping[str, float] = {
 BEAM_PLACE, BEAM_ANGLE, SLOPE = 0.5e-3, 3e-3, (1.5, 0.2)
 CAMERA = (10e-6, 10e-6, math.radians(0.03))
 """Standard deviations of one frame of the reference: m, m, rad."""
+LASER = 5.0
+"""V of the sum."""
+OFFSETS = ('offset_x', 'offset_y', 'offset_sum')
 
 
 def nominal() -> dict[str, float]:
@@ -104,6 +109,68 @@ def poses(loads: Array) -> Array:
     return generator.motion(loads, LENGTH, [])[:: generator.FINER]
 
 
+class Light(NamedTuple):
+    """Other light on one PSD. ``level``: its part of the sum, V; ``x``, ``y``: its place as the PSD reads it, V.
+
+    ``offset_x``, ``offset_y``: of the outputs of the amplifier, V, whatever light there is; ``offset_sum`` likewise.
+    """
+
+    level: float
+    x: float
+    y: float
+    offset_x: float
+    offset_y: float
+    offset_sum: float
+
+    def seen(self, laser: float, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """x, y and sum, V, with a laser of so much light that alone would read ``x``, ``y`` V."""
+        total = laser + self.level
+        share = self.level / total
+        return (
+            x + share * (self.x - x) + self.offset_x,
+            y + share * (self.y - y) + self.offset_y,
+            np.full(len(x), total + self.offset_sum),
+        )
+
+
+DARK = Light(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def draw_light(rng: np.random.Generator) -> tuple[Light, Light]:
+    """On both PSDs: 1 to 4 % of the light, anywhere within 2 mm; offsets of 10 mV, of the sum 5 mV (1 sd)."""
+
+    def one() -> Light:
+        return Light(
+            float(rng.uniform(0.05, 0.2)),
+            *rng.uniform(-4.0, 4.0, 2).tolist(),
+            *rng.normal(0.0, (0.010, 0.010, 0.005)).tolist(),
+        )
+
+    return one(), one()
+
+
+def relit(light: tuple[Light, Light], rng: np.random.Generator) -> tuple[Light, Light]:
+    """The same amplifiers in other light."""
+    first, second = (
+        new._replace(**{n: getattr(old, n) for n in OFFSETS}) for new, old in zip(draw_light(rng), light, strict=True)
+    )
+    return first, second
+
+
+def darkness(light: tuple[Light, Light], seconds: float, rng: np.random.Generator) -> Array:
+    """Volts (n, 6) with both lasers off: white noise, slower noise (20 ms) as large, the mains' flicker on the sums."""
+    n = round(seconds * generator.RATE)
+    flat = np.zeros(n)
+    volts = np.column_stack([column for one in light for column in one.seen(0.0, flat, flat)])
+    keep = math.exp(-1.0 / (0.020 * generator.RATE))
+    kicks = rng.normal(0.0, generator.SIGMA * math.sqrt(1.0 - keep**2), (n, 6))
+    volts += lfilter([1.0], [1.0, -keep], kicks, axis=0) + rng.normal(0.0, generator.SIGMA, (n, 6))
+    flicker = np.sin(2.0 * math.pi * 100.0 * np.arange(n) / generator.RATE + rng.uniform(0.0, 2.0 * math.pi))
+    for i in (2, 5):
+        volts[:, i] += 0.1 * light[i // 3].level * flicker
+    return generator.output(volts, [])
+
+
 @dataclass(frozen=True)
 class Recorded:
     """``volts`` (n, 6) at 1 kHz; ``frames`` (m,): samples at which the reference was taken, ``reference`` (m, 3)."""
@@ -122,11 +189,16 @@ def record(
     spread: Sequence[float] = CAMERA,
     outliers: float = 0.0,
     sigma: float = generator.SIGMA,
+    light: tuple[Light, Light] | None = None,
 ) -> Recorded:
-    """What the converter and a reference say of the motion ``pose`` (n, 3); ``outliers``: share of wrong frames."""
+    """What the converter and a reference say of the motion ``pose`` (n, 3); ``outliers``: share of wrong frames.
+
+    ``light``: besides that of the lasers.
+    """
     read = dots(rig, pose) / generator.MM_PER_V
-    light = np.full(len(pose), 5.0)
-    volts = np.column_stack((read[:, :2], light, read[:, 2:], light)) + rng.normal(0.0, sigma, (len(pose), 6))
+    both = (DARK, DARK) if light is None else light
+    columns = [column for i, one in enumerate(both) for column in one.seen(LASER, read[:, 2 * i], read[:, 2 * i + 1])]
+    volts = np.column_stack(columns) + rng.normal(0.0, sigma, (len(pose), 6))
     frames = np.arange(17, len(pose) - 17, every)
     reference = pose[frames] + rng.normal(size=(len(frames), 3)) * spread
     wrong = rng.random(len(frames)) < outliers

@@ -87,6 +87,13 @@ class PsdConfig:
     noise: tuple[float, float] = parameter(
         (0.0, 0.0), 'V', 'noise of x and of y, rms per sample; 0: amplifier.noise', minimum=0.0, maximum=10.0
     )
+    dark: tuple[float, float, float] = parameter(
+        (0.0, 0.0, 0.0),
+        'V',
+        'its x, y and sum with its laser off: the light that is taken off each reading; sum 0: none',
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
     axes: tuple[str, str] = parameter(
         ('x', 'y'),
         '',

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from psd_deflection.calibrating.dark import DarkLevel, check_effects
 from psd_deflection.calibrating.fit import (
     CLAMP_AT,
     CLOCK,
@@ -91,7 +92,7 @@ class Calibration:
     ``vector``, ``prior``: what the rig file says. ``noise`` (4,): of a sample of each reading, V rms. ``clock``: the
     offset of the reference's clock, s, to be added to its times. ``refused``: why the rig file was left as it is, or
     ''. ``widened``: parameters whose tolerance the recordings contradict. ``dropped``: terms that unseen motion
-    refused. ``rows``, ``fit``: for pictures.
+    refused. ``rows``, ``fit``: for pictures. ``dark``: what was measured with the lasers off; ``rig`` has it already.
     """
 
     rig: Rig
@@ -108,6 +109,7 @@ class Calibration:
     refused: str = ''
     widened: list[str] = field(default_factory=list)
     dropped: list[str] = field(default_factory=list)
+    dark: Sequence[DarkLevel] = ()
 
     @property
     def values(self) -> FloatArray:
@@ -139,6 +141,7 @@ def calibrate(
     """
     if psds_at_base(rig):
         raise ConfigError('solver = base_pair: PSDs at the base are not calibrated')
+    check_effects(rig)
     progress('noise')
     noise = np.median([noise_of(run, rig) for run in runs], axis=0)
     kind = kind_of(runs, alone)

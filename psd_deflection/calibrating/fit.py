@@ -398,7 +398,7 @@ def _components(
     own = (np.einsum('nij,nj->ni', inverse**2, rows.variances) / rows.sd**2)[good].mean(axis=0) * dots**2
     seen = np.array([_deviation(e, robustly) ** 2 for e in errors.T]) / share
     reference = np.sqrt(np.maximum(seen - own, 0.01 * own))
-    return Noise(reference, max(dots, 0.3), _fewer(errors, rows.run[good]))
+    return Noise(reference, max(dots, 0.3), fewer(errors, rows.run[good]))
 
 
 def _deviation(values: FloatArray, robustly: bool) -> float:
@@ -407,8 +407,11 @@ def _deviation(values: FloatArray, robustly: bool) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _fewer(errors: FloatArray, run: np.ndarray[tuple[int], np.dtype[np.int64]]) -> float:
-    """Rows that are worth one if errors follow on each other like an autoregression of the first order."""
+def fewer(errors: FloatArray, run: np.ndarray[tuple[int], np.dtype[np.int64]]) -> float:
+    """Rows that are worth one if ``errors`` (n, k) follow on each other like an autoregression of the first order.
+
+    ``run`` (n,): which recording each row is of.
+    """
     same = run[1:] == run[:-1]
     sums, worst = np.sum(errors**2, axis=0), 0.0
     for e, total in zip(errors.T, sums, strict=True):

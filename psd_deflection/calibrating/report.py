@@ -41,6 +41,9 @@ def report_html(found: Calibration, date: str) -> str:
     body.append(_undetermined(found))
     body.append('<h2>Noise</h2>')
     body.append(_noise(found))
+    if found.dark:
+        body.append('<h2>Dark levels and other light</h2>')
+        body.append(_dark(found))
     body.append('<h2>What to do next</h2><ul>')
     body.append(''.join(f'<li>{html.escape(words)}</li>' for words in advice(found)))
     source = html.escape(json.dumps(result(found, date)['provenance'], indent=1))
@@ -118,6 +121,31 @@ def _noise(found: Calibration) -> str:
         rows.append(('clock of the reference', f'add {clock * 1e3:.3f} ± {found.sd[CLOCK] * 1e3:.2g} ms to its times'))
         rows.append(('outliers of the reference', f'{int(np.sum(found.fit.weights == 0.0))} of {len(found.rows)}'))
     return table(('what', 'noise, 1 sd'), rows)
+
+
+def _dark(found: Calibration) -> str:
+    rows = []
+    for one in found.dark:
+        x, y = (f'{v:.5f} ± {sd:.1g}' for v, sd in zip(one.volts[:2], one.sd[:2], strict=True))
+        sums = f'{one.volts[2]:.5f} ± {one.sd[2]:.1g}'
+        file = ', '.join(f'{v:g}' for v in one.before)
+        place = ', '.join(f'{v * 1e3:+.2f}' for v in one.place)
+        rows.append((f'psd_{one.psd}', x, y, sums, file, f'{one.share:.3%}', place, f'{one.left * 1e6:.2g}'))
+    words = (
+        'With its laser off each PSD shows the other light: the estimate is freed of it by x, y and sum together. The '
+        'calibration above is that of the laser alone. Measure the dark levels again when the light has changed.'
+    )
+    head = (
+        '',
+        'x, V',
+        'y, V',
+        'sum, V',
+        'rig file, V',
+        'share of the light',
+        'it pulls to, mm',
+        'left at the edge, µm',
+    )
+    return f'<p class=quiet>{words}</p>' + table(head, rows)
 
 
 def _residuals(found: Calibration) -> Figure:

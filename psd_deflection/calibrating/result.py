@@ -8,6 +8,7 @@ import numpy as np
 
 from psd_deflection import __version__
 from psd_deflection.calibrating.calibrate import Calibration
+from psd_deflection.calibrating.dark import result_of_levels, source_of_levels, values_of_levels
 from psd_deflection.calibrating.fit import CLAMP_AT, CLOCK, NAMES
 from psd_deflection.calibrating.observation import CHANNEL_NAMES
 from psd_deflection.misalignment.model import ALL, COUNT, ZERO
@@ -45,6 +46,7 @@ def result(found: Calibration, date: str) -> dict[str, Any]:
         }
         if found.kind == 'reference'
         else None,
+        'dark': result_of_levels(found.dark) or None,
         'refused': found.refused or None,
         'widened': found.widened,
         'dropped': found.dropped,
@@ -59,14 +61,16 @@ def result(found: Calibration, date: str) -> dict[str, Any]:
 def source_of(found: Calibration, date: str) -> str:
     """Where a calibrated rig file comes from, in one line."""
     recordings = ', '.join(f'{run.name} (sha256 {run.digest[:16]})' for run in found.runs)
-    return f'psd-deflection {__version__}, {date}, from {recordings}'
+    dark = f'; dark levels from {source_of_levels(found.dark)}' if found.dark else ''
+    return f'psd-deflection {__version__}, {date}, from {recordings}{dark}'
 
 
 def values_of(found: Calibration, date: str) -> tuple[dict[str, object], list[ActiveEffect]]:
-    """Flat values that a rig file gets, and its effects; none if the calibration was refused."""
+    """Flat values that a rig file gets, and its effects; noise and dark levels alone if the calibration was refused."""
     noise = {f'psd_{n}.noise': [float(f'{v:.4g}') for v in found.noise[2 * n - 2 : 2 * n]] for n in (1, 2)}
+    measured = {**noise, **values_of_levels(found.dark)}
     if found.refused:
-        return dict(noise), []
+        return measured, []
     clamp = {name: float(found.values[CLAMP_AT + i]) for i, name in enumerate(CLAMP.values())}
     values, effects = rig_values(found.vector, found.values[:COUNT], clamp)
     at = np.array([*range(COUNT), *(CLAMP_AT + i for i in range(2) if found.fit.free[CLAMP_AT + i])])
@@ -75,7 +79,7 @@ def values_of(found: Calibration, date: str) -> tuple[dict[str, object], list[Ac
     correlation = found.covariance[np.ix_(at, at)] / np.outer(scale, scale)
     return {
         **values,
-        **noise,
+        **measured,
         'calibration.names': [NAMES[i] for i in at],
         'calibration.sds': [float(f'{v:.10g}') for v in sd],
         'calibration.correlations': [

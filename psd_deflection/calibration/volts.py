@@ -12,6 +12,9 @@ from psd_deflection.calibration.wiring import Wiring
 from psd_deflection.config import Rig
 from psd_deflection.records import Counts, FloatArray, dot_channels
 
+LEAST_LASER = 0.1
+"""Least light of a laser, as a share of the other light: with the laser off noise must not be divided by noise."""
+
 
 def counts_to_volts(counts: Counts, volts_per_count: float) -> npt.NDArray[np.float32]:
     """Volts (n, 3P) of converter counts (n, 3P) of P PSDs; ``volts_per_count`` V.
@@ -27,12 +30,14 @@ class Calibration:
     """Readings to the places of the dots.
 
     ``sensitivities``: m/V on x1, y1, x2, y2 ..., at the centre. ``sensors``: one for each PSD. ``wiring``: which
-    channel of the device is which axis of which PSD.
+    channel of the device is which axis of which PSD. ``dark``: of each PSD that sees other light its number (from 0)
+    and x, y, sum with its laser off, V.
     """
 
     sensitivities: tuple[float, ...]
     sensors: tuple[Sensor, ...]
     wiring: Wiring = field(default_factory=Wiring)
+    dark: tuple[tuple[int, tuple[float, float, float]], ...] = ()
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Calibration:
@@ -41,6 +46,7 @@ class Calibration:
             sensitivities=tuple(rig.sensitivities.ravel().tolist()),
             sensors=tuple(make_sensor(psd) for psd in rig.psds),
             wiring=Wiring.from_rig(rig),
+            dark=tuple((i, psd.dark) for i, psd in enumerate(rig.psds) if psd.dark[2] > 0.0),
         )
 
     def seen(self, volts: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
@@ -50,10 +56,17 @@ class Calibration:
     def dots(self, volts: npt.NDArray[np.float32]) -> FloatArray:
         """Places (n, 2P), m: x1, y1, x2, y2 ..., each from its PSD's centre; ``volts`` (n, 3P) float32 as :meth:`seen`.
 
-        The amplifier divides by the sum, so a voltage is the place over the sensitivity. The
+        The amplifier divides by the sum, so a voltage is the place over the sensitivity. Photocurrents add: with other
+        light of sum b a reading is v = ((W - b) v_laser + b v_dark)/W, W the sum, and v_laser is what counts. The
         nonlinear curve of a segmented sensor is inverted.
         """
         dots = np.multiply(volts[:, dot_channels(len(self.sensors))], self.sensitivities, dtype=np.float64)
+        for i, (x, y, level) in self.dark:
+            whole = volts[:, 3 * i + 2].astype(np.float64)
+            laser = np.maximum(whole - level, LEAST_LASER * level)
+            for column, dark in ((2 * i, x), (2 * i + 1, y)):
+                pull = level * dark * self.sensitivities[column]
+                dots[:, column] = (whole * dots[:, column] - pull) / laser
         for i, sensor in enumerate(self.sensors):
             if isinstance(sensor, Quadrant):
                 dots[:, 2 * i : 2 * i + 2] = sensor.from_linear(dots[:, 2 * i : 2 * i + 2])

@@ -26,9 +26,9 @@ ERROR = Field('error', str)
 """Column of a table with one row a recording: why it failed, else empty."""
 
 
-def recordings_argument(parser: argparse.ArgumentParser, what: str) -> None:
+def recordings_argument(parser: argparse.ArgumentParser, what: str, nargs: str = '+') -> None:
     """Add REC..., ``what`` each is."""
-    parser.add_argument('recordings', metavar='REC', nargs='+', help=what)
+    parser.add_argument('recordings', metavar='REC', nargs=nargs, help=what)
 
 
 def executor_option(parser: argparse.ArgumentParser) -> None:

@@ -5,6 +5,9 @@ Give several if you have them. DIR gets rig.yaml (use it as --params-file: estim
 holds what the calibration left open), report.html and calibration.json.
 
 --check RIG.yaml instead holds a calibrated rig file against a recording made since: what moved, by how much, how sure.
+--dark takes a recording with the lasers off, both or one after the other, in the light of the room: what the PSDs
+then read is written as psd_N.dark and taken off every reading. Without REC that is all that is done, when the light of
+the room has changed.
 --self takes recordings without reference and loads: the one redundant reading tells relative gains and turns.
 
 All REC together make one calibration. With --each every REC is one for itself: DIR/REC gets its files, or X.parquet a
@@ -12,6 +15,8 @@ row. REC may then be a pattern, or a .txt file that lists recordings and pattern
 
   psd-deflection calibrate run.csv --params-file my_rig.yaml --out new
   psd-deflection calibrate run.csv --reference camera.csv --out new
+  psd-deflection calibrate run.csv --dark lasers_off.csv --out new
+  psd-deflection calibrate --dark off.csv --params-file new/rig.yaml --out b
   psd-deflection calibrate today.csv --check new/rig.yaml
   psd-deflection calibrate run --self --params-file my_rig.yaml --out new
   psd-deflection calibrate 'archive/*' --each --out calibrations.parquet
@@ -23,7 +28,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -31,8 +36,17 @@ from typing import Any
 
 from tqdm import tqdm
 
+from psd_deflection import __version__
 from psd_deflection.calibrating import check as checking
 from psd_deflection.calibrating.calibrate import Calibration, calibrate
+from psd_deflection.calibrating.dark import (
+    DarkLevel,
+    dark_levels,
+    result_of_levels,
+    source_of_levels,
+    values_of_levels,
+    words_of_level,
+)
 from psd_deflection.calibrating.fit import NAMES
 from psd_deflection.calibrating.observation import Run
 from psd_deflection.calibrating.report import report_html
@@ -50,13 +64,13 @@ from psd_deflection.cli._options import make_writable, namespace_option, number
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save_all, show, warn
 from psd_deflection.cli._rig_file import rig_file
-from psd_deflection.config import Rig, load_rig
+from psd_deflection.config import Rig, load_rig, replace_values
 from psd_deflection.discovery.result import model_yaml
 from psd_deflection.errors import ConfigError, UsageError
 from psd_deflection.fleet.parquet import Field
 from psd_deflection.misalignment.rig import is_calibrated
 from psd_deflection.parameter_files import with_effects_section, with_values
-from psd_deflection.recordings.calibration_runs import read_runs
+from psd_deflection.recordings.calibration_runs import read_run, read_runs
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end
 from psd_deflection.simulation.catalogue import effects_of_rig, effects_to_values
@@ -70,7 +84,7 @@ HEAD = ('state', 'by', 'undetermined', 'heldout before (um)', 'after')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    recordings_argument(parser, 'recordings with a reference or with known loads')
+    recordings_argument(parser, 'recordings with a reference or with known loads', '*')
     parser.add_argument(
         '--params-file', metavar='RIG.yaml', help='the rig as it is known (default: the parameters in the recording)'
     )
@@ -87,6 +101,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=0.0,
         metavar='S',
         help='time over which each reference is a mean, s: the exposure of a camera (default 0)',
+    )
+    parser.add_argument(
+        '--dark',
+        metavar='FILE',
+        action='append',
+        default=[],
+        help='a recording with the lasers off, several if they were off one after the other; the light is that of REC',
     )
     parser.add_argument('--out', metavar='DIR', help='folder for rig.yaml, report.html, calibration.json')
     each_option(parser)
@@ -106,9 +127,14 @@ def run(args: argparse.Namespace) -> int:
             f'--reference is given {len(args.reference)} times for {len(args.recordings)} recordings: '
             f'give one for each, in the same order'
         )
+    if not args.recordings and (args.check is not None or args.alone or args.each or not args.dark):
+        raise UsageError('REC is missing: a recording with a reference or with known loads; --dark alone needs none')
     if args.check is not None:
-        if args.params_file is not None or args.out is not None or args.each or args.executor is not None:
-            raise UsageError('--check RIG.yaml is for itself: give none of --params-file, --out, --each, --executor')
+        others = (args.params_file, args.out, args.each or None, args.executor, args.dark or None)
+        if any(one is not None for one in others):
+            raise UsageError(
+                '--check RIG.yaml is for itself: give none of --params-file, --out, --each, --executor, --dark'
+            )
         return _check(args)
     if args.out is None:
         raise UsageError('--out DIR (a calibration) or --check RIG.yaml (of an older one) is needed')
@@ -119,15 +145,20 @@ def run(args: argparse.Namespace) -> int:
         args.alone,
         datetime.now(UTC).date().isoformat(),
         tuple(args.reference),
+        tuple(args.dark),
     )
     names = each_for_itself(args)
     if names is not None:
         return _each(args, names, asked)
     out = Path(args.out)
-    rig = asked.rig(args.recordings, warn)
+    rig = asked.rig(args.recordings or args.dark, warn)
     with told('reading', quiet=args.quiet or args.json):
         runs = asked.runs(args.recordings, rig)
+        levels = asked.levels(rig, runs)
     make_writable(args.out)
+    if not runs:
+        return _dark_alone(args, asked, rig, levels)
+    rig = replace_values(rig, values_of_levels(levels))
     hidden = True if args.quiet or args.json else None
     with tqdm(total=STEPS, disable=hidden, file=sys.stderr, bar_format='{l_bar}{bar}| {elapsed}') as bar:
 
@@ -135,14 +166,14 @@ def run(args: argparse.Namespace) -> int:
             bar.set_description_str(words)
             bar.update()
 
-        found = calibrate(runs, rig, alone=args.alone, progress=progress)
+        found = replace(calibrate(runs, rig, alone=args.alone, progress=progress), dark=levels)
         progress('report')
         files = asked.files(rig, found)
     save_all(files, out)
     if args.json:
         print(files['calibration.json'].removesuffix('\n'))  # noqa: T201 - no control characters, long lines
         return 0
-    show(sentence(found))
+    show(sentence(found), *map(words_of_level, levels))
     for direction in found.undetermined:
         show(f'undetermined: {", ".join(direction.parts)}; it needs {direction.needs}')
     show(f'see {out / "report.html"}; use {out / "rig.yaml"} as --params-file')
@@ -159,6 +190,7 @@ class Asked:
     alone: bool
     date: str
     references: tuple[str, ...] = ()
+    dark: tuple[str, ...] = ()
 
     def rig(self, recordings: Sequence[str], tell: Callable[[str], None]) -> Rig:
         """The known rig; ``tell`` is told if the recording names none."""
@@ -172,6 +204,12 @@ class Asked:
     def runs(self, recordings: Sequence[str], rig: Rig) -> list[Run]:
         """The recordings with their references."""
         return read_runs(recordings, rig, references=self.references, exposure=self.exposure, namespace=self.namespace)
+
+    def levels(self, rig: Rig, runs: Sequence[Run]) -> list[DarkLevel]:
+        """What the recordings of --dark tell, if there are any; ``runs``: with the lasers on."""
+        if not self.dark:
+            return []
+        return dark_levels([read_run(path, rig, namespace=self.namespace) for path in self.dark], rig, runs)
 
     def files(self, rig: Rig, found: Calibration) -> dict[str, str]:
         """The files of --out by their names."""
@@ -221,6 +259,8 @@ def _fields() -> list[Field]:
 def _each(args: argparse.Namespace, names: list[str], asked: Asked) -> int:
     if args.reference:
         raise UsageError('--reference: not with --each, which takes the reference that is in each recording')
+    if args.dark:
+        raise UsageError('--dark: not with --each, whose recordings may have been made in different light')
     if args.params_file is not None:
         # What is wrong in it is so for all.
         load_rig(args.params_file)
@@ -249,6 +289,23 @@ def _rig_yaml(params_file: str | None, rig: Rig, found: Calibration, date: str) 
     return rig_file(
         params_file, 'rig.yaml', lambda: model_yaml(rig, effects_of_rig(rig) if found.refused else effects), edit
     )
+
+
+def _dark_alone(args: argparse.Namespace, asked: Asked, rig: Rig, levels: Sequence[DarkLevel]) -> int:
+    """Write the dark levels into the rig file and change nothing else."""
+    source = f'Dark levels by psd-deflection {__version__}, {asked.date}, from {source_of_levels(levels)}'
+    text = rig_file(
+        asked.params_file,
+        'rig.yaml',
+        lambda: model_yaml(rig, effects_of_rig(rig)),
+        lambda text, path: with_values(text, values_of_levels(levels), source, path),
+    )
+    save_all({'rig.yaml': text}, Path(args.out))
+    if args.json:
+        print_json({'dark': result_of_levels(levels)}, indent=1)
+        return 0
+    show(*map(words_of_level, levels), f'use {Path(args.out) / "rig.yaml"} as --params-file')
+    return 0
 
 
 def _check(args: argparse.Namespace) -> int:

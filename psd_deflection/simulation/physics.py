@@ -22,6 +22,7 @@ class Physics:
     (x, y), N, at the tip. ``slope_ratio``: k of phi = -k dY/L; 0 is the nominal, parallel planes.
     ``beams``: l_i, on the plate if ``psds_at_base``; ``slopes``: how much each goes sideways along Z.
     ``half_area``: half width and height of the active areas. ``noise`` (3P,), V rms of each channel.
+    ``dark`` (P, 3): x, y and sum of each PSD with its laser off, V.
     ``phase``: how long after each sample the quantities are taken, below ``period``, s.
     """
 
@@ -47,6 +48,7 @@ class Physics:
     noise: FloatArray
     volts_per_count: float
     full_scale: float
+    dark: FloatArray
     phase: float = 0.0
     psds_at_base: bool = False
     weight_per_length: float = 0.0
@@ -80,6 +82,7 @@ class Physics:
             noise=rig.noises.ravel(),
             volts_per_count=rig.converter.volts_per_count,
             full_scale=rig.converter.full_scale,
+            dark=np.array([p.dark for p in rig.psds], dtype=np.float64),
             psds_at_base=at_base,
         )
 

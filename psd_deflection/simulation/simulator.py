@@ -115,6 +115,8 @@ class ForwardModel:
         for psd in range(psds):
             samples.volts[3 * psd : 3 * psd + 2] = samples.dots[2 * psd : 2 * psd + 2] / p.sensitivity[psd, :, None]
             samples.volts[3 * psd + 2] = samples.sums[psd]
+            if p.dark[psd, 2] > 0.0:
+                _add_light(samples.volts[3 * psd : 3 * psd + 3], p.dark[psd])
         for i, active in enumerate(self.effects):
             if active.effect.point == 'volts':
                 samples.between = partial(self._volts_between, i, samples, loads, temperature)
@@ -192,3 +194,10 @@ class RigSimulator:
             np.ascontiguousarray(samples.pose.T),
             np.ascontiguousarray(samples.true_dots.T),
         )
+
+
+def _add_light(volts: FloatArray, dark: FloatArray) -> None:
+    """Add the light of ``dark`` (3,) V to ``volts`` (3, n), x y sum of a PSD. Currents add; x and y are quotients."""
+    laser, level = volts[2].copy(), dark[2]
+    volts[:2] = (laser * volts[:2] + level * dark[:2, None]) / (laser + level)
+    volts[2] += level

@@ -187,7 +187,7 @@ class StreamNoise:
             out[c, c, 0] = level
             # More than the rig file's noise does not dither with certainty: a reading on the edge between
             # two steps varies by half a step with next to no noise.
-            out[c, c] += _undithered(min(level, stated) - rounding, step)
+            out[c, c] += undithered(min(level, stated) - rounding, step)
         return out
 
     def _close(self) -> bool:
@@ -344,7 +344,7 @@ def _positive(gamma: FloatArray) -> bool:
     return bool(np.isfinite(whole).all())
 
 
-def _undithered(variance: float, step: float) -> float:
+def undithered(variance: float, step: float) -> float:
     """Variance of the error that rounding to ``step`` leaves in the mean of many readings of that noise."""
     if step <= 0.0:
         return 0.0

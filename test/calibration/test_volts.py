@@ -17,7 +17,7 @@ from psd_deflection.calibration import (
     dot_noise_variances,
     make_sensor,
 )
-from psd_deflection.config import rig_from_values
+from psd_deflection.config import replace_values, rig_from_values
 from psd_deflection.declarations import SENSOR_TYPES, PsdConfig
 from psd_deflection.records import CHANNELS
 
@@ -156,3 +156,37 @@ def test_a_quadrants_electrodes_are_unbent_once() -> None:
     four = calibration.sensors[0].currents(np.array([[0.3e-3, -0.1e-3]]), 4.0)
     volts = calibration.volts_of_electrodes(np.hstack((four, np.ones((1, 4)))))
     np.testing.assert_allclose(calibration.dots(volts.astype(np.float32))[0, :2], [0.3e-3, -0.1e-3], rtol=1e-5)
+
+
+def test_other_light_is_taken_off_as_photocurrents_add() -> None:
+    """Currents of the laser at a place and of the light elsewhere, added electrode by electrode."""
+    rig = rig_from_values({'psd_1.sensitivity': [1e-3, 2e-3], 'psd_2.type': 'quadrant', 'psd_2.spot_radius': 1e-3})
+    plain = Calibration.from_rig(rig)
+    places = np.array([[1e-3, -2e-3], [-3e-3, 0.5e-3]]), np.array([[0.3e-3, -0.1e-3], [0.0, 0.4e-3]])
+    laser = [s.currents(place, 5.0) for s, place in zip(plain.sensors, places, strict=True)]
+    light = [
+        s.currents(np.array([[0.4e-3, 0.7e-3]]), level) for s, level in zip(plain.sensors, (0.2, 0.1), strict=True)
+    ]
+    dark = plain.volts_of_electrodes(np.hstack(light))[0]
+    levels = {f'psd_{n}.dark': dark[3 * n - 3 : 3 * n].tolist() for n in (1, 2)}
+    both = plain.volts_of_electrodes(np.hstack([a + b for a, b in zip(laser, light, strict=True)])).astype(np.float32)
+    assert abs(plain.dots(both) - np.hstack(places)).max() > 20e-6
+    freed = Calibration.from_rig(replace_values(rig, levels)).dots(both)
+    np.testing.assert_allclose(freed, np.hstack(places), atol=2e-9)
+
+
+def test_a_rig_without_dark_levels_reads_as_before_and_one_without_laser_stays_finite() -> None:
+    nominal = rig_from_values({})
+    some = np.random.default_rng(1).uniform(-9.0, 9.0, (50, 6)).astype(np.float32)
+    no_light = Calibration.from_rig(
+        replace_values(nominal, {'psd_1.dark': [5.0, 5.0, 0.0], 'psd_2.dark': [1.0, 1.0, -0.1]})
+    )
+    np.testing.assert_array_equal(no_light.dots(some), Calibration.from_rig(nominal).dots(some))
+    one = Calibration.from_rig(replace_values(nominal, {'psd_2.dark': [1.0, -1.0, 0.1]}))
+    np.testing.assert_array_equal(one.dots(some)[:, :2], Calibration.from_rig(nominal).dots(some)[:, :2])
+    # With the laser off what is left is noise, 2 mV of the sum and of x: no dot outside the active area.
+    for noise in (-2e-3, 0.0, 2e-3):
+        assert np.abs(one.dots(volts(0.0, 0.0, 0.0, 1.0 - noise, -1.0, 0.1 + noise))).max() < 1e-3
+    # The least light that is believed: a tenth of the other light.
+    np.testing.assert_allclose(one.dots(volts(0.0, 0.0, 0.0, 1.0, 0.0, 0.11))[0, 2:], [0.5e-3, 5e-3], rtol=1e-5)
+    assert np.isfinite(one.dots(np.zeros((1, 6), dtype=np.float32))).all()

@@ -153,3 +153,83 @@ def test_what_does_not_fit_is_refused(
         ended = int(str(stop.code))
     assert ended == status
     assert re.search(words, capsys.readouterr().err)
+
+
+@pytest.fixture(scope='module')
+def off(made: Path) -> Path:
+    """Both lasers off, in light that is 2 % and 1 % of theirs."""
+    light = [
+        *('--effect', 'ambient_light,psd=1,level=0.1,x=0.0015,y=-0.001'),
+        *('--effect', 'ambient_light,psd=2,level=0.05,x=-0.002,y=0.0005'),
+    ]
+    out = ['--out', str(made / 'off.csv'), '--loads', 'steps:0,0,0:5', '--world', 'amplifier.sum_nominal=1e-9']
+    assert main(['simulate', *out, *light]) == 0
+    run = ['--out', str(made / 'lit.csv'), '--loads', LOADS, '--reference-noise', '1e-5,5e-4', '--seed', '3']
+    assert main(['simulate', *run, *light, *HIDDEN]) == 0
+    return made / 'off.csv'
+
+
+def test_dark_levels_go_with_a_calibration(
+    made: Path, off: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Gains are those of the lasers alone: without dark levels they are 2 % and 1 % below."""
+    lit = ['calibrate', str(made / 'lit.csv'), '--params-file', str(RIG), '--quiet']
+    assert main([*lit, '--dark', str(off), '--out', str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert re.search(
+        r'psd_1 with its laser off: sum 0\.(0999|1000)\d ± .* 1\.9\d+% of the light pulls to \(\+1\.50', said
+    )
+    found = json.loads((tmp_path / 'calibration.json').read_text())
+    for axis in 'xy':
+        one = found['parameters'][f'psd_1.gain_{axis}']
+        assert abs(one['value']) < 4.0 * one['sd'] < 0.015
+    dark = found['dark']
+    assert dark['psd_1']['sum']['value'] == pytest.approx(0.1, abs=2e-4)
+    assert dark['psd_2']['place']['value'] == pytest.approx([-2e-3, 0.5e-3], abs=1e-6)
+    assert dark['psd_1']['recording']['name'] == 'off.csv'
+    assert load_rig(tmp_path / 'rig.yaml').psds[0].dark == pytest.approx((3.0, -2.0, 0.1), abs=1e-3)
+    assert '; dark levels from off.csv (sha256 ' in (tmp_path / 'rig.yaml').read_text().splitlines()[0]
+    page = (tmp_path / 'report.html').read_text()
+    assert 'Dark levels and other light' in page
+    assert '+1.50, -1.00' in page
+
+
+def test_dark_levels_alone_change_nothing_else(off: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['calibrate', '--dark', str(off), '--params-file', str(RIG), '--out', str(tmp_path), '--quiet']) == 0
+    assert 'psd_2 with its laser off' in capsys.readouterr().out
+    first, *rest = (tmp_path / 'rig.yaml').read_text().splitlines()
+    assert first.startswith('# Dark levels by psd-deflection ')
+    assert [line for line in rest if 'dark:' not in line] == RIG.read_text().splitlines()
+    assert len(rest) == len(RIG.read_text().splitlines()) + 2
+    again = ['--params-file', str(tmp_path / 'rig.yaml'), '--out', str(tmp_path / 'again'), '--json']
+    assert main(['calibrate', '--dark', str(off), *again]) == 0
+    tree = json.loads(capsys.readouterr().out)['dark']['psd_1']['sum']
+    assert tree['file'] == pytest.approx(tree['value'], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ('argv', 'status', 'words'),
+    [
+        (['--out', 'x'], 2, 'REC is missing'),
+        (['--self', '--dark', 'OFF', '--out', 'x'], 2, 'REC is missing'),
+        (['RUN', '--check', 'RIG', '--dark', 'OFF'], 2, '--check RIG.yaml is for itself: .*--dark'),
+        (['RUN', '--each', '--dark', 'OFF', '--out', 'x'], 2, '--dark: not with --each'),
+        (['--dark', 'RUN', '--params-file', str(RIG), '--out', 'x'], 4, 'the laser of psd_1 is off for 0.0 s'),
+        (
+            ['--dark', 'OFF', '--params-file', 'RIG', '--out', 'x'],
+            3,
+            'psd_1.dark: this rig file was calibrated without',
+        ),
+    ],
+)
+def test_what_does_not_go_with_dark_levels_is_refused(
+    made: Path, off: Path, argv: list[str], status: int, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    named = {'RUN': str(made / 'run.csv'), 'OFF': str(off), 'RIG': str(made / 'out' / 'rig.yaml')}
+    try:
+        ended = main(['calibrate', *(named.get(word, word) for word in argv)])
+    except SystemExit as stop:
+        ended = int(str(stop.code))
+    assert ended == status
+    assert re.search(words, capsys.readouterr().err)
+    assert not Path('x').exists()

@@ -146,6 +146,19 @@ def test_each_channel_has_its_own_noise_and_sensitivity() -> None:
     np.testing.assert_allclose(error.var(axis=0), dot_noise_variances(rig), rtol=0.05)
 
 
+def test_a_rig_with_dark_levels_is_simulated_in_that_light() -> None:
+    """PSD 2 has 0.2 V of other light at 1 V, -2 V: currents of the lasers' 5 V and of the light add."""
+    plain, lit = (load_rig(overrides=over) for over in ({}, {'psd_2.dark': [1.0, -2.0, 0.2]}))
+    history = loads.constant((3.0, -5.0, 1.0), 0.2).loads
+    laser, both = (ForwardModel(rig).run(history).volts for rig in (plain, lit))
+    np.testing.assert_array_equal(both[:3], laser[:3])
+    np.testing.assert_allclose(both[3], (5.0 * laser[3] + 0.2) / 5.2, rtol=1e-12)
+    np.testing.assert_allclose(both[4], (5.0 * laser[4] - 0.4) / 5.2, rtol=1e-12)
+    np.testing.assert_allclose(both[5], 5.2)
+    dots = Calibration.from_rig(lit).dots(both.T.astype(np.float32))
+    np.testing.assert_allclose(dots, ForwardModel(plain).run(history).dots.T, atol=2e-9)
+
+
 @pytest.mark.parametrize(
     ('name', 'values'),
     [('quantisation', {'step': 0.01}), ('quantisation', {'step': 0.04}), ('amplifier_saturation', {'limit': 0.4})],

@@ -134,8 +134,8 @@ def test_what_noise_does_not_dither_stays_as_an_error_of_rounding(sigma: float) 
     weight = np.exp(-0.5 * deviate**2) / np.exp(-0.5 * deviate**2).sum()
     mean = np.rint(place[:, None] + sigma * deviate) @ weight
     want = step**2 * float(np.mean((mean - place) ** 2))
-    assert noise._undithered((sigma * step) ** 2, step) == pytest.approx(want, rel=5e-3)
-    assert noise._undithered(1.0, 0.0) == 0.0
+    assert noise.undithered((sigma * step) ** 2, step) == pytest.approx(want, rel=5e-3)
+    assert noise.undithered(1.0, 0.0) == 0.0
 
 
 def stream() -> StreamNoise:
