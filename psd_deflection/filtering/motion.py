@@ -147,6 +147,7 @@ class ModalFilter:
         self._loads: list[AppliedLoad] = []
         self._held: FloatArray | None = None
         self.inertia = Inertia(self._modes, rig.link.length)
+        self._late_ones = 0
         self._times = self._period * np.arange(1.0, size + 1.0)
         self.set_noise(noise)
         self.forget()
@@ -272,17 +273,17 @@ class ModalFilter:
         The samples of the block have shown some of it: what the filter would have found is linear in what is foretold.
         The mean square of what that changes is how far what is published was off, and will be.
         """
-        now, taken = self._forced(self._t_ns), self._taken
-        if now is None or taken is None:
-            self._late = np.zeros((3, 2))
+        came, self._late_ones = self.inertia.late - self._late_ones, self.inertia.late
+        taken = self._taken
+        kept = math.exp(-self._size * self._period / LATE_S)
+        self._late = kept * self._late if taken is not None else np.zeros((3, 2))
+        if taken is None or not came or (now := self._forced(self._t_ns)) is None:
             return
         more = now.at - taken.forced.at
-        kept = math.exp(-self._size * self._period / LATE_S)
-        self._late = kept * self._late + (1.0 - kept) * np.square(more[:, -1, :2])
-        if more.any():
-            self._x = self._x + more[:, -1] - np.einsum('ain,an->ai', taken.gain, more[..., 0])
-            self._swung = self._swung + more[:, -1]
-            self._p[:, 2, 2] += np.square(np.maximum(now.doubt - taken.forced.doubt, 0.0))
+        self._late += (1.0 - kept) * np.square(more[:, -1, :2])
+        self._x = self._x + more[:, -1] - np.einsum('ain,an->ai', taken.gain, more[..., 0])
+        self._swung = self._swung + more[:, -1]
+        self._p[:, 2, 2] += np.square(np.maximum(now.doubt - taken.forced.doubt, 0.0))
 
     def _known_loads(self, t_ns: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
         """What the known loads of this block do: to each sample (3, N), to the end (3, 4), and to u, (3,)."""
@@ -481,6 +482,8 @@ class ModalFilter:
             raise ValueError(f'{INERTIA}: {len(values)} numbers do not tell accelerations in blocks of {n} samples')
         rows = np.reshape(values[1:told], (-1, 5)).tolist()
         self.inertia.told = [(joined_ns(s, ns), tuple(deflection)) for s, ns, *deflection in rows]
+        # Perhaps some came after the last block.
+        self._late_ones = -1
         self._late = np.reshape(known[:6], (3, 2))
         if len(known) > 6:
             moved, doubt, gain = np.split(np.array(known[6:]), (6 * n, 6 * n + 3))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from psd_deflection.recordings.bag_writer import BagWriter
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.replay_engine import replayed
 from psd_deflection.records import BaseAcceleration, FloatArray, RawChunk, Record, TipMotion
+from psd_deflection.runner.diagnostics import HealthReporter
 
 MODES = (Oscillator(14.0, 0.02), Oscillator(14.0, 0.02), Oscillator(21.0, 0.02))
 L = 0.585
@@ -220,6 +223,30 @@ def test_what_comes_late_is_put_right(run: motion.Run, monkeypatch: pytest.Monke
     assert after.velocity_covariance[4] > 4.0 * expected[38].velocity_covariance[4]
 
 
+def test_diagnostics_say_what_is_wrong_with_what_is_told(run: motion.Run) -> None:
+    pipeline = Pipeline(motion.rig_of())
+    session: Any = SimpleNamespace(pipeline=pipeline, refused_accelerations=0, why_refused='')
+    health = HealthReporter(session)
+
+    def said() -> tuple[int, str]:
+        (entry,) = health._motion()
+        return entry.level, entry.message
+
+    told = list(run.told)
+    through(pipeline, run, range(25), told)
+    assert said() == (0, 'the modes foretell the samples')
+    session.refused_accelerations, session.why_refused = 3, 'no frame'
+    through(pipeline, run, range(25, 30), told)
+    assert said() == (1, '3 base accelerations refused: no frame')
+    # Of four messages in a block two come late.
+    through(pipeline, run, range(30, 35), told, late=10)
+    assert said() == (1, '8 of 18 base accelerations came after the samples on which they acted')
+    through(pipeline, run, range(35, 42), [])
+    assert said() == (1, 'no base acceleration came for 0.1 s, and the last one was not 0: taken as 0')
+    (entry,) = health._motion()
+    assert dict(entry.values)['base accelerations, not ended by another'] == '1'
+
+
 def test_without_messages_nothing_is_told_and_before_the_first_block_nothing_is_taken(run: motion.Run) -> None:
     assert Pipeline(motion.rig_of({'filter': 'none'})).accelerate(run.told[0]) is None
     pipeline = Pipeline(motion.rig_of())
@@ -250,7 +277,11 @@ def test_a_recording_begun_at_any_block_replays_to_the_bit(start: int, run: moti
     rig = motion.rig_of({'filter_ahead': 0.005})
     live = Pipeline(rig)
     told = list(run.told)
-    through(live, dark, range(start), told, late=5)
+    through(live, dark, range(start), told, late=10)
+    # Two that the filter has not used yet. In block 37 the acceleration turned.
+    assert start != 38 or told[0].t_ns == 750 * MS
+    for message in (told.pop(0), told.pop(0)):
+        live.accelerate(message)
     with BagWriter(tmp_path / 'bag', rig_values=rig.flat()) as bag:
         memory = live.memory(rig)
         assert memory is not None
