@@ -1,8 +1,10 @@
 """How well the filter of the motion does: ``python -m blind.motion --runs 20``.
 
 A link with the thesis's dimensions is at rest for three seconds. Then its load is switched at random times (steps),
-swept (chirp) or wanders (operation). Truth and samples are computed here, by matrix exponentials and the exact plate,
-with the rig's noise and converter, without the product's simulator. The samples go through the whole pipeline.
+swept (chirp) or wanders (operation), or its base is turned about three axes by joints (joint), whose acceleration the
+filter is told 250 times a second, or is not told (untold). Truth and samples are computed here, by matrix exponentials
+or Runge and Kutta and the exact plate, with the rig's noise and converter, without the product's simulator. The samples
+go through the whole pipeline.
 
 Columns: rms error of the velocity by the filter (``own``: what its covariance says), and by the Savitzky-Golay filter
 of block means that does best, which knows the future; normalised innovations squared a sample, ``inside``: share of
@@ -15,9 +17,10 @@ mode; and the share of the poses that are inside three standard deviations after
 from __future__ import annotations
 
 import argparse
+import copy
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import expm
@@ -28,7 +31,7 @@ from tqdm import tqdm
 from blind.generator import EI, GJ, MM_PER_V, PLACES, RATE, SIGMA, Array, output
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.records import RawChunk, TipMotion
+from psd_deflection.records import BaseAcceleration, RawChunk, TipMotion
 
 LENGTH = 0.585
 GIVES = (LENGTH**3 / (3.0 * EI), LENGTH**3 / (3.0 * EI), LENGTH / GJ)
@@ -36,7 +39,17 @@ MODES = ((14.0, 0.02), (14.0, 0.02), (21.0, 0.02))
 REST = 3.0
 BLOCK = 20
 AXES = ('dX', 'dY', 'theta')
-KINDS = ('steps', 'chirp', 'operation')
+KINDS = ('steps', 'chirp', 'operation', 'joint')
+UNTOLD = 'untold'
+"""As ``joint``, but the filter is told nothing."""
+BEHIND = 0.3
+"""So far behind the base is the point about which joints turn it, m."""
+FASTEST = (6.0, 6.0, 15.0)
+"""Largest angular acceleration about x, y and z, rad/s^2; twice as much in the middle of a raised cosine."""
+TOLD = 4
+"""Samples from one message about the base's acceleration to the next."""
+PARTS = 2
+"""Steps of Runge and Kutta in a sample."""
 UNSEEN = 100
 """Samples that do not come."""
 BANDS = 8
@@ -46,12 +59,16 @@ LATER = np.arange(1, BLOCK + 1) / RATE
 
 @dataclass(frozen=True)
 class Run:
-    """One link in motion at 1 kHz. ``loads`` (n, 3), ``pose`` (n, 3), ``velocity`` (n, 3): truth; ``volts`` (n, 6)."""
+    """One link in motion at 1 kHz. ``loads`` (n, 3), ``pose`` (n, 3), ``velocity`` (n, 3): truth; ``volts`` (n, 6).
+
+    ``told``: of the base, in order.
+    """
 
     loads: Array
     pose: Array
     velocity: Array
     volts: Array
+    told: tuple[BaseAcceleration, ...] = ()
 
 
 def loads_of(kind: str, seconds: float, rng: np.random.Generator) -> Array:
@@ -96,15 +113,94 @@ def moved(loads: Array) -> tuple[Array, Array]:
     return pose, velocity
 
 
+def turns(t: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Rates of turn (n, 3), rad/s, and angular accelerations (n, 3), rad/s^2, at times ``t`` of a base on three joints.
+
+    Each joint moves again and again: it speeds up, goes on and slows down, with steps of the acceleration or with
+    raised cosines.
+    """
+    rate, acceleration = np.zeros((len(t), 3)), np.zeros((len(t), 3))
+    for axis, most in enumerate(FASTEST):
+        begin = REST
+        while begin < t[-1]:
+            peak, smooth = most * rng.uniform(-1.0, 1.0), bool(rng.integers(2))
+            long, cruise, rest = np.round(RATE * rng.uniform((0.1, 0.0, 0.0), (0.3, 0.3, 0.5))) / RATE
+            for sign, start in ((1.0, begin), (-1.0, begin + long + cruise)):
+                share = np.clip((t - start) / long, 0.0, 1.0)
+                angle = 2.0 * math.pi * share
+                now = (t > start) & (t < start + long)
+                acceleration[now, axis] += sign * peak * (1.0 - np.cos(angle[now]) if smooth else 1.0)
+                rate[:, axis] += sign * peak * long * (share - np.sin(angle) / (2.0 * math.pi) if smooth else share)
+            begin += 2.0 * long + cruise + rest
+    return rate, acceleration
+
+
+def swung(seconds: float, rng: np.random.Generator) -> tuple[Array, Array, tuple[BaseAcceleration, ...]]:
+    """Pose and velocity (n, 3) of a link without load whose base turns, and what is told of the base.
+
+    In the frame of the base the tip is a mass on springs; what its base does to it is base + alpha x r + omega x
+    (omega x r) + 2 omega x r', with r = (dX, dY, L), by Runge and Kutta.
+    """
+    n, h = round(seconds * RATE), 1.0 / (RATE * PARTS)
+    # Each step from just after its begin to just before its end.
+    t = (np.arange(n * PARTS)[:, None] * h + np.array([1e-9, 0.5 * h, h - 1e-9])).ravel()
+    rates, accelerations = turns(t, rng)
+    behind = np.array([0.0, 0.0, BEHIND])
+    base = np.cross(accelerations, behind) + np.cross(rates, np.cross(rates, behind))
+    (wx, wy, wz), (ax, ay, az) = rates.T, accelerations.T
+    w, zeta = 2.0 * math.pi * np.array(MODES)[:, 0], np.array(MODES)[:, 1]
+    system, force = np.zeros((len(t), 6, 6)), np.zeros((len(t), 6))
+    system[:, :3, 3:], system[:, 3:, :3], system[:, 3:, 3:] = np.eye(3), -np.diag(w * w), -np.diag(2.0 * zeta * w)
+    system[:, 3, 0] += wy * wy + wz * wz
+    system[:, 4, 1] += wx * wx + wz * wz
+    system[:, 3, 1] = az - wx * wy
+    system[:, 4, 0] = -az - wx * wy
+    system[:, 3, 4], system[:, 4, 3] = 2.0 * wz, -2.0 * wz
+    force[:, 3] = -base[:, 0] - LENGTH * (ay + wx * wz)
+    force[:, 4] = -base[:, 1] - LENGTH * (wy * wz - ax)
+    force[:, 5] = -az
+    out, y = np.empty((n, 6)), np.zeros(6)
+    for i in range(n * PARTS):
+        if i % PARTS == 0:
+            out[i // PARTS] = y
+        (a0, a1, a2), (f0, f1, f2) = system[3 * i : 3 * i + 3], force[3 * i : 3 * i + 3]
+        k1 = a0 @ y + f0
+        k2 = a1 @ (y + 0.5 * h * k1) + f1
+        k3 = a1 @ (y + 0.5 * h * k2) + f1
+        k4 = a2 @ (y + h * k3) + f2
+        y = y + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    # The mean over the time for which each holds: how far the rate of turn goes in it.
+    told = tuple(
+        BaseAcceleration(i * TOLD * 1_000_000, tuple(np.cross(mean, behind).tolist()), tuple(mean.tolist()))
+        for i, mean in enumerate(accelerations[1::3].reshape(-1, PARTS * TOLD, 3).mean(axis=1))
+    )
+    return out[:, :3], out[:, 3:], told
+
+
 def make(kind: str, seconds: float, seed: int) -> Run:
     """A run of ``kind``."""
-    return run_of(loads_of(kind, seconds, np.random.default_rng(seed)), seed)
+    rng = np.random.default_rng(seed)
+    if kind in ('joint', UNTOLD):
+        pose, velocity, told = swung(seconds, rng)
+        volts = volts_of(pose, np.random.default_rng([seed, 1]))
+        return Run(np.zeros_like(pose), pose, velocity, volts, told if kind == 'joint' else ())
+    return run_of(loads_of(kind, seconds, rng), seed)
 
 
 def run_of(loads: Array, seed: int) -> Run:
     """The run under ``loads`` (n, 3)."""
     pose, velocity = moved(loads)
     return Run(loads, pose, velocity, volts_of(pose, np.random.default_rng([seed, 1])))
+
+
+def biased(run: Run, share: float) -> Run:
+    """The same run, with all that is told of the base too large by ``share``."""
+
+    def larger(vector: tuple[float, ...]) -> tuple[float, ...]:
+        return tuple((1.0 + share) * v for v in vector)
+
+    told = tuple(BaseAcceleration(m.t_ns, larger(m.linear), larger(m.angular)) for m in run.told)
+    return replace(run, told=told)
 
 
 def volts_of(pose: Array, rng: np.random.Generator) -> Array:
@@ -182,13 +278,21 @@ def rms(errors: Array) -> float:
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
-def judge(run: Run, rig: Rig) -> Result:
-    """The run through the pipeline, against the truth."""
+def judge(run: Run, rig: Rig, late: int = 0) -> Result:
+    """The run through the pipeline, against the truth.
+
+    What is told of the base comes ``late`` samples after its stamp.
+    """
     pipeline = Pipeline(rig)
     motion = pipeline.motion_filter
     if motion is None:
         raise ValueError('the rig asks for no filter')
     blocks = len(run.volts) // BLOCK
+    told = list(run.told)
+
+    def there(message: BaseAcceleration) -> int:
+        return round(message.t_ns / 1e9 * RATE) + late
+
     velocity, own, squares = np.zeros((blocks, 3)), np.zeros((blocks, 3)), np.zeros((blocks, 3))
     pose, pose_own = np.zeros((blocks, 3)), np.zeros((blocks, 3))
     foretold, held = np.zeros((blocks * BLOCK, 3)), np.zeros((blocks * BLOCK, 3))
@@ -196,6 +300,8 @@ def judge(run: Run, rig: Rig) -> Result:
     first = int(REST * RATE) // BLOCK
     for block in range(blocks):
         before = motion.innovations
+        while told and there(told[0]) < BLOCK * (block + 1):
+            pipeline.accelerate(told.pop(0))
         for record in pipeline.process(chunk(run, block)):
             if isinstance(record, TipMotion):
                 at = BLOCK * (block + 1) - 1
@@ -213,7 +319,11 @@ def judge(run: Run, rig: Rig) -> Result:
             held[ahead] = np.array(estimate.pose) - run.pose[ahead]
         at = BLOCK * (block + 1) - 1 + UNSEEN
         if at < len(run.pose):
-            later = motion.predicted(np.array([UNSEEN / RATE]))
+            # No samples, but messages go on.
+            meanwhile = copy.deepcopy(motion)
+            for message in told[: sum(there(message) <= at for message in told[: UNSEEN + 1])]:
+                meanwhile.inertia.tell(message, message.t_ns)
+            later = meanwhile.predicted(np.array([UNSEEN / RATE]))
             unseen[block] = (later.pose[0] - run.pose[at]) / np.sqrt(later.variance[0])
     part, samples = slice(first, blocks), slice(first * BLOCK, blocks * BLOCK)
     return Result(
@@ -303,17 +413,22 @@ def main() -> None:
     parser.add_argument('--runs', type=int, default=20, help='of each kind of motion')
     parser.add_argument('--seconds', type=float, default=23.0, help='of a run, the first three at rest')
     parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--kinds', nargs='+', choices=(*KINDS, UNTOLD), default=(*KINDS, UNTOLD))
+    parser.add_argument('--bias', type=float, default=0.0, help='share by which what is told of the base is too large')
+    parser.add_argument('--late', type=int, default=0, help='it comes so many samples after its stamp')
     args = parser.parse_args()
     judged: dict[str, list[Result]] = {}
-    for kind in KINDS:
+    for kind in args.kinds:
         seeds = range(args.seed, args.seed + args.runs)
-        judged[kind] = [judge(make(kind, args.seconds, seed), rig_of()) for seed in tqdm(seeds, kind)]
+        judged[kind] = [
+            judge(biased(make(kind, args.seconds, seed), args.bias), rig_of(), args.late) for seed in tqdm(seeds, kind)
+        ]
     print(table({kind: figures(results) for kind, results in judged.items()}))
-    worst = by_frequency(judged['chirp'])
-    print(
-        'foretold / held at its worst up to the mode: '
-        + ', '.join(f'{a} {r:.2f}' for a, r in zip(AXES, worst, strict=True))
-    )
+    if 'chirp' in judged:
+        print(
+            'foretold / held at its worst up to the mode: '
+            + ', '.join(f'{a} {r:.2f}' for a, r in zip(AXES, by_frequency(judged['chirp']), strict=True))
+        )
     for kind, results in judged.items():
         unseen = np.concatenate([r.unseen for r in results])
         inside = np.mean(np.abs(unseen[np.isfinite(unseen[:, 0])]) < 3.0, axis=0)

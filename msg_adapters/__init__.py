@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from msg_adapters import (
+    accel_stamped,
     diagnostic_array,
     point_cloud2,
     point_stamped,
@@ -26,6 +27,7 @@ from msg_adapters.header import Fields
 from msg_adapters.message_type import MessageType
 from psd_deflection.records import (
     AppliedLoad,
+    BaseAcceleration,
     BlockStatus,
     DeflectionEstimate,
     DiagnosticReport,
@@ -41,7 +43,7 @@ from psd_deflection.records import (
     TipMotion,
 )
 
-Input = AppliedLoad | ReferencePose | ReferenceWithCovariance | TemperatureReading
+Input = AppliedLoad | BaseAcceleration | ReferencePose | ReferenceWithCovariance | TemperatureReading
 
 SAMPLES = '/psd/samples'
 DEFLECTION = '/link_tip/deflection'
@@ -51,6 +53,7 @@ FILTERED = '/link_tip/filtered/deflection'
 DIAGNOSTICS = '/diagnostics'
 RIG = '/link_tip/rig'
 LOAD = '/link_tip/load'
+ACCELERATION = '/link_base/acceleration'
 REFERENCE = '/reference/deflection'
 REFERENCE_WITH_COVARIANCE = '/reference/deflection_with_covariance'
 TEMPERATURE = '/environment/temperature'
@@ -99,6 +102,7 @@ TOPICS = (
     Topic(DIAGNOSTICS, diagnostic_array.MESSAGE, DiagnosticReport, diagnostic_array.from_report),
     Topic(RIG, string.MESSAGE, RigState, string.from_rig, latched=True),
     Topic(LOAD, wrench_stamped.MESSAGE, AppliedLoad, wrench_stamped.from_load, wrench_stamped.to_applied_load),
+    Topic(ACCELERATION, accel_stamped.MESSAGE, BaseAcceleration, accel_stamped.from_base, accel_stamped.to_base),
     Topic(REFERENCE, pose_stamped.MESSAGE, ReferencePose, pose_stamped.from_reference, pose_stamped.to_reference),
     Topic(
         REFERENCE_WITH_COVARIANCE,
@@ -115,10 +119,13 @@ each PSD beyond the second one of :func:`spot_topics`, a PointStamped."""
 TOPIC_TYPES: Mapping[str, str] = {t.name: t.message.name for t in TOPICS}
 MESSAGE_TYPES: Mapping[str, MessageType] = {t.message.name: t.message for t in TOPICS}
 INPUTS = tuple(t.name for t in TOPICS if t.to_record is not None)
-"""The topics that the node subscribes to."""
+"""The topics that the node subscribes to; :data:`FILTER_INPUTS` only with a filter."""
 
 FILTER_TOPICS = (VELOCITY, FILTERED)
 """Published if the rig asks for the filter."""
+
+FILTER_INPUTS = (ACCELERATION,)
+"""Subscribed to if the rig asks for the filter."""
 
 LATCHED = tuple(t.name for t in TOPICS if t.latched)
 
@@ -209,7 +216,7 @@ def _of_spots(spots: SpotMeans) -> tuple[Message, ...]:
 
 
 def from_fields(topic: str, fields: Mapping[str, Any]) -> Input:
-    """The record of a message on one of ``INPUTS``. Raises ValueError for any other topic."""
+    """The record of a message on one of ``INPUTS``. Raises ValueError for another topic, and if it cannot be used."""
     found = _BY_NAME.get(topic)
     if found is None or found.to_record is None:
         raise ValueError(f'{topic} is not an input')

@@ -26,12 +26,13 @@ from psd_deflection.correction import Correction
 from psd_deflection.declarations import ZEROS
 from psd_deflection.errors import ConfigError
 from psd_deflection.estimation import Answer, Dots, Estimation, HeldTwist, SeenBlock
-from psd_deflection.filtering.motion import STATE, ModalFilter, joined_ns, split_ns
+from psd_deflection.filtering.motion import INERTIA, STATE, ModalFilter, joined_ns, split_ns
 from psd_deflection.records import (
     ENVIRONMENT,
     KNOWN_LOAD,
     RESTART,
     AppliedLoad,
+    BaseAcceleration,
     BlockStatus,
     DeflectionEstimate,
     FloatArray,
@@ -96,6 +97,7 @@ class Pipeline:
         self._recent: list[Dots] = []
         self._environment: dict[str, float] = {}
         self.zero_refused = ''
+        self._end_ns: int | None = None
         self._frozen: tuple[int, ...] = (0,) * len(rig.psds)
         self.estimation = Estimation(rig, self._effects)
         self.stamped = self.estimation.stamped
@@ -196,7 +198,7 @@ class Pipeline:
         # It says which numbers belong to no sample; no estimate depends on it.
         values.pop(RESTART, None)
         held, frozen, loads = values.pop(HELD, None), values.pop(FROZEN, None), values.pop(TIP_LOADS, None)
-        motion, load = values.pop(STATE, None), values.pop(KNOWN_LOAD, None)
+        motion, load, inertia = values.pop(STATE, None), values.pop(KNOWN_LOAD, None), values.pop(INERTIA, None)
         systematic = values.pop(SYSTEMATIC, None)
         names = [name for name in values if name in REMEMBERED or name.startswith(SOME)]
         told = {name: tuple(v) for name in names if isinstance(v := values.pop(name), list)}
@@ -229,6 +231,8 @@ class Pipeline:
             self.motion_filter.set_noise(self.stamped.noise.gamma)
             if isinstance(motion, list):
                 self.motion_filter.restore(tuple(motion))
+            if isinstance(inertia, list):
+                self.motion_filter.restore_inertia(tuple(inertia))
             if isinstance(systematic, list):
                 self.estimation.systematic = np.reshape(systematic, (3, 3))
             if isinstance(load, list) and len(load) == 5:
@@ -259,6 +263,8 @@ class Pipeline:
             values.append((STATE, motion))
             if estimation.systematic is not None:
                 values.append((SYSTEMATIC, tuple(estimation.systematic.ravel().tolist())))
+        if self.motion_filter is not None and (inertia := self.motion_filter.inertia_memory()):
+            values.append((INERTIA, inertia))
         if not values:
             return None
         last = self.last_spots
@@ -273,6 +279,20 @@ class Pipeline:
         if self.motion_filter is None or not self.motion_filter.is_new(load):
             return None
         return self.change({KNOWN_LOAD: (*split_ns(load.t_ns), load.fx, load.fy, load.tz)})
+
+    def accelerate(self, base: BaseAcceleration, there_ns: int | None = None) -> int | None:
+        """Tell the filter of the motion a known acceleration of the base, from the next block on.
+
+        ``there_ns``: in a replay, when it was there. Returns the time (ns) to record for that: just after the last
+        block. A replay tells it before the next block whose last sample is not before that. None if there is no
+        filter, or no block yet. Raises ValueError if the acceleration cannot be used.
+        """
+        if there_ns is None and self._end_ns is not None:
+            there_ns = self._end_ns + 1
+        if self.motion_filter is None or there_ns is None:
+            return None
+        self.motion_filter.inertia.tell(base, there_ns)
+        return there_ns
 
     def temperature(self, celsius: float) -> ParameterChange | None:
         """Set the ambient temperature from the next block on; None if no correction needs it."""
@@ -306,6 +326,7 @@ class Pipeline:
         present = len(block.seq)
         self.counters.samples += present
         self.counters.blocks += 1
+        self._end_ns = int(block.t_ns[-1])
         volts = self._calibration.seen(block.volts)
         sums = volts[:, 2::3].astype(np.float64)
         samples = self.dots(block)

@@ -214,6 +214,17 @@ class AppliedLoad(NamedTuple):
     tz: float
 
 
+class BaseAcceleration(NamedTuple):
+    """A known acceleration of the link's base in ``link_base``, without gravity, held until the next one.
+
+    ``linear`` (3,): of the base's origin, m/s^2. ``angular`` (3,): rad/s^2.
+    """
+
+    t_ns: int
+    linear: tuple[float, ...]
+    angular: tuple[float, ...]
+
+
 class ReferencePose(NamedTuple):
     """An independent measurement of the tip: m, m, rad."""
 
@@ -314,6 +325,7 @@ Record = (
     | TipLoad
     | TipMotion
     | AppliedLoad
+    | BaseAcceleration
     | ReferencePose
     | ReferenceWithCovariance
     | TemperatureReading

@@ -19,6 +19,7 @@ import numpy as np
 
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError
+from psd_deflection.filtering.inertia import Forced, Inertia
 from psd_deflection.filtering.modal import BlockTables, Oscillator
 from psd_deflection.filtering.unseen import UnseenLoads
 from psd_deflection.records import AppliedLoad, FloatArray, IntArray
@@ -37,11 +38,15 @@ STEADY = 1e-9
 """The same of r/w, if the rig file states how the load wanders: it has no rate of change."""
 KNOWN_LOAD = 0.05
 """Share by which the deflection of a known load may differ from the rig file's link, one standard deviation."""
+LATE_S = 1.0
+"""What late accelerations change fades to 1/e in this time."""
 AXES = ('dX', 'dY', 'theta')
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 _FIRST, _SECOND = (np.array(side) for side in zip(*_PAIRS, strict=True))
 STATE = 'state.motion'
 """Name under which :meth:`ModalFilter.memory` is recorded."""
+INERTIA = 'state.inertia'
+"""The same of :meth:`ModalFilter.inertia_memory`."""
 
 
 class Moved(NamedTuple):
@@ -65,6 +70,14 @@ class Predicted(NamedTuple):
     velocity: FloatArray
     variance: FloatArray
     velocity_variance: FloatArray
+
+
+class _Taken(NamedTuple):
+    """Of the last block: what the accelerations did as far as they were known, and how its samples moved the state at
+    its end: ``gain`` (3, 4, N), 0 for a sample that is not there."""
+
+    forced: Forced
+    gain: FloatArray
 
 
 class Innovations(NamedTuple):
@@ -94,6 +107,7 @@ class Innovations(NamedTuple):
 class ModalFilter:
     """Holds pose, velocity and static deflection of the tip, at the last sample of the last block.
 
+    ``inertia``: takes the accelerations of the base. A late one puts right what was computed of the last block.
     ``innovations``: of the run so far. ``coasted``: s since the last sample that was used. ``coasts``: times that the
     filter went on without samples. Raises ConfigError if blocks are too long.
     """
@@ -132,6 +146,9 @@ class ModalFilter:
         self.coasts = 0
         self._loads: list[AppliedLoad] = []
         self._held: FloatArray | None = None
+        self.inertia = Inertia(self._modes, rig.link.length)
+        self._late_ones = 0
+        self._times = self._period * np.arange(1.0, size + 1.0)
         self.set_noise(noise)
         self.forget()
 
@@ -146,8 +163,11 @@ class ModalFilter:
         self._index: int | None = None
         self._t_ns = 0
         self.coasted = 0.0
+        self._taken: _Taken | None = None
+        self._late = np.zeros((3, 2))
         if self._unseen is not None:
             self._unseen.forget()
+        self._begin_unseen()
 
     def set_noise(self, gamma: FloatArray) -> None:
         """``gamma`` (C, C, N), m^2: covariance of reading c with reading d, so many samples later."""
@@ -190,34 +210,80 @@ class ModalFilter:
             # After a restart numbers and times do not agree.
             if missed < 0 or away > self._longest + 2.0 * seconds or abs(away - (missed + 1) * seconds) > 0.5 * seconds:
                 self.forget()
-            for _ in range(missed if self._index is not None else 0):
-                self._coast(seconds)
+            if self._index is not None:
+                self._take_late()
+                for k in range(missed):
+                    self._coast(seconds, self._forced(self._t_ns + round(1e9 * (k + 1) * seconds)))
+        self.inertia.forget_before(self._before_ns(t_ns))
         if self._index is None and slots is None:
             return None
         pushed = self._known_loads(t_ns)
+        forced = self._forced(t_ns)
         self._index, self._t_ns = index, t_ns
         if slots is None or poses is None:
-            self._coast(seconds)
+            self._coast(seconds, forced)
             if pushed is not None:
                 self._x = self._x + pushed[1]
             if self.coasted > self._longest:
                 self.forget()
                 return None
         else:
-            self._update(slots, poses, pushed)
+            self._update(slots, poses, pushed, forced)
         return self._moved()
 
-    def _coast(self, seconds: float) -> None:
+    def _coast(self, seconds: float, forced: Forced | None) -> None:
         if self.coasted == 0.0:
             self.coasts += 1
-            if self._unseen is not None:
-                self._unseen.begin()
+            self._begin_unseen()
         self.coasted += seconds
         phi = self._tables.phi
         self._x = np.einsum('aij,aj->ai', phi, self._x)
         added = np.einsum('ak,akij->aij', self._weights, self._tables.added)
         self._p = np.einsum('aij,ajl,aml->aim', phi, self._p, phi) + added
         self._shared = np.einsum('pij,pjl,pml->pim', phi[_FIRST], self._shared, phi[_SECOND])
+        self._taken = None
+        if forced is not None:
+            self._x = self._x + forced.at[:, -1]
+            self._p[:, 2, 2] += np.square(forced.doubt)
+            self._taken = _Taken(forced, np.zeros((3, 4, self._size)))
+
+    def _end_ns(self) -> int:
+        """Time of the last sample of the last block."""
+        return self._t_ns + round(0.5e9 * (self._size - 1) * self._period)
+
+    def _before_ns(self, t_ns: int) -> int:
+        """One sample before the block whose middle is at ``t_ns``."""
+        return t_ns - round(0.5e9 * (self._size + 1) * self._period)
+
+    def _begin_unseen(self) -> None:
+        """What is seen of loads from here on does not depend on what was before."""
+        self._swung = np.zeros((3, 4))
+        if self._unseen is not None:
+            self._unseen.begin()
+
+    def _forced(self, t_ns: int) -> Forced | None:
+        """What the base's accelerations do in the block whose middle is at ``t_ns``; None if none is known."""
+        if not self.inertia.known:
+            return None
+        return self.inertia.forced(self._before_ns(t_ns), self._times)
+
+    def _take_late(self) -> None:
+        """Put right what accelerations did in the last block that were not known then.
+
+        The samples of the block have shown some of it: what the filter would have found is linear in what is foretold.
+        The mean square of what that changes is how far what is published was off, and will be.
+        """
+        came, self._late_ones = self.inertia.late - self._late_ones, self.inertia.late
+        taken = self._taken
+        kept = math.exp(-self._size * self._period / LATE_S)
+        self._late = kept * self._late if taken is not None else np.zeros((3, 2))
+        if taken is None or not came or (now := self._forced(self._t_ns)) is None:
+            return
+        more = now.at - taken.forced.at
+        self._late += (1.0 - kept) * np.square(more[:, -1, :2])
+        self._x = self._x + more[:, -1] - np.einsum('ain,an->ai', taken.gain, more[..., 0])
+        self._swung = self._swung + more[:, -1]
+        self._p[:, 2, 2] += np.square(np.maximum(now.doubt - taken.forced.doubt, 0.0))
 
     def _known_loads(self, t_ns: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
         """What the known loads of this block do: to each sample (3, N), to the end (3, 4), and to u, (3,)."""
@@ -242,7 +308,11 @@ class ModalFilter:
         return samples, end, size
 
     def _update(
-        self, slots: IntArray, poses: FloatArray, pushed: tuple[FloatArray, FloatArray, FloatArray] | None
+        self,
+        slots: IntArray,
+        poses: FloatArray,
+        pushed: tuple[FloatArray, FloatArray, FloatArray] | None,
+        forced: Forced | None,
     ) -> None:
         says = self._tables.says(slots)
         foretold = np.einsum('ani,ai->an', says.observed, self._x)
@@ -253,6 +323,11 @@ class ModalFilter:
             after = after + pushed[1]
             p = p.copy()
             p[:, 2, 2] += pushed[2]
+        if forced is not None:
+            foretold = foretold + forced.at[:, slots, 0]
+            after = after + forced.at[:, -1]
+            p = p.copy()
+            p[:, 2, 2] += np.square(forced.doubt)
         miss = poses.T - foretold
         levels = self.levels
         # Of x0, one sample before the block: what the block says, then with what was known.
@@ -284,11 +359,19 @@ class ModalFilter:
         self._shared += np.einsum('pim,pjm->pij', both, mean[_SECOND])
         self._weights = weights
         self.coasted = 0.0
+        self._taken = None
+        if forced is not None:
+            gain = np.zeros((3, 4, self._size))
+            gain[..., slots] = mean
+            self._taken = _Taken(forced, gain)
         if self._unseen is not None:
             if pushed is not None:
                 # What a known load did was foreseen.
-                self._unseen.begin()
-            self._unseen.add(self._x, self._p, self._rate())
+                self._begin_unseen()
+            self._swung = np.einsum('aij,aj->ai', self._tables.phi, self._swung)
+            if forced is not None:
+                self._swung = self._swung + forced.at[:, -1]
+            self._unseen.add(self._x - self._swung, self._p, self._rate())
         taken = np.einsum('ak,ak->a', weights, squares).tolist()
         so_far = zip(self.innovations.squares, taken, strict=True)
         self.innovations = Innovations(tuple(a + b for a, b in so_far), self.innovations.samples + len(slots))
@@ -304,10 +387,21 @@ class ModalFilter:
             out[:, range(4), range(4)] = self._unseen.after(seconds)
         return out
 
+    def _unsure(self) -> FloatArray:
+        """Covariance (3, 4, 4) at the end of the block, with what the next messages about the base may put right."""
+        if not self.inertia.known:
+            return self._p
+        p = self._p.copy()
+        p[:, (0, 1), (0, 1)] += self._late
+        p[:, 1, 1] += np.square(self.inertia.unsure(self._end_ns()))
+        return p
+
     def _moved(self) -> Moved:
         """Of the end of the block, ``filter_ahead`` later."""
         x = np.einsum('aij,aj->ai', self._later, self._x)
-        p = np.einsum('aij,ajl,aml->aim', self._later, self._p, self._later)
+        if self.inertia.known and self._ahead > 0.0:
+            x = x + self.inertia.forced(self._end_ns(), np.array([self._ahead])).at[:, 0]
+        p = np.einsum('aij,ajl,aml->aim', self._later, self._unsure(), self._later)
         p += np.einsum('ac,acij->aij', self._rate(), self._later_spread)
         p += self._unforeseen(self.coasted + self._ahead)
         shared = np.einsum('pij,pjl,pml->pim', self._later[_FIRST], self._shared, self._later[_SECOND])
@@ -323,7 +417,9 @@ class ModalFilter:
         steps = np.stack([[mode.step(s) for s in seconds.tolist()] for mode in self._modes])
         added = np.stack([mode.spreads(seconds) for mode in self._modes])
         x = np.einsum('anij,aj->nai', steps, self._x)
-        p = np.einsum('anij,ajl,anml->naim', steps, self._p, steps)
+        if self.inertia.known:
+            x = x + self.inertia.forced(self._end_ns(), seconds).at.transpose(1, 0, 2)
+        p = np.einsum('anij,ajl,anml->naim', steps, self._unsure(), steps)
         p += np.einsum('ac,ancij->naij', self._rate(), added)
         p += np.stack([self._unforeseen(self.coasted + s) for s in seconds.tolist()])
         return Predicted(x[..., 0], self._w * x[..., 1], p[..., 0, 0], self._w**2 * p[..., 1, 1])
@@ -342,8 +438,8 @@ class ModalFilter:
         held = (1.0, *self._held.tolist()) if self._held is not None else (0.0,) * 4
         times = (float(self._index), *split_ns(self._t_ns), self.coasted)
         arrays = [self._x, self._p, self._shared, self._weights]
+        self._begin_unseen()
         if self._unseen is not None:
-            self._unseen.begin()
             arrays.append(self._unseen.variances)
         waiting = [v for load in self._loads for v in (*split_ns(load.t_ns), *load[1:])]
         return (*times, *held, *(v for array in arrays for v in array.ravel().tolist()), *waiting)
@@ -361,11 +457,38 @@ class ModalFilter:
         x, p, shared, weights = np.split(np.array(values[8:known]), (12, 60, 108))
         self._x, self._p, self._shared = x.reshape(3, 4), p.reshape(3, 4, 4), shared.reshape(3, 4, 4)
         self._weights = weights.reshape(3, self.levels)
+        self._begin_unseen()
         if self._unseen is not None:
-            self._unseen.begin()
             self._unseen.variances[:] = np.reshape(values[known:numbers], self._unseen.variances.shape)
         waiting = np.reshape(values[numbers:], (-1, 5)).tolist()
         self._loads = [AppliedLoad(joined_ns(s, ns), fx, fy, tz) for s, ns, fx, fy, tz in waiting]
+
+    def inertia_memory(self) -> tuple[float, ...]:
+        """What the next blocks depend on of the base's accelerations; () if nothing is known of them."""
+        if not self.inertia.known:
+            return ()
+        told = [v for t_ns, deflection in self.inertia.told for v in (*split_ns(t_ns), *deflection)]
+        arrays = [self._late]
+        if self._taken is not None:
+            arrays += [self._taken.forced.at[..., :2], self._taken.forced.doubt, self._taken.gain]
+        return (float(len(told)), *told, *(v for array in arrays for v in array.ravel().tolist()))
+
+    def restore_inertia(self, values: tuple[float, ...]) -> None:
+        """Go on from another one's :meth:`inertia_memory`. Raises ValueError if it had blocks of another size."""
+        n = self._size
+        told = int(values[0]) + 1 if values and 0.0 <= values[0] < len(values) and np.isfinite(values).all() else 0
+        known, taken = values[told:], 6 * n + 3 + 12 * n
+        if told % 5 != 1 or len(known) not in (6, 6 + taken):
+            raise ValueError(f'{INERTIA}: {len(values)} numbers do not tell accelerations in blocks of {n} samples')
+        rows = np.reshape(values[1:told], (-1, 5)).tolist()
+        self.inertia.told = [(joined_ns(s, ns), tuple(deflection)) for s, ns, *deflection in rows]
+        # Perhaps some came after the last block.
+        self._late_ones = -1
+        self._late = np.reshape(known[:6], (3, 2))
+        if len(known) > 6:
+            moved, doubt, gain = np.split(np.array(known[6:]), (6 * n, 6 * n + 3))
+            at = np.concatenate((moved.reshape(3, n, 2), np.zeros((3, n, 2))), axis=2)
+            self._taken = _Taken(Forced(at, doubt), gain.reshape(3, 4, n))
 
 
 def split_ns(t_ns: int) -> tuple[float, float]:

@@ -13,14 +13,14 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from msg_adapters import INPUTS, MESSAGE_TYPES, RIG, TOPIC_TYPES
+from msg_adapters import MESSAGE_TYPES, RIG, TOPIC_TYPES
 from psd_deflection import __version__
 from psd_deflection.config import Rig
 from psd_deflection.declarations import MonitorConfig
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor.feed import Feed
 from psd_deflection.records import ParameterChange, Record, RigState, SpotMeans
-from psd_deflection.runner.fanout import Fanout, published
+from psd_deflection.runner.fanout import Fanout, published, subscribed
 
 if TYPE_CHECKING:
     import foxglove
@@ -57,7 +57,7 @@ class FoxgloveServer:
         self._rig: tuple[bytes, int] | None = None
         self._repeat_at = math.inf
         # Before anybody looks: foxglove-sdk offers a new channel to a viewer that it does not let subscribe to it yet.
-        for topic, type_name in (published(rig) | {name: TOPIC_TYPES[name] for name in INPUTS}).items():
+        for topic, type_name in (published(rig) | {name: TOPIC_TYPES[name] for name in subscribed(rig)}).items():
             self._offer(topic, type_name)
         self._server = self._serve(rig.monitor)
         self.address = f'ws://{rig.monitor.foxglove_address}:{self._server.port}'

@@ -6,6 +6,7 @@ not a multiple of 20).
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import re
@@ -17,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from msg_adapters import (
+    ACCELERATION,
     DEFLECTION_WITH_COVARIANCE,
     DIAGNOSTICS,
     FILTERED,
@@ -27,6 +29,7 @@ from msg_adapters import (
     SAMPLES,
     TEMPERATURE,
     TOPIC_TYPES,
+    accel_stamped,
     pose_stamped,
     pose_with_covariance_stamped,
     string,
@@ -46,6 +49,7 @@ from psd_deflection.recordings.mcap_reader import McapReader, RawMessage
 from psd_deflection.recordings.recording import Recording, from_json
 from psd_deflection.records import (
     AppliedLoad,
+    BaseAcceleration,
     ParameterChange,
     RawChunk,
     ReferencePose,
@@ -330,6 +334,13 @@ class BagRecording(Recording):
     def loads(self) -> list[AppliedLoad]:
         """Known loads, each held until the next."""
         return self._decoded(LOAD, wrench_stamped.to_applied_load)
+
+    def accelerations(self) -> Iterator[tuple[int, BaseAcceleration]]:
+        """Known accelerations of the base, with the time of arrival. A live run refuses what is left out here, too."""
+        for channel, log_time, message in self.messages([ACCELERATION]):
+            self._check_type(channel.type, channel.encoding, ACCELERATION)
+            with contextlib.suppress(ValueError):
+                yield log_time, accel_stamped.to_base(cdr.decode(channel.type, message))
 
     def references(self) -> list[ReferencePose]:
         """Independent measurements of the tip."""

@@ -20,6 +20,7 @@ from psd_deflection.recordings.mcap_reader import RawMessage
 from psd_deflection.records import (
     RESTART,
     AppliedLoad,
+    BaseAcceleration,
     FloatArray,
     IntArray,
     ParameterChange,
@@ -151,6 +152,10 @@ class Recording(abc.ABC):
     @abc.abstractmethod
     def loads(self) -> list[AppliedLoad]:
         """Known loads, each held until the next."""
+
+    def accelerations(self) -> Iterator[tuple[int, BaseAcceleration]]:
+        """Known accelerations of the base as they came, each with the time (ns) when it was there."""
+        return iter(())
 
     @abc.abstractmethod
     def references(self) -> list[ReferencePose]:

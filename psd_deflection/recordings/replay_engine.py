@@ -6,6 +6,7 @@ Commands, the monitor and the benchmarks use it. ``source: replay`` is different
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -95,6 +96,8 @@ def replayed(
     noted = any(name == KNOWN_LOAD for change in changes for name, _ in change.values)
     loads = [] if noted or pipeline.motion_filter is None else recording.loads()
     loads.reverse()
+    accelerations = recording.accelerations() if pipeline.motion_filter is not None else iter(())
+    acceleration = next(accelerations, None)
     for block in recording.blocks() if blocks is None else blocks:
         while temperatures and temperatures[0].t_ns <= block.t_ns[0]:
             warmer = pipeline.temperature(temperatures.pop(0).celsius)
@@ -106,6 +109,12 @@ def replayed(
             change = changes.pop(0)
             pipeline.apply(change)
             yield [change]
+        while acceleration is not None and acceleration[0] <= block.t_ns[-1]:
+            # The unfinished block belongs to the time before it.
+            yield list(pipeline.flush())
+            with contextlib.suppress(ValueError):
+                pipeline.accelerate(acceleration[1], acceleration[0])
+            acceleration = next(accelerations, None)
         while loads and loads[-1].t_ns <= block.t_ns[-1]:
             pipeline.load(loads.pop())
         yield list(pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags)))

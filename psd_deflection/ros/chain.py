@@ -35,6 +35,7 @@ from psd_deflection.ros.transforms import installed, static_transforms, transfor
 from psd_deflection.ros.wires import InputRecorder, PublisherWire, message_class, qos, relative, topics_of
 from psd_deflection.runner.chain import ChainSession, Composed
 from psd_deflection.runner.diagnostics import ERROR, OK, WARN, HealthReporter
+from psd_deflection.runner.fanout import subscribed
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.rig_publisher import RigPublisher
 from psd_deflection.runner.session import Session, why_no_zero, zero_text
@@ -78,7 +79,7 @@ class ChainNode:
             told = RigPublisher(wire, session)
             session.fanout.change_wires.append(told)
             self._told.append(told)
-            InputRecorder(node, link).session = session
+            InputRecorder(node, subscribed(session.rig), link).session = session
         self._end = node.create_publisher(message_class(_KIND), relative(END_EFFECTOR), qos(END_EFFECTOR))
         self._tf = self._tf_static = None
         if installed():

@@ -39,6 +39,7 @@ from psd_deflection.ros.running import SPIN_S, executor_of, ros
 from psd_deflection.ros.transforms import TransformPublisher, installed
 from psd_deflection.ros.wires import InputRecorder, PublisherWire, VoltsPublisher, topics_of
 from psd_deflection.runner.diagnostics import STALE, HealthReporter
+from psd_deflection.runner.fanout import subscribed
 from psd_deflection.runner.realtime import Watchdog, settle
 from psd_deflection.runner.rig_publisher import RigPublisher
 from psd_deflection.runner.session import Session, why_no_zero, zero_text
@@ -128,7 +129,7 @@ class EstimatorNode:
 
     def _wires(self, rig: Rig) -> tuple[PublisherWire, InputRecorder]:
         try:
-            return PublisherWire(self.node, topics_of(rig)), InputRecorder(self.node)
+            return PublisherWire(self.node, topics_of(rig)), InputRecorder(self.node, subscribed(rig))
         except (InvalidQosOverridesError, ValueError, RuntimeError) as error:
             raise ConfigError(f'ROS parameters: qos_overrides: {error}') from None
 
@@ -207,6 +208,7 @@ class EstimatorNode:
         """Open the port and let samples flow; nothing is published yet."""
         node, rig, unzeroed = self.node.get_fully_qualified_name(), self._live.rig, self._live.unzeroed
         self._wire.offer(topics_of(rig))
+        self._inputs.listen(subscribed(rig))
         session = self._signals.interruptible(lambda: Session(rig, self._say, node, unzeroed))
         self.session = session
         try:

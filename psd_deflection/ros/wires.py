@@ -10,10 +10,10 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
 
 from msg_adapters import (
     DIAGNOSTICS,
-    INPUTS,
     TOPIC_TYPES,
     vector3_stamped,
 )
@@ -109,19 +109,29 @@ class VoltsPublisher:
 
 
 class InputRecorder:
-    """Records known loads, references and temperatures as they arrive.
+    """Gives the session what other nodes say, as it arrives.
 
-    ``session``: the one that records, or None. A message that is too long for its type is ignored and
+    ``session``: the one that takes it, or None. A message that is too long for its type is ignored and
     counted in ``refused``, so that another node cannot fill the disk. ``below``: as of :class:`PublisherWire`.
     """
 
-    def __init__(self, node: Node, below: str = '') -> None:
+    def __init__(self, node: Node, topics: Iterable[str], below: str = '') -> None:
         self.session: Session | None = None
         self.refused = 0
-        for topic in INPUTS:
-            node.create_subscription(
+        self._node = node
+        self._below = below
+        self._subscriptions: dict[str, Subscription] = {}
+        self.listen(topics)
+
+    def listen(self, topics: Iterable[str]) -> None:
+        """Subscribe to exactly these topics from now on. Only while no session runs."""
+        topics = tuple(topics)
+        for topic in [t for t in self._subscriptions if t not in topics]:
+            self._node.destroy_subscription(self._subscriptions.pop(topic))
+        for topic in [t for t in topics if t not in self._subscriptions]:
+            self._subscriptions[topic] = self._node.create_subscription(
                 message_class(TOPIC_TYPES[topic]),
-                relative(topic, below),
+                relative(topic, self._below),
                 lambda message, topic=topic: self._received(topic, message),
                 qos(topic),
                 raw=True,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from psd_deflection.filtering.inertia import HOLD_NS
 from psd_deflection.filtering.motion import AXES, Innovations
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.runner.session import Session
@@ -20,6 +21,9 @@ OFF_NS = 1_000_000
 
 BEYOND = 6.0
 """Standard deviations that the mean NIS of a second may be above 1: chance and a switched load explain that."""
+
+LATE_SHARE = 0.25
+"""Share of the base's accelerations that may be late: those of the end of a block are, if they come as they act."""
 
 LOAD_WALK = ('load wanders, fx (N in 1 s)', 'load wanders, fy (N in 1 s)', 'load wanders, tz (N m in 1 s)')
 
@@ -44,6 +48,7 @@ class HealthReporter:
         self._session = session
         self._seen: _Seen | None = None
         self._foretold = Innovations()
+        self._base = (0, 0, 0, 0)
 
     def report(self, t_ns: int) -> DiagnosticReport:
         """The report for the time since the last one. ``t_ns``: now, ROS time."""
@@ -199,10 +204,25 @@ class HealthReporter:
             ('NIS, 95 % band', '{:.3f} to {:.3f}'.format(*new.band(1.96))),
             ('coasting (s)', f'{motion.coasted:.3f}'),
             ('times that it coasted', str(motion.coasts)),
+            ('base accelerations', str(motion.inertia.count)),
+            ('base accelerations, after their samples', str(motion.inertia.late)),
+            ('base accelerations, not ended by another', str(motion.inertia.ended)),
+            ('base accelerations, refused', str(self._session.refused_accelerations)),
             *zip(LOAD_WALK, (f'{walk:.3g}' for walk in motion.load_walk()), strict=True),
         ]
         level, message = OK, 'the modes foretell the samples'
         worst = max(new.means())
+        told = motion.inertia
+        base = (told.count, told.late, told.ended, self._session.refused_accelerations)
+        came, late, ended, refused = (max(now - then, 0) for now, then in zip(base, self._base, strict=True))
+        self._base = base
+        if refused:
+            level, message = WARN, f'{refused} base accelerations refused: {self._session.why_refused}'
+        elif ended:
+            level = WARN
+            message = f'no base acceleration came for {HOLD_NS / 1e9:g} s, and the last one was not 0: taken as 0'
+        elif late > LATE_SHARE * came:
+            level, message = WARN, f'{late} of {came} base accelerations came after the samples on which they acted'
         if motion.coasted > 0.0:
             level, message = WARN, f'coasting for {motion.coasted:.2f} s: no samples that can be used'
         elif not new.samples:

@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from msg_adapters import DEFLECTION, FILTER_TOPICS, INPUTS, SPOTS, TOPIC_TYPES, messages, solver_topic, spot_topics
+from msg_adapters import (
+    DEFLECTION,
+    FILTER_INPUTS,
+    FILTER_TOPICS,
+    INPUTS,
+    SPOTS,
+    TOPIC_TYPES,
+    messages,
+    solver_topic,
+    spot_topics,
+)
 from psd_deflection.config import Rig
 from psd_deflection.recordings import cdr
 from psd_deflection.records import ParameterChange, Record
@@ -18,6 +28,11 @@ def published(rig: Rig) -> dict[str, str]:
         outputs = {topic: kind for topic, kind in outputs.items() if topic not in FILTER_TOPICS}
     outputs |= {solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in (*rig.estimator.solvers, ONE_PSD)}
     return outputs | dict.fromkeys(spot_topics(len(rig.psds)), TOPIC_TYPES[SPOTS[0]])
+
+
+def subscribed(rig: Rig) -> tuple[str, ...]:
+    """The topics of what a run of ``rig`` takes in."""
+    return tuple(topic for topic in INPUTS if rig.estimator.filter != 'none' or topic not in FILTER_INPUTS)
 
 
 class Wire(Protocol):

@@ -14,18 +14,19 @@ from concurrent.futures import Future, wait
 from functools import partial
 from pathlib import Path
 
-from msg_adapters import LOAD, TOPIC_TYPES, from_fields, to_messages
+from msg_adapters import ACCELERATION, LOAD, TOPIC_TYPES, accel_stamped, from_fields, to_messages
 from psd_deflection.config import Rig, left_as_in_the_thesis, replace_values
 from psd_deflection.declarations import ZEROS
 from psd_deflection.errors import Failed, Warned, printable
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.recordings import cdr
-from psd_deflection.records import AppliedLoad, ParameterChange, Record
+from psd_deflection.records import AppliedLoad, BaseAcceleration, ParameterChange, Record
 from psd_deflection.runner.acquisition import Acquisition
 from psd_deflection.runner.fanout import Fanout
 from psd_deflection.runner.processing import Processing, RecordSink
 from psd_deflection.runner.realtime import lock_memory
 from psd_deflection.runner.recorder import Recorder
+from psd_deflection.runner.repeats import Repeats
 from psd_deflection.runner.simulated_rig import SimulatedRigProcess, simulates
 from psd_deflection.runner.watcher import Watcher, WatcherWire
 from psd_deflection.runner.zero_store import ZeroStore
@@ -72,7 +73,8 @@ def why_no_zero(pipeline: Pipeline) -> str:
 class Session:
     """Opens the device on construction. ``say`` and every function in ``listeners`` get one line for each
     change of state, from any thread. ``input_sinks`` get known loads, references and temperatures as they come.
-    ``load``: the known load that is held now, or None. ``node``: full name of the ROS node, for recordings.
+    ``load``: the known load that is held now, or None. ``refused_accelerations``: their number, with
+    ``why_refused`` of the last one. ``node``: full name of the ROS node, for recordings.
     ``unzeroed``: ``rig`` with the zero that it was given, if it has one that was taken in an earlier session.
 
     Raises DeviceError, ConfigError, SolverError or RecordingError if the run cannot start.
@@ -84,7 +86,10 @@ class Session:
         self.listeners: list[Callable[[str], None]] = [say]
         self.input_sinks: list[RecordSink] = []
         self.load: AppliedLoad | None = None
+        self.refused_accelerations = 0
+        self.why_refused = ''
         say = self._tell
+        self._repeats = Repeats(say)
         check_live(rig.estimator.solver)
         check_arrangement(rig)
         # The geometry first: a rig that cannot be solved must not open a port.
@@ -225,10 +230,12 @@ class Session:
             self._tell(Failed(f'not recorded: {error}'))
 
     def take_input(self, topic: str, message: bytes) -> Record | None:
-        """Record an encoded message of a known load, a reference or a temperature, and show it.
+        """Record an encoded message of another node, and show it.
 
         Returns its record, or None if the message cannot be decoded or holds a number that is not finite.
         """
+        if topic == ACCELERATION:
+            return self._take_acceleration(message)
         self.recorder.put(topic, TOPIC_TYPES[topic], message, self.acquisition.now_ns())
         if self.watcher is not None:
             self.watcher.put_message(topic, TOPIC_TYPES[topic], message, self.acquisition.now_ns())
@@ -254,6 +261,35 @@ class Session:
         told = self.pipeline.load(load)
         if told is not None:
             self.processing.give([told])
+
+    def _take_acceleration(self, message: bytes) -> Record | None:
+        """Unlike the other inputs it is recorded when the pipeline has it: the filter's answer depends on that."""
+        try:
+            record = accel_stamped.to_base(cdr.decode(TOPIC_TYPES[ACCELERATION], message))
+        except ValueError as error:
+            self.processing.later(partial(self._refuse_acceleration, str(error)))
+            return None
+        self.processing.later(partial(self._accelerate, record, message))
+        return record
+
+    def _accelerate(self, record: BaseAcceleration, message: bytes) -> None:
+        try:
+            known_ns = self.pipeline.accelerate(record)
+        except ValueError as error:
+            self._refuse_acceleration(str(error))
+            return
+        if known_ns is None:
+            return
+        self.recorder.put(ACCELERATION, TOPIC_TYPES[ACCELERATION], message, known_ns)
+        if self.watcher is not None:
+            self.watcher.put_message(ACCELERATION, TOPIC_TYPES[ACCELERATION], message, known_ns)
+        for sink in self.input_sinks:
+            sink.put(record)
+
+    def _refuse_acceleration(self, why: str) -> None:
+        self.refused_accelerations += 1
+        self.why_refused = why
+        self._repeats.tell('acceleration', Warned(f'{ACCELERATION}: refused: {why}'), time.monotonic())
 
     def note_load(self, fx: float, fy: float, tz: float, *, add: bool = False) -> AppliedLoad:
         """Take down that this load (N, N, N m) acts at the tip from now on, as if it had come on ``/link_tip/load``.

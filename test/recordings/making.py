@@ -12,6 +12,7 @@ from psd_deflection.config import load_rig
 from psd_deflection.recordings.bag_writer import BagWriter, McapFile
 from psd_deflection.records import (
     AppliedLoad,
+    BaseAcceleration,
     BlockStatus,
     DeflectionEstimate,
     DiagnosticEntry,
@@ -72,6 +73,7 @@ def run(blocks: int) -> Iterator[Record]:
         yield motion(i)
         if i % 10 == 0:
             yield AppliedLoad(T0 + 20 * STEP * i, 0.5 * i, 0.0, 0.1)
+            yield BaseAcceleration(T0 + 20 * STEP * i, (0.5, 0.0, -9.0), (0.0, 0.1 * i, 2.0))
             yield ReferencePose(T0 + 20 * STEP * i, 1e-3, 2e-3, 3e-3)
             yield ReferenceWithCovariance(T0 + 20 * STEP * i, 1e-3, 2e-3, 3e-3, 0.0, 0.0, (1e-12,) * 9)
         if i % 50 == 49:

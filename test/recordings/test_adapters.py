@@ -37,6 +37,7 @@ from psd_deflection.recordings import cdr
 from psd_deflection.records import (
     CHANNELS,
     AppliedLoad,
+    BaseAcceleration,
     BlockStatus,
     DiagnosticEntry,
     DiagnosticReport,
@@ -148,7 +149,9 @@ def test_a_prefix_is_before_every_frame_once() -> None:
 
 @given(times, numbers, numbers, numbers)
 def test_inputs_come_back_as_they_went(t_ns: int, a: float, b: float, c: float) -> None:
-    for record in (AppliedLoad(t_ns, a, b, c), TemperatureReading(t_ns, a)):
+    # An acceleration without a stamp is refused.
+    base = BaseAcceleration(max(t_ns, 1), (a, b, c), (c, a, b))
+    for record in (AppliedLoad(t_ns, a, b, c), TemperatureReading(t_ns, a), base):
         (m,) = to_messages(record)
         back = from_fields(m.topic, cdr.decode(m.type, cdr.encode(m.type, m.fields)))
         assert back == record
@@ -162,6 +165,21 @@ def test_a_reference_comes_back_as_it_went(t_ns: int, dx: float, dy: float, thet
     assert isinstance(back, ReferencePose)
     assert back[:3] == (t_ns, dx, dy)
     assert back.theta == pytest.approx(theta, abs=1e-15, rel=1e-15)
+
+
+def test_the_fields_of_an_acceleration() -> None:
+    """What is in another frame, or says not when it acts, is none."""
+    base = BaseAcceleration(T0, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+    (m,) = to_messages(base, 'left/')
+    assert (m.topic, m.t_ns) == ('/link_base/acceleration', T0)
+    assert m.fields['header']['frame_id'] == 'left/link_base'
+    assert m.fields['accel'] == {'linear': {'x': 1.0, 'y': 2.0, 'z': 3.0}, 'angular': {'x': 4.0, 'y': 5.0, 'z': 6.0}}
+    assert from_fields(m.topic, m.fields) == base
+    for frame in ('', 'link_tip', 'link_base_2', 'x' * 1000):
+        with pytest.raises(ValueError, match=rf"frame_id is '{frame[:40]}': .* has to be given in link_base"):
+            from_fields(m.topic, m.fields | {'header': header(T0, frame)})
+    with pytest.raises(ValueError, match='stamp is 0'):
+        from_fields(m.topic, m.fields | {'header': header(0, 'link_base')})
 
 
 def test_an_estimated_load_is_no_input() -> None:

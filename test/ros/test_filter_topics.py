@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ pytestmark = pytest.mark.ros
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
-from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped, WrenchStamped  # noqa: E402
+from geometry_msgs.msg import AccelStamped, PoseWithCovarianceStamped, TwistStamped, WrenchStamped  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 
 from psd_deflection.cli.main import main  # noqa: E402
@@ -25,7 +26,7 @@ from test.ros.conftest import BLOCK_NS, stamp  # noqa: E402
 def test_velocity_and_filtered_pose_are_published_and_replay_to_the_bit(
     start: Callable[..., Any], peer: Any, tmp_path: Path, simulated_port: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    start('--port', simulated_port, '--ros-args', '-p', 'filter:=modal', '-p', f'bag_dir:={tmp_path}')
+    estimator = start('--port', simulated_port, '--ros-args', '-p', 'filter:=modal', '-p', f'bag_dir:={tmp_path}')
     speeds = peer.collect(TwistStamped, '/link_tip/velocity')
     poses = peer.collect(PoseWithCovarianceStamped, '/link_tip/filtered/deflection')
     health = peer.collect(DiagnosticArray, '/diagnostics')
@@ -40,9 +41,23 @@ def test_velocity_and_filtered_pose_are_published_and_replay_to_the_bit(
         for _ in range(5):
             load.publish(message)
             peer.until_of_now(speeds, 'velocities after the load')
-    now = len(speeds)
-    peer.until(lambda: len(speeds) >= now + 50, 'a second of velocities')
-    peer.until(lambda: len(health) >= 3, 'diagnostics')
+    turning = peer.node.create_publisher(AccelStamped, '/link_base/acceleration', 10)
+    peer.until(lambda: turning.get_subscription_count() > 0, 'the subscription')
+
+    def counted(key: str) -> int:
+        (status,) = [s for s in health[-1].status if s.name == 'estimator: motion'] if health else [None]
+        return int({v.key: v.value for v in status.values}[key]) if status is not None else 0
+
+    now, told = len(speeds), 0
+    while counted('base accelerations') < 10 or counted('base accelerations, refused') < 2 or len(speeds) < now + 50:
+        base = AccelStamped()
+        base.header.stamp = peer.node.get_clock().now().to_msg()
+        base.header.frame_id = 'link_base' if told % 10 else 'tool0'
+        base.accel.angular.x = math.nan if told % 10 == 5 else float(told % 7)
+        turning.publish(base)
+        told += 1
+        assert told < 1000
+        peer.until_of_now(speeds, 'velocities of a turning base')
     peer.call(SetBool, '/estimator/record', SetBool.Request(data=False))
     assert {m.header.frame_id for m in (*speeds, *poses)} == {'link_tip_rest'}
     assert [stamp(m) for m in speeds[:30]] == [stamp(m) for m in poses[:30]]
@@ -52,9 +67,16 @@ def test_velocity_and_filtered_pose_are_published_and_replay_to_the_bit(
     status = next(s for s in health[-1].status if s.name == 'estimator: motion')
     assert status.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
     assert float({v.key: v.value for v in status.values}['NIS a sample, dX']) > 0.5
+    # Best effort: either may have come first.
+    (said, *_) = [line for line in estimator.lines if '/link_base/acceleration: refused' in line]
+    assert "header.frame_id is 'tool0'" in said or 'accel.angular.x is nan' in said
     recording = open_recording(folder)
     noted = [name for change in recording.changes for name, _ in change.values]
     assert noted.count(KNOWN_LOAD) == 2
+    # Recorded is what the filter was told, and no more.
+    bases = [base for _, base in recording.accelerations()]
+    assert 10 <= len(bases) == recording.topics()['/link_base/acceleration'] <= told * 8 // 10
+    assert {base.angular[0] for base in bases} <= {0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0}
     assert recording.topics()['/link_tip/velocity'] == recording.topics()['/link_tip/filtered/deflection'] > 60
     assert main(['replay', str(folder), '--compare']) == 0
     assert 'no bit differs' in capsys.readouterr().out
@@ -68,3 +90,5 @@ def test_without_the_filter_there_is_no_topic_of_it(start: Callable[..., Any], p
     assert '/link_tip/velocity' not in graph
     assert '/link_tip/filtered/deflection' not in graph
     assert 'estimator: motion' not in {s.name for s in health[0].status}
+    assert peer.node.count_subscribers('/link_tip/load') == 1
+    assert peer.node.count_subscribers('/link_base/acceleration') == 0
