@@ -179,8 +179,8 @@ def test_a_map_that_is_off_draws_near_within_seconds_and_evenly() -> None:
         stamps.append(int(clock.to_host_ns(np.array([20_000 * k], np.int64))[0]))
     uneven = np.abs(np.diff(stamps) - 20 * MS)
     assert uneven[: 30 * 50].max() <= 1
-    assert uneven.max() < 4_100
-    assert uneven.max() > 100
+    # A sixth would be 3.2 us in 20 ms.
+    assert 3_600 < uneven.max() < 4_100
 
 
 @pytest.mark.parametrize('ahead', [0, 3_600_000 * MS])

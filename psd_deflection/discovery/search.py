@@ -103,7 +103,7 @@ def promising(scores: Sequence[Score], penalty: float, share: float, limit: int)
     """The best candidate of each variant, those that gain at least ``share`` of the best gain."""
     out: list[Score] = []
     seen: set[tuple[object, ...]] = set()
-    best = max((s.gain for s in scores), default=0.0)
+    best = max(s.gain for s in scores)
     for s in sorted(scores, key=lambda s: -(s.gain - penalty * s.dof)):
         if s.candidate.variant in seen or s.gain < share * best or s.gain <= 0.0:
             continue

@@ -89,6 +89,11 @@ def test_a_frame_and_its_bytes(label: str, wire: str, frame: GoodFrame) -> None:
         assert encode(frame, wide=label == WIDE) == received
 
 
+def test_a_sample_goes_with_16_bits_a_count_unless_asked_otherwise() -> None:
+    assert encode(SAMPLE) == encode(SAMPLE, wide=False)
+    assert len(encode(SAMPLE, wide=True)) == len(encode(SAMPLE)) + 2 * len(SAMPLE.counts)
+
+
 @pytest.mark.parametrize(('label', 'wire', 'reason'), BAD, ids=[c[0] for c in BAD])
 def test_bytes_that_are_no_frame(label: str, wire: str, reason: BadReason) -> None:
     received = bytes.fromhex(wire)

@@ -82,6 +82,10 @@ def test_of_what_is_no_covariance_as_little_as_makes_it_one_is_taken_off() -> No
     # Three tenths of what is taken off if all is made sure.
     np.testing.assert_allclose(made, [1.001, 0.8 * 0.85, 0.0], rtol=1e-9)
     assert made[1] < root_half < 0.8 * 0.95
+    for correlation, share in ((0.71, 0.03), (0.74, 0.1), (1.2, 1.0)):
+        each[0, 0, 1] = correlation
+        made = noise._covariance(each, sure)[0, 0]
+        np.testing.assert_allclose(made, [1.001, correlation * (1.0 - 0.5 * share), 0.0], rtol=1e-9)
     # What is one is left as it is, but for a thousandth of its own.
     each[0, 0, 1] = 0.7
     np.testing.assert_allclose(noise._covariance(each, sure)[0, 0], [1.001, 0.7, 0.0], rtol=1e-9)
