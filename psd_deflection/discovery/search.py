@@ -103,7 +103,7 @@ def promising(scores: Sequence[Score], penalty: float, share: float, limit: int)
     """The best candidate of each variant, those that gain at least ``share`` of the best gain."""
     out: list[Score] = []
     seen: set[tuple[object, ...]] = set()
-    best = max(s.gain for s in scores)
+    best = max((s.gain for s in scores), default=0.0)
     for s in sorted(scores, key=lambda s: -(s.gain - penalty * s.dof)):
         if s.candidate.variant in seen or s.gain < share * best or s.gain <= 0.0:
             continue
@@ -258,7 +258,7 @@ class Search:
         """One of the mistakes that touch every channel if it explains nearly all by itself, else ``null``."""
         if not scores or min(s.p for s in scores) > P_ACCEPT:
             return null
-        best = max(s.gain for s in scores)
+        best = max((s.gain for s in scores), default=0.0)
         starts: list[list[ActiveEffect]] = []
         for s in scores:
             if s.candidate.effect.name not in self.workspace.first:

@@ -840,6 +840,14 @@ def test_the_answer_is_written_as_it_is(found: Discovery) -> None:
     )
 
 
+def test_places_are_told_if_one_in_twenty_by_chance(found: Discovery) -> None:
+    first = found.where.cells[0]
+    cells = tuple(dataclasses.replace(first, p=p) for p in (0.0, 0.0499, 0.05, 1.0))
+    changed = dataclasses.replace(found, where=dataclasses.replace(found.where, cells=cells))
+    assert [place['p'] for place in told.result(changed)['where']] == [0.0, 0.0499]
+    assert told.result(found)['moves'] == dict(zip(('dx_m', 'dy_m', 'theta_rad'), found.moves, strict=True))
+
+
 def test_other_answers_have_other_sentences(found: Discovery) -> None:
     (named,) = found.effects
     floor = f'{1e6 * found.gap_floor:.3f} µm'

@@ -17,6 +17,7 @@ from psd_deflection.discovery import (
     coincidence,
     discover,
     experiment,
+    hidden,
     law_features,
     laws,
     localise,
@@ -51,6 +52,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.simulation.declaration import Effect, EffectParameter
 from psd_deflection.simulation.laws import Term
 from psd_deflection.simulation.loads import SIDEBAR_ARM
+from psd_deflection.simulation.physics import Physics
 
 from .test_formulas import RIG, observed
 from .test_law_formulas import Given
@@ -354,7 +356,7 @@ def test_a_candidate_counts_from_a_thousandth_of_sigma_on_and_on_its_own_side_on
         screen = Screen(plant, [(candidate('a', 'x'), [[size * unit]])])
         got = screen.score(plant.data)
         assert [s.gain for s in got] == ([pytest.approx(25.0, rel=1e-4)] if seen else [])
-    for size, least, gain in ((1.0, 0.0, 25.0), (-1.0, 0.0, 0.0), (-1.0, -1.0, 25.0)):
+    for size, least, gain in ((1.0, 0.0, 25.0), (10.0, 0.0, 25.0), (-1.0, 0.0, 0.0), (-1.0, -1.0, 25.0)):
         screen = Screen(plant, [(candidate('a', 'x', least=least), [[size * unit]])])
         assert screen.score(plant.data)[0].gain == pytest.approx(gain, rel=1e-4)
 
@@ -608,3 +610,109 @@ def test_a_law_of_the_noise_passes_at_the_p_of_its_limit_and_not_at_the_bic(monk
     assert laws.find_jitter(workspace, fit, 3.0) is not None
     monkeypatch.setattr(laws, 'BIC_ACCEPT', found.delta_bic)
     assert laws.find_jitter(workspace, fit, 3.0) is None
+
+
+def test_another_noise_is_told_to_three_decimals() -> None:
+    o = observed(warm=None)
+    stated = float(np.mean(RIG.noises[:, :2] ** 2)) + RIG.converter.volts_per_count**2 / 12.0
+    for factor, told in ((2.34567, 2.346), (0.123456, 0.123)):
+        ws = SimpleNamespace(observations=[o], noise=[SimpleNamespace(sigma=np.full(6, factor * math.sqrt(stated)))])
+        (finding,) = setup.noise_finding(cast(Workspace, ws))
+        assert finding.value == told
+        assert finding.evidence == pytest.approx(abs(math.log(factor)))
+
+
+@pytest.mark.parametrize(('gains', 'share'), [((-5.0, 1.0), 0.0), ((3.0, 2.0), 0.5), ((30.0, 2.0), 1.0)])
+def test_tied_effects_explain_none_to_all_of_the_gap(gains: tuple[float, float], share: float) -> None:
+    tie = coincidence.Coincidence((0, 'x'), (1, 'x'), (1.0, 1.0), 'V', 50.0)
+    fit = SimpleNamespace(effects=(active('a', x=1.0), active('b', x=1.0)), chi2=90.0)
+    found = SimpleNamespace(delta_chi2=list(gains), null=SimpleNamespace(chi2=100.0))
+    (unknown,) = weighing.tied(
+        [tie], cast(Fit, fit), cast(SearchResult, found), cast(Any, SimpleNamespace(dependences=()))
+    )
+    assert unknown.explains == pytest.approx(share)
+    assert not unknown.remains
+
+
+@pytest.mark.parametrize('channel', range(6))
+def test_a_limit_is_looked_for_on_every_channel(channel: int) -> None:
+    o = observed(warm=None)
+    volts = np.zeros_like(o.volts)
+    volts[7, channel] = -3.0
+    seen = dataclasses.replace(o, volts=volts)
+    limits = pytest.approx([2.8, 2.6, 1.8, 2.94])
+    assert proposals.highest_voltages([seen], True, 0.1) == limits
+    assert proposals.highest_voltages([seen], False, 0.1) == ([] if channel in (2, 5) else limits)
+
+
+@pytest.mark.parametrize('together', [0.9, -0.9])
+def test_two_sizes_agree_as_their_ratio_is_known(together: float) -> None:
+    """The variance of log a/b is that of a/a0 - b/b0: small if both go together."""
+    rng = np.random.default_rng(0)
+    jacobian = rng.standard_normal((200, 2)) * 1e3
+    jacobian[:, 1] = -together * jacobian[:, 0] + math.sqrt(1.0 - together**2) * jacobian[:, 1]
+    sizes, free = (1.0, 1.002), ((0, 'x'), (1, 'x'))
+    effects = (active('a', -9.0, 9.0, x=sizes[0]), active('b', -9.0, 9.0, x=sizes[1]))
+    fit = Fit(effects, 0.0, np.zeros(200), [], jacobian, free, ())
+    (tie,) = coincidence.coincidences(fit, Physics.of(RIG))
+    slope = np.array([1.0, -1.0]) / sizes
+    sd = math.hypot(math.sqrt(slope @ np.linalg.inv(jacobian.T @ jacobian) @ slope), 0.003)
+    z = math.log(sizes[0] / sizes[1]) / sd
+    want = 2.0 * math.log(10.0) * math.exp(-0.5 * z * z) / (sd * math.sqrt(2.0 * math.pi))
+    assert tie.odds == pytest.approx(want, rel=1e-6)
+    assert (tie.first, tie.second, tie.sizes, tie.unit) == (*free, sizes, 'V')
+
+
+def test_a_zero_may_be_of_the_beam_or_of_the_reading() -> None:
+    zero = next(e for e in hidden.mistakes(2, [], []) if e.name == 'zero')
+    way = zero.parameter('of_reading')
+    assert (way.minimum, way.maximum, way.choices, way.nominal) == (0, 1, (0, 1), 0)
+    assert len(list(zero.variants())) == 4
+
+
+def test_the_next_recording_is_one_of_the_first_ones_rig(monkeypatch: pytest.MonkeyPatch) -> None:
+    other = replace_values(RIG, {'link.length': 0.4})
+    asked: list[object] = []
+
+    def offered(rig: object, limits: object) -> list[experiment.Proposal]:
+        asked.append(rig)
+        raise RuntimeError('enough')
+
+    monkeypatch.setattr(planning, 'proposals', offered)
+    ws = SimpleNamespace(observations=[SimpleNamespace(rig=RIG), SimpleNamespace(rig=other)])
+    fit = cast(Fit, SimpleNamespace(jacobian=np.zeros((3, 1))))
+    with pytest.raises(RuntimeError, match='enough'):
+        planning.plan_next(cast(Workspace, ws), fit, [fit])
+    assert asked == [RIG]
+
+
+@pytest.mark.parametrize(('rest', 'listed'), [(1e-8, False), (1e-5, True)])
+def test_what_the_model_has_already_is_followed_by_nothing(rest: float, listed: bool) -> None:
+    plant = Plant(pictures(A), noise())
+    values = np.sin(np.arange(FINE))
+    row = np.zeros((6, FINE))
+    row[0] = values
+    aside = np.zeros((6, FINE))
+    aside[1] = values
+    known = (math.sqrt(1.0 - rest) * row + math.sqrt(rest) * aside).reshape(-1, 1)
+    found = dependences(plant, [('x1', {'wave': [values]})], plant.data, known)
+    assert bool(found) == listed
+
+
+def test_of_two_that_are_one_the_sum_is_known() -> None:
+    fit = refit(Plant(pictures(A), noise()), [active('a', x=0.0)])
+    twice = dataclasses.replace(
+        fit, jacobian=np.repeat(fit.jacobian, 2, axis=1), free=((0, 'x'), (1, 'x')), effects=fit.effects * 2
+    )
+    np.testing.assert_allclose(twice.covariance(), 0.25 * fit.covariance()[0, 0] * np.ones((2, 2)), rtol=1e-6)
+
+
+@pytest.mark.parametrize(('worse', 'refits'), [(59.9, 2), (60.0, 1), (60.1, 1)])
+def test_an_alternative_within_sixty_is_refitted_in_full(
+    monkeypatch: pytest.MonkeyPatch, worse: float, refits: int
+) -> None:
+    search = nothing_found()
+    asked = Asked(monkeypatch, steps, search, a=0.0, b=worse)
+    given_scores(search, scored('b', 90.0))
+    search.alternatives(asked.plain, asked.fit(active('a', x=0.1)), 0, 50.0)
+    assert [n for n, _ in asked.seen] == ['b'] * refits

@@ -68,6 +68,19 @@ def test_the_last_combination_is_the_length_of_the_base_line_wherever_the_beams_
             np.testing.assert_allclose(of.back(z.tolist(), np.eye(4))[0], row, atol=1e-15)
 
 
+def test_a_fit_follows_motion_unless_it_is_told_to_keep_the_mean() -> None:
+    def followed(fit: BlockFit) -> float:
+        fit.set_noise(white())
+        moving = 1e-4 * ((ALL - 9.5) / 9.5) ** 2
+        for _ in range(30):
+            got = fit.fit(ALL, np.outer(moving, [1.0, 0.0, 1.0, 0.0])).dots[0]
+        return got
+
+    assert followed(BlockFit(SIZE, PLACES, PLACES)) == followed(BlockFit(SIZE, PLACES, PLACES, True))
+    assert followed(BlockFit(SIZE, PLACES, PLACES, False)) == pytest.approx(1e-4 * np.mean(((ALL - 9.5) / 9.5) ** 2))
+    assert abs(followed(BlockFit(SIZE, PLACES, PLACES))) < 1e-6
+
+
 def test_inverses_of_positive_definite_matrices() -> None:
     a = np.random.default_rng(0).normal(size=(6, 7, 5))
     m = np.einsum('nij,nik->njk', a, a)

@@ -142,6 +142,21 @@ def test_what_noise_does_not_dither_stays_as_an_error_of_rounding(sigma: float) 
     assert noise._undithered(1.0, 0.0) == 0.0
 
 
+def test_a_segment_is_judged_by_its_roughness_and_that_of_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounding to a step q adds q^2/12."""
+    step, sigma = 4e-6, 1e-9
+    of = StreamNoise(SIZE, PLACES, PLACES, sigma**2, step)
+    seen: list[FloatArray] = []
+    monkeypatch.setattr(of, '_judge', lambda gamma, sure, fixed, rough: seen.append(rough))
+    monkeypatch.setattr(of, '_in_use', lambda: of.gamma)
+    rng = np.random.default_rng(0)
+    for block in range(2 * SEGMENT_BLOCKS):
+        of.add(block, np.arange(SIZE), sigma * rng.normal(size=(SIZE, 4)))
+    for rough in seen:
+        np.testing.assert_allclose(rough, step**2 / 12.0, rtol=1e-3)
+    assert seen
+
+
 def stream() -> StreamNoise:
     out = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0)
     out._judge(white(1.0), np.ones(SIZE), white(1.0)[0, 0], np.full(8, SIGMA**2))
@@ -190,6 +205,8 @@ def test_the_third_louder_segment_in_a_row_is_believed() -> None:
     for times, rough in ((9.0, None), (9.0, None), (1.0, None), (9.0, None), (9.0, 0.1), (9.0, None), (9.0, None)):
         judge(of, times, rough)
     assert level(of) == pytest.approx(1.0)
+    judge(of, 9.0)
+    assert level(of) == pytest.approx(9.0)
 
 
 @pytest.mark.parametrize(('rough', 'rest'), [(0.26, True), (0.24, False)])

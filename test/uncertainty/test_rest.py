@@ -44,6 +44,9 @@ def test_moving_is_five_times_the_noise_and_micrometres(noise_um: float, drifts:
 def test_diagnostics_say_whose_noise_it_is(covariance: str, words: str) -> None:
     stamped = StampedDots(load_rig(overrides={'covariance': covariance}))
     assert dict(stamped.words())['covariance from'] == words
+    # The noise of each reading is told if it is measured.
+    assert len(stamped.words()) == (5 if covariance == 'file' else 5 + len(stamped.noise_words()))
+    assert len(stamped.noise_words()) >= 4
 
 
 def test_diagnostics_say_of_how_many_readings_too_many_a_chi_square_is() -> None:
@@ -60,3 +63,12 @@ def test_diagnostics_say_how_probable_a_chi_square_is(more: dict[str, object], f
     stamped = StampedDots(load_rig(overrides=more))
     stamped.chi_square, stamped.freedom = 6.0, freedom
     assert dict(stamped.words())['p of that chi-square'] == f'{chi2.sf(6.0, freedom):.2g}'
+
+
+def test_the_check_of_three_psds_goes_on_from_its_memory() -> None:
+    one, other = (StampedDots(load_rig(overrides={'psd_3.center': [0.08, -0.06]})) for _ in range(2))
+    assert one._redundancy is not None
+    assert other._redundancy is not None
+    one._redundancy.set_state((2.0, 7.0, *(1e-12 * k for k in range(6))))
+    other.restore(one.memory())
+    assert other._redundancy.state() == one._redundancy.state()
