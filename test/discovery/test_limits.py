@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.calibration import Wiring
+from psd_deflection.commissioning.wirings import WIRINGS, differences
 from psd_deflection.config import replace_values
 from psd_deflection.discovery import (
     cleaning,
@@ -50,7 +51,7 @@ from psd_deflection.discovery.signatures import Candidate
 from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.declaration import Effect, EffectParameter
-from psd_deflection.simulation.laws import Term
+from psd_deflection.simulation.laws import Law, Term
 from psd_deflection.simulation.loads import SIDEBAR_ARM
 from psd_deflection.simulation.physics import Physics
 
@@ -241,7 +242,7 @@ def test_noise_of_a_sum_is_no_gap() -> None:
     found = laws.find_jitter(workspace, fit, 3.0)
     assert found is not None
     assert found.channels == ('sum2',)
-    assert found.heldout_gap == laws.heldout_gap(workspace, fit)
+    assert found.heldout_gap == validate.heldout_gap(workspace, fit)
     (term,) = found.law.terms
     squares = workspace.split(fit.residual)[0][5] ** 2
     known = law_features.known_fine(workspace, (), term.of[0])[0]
@@ -373,7 +374,7 @@ def test_of_those_that_gain_a_share_the_limit_itself_is_tried() -> None:
 def test_other_wirings_that_are_as_good_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     o = observed(warm=None)
     file = Wiring.from_rig(o.rig)
-    good = [w for w in setup.WIRINGS if len(setup.differences(w, file)) == 1][:4]
+    good = [w for w in WIRINGS if len(differences(w, file)) == 1][:4]
     monkeypatch.setattr(setup, '_sizes', lambda m, w: (0.0 if w in good else m.squared, np.ones(3)))
     _, (finding,), _ = setup.wire([o], ())
     assert len(finding.equivalent) == 2
@@ -389,7 +390,8 @@ def test_a_jump_is_a_step_that_gains_fifty(n: int, height: float, seen: bool) ->
         part[3 * psd - 2, n // 2 :] = height
         ws = SimpleNamespace(split=lambda _, part=part: [part], fine=[4], observations=[SimpleNamespace(period=1e-3)])
         found = setup.likely_jumps(cast(Workspace, ws), np.empty(0))
-        assert found == ([(1, psd, pytest.approx(n // 2 * 4e-3))] if seen else [])
+        assert [(r, p) for r, p, _ in found] == [(1, psd)] * seen
+        assert [t for *_, t in found] == pytest.approx([n // 2 * 4e-3] * seen)
 
 
 def test_below_25_hz_a_cell_says_what_its_channel_follows(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -555,8 +557,8 @@ def test_where_something_is_left_does_not_depend_on_the_units_of_what_is_fitted(
     assert [c.p for c in one.cells] == pytest.approx([c.p for c in other.cells])
 
 
-def law_with(*listed: Term) -> laws.Law:
-    return laws.Law('law_static_dx', 'link', 'static_dx', listed)
+def law_with(*listed: Term) -> Law:
+    return Law('law_static_dx', 'link', 'static_dx', listed)
 
 
 SWITCHED, STRAIGHT = Term('switched', (), 1e-6, times=(1.0, 2.0)), Term('product', ('dx',), 1e-6)
@@ -571,12 +573,17 @@ SWITCHED, STRAIGHT = Term('switched', (), 1e-6, times=(1.0, 2.0)), Term('product
     ],
 )
 def test_further_times_are_looked_for_if_the_only_law_begins_with_some(
-    monkeypatch: pytest.MonkeyPatch, found: list[laws.Law], again: bool
+    monkeypatch: pytest.MonkeyPatch, found: list[Law], again: bool
 ) -> None:
     monkeypatch.setattr(laws, 'responses', lambda *_: [])
     monkeypatch.setattr(laws, 'score', lambda *_: [])
     seeker, asked = Given({}), list[object]()
-    monkeypatch.setattr(seeker, '_switched_again', lambda trial, more: asked.append(more) or trial)
+
+    def switched_again(trial: laws._Trial, more: object) -> laws._Trial:
+        asked.append(more)
+        return trial
+
+    monkeypatch.setattr(seeker, '_switched_again', switched_again)
     seeker.grown(seeker.trial(found, (), 1))
     assert bool(asked) == again
 
@@ -716,3 +723,9 @@ def test_an_alternative_within_sixty_is_refitted_in_full(
     given_scores(search, scored('b', 90.0))
     search.alternatives(asked.plain, asked.fit(active('a', x=0.1)), 0, 50.0)
     assert [n for n, _ in asked.seen] == ['b'] * refits
+
+
+def test_a_variable_is_known_as_means_of_the_blocks_of_an_estimate() -> None:
+    workspace = Workspace([observed(warm=None), observed(1, name='second', warm=None)])
+    for o, got in zip(workspace.observations, law_features.known_values(workspace, (), 'load_fy'), strict=True):
+        np.testing.assert_allclose(got, o.loads[:, 1].reshape(-1, 20).mean(axis=1), atol=1e-12)
