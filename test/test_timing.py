@@ -224,6 +224,18 @@ def test_a_sample_fifty_milliseconds_early_is_a_jump(early_ns: int, jumped: bool
     assert clock.observe(20_000, 1020 * MS - early_ns) == jumped
 
 
+@pytest.mark.parametrize(('off_ns', 'jumped'), [(49_999_999, False), (50_000_000, True)])
+def test_a_clock_that_agrees_with_the_numbers_within_fifty_milliseconds_has_not_jumped(
+    off_ns: int, jumped: bool
+) -> None:
+    for sign in (1, -1):
+        clock = ClockMap()
+        clock.observe(0, 1000 * MS)
+        # A second later by the device, and 60 ms less by the host.
+        assert clock.observe(1_000_000, 1940 * MS, (1000 * MS + sign * off_ns) / 1000.0) == jumped
+        assert clock.state().resets == jumped
+
+
 def test_a_second_has_one_minimum_after_a_jump_too() -> None:
     clock = ClockMap()
     clock.observe(0, 0)

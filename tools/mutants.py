@@ -131,8 +131,7 @@ ROOMS: Mapping[str, Room] = {
         ),
         leave=('psd_deflection/discovery/report.py',),
         slow=tuple(
-            f'test/discovery/test_{n}.py'
-            for n in ('discover', 'plants', 'planning', 'setup', 'laws', 'readings')
+            f'test/discovery/test_{n}.py' for n in ('discover', 'plants', 'planning', 'setup', 'laws', 'readings')
         ),
     ),
 }
@@ -246,10 +245,13 @@ def warm(python: str, folder: Path, tests: Sequence[str]) -> Iterator[Callable[[
 STAGES = ('quick', 'slow')
 
 
-def tried(name: str, python: str, count: int, seed: int, known: Container[str]) -> Iterator[tuple[str, str]]:
+def tried(
+    name: str, python: str, count: int, seed: int, known: Container[str], slow: bool
+) -> Iterator[tuple[str, str]]:
     """The mutants of one room in words, and which of the ``STAGES`` noticed; '' if none did.
 
-    The slow tests do not try what is ``known`` to change no answer. Raises RuntimeError if the tests fail without.
+    The slow tests, if they are asked (``slow``), do not try what is ``known`` to change no answer. Raises RuntimeError
+    if the tests fail without.
     """
     room = ROOMS[name]
     lines = NOTICED.read_text().splitlines() if NOTICED.exists() else []
@@ -257,9 +259,13 @@ def tried(name: str, python: str, count: int, seed: int, known: Container[str]) 
     with tempfile.TemporaryDirectory() as scratch:
         folder = copy_of_checkout(Path(scratch))
         left = drawn(folder, room, count, seed)
-        for stage, tests in zip(STAGES, (room.tests, room.slow), strict=True):
-            last = stage == STAGES[-1] or not room.slow
-            if not left or not tests:
+        stages = [
+            (stage, tests)
+            for stage, tests in zip(STAGES, (room.tests, room.slow if slow else ()), strict=True)
+            if tests
+        ]
+        for stage, tests in stages:
+            if not left:
                 break
             left, these = [], left
             with warm(python, folder, tests) as passed:
@@ -277,7 +283,7 @@ def tried(name: str, python: str, count: int, seed: int, known: Container[str]) 
                             with NOTICED.open('a') as stream:
                                 stream.write(f'{key} {stage}\n')
                         file.write_text(text)
-                    if seen or last:
+                    if seen or stage == stages[-1][0]:
                         yield f'{words}  (line {mutant.line})', seen
                     else:
                         left.append(mutant)
@@ -301,6 +307,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--rooms', nargs='+', choices=list(ROOMS), default=list(ROOMS))
     parser.add_argument('--count', type=int, default=32, help='mutants of each room (default 32)')
     parser.add_argument('--seed', type=int, default=1, help='another seed draws others (default 1)')
+    parser.add_argument('--quick', action='store_true', help='without the slow tests')
     parser.add_argument('--python', default=sys.executable, help='the Python that runs the tests (default this one)')
     arguments = parser.parse_args(argv)
     known = equivalent()
@@ -312,7 +319,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     unnoticed: list[str] = []
     for name in arguments.rooms:
         same, left, noticed = 0, 0, dict.fromkeys(STAGES, 0)
-        for words, seen in tried(name, arguments.python, arguments.count, arguments.seed, known):
+        for words, seen in tried(name, arguments.python, arguments.count, arguments.seed, known, not arguments.quick):
             print(f'{seen or "NOT noticed"}: {words}', file=sys.stderr, flush=True)
             if seen:
                 noticed[seen] += 1

@@ -700,7 +700,7 @@ def named_effect(active: ActiveEffect, **given: Any) -> NamedEffect:
     [
         (0.003987, 2e-5, 'angle 0.003987 ± 2e-05 rad'),
         (0.1234, 0.05, 'angle 0.12 ± 0.05 rad'),
-        (0.1, 0.0, 'angle 0.1 ± 0 rad'),
+        (0.123, 0.0, 'angle 0.1 ± 0 rad'),
         (0.1, 0.051, ''),
         (-1.23456789, 1e-9, 'angle -1.23457 ± 1e-09 rad'),
     ],

@@ -729,3 +729,24 @@ def test_a_variable_is_known_as_means_of_the_blocks_of_an_estimate() -> None:
     workspace = Workspace([observed(warm=None), observed(1, name='second', warm=None)])
     for o, got in zip(workspace.observations, law_features.known_values(workspace, (), 'load_fy'), strict=True):
         np.testing.assert_allclose(got, o.loads[:, 1].reshape(-1, 20).mean(axis=1), atol=1e-12)
+
+
+@pytest.mark.parametrize(('nominal', 'choices', 'kept'), [(1.0, (0, 1), 1), (0.0, (0, 1), 0), (5.0, (2, 3), 2)])
+def test_a_choice_that_makes_no_difference_stays_as_it_is(nominal: float, choices: tuple[int, ...], kept: int) -> None:
+    way = EffectParameter('way', '', 0, 9, 1, '', nominal=nominal, kind='choice', choices=choices)
+    assert readings._settled_choice(way).choices == (kept,)
+    psd = dataclasses.replace(way, each=True)
+    size = EffectParameter('size', 'V', -1.0, 1.0, 0.1, '')
+    assert readings._settled_choice(psd) is psd
+    assert readings._settled_choice(size) is size
+
+
+def test_the_nuisance_takes_part_in_no_tie() -> None:
+    rng = np.random.default_rng(0)
+    jacobian = rng.standard_normal((200, 3)) * 1e4
+    effects = (active('a', -9.0, 9.0, x=1.0), active('b', -9.0, 9.0, x=1.0))
+    beside = active('n', -9.0, 9.0, x=1.0)
+    for free in (((-1, 'x'), (0, 'x'), (1, 'x')), ((0, 'x'), (-1, 'x'), (1, 'x'))):
+        fit = Fit(effects, 0.0, np.zeros(200), [], jacobian, free, (), (beside,))
+        (tie,) = coincidence.coincidences(fit, Physics.of(RIG))
+        assert (tie.first, tie.second) == ((0, 'x'), (1, 'x'))

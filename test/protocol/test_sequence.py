@@ -118,6 +118,9 @@ def test_numbers_given_anew_go_on_at_the_next_block() -> None:
     assert sequence.restart() == 20
     assert sequence.extend(0, 0) == (20, Step.NEXT, 0)
     assert sequence.extend(3, 3000) == (23, Step.GAP, 2)
+    # Any time is newer than those before, 0 too.
+    assert sequence.restart() == 40
+    assert sequence.extend(100, 0) == (140, Step.GAP, 100)
 
 
 class Recorded:
