@@ -419,6 +419,11 @@ def test_what_a_law_leaves_is_told_in_micrometres() -> None:
     found = SimpleNamespace(law=law, laws=[law], beside=[], heldout_gap=1.0)
     answer = SimpleNamespace(law=found, effects=())
     assert result._law(cast(Any, answer)).endswith('on unseen load cases it leaves 1000000.000 µm.')
+    creep = SimpleNamespace(effect=SimpleNamespace(name='creep'))
+    found.beside = [creep]
+    for named, words in (([], ', beside creep; on'), ([SimpleNamespace(active=creep)], 'y2 += 1; on')):
+        answer.effects = named
+        assert words in result._law(cast(Any, answer))
 
 
 LIMITS: dict[Any, dict[str, Any]] = {
@@ -750,3 +755,18 @@ def test_the_nuisance_takes_part_in_no_tie() -> None:
         fit = Fit(effects, 0.0, np.zeros(200), [], jacobian, free, (), (beside,))
         (tie,) = coincidence.coincidences(fit, Physics.of(RIG))
         assert (tie.first, tie.second) == ((0, 'x'), (1, 'x'))
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_what_is_pushed_against_its_bound_leaves_the_others_alone(sign: float) -> None:
+    """However little it is pushed: the first step of the rest is that of least squares without it."""
+    shown = pictures(A)
+    a = shown[A] / np.linalg.norm(shown[A]) * SIGMA
+    rest = np.random.default_rng(3).standard_normal(a.shape)
+    across = rest - a * np.sum(a * rest) / np.sum(a * a)
+    b = 0.6 * a + 0.8 * across / np.linalg.norm(across) * SIGMA
+    plant = Plant({A: a * 1e3, ('b', 'x'): b * 1e3}, -0.5 * sign * a + 3.0 * across / np.linalg.norm(across) * SIGMA)
+    least, most = (0.0, 1.0) if sign > 0.0 else (-1.0, 0.0)
+    fit = refit(plant, [active('a', least, most, x=0.0), active('b', x=0.0)], iterations=1)
+    want = np.sum(plant.measured[0] * b) / np.sum(b * b) / 1e3
+    assert fit.effects[1].values['x'] == pytest.approx(want, rel=1e-3)

@@ -124,6 +124,10 @@ def test_a_hello_of_512_bytes_encoded_is_sent_and_received() -> None:
     with pytest.raises(ValueError, match='513 bytes encoded, at most 512'):
         encode(HelloFrame(1, {'serial': 'x' * 491}))
     sent = encode(longest)
+    decoder = FrameDecoder()
+    assert decoder.feed(b'\x00' + sent[:-1]) == []
+    (received,) = decoder.feed(sent[-1:])
+    assert isinstance(received, HelloFrame)
     assert len(sent) == MAX_ENCODED + 1
     assert isinstance(decode(sent)[0], HelloFrame)
 

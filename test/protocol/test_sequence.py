@@ -183,6 +183,12 @@ def test_a_recorded_number_has_wrapped_if_20_khz_gives_as_many_samples() -> None
     assert (of.said, of.restarts) == (['sample numbers start again after 4000000000'], [(last, first)])
 
 
+def test_the_last_number_once_more_is_a_restart_of_a_recording() -> None:
+    of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
+    assert of.extended([7, 8], [8.0, 9.0]) == [27, 28]
+    assert (of.said, of.restarts) == (['sample numbers start again after 7'], [(7, 27)])
+
+
 def test_a_wrap_within_a_message_and_numbers_that_were_recorded_whole() -> None:
     assert Recorded([WRAP - 3], [0.0]).extended([WRAP - 2, WRAP - 1, 0, 1], [1.0, 2.0, 3.0, 4.0]) == [
         *range(WRAP - 2, WRAP + 2)
