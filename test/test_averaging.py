@@ -34,6 +34,13 @@ def test_a_block_is_complete_with_its_last_sample() -> None:
     assert cutter.flush() == []
 
 
+def test_a_block_in_one_piece_is_complete_at_once() -> None:
+    cutter = BlockCutter(20)
+    assert [b.seq.tolist() for b in cutter.add(*chunk_of(list(range(25))))] == [list(range(20))]
+    assert [b.seq.tolist() for b in cutter.add(*chunk_of([25, 39]))] == [[20, 21, 22, 23, 24, 25, 39]]
+    assert cutter.add(*chunk_of([40, 58])) == []
+
+
 def test_a_lost_last_sample_is_not_waited_for_beyond_the_next_block() -> None:
     cutter = BlockCutter(20)
     assert cutter.add(*chunk_of(list(range(19)))) == []

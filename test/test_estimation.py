@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from psd_deflection.config import load_rig
+from psd_deflection.estimation import Estimation, Readings
 from psd_deflection.misalignment.model import INDEX
 from psd_deflection.pipeline import Pipeline
 from psd_deflection.records import DeflectionEstimate, FloatArray, RawChunk
+from psd_deflection.solvers.interface import SolverStatus
 
 MEAN = {'block_fit': 'mean', 'covariance': 'file'}
 
@@ -103,3 +106,10 @@ def test_a_reading_that_contradicts_the_others_widens_the_covariance_of_a_mean_t
     # The truth is rest.
     assert max(np.abs(widened.pose) / np.sqrt(np.array(widened.covariance)[[0, 4, 8]])) < 2.0
     assert max(np.abs(reported.pose) / np.sqrt(np.array(reported.covariance)[[0, 4, 8]])) > 100.0
+
+
+def test_a_solver_that_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimation = Estimation(load_rig(overrides={'solver': 'wls'}), ())
+    failed = SimpleNamespace(status=SolverStatus.NOT_CONVERGED)
+    monkeypatch.setattr(type(estimation.primary), 'solve', lambda *_: failed)
+    assert estimation._solve(0, Readings((0.0,) * 4, (1e-12,) * 4)) == (None, 'wls: not converged')

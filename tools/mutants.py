@@ -1,9 +1,10 @@
 """``make mutants``: break the numerics one line at a time, and see whether a test notices.
 
 cosmic-ray makes the mutants: a sign, a number, a comparison, a truth value. Of each room so many are
-drawn with a fixed seed, each is put into a copy of this checkout, and those tests of the room that enter
-the function run until one fails. What no test notices is listed; tools/mutants_equivalent.txt has those
-that nobody could notice, each with the reason, and they do not count.
+drawn with a fixed seed, each is put into a copy of this checkout, and those quick tests of the room that enter
+the function run until one fails. What they do not notice is tried by the slow tests of the room, if it has any. What
+no test notices is listed; tools/mutants_equivalent.txt has those that nobody could notice, each with the reason, and
+they do not count.
 
   python -m tools.mutants --count 32 --rooms solvers geometry
 """
@@ -19,7 +20,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -30,19 +31,23 @@ from cosmic_ray.plugins import get_operator
 
 ROOT = Path(__file__).parent.parent
 EQUIVALENT = Path(__file__).with_name('mutants_equivalent.txt')
-NOTICED = ROOT / 'build' / 'mutants' / 'noticed.txt'
-"""Digests of broken files that a test has noticed: only what was not is tried again. Delete it to begin anew."""
+NOTICED = ROOT / 'build' / 'mutants' / 'noticed_by.txt'
+"""Broken files that a test has noticed, "DIGEST STAGE" a line: only what was not is tried again. Delete it to begin
+anew.
+"""
 
 
 class Room(NamedTuple):
-    """``code``: files and folders that are broken. ``tests``: what should notice.
+    """``code``: files and folders that are broken. ``tests``: what should notice, in seconds.
 
-    ``leave``: files that only draw or word what others computed.
+    ``leave``: files that only draw or word what others computed. ``slow``: what else CI runs; it takes minutes, and
+    tries what the ``tests`` do not notice.
     """
 
     code: tuple[str, ...]
     tests: tuple[str, ...]
     leave: tuple[str, ...] = ()
+    slow: tuple[str, ...] = ()
 
 
 _PIPELINE = 'test/test_pipeline.py -k not(drift or rms_errors or rotation or crosstalk or nonlinearity or iterative)'
@@ -116,15 +121,18 @@ ROOMS: Mapping[str, Room] = {
                 f'test/discovery/test_{n}.py'
                 for n in (
                     *('formulas', 'law_formulas', 'plant_formulas', 'answers', 'rules', 'steps', 'parts'),
-                    *('discover_parts', 'search_parts'),
+                    *('discover_parts', 'search_parts', 'limits', 'ties'),
                 )
             ),
             # Their pieces: a whole discovery of the catalogue takes seconds.
             'test/discovery/test_discover.py -k stripped or refined or coarse or imagined',
-            'test/discovery/test_planning.py -k loop or words',
+            'test/discovery/test_planning.py -k loop or words or every_proposal or pieces',
             'test/discovery/test_setup.py -k put_right or other_unit or at_its or outliers or stuck',
         ),
         leave=('psd_deflection/discovery/report.py',),
+        slow=tuple(
+            f'test/discovery/test_{n}.py' for n in ('discover', 'plants', 'planning', 'setup', 'laws', 'readings')
+        ),
     ),
 }
 
@@ -234,27 +242,51 @@ def warm(python: str, folder: Path, tests: Sequence[str]) -> Iterator[Callable[[
         process.terminate()
 
 
-def tried(name: str, python: str, count: int, seed: int) -> Iterator[tuple[str, bool]]:
-    """The mutants of one room in words, and whether a test noticed. Raises RuntimeError if the tests fail without."""
+STAGES = ('quick', 'slow')
+
+
+def tried(
+    name: str, python: str, count: int, seed: int, known: Container[str], slow: bool
+) -> Iterator[tuple[str, str]]:
+    """The mutants of one room in words, and which of the ``STAGES`` noticed; '' if none did.
+
+    The slow tests, if they are asked (``slow``), do not try what is ``known`` to change no answer. Raises RuntimeError
+    if the tests fail without.
+    """
     room = ROOMS[name]
-    noticed = frozenset(NOTICED.read_text().split()) if NOTICED.exists() else frozenset()
+    lines = NOTICED.read_text().splitlines() if NOTICED.exists() else []
+    noticed = dict(line.split(' ') for line in lines)
     with tempfile.TemporaryDirectory() as scratch:
         folder = copy_of_checkout(Path(scratch))
-        with warm(python, folder, room.tests) as passed:
-            for mutant in drawn(folder, room, count, seed):
-                file = folder / mutant.file
-                text = file.read_text()
-                code = mutant.code(text)
-                key = hashlib.sha256(f'{mutant.file}\n{code}'.encode()).hexdigest()
-                seen = key in noticed
-                if not seen:
-                    file.write_text(code)
-                    seen = not passed(mutant.file, function_at(text, mutant.line))
-                    file.write_text(text)
-                    if seen:
-                        with NOTICED.open('a') as stream:
-                            stream.write(key + '\n')
-                yield f'{mutant.words(text)}  (line {mutant.line})', seen
+        left = drawn(folder, room, count, seed)
+        stages = [
+            (stage, tests)
+            for stage, tests in zip(STAGES, (room.tests, room.slow if slow else ()), strict=True)
+            if tests
+        ]
+        for stage, tests in stages:
+            if not left:
+                break
+            left, these = [], left
+            with warm(python, folder, tests) as passed:
+                for mutant in these:
+                    file = folder / mutant.file
+                    text = file.read_text()
+                    code = mutant.code(text)
+                    words = mutant.words(text)
+                    key = hashlib.sha256(f'{mutant.file}\n{code}'.encode()).hexdigest()
+                    seen = noticed.get(key, '')
+                    if not seen and not (stage == 'slow' and words in known):
+                        file.write_text(code)
+                        if not passed(mutant.file, function_at(text, mutant.line)):
+                            seen = stage
+                            with NOTICED.open('a') as stream:
+                                stream.write(f'{key} {stage}\n')
+                        file.write_text(text)
+                    if seen or stage == stages[-1][0]:
+                        yield f'{words}  (line {mutant.line})', seen
+                    else:
+                        left.append(mutant)
 
 
 def equivalent() -> dict[str, str]:
@@ -275,25 +307,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--rooms', nargs='+', choices=list(ROOMS), default=list(ROOMS))
     parser.add_argument('--count', type=int, default=32, help='mutants of each room (default 32)')
     parser.add_argument('--seed', type=int, default=1, help='another seed draws others (default 1)')
+    parser.add_argument('--quick', action='store_true', help='without the slow tests')
     parser.add_argument('--python', default=sys.executable, help='the Python that runs the tests (default this one)')
     arguments = parser.parse_args(argv)
     known = equivalent()
     good = True
-    print('| room | mutants | equivalent | noticed | of those that count |\n|---|---|---|---|---|', flush=True)
+    print(
+        '| room | mutants | equivalent | noticed: quick | slow | of those that count |\n|---|---|---|---|---|---|',
+        flush=True,
+    )
     unnoticed: list[str] = []
     for name in arguments.rooms:
-        same, noticed, left = 0, 0, 0
-        for words, seen in tried(name, arguments.python, arguments.count, arguments.seed):
-            print(f'{"noticed" if seen else "NOT noticed"}: {words}', file=sys.stderr, flush=True)
-            noticed += seen
-            if not seen and words.rpartition('  (')[0] in known:
+        same, left, noticed = 0, 0, dict.fromkeys(STAGES, 0)
+        for words, seen in tried(name, arguments.python, arguments.count, arguments.seed, known, not arguments.quick):
+            print(f'{seen or "NOT noticed"}: {words}', file=sys.stderr, flush=True)
+            if seen:
+                noticed[seen] += 1
+            elif words.rpartition('  (')[0] in known:
                 same += 1
-            elif not seen:
+            else:
                 left += 1
                 unnoticed.append(words)
-        share = noticed / max(noticed + left, 1)
+        quick, slow = noticed.values()
+        share = (quick + slow) / max(quick + slow + left, 1)
         good &= share >= 0.95
-        print(f'| {name} | {same + noticed + left} | {same} | {noticed} | {share:.0%} |', flush=True)
+        print(f'| {name} | {same + quick + slow + left} | {same} | {quick} | {slow} | {share:.0%} |', flush=True)
     for words in unnoticed:
         print(f'\nnot noticed: {words}')
     return 0 if good else 1

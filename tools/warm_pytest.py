@@ -3,14 +3,15 @@
 Arguments: the tests, a file or folder each, perhaps with "-k WORDS". At first all of them are run, to see which
 functions of the checkout each test enters and how long it takes; the first line of the output is 1 if all passed, 0 if
 not. Then each line of the input is a file of the checkout and the first line of a function in it, 0 for what is in no
-function. The tests that enter it are run, the quickest first, and a line of the output is 1 if all passed, 0 if not.
-Every child imports the program again.
+function. The tests that enter it are run, the quickest first, as many as take ``MOST`` seconds together, and a line of
+the output is 1 if all passed, 0 if not. Every child imports the program again.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import json
 import os
 import signal
@@ -34,6 +35,9 @@ OURS = ('psd_deflection', 'msg_adapters', 'test', 'blind', 'bench', 'tools')
 
 LONGEST = 600.0
 """s that one of the arguments may take at first."""
+
+MOST = 120.0
+"""s, as measured at first, that the tests of one function may take together."""
 
 Entered = dict[int, CodeType]
 
@@ -156,7 +160,9 @@ def chosen(tests: dict[str, Test], file: str, first: int) -> list[str]:
     """
     near = {name: any(f == file for f, _ in test.entered) for name, test in tests.items()}
     names = [name for name, test in tests.items() if first == 0 or (file, first) in test.entered]
-    return sorted(names, key=lambda name: (not near[name], tests[name].seconds))
+    names.sort(key=lambda name: (not near[name], tests[name].seconds))
+    total = itertools.accumulate(tests[name].seconds for name in names)
+    return [name for name, seconds in zip(names, total, strict=True) if seconds <= MOST]
 
 
 def main() -> None:

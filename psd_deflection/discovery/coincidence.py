@@ -52,7 +52,7 @@ def _amplitudes(fit: Fit, physics: Physics | None, covariance: FloatArray) -> li
             continue
         p = fit.effects[i].effect.parameter(name)
         size = fit.effects[i].values[name] - p.off(physics)
-        clear = abs(size) > 5.0 * math.sqrt(max(float(covariance[column, column]), 0.0))
+        clear = abs(size) > 5.0 * math.sqrt(covariance[column, column])
         if p.kind == 'amplitude' and clear and not fit.effects[i].effect.finite:
             out.append((column, size, _SAME_UNIT.get(p.unit, p.unit)))
     return out

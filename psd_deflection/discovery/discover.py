@@ -67,10 +67,10 @@ class Discovery(Conclusion):
     setup: tuple[Finding, ...]
     lines: Mapping[str, object]
     known: tuple[ActiveEffect, ...]
-    law: FoundLaw | None = None
-    rivals: tuple[Fit, ...] = ()
-    unsettled: tuple[str, ...] = ()
-    moves: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    law: FoundLaw | None
+    rivals: tuple[Fit, ...]
+    unsettled: tuple[str, ...]
+    moves: tuple[float, float, float]
 
     @property
     def active_effects(self) -> list[ActiveEffect]:

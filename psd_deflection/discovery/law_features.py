@@ -74,9 +74,7 @@ def _unwhiten(rows: FloatArray, ar: FloatArray) -> FloatArray:
 
 def responses(ws: Workspace, fit: Fit) -> list[Response]:
     """How each recording answers to a term on each of ``SOUGHT``, beside the effects of ``fit``."""
-    q = np.empty((len(fit.residual), 0))
-    if fit.jacobian.shape[1]:
-        q, _ = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))
+    q, _ = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))
     columns = [ws.split(c) for c in np.ascontiguousarray(q.T)]
     out = []
     ws.simulations += 1

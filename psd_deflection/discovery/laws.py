@@ -128,7 +128,7 @@ def _fitted(law: Law, fit: Fit, covariance: FloatArray, index: int) -> Law:
     out = []
     for i, t in enumerate(law.terms, 1):
         own = {'coefficient': sd.get(f'c{i}', 0.0)}
-        own.update({k: sd[f'{k}{i}'] for k in t.shapes if k in FORMS[t.form].fitted and f'{k}{i}' in sd})
+        own.update({k: sd[f'{k}{i}'] for k in t.shapes if f'{k}{i}' in sd})
         shapes = {k: values[f'{k}{i}'] for k in t.shapes}
         sizes = {'coefficient': values[f'c{i}'], **shapes}
         # What the recording does not determine has no standard deviation.

@@ -235,7 +235,7 @@ def localise(
     raw_z, raw_excess = _energies(workspace.split(residual), layouts, apart)
     maxima = np.empty(DRAWS)
     q = None
-    if known is not None and known.shape[1]:
+    if known is not None:
         q, _ = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))
     present = (workspace.whiten([np.ones_like(m) for m in workspace.measured]) != 0.0).astype(np.float64)
     for draw in range(DRAWS):

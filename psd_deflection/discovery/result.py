@@ -202,7 +202,7 @@ def size_of(effect: NamedEffect | Rival) -> str:
     for p in effect.active.effect.parameters:
         value, sd = effect.active.values[p.name], effect.sd.get(p.name, 0.0)
         if p.kind == 'amplitude' and p.name in effect.sd and abs(value) > 2.0 * sd:
-            digits = 1 if sd <= 0.0 else max(1, 2 + math.floor(math.log10(max(abs(value) / sd, 1.0))))
+            digits = 1 if sd <= 0.0 else 2 + math.floor(math.log10(abs(value) / sd))
             out.append(f'{p.name} {value:.{min(digits, 6)}g} ± {sd:.1g} {p.unit}'.rstrip())
     return ', '.join(out)
 

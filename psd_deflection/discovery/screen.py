@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -75,12 +75,12 @@ class Screen:
             np.stack(parts) if parts else np.empty((0, sum(m.size for m in workspace.measured)), dtype=np.float32)
         )
         self.fisher = (self.rows @ self.rows.T).astype(np.float64)
-        self.lengths = np.maximum(np.diag(self.fisher).copy(), 1e-300)
+        self.lengths = np.diag(self.fisher)
 
     def _projected(self, residual: FloatArray, known: FloatArray | None) -> tuple[FloatArray, FloatArray]:
         g = (self.rows @ residual.astype(np.float32)).astype(np.float64)
         fisher = self.fisher
-        if known is not None and known.shape[1]:
+        if known is not None:
             q, _ = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))
             across = (self.rows @ q.astype(np.float32)).astype(np.float64)
             fisher = fisher - across @ across.T
@@ -124,7 +124,5 @@ class Screen:
         found.sort(key=lambda item: -item[0])
         out = []
         for _, a, b, gain, c, na in found[:limit]:
-            first = Score(a.candidate, a.gain, na, 0.0, c[:na])
-            second = Score(b.candidate, b.gain, len(c) - na, 0.0, c[na:])
-            out.append((first, second, gain))
+            out.append((replace(a, coefficients=c[:na]), replace(b, coefficients=c[na:]), gain))
         return out

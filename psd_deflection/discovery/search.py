@@ -258,7 +258,7 @@ class Search:
         """One of the mistakes that touch every channel if it explains nearly all by itself, else ``null``."""
         if not scores or min(s.p for s in scores) > P_ACCEPT:
             return null
-        best = max(s.gain for s in scores)
+        best = max((s.gain for s in scores), default=0.0)
         starts: list[list[ActiveEffect]] = []
         for s in scores:
             if s.candidate.effect.name not in self.workspace.first:

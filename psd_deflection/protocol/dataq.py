@@ -154,7 +154,7 @@ class ScanDecoder:
 
 def _step(stream: bytes, at: int) -> int | None:
     """Number of bytes to skip until three scans in a row end with the marker."""
-    for skip in range(1, STRIDE):
+    for skip in range(1, STRIDE + 1):
         first = at + skip + SCAN.size
         if all(stream[first + k * STRIDE : first + k * STRIDE + 2] == MARKER for k in range(3)):
             return skip

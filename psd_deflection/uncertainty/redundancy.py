@@ -105,11 +105,10 @@ class Redundancy:
 
     def _errors(self, q: FloatArray, pull: FloatArray) -> list[float]:
         """The error (2P,) m of each PSD if it alone is wrong; with one degree of freedom of each reading."""
-        errors = [0.0] * len(pull)
         if self.freedom < 3:
-            for i, (own, p) in enumerate(zip(np.diag(q).tolist(), pull.tolist(), strict=True)):
-                errors[i] = p / own if own > _UNSEEN * float(q.max()) else 0.0
-            return errors
+            least = _UNSEEN * float(q.max())
+            return [p / own if own > least else 0.0 for own, p in zip(np.diag(q).tolist(), pull.tolist(), strict=True)]
+        errors: list[float] = []
         for psd in range(self._psds):
             (a, b), (_, d) = q[2 * psd : 2 * psd + 2, 2 * psd : 2 * psd + 2].tolist()
             u, v = pull[2 * psd : 2 * psd + 2].tolist()
@@ -119,7 +118,7 @@ class Redundancy:
             else:
                 # It is seen in one direction only.
                 x, y = u / (a + d), v / (a + d)
-            errors[2 * psd : 2 * psd + 2] = [x, y]
+            errors += [x, y]
         return errors
 
     def _possible(

@@ -268,6 +268,10 @@ def test_a_spot_at_the_edge_is_told() -> None:
     assert spot.findings == ('psd_2: the spot is clipped at the edge',)
     assert spot.status is BlockStatus.OK
     assert estimate is not None
+    # Also if the other detector has failed.
+    spot, _ = findings_of(load_rig(), dark(counts, 1, slice(0, 1)))
+    assert spot.status is BlockStatus.LASER_LOST
+    assert spot.findings == ('psd_2: the spot is clipped at the edge',)
 
 
 def test_other_light_is_told_and_widens_the_covariance() -> None:

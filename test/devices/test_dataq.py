@@ -83,6 +83,15 @@ def test_lost_bytes_are_seen_and_the_step_is_found_again(lost: int, cuts: list[i
     assert sum(g.size for g in got if isinstance(g, BadFrame)) == 14 - lost
 
 
+@given(st.integers(1, 40), st.lists(st.integers(0, 10_000), max_size=20))
+def test_bytes_between_scans_cost_no_scan(more: int, cuts: list[int]) -> None:
+    """Also if they are as many as a scan has, as where a marker is damaged: four scans in all tell the step."""
+    for following in (4 if more % 14 else 3, 10):
+        got = fed(SCAN * 5 + b'\x11' * more + SCAN * following, cuts)
+        assert [g for g in got if not isinstance(g, BadFrame)] == [COUNTS] * (5 + following)
+        assert sum(g.size for g in got if isinstance(g, BadFrame)) == more
+
+
 @given(st.binary(max_size=300), st.lists(st.integers(0, 10_000), max_size=8))
 def test_garbage_raises_nothing_and_the_cuts_do_not_matter(junk: bytes, cuts: list[int]) -> None:
     assert fed(junk, cuts) == fed(junk, [])

@@ -121,6 +121,29 @@ def test_micros_that_go_back_while_the_number_stands_still_start_again() -> None
     assert [extender.extend(Line(7, t, VALUES)) for t in (2**32 - 5, 3)] == [2**32 - 5, 3]
 
 
+@pytest.mark.parametrize(
+    ('behind', 'earlier_us', 'again'),
+    [(63, 1000, True), (64, 1000, False), (10, 2**31 - 1, True), (10, 2**31, False)],
+)
+def test_a_line_that_comes_again_does_not_turn_back_the_clock(behind: int, earlier_us: int, again: bool) -> None:
+    """Less than 64 numbers and half a turn of the clock back; else the device has started again."""
+    extender = TimeExtender()
+    now = 3_000_000_000
+    for seq, t_us in ((998, 2**32 - 1000), (999, 500), (1000, now)):
+        extender.extend(Line(seq, t_us, VALUES))
+    turn = 2**32 if again else 0
+    assert extender.extend(Line(1000 - behind, now - earlier_us, VALUES)) == turn + now - earlier_us
+    assert extender.extend(Line(1001, now + 1, VALUES)) == turn + now + 1
+
+
+@pytest.mark.parametrize(('seq', 'again'), [(64, False), (65, True)])
+def test_the_first_numbers_after_a_restart_are_no_lines_of_before(seq: int, again: bool) -> None:
+    extender = TimeExtender()
+    for s, t in ((69, 2**32 - 1000), (70, 2**32 + 9000)):
+        extender.extend(Line(s, t % 2**32, VALUES))
+    assert (extender.extend(Line(seq, 5000, VALUES)) == 2**32 + 5000) == again
+
+
 def test_it_reads_the_rig(wired: Any, run: Any, unloaded: Any, volts: Any) -> None:
     port = wired(SimulatedLines(unloaded(load_rig()), PowerUp(first_seq=2**32 - 200)))
     running = run(load_rig(overrides={'source': 'lines', 'port': str(port.link)}))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import struct
 from collections.abc import Callable
 from typing import Any
 
@@ -186,3 +187,12 @@ def test_a_port_that_goes_away_while_it_is_asked_is_a_port_that_is_gone(pair: An
     with pytest.raises(PortClosedError):
         source.read(0.1)
     source.close()
+
+
+@pytest.mark.parametrize(('size', 'fits'), [(255, True), (256, False)])
+def test_a_message_has_255_bytes_at_most(size: int, fits: bool) -> None:
+    """One that is of no interest is passed over; what is longer is none."""
+    other = struct.pack('<HHBB', 0x1234, size, 0x81, 0x50) + bytes(size)
+    got = AptDecoder().feed(other + REPLY)
+    assert is_reply(got[-1])
+    assert got[:-1] == ([] if fits else [BadFrame('no APT header', len(other))])

@@ -19,6 +19,7 @@ from psd_deflection.discovery.discover import Discovery, discover
 from psd_deflection.discovery.experiment import Limits, Piece, Setting, Shown
 from psd_deflection.discovery.fit import Fit, refit
 from psd_deflection.discovery.hidden import beginning, mistakes, only_in
+from psd_deflection.discovery.laws import FoundLaw
 from psd_deflection.discovery.localise import Cell, Dependence, Localisation
 from psd_deflection.discovery.planning import Plan, Suggestion, Told
 from psd_deflection.discovery.search import far, promising, slot, unbound, unphysical
@@ -30,6 +31,7 @@ from psd_deflection.discovery.workspace import Workspace
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.catalogue import catalogue, make_active
 from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter, Proposal
+from psd_deflection.simulation.laws import Law, Term
 from psd_deflection.simulation.physics import Physics
 from psd_deflection.simulation.samples import SimulatedSamples
 from psd_deflection.simulation.simulator import ForwardModel
@@ -698,7 +700,7 @@ def named_effect(active: ActiveEffect, **given: Any) -> NamedEffect:
     [
         (0.003987, 2e-5, 'angle 0.003987 ± 2e-05 rad'),
         (0.1234, 0.05, 'angle 0.12 ± 0.05 rad'),
-        (0.1, 0.0, 'angle 0.1 ± 0 rad'),
+        (0.123, 0.0, 'angle 0.1 ± 0 rad'),
         (0.1, 0.051, ''),
         (-1.23456789, 1e-9, 'angle -1.23457 ± 1e-09 rad'),
     ],
@@ -838,6 +840,53 @@ def test_the_answer_is_written_as_it_is(found: Discovery) -> None:
         f'µm, {found.floors:.2f} times what noise alone leaves ({1e6 * found.gap_floor:.3f} µm). '
         f'Fitted: sensor_rotation {size}. Without it an estimate is wrong by up to {off}.'
     )
+
+
+def test_places_are_told_if_one_in_twenty_by_chance(found: Discovery) -> None:
+    first = found.where.cells[0]
+    cells = tuple(dataclasses.replace(first, p=p) for p in (0.0, 0.0499, 0.05, 1.0))
+    changed = dataclasses.replace(found, where=dataclasses.replace(found.where, cells=cells))
+    assert [place['p'] for place in told.result(changed)['where']] == [0.0, 0.0499]
+    assert told.result(found)['moves'] == dict(zip(('dx_m', 'dy_m', 'theta_rad'), found.moves, strict=True))
+
+
+def test_the_law_is_written_with_the_first_unknown(found: Discovery) -> None:
+    law = Law('law_y2', 'psd', 'y2', (Term('product', ('load_fx',), 1e-6),))
+    other = Law('law_beam_y2', 'optics', 'beam_y2', law.terms)
+    further = Law('law_x1', 'psd', 'x1', law.terms)
+    of_law = FoundLaw(
+        law,
+        (further,),
+        dataclasses.replace(found.fit, effects=found.fit.effects * 3),
+        found.fit,
+        ('y2',),
+        (other,),
+        1e-9,
+        30.0,
+        HeldOut(9.0, 2.0),
+        3e-7,
+    )
+    unknown = (Unknown('first', ('load_fx',), 0.75, rms=2e-6), Unknown('second', (), 0.5))
+    first, second = told.result(dataclasses.replace(found, unknown=unknown, law=of_law))['unknown']
+    assert second == {'signature': 'second', 'depends_on': [], 'explains': 0.5, 'rms': 0.0, 'law': None}
+    written = first.pop('law')
+    assert first == {'signature': 'first', 'depends_on': ['load_fx'], 'explains': 0.75, 'rms': 2e-6}
+    assert written == {
+        'stage': 'psd',
+        'acts_on': 'y2',
+        'channels': ['y2'],
+        'variables': ['load_fx'],
+        'kind': law.kind,
+        'expression': law.expression,
+        'further': [further.expression],
+        'heldout_after': 3e-7,
+        'beside': [a.label for a in found.fit.effects],
+        'equivalent': [
+            {'stage': 'optics', 'acts_on': 'beam_y2', 'variables': ['load_fx'], 'expression': other.expression}
+        ],
+        'evidence': {'delta_bic': 30.0, 'p': 1e-9, 'heldout_gain': 9.0, 'heldout_gain_error': 2.0},
+    }
+    assert told.result(dataclasses.replace(found, unknown=unknown))['unknown'][0]['law'] is None
 
 
 def test_other_answers_have_other_sentences(found: Discovery) -> None:

@@ -451,7 +451,9 @@ def law_of(*variables: str, on: str = 'y2') -> Law:
 BESIDE = (make_active('creep', {'amplitude': 0.1}, 't'), make_active('sensor_gain', {'psd': 1, 'x': 0.1}, 't'))
 
 
-@pytest.mark.parametrize(('more', 'left'), [(9.9, ('sensor_gain',)), (10.1, ('creep', 'sensor_gain'))])
+@pytest.mark.parametrize(
+    ('more', 'left'), [(9.9, ('sensor_gain',)), (10.0, ('sensor_gain',)), (10.1, ('creep', 'sensor_gain'))]
+)
 def test_an_effect_that_stood_in_for_the_law_goes(more: float, left: tuple[str, ...]) -> None:
     """If that costs no more than an effect must gain."""
     seeker = Given({('dx', 'creep sensor_gain'): 50.0, ('dx', 'sensor_gain'): 50.0 + more, ('dx', 'creep'): 90.0})
@@ -459,7 +461,7 @@ def test_an_effect_that_stood_in_for_the_law_goes(more: float, left: tuple[str, 
     assert tuple(a.effect.name for a in got.beside) == left
 
 
-@pytest.mark.parametrize(('without', 'terms_left'), [(109.9, 'dx'), (110.1, 'dx dy')])
+@pytest.mark.parametrize(('without', 'terms_left'), [(109.9, 'dx'), (110.0, 'dx'), (110.1, 'dx dy')])
 def test_a_term_that_the_law_does_not_miss_goes(without: float, terms_left: str) -> None:
     seeker = Given({('dx dy', ''): 100.0, ('dx', ''): without, ('dy', ''): 300.0}, chi2=0.0)
     got = seeker.grown(seeker.trial([law_of('dx', 'dy')], (), 1))
@@ -467,7 +469,7 @@ def test_a_term_that_the_law_does_not_miss_goes(without: float, terms_left: str)
     assert got.terms == len(terms_left.split())
 
 
-@pytest.mark.parametrize(('second', 'grown'), [(89.9, 'dx dy'), (90.1, 'dx')])
+@pytest.mark.parametrize(('second', 'grown'), [(89.9, 'dx dy'), (90.0, 'dx'), (90.1, 'dx')])
 def test_a_further_term_must_gain_as_an_effect_must(monkeypatch: pytest.MonkeyPatch, second: float, grown: str) -> None:
     offered = [
         law_features.Scored('y2', Term('product', (v,)), g) for v, g in (('theta', 9.0), ('dy', 8.0), ('x1', 7.0))

@@ -171,18 +171,19 @@ def test_the_likelihood_of_a_plant_has_the_level_that_fits_best() -> None:
     assert loud.level.tolist() == [9.0, 9.0]
 
 
+@pytest.mark.parametrize('stated', [0.5, 1.2])
 @pytest.mark.parametrize('period', [0.0, 0.01])
-def test_what_is_gained_on_a_fold_has_a_level_of_its_own(period: float) -> None:
+def test_what_is_gained_on_a_fold_has_a_level_of_its_own(period: float, stated: float) -> None:
     """Half of what the likelihood of each fold and channel differs by, its values weighed as independent ones."""
     seen, first, second = holed(), holed(1), [0.7 * rows for rows in holed(2)]
-    ws = PlantComparison(Pictures(seen, {}, period=period, noise=(0.5, 1e-3)))
+    ws = PlantComparison(Pictures(seen, {}, period=period, noise=(stated, 1e-3)))
     # Two pieces of each of three cases, four being wanted.
     cases = [i * 2 + np.arange(n) * 2 // n for i, n in enumerate(LENGTHS)]
     assert [c.tolist() for c in ws.case] == [c.tolist() for c in cases]
     assert ws.folds().tolist() == list(range(6))
     np.testing.assert_array_equal(ws.row_cases(), np.concatenate([np.tile(c, 2) for c in cases]))
     want = np.zeros(6)
-    least = (np.array([0.5, 1e-3]) / ws.level) ** 2
+    least = (np.array([stated, 1e-3]) / ws.level) ** 2
     for fold, channel in itertools.product(range(6), range(2)):
         sides = []
         for tables_of in (first, second):

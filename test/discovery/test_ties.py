@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from psd_deflection.discovery.coincidence import coincidences
 from psd_deflection.discovery.fit import Fit
-from psd_deflection.discovery.ties import ties
+from psd_deflection.discovery.ties import CommonCause, Tie, ties
 from psd_deflection.discovery.validate import HeldOut
 from psd_deflection.discovery.weighing import NamedEffect, Rival
 from psd_deflection.simulation.catalogue import make_active
@@ -70,3 +72,13 @@ def test_a_tie_of_known_cause_is_not_called_unknown(second: str, count: int) -> 
     free = ((0, 'scale'), (1, 'scale' if count == 0 else 'xy'))
     fit = Fit(effects, 0.0, np.zeros(2), [], 1e4 * np.eye(2), free, ())
     assert len(coincidences(fit, None)) == count
+
+
+def test_the_deviation_of_a_tie_is_told_in_per_cent() -> None:
+    cause = CommonCause('link_radius', 1.0, 1e-3)
+    assert '(2 ± 1 %)' in Tie(0.02, 0.0149, True, (cause,)).sentence
+
+
+def test_a_stiffness_without_a_deviation_is_the_half_of_no_tie() -> None:
+    without = dataclasses.replace(named(stiffness('torsional', -0.04), 1e-5), sd={})
+    assert ties([named(stiffness('bending', -0.04), 1e-5), without]) == ()

@@ -141,3 +141,14 @@ def test_candidates_fill_the_box_and_its_corners() -> None:
     found = {tuple(p) for p in room.candidates(3).round(12).tolist()}
     # No point of the rim is in this box: they are those of the grid.
     assert found == {(x, y) for x in (0.1, 0.15, 0.2) for y in (-0.3, 0.05, 0.4)}
+
+
+def test_the_cost_of_a_pair_is_that_of_least_squares() -> None:
+    """Readings of a flat plate go with dX, dY and theta as (-1, 0, y) and (0, -1, -x)."""
+    places = 0.1 * np.random.default_rng(2).normal(size=(5, 2, 2))
+    want = []
+    for pair in places:
+        rows = [row for x, y in pair.tolist() for row in ([-1.0, 0.0, y], [0.0, -1.0, -x])]
+        variances = np.linalg.inv(np.transpose(rows) @ np.array(rows)).diagonal()
+        want.append(np.sqrt(variances @ [1.0, 1.0, 0.01]))
+    np.testing.assert_allclose(placement._pair_costs(places[:, 0], places[:, 1]), want, rtol=1e-9)

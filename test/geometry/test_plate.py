@@ -110,6 +110,13 @@ def test_the_tie_is_the_cantilevers() -> None:
     assert np.degrees(tied[3:]) == pytest.approx([0.3305525741, 0.01762947062], rel=1e-9)
 
 
+def test_many_poses_are_tied_one_by_one() -> None:
+    flat = POSES[:, :3]
+    for ratios in (1.5, np.linspace(1.0, 2.0, 6)):
+        want = [tied_pose(p, k, 0.585) for p, k in zip(flat, np.broadcast_to(ratios, 6), strict=True)]
+        np.testing.assert_array_equal(tied_pose(flat, ratios, 0.585), want)
+
+
 def test_the_geometry_is_that_of_the_rig_file() -> None:
     values = {'psd_1.height': 0.02, 'psd_2.height': -0.01, 'psd_1.zero': [1e-3, 2e-3], 'link.length': 0.4}
     geometry = Geometry.from_rig(load_rig(overrides={**values, 'link.slope_ratio': 1.4, 'psd_2.center': [-0.09, 0.01]}))

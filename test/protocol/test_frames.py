@@ -89,6 +89,11 @@ def test_a_frame_and_its_bytes(label: str, wire: str, frame: GoodFrame) -> None:
         assert encode(frame, wide=label == WIDE) == received
 
 
+def test_a_sample_goes_with_16_bits_a_count_unless_asked_otherwise() -> None:
+    assert encode(SAMPLE) == encode(SAMPLE, wide=False)
+    assert len(encode(SAMPLE, wide=True)) == len(encode(SAMPLE)) + 2 * len(SAMPLE.counts)
+
+
 @pytest.mark.parametrize(('label', 'wire', 'reason'), BAD, ids=[c[0] for c in BAD])
 def test_bytes_that_are_no_frame(label: str, wire: str, reason: BadReason) -> None:
     received = bytes.fromhex(wire)
@@ -119,6 +124,10 @@ def test_a_hello_of_512_bytes_encoded_is_sent_and_received() -> None:
     with pytest.raises(ValueError, match='513 bytes encoded, at most 512'):
         encode(HelloFrame(1, {'serial': 'x' * 491}))
     sent = encode(longest)
+    decoder = FrameDecoder()
+    assert decoder.feed(b'\x00' + sent[:-1]) == []
+    (received,) = decoder.feed(sent[-1:])
+    assert isinstance(received, HelloFrame)
     assert len(sent) == MAX_ENCODED + 1
     assert isinstance(decode(sent)[0], HelloFrame)
 

@@ -39,8 +39,7 @@ def test_the_wrap_is_passed_with_and_without_a_gap() -> None:
 def test_a_restart_keeps_the_blocks_aligned_to_the_device() -> None:
     s = SequenceExtender(20)
     s.extend(100_003, 100_003_000)
-    number, step, _ = s.extend(0, 0)
-    assert (number, step) == (100_020, Step.RESTART)
+    assert s.extend(0, 0) == (100_020, Step.RESTART, 0)
     assert s.extend(1, 1000) == (100_021, Step.NEXT, 0)
 
 
@@ -54,6 +53,33 @@ def test_a_restart_from_any_number_leaves_out_less_than_two_blocks(last: int, se
         assert number // 20 == before // 20 + 1
         assert number % 20 == seq % 20
         assert s.extend((seq + 1) % WRAP, 1000) == (number + 1, Step.NEXT, 0)
+
+
+HALF = WRAP // 2
+
+
+@pytest.mark.parametrize(
+    ('ahead', 'later_us', 'step'),
+    [
+        # A neighbour, 63 numbers ahead or behind at most.
+        (63, -1, Step.GAP),
+        (64, -1, Step.RESTART),
+        (-63, 0, Step.REPEAT),
+        (-63, 1, Step.RESTART),
+        (-64, 0, Step.RESTART),
+        # A gap of less than half way round, if the time is newer.
+        (64, 1, Step.GAP),
+        (64, 0, Step.RESTART),
+        (HALF - 1, 1, Step.GAP),
+        (HALF, 1, Step.RESTART),
+    ],
+)
+def test_what_a_jump_of_the_number_means(ahead: int, later_us: int, step: Step) -> None:
+    s = SequenceExtender(20)
+    s.extend(5_000_000, 7000)
+    number, got, missing = s.extend((5_000_000 + ahead) % WRAP, 7000 + later_us)
+    assert (got, missing) == (step, ahead - 1 if step is Step.GAP else 0)
+    assert (number == 5_000_000 + ahead) == (step is not Step.RESTART)
 
 
 def test_a_clock_that_jumps_while_the_count_goes_on_is_no_restart() -> None:
@@ -92,6 +118,9 @@ def test_numbers_given_anew_go_on_at_the_next_block() -> None:
     assert sequence.restart() == 20
     assert sequence.extend(0, 0) == (20, Step.NEXT, 0)
     assert sequence.extend(3, 3000) == (23, Step.GAP, 2)
+    # Any time is newer than those before, 0 too.
+    assert sequence.restart() == 40
+    assert sequence.extend(100, 0) == (140, Step.GAP, 100)
 
 
 class Recorded:
@@ -137,6 +166,7 @@ def test_a_message_in_which_number_or_time_stands_still_is_refused() -> None:
         of.extended([8, 9, 9], [8.0, 9.0, 10.0])
     with pytest.raises(ValueError, match='dt does not rise'):
         of.extended([8, 9, 10], [8.0, 9.0, 9.0])
+    assert of.extended([8, 9], [8.0, 8.000001]) == [8, 9]
 
 
 def test_a_recorded_number_has_wrapped_if_20_khz_gives_as_many_samples() -> None:
@@ -151,6 +181,12 @@ def test_a_recorded_number_has_wrapped_if_20_khz_gives_as_many_samples() -> None
     first = last + 20 + number % 20
     assert of.extended([number], [5e7]) == [first]
     assert (of.said, of.restarts) == (['sample numbers start again after 4000000000'], [(last, first)])
+
+
+def test_the_last_number_once_more_is_a_restart_of_a_recording() -> None:
+    of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
+    assert of.extended([7, 8], [8.0, 9.0]) == [27, 28]
+    assert (of.said, of.restarts) == (['sample numbers start again after 7'], [(7, 27)])
 
 
 def test_a_wrap_within_a_message_and_numbers_that_were_recorded_whole() -> None:

@@ -95,3 +95,13 @@ def test_a_hello_and_a_line_of_any_json_are_harmless(value: Any) -> None:
 )
 def test_what_is_nested_over_three_deep_is_kept_as_text(value: object, kept: object) -> None:
     assert device_words({'a': value}) == {'a': kept}
+
+
+@pytest.mark.parametrize('sign', [1, -1])
+def test_whole_numbers_are_kept_as_far_as_json_has_them_exactly(sign: int) -> None:
+    assert device_words({'a': sign * 2**53}) == {'a': sign * 2**53}
+    assert device_words({'a': sign * (2**53 + 1)}) == {'a': 'a whole number of 54 bits'}
+
+
+def test_what_is_above_zero() -> None:
+    assert [positive(v) for v in (1e-9, 3, 0.0, 0, -1e-9, -0.5)] == [1e-9, 3.0, None, None, None, None]

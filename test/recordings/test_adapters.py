@@ -27,6 +27,7 @@ from msg_adapters import (
     pose_with_covariance_stamped,
     solver_topic,
     string,
+    temperature,
     to_messages,
     twist_stamped,
     vector3_stamped,
@@ -455,3 +456,51 @@ def test_a_text_of_a_million_characters_is_read_and_a_longer_one_is_not() -> Non
 def test_a_text_that_is_no_rig_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r'lacks|Expecting|nested|characters'):
         string.to_rig({'data': text})
+
+
+def test_a_temperature_goes_with_a_variance_that_says_not_known() -> None:
+    fields = temperature.from_reading(TemperatureReading(1_500_000_000, 21.5))
+    assert (fields['temperature'], fields['variance']) == (21.5, 0.0)
+    assert temperature.to_reading(fields) == TemperatureReading(1_500_000_000, 21.5)
+
+
+def test_a_rotation_without_tilts_is_about_z() -> None:
+    turned = quaternion(0.3)
+    assert list(turned.values()) == pytest.approx([0.0, 0.0, math.sin(0.15), math.cos(0.15)], abs=1e-15)
+
+
+def cloud(step: int, *more: dict[str, object]) -> dict[str, object]:
+    """One point of another program with our fields, and ``more`` of its own."""
+    names = ('seq', 'dt', *CHANNELS)
+    ours = [{'name': n, 'offset': 4 * i, 'datatype': 6 if i < 2 else 7, 'count': 1} for i, n in enumerate(names)]
+    size = {'point_step': step, 'row_step': step, 'width': 1, 'height': 1, 'data': bytes(step)}
+    return {'header': header(5, 'x'), 'is_bigendian': False, 'is_dense': True, 'fields': [*ours, *more], **size}
+
+
+@pytest.mark.parametrize(
+    'more',
+    [
+        {'name': 'x', 'offset': 32, 'datatype': 7, 'count': 3},
+        {'name': 'x', 'offset': 32, 'datatype': 9, 'count': 1},
+        {'name': '', 'offset': 32, 'datatype': 7, 'count': 1},
+        {'name': 'seq', 'offset': 32, 'datatype': 7, 'count': 1},
+    ],
+)
+def test_fields_that_cannot_be_read_are_passed_over(more: dict[str, object]) -> None:
+    kinds = np.dtype(point_cloud2.layout(cloud(48, more)))
+    assert kinds.names == ('seq', 'dt', *CHANNELS)
+    assert np.zeros(1, kinds)['seq'].dtype == np.dtype('<u4')
+
+
+def test_a_field_may_end_with_the_point_and_a_point_has_64_kib_at_most() -> None:
+    for offset, fits in ((44, True), (45, False)):
+        more = {'name': 'x', 'offset': offset, 'datatype': 7, 'count': 1}
+        if fits:
+            assert np.dtype(point_cloud2.layout(cloud(48, more))).names == ('seq', 'dt', *CHANNELS, 'x')
+        else:
+            with pytest.raises(ValueError, match='outside a point of 48 bytes'):
+                point_cloud2.layout(cloud(48, more))
+    stamp, points = point_cloud2.to_points(cloud(65_536))
+    assert (stamp, len(points)) == (5, 1)
+    with pytest.raises(ValueError, match='65537'):
+        point_cloud2.to_points(cloud(65_537))

@@ -7,7 +7,7 @@ import pytest
 
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.uncertainty.block_fit import BlockFit, basis, inverse
-from psd_deflection.uncertainty.combinations import combinations
+from psd_deflection.uncertainty.combinations import combinations, combinations_of
 
 PLACES = np.array([[0.0, 0.070], [-0.100, 0.0]])
 SIGMA = 1e-6
@@ -52,6 +52,33 @@ def test_combinations_are_orthogonal_and_the_last_does_not_see_motion() -> None:
     small = dots_of(np.array([[1e-6, 0.0, 0.0], [0.0, 1e-6, 0.0], [0.0, 0.0, 1e-6]]))
     assert abs(small @ t[3]).max() < 1e-12
     assert abs(small @ t[2]).max() > 5e-8
+
+
+def test_the_last_combination_is_the_length_of_the_base_line_wherever_the_beams_are() -> None:
+    """Over the root of 2, without that of the beams; and the way back is the way there."""
+    rng = np.random.default_rng(4)
+    for _ in range(5):
+        beams = PLACES + 5e-3 * rng.normal(size=(2, 2))
+        of, dots = combinations_of(PLACES, beams), 1e-3 * rng.normal(size=(6, 4))
+        at = PLACES + dots.reshape(6, 2, 2)
+        length = np.linalg.norm(at[:, 0] - at[:, 1], axis=1)
+        np.testing.assert_allclose(of.of(dots)[3], (length - np.linalg.norm(beams[0] - beams[1])) / 2**0.5, atol=1e-15)
+        np.testing.assert_allclose(of.fixed(dots), of.of(dots)[3], atol=1e-15)
+        for row, z in zip(dots, of.of(dots).T, strict=True):
+            np.testing.assert_allclose(of.back(z.tolist(), np.eye(4))[0], row, atol=1e-15)
+
+
+def test_a_fit_follows_motion_unless_it_is_told_to_keep_the_mean() -> None:
+    def followed(fit: BlockFit) -> float:
+        fit.set_noise(white())
+        moving = 1e-4 * ((ALL - 9.5) / 9.5) ** 2
+        for _ in range(30):
+            got = fit.fit(ALL, np.outer(moving, [1.0, 0.0, 1.0, 0.0])).dots[0]
+        return got
+
+    assert followed(BlockFit(SIZE, PLACES, PLACES)) == followed(BlockFit(SIZE, PLACES, PLACES, True))
+    assert followed(BlockFit(SIZE, PLACES, PLACES, False)) == pytest.approx(1e-4 * np.mean(((ALL - 9.5) / 9.5) ** 2))
+    assert abs(followed(BlockFit(SIZE, PLACES, PLACES))) < 1e-6
 
 
 def test_inverses_of_positive_definite_matrices() -> None:

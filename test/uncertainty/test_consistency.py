@@ -178,6 +178,28 @@ def test_exchanged_axes_are_named(psd: int, order: list[int]) -> None:
     assert seen(lambda r: r[order]) == f'the axes of psd_{psd} are exchanged'
 
 
+@pytest.mark.parametrize(('scatter', 'said'), [(0.005, 'y1 has the wrong sign'), (0.1, '')])
+def test_a_sign_is_wrong_if_nothing_but_the_sign_is(scatter: float, said: str) -> None:
+    """What is left of an inverted reading must be below a hundredth of its motion, or be noise."""
+    suspect = Suspect(CENTERS, CENTERS)
+    for block in range(60):
+        should = 4e-4 * (-1.0) ** block
+        reads = -should + scatter * 4e-4 * (-1.0) ** (block // 2)
+        suspect.add((0.0, reads, 0.0, 0.0), (0.0, reads - should, 0.0, 0.0))
+    assert suspect.most_likely(NOISE) == said
+
+
+def test_a_base_line_may_lie_along_any_direction() -> None:
+    residual = (1e-6, -2e-6, 3e-6, 4e-6)
+    for x, y in ((0.14, 0.05), (0.05, 0.14), (-0.05, 0.14), (0.0, -0.1)):
+        along = np.array([x, y, -x, -y]) / math.hypot(x, y) / 2**0.5
+        r = float(along @ residual)
+        got = Consistency().check((x, y), residual, COVARIANCE)
+        assert got.chi_square == pytest.approx(r * r / float(along @ COVARIANCE @ along), rel=1e-9)
+        want = [r / a if abs(a) > 0.02 else 0.0 for a in along]
+        assert got.errors == pytest.approx(want)
+
+
 def test_sound_readings_are_not_accused() -> None:
     assert seen(lambda r: r) == ''
 

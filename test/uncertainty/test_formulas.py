@@ -82,6 +82,10 @@ def test_of_what_is_no_covariance_as_little_as_makes_it_one_is_taken_off() -> No
     # Three tenths of what is taken off if all is made sure.
     np.testing.assert_allclose(made, [1.001, 0.8 * 0.85, 0.0], rtol=1e-9)
     assert made[1] < root_half < 0.8 * 0.95
+    for correlation, share in ((0.71, 0.03), (0.74, 0.1), (1.2, 1.0)):
+        each[0, 0, 1] = correlation
+        made = noise._covariance(each, sure)[0, 0]
+        np.testing.assert_allclose(made, [1.001, correlation * (1.0 - 0.5 * share), 0.0], rtol=1e-9)
     # What is one is left as it is, but for a thousandth of its own.
     each[0, 0, 1] = 0.7
     np.testing.assert_allclose(noise._covariance(each, sure)[0, 0], [1.001, 0.7, 0.0], rtol=1e-9)
@@ -138,6 +142,21 @@ def test_what_noise_does_not_dither_stays_as_an_error_of_rounding(sigma: float) 
     assert noise.undithered(1.0, 0.0) == 0.0
 
 
+def test_a_segment_is_judged_by_its_roughness_and_that_of_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounding to a step q adds q^2/12."""
+    step, sigma = 4e-6, 1e-9
+    of = StreamNoise(SIZE, PLACES, PLACES, sigma**2, step)
+    seen: list[FloatArray] = []
+    monkeypatch.setattr(of, '_judge', lambda gamma, sure, fixed, rough: seen.append(rough))
+    monkeypatch.setattr(of, '_in_use', lambda: of.gamma)
+    rng = np.random.default_rng(0)
+    for block in range(2 * SEGMENT_BLOCKS):
+        of.add(block, np.arange(SIZE), sigma * rng.normal(size=(SIZE, 4)))
+    for rough in seen:
+        np.testing.assert_allclose(rough, step**2 / 12.0, rtol=1e-3)
+    assert seen
+
+
 def stream() -> StreamNoise:
     out = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0)
     out._judge(white(1.0), np.ones(SIZE), white(1.0)[0, 0], np.full(8, SIGMA**2))
@@ -186,6 +205,8 @@ def test_the_third_louder_segment_in_a_row_is_believed() -> None:
     for times, rough in ((9.0, None), (9.0, None), (1.0, None), (9.0, None), (9.0, 0.1), (9.0, None), (9.0, None)):
         judge(of, times, rough)
     assert level(of) == pytest.approx(1.0)
+    judge(of, 9.0)
+    assert level(of) == pytest.approx(9.0)
 
 
 @pytest.mark.parametrize(('rough', 'rest'), [(0.26, True), (0.24, False)])

@@ -208,3 +208,10 @@ def test_no_stream_ends_the_estimates(name: str, step: float, lost: int) -> None
         if noise.add(b, slots, block[slots]):
             assert (noise.mean_sd() > 0.0).all()
             fit.set_noise(noise.gamma)
+
+
+def test_what_remembers_nothing_goes_on_as_from_the_start() -> None:
+    one, other = stream(), stream()
+    other.set_state(one.state())
+    assert one.state() == other.state() == (0.0, 0.0, 0.0, 0.0)
+    np.testing.assert_array_equal(one.gamma, other.gamma)

@@ -156,3 +156,9 @@ def test_another_one_goes_on_from_the_state() -> None:
     for values in ((0.0,) * 9, (5.0, 0.0, *(0.0,) * 8), (-1.0, 0.0, *(0.0,) * 8)):
         with pytest.raises(ValueError, match='10 values'):
             other.set_state(values)
+
+
+def test_a_chi_square_that_is_nothing_but_rounding_is_not_below_zero() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(40):
+        assert check(Redundancy(PSDS, UNKNOWNS), SLOPES @ rng.normal(size=UNKNOWNS)).chi_square >= 0.0

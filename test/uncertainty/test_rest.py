@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from psd_deflection.config import load_rig
 from psd_deflection.uncertainty.rest import why_moving
@@ -23,7 +24,8 @@ def test_two_blocks_tell_nothing_three_do() -> None:
     assert moves([0.0, 2.01, 2.01]).startswith('the link moves: y1 varied by 1.2 um rms in the last 3 blocks, noise')
     assert moves([0.0, 1.99, 1.99]) == ''
     # Of two at 0 and two at 1 m: 1/sqrt 3 m.
-    assert ' varied by 577350.3 um rms ' in moves([0.0, 0.0, 1e6, 1e6])
+    said = moves([0.0, 0.0, 1e6, 1e6], noise_um=1e5)
+    assert ' varied by 577350.3 um rms in the last 4 blocks, noise explains 100000.0 um; ' in said
 
 
 @pytest.mark.parametrize(('noise_um', 'drifts', 'scatters'), [(0.01, 2.0, 10.0), (3.0, 15.0, 15.0)])
@@ -42,6 +44,9 @@ def test_moving_is_five_times_the_noise_and_micrometres(noise_um: float, drifts:
 def test_diagnostics_say_whose_noise_it_is(covariance: str, words: str) -> None:
     stamped = StampedDots(load_rig(overrides={'covariance': covariance}))
     assert dict(stamped.words())['covariance from'] == words
+    # The noise of each reading is told if it is measured.
+    assert len(stamped.words()) == (5 if covariance == 'file' else 5 + len(stamped.noise_words()))
+    assert len(stamped.noise_words()) >= 4
 
 
 def test_diagnostics_say_of_how_many_readings_too_many_a_chi_square_is() -> None:
@@ -49,3 +54,21 @@ def test_diagnostics_say_of_how_many_readings_too_many_a_chi_square_is() -> None
     of_two, of_three = (dict(StampedDots(load_rig(overrides=more)).words()) for more in ({}, third))
     assert of_two['chi-square of the readings'] == '0.00'
     assert of_three['chi-square of the readings'] == '0.00 of 1 degrees of freedom'
+
+
+@pytest.mark.parametrize(
+    ('more', 'freedom'), [({}, 1), ({'psd_3.center': [0.08, -0.06], 'psd_4.center': [0.0, 0.1]}, 3)]
+)
+def test_diagnostics_say_how_probable_a_chi_square_is(more: dict[str, object], freedom: int) -> None:
+    stamped = StampedDots(load_rig(overrides=more))
+    stamped.chi_square, stamped.freedom = 6.0, freedom
+    assert dict(stamped.words())['p of that chi-square'] == f'{chi2.sf(6.0, freedom):.2g}'
+
+
+def test_the_check_of_three_psds_goes_on_from_its_memory() -> None:
+    one, other = (StampedDots(load_rig(overrides={'psd_3.center': [0.08, -0.06]})) for _ in range(2))
+    assert one._redundancy is not None
+    assert other._redundancy is not None
+    one._redundancy.set_state((2.0, 7.0, *(1e-12 * k for k in range(6))))
+    other.restore(one.memory())
+    assert other._redundancy.state() == one._redundancy.state()
