@@ -131,11 +131,15 @@ def test_another_vendors_dds_sees_the_same_values(start: Callable[..., Any], pee
     clean = {k: v for k, v in os.environ.items() if k not in ('LD_LIBRARY_PATH', '_ROS_WHEELS_BOOTSTRAP_COMPLETE')}
     script = Path(__file__).parent / 'cyclone_subscriber.py'
     other = subprocess.Popen(
-        [sys.executable, str(script), 'rt/link_tip/deflection', '50'], stdout=subprocess.PIPE, text=True, env=clean
+        [sys.executable, str(script), 'rt/link_tip/deflection', '50'],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=clean,
     )
     peer.until(lambda: other.poll() is not None, 'the other vendor to have 50 messages')
-    stdout, _ = other.communicate()
-    assert other.returncode == 0
+    stdout, stderr = other.communicate()
+    assert other.returncode == 0, (other.returncode, stderr, len(poses))
     seen = {row[0]: row[1:] for row in json.loads(stdout)}
     assert len(seen) == 50
     ours = {stamp(p): p for p in poses}
