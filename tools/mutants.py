@@ -56,7 +56,7 @@ _SOLVERS = (
     *('sensitivity', 'truth', 'golden', 'interface', 'properties', 'degenerate', 'registry', 'gauss_newton', 'one_psd'),
 )
 _UNCERTAINTY = (*('formulas', 'consistency', 'combinations', 'stamped', 'redundancy', 'rest', 'block_fit', 'noise'),)
-_RUNS = ('test/test_pipeline.py', 'test/test_more_psds.py', 'test/test_layouts.py')
+_RUNS = ('test/test_pipeline.py', 'test/test_layouts.py')
 
 ROOMS: Mapping[str, Room] = {
     'solvers': Room(

@@ -301,3 +301,19 @@ def test_each_of_three_detectors_is_still_by_itself() -> None:
         moved = volts.copy()
         moved[3, channel] += np.float32(STEP)
         assert health.still(moved) == tuple(psd != channel // 3 for psd in range(3))
+
+
+@pytest.mark.parametrize('sides', [[8e-3, 6e-3], [6e-3, 8e-3]])
+@pytest.mark.parametrize('psd', [1, 2])
+def test_other_light_counts_over_the_larger_side(psd: int, sides: list[float]) -> None:
+    rig = load_rig(overrides={'sum_max': 6.0, f'psd_{psd}.active_area': sides})
+    found = OpticsHealth(rig).background_variance(np.full((20, 2), 8.0))
+    share = (8.0 - rig.amplifier.sum_nominal) / 8.0
+    assert found[psd - 1] == pytest.approx((share * 4e-3) ** 2 / 3.0)
+    assert found[2 - psd] == pytest.approx((share * 5e-3) ** 2 / 3.0)
+
+
+def test_noise_of_just_a_step_may_stand_still() -> None:
+    volts = np.tile(np.array(GOOD, np.float32), (20, 1))
+    for noise, moves in ((20.0 / 65536.0, False), (20.1 / 65536.0, True)):
+        assert OpticsHealth(load_rig(overrides={'amplifier.noise': noise})).still(volts) == (moves, moves)

@@ -233,3 +233,8 @@ def test_spreads_of_what_is_seen_are_those_of_dense_least_squares() -> None:
     want = SIGMA * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
     got = placement.slope_ratio_spread(flat, 1.5, 0.585, centers, heights, SIGMA)
     assert got == pytest.approx(want, rel=1e-5)
+
+
+def test_a_twist_costs_what_it_moves_a_decimetre_off() -> None:
+    spreads = np.array([[3e-6, 4e-6, 0.0], [0.0, 0.0, 1e-4], [2e-6, 3e-6, 6e-5]])
+    np.testing.assert_allclose(placement.cost(spreads), [5e-6, 1e-5, 7e-6], rtol=1e-12)

@@ -536,3 +536,12 @@ def test_dots_of_another_number_of_psds_are_no_block(method: str, geometry: Geom
     if method in ('exact', 'ols', 'beam', 'pose', 'base_pair'):
         with pytest.raises(ValueError):
             solver.solve((0.0,) * (count + 2), (1e-12,) * (count + 2))
+
+
+def test_tilts_begin_at_none_and_take_few_steps(rays: Any) -> None:
+    """Of half a degree: each step is some thousand times smaller than the one before."""
+    for pose in POSES:
+        dots = np.asarray(rays.tip_dots(THREE, (*pose, 0.01, -0.008)))
+        one = make_solver('pose', THREE).solve(tuple(dots.tolist()), VARIANCES)
+        assert one[:5] == pytest.approx((*pose, 0.01, -0.008), abs=1e-12)
+        assert one.iterations <= 5
