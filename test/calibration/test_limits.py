@@ -317,3 +317,12 @@ def test_noise_of_just_a_step_may_stand_still() -> None:
     volts = np.tile(np.array(GOOD, np.float32), (20, 1))
     for noise, moves in ((20.0 / 65536.0, False), (20.1 / 65536.0, True)):
         assert OpticsHealth(load_rig(overrides={'amplifier.noise': noise})).still(volts) == (moves, moves)
+
+
+def test_other_light_counts_over_each_detectors_own_area() -> None:
+    """Of three, whose larger sides are 6, 8 and 10 mm."""
+    areas = {f'psd_{n}.active_area': [2e-3 * n, 4e-3 + 2e-3 * n] for n in (1, 2, 3)}
+    rig = load_rig(overrides={'sum_max': 6.0, 'psd_3.center': [0.08, -0.06], **areas})
+    share = (8.0 - rig.amplifier.sum_nominal) / 8.0
+    want = [(share * half) ** 2 / 3.0 for half in (3e-3, 4e-3, 5e-3)]
+    assert OpticsHealth(rig).background_variance(np.full((20, 3), 8.0)) == pytest.approx(want)

@@ -155,7 +155,7 @@ SIZES: dict[str, tuple[Values, Values]] = {
     'load_direction': ({'angle': 0.4}, {'angle': -1.9}),
     'load_offset': ({'x': 0.03, 'y': -0.05}, {'x': -0.2, 'y': -0.07}),
     'mains_interference': (
-        {'frequency': 50.0, **{f'amplitude_{c}': 0.1 * (i + 1) for i, c in enumerate(CHANNELS)}},
+        {'frequency': 50.0, **{f'amplitude_{c}': 0.25 * (i + 1) for i, c in enumerate(CHANNELS)}},
         {
             'frequency': 61.7,
             **{f'amplitude_{c}': -0.2 * (i + 1) for i, c in enumerate(CHANNELS)},
