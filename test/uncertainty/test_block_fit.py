@@ -318,3 +318,34 @@ def test_the_fit_is_the_posterior_of_gaussian_coefficients(size: int) -> None:
         np.testing.assert_allclose((got.covariance - covariance) / np.outer(sd, sd), 0.0, atol=1e-6, err_msg=str(block))
         misfits += misfit
     assert misfits > 0
+
+
+@pytest.mark.parametrize('combination', range(3))
+@pytest.mark.parametrize(('square', 'sudden'), [(15.9, False), (16.1, True)])
+def test_motion_is_believed_at_once_from_four_standard_deviations_on(
+    combination: int, square: float, sudden: bool
+) -> None:
+    """Before, a twelfth of what is beyond the noise, less half of it; the weight is tau^2/(tau^2 + v)."""
+    fit, turn, q = fitter(), combinations(PLACES), basis(SIZE)
+    fitted = fit.fit(ALL, square**0.5 * SIGMA * q[:, 2:3] * turn[combination])
+    at_the_stamp = float(turn[combination] @ fitted.dots)
+    followed = square**0.5 * SIGMA * _middle_of(q[:, 2])
+    tau = square - 1.0 if sudden else (square - 1.0) / 12.0 - 0.5
+    assert at_the_stamp / followed == pytest.approx(tau / (tau + 1.0), rel=1e-4)
+
+
+def _middle_of(column: FloatArray) -> float:
+    """Of a parabola over the places 0 ... 19, at 9.5."""
+    return float(np.polyval(np.polyfit(ALL - 9.5, column, 2), 0.0))
+
+
+@pytest.mark.parametrize(('share', 'misfit'), [(0.99, False), (1.01, True)])
+def test_a_block_misfits_from_five_standard_deviations_of_its_squares_on(share: float, misfit: bool) -> None:
+    """Of 20 samples and 5 orders 15 degrees of freedom: 15 + 5 sqrt(30). What is left is added as an error."""
+    fit, q = fitter(), basis(SIZE)
+    left = (ALL - 9.5) ** 5.0 - q @ (q.T @ (ALL - 9.5) ** 5.0)
+    left *= SIGMA * (share * (15.0 + 5.0 * 30.0**0.5)) ** 0.5 / float(np.linalg.norm(left))
+    got = fit.fit(ALL, np.outer(left, combinations(PLACES)[0]))
+    assert got.misfit == misfit
+    own = float(combinations(PLACES)[0] @ got.covariance @ combinations(PLACES)[0])
+    assert own == pytest.approx(SIGMA**2 / 20.0 + (float(left @ left) / 15.0 if misfit else 0.0), rel=1e-2)

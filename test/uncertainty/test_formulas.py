@@ -406,3 +406,24 @@ def test_lags_at_which_no_two_samples_are_apart_are_taken_as_independent() -> No
 def test_blocks_of_one_sample_have_no_roughness() -> None:
     places = np.arange(SEGMENT_BLOCKS) * SIZE
     np.testing.assert_array_equal(noise._roughness(places, np.ones((SEGMENT_BLOCKS, 3)), basis(SIZE)), np.zeros(3))
+
+
+def test_one_pair_at_a_lag_says_something_of_it() -> None:
+    """Of every other sample, and the last one: at each odd lag there is one pair."""
+    n = SEGMENT_BLOCKS * SIZE
+    keep = np.append(np.arange(0, n, 2), n - 1)
+    series = np.random.default_rng(3).normal(size=(len(keep), 1))
+    here = np.full(n, np.nan)
+    here[keep] = series[:, 0] - np.polyval(np.polyfit(keep, series[:, 0], 1), keep)
+    every = np.array([np.nanmean(here[: n - lag] * here[lag:]) for lag in range(100)])
+    got, _ = noise._autocovariance(keep, series, n, SIZE)
+    np.testing.assert_allclose(got[0, 0], every[:SIZE] + put_back(every[:, None, None]).item(), atol=1e-9)
+
+
+def test_noise_is_measured_from_the_second_segment_on() -> None:
+    of, rng = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0), np.random.default_rng(9)
+    said = []
+    for block in range(150):
+        of.add(block, ALL, SIGMA * rng.normal(size=(SIZE, 4)))
+        said.append(of.measured)
+    assert said == [False] * 99 + [True] * 51
