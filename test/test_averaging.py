@@ -90,3 +90,42 @@ def test_the_covariance_is_numpys() -> None:
     for n in (2, 3, 20):
         np.testing.assert_allclose(covariance(values[:n]), np.cov(values[:n].T), rtol=1e-12)
     assert not covariance(values[:1]).any()
+
+
+def test_a_repeat_in_the_first_chunk_is_passed_over_too() -> None:
+    for seq, kept in (([4, 4], [4]), ([4, 3], [4]), ([0, 0], [0]), ([5, 3, 4, 6, 6, 7], [5, 6, 7])):
+        cutter = BlockCutter(20)
+        cutter.add(*chunk_of(seq))
+        assert cutter.repeated == len(seq) - len(kept)
+        (block,) = cutter.flush()
+        assert block.seq.tolist() == kept
+        assert block.volts[:, 0].tolist() == kept
+        assert (block.t_ns == block.seq * 1_000_000).all()
+
+
+def test_what_a_sample_brings_along_stays_with_it() -> None:
+    """Flags of their own, through repeats, cuts and joins."""
+    cutter, done = BlockCutter(4), []
+    for seq in ([0, 1], [1, 2, 3, 4, 5, 9], [9, 10, 12]):
+        chunk, volts = chunk_of(seq)
+        done += cutter.add(RawChunk(chunk.seq, chunk.t_ns, chunk.readings, (10 * chunk.seq).astype(np.uint8)), volts)
+    done += cutter.flush()
+    assert [(b.index, b.seq.tolist()) for b in done] == [(0, [0, 1, 2, 3]), (1, [4, 5]), (2, [9, 10]), (3, [12])]
+    for block in done:
+        assert block.flags.tolist() == (10 * block.seq).tolist()
+    assert cutter.repeated == 2
+
+
+def test_a_block_of_one_sample_is_complete_with_it() -> None:
+    cutter = BlockCutter(1)
+    assert [b.index for b in cutter.add(*chunk_of([3]))] == [3]
+    assert [b.index for b in cutter.add(*chunk_of([4, 6, 7]))] == [4, 6, 7]
+    assert cutter.flush() == []
+
+
+def test_the_middle_is_the_mean_of_what_the_clock_said() -> None:
+    """Jitter of ns on some samples, of a block of four of which one is lost: 1.5 periods after its first place."""
+    seq = np.array([8, 9, 11])
+    t_ns = np.array([8_000_000, 9_000_003, 11_000_009])
+    block = SampleBlock(2, seq, t_ns, np.zeros((3, 6), np.float32), np.zeros(3, np.uint8))
+    assert block_middle_ns(block, 4, 1e6) == 9_500_000 + 4

@@ -55,13 +55,23 @@ _GOLDEN = 'test/test_golden.py'
 _SOLVERS = (
     *('sensitivity', 'truth', 'golden', 'interface', 'properties', 'degenerate', 'registry', 'gauss_newton', 'one_psd'),
 )
+_UNCERTAINTY = (*('formulas', 'consistency', 'combinations', 'stamped', 'redundancy', 'rest', 'block_fit', 'noise'),)
+_RUNS = ('test/test_pipeline.py', 'test/test_layouts.py')
 
 ROOMS: Mapping[str, Room] = {
     'solvers': Room(
         ('psd_deflection/solvers',),
         (*(f'test/solvers/test_{n}.py' for n in _SOLVERS), _GOLDEN),
+        slow=('test/solvers/test_audit.py', 'test/budget', *_RUNS),
     ),
-    'geometry': Room(('psd_deflection/geometry',), ('test/geometry',)),
+    'geometry': Room(
+        ('psd_deflection/geometry',),
+        ('test/geometry',),
+        slow=(
+            *(f'test/solvers/test_{n}.py' for n in ('sensitivity', 'truth', 'golden')),
+            'test/simulation/test_simulator.py',
+        ),
+    ),
     'averaging': Room(('psd_deflection/averaging.py',), ('test/test_averaging.py', _GOLDEN)),
     'timing': Room(('psd_deflection/timing.py',), ('test/test_timing.py', 'test/runner/test_clock_watch.py')),
     'pipeline': Room(
@@ -76,18 +86,16 @@ ROOMS: Mapping[str, Room] = {
             _GOLDEN,
         ),
     ),
-    'calibration': Room(('psd_deflection/calibration',), ('test/calibration', _GOLDEN)),
+    'calibration': Room(('psd_deflection/calibration',), ('test/calibration', _GOLDEN), slow=_RUNS),
     'uncertainty': Room(
         ('psd_deflection/uncertainty',),
         (
-            *(
-                f'test/uncertainty/test_{n}.py'
-                for n in ('formulas', 'consistency', 'redundancy', 'rest', 'block_fit', 'noise')
-            ),
+            *(f'test/uncertainty/test_{n}.py' for n in _UNCERTAINTY),
             'test/test_pipeline.py -k zero or contradict',
             'test/test_more_psds.py -k contradicts or degree or tells_on_itself or one_after or from_the_memory',
             'test/uncertainty/test_pipeline_state.py',
         ),
+        slow=_RUNS,
     ),
     'adapters': Room(
         ('msg_adapters',),
@@ -113,6 +121,7 @@ ROOMS: Mapping[str, Room] = {
             'test/simulation/test_effect_formulas.py',
             'test/simulation/test_effects.py -k back or play or pieces or (wrench and (creep or friction or load))',
         ),
+        slow=('test/simulation/test_effects.py', 'test/simulation/test_simulator.py'),
     ),
     'discovery': Room(
         ('psd_deflection/discovery',),

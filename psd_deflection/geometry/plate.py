@@ -223,4 +223,5 @@ def reading_slopes(
     jacobian = crossings(pose, beams, heights)[1].reshape(-1, 5)
     if tilts == 'free':
         return jacobian
-    return jacobian @ tie_matrix(0.0 if tilts == 'none' else slope_ratio, link_length)
+    # A flat plate's readings do not go with tilts at rest, to first order.
+    return jacobian @ tie_matrix(slope_ratio, link_length)

@@ -107,9 +107,7 @@ class BasePairSolver(Solver):
                     'dot back by what the deflection moved it (Fig. 5.9): the deflection cannot be seen; '
                     'put the PSDs in another plane'
                 )
-        length = float(np.hypot(*np.ptp(geometry.beams, axis=0)))
-        scale = np.array([1.0, 1.0, length, float(np.abs(heights).max()), float(np.abs(heights).max())])
-        seen = (jacobian / scale) @ (scale[:, None] * self._matrix)
+        seen = jacobian @ self._matrix
         seen /= np.linalg.norm(seen, axis=0)
         if np.linalg.svd(seen, compute_uv=False)[-1] < _SMALLEST_GAIN:
             raise SolverError(

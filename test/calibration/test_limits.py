@@ -186,3 +186,143 @@ def test_noise_is_told_whatever_the_link_does_slowly(order: int) -> None:
     assert told[10.0] > 190
     blamed = OpticsHealth(rig).late_findings(volts, Verdict(BlockStatus.OK, '', 0, faults=frozenset({2})), (0, 0))
     assert blamed == ()
+
+
+def test_what_is_exactly_at_its_limit_is_still_good() -> None:
+    assert judge(changed(2, 2.0), sum_min=2.0).status is BlockStatus.OK
+    assert judge(changed(5, 6.0), sum_max=6.0).findings == ()
+    health = OpticsHealth(load_rig(overrides={'sum_max': 6.0}))
+    assert health.background_variance(np.full((20, 2), 6.0)) == (0.0, 0.0)
+    # One step below the last one.
+    assert judge(one=changed(0, 32766 * STEP)).status is BlockStatus.OK
+    # Half of 2^-6 m, and a spot of 2^-10 m that touches the edge: doubles without rounding.
+    edges: dict[str, Any] = {'psd_1.active_area': [2.0**-6] * 2, 'psd_1.spot_radius': 2.0**-10}
+    for axis in (0, 1):
+        touches = [0.0] * 4
+        touches[axis] = 2.0**-7 - 2.0**-10
+        assert judge(dots=tuple(touches), **edges) == Verdict(BlockStatus.OK, '', 0)
+        touches[axis] = 2.0**-7
+        assert judge(dots=tuple(touches), **edges).status is BlockStatus.OK
+    nominal = load_rig().amplifier.sum_nominal
+    for share in (0.35, 0.65):
+        assert not OpticsHealth(load_rig())._half_light([share * nominal] * 2)
+
+
+def test_a_spot_at_a_corner_is_told_once_and_the_faulty_psd_hides_no_other() -> None:
+    corner = (*DOTS[:2], 4.9e-3, -4.9e-3)
+    assert judge(dots=corner).findings == ('psd_2: the spot is clipped at the edge',)
+    dark = judge(changed(2, 0.0), corner)
+    assert dark.faulty == 1
+    assert dark.findings == ('psd_2: the spot is clipped at the edge',)
+
+
+def test_the_sound_detectors_are_those_without_a_fault_if_samples_are_enough() -> None:
+    assert judge(changed(2, 0.0)).sound == (1,)
+    assert judge(changed(5, 0.0)).sound == (0,)
+    assert judge((*GOOD[:2], 0.0, *GOOD[3:5], 0.0)).sound == ()
+    assert judge(changed(2, 0.0), present=9).sound == ()
+    assert judge(changed(2, 0.0), present=10).sound == (1,)
+    # Of two lost lasers the first is named.
+    assert judge((*GOOD[:2], 0.0, *GOOD[3:5], 0.0)).reason.startswith('laser 1')
+
+
+def test_light_below_what_the_laser_gives_is_no_other_light() -> None:
+    rig = load_rig(overrides={'sum_max': 4.0})
+    assert OpticsHealth(rig).background_variance(np.full((20, 2), 4.5)) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize('channel', range(6))
+def test_a_detector_is_still_if_x_y_and_sum_are(channel: int) -> None:
+    health = OpticsHealth(load_rig())
+    volts = np.tile(np.array(GOOD, np.float32), (10, 1))
+    assert health.still(volts) == (True, True)
+    assert health.still(volts[:9]) == (False, False)
+    for row in (0, 1, 9):
+        moved = volts.copy()
+        moved[row, channel] += np.float32(STEP)
+        assert health.still(moved) == ((False, True) if channel < 3 else (True, False))
+
+
+def test_two_samples_can_be_still_and_one_cannot() -> None:
+    health = OpticsHealth(load_rig(overrides={'min_samples': 1}))
+    volts = np.tile(np.array(GOOD, np.float32), (2, 1))
+    assert health.still(volts) == (True, True)
+    assert health.still(volts[:1]) == (False, False)
+
+
+def test_a_detector_whose_noise_is_below_a_step_may_stand_still() -> None:
+    """One axis that moves is enough."""
+    quiet = {'psd_1.noise': [1e-5, 1e-5], 'psd_2.noise': [1e-5, 1e-3]}
+    volts = np.tile(np.array(GOOD, np.float32), (20, 1))
+    assert OpticsHealth(load_rig(overrides={'amplifier.noise': 1e-5, **quiet})).still(volts) == (False, True)
+
+
+@pytest.mark.parametrize('channel', range(6))
+@pytest.mark.parametrize('size', [10, 20])
+def test_noise_is_told_from_five_times_what_amplifier_and_converter_have(channel: int, size: int) -> None:
+    """The third difference of a, -a, a ... is 8 a, that of white noise of s has the rms s sqrt(20)."""
+    sigma = 1e-4
+    rig = load_rig(overrides={'amplifier.noise': sigma, 'block_size': size, 'min_samples': size // 2})
+    limit = 5.0 * np.sqrt(sigma**2 + STEP**2 / 12.0)
+    for share, told in ((0.99, 0), (1.01, 1)):
+        volts = np.zeros((size, 6))
+        volts[:, channel] = share * limit * np.sqrt(20.0) / 8.0 * (-1.0) ** np.arange(size)
+        found = OpticsHealth(rig).late_findings(volts.astype(np.float32), Verdict(BlockStatus.OK, '', 0), (0, 0))
+        assert found == (f'psd_{1 + channel // 3} is noisy: {share * limit * 1e3:.1f} mV a sample',) * told
+
+
+def test_blocks_of_nine_samples_and_blocks_with_gaps_tell_no_noise() -> None:
+    volts = np.tile((-1.0) ** np.arange(20, dtype=np.float32)[:, None], (1, 6)).astype(np.float32)
+    for size, present in ((9, 9), (20, 19)):
+        rig = load_rig(overrides={'block_size': size, 'min_samples': 4})
+        assert OpticsHealth(rig).late_findings(volts[:present], Verdict(BlockStatus.OK, '', 0), (0, 0)) == ()
+
+
+def test_a_frozen_detector_is_a_finding_unless_it_is_a_fault() -> None:
+    volts = np.tile(np.array(GOOD, np.float32), (20, 1))
+    health, ok = OpticsHealth(load_rig()), Verdict(BlockStatus.OK, '', 0)
+    blamed = Verdict(BlockStatus.LASER_LOST, '', 2, faults=frozenset({2}))
+    said = ('psd_1 stands still: no bit has moved for 5 blocks', 'psd_2 stands still: no bit has moved for 7 blocks')
+    assert health.late_findings(volts, ok, (5, 7)) == said
+    assert health.late_findings(volts, ok, (4, 7)) == said[1:]
+    assert health.late_findings(volts, blamed, (5, 7)) == said[:1]
+    refuses = OpticsHealth(load_rig(overrides={'frozen': 'refuse'}))
+    assert refuses.late_findings(volts, ok, (5, 7)) == ()
+
+
+def test_a_dot_outside_is_told_in_millimetres() -> None:
+    assert judge(dots=(*DOTS[:3], -6.25e-3)).reason == 'y2 at -6.250 mm, outside the active area'
+
+
+def test_each_of_three_detectors_is_still_by_itself() -> None:
+    health = OpticsHealth(load_rig(overrides={'psd_3.center': [0.08, -0.06]}))
+    volts = np.tile(np.array((*GOOD, 0.1, 0.2, 5.0), np.float32), (20, 1))
+    for channel in range(9):
+        moved = volts.copy()
+        moved[3, channel] += np.float32(STEP)
+        assert health.still(moved) == tuple(psd != channel // 3 for psd in range(3))
+
+
+@pytest.mark.parametrize('sides', [[8e-3, 6e-3], [6e-3, 8e-3]])
+@pytest.mark.parametrize('psd', [1, 2])
+def test_other_light_counts_over_the_larger_side(psd: int, sides: list[float]) -> None:
+    rig = load_rig(overrides={'sum_max': 6.0, f'psd_{psd}.active_area': sides})
+    found = OpticsHealth(rig).background_variance(np.full((20, 2), 8.0))
+    share = (8.0 - rig.amplifier.sum_nominal) / 8.0
+    assert found[psd - 1] == pytest.approx((share * 4e-3) ** 2 / 3.0)
+    assert found[2 - psd] == pytest.approx((share * 5e-3) ** 2 / 3.0)
+
+
+def test_noise_of_just_a_step_may_stand_still() -> None:
+    volts = np.tile(np.array(GOOD, np.float32), (20, 1))
+    for noise, moves in ((20.0 / 65536.0, False), (20.1 / 65536.0, True)):
+        assert OpticsHealth(load_rig(overrides={'amplifier.noise': noise})).still(volts) == (moves, moves)
+
+
+def test_other_light_counts_over_each_detectors_own_area() -> None:
+    """Of three, whose larger sides are 6, 8 and 10 mm."""
+    areas = {f'psd_{n}.active_area': [2e-3 * n, 4e-3 + 2e-3 * n] for n in (1, 2, 3)}
+    rig = load_rig(overrides={'sum_max': 6.0, 'psd_3.center': [0.08, -0.06], **areas})
+    share = (8.0 - rig.amplifier.sum_nominal) / 8.0
+    want = [(share * half) ** 2 / 3.0 for half in (3e-3, 4e-3, 5e-3)]
+    assert OpticsHealth(rig).background_variance(np.full((20, 3), 8.0)) == pytest.approx(want)

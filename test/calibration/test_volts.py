@@ -190,3 +190,56 @@ def test_a_rig_without_dark_levels_reads_as_before_and_one_without_laser_stays_f
     # The least light that is believed: a tenth of the other light.
     np.testing.assert_allclose(one.dots(volts(0.0, 0.0, 0.0, 1.0, 0.0, 0.11))[0, 2:], [0.5e-3, 5e-3], rtol=1e-5)
     assert np.isfinite(one.dots(np.zeros((1, 6), dtype=np.float32))).all()
+
+
+def test_a_place_is_valid_as_far_as_its_sensor_reaches() -> None:
+    np.testing.assert_array_equal(make_sensor(psd('duolateral')).reach(), [5e-3, 4e-3])
+    # A quadrant: 1.5 w, or the edge if that is nearer.
+    np.testing.assert_allclose(make_sensor(psd('quadrant', 2e-3)).reach(), [3e-3, 3e-3], rtol=1e-12)
+    np.testing.assert_allclose(make_sensor(psd('quadrant', 3e-3)).reach(), [4.5e-3, 4e-3], rtol=1e-12)
+
+
+@pytest.mark.parametrize('kind', SENSOR_TYPES)
+def test_less_than_no_light_is_no_place_either(kind: str) -> None:
+    """Offsets of the amplifiers with the laser off."""
+    assert np.isnan(make_sensor(psd(kind)).place(np.array([[-0.2, -0.1, -0.15, -0.1]]))).all()
+
+
+def test_a_ratio_is_a_place_and_back_for_each_sensor() -> None:
+    for kind in SENSOR_TYPES:
+        sensor = make_sensor(psd(kind, 2e-3))
+        places = np.array([[1e-3, -2e-3], [-0.5e-3, 1.5e-3]])
+        np.testing.assert_allclose(sensor.from_ratios(sensor.to_ratios(places)), places, rtol=1e-9)
+        linear = sensor.to_linear(sensor.to_ratios(places))
+        np.testing.assert_allclose(sensor.from_linear(linear), places, rtol=1e-9)
+        # Near the centre a place and its linear reading are the same.
+        np.testing.assert_allclose(sensor.to_linear(sensor.to_ratios(1e-3 * places)), 1e-3 * places, rtol=1e-5)
+
+
+def test_each_of_three_psds_has_its_own_curve_and_sensitivity() -> None:
+    """A quadrant between two lateral sensors: places through electrodes and volts, and back."""
+    values: dict[str, Any] = {'psd_3.center': [0.08, -0.06], 'psd_2.type': 'quadrant', 'psd_2.spot_radius': 1e-3}
+    sizes = {f'psd_{n}.sensitivity': [n * 1e-4, n * 1e-4 + 5e-5] for n in (1, 2, 3)}
+    calibration = Calibration.from_rig(rig_from_values({**values, **sizes}))
+    places = np.array([[1e-3, -2e-3, 0.3e-3, -0.1e-3, -3e-3, 0.5e-3], [-1e-3, 2e-3, -0.4e-3, 0.2e-3, 2e-3, 1e-3]])
+    parts = [s.currents(places[:, 2 * i : 2 * i + 2], 5.0) for i, s in enumerate(calibration.sensors)]
+    read = calibration.volts_of_electrodes(np.hstack(parts))
+    np.testing.assert_allclose(calibration.dots(read.astype(np.float32)), places, rtol=1e-5)
+    # A lateral sensor's volts are the places over the sensitivities.
+    np.testing.assert_allclose(read[:, [0, 1, 6, 7]], places[:, [0, 1, 4, 5]] / [1e-4, 1.5e-4, 3e-4, 3.5e-4], rtol=1e-9)
+    np.testing.assert_allclose(read[:, 2::3], 5.0)
+    # Without light on one axis of one of them that one says nothing.
+    for psd in range(3):
+        lost = np.hstack(parts)
+        lost[0, 4 * psd : 4 * psd + 4] = 0.0
+        want = read.copy()
+        want[0, 3 * psd : 3 * psd + 3] = 0.0
+        np.testing.assert_array_equal(calibration.volts_of_electrodes(lost), want)
+
+
+def test_less_light_than_a_tenth_of_the_other_is_taken_for_a_tenth() -> None:
+    one = Calibration.from_rig(rig_from_values({'psd_2.dark': [1.0, -1.0, 0.1]}))
+    # (S v - b d) / 0.01 V, for v = (1, 0) V at 0.5 mm/V, whatever is left of the light above 0.1 V.
+    for whole in (0.105, 0.1, 0.09):
+        want = [(whole * 0.5e-3 - 0.05e-3) / 0.01, 0.05e-3 / 0.01]
+        np.testing.assert_allclose(one.dots(volts(0.0, 0.0, 0.0, 1.0, 0.0, whole))[0, 2:], want, rtol=1e-5, atol=1e-10)

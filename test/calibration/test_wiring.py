@@ -109,3 +109,10 @@ def test_a_recording_of_a_rig_with_its_own_wiring_replays_bit_for_bit(
     assert main(['simulate', '--params-file', str(rig), '--loads', 'steps:0,0,0;0,-10,-5.85:1', '--out', out]) == 0
     assert main(['replay', out, '--compare']) == 0
     assert 'no bit differs' in capsys.readouterr().out
+
+
+def test_only_the_first_two_detectors_are_exchanged() -> None:
+    wiring = Wiring(True, (('x', 'y'), ('-y', 'x'), ('y', '-x')))
+    assert [wiring.input_of(psd) for psd in (1, 2, 3)] == [2, 1, 3]
+    assert wiring.columns == (3, 4, 5, 1, 0, 2, 7, 6, 8)
+    assert wiring.signs == (1.0, 1.0, 1.0, -1.0, 1.0, 1.0, 1.0, -1.0, 1.0)

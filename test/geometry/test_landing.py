@@ -8,7 +8,7 @@ import pytest
 from psd_deflection.errors import SolverError
 from psd_deflection.geometry import Geometry
 from psd_deflection.geometry.landing import landing, landings
-from psd_deflection.geometry.layout import check_shapes
+from psd_deflection.geometry.layout import check_shapes, check_twist
 from psd_deflection.geometry.plate import points_under_leaning
 from psd_deflection.geometry.rays import hit, rotation
 
@@ -60,3 +60,39 @@ def test_arrays_that_are_no_geometry_are_refused(centers: np.ndarray, heights: i
 @pytest.mark.parametrize('count', [2, 3])
 def test_a_geometry_is_of_so_many_psds(count: int) -> None:
     assert check_shapes(Geometry(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count), 0.585)) == count
+
+
+def test_the_beams_are_apart_by_more_than_a_micrometre_in_any_direction() -> None:
+    """The refusal says where they are: at the first one's place."""
+    for along in ((1.0, 0.0), (0.0, 1.0), (-0.6, 0.8)):
+        for apart, said in ((0.9e-6, True), (1.1e-6, False)):
+            centers = np.array([[0.01, 0.07], [0.01, 0.07]]) + np.array([[0.0, 0.0], along]) * apart
+            geometry = Geometry(centers, np.zeros((2, 2)), np.zeros(2), 0.585)
+            if said:
+                with pytest.raises(SolverError, match=r'psd_1 and psd_2 coincide at \(0\.01, 0\.07\) m'):
+                    check_twist(geometry)
+            else:
+                assert check_twist(geometry) == 2
+    # Beams, not centres, count; and of three any two that differ.
+    zeros = np.array([[0.0, 0.0], [1e-3, 0.0], [0.0, 0.0]])
+    assert check_twist(Geometry(np.zeros((3, 2)), zeros, np.zeros(3), 0.585)) == 3
+    with pytest.raises(SolverError, match='psd_1 and psd_2 and psd_3 coincide'):
+        check_twist(Geometry(np.zeros((3, 2)), np.zeros((3, 2)), np.zeros(3), 0.585))
+
+
+def test_a_force_at_the_tip_is_what_a_geometry_supposes() -> None:
+    assert Geometry(np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2), 0.585).slope_ratio == 1.5
+
+
+@pytest.mark.parametrize('name', ['centers', 'zeros', 'heights'])
+def test_what_is_not_finite_is_named(name: str) -> None:
+    arrays = {'centers': np.zeros((2, 2)), 'zeros': np.zeros((2, 2)), 'heights': np.zeros(2)}
+    arrays[name].ravel()[1] = np.inf
+    with pytest.raises(SolverError, match=f'geometry: {name} must be finite'):
+        check_shapes(Geometry(arrays['centers'], arrays['zeros'], arrays['heights'], 0.585))
+
+
+def test_arrays_of_another_count_are_refused_one_by_one() -> None:
+    for zeros, heights in (((3, 2), 2), ((2, 2), 3), ((2, 1), 2)):
+        with pytest.raises(SolverError, match='must all be of the same 2 PSDs'):
+            check_shapes(Geometry(np.zeros((2, 2)), np.zeros(zeros), np.zeros(heights), 0.585))

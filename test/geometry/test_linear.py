@@ -77,3 +77,30 @@ def test_gain_matrices(golden: Any, which: str, key: str, name: str, scaling: tu
     np.testing.assert_allclose(got, golden.constants[key][name], rtol=0.0, atol=1e-11)
     if name == 'ols':
         np.testing.assert_array_equal(gain_matrix(design), gain_matrix(design, np.ones(4)))
+
+
+@pytest.mark.parametrize('unit', [1e-18, 1.0, 1e18])
+def test_the_gain_does_not_depend_on_the_unit_of_length(golden: Any, unit: float) -> None:
+    beams = golden.geometry().beams
+    po = np.array([0.3, 0.5, 2.0, 0.4])
+    design = np.array([row for x, y in beams for row in ([-1.0, 0.0, y], [0.0, -1.0, -x])])
+    want = np.linalg.solve(design.T @ np.diag(po**2) @ design, design.T @ np.diag(po**2))
+    got = gain_matrix(design_matrix(unit * beams), po) * np.array([[1.0], [1.0], [unit]])
+    np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(('largest', 'finite'), [(0.05, True), (0.32, True), (0.34, False), (0.6, False)])
+def test_a_bound_is_infinite_from_where_an_error_could_hide_the_pose(largest: float, finite: bool) -> None:
+    """An error e of each entry, a tenth of it of the angle's: |G| E has the eigenvalue 3 e."""
+    design = design_matrix(np.array([[0.0, 0.1], [0.0, -0.1]]))
+    gain = np.abs(np.linalg.pinv(design))
+    errors = np.full((4, 3), largest)
+    errors[:, 2] = largest * 0.1
+    share = float(np.abs(np.linalg.eigvals(gain @ errors)).max())
+    assert share == pytest.approx(3.0 * largest)
+    bound = error_bound(design, np.array([1e-3, -2e-3, 0.01]), errors, np.full(4, -2e-6))
+    assert np.isfinite(bound).all() == finite
+    if finite:
+        # The series of (I - K)^-1, added up.
+        k, at = gain @ errors, gain @ (np.full(4, 2e-6) + errors @ np.array([1e-3, 2e-3, 0.01]))
+        np.testing.assert_allclose(bound, sum(np.linalg.matrix_power(k, n) @ at for n in range(600)), rtol=1e-6)

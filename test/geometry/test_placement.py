@@ -11,6 +11,7 @@ from psd_deflection.errors import ConfigError
 from psd_deflection.geometry import placement
 from psd_deflection.geometry.linear import condition_number, design_matrix
 from psd_deflection.geometry.placement import Room
+from psd_deflection.geometry.plate import plate_points
 from psd_deflection.records import FloatArray
 
 THESIS = np.array([[0.0, 0.070], [-0.100, 0.0]])
@@ -122,6 +123,10 @@ def test_a_room_holds_what_is_between_its_circles_and_in_its_box() -> None:
         (0.1, 0.2, None, '^keep_out = '),
         (0.1, -0.1, None, '^keep_out = '),
         (0.1, 0.0, (0.1, 0.0, 0.0, 0.1), '^box = '),
+        (0.1, 0.0, (0.0, 0.1, 0.1, 0.0), '^box = '),
+        (0.1, 0.0, (0.1, 0.0, 0.1, 0.1), '^box = '),
+        (0.1, 0.0, (0.0, 0.1, 0.1, 0.1), '^box = '),
+        (math.inf, 0.0, None, '^radius = '),
     ],
 )
 def test_an_impossible_room_is_refused(
@@ -152,3 +157,84 @@ def test_the_cost_of_a_pair_is_that_of_least_squares() -> None:
         variances = np.linalg.inv(np.transpose(rows) @ np.array(rows)).diagonal()
         want.append(np.sqrt(variances @ [1.0, 1.0, 0.01]))
     np.testing.assert_allclose(placement._pair_costs(places[:, 0], places[:, 1]), want, rtol=1e-9)
+
+
+def test_a_box_ends_at_each_of_its_sides() -> None:
+    room = Room(1.0, box=(-0.1, -0.2, 0.3, 0.4))
+    inside = [(-0.1, 0.0), (0.3, 0.35), (0.2, -0.2), (0.0, 0.4)]
+    outside = [(-0.11, 0.0), (0.31, 0.0), (0.0, -0.21), (0.0, 0.41)]
+    assert room.holds(np.array(inside)).all()
+    assert not room.holds(np.array(outside)).any()
+
+
+def test_candidates_are_on_the_rims_too() -> None:
+    """Eight on each rim for one on a side of the grid; a box that is a square around the room has a grid of its own."""
+    room = Room(1.0, keep_out=0.5)
+    found = {tuple(p + 0.0) for p in room.candidates(3).round(9)}
+    turn = 2.0 * np.pi * np.arange(24) / 24.0
+    rims = np.concatenate([r * np.column_stack((np.cos(turn), np.sin(turn))) for r in (1.0, 0.5)])
+    # Of the grid's nine points the middle is within the inner rim, and the corners are outside.
+    assert found == {tuple(p + 0.0) for p in rims.round(9)}
+    np.testing.assert_array_equal(room.candidates(), room.candidates(24))
+
+
+def test_one_place_is_no_room_for_two_and_two_are() -> None:
+    """A corner that touches the rim; a corner and one point of the rim."""
+    with pytest.raises(ConfigError, match='no room'):
+        placement.best_pair(Room(0.1, box=(0.06, 0.08, 0.2, 0.2)))
+    room = Room(0.1, box=(0.0999, 0.001, 0.2, 0.2))
+    assert len(room.candidates()) == 2
+    pair = placement.best_pair(room)
+    assert room.holds(pair).all()
+    # As far apart as the box allows: its two corners on the rim and below.
+    assert pair == pytest.approx(np.array([[0.0999, math.sqrt(0.1**2 - 0.0999**2)], [0.0999, 0.001]]), abs=1e-8)
+
+
+def test_of_two_at_one_height_the_left_one_is_first() -> None:
+    pair = placement.best_pair(Room(0.100, box=(-0.2, 0.011, 0.2, 0.2)))
+    x = math.sqrt(0.100**2 - 0.011**2)
+    assert pair == pytest.approx(np.array([[-x, 0.011], [x, 0.011]]), abs=1e-8)
+
+
+def test_the_first_of_a_ring_is_above_unless_another_azimuth_is_asked_for() -> None:
+    assert placement.opposite(0.1) == pytest.approx(np.array([[0.0, 0.1], [0.0, -0.1]]))
+    assert placement.opposite(0.1, 0.3) == pytest.approx(0.1 * np.array([[c, s] for c, s in _at(0.3, 0.3 + math.pi)]))
+    sixty = math.sqrt(0.75)
+    assert placement.ring(3, 0.1) == pytest.approx(0.1 * np.array([[0.0, 1.0], [-sixty, -0.5], [sixty, -0.5]]))
+    assert placement.ring(4, 0.1, 0.3) == pytest.approx(
+        0.1 * np.array(_at(*(0.3 + quarter * math.pi / 2.0 for quarter in range(4))))
+    )
+
+
+def _at(*angles: float) -> list[tuple[float, float]]:
+    return [(math.cos(a), math.sin(a)) for a in angles]
+
+
+def test_spreads_of_what_is_seen_are_those_of_dense_least_squares() -> None:
+    centers, heights = placement.ring(3, 0.1), np.array([0.1, -0.05, -0.05])
+    pose = np.array([1e-3, -2e-3, 0.02, 0.03, -0.04])
+    step = 1e-6
+    columns = [
+        (plate_points(pose + e, centers, heights) - plate_points(pose - e, centers, heights)).ravel() / (2.0 * step)
+        for e in step * np.eye(5)
+    ]
+    jacobian = np.stack(columns, axis=1)
+    want = SIGMA * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    assert placement.pose_spread(pose, centers, heights, SIGMA) == pytest.approx(want, rel=1e-5)
+    # With the tilts tied by k = 1.5 and k unknown; rows are dX, dY, theta, k.
+    flat = np.array([1e-3, -2e-3, 0.02])
+
+    def tied(x: FloatArray) -> FloatArray:
+        five = np.array([*x[:3], -x[3] * x[1] / 0.585, x[3] * x[0] / 0.585])
+        return plate_points(five, centers, heights).ravel()
+
+    x = np.array([*flat, 1.5])
+    jacobian = np.stack([(tied(x + e) - tied(x - e)) / (2.0 * step) for e in step * np.eye(4)], axis=1)
+    want = SIGMA * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    got = placement.slope_ratio_spread(flat, 1.5, 0.585, centers, heights, SIGMA)
+    assert got == pytest.approx(want, rel=1e-5)
+
+
+def test_a_twist_costs_what_it_moves_a_decimetre_off() -> None:
+    spreads = np.array([[3e-6, 4e-6, 0.0], [0.0, 0.0, 1e-4], [2e-6, 3e-6, 6e-5]])
+    np.testing.assert_allclose(placement.cost(spreads), [5e-6, 1e-5, 7e-6], rtol=1e-12)

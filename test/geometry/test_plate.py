@@ -10,6 +10,7 @@ import pytest
 from psd_deflection.config import load_rig
 from psd_deflection.geometry import Geometry
 from psd_deflection.geometry.plate import (
+    Tilts,
     crossing,
     crossings,
     flat_points,
@@ -17,6 +18,7 @@ from psd_deflection.geometry.plate import (
     flat_poses,
     plate_points,
     points_under,
+    reading_slopes,
     tie_matrix,
     tied_pose,
 )
@@ -134,3 +136,24 @@ def test_places_are_lifted_whatever_the_shape() -> None:
     assert many.shape == (4, 3, 3)
     assert many[2, 1].tolist() == [*across[2, 1], 8.0]
     assert lifted(across[0, 0], np.array([1.0, 2.0])).tolist() == [[0.0, 1.0, 1.0], [0.0, 1.0, 2.0]]
+
+
+@pytest.mark.parametrize('tilts', ['none', 'tied', 'bounded', 'free'])
+def test_readings_go_with_what_is_solved_for_as_differences_say(tilts: Tilts) -> None:
+    """Of a flat plate whatever its heights and tilts; tied to the deflection; with tilts of their own."""
+    pose, beams, k = np.array([2e-3, -3e-3, 0.04, 0.02, -0.03]), STAGGERED.beams, 1.4 / 0.585
+    heights = np.zeros(3) if tilts == 'none' else STAGGERED.heights
+
+    def readings(change: Any) -> Any:
+        if tilts == 'free':
+            moved = change
+        else:
+            tie = 0.0 if tilts == 'none' else k
+            moved = np.array([*change, -tie * change[1], tie * change[0]])
+        at = np.array([*pose[:3], 0.0, 0.0]) if tilts == 'none' else pose
+        return plate_points(at + moved, beams, heights).ravel()
+
+    steps = 1e-6 * np.eye(5 if tilts == 'free' else 3)
+    want = np.stack([(readings(e) - readings(-e)) / 2e-6 for e in steps], axis=1)
+    got = reading_slopes(beams, STAGGERED.heights, pose, tilts, 1.4, 0.585)
+    np.testing.assert_allclose(got, want, atol=1e-8)

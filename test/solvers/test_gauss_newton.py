@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from psd_deflection.solvers.gauss_newton import MAX_STEPS, fit
+from psd_deflection.solvers.gauss_newton import MAX_STEPS, Minimum, answer, fit
+from psd_deflection.solvers.interface import SolverStatus
 
 
 def curve(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
@@ -47,3 +48,35 @@ def test_endless_steps_end() -> None:
     one = fit(away, (0.0,), (1.0,), (1.0,))
     assert not one.converged
     assert one.steps == MAX_STEPS == 50
+
+
+def test_a_step_without_end_is_the_last() -> None:
+    """A slope of 1e-150 and a reading of 1e160: 1e310 to go."""
+
+    def flat(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
+        return [0.0], [(1e-150,)]
+
+    one = fit(flat, (0.0,), (1e160,), (1.0,))
+    assert not one.converged
+    assert one.steps == 1
+
+
+def test_the_residual_is_that_at_the_answer_to_the_last_digit() -> None:
+    """Readings that no curve explains: each step is a share of the one before, and the last one still counts."""
+    on, _ = curve((2.0, 0.3))
+    measured = [a + b for a, b in zip(on, (0.9, -0.7, 0.8), strict=True)]
+    one = fit(curve, (1.5, 0.2), measured, (0.01, 0.04, 0.02))
+    assert one.converged
+    assert one.steps > 5
+    want = np.array(measured) - curve(one.parameters)[0]
+    np.testing.assert_allclose(one.residual, want, rtol=0.0, atol=2e-15)
+
+
+def test_an_answer_takes_the_first_three_of_five() -> None:
+    covariance = [[float(10 * min(i, j) + max(i, j)) for j in range(5)] for i in range(5)]
+    for converged in (True, False):
+        got = answer(Minimum([0.0] * 5, covariance, [7.0, 8.0], converged, 4), (1.0, 2.0, 3.0, 4.0, 5.0), covariance)
+        assert got[:5] == (1.0, 2.0, 3.0, 4.0, 5.0)
+        assert got.covariance == (0.0, 1.0, 2.0, 1.0, 11.0, 12.0, 2.0, 12.0, 22.0)
+        assert (got.residual, got.iterations) == ((7.0, 8.0), 4)
+        assert got.status is (SolverStatus.OK if converged else SolverStatus.NOT_CONVERGED)

@@ -12,7 +12,7 @@ from psd_deflection.errors import ConfigError, SolverError
 from psd_deflection.geometry import Geometry
 from psd_deflection.solvers import SolverStatus, make_solver, solver_from_rig
 from psd_deflection.solvers.interface import Solver
-from psd_deflection.solvers.registry import check_arrangement
+from psd_deflection.solvers.registry import check_arrangement, solver_class
 from psd_deflection.solvers.some_psds import geometry_of, solver_of_some
 from test.solvers.test_truth import FLAT_THREE, RAISED, THREE, TWO, VARIANCES, least_squares
 
@@ -400,3 +400,148 @@ def test_options_come_from_the_rig_file() -> None:
         rig = rig_from_values({**two, **effect})
         said = solver_from_rig('beam', rig).solve(dots, VARIANCES[:4])
         assert said == make_solver('beam', Geometry.from_rig(rig), tilt_in_dots=in_dots).solve(dots, VARIANCES[:4])
+    # An effect that does not say how the plate leans leaves the tilts in, and so does one that says it does not.
+    for effect in (
+        {'effects.g.name': 'sensor_gain', 'effects.g.psd': 1, 'effects.g.x': 0.01},
+        {'effects.t.name': 'plane_tilt', 'effects.t.slope_ratio': 0.0},
+    ):
+        assert solver_class('beam').options_from_rig(rig_from_values({**two, **effect})) == {'tilt_in_dots': True}
+
+
+def test_a_large_turn_is_gone_to_by_half_radians() -> None:
+    """1.4 rad: two steps of 0.5, then 0.4 by tangents: off by 2e-2, 4e-6, nothing; the last trial sees that."""
+    dots = _turned(SKEW, 1.4)
+    one = make_solver('iterative', SKEW).solve(dots, VARIANCES[:4])
+    assert one.theta == pytest.approx(1.4, abs=1e-14)
+    assert one.iterations == 6
+
+
+def _turned(geometry: Geometry, theta: float) -> tuple[float, ...]:
+    """Dots of a flat plate that only turns: q = R(-theta) l."""
+    c, s = np.cos(theta), np.sin(theta)
+    return tuple((geometry.beams @ np.array([[c, -s], [s, c]]) - geometry.centers).ravel().tolist())
+
+
+def test_a_quarter_turn_has_a_way_out_of_where_no_angle_is_better() -> None:
+    """Each dot is a quarter turn from its beam, without rounding: at angle 0 the agreement is exactly 0."""
+    centers = np.array([[0.125, 0.0], [-0.125, 0.0]])
+    geometry = Geometry(centers, np.zeros((2, 2)), np.zeros(2), 0.585)
+    one = make_solver('iterative', geometry).solve((-0.125, -0.125, 0.125, 0.125), VARIANCES[:4])
+    assert one.status is SolverStatus.OK
+    assert one[:3] == pytest.approx((0.0, 0.0, np.pi / 2.0), abs=1e-14)
+
+
+def test_a_sine_below_minus_one_is_inadmissible_too() -> None:
+    solver = make_solver('wls_exact', TWO)
+    for dots in ((0.0, 0.0, 0.0, 0.5), (0.0, 0.0, 0.0, -0.5)):
+        assert solver.solve(dots, VARIANCES[:4]).status is SolverStatus.INADMISSIBLE
+    # And one that is no number is no sine.
+    assert solver.solve((float('nan'), 0.0, 0.0, 0.0), VARIANCES[:4]).status is SolverStatus.NOT_CONVERGED
+
+
+def test_a_link_without_end_and_a_weight_without_end_are_refused() -> None:
+    for length in (0.0, -1.0, float('inf')):
+        with pytest.raises(SolverError, match=r'link\.length = .* must be above 0'):
+            make_solver('beam', Geometry(TWO.centers, TWO.zeros, TWO.heights, length))
+    for k in (float('inf'), float('-inf'), float('nan')):
+        with pytest.raises(SolverError, match=r'link\.slope_ratio = .* must be finite'):
+            make_solver('beam', Geometry(TWO.centers, TWO.zeros, TWO.heights, 0.585, k))
+    for bad in (0.0, -1.0, float('inf'), float('nan')):
+        for at in range(4):
+            scaling = tuple(bad if i == at else 1.0 for i in range(4))
+            with pytest.raises(ConfigError, match='must have 4 elements above 0'):
+                make_solver('wls', TWO, weights='thesis', row_scaling=scaling)
+
+
+def test_the_thesis_weights_are_of_two_psds() -> None:
+    third = {'psd_3.center': [0.08, -0.06]}
+    for name in ('wls', 'wls_exact'):
+        solver_from_rig(name, rig_from_values({**third}))
+        solver_from_rig(name, rig_from_values({'wls.weights': 'thesis'}))
+        with pytest.raises(ConfigError, match='its weights are of two PSDs, the rig has 3'):
+            solver_from_rig(name, rig_from_values({**third, 'wls.weights': 'thesis'}))
+
+
+def test_a_psd_at_the_base_stands_below_the_tip_section() -> None:
+    """Named by its number; the one at the section itself is refused."""
+    for at in (0, 1):
+        for height, taken in ((-0.3, True), (0.0, False), (0.3, False)):
+            heights = np.array([-0.5, -0.4])
+            heights[at] = height
+            geometry = Geometry(AT_THE_BASE.centers, AT_THE_BASE.zeros, heights, 0.585)
+            if taken:
+                make_solver('base_pair', geometry)
+            else:
+                with pytest.raises(SolverError, match=rf'psd_{at + 1}\.height = {height:g} m: a PSD at the base'):
+                    make_solver('base_pair', geometry)
+
+
+def test_three_psds_at_the_base_in_two_planes_give_five_unknowns(rays: Any) -> None:
+    geometry = Geometry(
+        np.array([[0.01, 0.07], [-0.1, 0.02], [0.05, -0.06]]),
+        np.array([[3e-4, -2e-4], [1e-4, 5e-4], [0.0, 1e-4]]),
+        np.array([-0.585, -0.385, -0.485]),
+        0.585,
+    )
+    five = (1e-3, -2e-3, 0.01, 0.004, -0.006)
+    dots = tuple(np.asarray(rays.base_dots(geometry, five)).tolist())
+    got = make_solver('base_pair', geometry, assume='nothing').solve(dots, VARIANCES)
+    assert got.status is SolverStatus.OK
+    assert got[:5] == pytest.approx(five, abs=1e-12)
+
+
+def test_without_tilts_in_the_dots_beam_is_a_flat_plate_that_tells_its_tilts() -> None:
+    """Dots whose tilts a correction has taken off, on surfaces at heights."""
+    dots = (1e-3, -2e-3, 5e-4, 1e-3)
+    flat = make_solver('exact', RAISED).solve(dots, VARIANCES[:4])
+    got = make_solver('beam', RAISED, tilt_in_dots=False).solve(dots, VARIANCES[:4])
+    assert got[:3] == pytest.approx(flat[:3], abs=1e-12)
+    k = RAISED.slope_ratio / RAISED.link_length
+    assert got[3:5] == pytest.approx((-k * flat.dy, k * flat.dx), rel=1e-9)
+    np.testing.assert_allclose(got.covariance, flat.covariance, rtol=1e-6, atol=1e-18)
+    assert make_solver('beam', RAISED).solve(dots, VARIANCES[:4])[:3] != pytest.approx(flat[:3], abs=1e-6)
+
+
+def test_a_sine_is_inadmissible_from_one_on_in_either_direction() -> None:
+    """Readings that turn more and more: an angle, and beyond a quarter turn none."""
+    solver = make_solver('wls_exact', TWO)
+    for way in (1.0, -1.0):
+        said = [solver.solve((0.0, 0.0, 0.0, way * y), VARIANCES[:4]).status for y in np.linspace(0.01, 0.6, 60)]
+        ends = said.index(SolverStatus.INADMISSIBLE)
+        assert 3 < ends < 30
+        assert said == [SolverStatus.OK] * ends + [SolverStatus.INADMISSIBLE] * (60 - ends)
+
+
+def test_more_blocks_than_are_worked_on_at_once_share_their_variances(rays: Any) -> None:
+    dots = rays.tip_dots(SKEW, (1e-3, 2e-3, 0.02, 0.0, 0.0)) + np.random.default_rng(6).normal(size=(4100, 4)) * 1e-4
+    solver = make_solver('exact', SKEW)
+    many = solver.solve_many(dots, np.array(VARIANCES[:4]))
+    for i in (0, 4095, 4096, 4099):
+        one = solver.solve(tuple(dots[i].tolist()), VARIANCES[:4])
+        np.testing.assert_allclose(many.pose[i], one[:3], rtol=0.0, atol=1e-13)
+    assert many.status.tolist() == [0] * 4100
+
+
+@pytest.mark.parametrize(
+    ('method', 'geometry'),
+    [(m, SKEW) for m in ('exact', 'wls', 'wls_exact', 'ols', 'iterative', 'beam')]
+    + [('pose', THREE), ('base_pair', AT_THE_BASE)],
+)
+def test_dots_of_another_number_of_psds_are_no_block(method: str, geometry: Geometry) -> None:
+    """Fewer never; what is more is of no PSD either, wherever the readings are taken pair by pair."""
+    count = 2 * len(geometry.centers)
+    solver = make_solver(method, geometry)
+    with pytest.raises((ValueError, IndexError)):
+        solver.solve((0.0,) * (count - 1), VARIANCES[: count - 1])
+    if method in ('exact', 'ols', 'beam', 'pose', 'base_pair'):
+        with pytest.raises(ValueError):
+            solver.solve((0.0,) * (count + 2), (1e-12,) * (count + 2))
+
+
+def test_tilts_begin_at_none_and_take_few_steps(rays: Any) -> None:
+    """Of half a degree: each step is some thousand times smaller than the one before."""
+    for pose in POSES:
+        dots = np.asarray(rays.tip_dots(THREE, (*pose, 0.01, -0.008)))
+        one = make_solver('pose', THREE).solve(tuple(dots.tolist()), VARIANCES)
+        assert one[:5] == pytest.approx((*pose, 0.01, -0.008), abs=1e-12)
+        assert one.iterations <= 5

@@ -79,6 +79,13 @@ def test_a_fit_follows_motion_unless_it_is_told_to_keep_the_mean() -> None:
     assert followed(BlockFit(SIZE, PLACES, PLACES)) == followed(BlockFit(SIZE, PLACES, PLACES, True))
     assert followed(BlockFit(SIZE, PLACES, PLACES, False)) == pytest.approx(1e-4 * np.mean(((ALL - 9.5) / 9.5) ** 2))
     assert abs(followed(BlockFit(SIZE, PLACES, PLACES))) < 1e-6
+    # A mean cannot misfit: it does not try to follow, with gaps either.
+    mean = fitter(poly=False)
+    for slots in 5 * GAPS:
+        dots = np.outer(1e-5 * slots**2, [1.0, 0.5, 1.0, -0.5])
+        got = mean.fit(slots, dots)
+        assert not got.misfit
+        np.testing.assert_allclose(got.dots, dots.mean(axis=0), atol=2e-6)
 
 
 def test_inverses_of_positive_definite_matrices() -> None:
@@ -212,3 +219,133 @@ def test_so_few_samples_that_they_cannot_tell_all_orders_have_errors_as_large_as
         errors.append((fitted.dots - coefficients[0]) / np.sqrt(fitted.covariance.diagonal()))
     rms = float(np.sqrt(np.mean(np.square(errors))))
     assert (0.5 if present < 10 else 0.0) < rms < 1.0
+
+
+class Dense:
+    """The fit as its text says it, with whole matrices: Gaussian coefficients, posterior mean, noise of any colour."""
+
+    def __init__(self, gamma: FloatArray, beams: FloatArray) -> None:
+        self.of = combinations_of(PLACES, beams)
+        turned = np.einsum('ac,cdl,bd->abl', self.of.turn, gamma, self.of.turn)
+        size = gamma.shape[2]
+        later = np.subtract.outer(np.arange(size), np.arange(size)).T
+        back = turned.transpose(1, 0, 2)
+        self.spread = np.where(later >= 0, turned[:, :, np.abs(later)], back[:, :, np.abs(later)])
+        self.q = basis(size)
+        orders = self.q.shape[1]
+        powers = np.polynomial.polynomial.polyvander(np.arange(size) - 0.5 * (size - 1), orders - 1)
+        self.middle = np.linalg.lstsq(powers, self.q, rcond=None)[0][0]
+        self.size, self.orders = size, orders
+        self.usual_v = np.array([np.diag(self.information(a, np.arange(size), orders)) for a in range(4)])
+        self.squares, self.weight = np.zeros((4, orders)), np.ones((4, orders))
+
+    def information(self, a: int, slots: IntArray, told: int) -> FloatArray:
+        """Covariance (told, told) of the coefficients by generalised least squares."""
+        q = self.q[slots, :told]
+        return np.asarray(np.linalg.inv(q.T @ np.linalg.inv(self.spread[a, a][np.ix_(slots, slots)]) @ q))
+
+    def usual(self) -> FloatArray:
+        weight = np.maximum(self.weight, 1e-3)
+        return np.asarray(np.maximum(self.squares / weight - 0.5 * self.usual_v, 1e-9 * self.usual_v))
+
+    def fit(self, slots: IntArray, dots: FloatArray) -> tuple[tuple[float, ...], FloatArray, bool]:
+        z, n = self.of.of(dots), len(slots)
+        told = min(self.orders, max(n // 2, 1))
+        before, q = self.usual(), self.q[slots]
+        weights, more, value, misfit = np.zeros((4, self.size)), np.zeros(4), np.zeros(4), False
+        for a in range(4):
+            precision = np.linalg.inv(self.spread[a, a][np.ix_(slots, slots)])
+            spread = self.information(a, slots, told)
+            c = spread @ q[:, :told].T @ precision @ (z[a] - z[a].mean())
+            excess = c * c - np.diag(spread)
+            sure = np.minimum(self.usual_v[a, :told] / np.diag(spread), 1.0) ** 2
+            self.squares[a, :told] += (sure * excess - self.squares[a, :told]) / 12.0
+            self.weight[a, :told] += (sure - self.weight[a, :told]) / 12.0
+            tau = self.usual()[a]
+            sudden = c * c > 16.0 * (np.diag(spread) + before[a, :told])
+            tau[:told] = np.where(sudden, np.maximum(excess, tau[:told]), tau[:told])
+            if a == 3:
+                # The length of the base line: what it does in one block is noise.
+                tau = before[a]
+            prior = np.diag(np.r_[0.0, 1.0 / tau[1:told]])
+            inverted = np.linalg.inv(q[:, :told].T @ precision @ q[:, :told] + prior)
+            w = precision @ q[:, :told] @ inverted @ self.middle[:told]
+            weights[a, slots] = w
+            value[a] = w @ z[a]
+            more[a] = float((self.middle - w @ q)[1:] ** 2 @ tau[1:])
+            left = z[a] - z[a].mean() - q[:, :told] @ c
+            free = n - told
+            if free > 0 and left @ precision @ left > free + 5.0 * (2.0 * free) ** 0.5:
+                misfit = True
+                more[a] += float(left @ left) / free
+        covariance = np.einsum('as,abst,bt->ab', weights, self.spread, weights) + np.diag(more)
+        return *self.of.back(value.tolist(), covariance), misfit
+
+
+@pytest.mark.parametrize('size', [5, 12, 20])
+def test_the_fit_is_the_posterior_of_gaussian_coefficients(size: int) -> None:
+    """Through rest, motion, jumps and gaps, with noise that has colour and is common to readings."""
+    rng = np.random.default_rng(8)
+    now, before = SIGMA * rng.normal(size=(2, 4, 4))
+    gamma = np.zeros((4, 4, size))
+    gamma[:, :, 0] = now @ now.T + before @ before.T + SIGMA**2 * np.eye(4)
+    gamma[:, :, 1] = now @ before.T
+    beams = PLACES + 1e-3 * rng.normal(size=(2, 2))
+    fit, dense = BlockFit(size, PLACES, beams), Dense(gamma, beams)
+    fit.set_noise(gamma)
+    u = np.linspace(-1.0, 1.0, size)
+    misfits = 0
+    for block in range(190):
+        e = rng.normal(size=(size + 1, 4))
+        dots = e[1:] @ now.T + e[:-1] @ before.T + SIGMA * rng.normal(size=(size, 4))
+        dots += (beams - PLACES).ravel()
+        phase = block // 15
+        if phase in (1, 4):
+            dots += SIGMA * 10.0 ** (1 + block % 3) * np.sin(2.0 * u + block)[:, None] * [1.0, 0.5, 1.0, -0.3]
+        if phase in (2, 5) and block % 5 == 0:
+            dots[size // 3 :] += SIGMA * rng.choice([3.0, 8.0, 30.0]) * rng.normal(size=4)
+        slots = np.arange(size)
+        if phase in (3, 4, 5):
+            slots = np.sort(rng.choice(size, int(rng.integers(1, size + 1)), replace=False))
+        if phase > 5:
+            # So few at one end that nothing is learnt of motion, and what was is forgotten.
+            slots = np.arange(size - size // 3 - 1, size)
+        got = fit.fit(slots, dots[slots])
+        want, covariance, misfit = dense.fit(slots, dots[slots])
+        sd = np.sqrt(np.diag(covariance))
+        assert got.misfit == misfit, block
+        np.testing.assert_allclose((np.array(got.dots) - want) / sd, 0.0, atol=1e-6, err_msg=str(block))
+        np.testing.assert_allclose((got.covariance - covariance) / np.outer(sd, sd), 0.0, atol=1e-6, err_msg=str(block))
+        misfits += misfit
+    assert misfits > 0
+
+
+@pytest.mark.parametrize('combination', range(3))
+@pytest.mark.parametrize(('square', 'sudden'), [(15.9, False), (16.1, True)])
+def test_motion_is_believed_at_once_from_four_standard_deviations_on(
+    combination: int, square: float, sudden: bool
+) -> None:
+    """Before, a twelfth of what is beyond the noise, less half of it; the weight is tau^2/(tau^2 + v)."""
+    fit, turn, q = fitter(), combinations(PLACES), basis(SIZE)
+    fitted = fit.fit(ALL, square**0.5 * SIGMA * q[:, 2:3] * turn[combination])
+    at_the_stamp = float(turn[combination] @ fitted.dots)
+    followed = square**0.5 * SIGMA * _middle_of(q[:, 2])
+    tau = square - 1.0 if sudden else (square - 1.0) / 12.0 - 0.5
+    assert at_the_stamp / followed == pytest.approx(tau / (tau + 1.0), rel=1e-4)
+
+
+def _middle_of(column: FloatArray) -> float:
+    """Of a parabola over the places 0 ... 19, at 9.5."""
+    return float(np.polyval(np.polyfit(ALL - 9.5, column, 2), 0.0))
+
+
+@pytest.mark.parametrize(('share', 'misfit'), [(0.99, False), (1.01, True)])
+def test_a_block_misfits_from_five_standard_deviations_of_its_squares_on(share: float, misfit: bool) -> None:
+    """Of 20 samples and 5 orders 15 degrees of freedom: 15 + 5 sqrt(30). What is left is added as an error."""
+    fit, q = fitter(), basis(SIZE)
+    left = (ALL - 9.5) ** 5.0 - q @ (q.T @ (ALL - 9.5) ** 5.0)
+    left *= SIGMA * (share * (15.0 + 5.0 * 30.0**0.5)) ** 0.5 / float(np.linalg.norm(left))
+    got = fit.fit(ALL, np.outer(left, combinations(PLACES)[0]))
+    assert got.misfit == misfit
+    own = float(combinations(PLACES)[0] @ got.covariance @ combinations(PLACES)[0])
+    assert own == pytest.approx(SIGMA**2 / 20.0 + (float(left @ left) / 15.0 if misfit else 0.0), rel=1e-2)

@@ -210,3 +210,107 @@ def test_the_p_is_that_of_the_chi_square() -> None:
     for chi_square, p in ((0.0, '1'), (3.8415, '0.05'), (6.6349, '0.01')):
         stamped.chi_square = chi_square
         assert dict(stamped.words())['p of that chi-square'] == p
+
+
+def test_what_is_remembered_follows_its_laws_through_any_blocks() -> None:
+    """Chi-squares by chance around the limits, of either sign, for a while of one: each law written again."""
+    rng = np.random.default_rng(11)
+    along = np.array([*REST, *(-c for c in REST)]) / math.hypot(*REST) / 2**0.5
+    variance = float(along @ COVARIANCE @ along)
+    of, held, mean, lasting = Consistency(), 0.0, 0.0, 0.0
+    seen = set()
+    for block in range(1500):
+        limit = 400.0 if block % 300 > 250 else 25.0
+        chi_square = rng.choice([0.0, 1.5, 2.4, 3.0, 6.0, 7.0, 24.0, 26.0, 390.0, 410.0])
+        r = math.sqrt(chi_square * variance) * (1.0 if block // 40 % 2 else rng.choice([-1.0, 1.0]))
+        contradicts = chi_square > limit
+        held = max(0.98 * held, r * r if contradicts else 0.0)
+        held = held if held > limit * variance else 0.0
+        mean = mean + (r - mean) / 8.0
+        # 2.5 of a limit of 25, and its share of a wider one.
+        lasting = max(0.98 * lasting, mean * mean if mean * mean > 0.1 * limit * variance else 0.0)
+        lasting = lasting if lasting > variance else 0.0
+        doubtful = chi_square > 6.635 / 25.0 * limit
+        root = 1.5 * math.sqrt(max(held, lasting, r * r if doubtful else 0.0))
+        got = of.check(REST, tuple((along * r).tolist()), COVARIANCE, limit=limit)
+        assert got.chi_square == pytest.approx(chi_square, abs=1e-9)
+        assert got.contradict == (held > 0.0)
+        np.testing.assert_allclose(got.errors, r / along, rtol=1e-9)
+        np.testing.assert_allclose(got.possible, root / along, rtol=1e-9)
+        np.testing.assert_allclose((of.held, of.mean, of.lasting), (held, mean, lasting), rtol=1e-9, atol=1e-18)
+        seen.add((held > 0.0, lasting > 0.0, doubtful))
+    assert len(seen) > 5
+
+
+def named(said: FloatArray, should: FloatArray, noise: float) -> str:
+    """Of readings (n, 4) and what they should be: the words, from weighted moments by numpy."""
+    n = len(said)
+    weights = (1.0 - 1.0 / 500.0) ** np.arange(n - 1, -1, -1)
+    if n < 10:
+        return ''
+    orders = ([0, 1, 2, 3], [1, 0, 2, 3], [0, 1, 3, 2])
+    off = []
+    for order in orders:
+        apart = CENTERS[0] - CENTERS[1] + said[:, order][:, :2] - said[:, order][:, 2:]
+        off.append(float(weights @ (np.hypot(*apart.T) - math.hypot(*REST)) ** 2))
+    for psd in (1, 2):
+        if off[psd] < 0.01 * off[0] and off[psd] < weights.sum() * (10.0 * noise) ** 2:
+            return f'the axes of psd_{psd} are exchanged'
+    found = []
+    for c, name in enumerate(('x1', 'y1', 'x2', 'y2')):
+        own, shared, wanted = np.cov(said[:, c], should[:, c], aweights=weights, ddof=0)[[0, 0, 1], [0, 1, 1]]
+        if wanted < (100.0 * noise) ** 2:
+            continue
+        if own < (5.0 * noise) ** 2:
+            found.append(f'{name} does not move with the others')
+        elif abs(shared / wanted + 1.0) < 0.02 and own - shared**2 / wanted < (10.0 * noise) ** 2 + 1e-4 * wanted:
+            found.append(f'{name} has the wrong sign')
+    return found[0] if len(found) == 1 else ''
+
+
+def test_a_reading_is_named_by_the_moments_of_what_was_seen() -> None:
+    """Readings around each limit of the rules, a reading or two at a time; axes exchanged more or less exactly."""
+    rng = np.random.default_rng(12)
+    told: dict[str, int] = {}
+    for case in range(500):
+        n = int(rng.choice([9, 10, 11, 40]))
+        should = rng.normal(size=(n, 4)) * NOISE * 10.0 ** rng.uniform(1.7, 3.0, 4)
+        should[:, rng.random(4) < 0.5] *= 1e-3
+        said = should.copy()
+        for i in rng.choice(4, 1 + case % 2, replace=False):
+            slope = rng.choice([0.0, -1.0, -1.0, -1.018, -0.982, -1.022, -0.978, 1.0])
+            scatter = NOISE * rng.choice([0.0, 3.0, 4.5, 5.5, 9.0, 11.0]) + rng.choice([0.0, 0.9e-2]) * np.std(
+                should[:, i]
+            )
+            said[:, i] = slope * should[:, i] + scatter * rng.choice([-1.0, 1.0], n) + 1e-4
+        suspect = Suspect(CENTERS, CENTERS)
+        if case % 3 == 0:
+            # Poses of some millimetres whose base line is right but for noise once the axes are put right.
+            right = np.array([dots_of(rng.normal(size=3) * (2e-3, 2e-3, 0.02)) for _ in range(n)])
+            right[:, 0] += rng.choice([0.0, 5.0, 12.0, 17.0, 30.0]) * NOISE * rng.choice([-1.0, 1.0], n)
+            said = right[:, [[0, 1, 2, 3], [1, 0, 2, 3], [0, 1, 3, 2]][int(rng.integers(3))]]
+            should = said - 1e-5
+        for block in range(n):
+            suspect.add(tuple(said[block].tolist()), tuple((said[block] - should[block]).tolist()))
+        want = named(said, should, NOISE)
+        assert suspect.most_likely(NOISE) == want, case
+        told[want] = told.get(want, 0) + 1
+    assert len(told) == 11
+
+
+def test_what_was_seen_is_forgotten_by_a_five_hundredth_a_block() -> None:
+    """A reading that stands still for 500 blocks and follows for 1500: weights, moments and base lines by numpy."""
+    rng = np.random.default_rng(13)
+    suspect = Suspect(CENTERS, CENTERS)
+    places = 4e-4 * rng.normal(size=2000)
+    for block, place in enumerate(places.tolist()):
+        # Of y1 what is read: at first nothing.
+        read = place if block >= 500 else 0.0
+        suspect.add((0.0, read, 0.0, 0.0), (0.0, read - place, 0.0, 0.0))
+    weights = (1.0 - 1.0 / 500.0) ** np.arange(1999, -1, -1)
+    assert suspect._weight == pytest.approx(weights.sum(), rel=1e-12)
+    np.testing.assert_allclose(suspect._sum[5], weights @ (places - places[0]), rtol=1e-9)
+    np.testing.assert_allclose(suspect._squares[2, 1], weights @ (places - places[0]) ** 2, rtol=1e-9)
+    read = np.where(np.arange(2000) < 500, 0.0, places)
+    apart = np.hypot(REST[0], REST[1] + read)
+    assert suspect._swapped[0] == pytest.approx(weights @ (apart - math.hypot(*REST)) ** 2, rel=1e-9)

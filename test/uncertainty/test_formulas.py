@@ -262,3 +262,168 @@ def test_the_mean_has_the_variance_of_the_samples_that_are_present(slots: IntArr
     mean = lags[np.abs(np.subtract.outer(slots, slots))].mean()
     np.testing.assert_allclose(got.covariance.diagonal(), mean, rtol=1e-5)
     assert got.covariance[0, 1] == pytest.approx(0.3 * mean, rel=1e-4)
+
+
+def steps_of(stated: float, step: float) -> FloatArray:
+    return np.asarray(StreamNoise(SIZE, PLACES, PLACES, stated, step).gamma[0, 0])
+
+
+def test_the_least_noise_is_that_of_rounding_and_what_is_not_dithered_stays() -> None:
+    """q^2/12 a sample, and at every lag sum_k q^2/(2 pi^2 k^2) exp(-4 pi^2 k^2 s^2/q^2) for noise s."""
+    step = 2e-6
+    k = np.arange(1, 100_000)
+    for s in (0.0, 0.2e-6, 0.5e-6):
+        # The rig file's noise has the rounding in it.
+        stated = s**2 + step**2 / 12.0
+        stays = step**2 / (2.0 * np.pi**2) * float(np.sum(np.exp(-4.0 * (np.pi * k * s / step) ** 2) / k**2))
+        got = steps_of(stated, step)
+        np.testing.assert_allclose(got[1:], stays, rtol=6e-3, atol=1e-20)
+        assert got[0] - got[1] == pytest.approx(stated, rel=1e-9)
+    # Less than rounding there is not.
+    got = steps_of(0.0, step)
+    assert got[0] - got[1] == pytest.approx(step**2 / 12.0, rel=1e-9)
+    # Without a converter it is as stated.
+    np.testing.assert_array_equal(steps_of(3e-12, 0.0), [3e-12, *(0.0,) * (SIZE - 1)])
+
+
+def test_more_noise_than_the_rig_file_says_does_not_dither_for_sure() -> None:
+    """Measured at ten times the rig file's: what stays of rounding is what the rig file's would leave."""
+    step = 2e-6
+    of = StreamNoise(SIZE, PLACES, PLACES, step**2 / 12.0, step)
+    of._average, of._seen = white(100.0), 5
+    got = of._in_use()[0, 0]
+    assert got[5] == pytest.approx(noise.undithered(0.0, step), rel=1e-9)
+    assert got[5] > 0.9 * step**2 / 12.0
+
+
+def test_each_reading_has_its_own_steps_and_noise() -> None:
+    of = StreamNoise(SIZE, PLACES, PLACES, 1e-12 * np.arange(1.0, 5.0), 1e-6 * np.arange(4.0))
+    for c in range(4):
+        alone = StreamNoise(SIZE, PLACES, PLACES, 1e-12 * (c + 1.0), 1e-6 * c).gamma[c, c]
+        np.testing.assert_allclose(of.gamma[c, c], alone, rtol=1e-12)
+    np.testing.assert_allclose(of.sample_sd(), np.sqrt([of.gamma[c, c, 0] for c in range(4)]))
+    # Motion is judged with the largest step.
+    assert of._step == 3e-6
+
+
+def test_in_motion_each_reading_is_as_rough_as_it_is_and_coloured_like_the_base_line() -> None:
+    fixed = np.array([2.0, 1.0, 0.5])
+    got = noise._guess(fixed, np.array([1.0, 4.0]))
+    np.testing.assert_array_equal(got, [[fixed, 0.0 * fixed], [0.0 * fixed, 4.0 * fixed]])
+
+
+@pytest.mark.parametrize(('size', 'share'), [(64, 0.03), (65, 1.0)])
+def test_of_long_blocks_only_what_is_sure_is_taken(size: int, share: float) -> None:
+    """A correlation of 0.52 with the next of so many samples: a little more than there may be."""
+    each, sure = np.zeros((1, 1, size)), np.full(size, 0.5)
+    sure[0] = 1.0
+    each[0, 0, :2] = 1.0, 0.505
+    made = noise._covariance(each, sure)[0, 0]
+    np.testing.assert_allclose(made[:2], [1.001, 0.505 * (1.0 - 0.5 * share)], rtol=1e-9)
+
+
+@pytest.mark.parametrize(('size', 'coloured'), [(64, True), (65, False)])
+def test_colour_makes_the_weights_of_blocks_up_to_64_samples(size: int, coloured: bool) -> None:
+    """Noise of the one lag: in motion the weights are those of generalised, or of ordinary, least squares."""
+    gamma = np.zeros((4, 4, size))
+    gamma[range(4), range(4), 0], gamma[range(4), range(4), 1] = SIGMA**2, 0.45 * SIGMA**2
+    fit, rng = BlockFit(size, PLACES, PLACES), np.random.default_rng(7)
+    fit.set_noise(gamma)
+    powers = np.polynomial.polynomial.polyvander(np.linspace(-1.0, 1.0, size), 4)
+    at = np.arange(size)
+    for _ in range(100):
+        dots = np.outer(1e-3 * powers @ rng.normal(size=5), [1.0, 0.0, 1.0, 0.0])
+        dots += SIGMA * rng.normal(size=(size, 4))
+        fit.fit(at, dots)
+    toeplitz = np.eye(size) + 0.45 * (np.eye(size, k=1) + np.eye(size, k=-1))
+    weight = np.linalg.inv(toeplitz) if coloured else np.eye(size)
+    want = (np.linalg.inv(powers.T @ weight @ powers) @ powers.T @ weight @ dots)[0]
+    got = fit.fit(at, dots).dots
+    assert got[0] + got[2] == pytest.approx(want[0] + want[2], abs=2e-9)
+
+
+def test_a_segment_need_not_be_whole_to_be_of_its_place() -> None:
+    """Segments are of 50 blocks by their numbers: what begins in the middle of one ends with it."""
+    of = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0)
+    rng = np.random.default_rng(8)
+    told = [b for b in range(20, 130) if of.add(b, ALL, SIGMA * rng.normal(size=(SIZE, 4)))]
+    assert told == [49, 99]
+    # A block of a later segment closes one whose end was lost; too little of one changes nothing.
+    of = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0)
+    told = [b for b in [*range(40), 51, *range(52, 60), 130] if of.add(b, ALL, SIGMA * rng.normal(size=(SIZE, 4)))]
+    assert told == [51]
+
+
+@pytest.mark.parametrize(('times', 'rest'), [(2.9, True), (3.1, False)])
+def test_what_rounding_hides_is_no_motion(times: float, rest: bool) -> None:
+    """Means that vary by so many times what rounding alone may; the base line stands still to the bit.
+
+    Both have the rounding's share besides: 1 + 2.9 is less than four times 1.
+    """
+    step = 4e-6
+    least = step**2 / 12.0
+    of = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, step)
+    # A thousandth is added as a reading's own.
+    of._judge(white(times / 1.001 * least / SIGMA**2), np.ones(SIZE), np.zeros(SIZE), np.full(8, least))
+    assert of.at_rest == rest
+
+
+@pytest.mark.parametrize(('times', 'after'), [(2.9, 1.95), (3.1, 1.0), (-0.15, 0.425), (-0.25, -0.25)])
+def test_rounding_counts_with_the_noise_that_rises_or_falls(times: float, after: float) -> None:
+    """Of noise as large as rounding: (2.9 + 1)/(1 + 1) is not twice, and (1 - 0.15)/2 is not below two fifths."""
+    of = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 12.0**0.5 * SIGMA)
+    of._judge(white(1.0), np.ones(SIZE), white(1.0)[0, 0], np.full(8, SIGMA**2))
+    before = white(times)
+    # A thousandth of the largest is added as a reading's own: of negative ones 1e-24 m^2.
+    if times > 0.0:
+        before /= 1.001
+    of._judge(before, np.ones(SIZE), before[0, 0], np.full(8, SIGMA**2))
+    assert of._average is not None
+    assert of._average[0, 0, 0] / SIGMA**2 == pytest.approx(after, rel=2e-3)
+
+
+def test_what_is_sure_of_the_lags_is_averaged_with_them() -> None:
+    of = stream()
+    for count, sure in ((2, 0.5), (3, 0.2)):
+        before = of._sure.copy()
+        of._judge(white(1.0), np.full(SIZE, sure), white(1.0)[0, 0], np.full(8, SIGMA**2))
+        np.testing.assert_allclose(of._sure, before + (sure - before) / count)
+        assert of._count == count
+
+
+def test_lags_at_which_no_two_samples_are_apart_are_taken_as_independent() -> None:
+    """Every other sample is lost: of odd lags nothing is known but what the line took off."""
+    n = SEGMENT_BLOCKS * SIZE
+    keep = np.arange(0, n, 2)
+    series = np.random.default_rng(3).normal(size=(len(keep), 1))
+    left = series[:, 0] - np.polyval(np.polyfit(keep, series[:, 0], 1), keep)
+    every = np.zeros(100)
+    every[::2] = [left[: len(left) - lag] @ left[lag:] / (len(left) - lag) for lag in range(50)]
+    got, _ = noise._autocovariance(keep, series, n, SIZE)
+    np.testing.assert_allclose(got[0, 0], every[:SIZE] + put_back(every[:, None, None]).item(), atol=1e-9)
+
+
+def test_blocks_of_one_sample_have_no_roughness() -> None:
+    places = np.arange(SEGMENT_BLOCKS) * SIZE
+    np.testing.assert_array_equal(noise._roughness(places, np.ones((SEGMENT_BLOCKS, 3)), basis(SIZE)), np.zeros(3))
+
+
+def test_one_pair_at_a_lag_says_something_of_it() -> None:
+    """Of every other sample, and the last one: at each odd lag there is one pair."""
+    n = SEGMENT_BLOCKS * SIZE
+    keep = np.append(np.arange(0, n, 2), n - 1)
+    series = np.random.default_rng(3).normal(size=(len(keep), 1))
+    here = np.full(n, np.nan)
+    here[keep] = series[:, 0] - np.polyval(np.polyfit(keep, series[:, 0], 1), keep)
+    every = np.array([np.nanmean(here[: n - lag] * here[lag:]) for lag in range(100)])
+    got, _ = noise._autocovariance(keep, series, n, SIZE)
+    np.testing.assert_allclose(got[0, 0], every[:SIZE] + put_back(every[:, None, None]).item(), atol=1e-9)
+
+
+def test_noise_is_measured_from_the_second_segment_on() -> None:
+    of, rng = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0), np.random.default_rng(9)
+    said = []
+    for block in range(150):
+        of.add(block, ALL, SIGMA * rng.normal(size=(SIZE, 4)))
+        said.append(of.measured)
+    assert said == [False] * 99 + [True] * 51

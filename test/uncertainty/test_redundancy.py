@@ -162,3 +162,28 @@ def test_a_chi_square_that_is_nothing_but_rounding_is_not_below_zero() -> None:
     rng = np.random.default_rng(3)
     for _ in range(40):
         assert check(Redundancy(PSDS, UNKNOWNS), SLOPES @ rng.normal(size=UNKNOWNS)).chi_square >= 0.0
+
+
+def test_at_first_none_is_left_out_and_nothing_is_held() -> None:
+    assert Redundancy(PSDS, UNKNOWNS).state() == (0.0,) * (2 + 2 * PSDS)
+
+
+def test_the_unit_of_an_unknown_changes_nothing() -> None:
+    readings = with_error(2, (1.0, 0.5), 2.0 * LIMIT)
+    plain = Redundancy(PSDS, UNKNOWNS).check(tuple(readings.tolist()), SLOPES, COVARIANCE, 1.0)
+    for unit in (1e-9, 1e9):
+        scaled = SLOPES * [1.0, unit, 1.0]
+        got = Redundancy(PSDS, UNKNOWNS).check(tuple(readings.tolist()), scaled, COVARIANCE, 1.0)
+        assert got.chi_square == pytest.approx(plain.chi_square, rel=1e-9)
+        np.testing.assert_allclose(got.errors, plain.errors, rtol=1e-6)
+
+
+@pytest.mark.parametrize(('left', 'both'), [(5e-4, True), (3e-4, False)])
+def test_a_psd_that_is_seen_in_one_direction_only_has_its_error_there(left: float, both: bool) -> None:
+    """Of its part of Q, of unequal readings, so much of the product of the diagonal is left of the determinant."""
+    a, d = 4.0, 0.25
+    b = (a * d * (1.0 - left)) ** 0.5
+    q, pull = np.eye(2 * PSDS), np.zeros(2 * PSDS)
+    q[2:4, 2:4], pull[2:4] = [[a, b], [b, d]], (0.3, -0.2)
+    want = np.linalg.solve(q[2:4, 2:4], pull[2:4]) if both else pull[2:4] / (a + d)
+    np.testing.assert_allclose(Redundancy(PSDS, UNKNOWNS)._errors(q, pull)[2:4], want, rtol=1e-9)
