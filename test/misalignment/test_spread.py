@@ -117,3 +117,31 @@ def test_a_zero_taken_now_replaces_what_the_file_left_open() -> None:
     list(other.process(chunk_of(dots[:600])))
     other.apply(change)
     assert next(other.process(chunk_of(dots[600:], 600))) == records[0]
+
+
+@pytest.mark.parametrize('blocks', [1, 2, 25])
+def test_the_variance_of_a_zero_is_that_of_its_blocks_over_their_number(blocks: int) -> None:
+    """What scatters by more than the noise says is believed; of one block there is only what the noise says."""
+    rig = calibrated(block_fit='mean')
+    places = np.random.default_rng(4).normal(0.0, [1e-6, 1e-9, 1e-6, 1e-9], (blocks, 4))
+    pipeline = Pipeline(rig)
+    list(pipeline.process(chunk_of(np.repeat(places, 20, axis=0))))
+    change = pipeline.zero()
+    assert change is not None
+    noise = 5e-4**2 * (2e-3**2 + (10.0 / 2**15) ** 2 / 12.0) / 20.0
+    scatter = ((places - places.mean(axis=0)) ** 2).sum(axis=0) / max(blocks - 1, 1)
+    wanted = np.maximum(scatter, noise) / blocks
+    np.testing.assert_allclose(pipeline.estimation.zero_variances, wanted, rtol=1e-3)
+    assert dict(change.values)[ZERO_VARIANCES] == pipeline.estimation.zero_variances
+
+
+def test_a_zero_from_elsewhere_is_taken_for_one_of_25_blocks() -> None:
+    pipeline = Pipeline(calibrated())
+    pipeline.change({'psd_1.zero': (0.0, 1e-6)})
+    noise = 5e-4**2 * (2e-3**2 + (10.0 / 2**15) ** 2 / 12.0) / 20.0
+    np.testing.assert_allclose(pipeline.estimation.zero_variances, [noise / 25.0] * 4, rtol=1e-9)
+    assert pipeline.tip_loads.zeroed
+    # Another parameter is none.
+    other = Pipeline(calibrated())
+    other.change({'sum_min': 0.5})
+    assert (other.estimation.zero_variances, other.tip_loads.zeroed) == ((), False)
