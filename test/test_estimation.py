@@ -74,20 +74,29 @@ def test_a_twist_that_is_taken_for_none_is_as_unsure_as_any() -> None:
     assert found.covariance[4] - found.covariance[0] == pytest.approx(0.1**2 * 0.02**2, rel=1e-9)
 
 
-def test_the_noise_of_a_zero_of_psds_at_the_base_is_that_of_the_rig_file() -> None:
+def test_the_noise_of_a_zero_of_psds_at_the_base_is_that_of_the_rig_file(monkeypatch: pytest.MonkeyPatch) -> None:
     base = {'psd_1.height': -0.585, 'psd_2.height': -0.485, 'solver': 'base_pair', 'solvers': ['base_pair']}
     want = 5e-4**2 * (2e-3**2 + (10.0 / 2**15) ** 2 / 12.0) / 20.0
-    assert Estimation(load_rig(overrides=base), ()).zero_noise(20) == pytest.approx((want,) * 4, rel=1e-9, abs=0.0)
+    # Of the others it is that of a block's mean, as it was measured.
+    for rig, noise in ((load_rig(overrides=base), want), (load_rig(), 20e-12)):
+        estimation = Estimation(rig, ())
+        monkeypatch.setattr(estimation.stamped, 'mean_variances', lambda size: (size * 1e-12,) * 4)
+        assert estimation.zero_noise(20) == pytest.approx((noise,) * 4, rel=1e-9, abs=0.0)
 
 
 @pytest.mark.parametrize('covariance', ['file', 'measured'])
-def test_the_translation_by_one_detector_is_as_unsure_as_its_reading(covariance: str) -> None:
+def test_the_translation_by_one_detector_is_as_unsure_as_its_reading(
+    monkeypatch: pytest.MonkeyPatch, covariance: str
+) -> None:
     """At rest the arm of PSD 2 lies along X: its own variance is all of dX. 2 mV and a step of 10 V/2^15, of 20."""
-    volts = at_rest(2)
-    volts[20:, :3] = 0.0
-    found = estimates(volts, {'block_fit': 'mean', 'covariance': covariance, 'degraded': 'hold'})
-    want = 5e-4**2 * (2e-3**2 + (10.0 / 2**15) ** 2 / 12.0) / 20.0
-    assert found[1].covariance[0] == pytest.approx(want, rel=1e-6, abs=0.0)
+    volts = at_rest(1)
+    volts[:, :3] = 0.0
+    rig = load_rig(overrides={'block_fit': 'mean', 'covariance': covariance, 'degraded': 'zero'})
+    pipeline = Pipeline(rig)
+    monkeypatch.setattr(pipeline.stamped, 'mean_variances', lambda size: (0.0, 0.0, size * 1e-12, 0.0))
+    (found,) = (r for r in pipeline.process(chunk(volts)) if isinstance(r, DeflectionEstimate) and r.primary)
+    file = 5e-4**2 * (2e-3**2 + (10.0 / 2**15) ** 2 / 12.0) / 20.0
+    assert found.covariance[0] == pytest.approx(file if covariance == 'file' else 20e-12, rel=1e-9, abs=0.0)
 
 
 def test_fewer_samples_make_the_mean_less_sure() -> None:

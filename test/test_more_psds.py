@@ -308,6 +308,7 @@ def test_one_that_stands_still_is_not_taken_for_the_one_that_contradicts(three: 
     pipeline = Pipeline(rig)
     spots = spots_of(list(pipeline.process(chunk_of(counts))))
     assert {s.left_out for s in spots} == {(1,)}
+    assert (pipeline.counters.estimates, pipeline.counters.degraded) == (10, 10)
     assert pipeline.counters.findings['psd_3 stands still'] == 6
 
 

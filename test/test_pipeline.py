@@ -481,6 +481,15 @@ def test_a_zero_reaches_back_over_half_a_second_without_samples(rig: Rig, index:
     assert dict(change.values)['psd_1.zero'] == pytest.approx((1.5e-6 if blocks == 2 else 2e-6, 0.0), abs=1e-10)
 
 
+def test_the_filter_begins_anew_with_a_zero_and_with_nothing_else() -> None:
+    pipeline = Pipeline(load_rig(overrides={'filter': 'modal'}))
+    first = pipeline.motion_filter
+    pipeline.change({'sum_min': 0.5})
+    assert pipeline.motion_filter is first is not None
+    pipeline.change({'psd_2.zero': (1e-6, 0.0)})
+    assert pipeline.motion_filter is not first
+
+
 def test_what_is_told_of_a_block(rig: Rig) -> None:
     """Means and covariance of the samples that came, by hand; the time is that of the middle of the block."""
     volts = np.random.default_rng(1).normal(0.0, 2e-3, (20, 6))

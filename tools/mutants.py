@@ -78,7 +78,7 @@ ROOMS: Mapping[str, Room] = {
             'test/uncertainty/test_pipeline_state.py',
             'test/calibration/test_health.py',
             'test/simulation/test_added_effect.py -k refused or heights',
-            'test/test_more_psds.py -k psd_left or without_one or contradicts or tells_on_itself or of_all_psds',
+            'test/test_more_psds.py -k psd_left or without_one or contradicts or on_itself or all_psds or the_last',
             'test/filtering/test_motion.py -k anew or begun_at or noted or is_refused',
             _GOLDEN,
         ),
