@@ -9,8 +9,8 @@ from psd_deflection.config import Rig, rig_from_values
 from psd_deflection.misalignment.model import COUNT, INDEX, readings
 from psd_deflection.misalignment.rig import known_of_rig, vector_of_rig
 from psd_deflection.misalignment.spread import ParameterSpread
-from psd_deflection.pipeline import ZERO_VARIANCES, Pipeline
-from psd_deflection.records import DeflectionEstimate, FloatArray, ParameterChange, RawChunk, Record
+from psd_deflection.pipeline import SYSTEMATIC, ZERO_VARIANCES, Pipeline
+from psd_deflection.records import DeflectionEstimate, FloatArray, ParameterChange, RawChunk, Record, TipMotion
 
 NAMES = ['psd_1.rotation', 'psd_1.gain_x', 'psd_2.gain_y', 'psd_2.center_x', 'psd_1.zero_x']
 SDS = [0.005, 0.004, 0.003, 2e-4, 3e-6]
@@ -145,3 +145,23 @@ def test_a_zero_from_elsewhere_is_taken_for_one_of_25_blocks() -> None:
     other = Pipeline(calibrated())
     other.change({'sum_min': 0.5})
     assert (other.estimation.zero_variances, other.tip_loads.zeroed) == ((), False)
+
+
+def test_what_the_filters_covariance_holds_besides_noise_is_remembered() -> None:
+    """A recording begins with a block in the dark: its motion is as unsure as that of the run."""
+    rig = calibrated(filter='modal')
+    live, replay, without = Pipeline(rig), Pipeline(rig), Pipeline(rig)
+    list(live.process(chunk_of(still(rig, POSE, 200))))
+    memory = live.memory(rig)
+    assert memory is not None
+    told = dict(memory.values)[SYSTEMATIC]
+    assert live.estimation.systematic is not None
+    assert told == tuple(live.estimation.systematic.ravel().tolist())
+    replay.apply(memory)
+    without.apply(memory._replace(values=tuple(v for v in memory.values if v[0] != SYSTEMATIC)))
+    dark = chunk_of(still(rig, POSE, 20), 200)
+    dark.readings[:, :3] = 0.0
+    moved = [[r for r in pipeline.process(dark) if isinstance(r, TipMotion)] for pipeline in (live, replay, without)]
+    assert moved[0] == moved[1]
+    more = np.array(moved[0][0].covariance) - moved[2][0].covariance
+    np.testing.assert_allclose(more, told, rtol=1e-6)
