@@ -45,15 +45,6 @@ def point_of(psds: int, more: int = 0) -> np.dtype[np.void]:
     return np.dtype([*kinds, *(('flags', '<u4'), ('seq_high', '<u4'))[:more]])
 
 
-PLAIN = point_of(2)
-"""One sample of two PSDs: 32 bytes."""
-
-FLAGGED = point_of(2, 1)
-"""One sample of a block in which some sample carries a flag: 36 bytes."""
-
-LONG = point_of(2, 2)
-"""One sample of a block in which some sample number has more than 32 bits: 40 bytes."""
-
 MAX_SPAN_NS = 2**32 - 1
 """The largest ``dt``: 4.29 s."""
 

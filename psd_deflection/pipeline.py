@@ -160,7 +160,7 @@ class Pipeline:
         last. Replay applies the returned record again.
         """
         self.zero_refused = ''
-        if not self._recent or self.last_spots is None:
+        if not self._recent:
             return None
         recent = np.array(self._recent)
         noise = self.estimation.zero_noise(self._cutter.block_size)

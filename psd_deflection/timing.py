@@ -81,7 +81,7 @@ class ClockMap:
         self._anchor_host = host_ns
         self._slope = 0.0
         self._mapped = device_ns - SECOND_NS
-        self._fit = (0.0, float(host_ns - device_ns))
+        self._skew = 0.0
         self._last_device = device_ns
         self._residual = 0.0
         self._round_trip: int | None = None
@@ -144,7 +144,7 @@ class ClockMap:
         device = t_device_us * 1000
         delay = t_host_ns - device
         # A reply is not used to detect a jump of the clock; the samples are.
-        if not self._started or self._bucket_min is None or abs(self._host(device) - t_host_ns) > EARLY_NS:
+        if self._bucket_min is None or abs(self._host(device) - t_host_ns) > EARLY_NS:
             return
         trip = t_host_ns - sent_ns
         self._round_trip = trip if self._round_trip is None else min(self._round_trip, trip)
@@ -162,7 +162,7 @@ class ClockMap:
     def state(self) -> ClockState:
         """Skew, offset and residual of the current map."""
         return ClockState(
-            self._fit[0] * 1e6,
+            self._skew * 1e6,
             self._anchor_host - self._anchor_device,
             self._residual,
             len(self._minima),
@@ -185,7 +185,7 @@ class ClockMap:
             skew, intercept = 0.0, float(min(delay + MAX_SKEW * max(now - device, 0) for device, delay in points))
         else:
             skew, intercept = lower_line([(d - self._origin, y) for d, y in self._minima])
-        self._fit = (skew, intercept)
+        self._skew = skew
         # The slope changes at the last stamp that was returned, so the map stays continuous.
         turn = max(self._mapped, self._anchor_device)
         target = turn + intercept + skew * (turn - self._origin)

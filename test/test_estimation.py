@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +15,7 @@ from psd_deflection.config import load_rig
 from psd_deflection.estimation import Estimation, Readings
 from psd_deflection.misalignment.model import INDEX
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.records import DeflectionEstimate, FloatArray, RawChunk
+from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, RawChunk, SpotMeans
 from psd_deflection.solvers.interface import SolverStatus
 
 MEAN = {'block_fit': 'mean', 'covariance': 'file'}
@@ -52,16 +54,72 @@ def test_the_variance_of_a_held_twist_grows_to_that_of_any_twist(seconds: float)
     assert last[1, 1] - last[0, 0] == pytest.approx(0.1**2 * want, rel=1e-3)
 
 
-def test_half_the_light_doubles_the_noise_of_the_readings() -> None:
-    values = {**MEAN, 'splitter': True}
+@pytest.mark.parametrize('earlier_ms', [0, 1, 300])
+def test_a_twist_is_not_held_for_less_than_no_time(earlier_ms: int) -> None:
+    """A device that was set back: the held variance stays as it was measured."""
+    pipeline = Pipeline(load_rig(overrides={**MEAN, 'degraded': 'hold'}))
+    first, dark = chunk(at_rest(1)), at_rest(1)
+    dark[:, :3] = 0.0
+    second = replace(chunk(dark, 20), t_ns=first.t_ns - earlier_ms * 1_000_000)
+    found = [r for c in (first, second) for r in pipeline.process(c) if isinstance(r, DeflectionEstimate) and r.primary]
+    assert found[1].covariance[8] == found[0].covariance[8]
+    assert (found[1].solver, found[1].phi, found[1].omega, found[1].residual_rms) == ('one_psd', 0.0, 0.0, 0.0)
+
+
+def test_a_twist_that_is_taken_for_none_is_as_unsure_as_any() -> None:
+    volts = at_rest(1)
+    volts[:, :3] = 0.0
+    (found,) = estimates(volts, {**MEAN, 'degraded': 'zero', 'twist_sd': 0.02})
+    assert (found.theta, found.covariance[8]) == (0.0, 0.02**2)
+    assert found.covariance[4] - found.covariance[0] == pytest.approx(0.1**2 * 0.02**2, rel=1e-9)
+
+
+def test_the_noise_of_a_zero_of_psds_at_the_base_is_that_of_the_rig_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = {'psd_1.height': -0.585, 'psd_2.height': -0.485, 'solver': 'base_pair', 'solvers': ['base_pair']}
+    want = 5e-4**2 * (2e-3**2 + (10.0 / 2**15) ** 2 / 12.0) / 20.0
+    # Of the others it is that of a block's mean, as it was measured.
+    for rig, noise in ((load_rig(overrides=base), want), (load_rig(), 20e-12)):
+        estimation = Estimation(rig, ())
+        monkeypatch.setattr(estimation.stamped, 'mean_variances', lambda size: (size * 1e-12,) * 4)
+        assert estimation.zero_noise(20) == pytest.approx((noise,) * 4, rel=1e-9, abs=0.0)
+
+
+@pytest.mark.parametrize('covariance', ['file', 'measured'])
+def test_the_translation_by_one_detector_is_as_unsure_as_its_reading(
+    monkeypatch: pytest.MonkeyPatch, covariance: str
+) -> None:
+    """At rest the arm of PSD 2 lies along X: its own variance is all of dX. 2 mV and a step of 10 V/2^15, of 20."""
+    volts = at_rest(1)
+    volts[:, :3] = 0.0
+    rig = load_rig(overrides={'block_fit': 'mean', 'covariance': covariance, 'degraded': 'zero'})
+    pipeline = Pipeline(rig)
+    monkeypatch.setattr(pipeline.stamped, 'mean_variances', lambda size: (0.0, 0.0, size * 1e-12, 0.0))
+    (found,) = (r for r in pipeline.process(chunk(volts)) if isinstance(r, DeflectionEstimate) and r.primary)
+    file = 5e-4**2 * (2e-3**2 + (10.0 / 2**15) ** 2 / 12.0) / 20.0
+    assert found.covariance[0] == pytest.approx(file if covariance == 'file' else 20e-12, rel=1e-9, abs=0.0)
+
+
+def test_fewer_samples_make_the_mean_less_sure() -> None:
+    """Of twelve samples the variance is 20/12 of that of twenty."""
+    pipeline = Pipeline(load_rig(overrides=MEAN))
+    list(pipeline.process(chunk(at_rest(1)[:12])))
+    (few,) = (r for r in pipeline.flush() if isinstance(r, DeflectionEstimate) and r.primary)
+    (whole,) = estimates(at_rest(1), MEAN)
+    np.testing.assert_allclose(few.covariance, 20.0 / 12.0 * np.array(whole.covariance), rtol=1e-12, atol=1e-24)
+
+
+@pytest.mark.parametrize('rule', [MEAN, {}], ids=['mean', 'fit'])
+def test_half_the_light_doubles_the_noise_of_the_readings(rule: Mapping[str, object]) -> None:
+    values = {**rule, 'splitter': True}
     (full,), (half,) = (np.array([e.covariance for e in estimates(at_rest(1, v), values)]) for v in (5.0, 2.5))
     np.testing.assert_allclose(half, 4.0 * full, rtol=1e-9, atol=1e-24)
 
 
-def test_other_light_may_come_from_anywhere_on_the_active_area() -> None:
+@pytest.mark.parametrize('rule', [MEAN, {}], ids=['mean', 'fit'])
+def test_other_light_may_come_from_anywhere_on_the_active_area(rule: Mapping[str, object]) -> None:
     """A share b of light from a place that is uniform over the length L: variance (b L/2)^2/3 in each reading."""
     length, share = 10e-3, (8.0 - 5.0) / 8.0
-    dark, bright = (np.array(estimates(at_rest(1, v), MEAN)[0].covariance) for v in (5.0, 8.0))
+    dark, bright = (np.array(estimates(at_rest(1, v), rule)[0].covariance) for v in (5.0, 8.0))
     # Readings of one variance v: that of the twist is v over the sum of squares about the middle of the base line.
     own = dark[8] * (0.1**2 + 0.07**2) / 2.0
     np.testing.assert_allclose(bright, dark * (1.0 + (share * length / 2.0) ** 2 / 3.0 / own), rtol=1e-6, atol=1e-20)
@@ -98,6 +156,49 @@ def test_the_translation_by_one_detector_is_as_unsure_as_its_zero(name: str, add
     np.testing.assert_allclose([more[0], more[1] - 0.1**2 * more[2]], want, rtol=1e-2, atol=1e-14)
 
 
+@pytest.mark.parametrize('psd', [0, 1])
+@pytest.mark.parametrize('axis', [0, 1])
+def test_by_one_detector_a_zero_counts_along_its_axis_however_the_tip_is_turned(psd: int, axis: int) -> None:
+    """d = l - R(theta) (c + m): to C come s^2 of l, and v g g^T of the twist's variance v, g = -R'(theta) (c + m)."""
+    theta = 0.3
+    c, s = math.cos(theta), math.sin(theta)
+    turned, slope = np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
+    volts = at_rest(2)
+    beams = np.array([[0.0, 0.07], [-0.1, 0.0]])
+    for n, beam in enumerate(beams):
+        volts[:, 3 * n : 3 * n + 2] = (turned.T @ (beam - (1e-3, 2e-3)) - beam) / 5e-4
+    dot = volts[0, 3 * psd : 3 * psd + 2] * 5e-4
+    volts[20:, 3 - 3 * psd : 6 - 3 * psd] = 0.0
+    name = f'psd_{psd + 1}__zero_{"xy"[axis]}'
+    area = {f'psd_{n}.active_area': [0.1, 0.1] for n in (1, 2)}
+    sure, unsure = (
+        estimates(volts, {**calibrated(**{name: sd}), **area, 'converter.full_scale': 100.0, 'degraded': 'hold'})[1]
+        for sd in (0.0, 1e-4)
+    )
+    assert unsure.pose == pytest.approx((1e-3, 2e-3, theta), abs=1e-6)
+    more = (np.array(unsure.covariance) - sure.covariance).reshape(3, 3)
+    g = -slope @ (beams[psd] + dot)
+    own = np.diag([1e-8 if i == axis else 0.0 for i in range(2)])
+    np.testing.assert_allclose(more[:2, :2], own + more[2, 2] * np.outer(g, g), rtol=1e-3, atol=1e-12)
+
+
+def test_what_a_calibration_left_open_is_told_beside_the_noise() -> None:
+    """``systematic`` is what the covariance holds besides noise, of the last estimate."""
+    rig = {**calibrated(psd_1__zero_x=3e-6, psd_2__zero_y=2e-6), 'consistency': 'report', 'solvers': ['exact']}
+    covariances = []
+    for values in (rig, {**rig, 'covariance': 'noise'}):
+        pipeline = Pipeline(load_rig(overrides=values))
+        (found,) = (r for r in pipeline.process(chunk(at_rest(1))) if isinstance(r, DeflectionEstimate) and r.primary)
+        covariances.append(np.array(found.covariance).reshape(3, 3))
+        if values is rig:
+            told = pipeline.estimation.systematic
+        else:
+            assert pipeline.estimation.systematic is None
+    assert told is not None
+    np.testing.assert_allclose(told, covariances[0] - covariances[1], rtol=1e-9, atol=1e-24)
+    assert told[0, 0] > 1e-12
+
+
 def test_a_reading_that_contradicts_the_others_widens_the_covariance_of_a_mean_too() -> None:
     volts = at_rest(1)
     volts[:, 0] = 1e-3 / 5e-4
@@ -108,8 +209,39 @@ def test_a_reading_that_contradicts_the_others_widens_the_covariance_of_a_mean_t
     assert max(np.abs(reported.pose) / np.sqrt(np.array(reported.covariance)[[0, 4, 8]])) > 100.0
 
 
+def test_four_readings_that_contradict_each_other_are_refused_if_that_is_asked_for() -> None:
+    volts = at_rest(1)
+    volts[:, 0] = 1e-3 / 5e-4
+    records = list(Pipeline(load_rig(overrides={'consistency': 'refuse'})).process(chunk(volts)))
+    assert not [r for r in records if isinstance(r, DeflectionEstimate)]
+    (spots,) = (r for r in records if isinstance(r, SpotMeans))
+    assert spots.status is BlockStatus.INCONSISTENT
+    assert re.fullmatch(r'the four readings contradict each other: chi-square \d{4,} of 1', spots.reason)
+
+
+def test_a_method_without_a_covariance_has_none() -> None:
+    pipeline = Pipeline(load_rig(overrides={'solvers': ['exact', 'iterative_printed', 'wls']}))
+    found = {r.solver: r for r in pipeline.process(chunk(at_rest(1))) if isinstance(r, DeflectionEstimate)}
+    assert list(found) == ['exact', 'iterative_printed', 'wls']
+    assert np.isnan(found['iterative_printed'].covariance).all()
+    assert not np.isnan(found['wls'].covariance).any()
+
+
 def test_a_solver_that_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     estimation = Estimation(load_rig(overrides={'solver': 'wls'}), ())
     failed = SimpleNamespace(status=SolverStatus.NOT_CONVERGED)
     monkeypatch.setattr(type(estimation.primary), 'solve', lambda *_: failed)
     assert estimation._solve(0, Readings((0.0,) * 4, (1e-12,) * 4)) == (None, 'wls: not converged')
+
+
+def test_readings_that_the_primary_solver_cannot_solve_do_not_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimation = Estimation(load_rig(), ())
+    asked: list[int] = []
+
+    def fails(number: int, readings: Readings) -> tuple[None, str]:
+        asked.append(number)
+        return None, 'not converged'
+
+    monkeypatch.setattr(estimation, '_solve', fails)
+    assert not estimation._agree(Readings((0.0,) * 4, (1e-12,) * 4))
+    assert asked == [0]

@@ -299,6 +299,19 @@ def test_a_stuck_psd_tells_on_itself_where_the_check_cannot(three: Rig) -> None:
     assert [s.left_out for s in spots_of(records)].count((2,)) > 70
 
 
+@pytest.mark.parametrize('rule', [{}, {'block_fit': 'mean', 'covariance': 'file'}], ids=['fit', 'mean'])
+def test_one_that_stands_still_is_not_taken_for_the_one_that_contradicts(three: Rig, rule: dict[str, object]) -> None:
+    """At rest PSD 1 is 1 mm off; PSD 3 does not move by a bit, as a quiet one may."""
+    rig = with_solver(three, 'exact', **LEVEL, **rule)
+    counts = at_rest(rig, np.array([1e-3, 0.0, 0.0, 0.0, 0.0, 0.0]), 200, 1)
+    counts[:, 6:] = np.rint(np.array([0.0, 0.0, 5.0]) / STEP)
+    pipeline = Pipeline(rig)
+    spots = spots_of(list(pipeline.process(chunk_of(counts))))
+    assert {s.left_out for s in spots} == {(1,)}
+    assert (pipeline.counters.estimates, pipeline.counters.degraded) == (10, 10)
+    assert pipeline.counters.findings['psd_3 stands still'] == 6
+
+
 def test_refuse_refuses_only_what_cannot_be_told(three: Rig) -> None:
     told, _, _ = run(with_solver(three, 'exact', consistency='refuse', **LEVEL), inverted(2))
     assert len(primaries(told)) > 110
@@ -323,6 +336,18 @@ def test_with_one_psd_left_the_rule_for_one_holds(three: Rig) -> None:
     records, truth, _ = run(with_solver(three, 'exact', degraded='hold', **LEVEL), two_dark)
     assert {e.solver for e in primaries(records)[90:]} == {'one_psd'}
     assert_inside(records, truth)
+
+
+@pytest.mark.parametrize('psd', [0, 1, 2])
+def test_each_of_three_may_be_the_last(three: Rig, psd: int) -> None:
+    """The tip is 1 mm off and not turned: so are the dots, the other way."""
+    rig = with_solver(three, 'exact', degraded='zero', block_fit='mean', covariance='file', **LEVEL)
+    counts = at_rest(rig, np.tile([-1e-3, 2e-3], 3), 20, 1)
+    for other in {0, 1, 2} - {psd}:
+        counts[:, 3 * other : 3 * other + 3] = 0
+    (found,) = primaries(list(Pipeline(rig).process(chunk_of(counts))))
+    assert found.solver == 'one_psd'
+    assert found.pose == pytest.approx((1e-3, -2e-3, 0.0), abs=2e-6)
 
 
 def test_two_of_four_may_fail_one_after_the_other(three: Rig) -> None:
@@ -421,7 +446,9 @@ def test_a_bag_whose_number_of_psds_changes_is_refused(tmp_path: Path, three: Ri
 
 def test_the_cloud_of_two_is_as_it_was() -> None:
     names = ('seq', 'dt', 'x1', 'y1', 'sum1', 'x2', 'y2', 'sum2', 'flags', 'seq_high')
-    for more, dtype in enumerate((point_cloud2.PLAIN, point_cloud2.FLAGGED, point_cloud2.LONG)):
+    assert point_cloud2.point_of(2) == point_cloud2.point_of(2, 0)
+    for more in range(3):
+        dtype = point_cloud2.point_of(2, more)
         assert dtype.names == names[: 8 + more]
         assert dtype.itemsize == 32 + 4 * more
     assert [point_cloud2.point_of(n).itemsize for n in (3, MOST_PSDS)] == [44, 8 + 12 * MOST_PSDS]

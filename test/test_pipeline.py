@@ -14,10 +14,13 @@ import pytest
 from psd_deflection.cli.main import main
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.mechanics import LinkStatics
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.pipeline import FROZEN, Pipeline
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import (
     ENVIRONMENT,
+    KNOWN_LOAD,
+    AppliedLoad,
+    BaseAcceleration,
     BlockStatus,
     Counts,
     DeflectionEstimate,
@@ -27,6 +30,7 @@ from psd_deflection.records import (
     SampleBlock,
     SpotMeans,
     TipLoad,
+    TipMotion,
 )
 from psd_deflection.runner.session import why_no_zero
 from psd_deflection.simulation.loads import direct, sidebar
@@ -354,3 +358,151 @@ def test_counters_count(rig: Rig) -> None:
     counters = pipeline.counters
     assert (counters.samples, counters.blocks, counters.estimates, counters.degraded) == (110, 6, 3, 0)
     assert counters.refused == {'laser_lost': 2, 'saturated': 1}
+
+
+@pytest.mark.parametrize('psd', [1, 2])
+def test_the_light_of_a_room_is_taken_off_by_the_sum_of_its_own_psd(psd: int) -> None:
+    """0.5 V at (2, -1) mm beside 4.5 V of a laser at the centre; the other PSD has 4 V without such light."""
+    values = {'name': 'ambient_light', 'psd': psd, 'level': 0.5, 'x': 2e-3, 'y': -1e-3}
+    dots = np.zeros((40, 4))
+    dots[:, 2 * psd - 2 : 2 * psd] = 0.5 / 5.0 * np.array([2e-3, -1e-3])
+    chunk = exact_chunk(dots)
+    chunk.readings[:, 8 - 3 * psd] = 4.0
+    records = run(Pipeline(load_rig(overrides={f'effects.a.{k}': v for k, v in values.items()})).process, chunk)
+    np.testing.assert_allclose(estimates(records, 'exact'), np.zeros((2, 3)), atol=1e-9)
+    for spots in records:
+        if isinstance(spots, SpotMeans):
+            np.testing.assert_allclose(spots.dots, np.zeros(4), atol=1e-10)
+            assert spots.sums == ((5.0, 4.0) if psd == 1 else (4.0, 5.0))
+
+
+def test_the_stamp_goes_by_the_rate_of_the_rig_file() -> None:
+    """Of 20 samples at 2 Hz the first eleven came, at 0 to 5 s: the middle of the block is at 4.75 s."""
+    pipeline = Pipeline(load_rig(overrides={'converter.sample_rate_hz': 2.0}))
+    chunk = exact_chunk(np.zeros((11, 4)))
+    run(pipeline.process, RawChunk(chunk.seq, chunk.seq * 500_000_000, chunk.readings, chunk.flags))
+    assert spots_of(run(pipeline.flush)).t_ns == 4_750_000_000
+
+
+def test_a_known_load_is_applied_again_at_its_nanosecond() -> None:
+    """While the samples are lost the filter foretells what a load does that acts from then on."""
+    rig = load_rig(overrides={'filter': 'modal'})
+    live, again, rounded = Pipeline(rig), Pipeline(rig), Pipeline(rig)
+    counts = still(REST, 20 * 12, 1)
+    dark = counts[200:].copy()
+    dark[:, :3] = 0
+    motions = []
+    for pipeline in (live, again, rounded):
+        run(pipeline.process, chunk_of(counts[:200]))
+        if pipeline is live:
+            pipeline.load(AppliedLoad(0, 0.0, 0.0, 0.0))
+            told = pipeline.load(AppliedLoad(200_123_456, 3.0, -2.0, 1.0))
+            assert told is not None
+            assert told.values == ((KNOWN_LOAD, (0.0, 200_123_456.0, 3.0, -2.0, 1.0)),)
+        else:
+            pipeline.apply(ParameterChange(0, 0, ((KNOWN_LOAD, (0.0,) * 5),)))
+            ns = 200_123_456.0 if pipeline is again else 205_000_000.0
+            pipeline.apply(ParameterChange(0, 0, ((KNOWN_LOAD, (0.0, ns, 3.0, -2.0, 1.0)),)))
+        motions.append([r for r in run(pipeline.process, chunk_of(dark, 200)) if isinstance(r, TipMotion)])
+    assert len(motions[0]) == 2
+    assert all(m.phi == m.omega == 0.0 for m in motions[0])
+    assert motions[0] == motions[1] != motions[2]
+
+
+def test_an_acceleration_is_there_after_the_last_block(rig: Rig) -> None:
+    base = BaseAcceleration(5, (0.1, 0.0, 0.0), (0.0, 0.0, 0.0))
+    for at in (None, 7):
+        assert Pipeline(rig).accelerate(base, at) is None
+    pipeline = Pipeline(load_rig(overrides={'filter': 'modal'}))
+    assert pipeline.accelerate(base) is None
+    run(pipeline.process, chunk_of(still(REST, 50, 1)))
+    # The last sample of the last whole block came at 39 ms.
+    assert pipeline.accelerate(base) == 39_000_001
+    # A replay says when it was there.
+    assert pipeline.accelerate(base._replace(t_ns=6), 12_345) == 12_345
+    assert Pipeline(pipeline.rig).accelerate(base, 12_345) == 12_345
+
+
+def test_detectors_that_stand_still_from_the_first_block_on_are_told_with_the_fifth(rig: Rig) -> None:
+    for blocks, told in ((4, {}), (5, {'psd_1 stands still': 1, 'psd_2 stands still': 1})):
+        pipeline = Pipeline(rig)
+        run(pipeline.process, exact_chunk(np.zeros((20 * blocks, 4))))
+        assert pipeline.counters.findings == told
+        memory = pipeline.memory(rig)
+        assert memory is not None
+        assert dict(memory.values)[FROZEN] == (blocks, blocks)
+
+
+def test_what_drifts_is_taken_off_by_time_and_temperature_as_far_as_they_are_known() -> None:
+    """A beam wanders by 1 mm/s, a PSD by 5 um/K: of readings that do so, a tip at rest is left."""
+    values = {
+        'effects.a.name': 'laser_pointing_drift',
+        'effects.a.psd': 1,
+        'effects.a.rate_x': 1e-3,
+        'effects.b.name': 'thermal_drift',
+        'effects.b.psd': 2,
+        'effects.b.y': 5e-6,
+    }
+    pipeline = Pipeline(load_rig(overrides=values))
+    dots = np.zeros((400, 4))
+    dots[:, 0] = 1e-3 * np.arange(400) * 1e-3
+    # Three degrees more from 0.2 s on; before, no temperature is known.
+    dots[200:, 3] = 5e-6 * 3.0
+    chunk = exact_chunk(dots)
+    shown = []
+    for part in (slice(0, 200), slice(200, 400)):
+        if part.start:
+            pipeline.temperature(20.0)
+            pipeline.temperature(23.0)
+        late = RawChunk(chunk.seq[part], 10**18 + chunk.t_ns[part], chunk.readings[part], chunk.flags[part])
+        shown.append(estimates(run(pipeline.process, late), 'exact'))
+    assert (np.abs(np.concatenate(shown)) < [1e-8, 1e-8, 1e-7]).all()
+
+
+def test_effects_may_change_during_a_run() -> None:
+    gain = {'name': 'sensor_gain', 'psd': 1, 'y': 0.1}
+    pipeline = Pipeline(load_rig(overrides={f'effects.a.{k}': v for k, v in gain.items()}))
+    pipeline.change({'effects.a.y': 0.25})
+    dots = np.zeros((20, 4))
+    dots[:, 1] = 1.25e-4
+    dots[:, 3] = 1e-4
+    np.testing.assert_allclose(
+        estimates(run(pipeline.process, exact_chunk(dots)), 'exact'), [[0.0, -1e-4, 0.0]], atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(('index', 'blocks'), [(25, 2), (26, 1)])
+def test_a_zero_reaches_back_over_half_a_second_without_samples(rig: Rig, index: int, blocks: int) -> None:
+    pipeline = Pipeline(rig)
+    for first, x in ((0, 1e-6), (20 * index, 2e-6)):
+        run(pipeline.process, exact_chunk(np.tile([x, 0.0, 0.0, 0.0], (20, 1)), first))
+    change = pipeline.zero()
+    assert change is not None
+    assert dict(change.values)['psd_1.zero'] == pytest.approx((1.5e-6 if blocks == 2 else 2e-6, 0.0), abs=1e-10)
+
+
+def test_the_filter_begins_anew_with_a_zero_and_with_nothing_else() -> None:
+    pipeline = Pipeline(load_rig(overrides={'filter': 'modal'}))
+    first = pipeline.motion_filter
+    pipeline.change({'sum_min': 0.5})
+    assert pipeline.motion_filter is first is not None
+    pipeline.change({'psd_2.zero': (1e-6, 0.0)})
+    assert pipeline.motion_filter is not first
+
+
+def test_what_is_told_of_a_block(rig: Rig) -> None:
+    """Means and covariance of the samples that came, by hand; the time is that of the middle of the block."""
+    volts = np.random.default_rng(1).normal(0.0, 2e-3, (20, 6))
+    volts[:, [2, 5]] += (4.0, 5.0)
+    seq = np.array([n for n in range(40, 60) if n not in (43, 50)])
+    chunk = RawChunk(seq, seq * 1_000_000 + 7, volts[seq - 40].astype(np.float32), np.zeros(18, np.uint8))
+    pipeline = Pipeline(rig)
+    records = run(pipeline.process, chunk) + run(pipeline.flush)
+    spots = spots_of(records)
+    assert (spots.t_ns, spots.index, spots.present, spots.lost) == (49_500_007, 2, 18, 2)
+    seen = volts[seq - 40].astype(np.float32).astype(float)
+    np.testing.assert_allclose(spots.sums, seen[:, [2, 5]].mean(axis=0), rtol=1e-12)
+    assert (spots.status, spots.reason, spots.findings, spots.left_out) == (BlockStatus.OK, '', (), ())
+    assert isinstance(records[-1], SampleBlock)
+    assert pipeline.last_spots is spots
+    assert pipeline.last_estimate is records[0]

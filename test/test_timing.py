@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
-from psd_deflection.timing import ClockMap, lower_line
+from psd_deflection.timing import ClockMap, ClockState, lower_line
 
 MS = 1_000_000
 
@@ -215,6 +217,191 @@ def test_two_milliseconds_are_what_shows_a_rate(drift_ns: int, fitted: bool) -> 
         clock.observe(1_000_000 * second, 1000 * MS * second + (drift_ns * second + 1) // 2)
     assert clock.state().points == 3
     assert (clock.state().skew_ppm != 0.0) == fitted
+
+
+@pytest.mark.parametrize(('above_ns', 'fitted'), [(999_999, True), (1_000_000, False)])
+def test_a_point_a_millisecond_above_the_line_is_a_stall(above_ns: int, fitted: bool) -> None:
+    clock = ClockMap()
+    for second, above in enumerate((0, above_ns, 0, 0)):
+        clock.observe(1_000_000 * second, 1002 * MS * second + above)
+    assert clock.state().skew_ppm == pytest.approx(2000.0 if fitted else 0.0, rel=1e-9)
+
+
+@pytest.mark.parametrize(('drift_ns', 'fitted'), [(1_999_999, False), (2_000_000, True)])
+def test_a_drift_counts_from_the_first_minimum(drift_ns: int, fitted: bool) -> None:
+    """The least delay of each second is half a second after its first sample, which is 3 ms late."""
+    clock = ClockMap()
+    for half in range(8):
+        late = 3 * MS if half % 2 == 0 else (drift_ns * (half // 2) + 1) // 2
+        clock.observe(500_000 * half, 500 * MS * half + late)
+        if half == 6:
+            assert clock.state().points == 3
+            assert (clock.state().skew_ppm != 0.0) == fitted
+
+
+def test_a_clock_that_may_be_90_ppm_off_is_not_fitted_early() -> None:
+    """Of minima twelve seconds apart the third shows more than two milliseconds."""
+    clock = ClockMap()
+    for k in range(4):
+        clock.observe(12_000_000 * k, round(12_000 * MS * k * (1.0 + 90e-6)))
+        clock.to_host_ns(np.array([12_000_000 * k], np.int64))
+    state = clock.state()
+    assert (state.points, state.resets, state.skew_ppm) == (3, 0, 0.0)
+
+
+def test_a_map_that_was_shown_nothing_is_the_identity() -> None:
+    clock = ClockMap()
+    assert clock.state() == ClockState(0.0, 0, 0.0, 0, 0, None)
+    assert clock.host_ns(7) == 7000
+    clock.observe_reply(7, 5000, 6000)
+    assert clock.state().round_trip_ns is None
+    clock.observe(5, 123_456)
+    assert clock.state() == ClockState(0.0, 123_456 - 5000, 0.0, 0, 0, None)
+
+
+@pytest.mark.parametrize(
+    ('second_us', 'slope'),
+    [
+        # The first delay may have grown by 1e-4 of the time since: so much is missing, to be made up in 1 s.
+        (9_999_990, 1e-4 * 9.99999),
+        # After 10 s in 5 s, up to a millisecond.
+        (10_000_000, 1e-4 * 10.0 / 5.0),
+        (10_000_010, 1e-4 * 10.00001),
+        # By 2 ms a second at most.
+        (19_000_000, 1.9e-3),
+        (21_000_000, 2e-3),
+    ],
+)
+@pytest.mark.parametrize('up_us', [0, 3_600_000_000])
+def test_how_fast_a_map_draws_near(second_us: int, slope: float, up_us: int) -> None:
+    clock = ClockMap()
+    clock.observe(up_us, 7 * MS)
+    clock.observe(up_us + second_us, 1000 * second_us + 17 * MS)
+    assert clock.state().residual_ns == pytest.approx(0.1 * second_us, rel=1e-8)
+    assert clock.host_ns(up_us + 20_000_000) == pytest.approx(20_007 * MS + slope * 20e9, abs=2, rel=0)
+
+
+def test_a_map_goes_back_by_two_milliseconds_a_second_at_most() -> None:
+    clock = ClockMap()
+    clock.observe(0, 17 * MS)
+    clock.observe(1000, 8 * MS)
+    assert clock.host_ns(500_000) == 517 * MS - MS
+
+
+@pytest.mark.parametrize(('more_ns', 'jumped'), [(0, False), (1, True)])
+def test_a_second_that_is_all_five_seconds_late_is_a_jump(more_ns: int, jumped: bool) -> None:
+    """The map allows for 1e-4 of the second since its first sample."""
+    clock = ClockMap()
+    clock.observe(0, 0)
+    late = 5000 * MS + 100_000 + more_ns
+    assert not clock.observe(1_000_000, 1000 * MS + late)
+    assert clock.observe(2_000_000, 2000 * MS + late) == jumped
+    assert clock.state().resets == jumped
+
+
+def test_the_same_time_again_is_no_jump_but_for_one_that_comes_too_early() -> None:
+    clock = ClockMap()
+    clock.observe(1000, 100 * MS)
+    assert not clock.observe(1000, 110 * MS)
+    # A clock that stands still is not in step with the numbers.
+    assert clock.observe(1000, 40 * MS, passed_us=0.0)
+
+
+def residual_of_the_next(clock: ClockMap, second: int) -> float:
+    """ns, as a late sample at the beginning of ``second`` leaves it."""
+    clock.observe(1_000_000 * second, 1000 * MS * second + MS)
+    return clock.state().residual_ns
+
+
+def test_of_samples_as_late_as_each_other_the_first_counts() -> None:
+    clock = ClockMap()
+    for k in range(10):
+        clock.observe(100_000 * k, 100 * MS * k)
+    assert residual_of_the_next(clock, 1) == pytest.approx(1e-4 * 1000 * MS)
+
+
+def test_the_pair_with_which_a_map_is_laid_anew_counts() -> None:
+    clock = ClockMap()
+    clock.observe(0, 0)
+    clock.lay_anew(3_000_000, 3000 * MS - 5 * MS)
+    assert residual_of_the_next(clock, 4) == pytest.approx(1e-4 * 1000 * MS)
+
+
+@pytest.mark.parametrize(('delay_ns', 'after_ns', 'delay'), [(-1000, 500 * MS, -1000), (0, 0, 0), (1000, 0, 0)])
+def test_an_answer_counts_if_it_is_less_late_than_the_samples(delay_ns: int, after_ns: int, delay: int) -> None:
+    clock = ClockMap()
+    clock.observe(7_000_000, 7000 * MS)
+    clock.observe_reply(7_500_000, 7499 * MS, 7500 * MS + delay_ns)
+    assert clock.state().round_trip_ns == MS + delay_ns
+    assert residual_of_the_next(clock, 8) == pytest.approx(delay + 1e-4 * (1000 * MS - after_ns))
+    # One of a second that is over changes nothing but the trip.
+    clock.observe_reply(7_500_000, 7500 * MS - 5000, 7500 * MS - 2000)
+    assert clock.state().round_trip_ns == 3000
+    assert residual_of_the_next(clock, 9) == pytest.approx(delay + 1e-4 * (2000 * MS - after_ns))
+
+
+@pytest.mark.parametrize(('off_ns', 'believed'), [(50_000_000, True), (50_000_001, False)])
+def test_an_answer_fifty_milliseconds_off_is_believed(off_ns: int, believed: bool) -> None:
+    for sign in (1, -1):
+        clock = ClockMap()
+        clock.observe(0, 1000 * MS)
+        clock.observe_reply(1000, 900 * MS, 1001 * MS + sign * off_ns)
+        assert clock.state().round_trip_ns == (101 * MS + sign * off_ns if believed else None)
+
+
+def test_the_map_turns_at_the_last_stamp() -> None:
+    clock = ClockMap()
+    clock.observe(0, MS)
+    clock.observe(1000, MS)
+    # A millisecond too late: it draws near by 1 us a ms.
+    stamps = clock.to_host_ns(np.arange(1000, 21_000, 1000, dtype=np.int64))
+    assert stamps.tolist() == [MS + k * (MS - 1000) for k in range(1, 21)]
+    # And by 2 us from here on.
+    clock.observe(20_500, 20_500_000 - 9 * MS)
+    assert [clock.host_ns(20_000 + us) for us in (0, 1000)] == [stamps[-1], stamps[-1] + MS - 2000]
+
+
+def test_after_ten_seconds_the_map_turns_once_a_second() -> None:
+    """From 9.5 s on each sample is less late than all before it."""
+    clock = ClockMap()
+    left = []
+    for k in range(120):
+        clock.observe(100_000 * k, 100 * MS * k - (MS + 1000 * k if k >= 95 else 0))
+        clock.to_host_ns(np.array([100_000 * k], np.int64))
+        left.append(clock.state().residual_ns)
+    assert len(set(left[95:100])) == 5
+    assert len(set(left[100:110])) == len(set(left[110:])) == 1
+    assert left[109] != left[110]
+
+
+def test_a_clock_that_has_run_for_years_is_followed() -> None:
+    clock = ClockMap()
+    up = 3 * 365 * 86_400 * 1_000_000
+    for k in range(40 * 10):
+        clock.observe(up + 100_000 * k, round(100 * MS * k * (1.0 - 300e-6)) + 200_000)
+        clock.to_host_ns(np.array([up + 100_000 * k], np.int64))
+        # Off by 300 ppm until that shows, in seven seconds.
+        assert abs(clock.state().residual_ns) < 2.5 * MS
+    true = round(39_900 * MS * (1.0 - 300e-6)) + 200_000
+    assert clock.host_ns(up + 39_900_000) - true == pytest.approx(0.0, abs=2000)
+
+
+def test_of_all_lines_below_the_points_the_lower_line_is_nearest_to_them() -> None:
+    rng = np.random.default_rng(8)
+    for _ in range(100):
+        x = rng.choice(50, int(rng.integers(2, 9)), replace=False)
+        points = [(int(a), int(b)) for a, b in zip(x, rng.integers(-20, 20, len(x)), strict=True)]
+        far = []
+        for (a, y), (b, z) in itertools.combinations(points, 2):
+            over = [q - y - (z - y) / (b - a) * (p - a) for p, q in points]
+            if min(over) > -1e-9:
+                far.append(sum(over))
+        slope, intercept = lower_line(points)
+        over = [q - slope * p - intercept for p, q in points]
+        assert min(over) > -1e-9
+        assert sum(over) == pytest.approx(min(far), abs=1e-9)
+    # Of one abscissa there is no slope.
+    assert lower_line([(5, 7), (5, 3)]) == lower_line([(5, 3)]) == (0.0, 3.0)
 
 
 @pytest.mark.parametrize(('early_ns', 'jumped'), [(50_000_000, False), (50_000_001, True)])

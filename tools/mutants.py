@@ -73,17 +73,32 @@ ROOMS: Mapping[str, Room] = {
         ),
     ),
     'averaging': Room(('psd_deflection/averaging.py',), ('test/test_averaging.py', _GOLDEN)),
-    'timing': Room(('psd_deflection/timing.py',), ('test/test_timing.py', 'test/runner/test_clock_watch.py')),
+    'timing': Room(
+        ('psd_deflection/timing.py',),
+        ('test/test_timing.py', 'test/runner/test_clock_watch.py'),
+        slow=('test/runner/test_acquisition.py', 'test/runner/test_pinger.py'),
+    ),
     'pipeline': Room(
         ('psd_deflection/pipeline.py', 'psd_deflection/estimation.py', 'psd_deflection/correction.py'),
         (
             _PIPELINE,
             'test/test_estimation.py',
+            'test/test_correction.py',
             'test/misalignment/test_spread.py',
             'test/uncertainty/test_pipeline_state.py',
-            'test/test_more_psds.py -k psd_left or without_one or contradicts or tells_on_itself or of_all_psds',
+            'test/calibration/test_health.py',
+            'test/simulation/test_added_effect.py -k refused or heights',
+            'test/test_more_psds.py -k psd_left or without_one or contradicts or on_itself or all_psds or the_last',
             'test/filtering/test_motion.py -k anew or begun_at or noted or is_refused',
             _GOLDEN,
+        ),
+        slow=(
+            'test/test_pipeline.py -k drift or an_effect_in or iterative',
+            'test/test_more_psds.py',
+            'test/filtering/test_motion.py -k recorded or coast or ahead or foretold or stated',
+            'test/filtering/test_inertia.py',
+            'test/simulation/test_base_pair.py',
+            'test/simulation/test_effects.py -k correction or together or the_wrench',
         ),
     ),
     'calibration': Room(('psd_deflection/calibration',), ('test/calibration', _GOLDEN), slow=_RUNS),
@@ -104,6 +119,10 @@ ROOMS: Mapping[str, Room] = {
             'test/recordings/test_contract.py',
             'test/test_more_psds.py -k cloud_of_two',
         ),
+        slow=(
+            *(f'test/recordings/test_{n}.py' for n in ('bag_writer', 'bag_reader', 'cdr', 'references')),
+            'test/chains/test_chain.py',
+        ),
     ),
     'protocol': Room(
         ('psd_deflection/protocol',),
@@ -111,6 +130,10 @@ ROOMS: Mapping[str, Room] = {
             'test/protocol',
             *(f'test/devices/test_{n}.py' for n in ('dataq', 'text_lines', 'thorlabs')),
             'test/recordings/test_bag_reader.py -k restart or wrap or again',
+        ),
+        slow=(
+            *(f'test/devices/test_{n}.py' for n in ('source', 'survey')),
+            *(f'test/runner/test_{n}.py' for n in ('acquisition', 'hello', 'restarts')),
         ),
     ),
     'effects': Room(

@@ -79,7 +79,7 @@ def encode_readings(x_difference: int, y_difference: int, total: int) -> bytes:
 
 def encode_info(serial: int, model: str) -> bytes:
     """The hardware info of a device (for the simulated one)."""
-    body = INFO.pack(serial, model.encode('ascii')[:8], 16, bytes((0, 0, 1, 0)), b'simulated', 1, 0, 1)
+    body = INFO.pack(serial, model.encode('ascii'), 16, bytes((0, 0, 1, 0)), b'simulated', 1, 0, 1)
     return HEADER.pack(INFO_REPLY, len(body), HOST_ADDRESS | LONG, DEVICE_ADDRESS) + body
 
 

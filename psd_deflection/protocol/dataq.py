@@ -82,7 +82,7 @@ def plan_rate(wanted_hz: float, model: Model, per_channel: bool) -> Rate | None:
     it.
     """
     ticks = CLOCK_HZ / wanted_hz / (ANALOG + 1 if per_channel else 1)
-    dec = max(1, math.ceil(ticks / SRATE_MAX))
+    dec = math.ceil(ticks / SRATE_MAX)
     if dec > (DEC_MAX if model.decimates else 1):
         return None
     srate = round(ticks / dec)
@@ -140,7 +140,6 @@ class ScanDecoder:
                     out.append(SCAN.unpack_from(stream, at))
                     at += STRIDE
                     continue
-                self._in_step = False
             if end - at < LOOK:
                 break
             skip = _step(stream, at)

@@ -58,7 +58,7 @@ class SequenceExtender:
             self._last, self._last_time = seq, t_device_us
             return seq, Step.FIRST, 0
         ahead = (seq + self._offset - last) % WRAP
-        if 0 < ahead < NEARBY or (ahead < WRAP // 2 and ahead > 0 and t_device_us > self._last_time):
+        if 0 < ahead < (WRAP // 2 if t_device_us > self._last_time else NEARBY):
             self._last, self._last_time = last + ahead, t_device_us
             return last + ahead, (Step.NEXT if ahead == 1 else Step.GAP), ahead - 1
         behind = -ahead % WRAP
@@ -115,7 +115,7 @@ class RecordedSequence:
     def extended(self, seq: IntArray, t_ns: IntArray, whole: bool) -> IntArray:
         """Numbers that increase from call to call. Raises ValueError if they do not increase within one call."""
         seq = seq.copy()
-        if seq[-1] < seq[0] and not whole:
+        if not whole:
             seq[seq < seq[0]] += WRAP
         if bool((np.diff(seq) <= 0).any()):
             raise ValueError('seq does not rise within the message')

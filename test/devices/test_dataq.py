@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from psd_deflection.config import load_rig
@@ -17,12 +17,24 @@ from psd_deflection.devices import PowerUp
 from psd_deflection.devices.dataq import SimulatedDataq
 from psd_deflection.devices.registry import make_source
 from psd_deflection.errors import ConfigError, DeviceError
-from psd_deflection.protocol.dataq import MODELS, ScanDecoder, command, find_reply, plan_rate, scan_list
+from psd_deflection.protocol.dataq import (
+    MODELS,
+    VOLTS_PER_COUNT,
+    ScanDecoder,
+    command,
+    find_reply,
+    plan_rate,
+    scan_list,
+)
 from psd_deflection.protocol.frames import BadFrame
 
 # x1 = 1, y1 = -2, sum1 = 16384, x2 = 256, y2 = -32767, sum2 = 16384, then the counter at zero.
 SCAN = bytes.fromhex('0100 feff 0040 0001 0180 0040 0080')
 COUNTS = (1, -2, 16384, 256, -32767, 16384)
+
+
+def test_ten_volts_are_half_of_16_bits() -> None:
+    assert VOLTS_PER_COUNT * 2**15 == 10.0
 
 
 def test_commands_end_in_a_carriage_return() -> None:
@@ -84,12 +96,30 @@ def test_lost_bytes_are_seen_and_the_step_is_found_again(lost: int, cuts: list[i
 
 
 @given(st.integers(1, 40), st.lists(st.integers(0, 10_000), max_size=20))
+@example(14, [])
+@example(15, [])
+@example(28, [])
+@example(29, [])
 def test_bytes_between_scans_cost_no_scan(more: int, cuts: list[int]) -> None:
     """Also if they are as many as a scan has, as where a marker is damaged: four scans in all tell the step."""
     for following in (4 if more % 14 else 3, 10):
         got = fed(SCAN * 5 + b'\x11' * more + SCAN * following, cuts)
         assert [g for g in got if not isinstance(g, BadFrame)] == [COUNTS] * (5 + following)
-        assert sum(g.size for g in got if isinstance(g, BadFrame)) == more
+        # By a scan's length at a time, and then what is left.
+        whole = (more - 1) // 14
+        assert [g.size for g in got if isinstance(g, BadFrame)] == [14] * whole + [more - 14 * whole]
+
+
+def test_two_readings_at_the_rail_are_no_marker() -> None:
+    """The marker is the negative rail as well: three in a row in one place tell the step, two do not."""
+    railed = bytes.fromhex('0100 0080') + SCAN[4:]
+    # A byte is lost before the first of two scans whose y1 is at the rail.
+    stream = SCAN * 3 + SCAN[1:] + railed * 2 + SCAN * 6
+    got = fed(stream, [])
+    assert [g.size for g in got if isinstance(g, BadFrame)] == [13]
+    assert [g for g in got if not isinstance(g, BadFrame)] == [COUNTS] * 3 + [(1, -32768, *COUNTS[2:])] * 2 + [
+        COUNTS
+    ] * 6
 
 
 @given(st.binary(max_size=300), st.lists(st.integers(0, 10_000), max_size=8))

@@ -40,6 +40,10 @@ LINE = Line(7, 7000, VALUES)
         (b'7,7000,0.1,-0.2,5,0,1.5,nan', BadFrame('a reading is no number', 27)),
         (b'7,7000,0.1,-0.2,5,0,1.5,1e9', BadFrame('a reading is no number', 27)),
         (b'-7,7000,0,0,5,0,0,5', BadFrame('seq or t_us is no whole number', 19)),
+        (b'7,7e3,0,0,5,0,0,5', BadFrame('seq or t_us is no whole number', 17)),
+        (b'4294967296,7,0,0,5,0,0,5', BadFrame('seq or t_us is over 32 bits', 24)),
+        (b'4294967295,4294967295,0,0,5,0,0,5', Line(2**32 - 1, 2**32 - 1, (0, 0, 5, 0, 0, 5))),
+        (b'#{"serial": "a*b"}', Description({'serial': 'a*b'})),
         (b'7,4294967296,0,0,5,0,0,5', BadFrame('seq or t_us is over 32 bits', 24)),
         (b'1,1,0,0,5,0,0,5*00', BadFrame('check differs', 18)),
         (b'1,1,0,0,5,0,0,5*zz', BadFrame('check differs', 18)),
@@ -73,6 +77,16 @@ def test_lines_come_out_however_the_stream_was_cut(cuts: list[int]) -> None:
     decoder = LineDecoder()
     places = sorted({0, len(STREAM), *cuts})
     assert [i for a, b in itertools.pairwise(places) for i in decoder.feed(STREAM[a:b])] == ITEMS
+
+
+@pytest.mark.parametrize('cut', [0, 200, 399, 400, 401])
+def test_a_line_has_400_bytes_at_most(cut: int) -> None:
+    for size in (400, 401):
+        line = b'7,7000,0.1,-0.2,5,0,1.5,4.75'.ljust(size) + b'\n'
+        decoder = LineDecoder()
+        decoder.feed(b'\n')
+        found = decoder.feed(line[:cut]) + decoder.feed(line[cut:])
+        assert found == ([LINE] if size == 400 else [BadFrame('longer than a line', 401)])
 
 
 def test_a_whole_line_that_comes_first_is_a_line() -> None:
@@ -119,6 +133,30 @@ def test_micros_that_go_back_while_the_number_stands_still_start_again() -> None
     """As far back as a wrap: but a device that counts its samples does not count one for 71 minutes."""
     extender = TimeExtender()
     assert [extender.extend(Line(7, t, VALUES)) for t in (2**32 - 5, 3)] == [2**32 - 5, 3]
+
+
+@pytest.mark.parametrize(
+    ('ahead', 'earlier_us', 'turns'),
+    [
+        # A line of the next number, or of a later one less than half way round; the clock goes back more than half way.
+        (1, 2**31 + 1, 1),
+        (2**31 - 1, 2**31 + 1, 1),
+        (2**31, 2**31 + 1, 0),
+        # Less is no wrap.
+        (1, 2**31, 0),
+    ],
+)
+def test_what_a_clock_that_goes_back_means(ahead: int, earlier_us: int, turns: int) -> None:
+    extender = TimeExtender()
+    now = 3_000_000_000
+    extender.extend(Line(1000, now, VALUES))
+    assert extender.extend(Line(1000 + ahead, now - earlier_us, VALUES)) == turns * 2**32 + now - earlier_us
+
+
+def test_the_same_line_again_is_of_the_same_time() -> None:
+    extender = TimeExtender()
+    lines = [(5, 2**32 - 5), (6, 3), (6, 3), (7, 1003)]
+    assert [extender.extend(Line(s, t, VALUES)) - 2**32 for s, t in lines] == [-5, 3, 3, 1003]
 
 
 @pytest.mark.parametrize(
@@ -234,6 +272,12 @@ def test_readings_out_of_bounds_are_no_samples(wired: Any, info: bytes, line: by
     source.close()
     assert events
     assert all(isinstance(event, BadFrame) and event.reason == reason for event in events)
+
+
+def test_a_thousand_volts_are_the_most(wired: Any) -> None:
+    for line, reading in ((b'1,1000,0,0,1000,0,-1000,5', 1000.0), (b'1,1000,0,0,1000.1,0,0,5', None)):
+        _, event = sent(wired, b'"serial": "a"', line)
+        assert (event.readings[2] if isinstance(event, Sample) else None) == reading
 
 
 def sent(wired: Any, info: bytes, line: bytes, **more: Any) -> Any:

@@ -55,9 +55,45 @@ def test_questions_and_answers_byte_by_byte() -> None:
     assert len(encode_info(1, 'TQD001')) == 90
 
 
+def test_the_info_of_an_aligner_byte_by_byte() -> None:
+    """Serial number, model, type 16, firmware 1.0.0 from its last number on, notes, version, state, channels."""
+    body = bytes.fromhex('0df4 2004') + b'KPA101\0\0' + bytes.fromhex('1000 00000100')
+    body += b'simulated'.ljust(60, b'\0') + bytes.fromhex('0100 0000 0100')
+    assert encode_info(0x0420F40D, 'KPA101') == bytes.fromhex('0600 5400 81 50') + body
+    assert encode_info(1, 'KPA101-LONG')[10:18] == b'KPA101-L'
+    # What is not as long is none.
+    short = bytes.fromhex('0600 5300 81 50') + body[:-1]
+    assert AptDecoder().feed(short) == [BadFrame('length does not fit the message', 89)]
+
+
+def test_ten_volts_are_the_whole_range() -> None:
+    assert readings_of(32767, -32767, 65535) == pytest.approx((10.0, -10.0, 10.0), rel=1e-12)
+    # Half of the light: the same difference is twice as far out.
+    assert readings_of(16384, 0, 32768)[0] == pytest.approx(10.0 * (16384 / 32767) / (32768 / 65535), rel=1e-12)
+
+
+def test_what_is_no_reading_is_passed_over() -> None:
+    other = bytearray(REPLY)
+    other[6] = 4
+    assert [is_reply(m) for m in AptDecoder().feed(bytes(other) + REPLY)] == [True]
+
+
+def test_what_is_thrown_away_is_counted() -> None:
+    decoder = AptDecoder()
+    # Three bytes begin no header; five are too few for one.
+    assert decoder.feed(bytes(8)) == []
+    assert decoder.reset() == 8
+    assert decoder.feed(REPLY[:10]) == []
+    assert decoder.reset() == 10
+    assert [is_reply(m) for m in decoder.feed(REPLY)] == [True]
+
+
 def test_without_light_no_place_is_made_up() -> None:
     assert readings_of(20000, -20000, 0) == Readings(0.0, 0.0, 0.0)
     assert readings_of(3, -3, 300)[:2] == (0.0, 0.0)
+    # 0.05 V are 327.7 counts.
+    assert readings_of(3, -3, 327)[:2] == (0.0, 0.0)
+    assert readings_of(3, -3, 328)[:2] == pytest.approx((300 / 32767 / 0.05005, -300 / 32767 / 0.05005), rel=1e-4)
 
 
 STREAM = (

@@ -9,8 +9,8 @@ from psd_deflection.config import Rig, rig_from_values
 from psd_deflection.misalignment.model import COUNT, INDEX, readings
 from psd_deflection.misalignment.rig import known_of_rig, vector_of_rig
 from psd_deflection.misalignment.spread import ParameterSpread
-from psd_deflection.pipeline import ZERO_VARIANCES, Pipeline
-from psd_deflection.records import DeflectionEstimate, FloatArray, ParameterChange, RawChunk, Record
+from psd_deflection.pipeline import SYSTEMATIC, ZERO_VARIANCES, Pipeline
+from psd_deflection.records import DeflectionEstimate, FloatArray, ParameterChange, RawChunk, Record, TipMotion
 
 NAMES = ['psd_1.rotation', 'psd_1.gain_x', 'psd_2.gain_y', 'psd_2.center_x', 'psd_1.zero_x']
 SDS = [0.005, 0.004, 0.003, 2e-4, 3e-6]
@@ -117,3 +117,51 @@ def test_a_zero_taken_now_replaces_what_the_file_left_open() -> None:
     list(other.process(chunk_of(dots[:600])))
     other.apply(change)
     assert next(other.process(chunk_of(dots[600:], 600))) == records[0]
+
+
+@pytest.mark.parametrize('blocks', [1, 2, 25])
+def test_the_variance_of_a_zero_is_that_of_its_blocks_over_their_number(blocks: int) -> None:
+    """What scatters by more than the noise says is believed; of one block there is only what the noise says."""
+    rig = calibrated(block_fit='mean')
+    places = np.random.default_rng(4).normal(0.0, [1e-6, 1e-9, 1e-6, 1e-9], (blocks, 4))
+    pipeline = Pipeline(rig)
+    list(pipeline.process(chunk_of(np.repeat(places, 20, axis=0))))
+    change = pipeline.zero()
+    assert change is not None
+    noise = 5e-4**2 * (2e-3**2 + (10.0 / 2**15) ** 2 / 12.0) / 20.0
+    scatter = ((places - places.mean(axis=0)) ** 2).sum(axis=0) / max(blocks - 1, 1)
+    wanted = np.maximum(scatter, noise) / blocks
+    np.testing.assert_allclose(pipeline.estimation.zero_variances, wanted, rtol=1e-3)
+    assert dict(change.values)[ZERO_VARIANCES] == pipeline.estimation.zero_variances
+
+
+def test_a_zero_from_elsewhere_is_taken_for_one_of_25_blocks() -> None:
+    pipeline = Pipeline(calibrated())
+    pipeline.change({'psd_1.zero': (0.0, 1e-6)})
+    noise = 5e-4**2 * (2e-3**2 + (10.0 / 2**15) ** 2 / 12.0) / 20.0
+    np.testing.assert_allclose(pipeline.estimation.zero_variances, [noise / 25.0] * 4, rtol=1e-9)
+    assert pipeline.tip_loads.zeroed
+    # Another parameter is none.
+    other = Pipeline(calibrated())
+    other.change({'sum_min': 0.5})
+    assert (other.estimation.zero_variances, other.tip_loads.zeroed) == ((), False)
+
+
+def test_what_the_filters_covariance_holds_besides_noise_is_remembered() -> None:
+    """A recording begins with a block in the dark: its motion is as unsure as that of the run."""
+    rig = calibrated(filter='modal')
+    live, replay, without = Pipeline(rig), Pipeline(rig), Pipeline(rig)
+    list(live.process(chunk_of(still(rig, POSE, 200))))
+    memory = live.memory(rig)
+    assert memory is not None
+    told = dict(memory.values)[SYSTEMATIC]
+    assert live.estimation.systematic is not None
+    assert told == tuple(live.estimation.systematic.ravel().tolist())
+    replay.apply(memory)
+    without.apply(memory._replace(values=tuple(v for v in memory.values if v[0] != SYSTEMATIC)))
+    dark = chunk_of(still(rig, POSE, 20), 200)
+    dark.readings[:, :3] = 0.0
+    moved = [[r for r in pipeline.process(dark) if isinstance(r, TipMotion)] for pipeline in (live, replay, without)]
+    assert moved[0] == moved[1]
+    more = np.array(moved[0][0].covariance) - moved[2][0].covariance
+    np.testing.assert_allclose(more, told, rtol=1e-6)

@@ -58,6 +58,13 @@ GOOD: list[tuple[str, str, GoodFrame]] = [
     ('stop', '0615660bdfbf00', StopFrame()),
 ]
 
+
+def sealed(body: bytes) -> str:
+    """The bytes of a frame with this type and body, hexadecimal."""
+    encoded: bytes = cobs.encode(body + zlib.crc32(body).to_bytes(4, 'little'))
+    return encoded.hex() + '00'
+
+
 BAD: list[tuple[str, str, BadReason]] = [
     ('unknown type', '087f010212a6f95700', BadReason.UNKNOWN_TYPE),
     ('sample with too few bytes, CRC right', '02010601b383848900', BadReason.LENGTH),
@@ -71,6 +78,11 @@ BAD: list[tuple[str, str, BadReason]] = [
     ),
     ('start with a wrong CRC', '0614f03bd8c900', BadReason.CRC),
     ('too short for a CRC', '0314f000', BadReason.TOO_SHORT),
+    ('a CRC of nothing', '0101010100', BadReason.TOO_SHORT),
+    ('hello without a version, CRC right', sealed(b'\x10'), BadReason.LENGTH),
+    ('ping with too few bytes, CRC right', sealed(b'\x12' + bytes(7)), BadReason.LENGTH),
+    ('pong with a byte too many, CRC right', sealed(b'\x13' + bytes(17)), BadReason.LENGTH),
+    ('status with a byte too many, CRC right', sealed(b'\x02' + bytes(7)), BadReason.LENGTH),
     ('not COBS: the code points past the end', '0901020300', BadReason.COBS),
     ('longer than a frame can be', '01' * (MAX_ENCODED + 1) + '00', BadReason.TOO_LONG),
 ]
@@ -98,6 +110,24 @@ def test_a_sample_goes_with_16_bits_a_count_unless_asked_otherwise() -> None:
 def test_bytes_that_are_no_frame(label: str, wire: str, reason: BadReason) -> None:
     received = bytes.fromhex(wire)
     assert decode(received + SAMPLE_BYTES) == [BadFrame(reason, len(received) - 1), SAMPLE]
+
+
+@pytest.mark.parametrize('wide', [False, True])
+def test_a_device_time_of_285_years_is_the_latest(wide: bool) -> None:
+    latest = SAMPLE._replace(t_device_us=2**53)
+    assert decode(encode(latest, wide=wide)) == [latest]
+    (bad,) = decode(encode(SAMPLE._replace(t_device_us=2**53 + 1), wide=wide))
+    assert isinstance(bad, BadFrame)
+    assert bad.reason == BadReason.BODY
+
+
+def test_a_frame_that_is_too_long_is_as_long_as_it_was_however_it_was_cut() -> None:
+    for cuts in ((600,), (512, 600), (513, 600), (100, 513, 514, 600)):
+        decoder = FrameDecoder()
+        decoder.feed(b'\x00')
+        for a, b in itertools.pairwise((0, *cuts)):
+            assert decoder.feed(b'\x01' * (b - a)) == []
+        assert decoder.feed(b'\x00' + SAMPLE_BYTES) == [BadFrame(BadReason.TOO_LONG, 600), SAMPLE]
 
 
 def test_the_tail_of_a_frame_that_began_before_we_listened_is_passed_over() -> None:

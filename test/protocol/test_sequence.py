@@ -150,6 +150,9 @@ def test_a_recording_goes_on_if_neither_number_nor_time_goes_back() -> None:
     assert not of.follows([8, 9], [7.0, 9.0])
     assert not of.follows([8, 8], [8.0, 9.0])
     assert not of.follows([8, 9], [8.0, 8.0])
+    assert of.follows([8, 9], [8.0, 8.000001])
+    assert of.follows([8, 9], [7.000001, 9.0])
+    assert not of.follows([8, 9], [7.0, 9.0])
 
 
 def test_a_time_that_goes_back_is_told_and_the_last_time_counts() -> None:
@@ -187,6 +190,37 @@ def test_the_last_number_once_more_is_a_restart_of_a_recording() -> None:
     of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
     assert of.extended([7, 8], [8.0, 9.0]) == [27, 28]
     assert (of.said, of.restarts) == (['sample numbers start again after 7'], [(7, 27)])
+
+
+def test_the_number_after_the_last_of_32_bits_is_0_and_goes_on() -> None:
+    of = Recorded([WRAP - 1], [0.0])
+    assert of.said == []
+    assert of.extended([0], [1.0]) == [WRAP]
+    assert of.follows([1], [2.0])
+    assert of.extended([1, 2], [2.0, 3.0]) == [WRAP + 1, WRAP + 2]
+    assert (of.said, of.restarts) == ([], [])
+
+
+def test_after_a_wrap_and_a_restart_numbers_go_on() -> None:
+    """WRAP + 10 lies in block 214748365, which begins at WRAP + 4: the next one begins at WRAP + 24."""
+    of = Recorded([WRAP - 5], [0.0])
+    assert of.extended([10], [1.0]) == [WRAP + 10]
+    # Too far ahead for the time that has passed, if it was a wrap.
+    assert of.extended([3], [2.0]) == [WRAP + 24 + (WRAP + 3) % 20]
+    assert of.restarts == [(WRAP + 10, WRAP + 24 + (WRAP + 3) % 20)]
+    first = WRAP + 24 + (WRAP + 3) % 20
+    assert of.follows([4], [3.0])
+    assert of.extended([4, 5], [3.0, 4.0]) == [first + 1, first + 2]
+    # Whole numbers have the wrap in them.
+    assert of.extended([WRAP + 6], [5.0], whole=True) == [first + 3]
+
+
+def test_whole_numbers_that_go_back_within_a_message_are_refused() -> None:
+    of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
+    with pytest.raises(ValueError, match='seq does not rise'):
+        of.extended([9, 8], [8.0, 9.0], whole=True)
+    with pytest.raises(ValueError, match='seq does not rise'):
+        of.extended([9, 8, 10], [8.0, 9.0, 10.0])
 
 
 def test_a_wrap_within_a_message_and_numbers_that_were_recorded_whole() -> None:

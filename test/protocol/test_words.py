@@ -103,5 +103,11 @@ def test_whole_numbers_are_kept_as_far_as_json_has_them_exactly(sign: int) -> No
     assert device_words({'a': sign * (2**53 + 1)}) == {'a': 'a whole number of 54 bits'}
 
 
+def test_a_text_has_200_characters_at_most() -> None:
+    for text, kept in (('x' * 200, 'x' * 200), ('x' * 201, 'x' * 199 + '…')):
+        assert device_words({'a': text, 'b': [text]}) == {'a': kept, 'b': [kept]}
+        assert list(device_words({text: {text: 1}}).items()) == [(kept, {kept: 1})]
+
+
 def test_what_is_above_zero() -> None:
     assert [positive(v) for v in (1e-9, 3, 0.0, 0, -1e-9, -0.5)] == [1e-9, 3.0, None, None, None, None]

@@ -16,11 +16,14 @@ from rosbags.typesys import Stores, get_typestore
 from msg_adapters import (
     DEFLECTION,
     DEFLECTION_WITH_COVARIANCE,
+    INPUTS,
+    LATCHED,
     MESSAGE_TYPES,
     RIG,
     SAMPLES,
     SPOTS,
     TOPIC_TYPES,
+    TOPICS,
     from_fields,
     point_cloud2,
     pose_stamped,
@@ -33,15 +36,18 @@ from msg_adapters import (
     vector3_stamped,
 )
 from msg_adapters.header import header, stamp_ns
+from msg_adapters.message_type import MessageType
 from msg_adapters.orientation import angles, quaternion
 from psd_deflection.recordings import cdr
 from psd_deflection.records import (
     CHANNELS,
+    MOST_PSDS,
     AppliedLoad,
     BaseAcceleration,
     BlockStatus,
     DiagnosticEntry,
     DiagnosticReport,
+    EndEffectorDeflection,
     FloatArray,
     ReferencePose,
     RigState,
@@ -49,6 +55,7 @@ from psd_deflection.records import (
     TemperatureReading,
     TipLoad,
     TipMotion,
+    channel_names,
 )
 
 from .making import STEP, T0, block, estimate, run, spots
@@ -86,6 +93,12 @@ def test_quaternion_is_the_rotation_of_the_contract(theta: float, phi: float, om
     np.testing.assert_allclose(rotation(*back), rotation(theta, phi, omega), atol=1e-7)
 
 
+@pytest.mark.parametrize('length', [0.1, 10.0])
+def test_a_quaternion_of_any_length_has_the_angles_of_its_direction(length: float) -> None:
+    q = {k: length * v for k, v in quaternion(0.3, -0.2, 0.1).items()}
+    assert angles(q) == pytest.approx((0.3, -0.2, 0.1), abs=1e-14)
+
+
 def test_a_quaternion_that_was_never_filled_in_has_no_angles() -> None:
     assert all(map(math.isnan, angles({'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 0.0})))
 
@@ -120,6 +133,28 @@ def test_definitions_are_the_standard_ones(name: str) -> None:
     headings = [line for line in MESSAGE_TYPES[name].definition.splitlines() if line.startswith('MSG: ')]
     assert len(set(headings)) == len(headings)
     assert f'MSG: {name.replace("/msg/", "/")}' not in headings
+
+
+def test_the_parts_of_a_definition_stand_below_80_signs_each() -> None:
+    kind = MessageType('a/msg/B', '', 'a/C c\n', {'a/C': 'int8 d\nint8 E=1\n'})
+    assert kind.definition == f'a/C c\n{"=" * 80}\nMSG: a/C\nint8 d\nint8 E=1\n'
+    assert (kind.members(), kind.members('a/C'), kind.members('int8')) == ([('a/C', 'c')], [('int8', 'd')], [])
+
+
+def test_what_is_latched_and_what_is_listened_to() -> None:
+    assert LATCHED == ('/link_tip/rig',)
+    assert INPUTS == (
+        '/link_tip/load',
+        '/link_base/acceleration',
+        '/reference/deflection',
+        '/reference/deflection_with_covariance',
+        '/environment/temperature',
+    )
+
+
+def test_each_topic_has_the_fields_of_its_own_dot() -> None:
+    published = {m.topic: m.fields for m in to_messages(spots(3))}
+    assert {t.name: t.fields(spots(3)) for t in TOPICS if t.name in SPOTS} == published
 
 
 def test_each_raw_sample_as_plain_numbers() -> None:
@@ -215,6 +250,8 @@ def test_an_independent_decoder_reads_the_samples_of_a_block(flags: int) -> None
     assert [f.offset for f in cloud.fields] == [4 * i for i in range(len(names))]
     assert [f.datatype for f in cloud.fields][:8] == [6, 6, 7, 7, 7, 7, 7, 7]
     assert (cloud.height, cloud.width, cloud.point_step) == (1, 18, 36 if flags else 32)
+    assert (cloud.row_step, cloud.is_bigendian, cloud.is_dense) == (18 * cloud.point_step, False, True)
+    assert {f.count for f in cloud.fields} == {1}
     assert cloud.header.frame_id == 'link_tip'
     formats = ['<u4', '<u4', *['<f4'] * 6, '<u4'][: len(names)]
     points = np.frombuffer(cloud.data.tobytes(), np.dtype(list(zip(names, formats, strict=True))))
@@ -231,6 +268,10 @@ def test_seq_is_recorded_modulo_2_to_the_32_with_what_is_above_beside_it() -> No
     assert points['seq'][[0, -1]].tolist() == [2**32 - 16, 3]
     assert points['seq_high'][[0, -1]].tolist() == [0, 1]
     assert [f['name'] for f in m.fields['fields']] == ['seq', 'dt', *CHANNELS, 'flags', 'seq_high']
+    # It is enough that the last number is above.
+    (m,) = to_messages(block(start, lost=(17, 18, 19), first_index=start))
+    _, points = point_cloud2.to_points(m.fields)
+    assert points['seq_high'].tolist() == [0] * 16 + [1]
     (before,) = to_messages(block(start - 1, first_index=start - 1))
     assert before.fields['point_step'] == 32
 
@@ -251,8 +292,10 @@ def test_a_block_is_cut_only_if_its_times_do_not_fit(span: int, pieces: int) -> 
     whole = block(0)
     t_ns = whole.t_ns.copy()
     t_ns[-1] = t_ns[0] + span
-    messages = to_messages(SampleBlock(0, whole.seq, t_ns, whole.volts, whole.flags))
+    given_block = SampleBlock(0, whole.seq, t_ns, whole.volts, whole.flags)
+    messages = to_messages(given_block)
     assert len(messages) == pieces
+    assert (next(point_cloud2.parts(given_block)) is given_block) == (pieces == 1)
     seen = [point_cloud2.to_points(m.fields) for m in messages]
     times = np.concatenate([t + points['dt'].astype(np.int64) for t, points in seen])
     np.testing.assert_array_equal(times, t_ns)
@@ -281,6 +324,21 @@ def test_a_cloud_of_another_program_may_have_numbers_of_any_kind(kind: str) -> N
     assert [tuple(row) for row in got.tolist()] == [tuple(range(8)), tuple(range(10, 18))]
 
 
+def test_a_cloud_of_another_program_may_be_big_endian() -> None:
+    (m,) = to_messages(block(0))
+    _, ours = point_cloud2.to_points(m.fields)
+    swapped = np.frombuffer(m.fields['data'], '<u4').astype('>u4').tobytes()
+    _, points = point_cloud2.to_points({**m.fields, 'is_bigendian': True, 'data': swapped})
+    assert points.tolist() == ours.tolist()
+
+
+@pytest.mark.parametrize('psds', range(2, MOST_PSDS + 1))
+def test_a_cloud_is_of_as_many_psds_as_have_all_their_channels(psds: int) -> None:
+    assert point_cloud2.psds_of(np.zeros(1, point_cloud2.point_of(psds))) == psds
+    names = [*channel_names(psds), *channel_names(MOST_PSDS)[3 * psds : 3 * psds + 2]]
+    assert point_cloud2.psds_of(np.zeros(1, [(name, '<f4') for name in names])) == psds
+
+
 def test_points_that_contradict_themselves_are_refused() -> None:
     (m,) = to_messages(block(0))
     for change, message in (
@@ -288,6 +346,8 @@ def test_points_that_contradict_themselves_are_refused() -> None:
         ({'height': 2}, 'height'),
         ({'point_step': 28, 'width': 20, 'data': bytes(560)}, 'outside a point'),
         ({'point_step': 2**32 - 1, 'width': 0, 'data': b''}, 'a point of'),
+        ({'point_step': 0, 'width': 0, 'data': b''}, 'a point of 0 bytes is not one of ours'),
+        ({'point_step': 1, 'width': 1, 'data': b'x'}, "'seq' at offset 0 is outside a point of 1 bytes"),
         ({'fields': m.fields['fields'][1:]}, r"no field 'seq' \(fields: dt, x1, y1, sum1, x2, y2, sum2\)"),
         ({'fields': []}, r"no field 'seq' \(fields: none\)"),
     ):
@@ -305,6 +365,12 @@ def test_of_a_block_without_one_psd_the_others_are_published() -> None:
     """PSD 2 is left out as it is dark: then it has no dot; or as it contradicts the others: then it has."""
     for status, topics in ((BlockStatus.LASER_LOST, [SPOTS[0]]), (BlockStatus.OK, list(SPOTS))):
         assert [m.topic for m in to_messages(replace(spots(3, status), left_out=(2,)))] == topics
+
+
+def test_dots_that_are_no_numbers_are_not_published() -> None:
+    lost = replace(spots(3), dots=(1e-3, -2e-3, math.nan, 0.0))
+    assert to_messages(lost) == ()
+    assert to_messages(replace(lost, left_out=(2,))) == ()
 
 
 def test_each_dot_is_published_in_its_own_frame_and_axes() -> None:
@@ -336,6 +402,30 @@ def test_no_covariance_stands_anywhere_else() -> None:
     assert k.tolist() == np.diag([0.0, 0.0, 1e6, 1e6, 1e6, 0.0]).tolist()
 
 
+def test_an_end_effector_has_its_whole_pose_in_the_frame_of_its_chain() -> None:
+    e = EndEffectorDeflection(T0, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3, 0.9), tuple(map(float, range(36))))
+    fields = pose_with_covariance_stamped.from_end_effector(e, 'arm')
+    assert (stamp_ns(fields), fields['header']['frame_id']) == (T0, 'arm')
+    assert fields['pose']['pose'] == {
+        'position': {'x': 1.0, 'y': 2.0, 'z': 3.0},
+        'orientation': {'x': 0.1, 'y': 0.2, 'z': 0.3, 'w': 0.9},
+    }
+    assert fields['pose']['covariance'] == [*map(float, range(36))]
+
+
+def test_a_vector_of_two_or_four_numbers_is_refused() -> None:
+    e = EndEffectorDeflection(T0, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3, 0.9), (0.0,) * 36)
+    for numbers in ((1.0, 2.0), (1.0,) * 5):
+        for wrong in (e._replace(position=numbers), e._replace(quaternion=numbers)):
+            with pytest.raises(ValueError, match='zip'):
+                pose_with_covariance_stamped.from_end_effector(wrong, 'arm')
+        for base in (BaseAcceleration(T0, numbers, (0.0,) * 3), BaseAcceleration(T0, (0.0,) * 3, numbers)):
+            with pytest.raises(ValueError, match='zip'):
+                to_messages(base)
+    with pytest.raises(ValueError, match='zip'):
+        pose_stamped.to_poses(np.ones((1, 6)))
+
+
 def test_a_pose_lies_in_the_plane_with_all_its_angles() -> None:
     e = estimate(3)
     for fields in (to_messages(e)[0].fields['pose'], pose_with_covariance_stamped.from_estimate(e)['pose']['pose']):
@@ -359,8 +449,12 @@ def test_a_reference_has_the_covariance_of_x_y_and_yaw() -> None:
     fields = pose_with_covariance_stamped.from_estimate(estimate(3))
     fields['pose']['covariance'] = list(range(36))
     # Rows and columns 0, 1 and 5 of six.
-    wanted = (0, 1, 5, 6, 7, 11, 30, 31, 35)
-    assert pose_with_covariance_stamped.to_reference(fields).covariance == wanted
+    wanted = [0, 1, 5, 6, 7, 11, 30, 31, 35]
+    reference = pose_with_covariance_stamped.to_reference(fields)
+    assert list(reference.covariance) == wanted
+    e = estimate(3)
+    assert (reference.t_ns, reference.dx, reference.dy) == (e.t_ns, e.dx, e.dy)
+    assert (reference.theta, reference.phi, reference.omega) == pytest.approx((e.theta, e.phi, e.omega), abs=1e-15)
 
 
 def test_a_load_is_a_force_in_the_plane_and_a_torque_about_z() -> None:

@@ -71,7 +71,7 @@ TOPICS = {
 
 
 def points_of(cloud: Any) -> Any:
-    return np.frombuffer(bytes(cloud.data), point_cloud2.PLAIN if cloud.point_step == 32 else point_cloud2.FLAGGED)
+    return np.frombuffer(bytes(cloud.data), point_cloud2.point_of(2, cloud.point_step // 4 - 8))
 
 
 def test_what_is_published_and_how_often(start: Callable[..., Any], peer: Any) -> None:

@@ -7,8 +7,18 @@ import pytest
 
 from blind import generator
 from psd_deflection.config import Rig, load_rig, rig_as_recorded
-from psd_deflection.pipeline import TIP_LOADS, Pipeline
-from psd_deflection.records import BlockStatus, DeflectionEstimate, RawChunk, Record, SpotMeans, TipLoad
+from psd_deflection.pipeline import FROZEN, HELD, TIP_LOADS, ZERO_VARIANCES, Pipeline
+from psd_deflection.records import (
+    ENVIRONMENT,
+    KNOWN_LOAD,
+    BlockStatus,
+    DeflectionEstimate,
+    ParameterChange,
+    RawChunk,
+    Record,
+    SpotMeans,
+    TipLoad,
+)
 from psd_deflection.simulation.simulator import RigSimulator
 
 
@@ -99,6 +109,65 @@ def test_the_sag_is_in_a_zero_that_was_taken() -> None:
         assert pipeline.zero() is not None
     # The sag of 20 um is in the zero now.
     assert np.mean([e.dy for e in estimates(records)]) == pytest.approx(0.0, abs=1e-7)
+
+
+DRIFTS = {
+    'effects.a.name': 'thermal_drift',
+    'effects.a.psd': 1,
+    'effects.a.x': 1e-6,
+    'effects.b.name': 'laser_pointing_drift',
+    'effects.b.psd': 2,
+    'effects.b.rate_y': 1e-5,
+}
+
+
+@pytest.mark.parametrize('name', ENVIRONMENT)
+def test_what_is_known_of_the_surroundings_replays_to_the_bit(name: str) -> None:
+    """The first time, the first temperature, the last temperature."""
+    rig = load_rig(overrides=DRIFTS)
+    samples = volts(1, 1)
+    live, replay, without = Pipeline(rig), Pipeline(rig), Pipeline(rig)
+    live.temperature(21.5)
+    list(live.process(chunk(samples[:400])))
+    live.temperature(24.0)
+    list(live.process(chunk(samples[400:600], 400)))
+    memory = live.memory(rig)
+    assert memory is not None
+    assert dict(memory.values)[name] == dict(zip(ENVIRONMENT, (0.0, 21.5, 24.0), strict=True))[name]
+    rest = chunk(samples[600:], 600)
+    expected = estimates(list(live.process(rest)))
+    replay.apply(memory)
+    assert estimates(list(replay.process(rest))) == expected
+    without.apply(memory._replace(values=tuple(v for v in memory.values if v[0] != name)))
+    assert estimates(list(without.process(rest))) != expected
+
+
+def test_what_was_changed_is_remembered() -> None:
+    """Numbers, words, lists and truth values; not what was changed back."""
+    rig = load_rig()
+    live, replay = Pipeline(rig), Pipeline(rig)
+    live.change({'psd_2.zero': (1e-5, -2e-5), 'sum_min': 0.5, 'degraded': 'hold', 'twist_sd': 0.5})
+    live.change({'twist_sd': rig.values['twist_sd'], 'frozen': 'refuse'})  # type: ignore[dict-item]
+    memory = live.memory(rig)
+    assert memory is not None
+    wanted = {'psd_2.zero': (1e-5, -2e-5), 'sum_min': 0.5, 'degraded': 'hold', 'frozen': 'refuse'}
+    assert dict(memory.values) == wanted
+    replay.apply(memory)
+    assert replay.rig == live.rig != rig
+
+
+@pytest.mark.parametrize(
+    ('name', 'value'),
+    [(HELD, (0.0, 1.0)), (FROZEN, (4.0,)), (ZERO_VARIANCES, (1e-12, 1e-12)), (KNOWN_LOAD, (0.0, 0.0, 1.0, 0.0))],
+)
+def test_a_memory_of_another_length_is_none(name: str, value: tuple[float, ...]) -> None:
+    rig = load_rig(overrides={'filter': 'modal', 'degraded': 'hold'})
+    pipeline, fresh = Pipeline(rig), Pipeline(rig)
+    pipeline.apply(ParameterChange(0, 0, ((name, value),)))
+    assert pipeline.memory(rig) == fresh.memory(rig)
+    assert pipeline.estimation.zero_variances == ()
+    samples = chunk(volts(1, 1)[:200])
+    assert list(map(str, pipeline.process(samples))) == list(map(str, fresh.process(samples)))
 
 
 def test_a_recording_from_before_has_the_mean_and_the_rig_files_noise() -> None:
