@@ -19,7 +19,7 @@ ROOT = Path(__file__).parent.parent
 BESIDE_THE_PACKAGE = {'bench', 'blind', 'data', 'docs'}
 """Folders of test/ that are no room of the package: what they test, or use, lies beside it."""
 
-TESTED_ELSEWHERE = {'correction', 'errors', 'files', 'pages', 'parameters', 'records'}
+TESTED_ELSEWHERE = {'errors', 'files', 'pages', 'parameters', 'records'}
 """Rooms without a test file of their own: declarations; the correction, of which the effects' tests are; and the pages,
 which the tests of the reports open in a browser."""
 
