@@ -20,8 +20,7 @@ BESIDE_THE_PACKAGE = {'bench', 'blind', 'data', 'docs'}
 """Folders of test/ that are no room of the package: what they test, or use, lies beside it."""
 
 TESTED_ELSEWHERE = {'errors', 'files', 'pages', 'parameters', 'records'}
-"""Rooms without a test file of their own: declarations; the correction, of which the effects' tests are; and the pages,
-which the tests of the reports open in a browser."""
+"""Rooms without a test file of their own: declarations, and the pages, which tests of the reports open in a browser."""
 
 EXECUTABLES: tuple[str, ...] = next(
     ast.literal_eval(line.value)
