@@ -12,6 +12,7 @@ import multiprocessing
 import os
 import re
 import signal
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from typing import Any, Protocol, TypeVar
@@ -69,9 +70,13 @@ class _Processes:
 
     def _made(self) -> ProcessPoolExecutor:
         # As Ctrl-C reaches them too, they end without a word.
-        return ProcessPoolExecutor(
+        pool = ProcessPoolExecutor(
             self.slots, multiprocessing.get_context('spawn'), signal.signal, (signal.SIGINT, signal.SIG_DFL)
         )
+        # All processes at once: in CPython 3.11 the pool hangs if one is lost while another one is begun.
+        for _ in range(self.slots):
+            pool.submit(time.sleep, 0.01 * self.slots)
+        return pool
 
     def submit(self, task: Callable[..., T], *arguments: object) -> Future[T]:
         return self._pool.submit(task, *arguments)
