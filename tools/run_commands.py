@@ -75,6 +75,7 @@ CI_RUNS = (
     (r'^python -m blind\.laws\b', 'Makefile', 'python -m blind.laws --jobs'),
     (r'^python -m bench\.campaign\.camera\b', 'Makefile', 'python -m bench.campaign.camera --frames'),
     (r'^python -m bench\.campaign\.hellos$', 'Makefile', 'python -m bench.campaign.hellos '),
+    (r'^python -m bench\.campaign\.fuzz\b', 'Makefile', 'python -m bench.campaign.fuzz $$target'),
 )
 """What CI runs without us: pattern, file, and the text in it that does."""
 
