@@ -49,7 +49,8 @@ def outcomes(
     """The outcome of ``work`` on each of ``names``, in their order; ``ended`` is called when one has ended.
 
     ``work`` and its results must be able to go to another process. If a worker of a pool is killed, what was under way
-    is tried again, one at a time, so that only the recording that kills its worker fails. Dask does this by itself.
+    is tried again, one at a time and twice at most, so that only a recording that kills its worker fails. Dask does
+    this by itself.
     """
     return _Run(work, names, engine, ended).outcomes()
 
@@ -111,11 +112,14 @@ class _Run(Generic[T]):
             self._engine.renew()
 
     def _try_alone(self, i: int) -> None:
-        try:
-            outcome = self._submit(i).result()
-        except BrokenExecutor as error:
-            self._engine.renew()
-            outcome = self._lost(i, error)
+        """Twice: whether it was under way when a worker was lost, or waited for one, cannot be known."""
+        for _ in range(2):
+            try:
+                outcome = self._submit(i).result()
+                break
+            except BrokenExecutor as error:
+                self._engine.renew()
+                outcome = self._lost(i, error)
         self._end(i, outcome)
 
     def _lost(self, i: int, error: BaseException) -> Outcome[T]:

@@ -66,8 +66,8 @@ def test_outcomes_come_in_order_whatever_ends_first() -> None:
 
 
 def test_a_lost_worker_costs_only_what_it_worked_on() -> None:
-    # `cc` breaks the pool while `a` and `bbb` are under way, and once more alone.
-    engine = Later(3, 'cc', 'cc')
+    # `cc` breaks the pool while `a` and `bbb` are under way, and twice more alone.
+    engine = Later(3, 'cc', 'cc', 'cc')
     engine.slots = 3
 
     def alone(task: Callable[..., T], *arguments: object) -> Future[T]:
@@ -80,6 +80,14 @@ def test_a_lost_worker_costs_only_what_it_worked_on() -> None:
     found = list(outcomes(length, ['a', 'bbb', 'cc', 'dddd', 'e'], engine))
     assert [o.value for o in found] == [1, 3, None, 4, 1]
     assert found[2].error == 'cc: its worker was killed, twice; too little memory?'
+    assert engine.renewed == 3
+
+
+def test_a_worker_that_is_lost_once_more_costs_nothing() -> None:
+    # `cc` waited for a worker when the pool was lost, and is killed once itself.
+    engine = Later(1, 'cc', 'cc')
+    found = list(outcomes(length, ['a', 'cc', 'dddd'], engine))
+    assert [o.value for o in found] == [1, 2, 4]
     assert engine.renewed == 2
 
 
