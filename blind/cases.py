@@ -268,6 +268,7 @@ def all_cases(
     first: int = 0,
     spreads: int = 60,
     mistakes: int = 5,
+    fours: int = 40,
 ) -> Iterator[Case]:
     """The whole suite. ``first``: number of the first seed, for a run on cases never seen before."""
     for seed in range(first, first + seeds):
@@ -294,6 +295,17 @@ def all_cases(
     for i in range(first, first + nulls):
         yield Case(f'null-{i}', 'null', 'one', ())
     yield from hard_cases(first, spreads, mistakes)
+    yield from cases_of_four(first, fours)
+
+
+def cases_of_four(first: int, fours: int) -> Iterator[Case]:
+    """Four effects at once, each with a gap of 3 to 30 floors."""
+    rng = np.random.default_rng(20261123 + first)
+    for i in range(first, first + fours):
+        names = [str(n) for n in rng.choice([n for n in EFFECTS if n not in UNSPREAD], 4, replace=False)]
+        gaps = np.exp(rng.uniform(math.log(3.0), math.log(30.0), 4)).tolist()
+        two = bool(set(names) & SHOWS_ACROSS_LENGTHS)
+        yield Case(f'four-{i}-{"-".join(names)}', 'four', 'two' if two else 'one', tuple(zip(names, gaps, strict=True)))
 
 
 MISTAKES: Mapping[str, tuple[float, ...]] = {

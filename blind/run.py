@@ -108,12 +108,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--pairs', type=int, default=60)
     parser.add_argument('--spreads', type=int, default=60, help='pairs and triples of very different size')
     parser.add_argument('--mistakes', type=int, default=5, help='sizes of each mistake of the set-up')
+    parser.add_argument('--fours', type=int, default=40, help='four effects at once')
     parser.add_argument('--first', type=int, default=0, help='number of the first seed: fresh cases')
     parser.add_argument('--only', default='', help='only cases whose name contains this')
     parser.add_argument('--score', action='store_true', help='only score what is there')
     args = parser.parse_args(argv)
     folder = Path(args.out)
-    whole = all_cases(args.seeds, args.nulls, args.wrong, args.pairs, args.first, args.spreads, args.mistakes)
+    whole = all_cases(
+        args.seeds, args.nulls, args.wrong, args.pairs, args.first, args.spreads, args.mistakes, args.fours
+    )
     listed = short_cases() if args.short else list(whole)
     cases = [c for c in listed if args.only in c.key]
     if not args.score:

@@ -23,6 +23,7 @@ THRESHOLDS: dict[str, float] = {
     'both_of_a_pair': 0.85,
     'unknown': 0.90,
     'all_of_a_spread': 0.95,
+    'all_of_four': 0.85,
     'unsaid_floors': 1.5,
     'mistake_named': 0.95,
     'heldout_over_floor_median': 1.05,
@@ -200,6 +201,9 @@ def _spread(sheet: _Sheet, rows: Sequence[Row]) -> None:
     of = [r for r in rows if r.kind == 'spread']
     hits = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
     sheet.rate('all of a pair or triple of 1:10:100 floors', of, hits, THRESHOLDS['all_of_a_spread'], 1.0, True)
+    of = [r for r in rows if r.kind == 'four']
+    hits = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
+    sheet.rate('all of four effects at once, 3 to 30 floors', of, hits, THRESHOLDS['all_of_four'], 1.0, True)
     most = THRESHOLDS['unsaid_floors']
     unsaid = [r for r in rows if r.answer['remaining']['floors'] > most and not r.answer['unknown']]
     sheet.failures += [f'{r.key}: {_said(r)}' for r in unsaid]
@@ -211,7 +215,7 @@ def _mistakes(sheet: _Sheet, rows: Sequence[Row]) -> None:
     of = [r for r in rows if r.kind == 'mistake']
     hits = [{s['name'] for s in r.answer['setup']} == {r.mistake} and not r.named for r in of]
     sheet.rate('mistake of the set-up named, and nothing else', of, hits, THRESHOLDS['mistake_named'], 1.0, True)
-    sound = [r for r in rows if r.kind in ('faultless', 'null', 'single', 'pair', 'spread')]
+    sound = [r for r in rows if r.kind in ('faultless', 'null', 'single', 'pair', 'spread', 'four')]
     wrongly = [r for r in sound if r.answer['setup']]
     sheet.failures += [f'{r.key}: set-up {", ".join(s["name"] for s in r.answer["setup"])}' for r in wrongly]
     sheet.rate('mistake named where there is none', sound, [bool(r.answer['setup']) for r in sound], 0.0, 0.0, False)
