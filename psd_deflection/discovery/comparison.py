@@ -133,6 +133,10 @@ class Comparison(ABC):
         scale, unit = self.scale_shown
         return f'{scale * size:{digits}} {unit}'.rstrip() if np.isfinite(size) else 'not known'
 
+    def sd(self, jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
+        """(p,): standard deviations by the noise; the whitened ``jacobian`` (D, p) has the ``covariance`` (p, p)."""
+        return np.sqrt(np.diag(covariance))
+
     def loss(self, residual: FloatArray) -> float:
         """Twice the negative log-likelihood of a vector (D,), up to a constant: chi-square if the noise is known."""
         return float(residual @ residual)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtri, stdtrit
 from scipy.stats import chi2 as chi2_law
 
 from psd_deflection.discovery.coincidence import coincidences
@@ -249,6 +250,24 @@ class PlantComparison(Comparison):
             stop = int(negative[0]) if len(negative) else n
             count += float(seen.sum()) / (1.0 + 2.0 * float(correlation[1:stop].sum()))
         return max(count, 2.0)
+
+    def sd(self, jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
+        """(p,): with them, 1.96 sd are the 95 % interval of Student's t, because few values tell a channel's level.
+
+        The degrees of freedom of a parameter that several channels tell of are those of Welch (1947).
+        """
+        rows = np.concatenate([np.repeat(np.arange(len(m)), m.shape[1]) for m in self.measured])
+        told = jacobian @ covariance
+        fitted = np.bincount(rows, (told * jacobian).sum(axis=1), len(self.channels))
+        left = np.maximum(self.independent - fitted, 1.0)
+        by_channel = np.zeros((len(self.channels), len(covariance)))
+        np.add.at(by_channel, rows, told**2)
+        open_level = self.level > self.known
+        by_channel *= np.where(open_level, self.independent / left, 1.0)[:, None]
+        variance = by_channel.sum(axis=0)
+        share = by_channel / np.maximum(variance, 1e-300)
+        unsure = (share**2 * np.where(open_level, 1.0 / left, 0.0)[:, None]).sum(axis=0)
+        return np.asarray(np.sqrt(variance) * stdtrit(1.0 / np.maximum(unsure, 1e-9), 0.975) / ndtri(0.975))
 
     def effective_size(self) -> float:
         """Independent values of all channels."""

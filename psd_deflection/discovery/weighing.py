@@ -219,7 +219,7 @@ def sd_of(workspace: Comparison, fit: Fit, index: int) -> dict[str, float]:
     From the noise. If more than noise remains, the model is not exact, and the scatter over load cases or recordings
     tells how far it is off; the larger of the two is taken.
     """
-    sd = np.sqrt(np.diag(fit.covariance()))
+    sd = workspace.sd(fit.jacobian, fit.covariance())
     if workspace.open_level or workspace.gap(fit.difference) > UNSAID * workspace.floor():
         sd = np.maximum(sd, scatter(workspace, fit))
     return {fit.free[j][1]: float(sd[j]) for j in fit.columns_of(index)}

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2 as chi2_law
 from scipy.stats import norm
+from scipy.stats import t as student
 
 from psd_deflection.discovery import plants
 from psd_deflection.discovery.fit import refit
@@ -150,6 +151,48 @@ def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
     assert (same.unit, same.scale_shown, same.worded(0.1234)) == ('N', (1.0, 'N'), '0.123 N')
     # A number without a unit has none behind it.
     assert PlantComparison(Pictures(seen, {}, units=('', ''))).worded(0.5) == '0.5'
+
+
+def fitted(values: Sequence[FloatArray], picture: Sequence[FloatArray], **given: Any) -> tuple[PlantComparison, Any]:
+    workspace = PlantComparison(Pictures(values, {'size': picture}, **given))
+    fit = refit(workspace, [on('size', 0.0)])
+    while workspace.renoise(fit.effects):
+        fit = refit(workspace, fit.effects)
+    return workspace, fit
+
+
+def sized(values: Sequence[FloatArray], picture: Sequence[FloatArray]) -> float:
+    return float(fitted(values, picture)[1].effects[0].values['size'])
+
+
+def sd_of_size(values: Sequence[FloatArray], picture: Sequence[FloatArray], **given: Any) -> float:
+    workspace, fit = fitted(values, picture, **given)
+    return float(workspace.sd(fit.jacobian, fit.covariance())[0])
+
+
+def test_few_values_make_the_interval_of_student() -> None:
+    # Of one channel: the textbook's line through the origin. Of two: Welch (1947).
+    values, told = tables(3), [np.linspace(1.0, 2.0, n) for n in LENGTHS]
+    x, y = np.concatenate(told), np.concatenate([rows[0] for rows in values])
+    picture = [np.stack([part, 0.0 * part]) for part in told]
+    size = float(x @ y / (x @ x))
+    left = float(np.sum((y - size * x) ** 2)) / (len(x) - 1)
+    wanted = math.sqrt(left / float(x @ x)) * student.ppf(0.975, len(x) - 1) / norm.ppf(0.975)
+    assert sd_of_size(values, picture) == pytest.approx(wanted, rel=1e-3)
+    both = [np.stack([part, 0.1 * part]) for part in told]
+    parts, freedom = [], []
+    for scale, row in ((1.0, 0), (0.1, 1)):
+        y = np.concatenate([rows[row] for rows in values])
+        level = float(np.mean((y - sized(values, both) * scale * x) ** 2))
+        parts.append(scale**2 * float(x @ x) / level)
+    for part in parts:
+        freedom.append(len(x) - part / sum(parts))
+    variances = [part / sum(parts) ** 2 * len(x) / nu for part, nu in zip(parts, freedom, strict=True)]
+    nu = sum(variances) ** 2 / sum(v * v / n for v, n in zip(variances, freedom, strict=True))
+    wanted = math.sqrt(sum(variances)) * student.ppf(0.975, nu) / norm.ppf(0.975)
+    assert sd_of_size(values, both) == pytest.approx(wanted, rel=1e-3)
+    # A stated noise is not told by the values: it is the normal law's.
+    assert sd_of_size(values, picture, noise=(9.0, 9.0)) == pytest.approx(9.0 / math.sqrt(float(x @ x)), rel=1e-3)
 
 
 def test_the_likelihood_of_a_plant_has_the_level_that_fits_best() -> None:
