@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,10 +25,12 @@ from test.runner.conftest import Estimates, ScriptedDevice
 
 Sample = Callable[..., SampleFrame]
 
-STARTS = [(3000, 205), (2**31 + 7, 193), (5, 200), (4_000_000_000, 120), (3_999_999_870, 100)]
-"""First number and samples of each run of the device: most begin or end amid a block."""
+STARTS = [(3000, 205), (2**31 + 7, 193), (5, 200), (4_000_000_000, 120), (3_999_999_870, 110)]
+"""First number and samples of each run of the device: most begin or end amid a block, the last one ends with one."""
 
 SENT = sum(n for _, n in STARTS)
+BLOCKS = Counter((run, number // 20) for run, (first, n) in enumerate(STARTS) for number in range(first, first + n))
+ESTIMATES = sum(samples >= load_rig().estimator.min_samples for samples in BLOCKS.values())
 
 
 @pytest.fixture
@@ -35,7 +38,7 @@ def bag(device: ScriptedDevice, sample: Sample, tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(processing, 'REQUEST_TIMEOUT_S', WAIT_S)
     values = {'port': str(device.link), 'bag_dir': str(tmp_path / 'bags'), 'keep_zero': False, 'realtime': False}
     session = Session(load_rig(overrides={**values, 'record': True, 'disk_reserve': 1_000_000}), lambda _: None)
-    estimates = Estimates(SENT // 20 - len(STARTS))
+    estimates = Estimates(ESTIMATES)
     session.processing.sinks.append(estimates)
     session.start()
     for first, count in STARTS:
