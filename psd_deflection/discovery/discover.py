@@ -136,9 +136,9 @@ def discover(
         # The loads of the last moments are noted after the end.
         observations = [_without_end(o, max(delays)) for o in observations]
         workspace = Workspace(observations, base)
-    workspace.base = (*base, *_beginnings(workspace))
+    workspace.nuisance = tuple(_beginnings(workspace))
     # Signatures that are kept are those of recordings as they were, from rest.
-    changed = bool(findings) or len(workspace.base) > len(base) or any(d > 0.0 for d in delays)
+    changed = bool(findings) or bool(workspace.nuisance) or any(d > 0.0 for d in delays)
     kept = SignatureBank() if bank is None or changed else bank
     kept.nominal(workspace)
     found = _proposals(workspace)
@@ -149,7 +149,7 @@ def discover(
 
     def screen(_: Comparison, current: Fit | None) -> Screen:
         ws = workspace
-        residual = ws.residual(ws.base)[0] if current is None else current.residual
+        residual = ws.residual([*ws.base, *ws.nuisance])[0] if current is None else current.residual
         more = mistakes(len(observations), delays, likely_jumps(ws, residual))
         more = [e for e in more if e.name not in FIRST or e.name in looked_for]
         library = [e for e in catalogue().values() if e.name not in without and not e.lattice]
@@ -180,6 +180,7 @@ def discover(
             search, result = other, plain
         else:
             workspace.noise = noise
+    workspace.nuisance = result.fit.nuisance
     progress('weighing')
     heldout, fit = accept(search, result, rng)
     seen = 0.0 if lattice is None else 2.0 * _lattice_gain(workspace, lattice)

@@ -274,8 +274,11 @@ def shown(
     rows, slopes = [], []
     for model in models:
         there = white(model.effects)
-        columns = np.empty((len(there), len(model.free)))
+        columns = np.zeros((len(there), len(model.free)))
         for j, (i, name) in enumerate(model.free):
+            if i < 0:
+                # How another recording began does not show in this one.
+                continue
             parameter = model.effects[i].effect.parameter(name)
             h = STEP * parameter.scale
             if model.effects[i].values[name] + h > parameter.maximum:

@@ -125,7 +125,7 @@ def responses(ws: Workspace, fit: Fit) -> list[Response]:
 def _variables(ws: Workspace, effects: Sequence[ActiveEffect], i: int) -> tuple[ForwardModel, SimulatedSamples]:
     """Recording number ``i``, simulated with ``effects`` besides those of the rig file."""
     o = ws.observations[i]
-    model = ForwardModel(o.rig, only_in(sort_effects([*ws.base, *effects]), i))
+    model = ForwardModel(o.rig, only_in(sort_effects([*ws.base, *ws.nuisance, *effects]), i))
     return model, model.run(o.loads, o.temperature)
 
 

@@ -454,7 +454,7 @@ def _tied(best: _Trial, others: Sequence[_Trial]) -> tuple[Law, ...]:
 
 def _channels(ws: Workspace, best: _Trial) -> tuple[str, ...]:
     """Where the law shows: the channels with more than a twentieth of its energy."""
-    _, alone = ws.residual([*ws.base, *best.beside])
+    _, alone = ws.residual([*ws.base, *best.fit.nuisance, *best.beside])
     moved = ws.whiten([a - b for a, b in zip(alone, best.fit.difference, strict=True)])
     energy: FloatArray = np.sum([np.sum(part**2, axis=1) for part in ws.split(moved)], axis=0)
     return tuple(c for c, e in zip(CHANNELS, energy, strict=True) if e > 0.05 * float(energy.sum()))

@@ -197,7 +197,7 @@ def _effect_section(effect: NamedEffect) -> str:
 def _law_figure(discovery: Discovery, found: FoundLaw) -> Figure:
     """What is missing and what the law leaves against its first variable, in the channel where it shows most."""
     ws, name = discovery.workspace, found.law.variables[0]
-    _, alone = ws.residual([*ws.base, *found.beside])
+    _, alone = ws.residual([*ws.base, *found.fit.nuisance, *found.beside])
     missing, left = ws.block_dots(alone), ws.block_dots(found.fit.difference)
     moved = np.concatenate([a - b for a, b in zip(missing, left, strict=True)], axis=1)
     row = int(np.argmax(np.nansum(moved**2, axis=1)))

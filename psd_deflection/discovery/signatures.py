@@ -159,9 +159,9 @@ class SignatureBank:
         self._base: tuple[ActiveEffect, ...] = ()
 
     def nominal(self, workspace: Comparison) -> list[FloatArray]:
-        """The simulation without any effect, except those of the rig file."""
+        """The simulation with what every model has, and no more."""
         if self._nominal is None:
-            self._base = workspace.base
+            self._base = (*workspace.base, *workspace.nuisance)
             self._nominal = workspace.simulate(self._base)
         return self._nominal
 

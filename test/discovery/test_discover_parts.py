@@ -209,6 +209,18 @@ def test_how_a_recording_began_is_adjusted_and_not_told() -> None:
     assert float(after @ after) < ws.size + 4.0 * math.sqrt(2.0 * ws.size)
 
 
+def test_a_large_effect_is_told_from_how_the_recording_began() -> None:
+    """The ringing that the effect makes larger and the one of the beginning are fitted together."""
+    gain = make_active('sensor_gain', {'psd': 1, 'x': 0.04, 'y': -0.06}, 'here')
+    o = observed(effects=(gain,), warm=None)
+    found = discover([dataclasses.replace(o, volts=o.volts[350:], loads=o.loads[350:])], RIG)
+    assert [e.active.effect.name for e in found.effects] == ['sensor_gain']
+    assert (found.verdict, found.unknown, found.nuisance) == ('effects_found', (), ())
+    (named,) = found.effects
+    assert abs(named.active.values['y'] + 0.06) < 4.0 * named.sd['y']
+    assert found.floors < 1.1
+
+
 def test_coarse_steps_are_taken_out_before_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     given = Given(monkeypatch)
     fine = observed(warm=None)
