@@ -12,7 +12,7 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -78,22 +78,39 @@ def _one(job: tuple[dict[str, Any], list[dict[str, Any]], str]) -> str:
     return case.key
 
 
-def seal(cases: Sequence[Case], folder: Path) -> str:
-    """Write truths and thresholds; returns the hash over all of them."""
+def _sealed(case: Case, path: Path) -> None:
+    if path.exists():
+        return
+    partial = path.with_suffix('.partial')
+    partial.write_text(json.dumps({'case': dataclasses.asdict(case), 'truth': truth_of(case)}, sort_keys=True))
+    partial.replace(path)
+
+
+def seal(cases: Sequence[Case], folder: Path, jobs: int = 1) -> str:
+    """Write truths and thresholds, with ``jobs`` processes; returns the hash over all of them."""
     truths = folder / 'sealed'
     truths.mkdir(parents=True, exist_ok=True)
+    paths = [truths / f'{case.key}.json' for case in cases]
+    _all(_sealed, cases, paths, jobs=jobs, desc='sealing truths')
     digest = hashlib.sha256(json.dumps(score.THRESHOLDS, sort_keys=True).encode())
-    for case in tqdm(cases, desc='sealing truths', file=sys.stderr):
-        path = truths / f'{case.key}.json'
-        if not path.exists():
-            text = json.dumps({'case': dataclasses.asdict(case), 'truth': truth_of(case)}, sort_keys=True)
-            partial = path.with_suffix('.partial')
-            partial.write_text(text)
-            partial.replace(path)
+    for path in paths:
         digest.update(path.read_bytes())
     (folder / 'thresholds.json').write_text(json.dumps(score.THRESHOLDS, indent=1))
     (folder / 'seal.sha256').write_text(digest.hexdigest() + '\n')
     return digest.hexdigest()
+
+
+def _all(work: Callable[..., object], *each: Sequence[object], jobs: int, desc: str) -> None:
+    """``work`` on each, in this process or in ``jobs`` of them, with a progress bar."""
+    with tqdm(total=len(each[0]), desc=desc, file=sys.stderr) as bar:
+        if jobs > 1:
+            with ProcessPoolExecutor(jobs) as pool:
+                for _ in pool.map(work, *each):
+                    bar.update()
+        else:
+            for given in zip(*each, strict=True):
+                work(*given)
+                bar.update()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -120,7 +137,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     listed = short_cases() if args.short else list(whole)
     cases = [c for c in listed if args.only in c.key]
     if not args.score:
-        print(f'{len(cases)} cases; truths sealed: {seal(cases, folder)}')
+        print(f'{len(cases)} cases; truths sealed: {seal(cases, folder, args.jobs)}')
         (folder / 'answers').mkdir(parents=True, exist_ok=True)
         jobs = []
         for case in cases:
@@ -128,16 +145,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if not target.exists():
                 sealed = json.loads((folder / 'sealed' / f'{case.key}.json').read_text())
                 jobs.append((sealed['case'], sealed['truth'], str(target)))
-        bar = tqdm(total=len(jobs), desc='answers', file=sys.stderr)
-        if args.jobs > 1:
-            with ProcessPoolExecutor(args.jobs) as pool:
-                for _ in pool.map(_one, jobs):
-                    bar.update()
-        else:
-            for job in jobs:
-                _one(job)
-                bar.update()
-        bar.close()
+        _all(_one, jobs, jobs=args.jobs, desc='answers')
     rows = score.load(folder, [c.key for c in cases])
     text, passed = score.summary(rows)
     print(text)
