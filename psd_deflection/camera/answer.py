@@ -72,7 +72,8 @@ class TargetPose(NamedTuple):
 
 def plane_of(rotation: FloatArray, place: FloatArray, keystone: FloatArray) -> FloatArray:
     """(3, 3): (x, y, 1) on a target to its ray, in the camera's axes."""
-    plane = np.column_stack([rotation[:, 0], rotation[:, 1], place])
+    plane = np.array(rotation)
+    plane[:, 2] = place
     if keystone.size:
         plane[2, :2] += place[2] * keystone
     return plane

@@ -55,7 +55,7 @@ class Discs:
         if regions[1].axes[0] < math.cos(_OBLIQUE) * regions[1].axes[1]:
             raise RefusedError(Status.OBLIQUE)
         apart = np.subtract(regions[0].centre, regions[2].centre)
-        upright = float(apart @ self._up) / float(np.linalg.norm(apart))
+        upright = float(apart @ self._up) / math.hypot(*apart.tolist())
         if self._answered and abs(upright) < _UNSURE:
             # The target looks the same after half a turn.
             raise RefusedError(Status.HALF_TURN)
@@ -63,7 +63,7 @@ class Discs:
             regions = regions[::-1]
         found = self._fit(image, regions, lens, full_scale)
         seen = found.points[0] - found.points[2]
-        self._up, self._answered = seen / np.linalg.norm(seen), True
+        self._up, self._answered = seen / math.hypot(*seen.tolist()), True
         return found
 
     def _fit(self, image: Any, regions: list[Region], lens: Lens, full_scale: float) -> TargetPose:
@@ -104,10 +104,9 @@ class Discs:
 
     def _frontal(self, rays: FloatArray) -> FloatArray:
         """The rotation of a plate that faces the camera, by the line of discs."""
-        up = np.append(rays[0] - rays[2], 0.0)
-        up /= np.linalg.norm(up)
-        normal = np.array([0.0, 0.0, self._towards])
-        return np.column_stack([np.cross(up, normal), up, normal])
+        x, y = (rays[0] - rays[2]).tolist()
+        long, to = math.hypot(x, y), self._towards
+        return np.array([[to * y / long, x / long, 0.0], [-to * x / long, y / long, 0.0], [0.0, 0.0, to]])
 
     def _tilt(self, region: Region, frontal: FloatArray) -> FloatArray:
         """A turn about the long axis of the ellipse that makes it as narrow as it is, in the target's axes, rad."""
@@ -118,15 +117,13 @@ class Discs:
 
     def _place(self, rays: FloatArray, rotation: FloatArray) -> FloatArray:
         """Where a target of this rotation has its centres on ``rays`` (3, 2): linear least squares."""
-        turned_points = np.column_stack([self._centres, np.zeros(3)]) @ rotation.T
-        rows, right = [], []
-        for ray, point in zip(rays, turned_points, strict=True):
-            for axis in (0, 1):
-                row = np.zeros(3)
-                row[axis], row[2] = 1.0, -ray[axis]
-                rows.append(row)
-                right.append(ray[axis] * point[2] - point[axis])
-        place = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
+        turned_points = self._centres @ rotation[:, :2].T
+        # x - u z = u pz - px for each ray (u, v) and point p, and so in y: x and y are eliminated first.
+        right = rays * turned_points[:, 2:] - turned_points[:, :2]
+        ray, at = rays.sum(axis=0) / len(rays), right.sum(axis=0) / len(rays)
+        off = rays - ray
+        far = -float((off * (right - at)).sum() / (off * off).sum())
+        place = np.array([*(at + ray * far).tolist(), far])
         if place[2] <= 0.0:
             raise RefusedError(Status.MISFIT)
         return np.asarray(place)

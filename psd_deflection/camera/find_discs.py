@@ -104,7 +104,8 @@ def _found(binaries: Iterable[Any], ratio: float, clear: float) -> list[Region]:
 def _binaries(grey: Any, *, smooth: bool = True) -> Iterator[Any]:
     """The image cut at several levels: the one between the two commonest first."""
     cv2 = opencv()
-    thin = max(min(grey.shape) // 120, 1)
+    # The first look decides nothing but where to look closer.
+    thin = max(min(grey.shape) // (120 if smooth else 60), 1)
     share = np.cumsum(np.bincount(grey[::thin, ::thin].ravel(), minlength=256))
     low, high = np.searchsorted(share, (0.02 * share[-1], 0.998 * share[-1])).tolist()
     if high - low < _MIN_CONTRAST:

@@ -32,6 +32,7 @@ class Lens:
             raise ConfigError('camera.distortion: must have 0, 4, 5, 8 or 12 numbers, in the order of OpenCV')
         self.matrix, self.known = matrix, known
         self.distortion = np.concatenate([distortion, np.zeros(12 - distortion.size)])
+        self._straight = not self.distortion.any()
         self._inverse = np.linalg.inv(matrix)
         self._grids: dict[tuple[int, int], FloatArray] = {}
 
@@ -51,7 +52,7 @@ class Lens:
     def rays(self, pixels: FloatArray) -> FloatArray:
         """Rays (..., 2) of pixels (..., 2)."""
         bent: FloatArray = pixels @ self._inverse[:2, :2].T + self._inverse[:2, 2]
-        if not self.distortion.any():
+        if self._straight:
             return bent
         ray: FloatArray = bent
         for _ in range(_ITERATIONS):
@@ -77,6 +78,8 @@ class Lens:
         return self.pixels(points[..., :2] / points[..., 2:])
 
     def _bend(self, rays: FloatArray) -> FloatArray:
+        if self._straight:
+            return rays
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = self.distortion
         x, y = rays[..., 0], rays[..., 1]
         r2 = x * x + y * y

@@ -21,12 +21,12 @@ target is then farther by the factor 1 + keystone (x, y), whatever the focal len
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr
 
 from psd_deflection.camera.answer import RefusedError, Status, TargetPose, plane_of
 from psd_deflection.camera.lens import AFFINE_FOCAL, Lens
@@ -35,6 +35,9 @@ from psd_deflection.records import FloatArray, IntArray
 _STEPS = 15
 _SETTLED = 10.0
 """A step of fewer standard deviations is the last once the picture fits: over it the model is linear."""
+_NEAR, _LINEAR = 30.0, 0.2
+"""The same of some of the pixels, which all of them will correct: as many as change the blur by this share of it, and
+three at least."""
 _THINNED = 4
 _LIGHTS = 6
 _HALF_OCTANT = math.tan(math.pi / 8)
@@ -54,6 +57,9 @@ _SHARPEST = 0.25
 """Smallest blur, px: a pixel's own width."""
 
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
+
+_FAR = 1e6
+"""Farther than any pixel, px."""
 
 MOST_BLUR = 1.0
 """Longest motion blur with an answer, in units of a disc's radius."""
@@ -159,8 +165,7 @@ class Fitter:
         self._lens, self._centres, self._radius = lens, centres, radius
         grid = lens.grid(image_shape)
         self._rows, self._columns = image_shape
-        self._rays = np.ones((3, grid[..., 0].size), dtype=np.float32)
-        self._rays[:2] = grid.reshape(-1, 2).T
+        self._rays = np.ascontiguousarray(grid.reshape(-1, 2).T, dtype=np.float32)
         self._points = np.column_stack([centres, np.ones(len(centres))])
         self._blur = np.eye(2)
 
@@ -190,7 +195,7 @@ class Fitter:
         for _ in range(3):
             normal = self._linearise(rims, shape, noise)
             shape, step, deviation = self._stepped(normal, shape, prior, len(rims.level))
-            if np.all(np.abs(step) < _SETTLED * deviation):
+            if (np.abs(step) < _SETTLED * deviation).all():
                 break
         found = self._judge(normal, rims, shape, step, prior, pixel_radius, full_scale)
         if _motion(shape.blur) < _SKEW_BLUR:
@@ -198,50 +203,58 @@ class Fitter:
         return found
 
     def _gather(self, image: Any, shape: _Shape, half: float) -> tuple[_Rims, FloatArray]:
-        """The pixels nearer than ``half`` to a rim, and first lights by the means in and out of it."""
-        rows, columns = self._rows, self._columns
-        middles = self._lens.project(self._points @ shape.plane.T)
+        """The pixels nearer than ``half`` to a rim, and first lights by the means well in and out of it."""
+        plane = shape.plane
+        middles = self._lens.project(self._points @ plane.T)
         bends = self._bends(middles)
         # Over a disc the way from the image to the plane is nearly affine: good enough to choose pixels.
-        plane = shape.plane
-        slopes = self._slopes(plane, bends)
+        slopes = self._slopes(plane, np.asarray(np.linalg.inv(plane), dtype=float), bends)
         squares = slopes.transpose(0, 2, 1) @ slopes
-        reach = self._radius * np.sqrt(np.linalg.inv(squares)[:, (0, 1), (0, 1)])
-        if (middles - reach).min() < half + 2 or (middles + reach > (columns - half - 3, rows - half - 3)).any():
+        xx, xy, yy = squares[:, 0, 0], squares[:, 0, 1], squares[:, 1, 1]
+        reach = self._radius * np.sqrt(np.stack([yy, xx], axis=1) / (xx * yy - xy * xy)[:, None])
+        limits = (self._columns - half - 3, self._rows - half - 3)
+        if (middles - reach).min() < half + 2 or (middles + reach > limits).any():
             raise RefusedError(Status.OUTSIDE)
         # Wide enough for the direction in which the picture is the longest.
-        bands = half * np.sqrt(np.linalg.eigvalsh(squares)[:, 1])
-        starts = np.floor(middles - reach - half - 1).astype(int).tolist()
-        ends = np.ceil(middles + reach + half + 2).astype(int).tolist()
-        begin, places, parts = [0], [], []
-        wide = np.arange(max(self._rows, self._columns), dtype=float)
-        light = np.zeros((len(self._centres), _LIGHTS))
-        for k, ((left, top), (right, bottom)) in enumerate(zip(starts, ends, strict=True)):
-            u, v = wide[: right - left] + (left - middles[k, 0]), wide[: bottom - top] + (top - middles[k, 1])
-            (xx, xy), (_, yy) = squares[k].tolist()
-            away = np.multiply.outer((2 * xy * v).astype(np.float32), u.astype(np.float32))
-            away += (xx * u * u).astype(np.float32)
-            away += (yy * v * v).astype(np.float32)[:, None]
-            least, most = max(self._radius - float(bands[k]), 0.0) ** 2, (self._radius + float(bands[k])) ** 2
-            near = np.flatnonzero((away > least) & (away < most))
-            down, along = np.divmod(near, right - left)
-            place = near + (down * (columns - right + left) + (top * columns + left))
-            inside = (away.ravel()[near] < self._radius**2).astype(float)
-            level = image.ravel()[place]
-            many, total = float(inside.sum()), float(level.sum())
-            bright = float(inside @ level)
-            light[k, 0], light[k, 3] = (total - bright) / max(len(near) - many, 1.0), bright / max(many, 1.0)
-            size = 1.0 / float(reach[k, 0])
-            flat = np.empty((3, len(near)), dtype=np.float32)
-            flat[0] = 1.0
-            np.multiply(u[along], size, out=flat[1])
-            np.multiply(v[down], size, out=flat[2])
-            places.append(place)
-            parts.append(flat)
-            begin.append(begin[-1] + len(near))
-        chosen = np.concatenate(places)
+        bands = half * np.sqrt((xx + yy) / 2 + np.hypot((xx - yy) / 2, xy))
+        starts = np.floor(middles - reach - half - 1)
+        wide, tall = (int(n) for n in np.ceil((middles + reach - starts).max(axis=0) + half + 2).tolist())
+        # All discs at once, in boxes of one size; of the smaller ones not all is used.
+        u = np.arange(wide) + (starts - middles)[:, :1]
+        v = np.arange(tall) + (starts - middles)[:, 1:]
+        ends = reach + half + 2
+        u[u >= ends[:, :1]], v[v >= ends[:, 1:]] = _FAR, _FAR
+        away = ((2 * xy)[:, None] * v).astype(np.float32)[:, :, None] * u.astype(np.float32)[:, None, :]
+        away += (xx[:, None] * u * u).astype(np.float32)[:, None, :]
+        away += (yy[:, None] * v * v).astype(np.float32)[:, :, None]
+        squared = np.square([np.maximum(self._radius - bands, 0.0), self._radius + bands]).astype(np.float32)
+        least, most = squared[:, :, None, None]
+        near = np.flatnonzero((away > least) & (away < most))
+        line = near // wide
+        along = near - wide * line
+        begin = np.searchsorted(line, np.arange(4) * tall)
+        corner = starts[:, 0] + starts[:, 1] * self._columns
+        chosen = (corner[:, None] + self._columns * np.arange(tall)).astype(int).ravel()[line]
+        chosen += along
         level = image.ravel()[chosen].astype(np.float32)
-        return _Rims(np.array(begin), level, self._rays[:, chosen], np.hstack(parts), bends, chosen), light
+        rays, flat = np.empty((2, 3, len(near)), dtype=np.float32)
+        rays[2] = flat[0] = 1.0
+        np.take(self._rays[0], chosen, out=rays[0], mode='clip')
+        np.take(self._rays[1], chosen, out=rays[1], mode='clip')
+        size = np.float32(1.0 / reach[:, 0].max())
+        np.multiply(along, size, out=flat[1], casting='unsafe')
+        flat[1] += np.repeat((u[:, 0] * size).astype(np.float32), np.diff(begin))
+        np.take((v.ravel() * size).astype(np.float32), line, out=flat[2], mode='clip')
+        # The rise lies between: its pixels would make the contrast too small and the first step too long.
+        some, seen = away.ravel()[near[::_THINNED]], level[::_THINNED]
+        first = -(-begin // _THINNED)
+        light = np.zeros((3, _LIGHTS))
+        for k, (a, b, band) in enumerate(zip(first[:-1].tolist(), first[1:].tolist(), bands.tolist(), strict=True)):
+            inner = some[a:b] < max(self._radius - band / 2, self._radius / 2) ** 2
+            outer = some[a:b] > (self._radius + band / 2) ** 2
+            light[k, 0] = float(seen[a:b] @ outer) / max(int(np.count_nonzero(outer)), 1)
+            light[k, 3] = float(seen[a:b] @ inner) / max(int(np.count_nonzero(inner)), 1)
+        return _Rims(begin, level, rays, flat, bends, chosen), light
 
     def _bends(self, pixels: FloatArray) -> FloatArray:
         """d ray / d pixel (n, 2, 2) at pixels (n, 2)."""
@@ -249,9 +262,9 @@ class Fitter:
         ends = self._lens.rays(pixels[:, None] + offsets)
         return np.stack([ends[:, 0] - ends[:, 1], ends[:, 2] - ends[:, 3]], axis=-1)
 
-    def _slopes(self, plane: FloatArray, bends: FloatArray) -> FloatArray:
+    def _slopes(self, plane: FloatArray, inverse: FloatArray, bends: FloatArray) -> FloatArray:
         """d plane point / d pixel (n, 2, 2) at the discs' centres; it changes little over a disc."""
-        far, inverse = self._points @ plane[2], np.linalg.inv(plane)
+        far = self._points @ plane[2]
         forward = inverse[:2, :2] - self._centres[:, :, None] * inverse[2, :2]
         return np.asarray((forward * far[:, None, None]) @ bends)
 
@@ -260,9 +273,10 @@ class Fitter:
         for _ in range(_STEPS):
             normal = self._linearise(rims, shape, None)
             shape, step, deviation = self._stepped(normal, shape, prior, len(rims.level))
-            if np.all(np.abs(step) < 3.0 * deviation):
+            many = _LINEAR * float(np.trace(shape.blur)) / float(deviation[7] + deviation[9] + 1e-12)
+            if (np.abs(step) < min(max(many, 3.0), _NEAR) * deviation).all():
                 break
-        return shape, self._noise(normal)
+        return shape, _noise(normal, rims, step)
 
     def _stepped(
         self, normal: _Normal, shape: _Shape, prior: Prior, count: int
@@ -270,46 +284,51 @@ class Fitter:
         """The shape after a Gauss-Newton step, the step and the standard deviations."""
         variance = max(normal.squares / max(count - 30, 1), 1e-9)
         stiff, pull = _beforehand(shape, prior)
-        hessian = normal.hessian / variance + np.diag(stiff)
+        inverse = _covariance(normal, variance, stiff)
         gradient = normal.gradient / variance + stiff * pull
-        try:
-            inverse = np.linalg.inv(hessian + 1e-9 * np.diag(np.diag(hessian)))
-        except np.linalg.LinAlgError:
-            raise RefusedError(Status.MISFIT) from None
         step = inverse @ gradient
-        if not np.all(np.isfinite(step)):
+        if not np.isfinite(step).all():
             raise RefusedError(Status.MISFIT)
-        step *= min(1.0, 0.2 / max(float(np.max(np.abs(step[:3]))), 1e-12))
+        step *= min(1.0, 0.2 / max(*np.abs(step[:3]).tolist(), 1e-12))
         light = shape.light + normal.back[:, :, -1] - normal.back[:, :, :-1] @ step
-        deviation = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+        deviation = np.sqrt(np.maximum(inverse.diagonal(), 0.0))
         return _moved(shape, step, light), step, deviation
 
     def _linearise(self, rims: _Rims, shape: _Shape, noise: tuple[float, float] | None) -> _Normal:
         """Normal equations at ``shape``; ``noise``: variances outside and inside, None: equal."""
         plane = shape.plane
-        inverse = np.linalg.inv(plane)
-        slopes = self._slopes(plane, rims.bend)
+        inverse: FloatArray = np.asarray(np.linalg.inv(plane), dtype=float)
+        slopes = self._slopes(plane, inverse, rims.bend)
         curved = (slopes[:, 0, 0] * slopes[:, 1, 1] - slopes[:, 0, 1] * slopes[:, 1, 0]) ** 2 * (0.5 / self._radius)
-        discs = np.column_stack([self._centres, slopes.reshape(-1, 4), curved]).astype(np.float32)
+        discs = np.empty((7, len(slopes)), dtype=np.float32)
+        discs[:2], discs[2:6], discs[6] = self._centres.T, slopes.reshape(-1, 4).T, curved
         # One number a disc to one a pixel.
-        centre_x, centre_y, uu, vu, uv, vv, curved = np.repeat(discs.T, np.diff(rims.begin), axis=1)
+        centre_x, centre_y, uu, vu, uv, vv, curved = np.repeat(discs, rims.begin[1:] - rims.begin[:-1], axis=1)
         px, py, depth = inverse.astype(np.float32) @ rims.rays
         px /= depth
         py /= depth
-        ox, oy = px - centre_x, py - centre_y
-        rho = np.sqrt(ox * ox + oy * oy)
+        ox, oy = np.subtract(px, centre_x, out=centre_x), np.subtract(py, centre_y, out=centre_y)
+        rho = ox * ox
+        rho += oy * oy
+        np.sqrt(rho, out=rho)
         ox /= rho
         oy /= rho
         nx, ny = ox * uu, ox * vu
         nx += oy * uv
         ny += oy * vv
-        flat = 1.0 / np.sqrt(nx * nx + ny * ny)
+        flat = nx * nx
+        flat += ny * ny
+        np.sqrt(flat, out=flat)
+        np.reciprocal(flat, out=flat)
         nx *= flat
         ny *= flat
-        bxx, bxy, byy = (float(b) for b in (shape.blur[0, 0], shape.blur[0, 1], shape.blur[1, 1]))
-        xx, xy, yy = nx * nx, 2 * nx * ny, ny * ny
-        across = bxx * xx + bxy * xy + byy * yy
-        per_sigma = 1.0 / np.sqrt(across)
+        (bxx, bxy), (_, byy) = shape.blur.tolist()
+        xx, xy, yy = nx * nx, nx * ny, ny * ny
+        xy += xy
+        across = bxx * xx
+        across += bxy * xy
+        across += byy * yy
+        per_sigma = np.reciprocal(np.sqrt(across))
         # The rim's curvature, det(slopes)^2 / (radius |slope|^3), moves the half level by the blur along it.
         curved *= flat * flat
         curved *= (bxx + byy) - across
@@ -317,9 +336,11 @@ class Fitter:
         z -= curved
         z *= flat
         z *= per_sigma
-        bell = np.exp(-0.5 * z * z)
+        bell = -0.5 * z
+        bell *= z
+        np.exp(bell, out=bell)
         bell *= 1.0 / _ROOT_2PI
-        level = ndtr(z)
+        level = _below(z, bell)
         rows = np.empty((_LIGHTS + 11 + shape.skew.size + shape.keystone.size, len(z)), dtype=np.float32)
         parameters = rows[_LIGHTS:-1]
         contrast = np.empty_like(z)
@@ -369,7 +390,10 @@ class Fitter:
             np.multiply(rise, square, out=row)
         root = None
         if noise is not None:
-            root = 1.0 / np.sqrt(noise[0] + (noise[1] - noise[0]) * np.clip((z + 1.5) / 3.0, 0.0, 1.0))
+            root = z * ((noise[1] - noise[0]) / 3.0)
+            root += sum(noise) / 2
+            np.clip(root, min(noise), max(noise), out=root)
+            np.reciprocal(np.sqrt(root, out=root), out=root)
             rows *= root
         return self._eliminated(rims, rows, z, (nx, ny), root)
 
@@ -379,21 +403,11 @@ class Fitter:
         spans = zip(rims.begin[:-1].tolist(), rims.begin[1:].tolist(), strict=True)
         gram = np.stack([part @ part.T for part in (rows[:, a:b] for a, b in spans)]).astype(float)
         lights = gram[:, :_LIGHTS, :_LIGHTS]
-        stiff = 1e-7 * np.einsum('kii->k', lights)[:, None, None] * np.eye(_LIGHTS)
-        back = np.linalg.solve(lights + stiff, gram[:, :_LIGHTS, _LIGHTS:])
+        diagonal = np.einsum('kii->ki', lights)
+        diagonal += 1e-7 * diagonal.sum(axis=1, keepdims=True)
+        back = np.linalg.solve(lights, gram[:, :_LIGHTS, _LIGHTS:])
         rest = (gram[:, _LIGHTS:, _LIGHTS:] - gram[:, _LIGHTS:, :_LIGHTS] @ back).sum(axis=0)
         return _Normal(rest[:-1, :-1], rest[:-1, -1], back, rows, z, side, root, max(float(rest[-1, -1]), 0.0))
-
-    @staticmethod
-    def _noise(normal: _Normal) -> tuple[float, float] | None:
-        """Variances outside and inside the discs: bright pixels may be noisier than dark ones."""
-        residual = normal.rows[-1]
-        dark, bright = residual[normal.z < -1.5], residual[normal.z > 1.5]
-        if min(len(dark), len(bright)) < 30:
-            return None
-        # Quantisation alone is 1/12. A side that clips is not much better than the other.
-        low, high = max(float(dark @ dark) / len(dark), 0.1), max(float(bright @ bright) / len(bright), 0.1)
-        return max(low, high / 9), max(high, low / 9)
 
     def _judge(
         self,
@@ -415,15 +429,13 @@ class Fitter:
             raise RefusedError(Status.BLURRED)
         if sharp > MOST_DEFOCUS * pixel_radius:
             raise RefusedError(Status.DEFOCUSED)
-        # The residuals after the last step, which was small.
-        residual = normal.rows[-1].copy()
-        scored = normal.rows[_LIGHTS:-1].copy()
-        for k, back in enumerate(normal.back):
-            of = slice(rims.begin[k], rims.begin[k + 1])
-            part = back.astype(np.float32)
-            scored[:, of] -= part[:, :-1].T @ normal.rows[:_LIGHTS, of]
-            residual[of] -= part[:, -1] @ normal.rows[:_LIGHTS, of]
-        residual -= step.astype(np.float32) @ scored
+        count = len(rims.level)
+        stiff, pull = _beforehand(shape, prior)
+        left = normal.squares - float(step @ (2.0 * normal.gradient - normal.hessian @ step))
+        chi_square = max(left / (count - 30), 1e-9)
+        inverse = _covariance(normal, chi_square, stiff)
+        pose = [*range(6), *range(10 + shape.skew.size, len(inverse))]
+        *pulls, residual = _after(normal, rims, step, inverse[pose])
         raw = residual if normal.root is None else residual / normal.root
         sector = _sectors(normal.side, rims)
         relative = raw / float(contrast.mean())
@@ -432,30 +444,35 @@ class Fitter:
         misfit = self._misfit(normal.z, relative, sector, rims, full_scale)
         if misfit > MOST_MISFIT + MISFIT_OF_BLUR * min(max(motion / sharp - 0.5, 0.0), 1.5):
             raise RefusedError(Status.MISFIT)
-        count = len(residual)
-        chi_square = float(residual @ residual) / (count - 30)
-        stiff, pull = _beforehand(shape, prior)
-        inverse = np.linalg.inv(normal.hessian / chi_square + np.diag(stiff))
         # What the model does not say: a level that is off by the misfit moves the rim by that over the steepest rise.
         # It may be one disc's alone, and moves a rim more easily than it bends one.
         wrong = 4.0 * misfit * _ROOT_2PI * math.hypot(sharp, motion)
-        bent = inverse @ _of_bent_rims(normal, rims, scored) / (pixel_radius * chi_square)
+        bent = inverse @ _of_bent_rims(normal, rims) / (pixel_radius * chi_square)
         bent[:, :6] *= math.hypot(CENTRE_FLOOR, wrong)
         bent[:, 6:] *= 0.5 * wrong
         # Pixels may be wrong together: along a rim, or along the rows or columns in which a camera is read.
-        pose = [*range(6), *range(len(inverse) - shape.keystone.size, len(inverse))]
-        pulls = (inverse[pose].astype(np.float32) @ scored) * (residual / chi_square)
-        line, column = np.divmod(rims.pixel, self._columns)
-        inverse = inverse[np.ix_(pose, pose)]
-        wider = np.ones(len(pose))
-        for group in (sector, line - int(line.min()), column - int(column.min())):
-            squares = [float(total @ total) for total in (np.bincount(group, pull) for pull in pulls)]
-            wider = np.maximum(wider, np.sqrt(np.divide(squares, np.diag(inverse))))
+        weighted = residual / np.float32(chi_square)
+        line = rims.pixel // self._columns
+        column = rims.pixel - self._columns * line
+        squares = np.zeros(len(pose))
+        # Pixels of one line follow each other.
+        begin = np.concatenate([[0], 1 + np.flatnonzero(line[1:] != line[:-1])])
+        lines = line[begin]
+        for k, one in enumerate(pulls):
+            one *= weighted
+            totals = (
+                np.bincount(sector, one),
+                np.bincount(column, one),
+                np.bincount(lines, np.add.reduceat(one, begin)),
+            )
+            squares[k] = max(float(total @ total) for total in totals)
+        inverse = inverse[pose][:, pose]
+        wider = np.sqrt(np.maximum(squares / inverse.diagonal(), 1.0))
         covariance = inverse * np.outer(wider, wider)
         covariance += bent[pose] @ bent[pose].T
         # What the first three moments of the motion do not say of its mean.
         covariance[:6, :6] += self._moved_centres(shape, MEAN_OF_BLUR * max(motion - 0.15, 0.0))
-        noise = float(np.sqrt(np.mean(raw * raw)))
+        noise = math.sqrt(float(raw @ raw) / count)
         return TargetPose(
             shape.rotation,
             shape.place,
@@ -487,27 +504,20 @@ class Fitter:
         camera's own profile, which moves no centre. Raises RefusedError.
         """
         parts, worst = 3 * _SECTORS, 0.0
-        for k in range(3):
-            of = slice(rims.begin[k], rims.begin[k + 1])
-            here, off = z[of], raw[of]
-            full = float(np.mean(rims.level[of][here > 1.0] >= full_scale - 1.0))
-            if full > 0.1:
-                # Blooming: the rise ends at full scale before it has reached its level.
-                high, low = off[(here > 0.3) & (here < 1.2)], off[(here < -0.3) & (here > -1.2)]
-                uneven = abs(float(high.mean() + low.mean())) / 2 if len(high) and len(low) else 0.0
-                worst = max(worst, uneven)
-                if uneven > UNEVEN:
-                    raise RefusedError(Status.SATURATED)
-        if math.sqrt(float(np.mean(raw * raw))) > MOST_NOISE:
+        if rims.level.max() >= full_scale - 1.0:
+            worst = _unevenness(z, raw, rims, full_scale)
+            if worst > UNEVEN:
+                raise RefusedError(Status.SATURATED)
+        if math.sqrt(float(raw @ raw) / len(raw)) > MOST_NOISE:
             raise RefusedError(Status.MISFIT)
         zone = np.clip((z + 3.0) * (_ZONES / 6.0), 0, _ZONES - 1).astype(int)
         cell = sector * _ZONES + zone
         count = np.bincount(cell, minlength=parts * _ZONES).reshape(parts, _ZONES).astype(float)
         total = np.bincount(cell, raw, parts * _ZONES).reshape(parts, _ZONES)
-        square = np.bincount(cell, raw * raw, parts * _ZONES).reshape(parts, _ZONES)
+        squares = float(raw @ raw)
         mean = total / np.maximum(count, 1.0)
         common = total.sum(axis=0) / np.maximum(count.sum(axis=0), 1.0)
-        within = max(float((square - mean * total).sum() / max(count.sum() - np.count_nonzero(count), 1.0)), 0.0)
+        within = max(float((squares - (mean * total).sum()) / max(count.sum() - np.count_nonzero(count), 1.0)), 0.0)
         filled = count > 3
         excess = np.where(filled, (mean - common) ** 2 - within / np.maximum(count, 1.0), 0.0)
         by_sector = excess.sum(axis=1) / np.maximum(filled.sum(axis=1), 1)
@@ -542,22 +552,99 @@ class Fitter:
         return bool(np.any(dwell[1:-1] < DIP * np.minimum(left[:-2], right[2:]) - 0.015))
 
 
-def _of_bent_rims(normal: _Normal, rims: _Rims, scored: Pixels) -> FloatArray:
+def _covariance(normal: _Normal, variance: float, stiff: FloatArray) -> FloatArray:
+    """Of the parameters, if a residual has ``variance``. Raises RefusedError."""
+    hessian = normal.hessian / variance
+    diagonal = np.einsum('ii->i', hessian)
+    diagonal += stiff
+    diagonal *= 1.0 + 1e-9
+    try:
+        return np.asarray(np.linalg.inv(hessian), dtype=float)
+    except np.linalg.LinAlgError:
+        raise RefusedError(Status.MISFIT) from None
+
+
+def _after(normal: _Normal, rims: _Rims, step: FloatArray, ways: FloatArray) -> Pixels:
+    """``ways`` (q, p) @ the derivatives with the lights eliminated, then the residuals after ``step``.
+
+    (q + 1, n), weighted as ``normal.rows`` are. The step must be small.
+    """
+    q, parameters = len(ways), len(step)
+    onto = np.zeros((len(normal.back), q + 1, _LIGHTS + parameters + 1))
+    onto[:, :q, _LIGHTS:-1] = ways
+    onto[:, q, _LIGHTS:-1] = -step
+    onto[:, :, :_LIGHTS] = -onto[:, :, _LIGHTS:-1] @ normal.back[:, :, :-1].transpose(0, 2, 1)
+    onto[:, q, :_LIGHTS] -= normal.back[:, :, -1]
+    onto[:, q, -1] = 1.0
+    begin = rims.begin.tolist()
+    out = np.empty((q + 1, begin[-1]), dtype=np.float32)
+    for a, b, one in zip(begin[:-1], begin[1:], onto.astype(np.float32), strict=True):
+        np.matmul(one, normal.rows[:, a:b], out=out[:, a:b])
+    return out
+
+
+def _noise(normal: _Normal, rims: _Rims, step: FloatArray) -> tuple[float, float] | None:
+    """Variances outside and inside the discs after ``step``: bright pixels may be noisier than dark ones."""
+    residual = _after(normal, rims, step, np.zeros((0, len(step))))[0]
+    dark, bright = residual[normal.z < -1.5], residual[normal.z > 1.5]
+    if min(len(dark), len(bright)) < 30:
+        return None
+    # Quantisation alone is 1/12. A side that clips is not much better than the other.
+    low, high = max(float(dark @ dark) / len(dark), 0.1), max(float(bright @ bright) / len(bright), 0.1)
+    return max(low, high / 9), max(high, low / 9)
+
+
+def _unevenness(z: Pixels, raw: Pixels, rims: _Rims, full_scale: float) -> float:
+    """Of the rises of discs that reach full scale: blooming ends a rise before it has reached its level."""
+    worst = 0.0
+    for a, b in zip(rims.begin[:-1].tolist(), rims.begin[1:].tolist(), strict=True):
+        here, off = z[a:b], raw[a:b]
+        if float(np.mean(rims.level[a:b][here > 1.0] >= full_scale - 1.0)) > 0.1:
+            high, low = off[(here > 0.3) & (here < 1.2)], off[(here < -0.3) & (here > -1.2)]
+            if len(high) and len(low):
+                worst = max(worst, abs(float(high.mean() + low.mean())) / 2)
+    return worst
+
+
+def _of_bent_rims(normal: _Normal, rims: _Rims) -> FloatArray:
     """What rims that are not where the model has them do to the gradient (p, 15), for a shift of the pixel radius.
 
     Of each disc the shifts by the cosine and sine of the angle around it (columns 0 to 5), by those of twice the angle,
     which are a tilt, and all around.
     """
-    x, y = normal.side
-    moved, bent = [], []
-    for a, b in zip(rims.begin[:-1].tolist(), rims.begin[1:].tolist(), strict=True):
-        along, down = x[a:b], y[a:b]
-        around = np.stack([along, down, along * along - down * down, 2 * along * down, np.ones_like(along)])
-        # The derivative by the radius is that by a shift of the whole rim.
-        by_shape = (scored[:, a:b] @ (around * normal.rows[_LIGHTS + 6, a:b]).T).astype(float)
-        moved.append(by_shape[:, :2])
-        bent.append(by_shape[:, 2:])
-    return np.hstack(moved + bent)
+    # Some of the pixels are enough for what only widens the covariance.
+    x, y = (side[::_THINNED] for side in normal.side)
+    rows = np.ascontiguousarray(normal.rows[:-1, ::_THINNED])
+    # The derivative by the radius is that by a shift of the whole rim.
+    around = np.empty((5, len(x)), dtype=np.float32)
+    np.multiply(rows[_LIGHTS + 6], _THINNED, out=around[4])
+    np.multiply(x, around[4], out=around[0])
+    np.multiply(y, around[4], out=around[1])
+    np.multiply(x, around[0], out=around[2])
+    around[2] -= y * around[1]
+    np.multiply(y, around[0], out=around[3])
+    around[3] *= 2.0
+    begin = (-(-rims.begin // _THINNED)).tolist()
+    by_row = np.array([rows[:, a:b] @ around[:, a:b].T for a, b in itertools.pairwise(begin)])
+    by_shape = by_row[:, _LIGHTS:] - normal.back[:, :, :-1].transpose(0, 2, 1) @ by_row[:, :_LIGHTS]
+    return np.hstack([*by_shape[:, :, :2], *by_shape[:, :, 2:]])
+
+
+def _below(z: Pixels, bell: Pixels) -> Pixels:
+    """The normal distribution up to ``z``, whose density is ``bell``, to 3e-7: Abramowitz and Stegun, 26.2.17."""
+    t: Pixels = np.abs(z)
+    t *= 0.2316419
+    t += 1.0
+    np.reciprocal(t, out=t)
+    tail: Pixels = t * np.float32(1.330274429)
+    for coefficient in (-1.821255978, 1.781477937, -0.356563782, 0.319381530):
+        tail += coefficient
+        tail *= t
+    tail *= bell
+    np.subtract(0.5, tail, out=tail)
+    np.copysign(tail, z, out=tail)
+    tail += 0.5
+    return tail
 
 
 def _expected(prior: Prior, rotation: FloatArray) -> FloatArray:
@@ -568,13 +655,15 @@ def _expected(prior: Prior, rotation: FloatArray) -> FloatArray:
 def _beforehand(shape: _Shape, prior: Prior) -> tuple[FloatArray, FloatArray]:
     """What is known without this image: inverse variances of the parameters; how far each is from what is expected."""
     size = 10 + shape.skew.size
-    stiff, pull = np.zeros(size + shape.keystone.size), np.zeros(size + shape.keystone.size)
+    stiff, pull = np.zeros((2, size + shape.keystone.size))
     # The tilt against the prior's plane in the target's own axes: a turn in the plane does not change it.
-    off = prior.rotation.T @ shape.rotation
-    stiff[:2], pull[:2] = prior.sd**-2, (-off[2, 1], off[2, 0])
+    x, y, _ = (prior.rotation[:, 2] @ shape.rotation).tolist()
+    stiff[0] = stiff[1] = prior.sd**-2
+    pull[0], pull[1] = -y, x
     stiff[6], pull[6] = RADIUS_SD**-2, 1.0 - shape.swell
-    # No motion is skewed by more than about one.
-    stiff[10:size], pull[10:size] = 1.0, -shape.skew
+    if shape.skew.size:
+        # No motion is skewed by more than about one.
+        stiff[10:size], pull[10:size] = 1.0, -shape.skew
     if shape.keystone.size:
         # That of a tilt of one sd, seen by a focal length of one image width.
         stiff[size:] = (prior.sd * AFFINE_FOCAL / float(shape.place[2])) ** -2
@@ -583,30 +672,37 @@ def _beforehand(shape: _Shape, prior: Prior) -> tuple[FloatArray, FloatArray]:
 
 
 def _moved(shape: _Shape, step: FloatArray, light: FloatArray) -> _Shape:
-    blur = shape.blur + np.array([[step[7], step[8]], [step[8], step[9]]])
+    by_xx, by_xy, by_yy = step[7:10].tolist()
+    blur = np.add(shape.blur, [[by_xx, by_xy], [by_xy, by_yy]])
     small, large = _spread(blur)
     if small < _SHARPEST**2 or large > 900.0:
         values, vectors = np.linalg.eigh(blur)
         blur = (vectors * np.clip(values, _SHARPEST**2, 900.0)) @ vectors.T
+    skews = shape.skew.size
     return _Shape(
         shape.rotation @ turned(step[:3]),
         shape.place + step[3:6],
-        float(np.clip(shape.swell + step[6], 0.7, 1.4)),
+        min(max(shape.swell + float(step[6]), 0.7), 1.4),
         blur,
-        np.clip(shape.skew + step[10 : 10 + shape.skew.size], -1.5, 1.5),
+        np.clip(shape.skew + step[10 : 10 + skews], -1.5, 1.5) if skews else shape.skew,
         light,
-        shape.keystone + step[10 + shape.skew.size :],
+        shape.keystone + step[10 + skews :],
     )
 
 
 def turned(v: FloatArray) -> FloatArray:
     """The rotation (3, 3) about ``v`` by its length, rad (Rodrigues)."""
-    angle = float(np.linalg.norm(v))
-    cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    if angle < 1e-9:
-        return np.asarray(np.eye(3) + cross)
-    sine, versed = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
-    return np.asarray(np.eye(3) + sine * cross + versed * cross @ cross)
+    x, y, z = v.tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    sine, versed = (math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2) if angle > 1e-9 else (1.0, 0.5)
+    sx, sy, sz, vx, vy, vz = sine * x, sine * y, sine * z, versed * x, versed * y, versed * z
+    return np.array(
+        [
+            [1.0 - vy * y - vz * z, vx * y - sz, vx * z + sy],
+            [vx * y + sz, 1.0 - vx * x - vz * z, vy * z - sx],
+            [vx * z - sy, vy * z + sx, 1.0 - vx * x - vy * y],
+        ]
+    )
 
 
 def _motion(blur: FloatArray) -> float:
@@ -618,12 +714,11 @@ def _motion(blur: FloatArray) -> float:
 def _sectors(side: tuple[Pixels, Pixels], rims: _Rims) -> IntArray:
     """The part of a rim to which each pixel belongs, counted through all discs: 16 parts of equal angle."""
     x, y = np.abs(side[0]), np.abs(side[1])
-    part = np.repeat(_SECTORS * np.arange(len(rims.begin) - 1), np.diff(rims.begin))
-    part += side[0] > 0
-    part += 2 * (side[1] > 0)
-    part += 4 * (y > x)
-    part += 8 * (np.minimum(x, y) > _HALF_OCTANT * np.maximum(x, y))
-    return part
+    part = (np.minimum(x, y) > _HALF_OCTANT * np.maximum(x, y)).astype(np.uint8)
+    for bit in (y > x, side[1] > 0, side[0] > 0):
+        part += part
+        part += bit
+    return np.asarray(np.repeat(_SECTORS * np.arange(len(rims.begin) - 1), np.diff(rims.begin)) + part)
 
 
 def _width(blur: FloatArray) -> float:
@@ -633,5 +728,6 @@ def _width(blur: FloatArray) -> float:
 
 def _spread(blur: FloatArray) -> tuple[float, float]:
     """The eigenvalues of a variance (2, 2), the smaller first."""
-    half, apart = (blur[0, 0] + blur[1, 1]) / 2, math.hypot((blur[0, 0] - blur[1, 1]) / 2, blur[0, 1])
-    return float(half - apart), float(half + apart)
+    (xx, xy), (_, yy) = blur.tolist()
+    half, apart = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)
+    return half - apart, half + apart
