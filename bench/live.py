@@ -5,7 +5,7 @@ Every figure stands beside a peer's from the same run, as a ratio: machines diff
 - Latency: last byte of a block written to the port -> callback in another process, beside a bare
   publisher of the same message -> the same callback, both in the same subscriber at the same time.
 - The same with the live page open, in turns with the node alone.
-- CPU: the node with recording, as a share of one core.
+- CPU: the node with recording, as a share of one core, beside the sum of its bare parts.
 - Start: from the command to the first estimate that another process hears, beside a bare publisher's.
 
 The rows go into ``bench/results.json``, unless the node is that of ``--checkout``, another version of this repository:
@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import itertools
 import json
 import os
 import subprocess
@@ -25,7 +26,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -121,6 +122,98 @@ def looker(url: str) -> None:
     print(asyncio.run(look()))
 
 
+def used(seconds: float, turn: Callable[[], object]) -> None:
+    """Prints the share of a core that this process takes, in percent, if it does ``turn`` once a block."""
+    end, before = time.monotonic() + seconds, time.process_time()
+    due = time.monotonic()
+    while due < end:
+        turn()
+        due += 1.0 / BLOCKS_PER_S
+        time.sleep(max(due - time.monotonic(), 0.0))
+    print(100.0 * (time.process_time() - before) / seconds)
+
+
+def bare_reader(port: str, seconds: float) -> None:
+    """Child process: reads the port and does nothing with it."""
+    fd = os.open(port, os.O_RDONLY | os.O_NOCTTY)
+    used(seconds, lambda: os.read(fd, 4096))
+
+
+def blocks_of(recording: str) -> Iterator[list[tuple[str, str, bytes]]]:
+    """For ever: the messages of one block after the other, as topic, type and bytes."""
+    from mcap.reader import make_reader
+
+    blocks: dict[int, list[tuple[str, str, bytes]]] = {}
+    with next(Path(recording).glob('*.mcap')).open('rb') as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            if schema is not None:
+                blocks.setdefault(message.log_time // 20_000_000, []).append((channel.topic, schema.name, message.data))
+    return itertools.cycle(blocks.values())
+
+
+def bare_publishers(recording: str, seconds: float) -> None:
+    """Child process: publishes the messages of each block, which are encoded already."""
+    import rclpy
+
+    from psd_deflection.ros.wires import message_class
+
+    rclpy.init()
+    node = rclpy.create_node('bench_publishers')
+    blocks = blocks_of(recording)
+    publishers = {topic: node.create_publisher(message_class(kind), topic, 10) for topic, kind, _ in next(blocks)}
+
+    def turn() -> None:
+        for topic, _, data in next(blocks):
+            if topic in publishers:
+                publishers[topic].publish(data)
+
+    used(seconds, turn)
+
+
+def bare_writer(recording: str, seconds: float) -> None:
+    """Child process: writes the messages of each block into an MCAP file."""
+    from mcap.writer import CompressionType, Writer
+
+    blocks = blocks_of(recording)
+    with tempfile.TemporaryFile() as file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start()
+        channels: dict[str, int] = {}
+
+        def turn() -> None:
+            now = time.time_ns()
+            for topic, kind, data in next(blocks):
+                if topic not in channels:
+                    channels[topic] = writer.register_channel(
+                        topic, 'cdr', writer.register_schema(kind, 'ros2msg', b'')
+                    )
+                writer.add_message(channels[topic], now, data, now)
+
+        used(seconds, turn)
+
+
+def parts(seconds: float, times: int) -> list[float]:
+    """Reading the port, publishing and writing the same messages, each alone: the sum of their CPU, % of a core."""
+    sums = []
+    with tempfile.TemporaryDirectory() as folder:
+        recording, _ = make_recording(Path(folder), 0.1)
+        for _ in range(times):
+            device = Device()
+            device.thread.start()
+            total = 0.0
+            for role, what in (
+                ('reader', device.port.name),
+                ('publishers', str(recording)),
+                ('writer', str(recording)),
+            ):
+                said, _ = child(role, what, seconds).communicate()
+                total += float(said)
+            sums.append(total)
+            device.stop.set()
+            device.thread.join()
+    return sums
+
+
 class Device:
     """Writes samples to a port by the clock; notes when the last byte of each block was written."""
 
@@ -154,9 +247,9 @@ class Device:
                 self.written.append(time.monotonic_ns())
 
 
-def child(role: str, url: str = '') -> subprocess.Popen[str]:
+def child(role: str, what: str = '', seconds: float = 0.0) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, '-m', 'bench.live', '--role', role, '--url', url],
+        [sys.executable, '-m', 'bench.live', '--role', role, '--of', what, '--seconds', str(seconds)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -243,7 +336,7 @@ def live(node: Node, seconds: float, settle: float, rounds: int) -> list[Row]:
     for _ in range(rounds):
         measure(node, seconds / rounds, settle, False, alone)
         measure(node, seconds / rounds, settle, True, with_page)
-    return live_rows(alone, with_page)
+    return live_rows(alone, with_page, parts(seconds / rounds, rounds))
 
 
 def make_recording(folder: Path, minutes: float) -> tuple[Path, int]:
@@ -310,10 +403,13 @@ def start(node_of: Node, times: int) -> Row:
     )
 
 
-def live_rows(alone: Latencies, with_page: Latencies) -> list[Row]:
+def live_rows(alone: Latencies, with_page: Latencies, bare_parts: list[float]) -> list[Row]:
     """What :func:`live` measured."""
     rows = []
-    for what, found, bounds in (('', alone, (1.4, 1.2)), (', live page looked at', with_page, (None, None))):
+    for what, found, bounds, most in (
+        ('', alone, (1.4, 1.2), 1.25),
+        (', live page looked at', with_page, (None, None), 1.5),
+    ):
         for word, percent, parts, bound in (('median', 50, 10, bounds[0]), ('99th percentile', 99, 3, bounds[1])):
             # In parts of the run, so that there is a spread.
             ours, bare = (
@@ -331,7 +427,16 @@ def live_rows(alone: Latencies, with_page: Latencies) -> list[Row]:
                 )
             )
         shares = [100 * share for share in found.shares]
-        rows.append(Row(f'live{what}: CPU of the node, recording', '% of a core', [figure('node', 'ours', shares)]))
+        rows.append(
+            Row(
+                f'live{what}: CPU of the node, recording',
+                '% of a core',
+                [
+                    figure('node', 'ours', shares),
+                    figure('reading the port, publishing, writing, each bare and alone', 'limit', bare_parts, most),
+                ],
+            )
+        )
     return rows
 
 
@@ -346,15 +451,19 @@ def main() -> int:
     parser.add_argument('--results', type=Path, default=RESULTS)
     parser.add_argument('--settle', type=float, default=5.0, help='seconds before each measurement')
     parser.add_argument('--rounds', type=int, default=2, help='in which it is done, so that a busy moment meets both')
-    parser.add_argument('--role', choices=('subscriber', 'bare', 'looker'), help=argparse.SUPPRESS)
-    parser.add_argument('--url', help=argparse.SUPPRESS)
+    roles: dict[str, Callable[[], None]] = {
+        'subscriber': subscriber,
+        'bare': bare_publisher,
+        'looker': lambda: looker(args.of),
+        'reader': lambda: bare_reader(args.of, args.seconds),
+        'publishers': lambda: bare_publishers(args.of, args.seconds),
+        'writer': lambda: bare_writer(args.of, args.seconds),
+    }
+    parser.add_argument('--role', choices=tuple(roles), help=argparse.SUPPRESS)
+    parser.add_argument('--of', help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.role == 'subscriber':
-        subscriber()
-    elif args.role == 'bare':
-        bare_publisher()
-    elif args.role == 'looker':
-        looker(args.url)
+    if args.role:
+        roles[args.role]()
     else:
         node = Node(args.checkout.resolve(), args.parameters)
         rows = live(node, args.seconds, args.settle, args.rounds)
