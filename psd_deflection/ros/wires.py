@@ -111,13 +111,12 @@ class VoltsPublisher:
 class InputRecorder:
     """Gives the session what other nodes say, as it arrives.
 
-    ``session``: the one that takes it, or None. A message that is too long for its type is ignored and
-    counted in ``refused``, so that another node cannot fill the disk. ``below``: as of :class:`PublisherWire`.
+    ``session``: the one that takes it, or None. A message that is too long for its type is refused, so that another
+    node cannot fill the disk. ``below``: as of :class:`PublisherWire`.
     """
 
     def __init__(self, node: Node, topics: Iterable[str], below: str = '') -> None:
         self.session: Session | None = None
-        self.refused = 0
         self._node = node
         self._below = below
         self._subscriptions: dict[str, Subscription] = {}
@@ -139,14 +138,14 @@ class InputRecorder:
             )
 
     def _received(self, topic: str, message: bytes) -> None:
+        if self.session is None:
+            return
         if len(message) > MAX_INPUT_BYTES:
-            self.refused += 1
-        elif self.session is not None:
-            record = self.session.take_input(topic, bytes(message))
+            self.session.refuse_input(topic, f'{len(message)} bytes: must be at most {MAX_INPUT_BYTES}')
+            return
+        record = self.session.take_input(topic, bytes(message))
+        if isinstance(record, TemperatureReading):
             try:
-                if record is None:
-                    self.refused += 1
-                elif isinstance(record, TemperatureReading):
-                    self.session.temperature(record.celsius)
-            except TimeoutError:
-                self.refused += 1
+                self.session.temperature(record.celsius)
+            except TimeoutError as error:
+                self.session.refuse_input(topic, str(error))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from msg_adapters import ACCELERATION
 from psd_deflection.filtering.inertia import HOLD_NS
 from psd_deflection.filtering.motion import AXES, Innovations
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
@@ -39,6 +40,7 @@ class _Seen(NamedTuple):
     degraded: int
     contradictions: int
     clock_jumps: int
+    refused: int
 
 
 class HealthReporter:
@@ -66,6 +68,7 @@ class HealthReporter:
             pipeline.degraded,
             s.pipeline.stamped.contradictions,
             wire.clock_jumps,
+            s.refused.total(),
         )
         # The first report counts from the start. The time that it covers is unknown, so it gives no rates.
         before = self._seen
@@ -101,6 +104,9 @@ class HealthReporter:
             level, message = ERROR, 'no samples'
         elif new.lost or new.bad or new.dropped:
             level, message = WARN, f'{new.lost} samples lost, {new.bad} bad frames, {new.dropped} dropped'
+        elif new.refused:
+            level = WARN
+            message = '; '.join(f'{topic}: refused: {why}' for topic, why in sorted(s.why_refused.items()))
         values = [
             ('port', s.rig.acquisition.port),
             ('rate (samples/s)', rate),
@@ -116,6 +122,7 @@ class HealthReporter:
             ('disconnects', str(wire.disconnects)),
             ('silences', str(wire.silences)),
             ('refused on coming back', str(wire.refused_reopenings)),
+            *((f'messages refused: {topic}', str(count)) for topic, count in sorted(s.refused.items())),
             ('blocks waiting', str(s.acquisition.queue.qsize())),
         ]
         values.append(('simulated', 'yes' if s.simulated else 'no'))
@@ -207,17 +214,17 @@ class HealthReporter:
             ('base accelerations', str(motion.inertia.count)),
             ('base accelerations, after their samples', str(motion.inertia.late)),
             ('base accelerations, not ended by another', str(motion.inertia.ended)),
-            ('base accelerations, refused', str(self._session.refused_accelerations)),
+            ('base accelerations, refused', str(self._session.refused[ACCELERATION])),
             *zip(LOAD_WALK, (f'{walk:.3g}' for walk in motion.load_walk()), strict=True),
         ]
         level, message = OK, 'the modes foretell the samples'
         worst = max(new.means())
         told = motion.inertia
-        base = (told.count, told.late, told.ended, self._session.refused_accelerations)
+        base = (told.count, told.late, told.ended, self._session.refused[ACCELERATION])
         came, late, ended, refused = (max(now - then, 0) for now, then in zip(base, self._base, strict=True))
         self._base = base
         if refused:
-            level, message = WARN, f'{refused} base accelerations refused: {self._session.why_refused}'
+            level, message = WARN, f'{refused} base accelerations refused: {self._session.why_refused[ACCELERATION]}'
         elif ended:
             level = WARN
             message = f'no base acceleration came for {HOLD_NS / 1e9:g} s, and the last one was not 0: taken as 0'

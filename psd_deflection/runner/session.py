@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, wait
 from functools import partial
@@ -73,8 +74,8 @@ def why_no_zero(pipeline: Pipeline) -> str:
 class Session:
     """Opens the device on construction. ``say`` and every function in ``listeners`` get one line for each
     change of state, from any thread. ``input_sinks`` get known loads, references and temperatures as they come.
-    ``load``: the known load that is held now, or None. ``refused_accelerations``: their number, with
-    ``why_refused`` of the last one. ``node``: full name of the ROS node, for recordings.
+    ``load``: the known load that is held now, or None. ``refused``: messages of other nodes that could not
+    be used, by topic, ``why_refused``: the last one of each. ``node``: full name of the ROS node, for recordings.
     ``unzeroed``: ``rig`` with the zero that it was given, if it has one that was taken in an earlier session.
 
     Raises DeviceError, ConfigError, SolverError or RecordingError if the run cannot start.
@@ -86,8 +87,8 @@ class Session:
         self.listeners: list[Callable[[str], None]] = [say]
         self.input_sinks: list[RecordSink] = []
         self.load: AppliedLoad | None = None
-        self.refused_accelerations = 0
-        self.why_refused = ''
+        self.refused: Counter[str] = Counter()
+        self.why_refused: dict[str, str] = {}
         say = self._tell
         self._repeats = Repeats(say)
         check_live(rig.estimator.solver)
@@ -241,9 +242,11 @@ class Session:
             self.watcher.put_message(topic, TOPIC_TYPES[topic], message, self.acquisition.now_ns())
         try:
             record = from_fields(topic, cdr.decode(TOPIC_TYPES[topic], message))
-        except ValueError:
+        except ValueError as error:
+            self.refuse_input(topic, str(error))
             return None
         if not all(math.isfinite(n) for field in record for n in (field if isinstance(field, tuple) else (field,))):
+            self.refuse_input(topic, 'a number is not finite')
             return None
         if record.t_ns == 0:
             record = record._replace(t_ns=self.acquisition.now_ns())
@@ -267,7 +270,7 @@ class Session:
         try:
             record = accel_stamped.to_base(cdr.decode(TOPIC_TYPES[ACCELERATION], message))
         except ValueError as error:
-            self.processing.later(partial(self._refuse_acceleration, str(error)))
+            self.refuse_input(ACCELERATION, str(error))
             return None
         self.processing.later(partial(self._accelerate, record, message))
         return record
@@ -276,7 +279,7 @@ class Session:
         try:
             known_ns = self.pipeline.accelerate(record)
         except ValueError as error:
-            self._refuse_acceleration(str(error))
+            self._refuse(ACCELERATION, str(error))
             return
         if known_ns is None:
             return
@@ -286,10 +289,14 @@ class Session:
         for sink in self.input_sinks:
             sink.put(record)
 
-    def _refuse_acceleration(self, why: str) -> None:
-        self.refused_accelerations += 1
-        self.why_refused = why
-        self._repeats.tell('acceleration', Warned(f'{ACCELERATION}: refused: {why}'), time.monotonic())
+    def refuse_input(self, topic: str, why: str) -> None:
+        """Count a message of another node that cannot be used, and say so."""
+        self.processing.later(partial(self._refuse, topic, why))
+
+    def _refuse(self, topic: str, why: str) -> None:
+        self.refused[topic] += 1
+        self.why_refused[topic] = why
+        self._repeats.tell(f'refused {topic}', Warned(f'{topic}: refused: {why}'), time.monotonic())
 
     def note_load(self, fx: float, fy: float, tz: float, *, add: bool = False) -> AppliedLoad:
         """Take down that this load (N, N, N m) acts at the tip from now on, as if it had come on ``/link_tip/load``.

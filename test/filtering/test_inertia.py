@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +14,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from blind import motion
-from msg_adapters import to_messages
+from msg_adapters import ACCELERATION, to_messages
 from psd_deflection.config import rig_from_values
 from psd_deflection.filtering import inertia
 from psd_deflection.filtering.inertia import HOLD_NS, Inertia
@@ -225,7 +226,7 @@ def test_what_comes_late_is_put_right(run: motion.Run, monkeypatch: pytest.Monke
 
 def test_diagnostics_say_what_is_wrong_with_what_is_told(run: motion.Run) -> None:
     pipeline = Pipeline(motion.rig_of())
-    session: Any = SimpleNamespace(pipeline=pipeline, refused_accelerations=0, why_refused='')
+    session: Any = SimpleNamespace(pipeline=pipeline, refused=Counter(), why_refused={})
     health = HealthReporter(session)
 
     def said() -> tuple[int, str]:
@@ -235,7 +236,7 @@ def test_diagnostics_say_what_is_wrong_with_what_is_told(run: motion.Run) -> Non
     told = list(run.told)
     through(pipeline, run, range(25), told)
     assert said() == (0, 'the modes foretell the samples')
-    session.refused_accelerations, session.why_refused = 3, 'no frame'
+    session.refused[ACCELERATION], session.why_refused[ACCELERATION] = 3, 'no frame'
     through(pipeline, run, range(25, 30), told)
     assert said() == (1, '3 base accelerations refused: no frame')
     # Of four messages in a block two come late.

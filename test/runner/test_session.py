@@ -17,7 +17,7 @@ from psd_deflection.recordings.readers import open_recording
 from psd_deflection.records import AppliedLoad, Record, ReferencePose
 from psd_deflection.runner import processing
 from psd_deflection.runner import session as module
-from psd_deflection.runner.diagnostics import STALE, HealthReporter
+from psd_deflection.runner.diagnostics import STALE, WARN, HealthReporter
 from psd_deflection.runner.session import Session
 from test.heard import WAIT_S
 from test.runner.conftest import Estimates, ScriptedDevice
@@ -157,3 +157,10 @@ def test_an_input_that_is_no_number_is_recorded_and_not_shown(running: Running) 
     assert isinstance(now, ReferencePose)
     assert now.t_ns > good.t_ns
     assert seen.records == [good, now]
+    # Both are counted, and the last reason is told.
+    running.session.processing.request(lambda: None)
+    assert running.session.refused == {REFERENCE: 2}
+    entry = HealthReporter(running.session).report(0).entries[0]
+    assert dict(entry.values)[f'messages refused: {REFERENCE}'] == '2'
+    assert entry.level == WARN
+    assert entry.message.startswith(f'{REFERENCE}: refused: ')
