@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import chi2
 
 from psd_deflection.discovery.comparison import Comparison
@@ -60,20 +59,20 @@ class Screen:
     def __init__(self, workspace: Comparison, found: Sequence[tuple[Candidate, Columns]]) -> None:
         self.candidates: list[Candidate] = []
         self.slices: list[slice] = []
-        parts: list[npt.NDArray[np.float32]] = []
+        # One array from the start: a recording of minutes has hundreds of megabytes of signatures.
+        rows = np.empty((sum(len(c) for _, c in found), sum(m.size for m in workspace.measured)), dtype=np.float32)
         at = 0
         for candidate, columns in found:
-            white = [workspace.whiten(column).astype(np.float32) for column in columns]
+            white = rows[at : at + len(columns)]
+            for row, column in zip(white, columns, strict=True):
+                row[:] = workspace.whiten(column)
             # Ignore signatures that change the readings by less than a thousandth of sigma.
             if max(float(np.dot(w, w)) for w in white) < 1e-6:
                 continue
             self.candidates.append(candidate)
-            self.slices.append(slice(at, at + len(white)))
-            at += len(white)
-            parts += white
-        self.rows = (
-            np.stack(parts) if parts else np.empty((0, sum(m.size for m in workspace.measured)), dtype=np.float32)
-        )
+            self.slices.append(slice(at, at + len(columns)))
+            at += len(columns)
+        self.rows = rows[:at]
         self.fisher = (self.rows @ self.rows.T).astype(np.float64)
         self.lengths = np.diag(self.fisher)
 

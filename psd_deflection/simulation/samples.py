@@ -15,6 +15,11 @@ def _none() -> FloatArray:
     return np.empty((0, 0))
 
 
+def no_samples_between(phase: float) -> FloatArray:
+    """Nothing: only an effect on the volts may ask for them, while it acts."""
+    return np.empty((6, 0))
+
+
 @dataclass(slots=True, eq=False)
 class SimulatedSamples:
     """n samples, one row a quantity, filled stage by stage; effects change rows in place.
@@ -41,4 +46,4 @@ class SimulatedSamples:
     sums: FloatArray = field(default_factory=_none)
     volts: FloatArray = field(default_factory=_none)
     noise: FloatArray = field(default_factory=lambda: np.zeros(6))
-    between: Callable[[float], FloatArray] = lambda phase: np.empty((6, 0))
+    between: Callable[[float], FloatArray] = no_samples_between

@@ -24,7 +24,7 @@ from psd_deflection.simulation.declaration import ActiveEffect, State
 from psd_deflection.simulation.modes import Filter, mode_coefficients
 from psd_deflection.simulation.optics import dots_on_plate
 from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.samples import SimulatedSamples
+from psd_deflection.simulation.samples import SimulatedSamples, no_samples_between
 from psd_deflection.solvers.registry import check_arrangement
 
 
@@ -121,6 +121,8 @@ class ForwardModel:
             if active.effect.point == 'volts':
                 samples.between = partial(self._volts_between, i, samples, loads, temperature)
                 self._apply(i, samples)
+        # It holds the samples: a circle that would keep them in memory until Python looks for circles.
+        samples.between = no_samples_between
         return samples
 
     def _volts_between(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,10 @@ from psd_deflection.devices.serve import served_loads
 from psd_deflection.errors import RecordingError
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation import loads
-from psd_deflection.simulation.catalogue import make_active
+from psd_deflection.simulation.catalogue import catalogue, make_active
 from psd_deflection.simulation.declaration import ActiveEffect
 from psd_deflection.simulation.modes import Filter, mode_coefficients
+from psd_deflection.simulation.physics import Physics
 from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
 
 
@@ -229,3 +231,19 @@ def test_a_lag_is_exact_just_after_a_load_step_too(tau: float) -> None:
     skew = make_active('channel_skew', {'psd': 1, 'delay': 0.4e-3}, 'test')
     late = np.concatenate((np.repeat(fine[:3, :1], 4, axis=1), expected[:3, :-4]), axis=1)
     np.testing.assert_allclose(effect_volts(lag, skew)[:3], late[:, :-1:FINER], rtol=0.0, atol=3e-7)
+
+
+@pytest.mark.parametrize('name', ['mains_interference', 'amplifier_lag', 'channel_skew', 'sensor_rotation'])
+def test_samples_that_nobody_needs_leave_no_circle_in_memory(name: str) -> None:
+    # A search makes hundreds of them, each of tens of megabytes.
+    effect = catalogue()[name]
+    rig = load_rig()
+    values = effect.off_values(Physics.of(rig), next(effect.variants()))
+    gc.collect()
+    gc.disable()
+    try:
+        samples = ForwardModel(rig, [ActiveEffect(effect, values)]).expect(np.zeros((200, 3)))
+        del samples
+        assert gc.collect() == 0
+    finally:
+        gc.enable()
