@@ -122,7 +122,7 @@ def looker(url: str) -> None:
     print(asyncio.run(look()))
 
 
-def used(seconds: float, turn: Callable[[], object]) -> None:
+def tell_share(seconds: float, turn: Callable[[], object]) -> None:
     """Prints the share of a core that this process takes, in percent, if it does ``turn`` once a block."""
     end, before = time.monotonic() + seconds, time.process_time()
     due = time.monotonic()
@@ -136,7 +136,7 @@ def used(seconds: float, turn: Callable[[], object]) -> None:
 def bare_reader(port: str, seconds: float) -> None:
     """Child process: reads the port and does nothing with it."""
     fd = os.open(port, os.O_RDONLY | os.O_NOCTTY)
-    used(seconds, lambda: os.read(fd, 4096))
+    tell_share(seconds, lambda: os.read(fd, 4096))
 
 
 def blocks_of(recording: str) -> Iterator[list[tuple[str, str, bytes]]]:
@@ -167,7 +167,7 @@ def bare_publishers(recording: str, seconds: float) -> None:
             if topic in publishers:
                 publishers[topic].publish(data)
 
-    used(seconds, turn)
+    tell_share(seconds, turn)
 
 
 def bare_writer(recording: str, seconds: float) -> None:
@@ -189,7 +189,7 @@ def bare_writer(recording: str, seconds: float) -> None:
                     )
                 writer.add_message(channels[topic], now, data, now)
 
-        used(seconds, turn)
+        tell_share(seconds, turn)
 
 
 def parts(seconds: float, times: int) -> list[float]:
