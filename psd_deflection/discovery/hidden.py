@@ -127,9 +127,21 @@ def mistakes(recordings: int, delays: Sequence[float], jumps: Sequence[tuple[int
     ]
     if delays:
         late = EffectParameter('late_by', 's', -2.0, 2.0, 1e-3, 'the loads are noted late by', grid=tuple(delays))
-        out.append(
-            Effect('load_delay', 'load', 'late loads', '', '', '', (late,), 'load', apply=_delay, order=-1, finite=True)
+        late_loads = Effect(
+            'load_delay',
+            'load',
+            'late loads',
+            '',
+            '',
+            '',
+            (late,),
+            'load',
+            apply=_delay,
+            order=-1,
+            finite=True,
+            whole=True,
         )
+        out.append(late_loads)
     if recordings > 1:
         names = ('x1', 'y1', 'x2', 'y2')
         places = [_amplitude(n, 'm', -0.02, 0.02, 1e-5, 'unloaded dot') for n in names]

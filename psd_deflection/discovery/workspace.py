@@ -41,9 +41,17 @@ def fine_means(rows: FloatArray, size: int, present: FloatArray | None = None) -
     n = rows.shape[1] // size
     cut = rows[:, : n * size].reshape(rows.shape[0], n, size)
     if present is None:
-        return np.asarray(cut.mean(axis=2))
+        return _sums(cut) / size
     weights = present[:, : n * size].reshape(cut.shape)
-    return np.asarray((cut * weights).sum(axis=2) / np.maximum(weights.sum(axis=2), 1.0))
+    return _sums(cut * weights) / np.maximum(_sums(weights), 1.0)
+
+
+def _sums(cut: FloatArray) -> FloatArray:
+    """Sums over the last axis of ``cut`` (k, n, size): numpy's own sum over so few is several times slower."""
+    total = cut[:, :, 0].copy()
+    for i in range(1, cut.shape[2]):
+        total += cut[:, :, i]
+    return total
 
 
 class Workspace(Comparison):
@@ -138,8 +146,12 @@ class Workspace(Comparison):
         self.simulations += 1
         out = []
         for i, (o, size, present) in enumerate(zip(self.observations, self.fine, self._present, strict=True)):
-            chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.loads, o.temperature)
-            out.append(fine_means(chunk.volts, size, present))
+            model = ForwardModel(o.rig, only_in(sort_effects(effects), i))
+            means = np.empty((6, len(o.loads) // size))
+            for at, volts in model.expect_in_pieces(o.loads, o.temperature, size):
+                there = None if present is None else present[:, at]
+                means[:, at.start // size : at.stop // size] = fine_means(volts, size, there)
+            out.append(means)
         return out
 
     def whiten(self, fine: Sequence[FloatArray]) -> FloatArray:

@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Collection, Iterator, Sequence
 from decimal import Decimal
+from functools import cached_property
 from itertools import chain
 from operator import attrgetter, itemgetter
 from pathlib import Path
@@ -305,20 +306,26 @@ class CsvRecording(Recording):
             raise self._refuse(f'has {", ".join(filled)} without the others of {", ".join(names)}', row.line)
         return tuple(self._number(row, n) for n in filled)
 
+    @cached_property
+    def _loads(self) -> tuple[list[AppliedLoad], int, int]:
+        """The loads that differ from the one before; number of rows with a load; time of the last, ns."""
+        loads: list[AppliedLoad] = []
+        said: tuple[float, ...] | None = None
+        count = last = 0
+        for t_ns, values in self._optional(LOAD_COLUMNS):
+            if values != said:
+                loads.append(AppliedLoad(t_ns, *values))
+                said = values
+            count, last = count + 1, t_ns
+        return loads, count, last
+
     def loads(self) -> list[AppliedLoad]:
         """The first load and each load that differs from the one before it."""
-        out: list[AppliedLoad] = []
-        for t_ns, (fx, fy, tz) in self._optional(LOAD_COLUMNS):
-            if not out or out[-1][1:] != (fx, fy, tz):
-                out.append(AppliedLoad(t_ns, fx, fy, tz))
-        return out
+        return list(self._loads[0])
 
     def rows_with_load(self) -> tuple[int, int]:
         """Number of rows that say their load, and the time of the last one, ns; (0, 0) if none does."""
-        count = last = 0
-        for t_ns, _ in self._optional(LOAD_COLUMNS):
-            count, last = count + 1, t_ns
-        return count, last
+        return self._loads[1:]
 
     def references(self) -> list[ReferencePose]:
         """One reference for each row that has one."""

@@ -166,7 +166,8 @@ class Effect:
     blocks: empty at first, then always as many numbers. What ``configure`` changes needs no ``trace_back``.
     ``uses``: inputs of the correction besides dots and sums. ``order``: among the effects of one
     stage. ``finite``: the signature at the nominal value vanishes, so exactly the values of
-    ``grid`` are probed. Raises ValueError if the declaration contradicts itself.
+    ``grid`` are probed. ``whole``: ``apply`` must see the whole history at once, because a sample depends on later
+    ones; no effect of the catalogue does. Raises ValueError if the declaration contradicts itself.
     """
 
     name: str
@@ -183,6 +184,7 @@ class Effect:
     trace_back: Callable[[Traced, Values, list[float]], None] | None = None
     uses: frozenset[Use] = frozenset()
     finite: bool = False
+    whole: bool = False
     order: int = 0
 
     def __post_init__(self) -> None:

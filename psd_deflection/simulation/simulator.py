@@ -9,7 +9,7 @@ points (:data:`~psd_deflection.simulation.declaration.Point`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -26,6 +26,9 @@ from psd_deflection.simulation.optics import dots_on_plate
 from psd_deflection.simulation.physics import Physics
 from psd_deflection.simulation.samples import SimulatedSamples, no_samples_between
 from psd_deflection.solvers.registry import check_arrangement
+
+PIECE = 8192
+"""Samples of a piece of :meth:`ForwardModel.expect_in_pieces`: an array of them is 64 KB."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,6 +156,20 @@ class ForwardModel:
         full = self.physics.full_scale
         np.clip(samples.volts, -full, full - self.physics.volts_per_count, out=samples.volts)
         return samples
+
+    def expect_in_pieces(
+        self, loads: FloatArray, temperature: FloatArray | None = None, unit: int = 1
+    ) -> Iterator[tuple[slice, FloatArray]]:
+        """(which samples, their volts (3P, m)) of a long history, piece after piece, each as by :meth:`expect`.
+
+        A piece is a multiple of ``unit`` samples, but for the last, and so short that what is computed for it stays
+        in the processor's cache.
+        """
+        n = len(loads)
+        size = n if any(active.effect.whole for active in self.effects) else max(1, PIECE // unit) * unit
+        for first in range(0, n, max(1, size)):
+            at = slice(first, min(first + size, n))
+            yield at, self.expect(loads[at], None if temperature is None else temperature[at]).volts
 
     def _at(self, point: str, samples: SimulatedSamples) -> None:
         for i, active in enumerate(self.effects):

@@ -487,6 +487,8 @@ def test_mistakes_and_beginnings_have_room_enough() -> None:
         assert (declared[name].order, declared[name].point) == (98, 'configure')
     (late,) = declared['load_delay'].parameters
     assert (late.minimum, late.maximum, late.scale, late.unit) == (-2.0, 2.0, 1e-3, 's')
+    # It looks at later loads too.
+    assert declared['load_delay'].whole
     # Before everything else that a load passes.
     assert (declared['load_delay'].order, declared['load_delay'].finite, declared['load_delay'].point) == (
         -1,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from psd_deflection.config import load_rig
 from psd_deflection.devices.serve import served_loads
 from psd_deflection.errors import RecordingError
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation import loads
+from psd_deflection.simulation import loads, simulator
 from psd_deflection.simulation.catalogue import catalogue, make_active
 from psd_deflection.simulation.declaration import ActiveEffect
 from psd_deflection.simulation.modes import Filter, mode_coefficients
@@ -247,3 +248,20 @@ def test_samples_that_nobody_needs_leave_no_circle_in_memory(name: str) -> None:
         assert gc.collect() == 0
     finally:
         gc.enable()
+
+
+def test_a_long_history_is_simulated_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pieces give the bits of the whole; an effect that needs the whole history gets it in one piece."""
+    steps = np.repeat(np.array([[0.0, 0.0, 0.0], [3.0, 1.0, 0.1]]), 30, axis=0)
+    warm = np.linspace(20.0, 21.0, len(steps))
+    lag = make_active('amplifier_lag', {'time_constant': 1e-3}, 'test')
+    at_once = ActiveEffect(dataclasses.replace(lag.effect, whole=True), lag.values)
+    monkeypatch.setattr(simulator, 'PIECE', 14)
+    for effects, sizes in (([lag], [12, 12, 12, 12, 12]), ([at_once], [60])):
+        model = ForwardModel(load_rig(), effects)
+        pieces = list(model.expect_in_pieces(steps, warm, 4))
+        assert [at.stop - at.start for at, _ in pieces] == sizes
+        assert [at.start for at, _ in pieces] == [sum(sizes[:i]) for i in range(len(sizes))]
+        whole = ForwardModel(load_rig(), effects).expect(steps, warm).volts
+        assert np.array_equal(np.concatenate([volts for _, volts in pieces], axis=1), whole)
+    assert list(ForwardModel(load_rig(), []).expect_in_pieces(steps[:0], None)) == []
