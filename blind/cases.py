@@ -326,6 +326,9 @@ MISTAKES: Mapping[str, tuple[float, ...]] = {
 }
 """Mistakes of the set-up, each with five sizes: a channel, PSD or load; a factor; s, m, or a share of the time."""
 
+FAULTLESS = (('gaps', 0.3), ('outliers', 0.01), ('under_load', 0.0), ('own_zeros', 3e-4))
+"""Recordings that look odd and are right: share of the samples, share, nothing, m."""
+
 SPREADS = ((3.0, 30.0), (3.0, 300.0), (3.0, 30.0, 300.0))
 """Gaps of effects that act together, in floors: the small ones must not vanish behind the large ones."""
 
@@ -343,9 +346,9 @@ def hard_cases(first: int, spreads: int, mistakes: int) -> Iterator[Case]:
     for name, sizes in MISTAKES.items():
         for k in range(min(mistakes, len(sizes))):
             yield Case(f'mistake-{name}-{k}-{first}', 'mistake', 'one', (), mistake=(name, float(sizes[k])))
-    for i in range(first, first + 3 * mistakes):
-        kind = ('gaps', 'outliers', 'under_load')[i % 3]
-        yield Case(f'faultless-{kind}-{i}', 'faultless', 'one', (), mistake=(kind, 0.3 if kind == 'gaps' else 0.01))
+    for i in range(first, first + 4 * mistakes):
+        kind = FAULTLESS[i % 4]
+        yield Case(f'faultless-{kind[0]}-{i}', 'faultless', 'one', (), mistake=kind)
 
 
 UNSPREAD = frozenset(('amplifier_saturation', 'quantisation', 'plane_tilt', 'sensor_nonlinearity'))

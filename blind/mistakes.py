@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -141,8 +142,28 @@ MAKE: Mapping[str, Make] = {
 }
 
 
+def own_zeros(size: float, g: Generator, rig: Rig, noise: str, seed: int) -> list[Observation]:
+    """Three recordings with beams that are moved in between by up to ``size``, m, as the zero of each says."""
+    rng, out = np.random.default_rng(seed), []
+    for i in range(3):
+        truth: list[dict[str, Any]] = []
+        zeros: dict[str, object] = {}
+        for psd in (1, 2):
+            x, y = rng.uniform(-size, size, 2).tolist()
+            # The detector with its beam, and then the detector back.
+            truth.append({'name': 'sensor_position', 'psd': psd, 'x': x, 'y': y, 'aimed': 1.0})
+            truth.append({'name': 'sensor_position', 'psd': psd, 'x': -x, 'y': -y, 'aimed': 0.0})
+            before = rig.zeros[psd - 1]
+            zeros[f'psd_{psd}.zero'] = [float(before[0]) + x, float(before[1]) + y]
+        volts = g.record(truth, noise, 10 * seed + i)
+        out.append(Observation(f'recording {i + 1}', replace_values(rig, zeros), volts, g.loads, g.temperature))
+    return out
+
+
 def observed(mistake: tuple[str, float], g: Generator, rig: Rig, noise: str, seed: int) -> list[Observation]:
     """A recording without any hidden effect, with one mistake."""
     name, size = mistake
+    if name == 'own_zeros':
+        return own_zeros(size, g, rig, noise, seed)
     o = Observation('recording 1', rig, g.record([], noise, seed), g.loads, g.temperature)
     return MAKE[name](size, o, np.random.default_rng(seed))

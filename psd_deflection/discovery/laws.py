@@ -45,6 +45,8 @@ FOLLOWED = 3
 MAX_TERMS = 4
 BUDGET = 600
 """Forward simulations beside one set of effects after which no term is added."""
+ALTOGETHER = 1800
+"""Forward simulations of the whole search after which none is."""
 TIED = 21.6
 """Loss in chi-square below which another law counts as equivalent, as for effects."""
 UNDETERMINED = 100.0
@@ -142,7 +144,7 @@ class _Seeker:
 
     def __init__(self, ws: Workspace, start: Fit, penalty: float) -> None:
         self.ws, self.start, self.penalty = ws, start, penalty
-        self.last = ws.simulations + BUDGET
+        self.last = min(ws.simulations + BUDGET, max(ws.simulations, ALTOGETHER))
         self.found = responses(ws, start)
         self.listed = list(terms(self.found))
         if len(ws.observations) == 1:

@@ -297,10 +297,10 @@ def test_a_mistake_is_refitted_from_where_it_may_be(monkeypatch: pytest.MonkeyPa
     assert search._mistake(null, scores) is null
     assert [a[1:] for a in asked] == [(2, 12)]
     assert asked[0][0] == [pytest.approx({'x': 30.1e-6})]
-    # From afar other rates are starts of their own.
+    # From afar other rates, and readings of twice the size, are starts of their own.
     far = dataclasses.replace(null, chi2=10.1 * null.residual.size)
     search._mistake(far, scores)
-    assert [s.get('error') for s in asked[1][0]] == [-0.2, -0.1, -0.04, 0.04, 0.1, 0.25, None]
+    assert [s.get('error') for s in asked[1][0]] == [-0.2, -0.1, -0.04, 0.04, 0.1, 0.25, None, -0.5]
 
 
 # Laws.

@@ -91,24 +91,24 @@ def test_two_that_hide_each_other_are_found_as_a_pair() -> None:
 @pytest.mark.parametrize(('left', 'taken'), [(0.005, True), (0.02, False)])
 def test_a_mistake_is_taken_first_if_it_explains_nearly_all(left: float, taken: bool) -> None:
     """All but a hundredth of what is beyond noise. Beside an effect it is not looked for."""
-    shown = {('sensitivity', 'x'): pictures(A)[A], B: pictures(B, seed=4)[B]}
-    shown[B] = across(shown[B], shown['sensitivity', 'x'])
+    shown = {('link_length', 'x'): pictures(A)[A], B: pictures(B, seed=4)[B]}
+    shown[B] = across(shown[B], shown['link_length', 'x'])
     whole = 100_000.0
     plant = Plant(
-        shown, without_noise((shown['sensitivity', 'x'], whole * (1 - left)), (shown[B], whole * left)) + noise()
+        shown, without_noise((shown['link_length', 'x'], whole * (1 - left)), (shown[B], whole * left)) + noise()
     )
     said: list[str] = []
-    search = searching(plant, shown, ['sensitivity', 'b'], said)
+    search = searching(plant, shown, ['link_length', 'b'], said)
     null = refit(plant, ())
     scores = search.screen.score(null.residual)
     first = search._mistake(null, scores)
-    assert named(first) == (['sensitivity'] if taken else [])
-    assert said == (['the set-up: sensitivity'] if taken else [])
+    assert named(first) == (['link_length'] if taken else [])
+    assert said == (['the set-up: link_length'] if taken else [])
     if taken:
-        assert named(searching(plant, shown, ['sensitivity', 'b']).run().fit) == ['b', 'sensitivity']
+        assert named(searching(plant, shown, ['link_length', 'b']).run().fit) == ['b', 'link_length']
     # One that is weaker than the best by more than the third of it is not even tried.
     weak = [
-        dataclasses.replace(s, gain=0.29 * scores[0].gain) if s.candidate.effect.name == 'sensitivity' else s
+        dataclasses.replace(s, gain=0.29 * scores[0].gain) if s.candidate.effect.name == 'link_length' else s
         for s in scores
     ]
     best = dataclasses.replace(scores[0], candidate=candidate('b', 'x'))
