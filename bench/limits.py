@@ -12,7 +12,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import csv
+import os
 import struct
+import subprocess
 import sys
 import tempfile
 import time
@@ -35,7 +37,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.signal import lsim
 
 from bench.live import make_recording
-from bench.rows import RESULTS, Row, figure, in_turns, keep, tell
+from bench.rows import RESULTS, ROOT, Row, figure, in_turns, keep, tell
 from msg_adapters import SAMPLES, point_cloud2
 from psd_deflection.config import Rig, load_rig
 from psd_deflection.discovery.discover import discover
@@ -385,13 +387,52 @@ def searched(
     return row
 
 
+def used_by(checkout: Path, *arguments: str) -> tuple[float, float]:
+    """(s, MB): time and most memory of the command ``psd-deflection`` of ``checkout``."""
+    command = [sys.executable, '-m', 'psd_deflection', *arguments]
+    began = time.perf_counter()
+    with subprocess.Popen(command, cwd=checkout, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f'{" ".join(command)} in {checkout}: exit status {process.returncode}')
+    return time.perf_counter() - began, usage.ru_maxrss / 1024
+
+
+def verdicts(times: int, checkout: Path | None) -> list[Row]:
+    """The command ``discover`` from start to report, on CSV files of one effect; beside that of ``checkout``."""
+    rows = []
+    versions = [('psd-deflection discover', 'ours', ROOT), *([('of --checkout', 'peer', checkout)] if checkout else [])]
+    with tempfile.TemporaryDirectory() as folder:
+        for repeats in (1, 4, 10):
+            table = Path(folder) / f'{repeats}.csv'
+            loads = ['--loads', 'identification'] * repeats
+            effect = SEARCHES[0][1][0]
+            used_by(ROOT, 'simulate', '--out', str(table), *loads, '--effect', effect, '--seed', '5')
+            lasts = len(load_history('identification', 1000.0).loads) * repeats / 1000.0
+            used: dict[str, list[tuple[float, float]]] = {name: [] for name, _, _ in versions}
+            for _ in range(times):
+                for name, _, where in versions:
+                    used[name].append(used_by(where, 'discover', str(table), '--out', f'{folder}/found'))
+            for what, unit, i in (('from start to report', 's', 0), ('memory', 'MB', 1)):
+                work = f'discover, {lasts:g} s in a CSV, one effect: {what}'
+                figures = [
+                    figure(n, kind, [u[i] for u in used[n]], 1.0 if i == 0 and kind == 'peer' else None)
+                    for n, kind, _ in versions
+                ]
+                rows.append(Row(work, unit, figures))
+            rows[-2].figures.append(figure('what its recording lasts', 'limit', [lasts], 1.0))
+    return rows
+
+
 def main() -> int:
     """Measure and keep."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--minutes', type=float, default=10.0, help='of the recordings that are replayed and converted')
     parser.add_argument('--seconds', type=float, default=60.0, help='of the recording that discover gets')
     parser.add_argument('--times', type=int, default=5)
-    parser.add_argument('--only', choices=('frames', 'replay', 'conversion', 'simulation', 'discover'))
+    parser.add_argument('--only', choices=('frames', 'replay', 'conversion', 'simulation', 'discover', 'verdict'))
+    parser.add_argument('--checkout', type=Path, help='another version of this repository, whose verdict is timed too')
     parser.add_argument('--results', type=Path, default=RESULTS)
     args = parser.parse_args()
     jobs: dict[str, Callable[[], list[Row]]] = {
@@ -400,6 +441,7 @@ def main() -> int:
         'conversion': lambda: conversion(args.times, args.minutes),
         'simulation': lambda: simulation(args.times),
         'discover': lambda: search(args.times // 2, args.seconds),
+        'verdict': lambda: verdicts(max(1, args.times // 2), args.checkout),
     }
     for name, job in jobs.items():
         if args.only in (None, name):

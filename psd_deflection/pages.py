@@ -6,6 +6,7 @@ import base64
 import html
 import io
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -42,8 +43,10 @@ def wide(content: str, words: str) -> str:
 def picture(figure: Figure, words: str) -> str:
     """The figure as a picture in the page; ``words`` say what it shows, for who cannot see it."""
     buffer = io.BytesIO()
-    FigureCanvasAgg(figure)
-    figure.savefig(buffer, format='png', dpi=110)
+    figure.set_dpi(110)
+    canvas: Any = FigureCanvasAgg(figure)
+    # Not savefig, which goes through the drawing twice.
+    canvas.print_png(buffer)
     code = base64.b64encode(buffer.getvalue()).decode()
     return wide(f'<img alt="{html.escape(words)}" src="data:image/png;base64,{code}">', f'picture: {words}')
 
