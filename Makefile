@@ -22,7 +22,7 @@
 # make blind    hide effects with a second generator and see whether discover names them (an hour or two on two cores; JOBS=1 for one)
 # make blind-calibration  200 rigs of the second generator, misaligned by chance, calibrated and checked (six minutes on two idle cores; RIGS=20 for a look, LIGHT=--light in the light of a room)
 # make blind-laws  laws that no catalogue has, drawn by chance: does discover find where they act and on what they depend (a quarter of an hour on an idle core; LAWS='--first 500' for fresh ones)
-# make blind-next  one recording leaves several effects open: do the recordings that discover --next plans settle it (half an hour on an idle core; NEXT='--only clamp' for a look)
+# make blind-next  one recording leaves several effects open: do the recordings that discover --next plans settle it (two minutes on two idle cores; NEXT='--only clamp' for a look)
 # make blind-watch  bumps, gains, slips and 24 quiet hours: what the watch sees, and when it is silent (half an hour on an idle core; WATCH='--runs 5 --hours 1' for a look)
 # make camera-campaign  render 10,000 frames, most of them bad, and see whether the camera is right about each (twenty minutes on an idle core)
 # make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report

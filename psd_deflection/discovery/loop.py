@@ -64,8 +64,10 @@ def settle(
         found = discover(known, rig, seed=seed, without=without, progress=progress)
         progress('planning')
         plan = next_of(found, limits)
-        # A rival with more parameters that came out as the named effect would be has nothing left that could be tested.
-        if plan is None or not (plan.useful or found.unsettled):
+        # A rival with more parameters that came out as the named effect would be has nothing left that could be tested:
+        # nothing within the limits needs its further ones.
+        needed = any(rival.parameters <= found.fit.parameters for rival in found.rivals)
+        if plan is None or not (plan.useful or (found.unsettled and needed)):
             return Settled(found, tuple(plans), None, 'unique')
         if not plan.useful:
             return Settled(found, tuple(plans), plan, 'limits')

@@ -164,16 +164,17 @@ def test_a_bad_limit_is_refused(word: str, part: str) -> None:
 
 
 class Searches:
-    """Stands for discover: each search leaves one equivalent fewer; plans are those of ``useful``."""
+    """Stands for discover: each search leaves one fewer rival of ``free`` parameters; plans are of ``useful``."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, equivalents: int, useful: bool = True) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, equivalents: int, useful: bool = True, free: int = 1) -> None:
         self.seen: list[int] = []
 
         def discover(known: list[object], rig: Rig, seed: int, **_: object) -> object:
             assert seed == 0
             self.seen.append(len(known))
             left = ('other',) * max(equivalents - len(known) + 1, 0)
-            return SimpleNamespace(unsettled=left)
+            rivals = [SimpleNamespace(parameters=free)] * len(left)
+            return SimpleNamespace(unsettled=left, rivals=rivals, fit=SimpleNamespace(parameters=1))
 
         monkeypatch.setattr(loop, 'discover', discover)
         monkeypatch.setattr(
@@ -200,6 +201,9 @@ def test_the_loop_ends_when_nothing_would_help_or_no_more_is_allowed(monkeypatch
     done = Searches(monkeypatch, 2, useful=False).settle()
     assert (done.outcome, len(done.plans)) == ('limits', 0)
     assert done.sentence.endswith('Nothing helps.')
+    # A rival that needs more parameters for the same is not needed.
+    assert Searches(monkeypatch, 2, useful=False, free=2).settle().outcome == 'unique'
+    assert Searches(monkeypatch, 2, free=2).settle().sentence == 'The answer is unique after 2 more recordings.'
     done = Searches(monkeypatch, 9).settle(most=1)
     assert (done.outcome, len(done.plans)) == ('recordings', 1)
     assert done.sentence == 'The answer is not unique after 1 more recording, and no more were allowed.'
