@@ -31,9 +31,9 @@ LIKELY = 0.3
 """A mistake of the set-up is tried if it explains, to first order, this share of what the best candidate explains."""
 NEARLY_ALL = 0.01
 """It is taken before any effect if it alone leaves less than this share of the chi-square beyond noise."""
-ELSEWHERE = {'sample_rate': (-0.2, -0.1, -0.04, 0.04, 0.1, 0.25), 'sensitivity': (-0.5,)}
-"""Errors from which a mistake of the set-up is fitted too, because a linear step does not reach them: another frequency
-of the ringing, readings of twice the size."""
+OTHER_RATES = (-0.2, -0.1, -0.04, 0.04, 0.1, 0.25)
+TOO_FAR, HALF = -0.7, -0.5
+"""A linear step beyond the first of a sensitivity's error begins at the second instead: readings of twice the size."""
 MAX_EFFECTS = 4
 ROUNDS = 3
 """How often effects are added: again only if the noise beside those found is another than before."""
@@ -265,11 +265,14 @@ class Search:
         for s in scores:
             if s.candidate.effect.name not in self.workspace.first:
                 continue
+            start, name = s.candidate.from_coefficients(s.coefficients), s.candidate.effect.name
+            if name == 'sensitivity' and start.values['error'] < TOO_FAR:
+                start = ActiveEffect(start.effect, {'error': HALF})
             if s.gain > LIKELY * best:
-                starts.append([s.candidate.from_coefficients(s.coefficients)])
-            if far(null):
-                elsewhere = ELSEWHERE.get(s.candidate.effect.name, ())
-                starts += [[ActiveEffect(s.candidate.effect, {'error': v})] for v in elsewhere]
+                starts.append([start])
+            if name == 'sample_rate' and far(null):
+                # A linear step does not reach another frequency of the ringing.
+                starts += [[ActiveEffect(start.effect, {'error': v})] for v in OTHER_RATES]
         found = self._best_of(starts, 2, 12)
         size = self.workspace.size
         if found is None or not self._passes(null, found, null):

@@ -292,15 +292,21 @@ def test_a_mistake_is_refitted_from_where_it_may_be(monkeypatch: pytest.MonkeyPa
     scores = [
         scored('a', 100.0),
         dataclasses.replace(scored('sample_rate', 30.0), candidate=rate),
-        scored('sensitivity', 30.1),
+        scored('link_length', 30.1),
     ]
     assert search._mistake(null, scores) is null
     assert [a[1:] for a in asked] == [(2, 12)]
     assert asked[0][0] == [pytest.approx({'x': 30.1e-6})]
-    # From afar other rates, and readings of twice the size, are starts of their own.
+    # From afar other rates are starts of their own.
     far = dataclasses.replace(null, chi2=10.1 * null.residual.size)
     search._mistake(far, scores)
-    assert [s.get('error') for s in asked[1][0]] == [-0.2, -0.1, -0.04, 0.04, 0.1, 0.25, None, -0.5]
+    assert [s.get('error') for s in asked[1][0]] == [-0.2, -0.1, -0.04, 0.04, 0.1, 0.25, None]
+    # Where a linear step ends beyond its reach, readings of twice the size are.
+    gain = dataclasses.replace(rate, effect=effect('sensitivity', 'error'))
+    for linear, begun in ((-0.69, -0.69), (-0.71, -0.5)):
+        steps = np.array([linear / gain.effect.parameters[0].scale])
+        search._mistake(null, [dataclasses.replace(scored('sensitivity', 30.1), candidate=gain, coefficients=steps)])
+        assert asked[-1][0] == [{'error': pytest.approx(begun)}]
 
 
 # Laws.
