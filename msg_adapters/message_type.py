@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
+from typing import Any
 
 _SHARED: Mapping[str, str] = {
     'builtin_interfaces/Time': 'int32 sec\nuint32 nanosec\n',
@@ -23,6 +24,10 @@ _SHARED: Mapping[str, str] = {
 """Types that several messages contain."""
 
 _SEPARATOR = '=' * 80 + '\n'
+
+
+class Constant(list[Any]):
+    """The elements of an array field that never change, so that what is written of them may be kept."""
 
 
 class MessageType:

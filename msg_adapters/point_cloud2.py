@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from msg_adapters.header import Fields, header, stamp_ns
-from msg_adapters.message_type import MessageType
+from msg_adapters.message_type import Constant, MessageType
 from psd_deflection.records import CHANNELS, MOST_PSDS, SampleBlock, channel_names
 
 MESSAGE = MessageType(
@@ -55,13 +55,13 @@ _FORMATS = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f
 
 
 @functools.cache
-def _fields(psds: int, more: int) -> list[dict[str, Any]]:
+def _fields(psds: int, more: int) -> Constant:
     # Every field is four bytes wide.
     channels = channel_names(psds)
-    return [
+    return Constant(
         {'name': name, 'offset': 4 * i, 'datatype': FLOAT32 if name in channels else UINT32, 'count': 1}
         for i, name in enumerate(point_of(psds, more).names or ())
-    ]
+    )
 
 
 def from_block(block: SampleBlock) -> Fields:

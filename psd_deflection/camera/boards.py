@@ -16,7 +16,7 @@ from psd_deflection.camera.answer import RefusedError, Status, TargetPose
 from psd_deflection.camera.lens import Lens
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.refine_corners import LEAST_REACH, refined
-from psd_deflection.camera.rim_fit import turned
+from psd_deflection.camera.rim_model import turned
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.errors import ConfigError
 from psd_deflection.records import FloatArray

@@ -10,7 +10,8 @@ import numpy as np
 from psd_deflection.camera.answer import RefusedError, Status, TargetPose
 from psd_deflection.camera.find_discs import MIN_RADIUS, Region, find_discs
 from psd_deflection.camera.lens import Lens
-from psd_deflection.camera.rim_fit import Fitter, Prior, turned
+from psd_deflection.camera.rim_fit import Fitter
+from psd_deflection.camera.rim_model import Prior, turned
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.records import FloatArray
 

@@ -20,7 +20,7 @@ from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
 from msg_adapters import MESSAGE_TYPES
-from msg_adapters.message_type import MessageType
+from msg_adapters.message_type import Constant, MessageType
 
 Encoder = Callable[[Mapping[str, Any]], bytes]
 _Writer = Callable[[bytearray, Any], None]
@@ -101,8 +101,21 @@ def _write_text(out: bytearray, value: str) -> None:
 
 def _array_writer(write_one: _Writer, kind: str, length: str) -> _Writer:
     """``length``: number of elements of a fixed array, else ''."""
+    # The last constant array, where it began and its bytes: one object, because several threads encode.
+    last: tuple[object, int, bytes] = (None, 0, b'')
 
     def write(out: bytearray, values: Any) -> None:
+        nonlocal last
+        known, place, written = last
+        at = len(out)
+        if values is known and at % 8 == place:
+            out += written
+            return
+        write_all(out, values)
+        if isinstance(values, Constant):
+            last = values, at % 8, bytes(out[at:])
+
+    def write_all(out: bytearray, values: Any) -> None:
         if not length:
             _write_size(out, len(values))
         elif len(values) != int(length):

@@ -17,7 +17,7 @@ import numpy as np
 
 from psd_deflection.errors import RecordingError, printable
 from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.csv_reader import MAX_LINE, MAX_SECONDS
+from psd_deflection.recordings.csv_rows import MAX_LINE, MAX_SECONDS
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay_engine import replayed

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from msg_adapters import MESSAGE_TYPES
-from msg_adapters.message_type import MessageType
+from msg_adapters.message_type import Constant, MessageType
 from psd_deflection.recordings import cdr
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -71,3 +71,29 @@ def test_the_encoder_takes_every_kind_of_field() -> None:
 def test_a_type_that_is_not_ours_is_refused() -> None:
     with pytest.raises(KeyError):
         cdr.encode('std_msgs/msg/Empty', {})
+
+
+def test_a_constant_array_is_written_as_any_other_wherever_it_begins() -> None:
+    fields = [
+        {'name': 'seq', 'offset': 0, 'datatype': 6, 'count': 1},
+        {'name': 'x', 'offset': 4, 'datatype': 7, 'count': 1},
+    ]
+    others = [*fields, {'name': 'y', 'offset': 8, 'datatype': 7, 'count': 1}]
+    rest = {
+        'height': 1,
+        'width': 0,
+        'is_bigendian': False,
+        'point_step': 8,
+        'row_step': 0,
+        'data': b'',
+        'is_dense': True,
+    }
+    kept = [Constant(fields), Constant(others), Constant([])]
+    for frame in ('', 'a', 'ab', 'abc', 'abcd', 'abcde', 'tip', 'link_tip') * 2:
+        for constant in (*kept, kept[0], *kept):
+            header = {'stamp': {'sec': 1, 'nanosec': 2}, 'frame_id': frame}
+            message = {'header': header, 'fields': constant, **rest}
+            plain = {**message, 'fields': list(constant)}
+            assert cdr.encode('sensor_msgs/msg/PointCloud2', message) == cdr.encode(
+                'sensor_msgs/msg/PointCloud2', plain
+            )

@@ -1,0 +1,215 @@
+"""The rows of a CSV file with a header and a column ``t``: many at once if they are plain, one by one if they are not.
+
+Times are read as decimals into integer nanoseconds, never through a float: a float cannot hold
+nanoseconds since the epoch. The file is read in passes and never held whole in memory.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator, Sequence
+from decimal import Decimal
+from operator import lt
+from pathlib import Path
+from typing import BinaryIO, NamedTuple, TextIO
+
+from psd_deflection.errors import RecordingError
+
+MAX_LINE = 10_000
+"""Maximum characters of a line; a longer line is not a row of samples."""
+
+MAX_SECONDS = 2**31
+"""A ROS stamp has 31 bits of seconds."""
+
+NUMBER = re.compile(
+    r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?|[+-]?(?:nan|inf|infinity)', re.ASCII | re.IGNORECASE
+)
+
+_SECONDS = re.compile(r'(1?[0-9]{1,9})\.([0-9]{1,9})', re.ASCII)
+"""Seconds that are below the bound and whole nanoseconds, as most loggers write them."""
+
+_ALL_SECONDS = re.compile(r'(?:1?[0-9]{1,9}\.[0-9]{1,9}\n)+', re.ASCII)
+
+_PLAIN = b'0123456789.,+-eE\n'
+"""Bytes of lines that need no reader of CSV: no quotes, no spaces, nothing but numbers and commas."""
+
+_PIECE = 1 << 16
+"""Bytes that are read at once."""
+
+_TOGETHER = 500
+"""Number of rows that are handed on at once: numpy's cost is per call."""
+
+
+class Rows(NamedTuple):
+    """Rows that follow each other: number of the line and time, ns, of each; ``cells``: those of all rows in turn."""
+
+    lines: Sequence[int]
+    t_ns: Sequence[int]
+    cells: list[str]
+
+
+class CsvTable:
+    """The lines of one file. The calls raise RecordingError naming file, line and column of a fault."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        first = next(self._cells(None, 0), None)
+        if first is None:
+            raise self.refuse('is empty')
+        self.header_line, names = first
+        self.header = [name.strip() for name in names]
+
+    def refuse(self, why: str, line: int | None = None) -> RecordingError:
+        """The error that says so of this file."""
+        return RecordingError(f'{self.path}{"" if line is None else f":{line}"}: {why}')
+
+    def rows(self) -> Iterator[Rows]:
+        """All rows behind the header, which has a column ``t``; before an error, those before the bad row."""
+        last, line = -1, 0
+        try:
+            with self.path.open('rb') as stream:
+                begin = self._behind_header(stream)
+                if begin:
+                    line, at = self.header_line, begin
+                    for size, rows in self._plain(stream):
+                        if rows.t_ns[0] <= last:
+                            break
+                        yield rows._replace(lines=range(line + 1, line + 1 + len(rows.t_ns)))
+                        last = rows.t_ns[-1]
+                        line, at = line + len(rows.t_ns), at + size
+                    stream.seek(at)
+                    if not stream.read(1):
+                        return
+                    begin = at
+        except OSError as error:
+            raise self.refuse(f'cannot be read ({error.strerror or error})') from None
+        yield from self._any(begin, line, last)
+
+    def _behind_header(self, stream: BinaryIO) -> int:
+        """Bytes of the header if it is the first line and ends with a newline, else 0; ``stream`` is there then."""
+        first = stream.readline(MAX_LINE + 1)
+        if self.header_line != 1 or not first.endswith(b'\n') or b'\r' in first.removesuffix(b'\r\n'):
+            return 0
+        return len(first)
+
+    def _plain(self, stream: BinaryIO) -> Iterator[tuple[int, Rows]]:
+        """Plain rows with rising times from where ``stream`` is, with their size in bytes, up to the first that is not.
+
+        The numbers of their lines are left out.
+        """
+        width, at = len(self.header), self.header.index('t')
+        rest = b''
+        while data := stream.read(_PIECE):
+            data = rest + data
+            cut = data.rfind(b'\n') + 1
+            piece, rest = data[:cut], data[cut:]
+            text = piece.replace(b'\r\n', b'\n')
+            if len(rest) > MAX_LINE or text.translate(None, _PLAIN):
+                return
+            if not text:
+                continue
+            lines = text.decode('ascii').split('\n')
+            lines.pop()
+            if {line.count(',') for line in lines} != {width - 1} or max(map(len, lines)) > MAX_LINE:
+                return
+            cells = ','.join(lines).split(',')
+            t_ns = self._many_nanoseconds(cells[at::width])
+            if t_ns is None or not all(map(lt, t_ns, t_ns[1:])):
+                return
+            yield len(piece), Rows((), t_ns, cells)
+
+    def _many_nanoseconds(self, cells: list[str]) -> list[int] | None:
+        """Times in ns; None if one is not written as seconds with up to nine decimals."""
+        together = '\n'.join(cells) + '\n'
+        if _ALL_SECONDS.fullmatch(together) is None:
+            return None
+        decimals = len(cells[0].partition('.')[2])
+        if {cell[-1 - decimals : -decimals] for cell in cells} == {'.'}:
+            whole = together.replace('.', '').split('\n')
+            whole.pop()
+            scale = 10 ** (9 - decimals)
+            return [scale * t for t in map(int, whole)]
+        return [self._nanoseconds(cell, 0) for cell in cells]
+
+    def _any(self, begin: int, line: int, last: int) -> Iterator[Rows]:
+        """The rows from byte ``begin`` on, behind line number ``line`` and time ``last``, ns."""
+        width, at = len(self.header), self.header.index('t')
+        lines: list[int] = []
+        times: list[int] = []
+        together: list[str] = []
+        try:
+            for number, cells in self._cells(begin, line):
+                if len(cells) != width:
+                    raise self.refuse(f'has {len(cells)} cells, the header has {width}', number)
+                t_ns = self._nanoseconds(cells[at], number)
+                if t_ns <= last:
+                    raise self.refuse(
+                        f'column t holds {cells[at].strip()!r}, which is not after the row before', number
+                    )
+                last = t_ns
+                lines.append(number)
+                times.append(t_ns)
+                together += cells
+                if len(lines) == _TOGETHER:
+                    full = Rows(lines, times, together)
+                    lines, times, together = [], [], []
+                    yield full
+        except RecordingError:
+            # Rows before the bad one are good.
+            if lines:
+                yield Rows(lines, times, together)
+            raise
+        if lines:
+            yield Rows(lines, times, together)
+
+    def _cells(self, begin: int | None, line: int) -> Iterator[tuple[int, list[str]]]:
+        """(line number, cells) of every line that is not blank, from byte ``begin`` on, behind line number ``line``.
+
+        ``begin`` None: with the header; 0: behind the header, wherever it ends.
+        """
+        lines = self._lines(begin or 0, line)
+        reader = csv.reader(lines, strict=True, skipinitialspace=True)
+        skip = begin == 0
+        try:
+            for cells in reader:
+                if len(cells) > 1 or (cells and cells[0].strip()):
+                    if skip:
+                        skip = False
+                        continue
+                    yield line + reader.line_num, cells
+        except csv.Error as error:
+            raise self.refuse(f'is no row of a CSV ({error})', line + reader.line_num) from None
+
+    def _lines(self, begin: int, line: int) -> Iterator[str]:
+        try:
+            with self._opened(begin) as stream:
+                while text := stream.readline(MAX_LINE + 1):
+                    line += 1
+                    if len(text) > MAX_LINE:
+                        raise self.refuse(f'is longer than {MAX_LINE} characters', line)
+                    yield text
+        except OSError as error:
+            raise self.refuse(f'cannot be read ({error.strerror or error})') from None
+        except UnicodeDecodeError:
+            raise self.refuse('is not text in UTF-8') from None
+
+    def _opened(self, begin: int) -> TextIO:
+        stream = self.path.open(encoding='utf-8' if begin else 'utf-8-sig', newline=None)
+        if begin:
+            stream.seek(begin)
+        return stream
+
+    def _nanoseconds(self, cell: str, line: int) -> int:
+        text = cell.strip()
+        plain = _SECONDS.fullmatch(text)
+        if plain is not None:
+            return int(plain[1] + plain[2].ljust(9, '0'))
+        if NUMBER.fullmatch(text) is None:
+            raise self.refuse(f'column t holds {text!r}, which is not a number', line)
+        seconds = Decimal(text)
+        finite = seconds.is_finite() and 0 <= seconds < MAX_SECONDS
+        t_ns = int((seconds * 1_000_000_000).to_integral_value()) if finite else -1
+        if not 0 <= t_ns < MAX_SECONDS * 1_000_000_000:
+            raise self.refuse(f'column t holds {text!r}; seconds from 0 to {MAX_SECONDS} are read', line)
+        return t_ns
