@@ -38,7 +38,7 @@ class Comparison(ABC):
     first: frozenset[str] = frozenset()
     setup: frozenset[str] = frozenset()
     open_level: bool = False
-    budget: int = 500
+    budget: int = 700
     digits: str = '.4g'
 
     @property

@@ -34,6 +34,8 @@ NEARLY_ALL = 0.01
 OTHER_RATES = (-0.2, -0.1, -0.04, 0.04, 0.1, 0.25)
 TOO_FAR, HALF = -0.7, -0.5
 """A linear step beyond the first of a sensitivity's error begins at the second instead: readings of twice the size."""
+STANDS_IN = 0.2
+"""An effect beside others explains this share of what they leave at least, if more than the noise is left after it."""
 MAX_EFFECTS = 4
 ROUNDS = 3
 """How often effects are added: again only if the noise beside those found is another than before."""
@@ -177,6 +179,12 @@ class Search:
         more = self.penalty * (larger.parameters - smaller.parameters)
         return gain - more > BIC_ACCEPT
 
+    def _stands_in(self, smaller: Fit, larger: Fit) -> bool:
+        """Whether what ``larger`` adds only stands in for something that the library lacks."""
+        size = self.workspace.size
+        little = larger.chi2 - size > (1.0 - STANDS_IN) * (smaller.chi2 - size)
+        return little and larger.chi2 > 2 * size and bool(smaller.effects) and not self.workspace.open_level
+
     def library_p(self, gain: float, dof: int) -> float:
         """p of a gain in chi-square, over the whole library (Sidak)."""
         count = max(1, len(self.screen.candidates))
@@ -229,10 +237,12 @@ class Search:
                 if slot(s.candidate.effect, s.candidate.start) not in taken and s.candidate.effect.name not in ws.first
             ]
             better = self._further(current, scores)
-            if better is None or not self._passes(current, better, null):
-                # Of two causes of a rough machine neither may help alone.
-                better = self._try_pairs(null, current) if ws.open_level and len(current.effects) < 2 else current
-                if better is current or not self._passes(current, better, null):
+            passes = better is not None and self._passes(current, better, null)
+            if better is None or not passes or self._stands_in(current, better):
+                # Of two causes of a rough machine neither may help alone, and a wrong first effect hides a pair.
+                pair = len(current.effects) < 2 and (ws.open_level or passes)
+                better = self._try_pairs(null, current) if pair else current
+                if better is current or not self._passes(current, better, null) or self._stands_in(current, better):
                     break
             else:
                 self._say('adding ' + better.effects[-1].label)
