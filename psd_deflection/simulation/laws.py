@@ -112,6 +112,10 @@ def _over(v: FloatArray, shapes: Values) -> FloatArray:
     return (v > shapes['threshold']).astype(np.float64)
 
 
+def _under(v: FloatArray, shapes: Values) -> FloatArray:
+    return (v < shapes['threshold']).astype(np.float64)
+
+
 def _wave(v: FloatArray, shapes: Values) -> FloatArray:
     return np.sin(2.0 * math.pi * v / shapes['period'] + shapes['phase'])
 
@@ -201,6 +205,7 @@ FORMS: Mapping[str, Form] = {
         unit_of_v=0,
     ),
     'over': Form('switched', '[1 if {v} > {threshold}]', apart=_over, fixed=('threshold',), unit_of_v=0),
+    'under': Form('switched', '[1 if {v} < {threshold}]', apart=_under, fixed=('threshold',), unit_of_v=0),
     'switched': Form('switched', '{v} [between {times}]'),
     'rate': Form('rate', 'd({v})/dt', following=_rate, per_second=1),
     'rate_absolute': Form('rate', '|d({v})/dt|', following=_rate_absolute, per_second=1),

@@ -47,7 +47,7 @@ def told(**law: Any) -> dict[str, Any]:
     whole = {'stage': 'psd', 'variables': ['x1'], 'kind': 'static', 'expression': '', 'heldout_after': 2.2e-7}
     said = {**whole, 'equivalent': [], **law}
     gap = {'floor': 2e-7, 'heldout_after': 1e-6}
-    return {'verdict': 'unknown_effect', 'effects': [], 'unknown': [{'law': said}], 'gap': gap}
+    return {'verdict': 'unknown_effect', 'effects': [], 'setup': [], 'unknown': [{'law': said}], 'gap': gap}
 
 
 def test_an_answer_is_right_if_the_law_or_one_that_ties_is() -> None:
@@ -62,6 +62,31 @@ def test_an_answer_is_right_if_the_law_or_one_that_ties_is() -> None:
     assert (row['stage'], row['variables'], row['law'], row['floors']) == (False, False, None, pytest.approx(5.0))
     assert judged(None, told())['alarm']
     assert not judged(None, {**told(), 'unknown': []})['alarm']
+
+
+def test_a_law_that_never_acts_is_drawn_anew() -> None:
+    law = next(law for law in drawn(396, 12) if law['number'] == 400)
+    assert gap_of(designs('one'), sized(law)) == pytest.approx(law['gap'], rel=0.1)
+
+
+def test_a_dot_that_jumps_may_be_told_as_jumps_of_its_detector() -> None:
+    truth = {**law_forms.draw(1, 'optics', 'events'), 'where': 'x2', 'times': [5.4, 9.0], 'gap': 9.0}
+    found = [{'name': 'jump', 'where': 'psd_2', 'value': t} for t in (9.002, 5.399)]
+    nothing = {**told(), 'unknown': [], 'verdict': 'nothing_missing'}
+    row = judged(truth, {**nothing, 'setup': found})
+    assert (row['stage'], row['variables'], row['stage_alone'], row['jumps']) == (True, True, False, True)
+    wrong = [
+        [],
+        found[:1],
+        [*found, found[0]],
+        [found[0], {**found[1], 'where': 'psd_1'}],
+        [found[0], {**found[1], 'value': 5.3}],
+    ]
+    for said in wrong:
+        row = judged(truth, {**nothing, 'setup': said})
+        assert (row['stage'], row['variables'], row['jumps']) == (False, False, False)
+    for other in ({'where': 'load_fx'}, {'form': 'gain_events'}):
+        assert not judged({**truth, **other}, {**nothing, 'setup': found})['jumps']
 
 
 def test_a_threshold_that_is_missed_is_said() -> None:

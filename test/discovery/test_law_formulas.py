@@ -70,8 +70,10 @@ def test_the_terms_that_are_tried_are_those_of_a_grid(seen: tuple[Workspace, Fit
         taus = [0.02, 0.1, 0.3, 1.0, 3.0, 10.0]
         assert numbers('relaxed', name, 'tau') == [s['tau'] for s in got['relaxed', (name, name)]] == taus
     # Between the values that held loads take; else two dozen levels.
-    assert numbers('over', 'load_fx', 'threshold') == [-5.0, 0.5, 3.0]
-    assert numbers('over', 'x1', 'threshold') == pytest.approx([-1e-3 + 4e-3 * (k + 0.5) / 24 for k in range(24)])
+    for form in ('over', 'under'):
+        assert numbers(form, 'load_fx', 'threshold') == [-5.0, 0.5, 3.0]
+        levels = [-1e-3 + 4e-3 * (k + 0.5) / 24 for k in range(24)]
+        assert numbers(form, 'x1', 'threshold') == pytest.approx(levels)
     waves: Any = [(s['period'], s['phase']) for s in got['wave', ('x1',)]]
     assert waves == [
         (pytest.approx(share * 3e-3), phase)
@@ -84,7 +86,7 @@ def test_the_terms_that_are_tried_are_those_of_a_grid(seen: tuple[Workspace, Fit
     only = {form: {of[0] for f, of in got if f == form} for form in ('rate', 'rate_absolute', 'drag', 'direction')}
     assert only == {'rate': {'x1'}, 'rate_absolute': {'x1'}, 'drag': {'x1'}, 'direction': {'load_fx'}}
     assert {form for form, _ in got} == {
-        *('product', 'absolute', 'signed_square', 'above', 'below', 'beyond', 'within', 'over', 'rate'),
+        *('product', 'absolute', 'signed_square', 'above', 'below', 'beyond', 'within', 'over', 'under', 'rate'),
         *('rate_absolute', 'drag', 'direction', 'play', 'relaxed', 'wave', 'resonance'),
     }
 

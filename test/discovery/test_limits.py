@@ -464,6 +464,8 @@ LIMITS: dict[Any, dict[str, Any]] = {
         'FAR': 10.0,
         'LIKELY': 0.3,
         'NEARLY_ALL': 0.01,
+        'STANDS_IN': 0.2,
+        'NEAR': 0.1,
         'MAX_EFFECTS': 4,
         'ROUNDS': 3,
         'TRIALS': 7,
@@ -510,7 +512,7 @@ def test_what_is_not_said_is_as_stated() -> None:
     assert weighing.Unknown('', (), 0.5) == weighing.Unknown('', (), 0.5, remains=True, rms=0.0)
     given = Comparison
     assert (given.nuisance, given.first, given.setup, given.open_level) == ((), frozenset(), frozenset(), False)
-    assert (given.budget, plants.PlantComparison.open_level, plants.PlantComparison.budget) == (500, True, 4000)
+    assert (given.budget, plants.PlantComparison.open_level, plants.PlantComparison.budget) == (700, True, 4000)
     assert (plants.Plant.nuisance, plants.Plant.noise, plants.Plant.period, plants.Plant.physics) == ((), (), 0.0, None)
     assert not plants.plant_effect('a', EffectParameter('x', 'V', -1.0, 1.0, 0.1, '')).finite
 
