@@ -162,8 +162,14 @@ class _Seeker:
         fit = refit(self.ws, [*beside, *(ActiveEffect(effect_of(law), values_of(law)) for law in laws)], iterations)
         covariance = _covariance(fit)
         better = tuple(_fitted(law, fit, covariance, len(beside) + i) for i, law in enumerate(laws))
-        # A shape at its bound means that the form is not the right one.
-        bound = any(i >= len(beside) for i, _ in fit.at_bound)
+        # A shape at its bound means that the form is not the right one; one that is not fitted has no room.
+        fixed = {
+            (len(beside) + i, f'{name}{k}')
+            for i, law in enumerate(laws)
+            for k, t in enumerate(law.terms, 1)
+            for name in FORMS[t.form].fixed
+        }
+        bound = any(i >= len(beside) and (i, name) not in fixed for i, name in fit.at_bound)
         return _Trial(better, fit, math.inf if bound else self.cost(better, fit))
 
     def done(self, trial: _Trial) -> bool:

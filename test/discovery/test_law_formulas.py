@@ -564,6 +564,16 @@ def test_a_shape_at_its_bound_is_not_the_right_form(seen: tuple[Workspace, Fit])
             assert math.isinf(seeker.trial([bound], fit.effects, 1).cost) == refused
 
 
+@pytest.mark.parametrize('form', ['over', 'under'])
+def test_a_threshold_that_no_refit_moves_is_not_at_its_bound(seen: tuple[Workspace, Fit], form: str) -> None:
+    workspace, fit = seen
+    seeker = laws._Seeker(workspace, fit, 3.0)
+    level = Law('b', 'psd', 'y2', (Term(form, ('x1',), shapes={'threshold': 1e-4}),))
+    got = seeker.trial([law_of('load_fy'), level], fit.effects, 2)
+    assert math.isfinite(got.cost)
+    assert got.fit.effects[-1].values['threshold1'] == 1e-4
+
+
 @pytest.mark.parametrize('recordings', [1, 2])
 def test_events_are_looked_for_in_one_recording_only(monkeypatch: pytest.MonkeyPatch, recordings: int) -> None:
     """In another one they have other times."""

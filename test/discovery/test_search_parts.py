@@ -228,7 +228,7 @@ def test_a_swap_must_be_better_by_two(monkeypatch: pytest.MonkeyPatch, lead: flo
     assert named(fit) == [['a'], ['b'], ['c']][rounds]
     assert asked.seen == [('b', 8), ('c', 8)][:rounds]
     assert [named(f) for f in others[0]] == [[order[named(fit)[0]]]]
-    search._begun = search.workspace.simulations - 750
+    search._begun = search.workspace.simulations - 1050
     asked.seen.clear()
     search.swap(asked.plain, asked.fit(active('a', x=0.1)))
     assert len(asked.seen) == rounds
@@ -251,11 +251,11 @@ def test_alternatives_are_the_best_of_each_name(monkeypatch: pytest.MonkeyPatch)
     given_scores(search, scored('a', 99.0), *(scored(n, 90.0 - i) for i, n in enumerate(names)), scored('b', 60.0))
     assert [named(f) for f in search.alternatives(asked.plain, one, 0, 50.0)] == [[n] for n in 'bcdefghi']
     assert asked.seen == [(n, 3) for n in 'bcdefghi']
-    search._begun = search.workspace.simulations - 500
+    search._begun = search.workspace.simulations - 700
     asked.seen.clear()
     search.alternatives(asked.plain, one, 0, 50.0)
     assert [n for n, _ in asked.seen] == ['b', 'c']
-    search._begun = search.workspace.simulations - 1000
+    search._begun = search.workspace.simulations - 1400
     assert len(search.alternatives(asked.plain, one, 0, 50.0)) == 2
     search._begun -= 1
     assert search.alternatives(asked.plain, one, 0, 50.0) == []
@@ -664,6 +664,7 @@ class Steps:
         further: Sequence[str],
         pairs: Sequence[str],
         refused: str = '',
+        stand_in: str = '',
         **ws: Any,
     ) -> None:
         self.search, self.done = nothing_found(), list[str]()
@@ -705,6 +706,7 @@ class Steps:
             ('swap', lambda null, fit: (fit, [])),
             ('weigh', lambda null, fit: ([], [], [])),
             ('_passes', lambda smaller, larger, null: ''.join(named(larger)) != refused),
+            ('_stands_in', lambda smaller, larger: ''.join(named(larger)) == stand_in),
         ):
             monkeypatch.setattr(search, name, step)
         self.found = ''.join(named(search.run().fit))
@@ -759,6 +761,41 @@ def test_of_two_causes_of_a_rough_machine_neither_may_help_alone(monkeypatch: py
     # A pair instead of the one that is there; one that does not pass is not taken.
     assert Steps(monkeypatch, ['a', ''], ['bc'], open_level=True).found == 'bc'
     assert Steps(monkeypatch, ['a', 'ab', ''], ['', 'cd'], 'ab', open_level=True).found == 'a'
+
+
+def test_what_stands_in_is_not_added_and_a_pair_is_looked_for_instead(monkeypatch: pytest.MonkeyPatch) -> None:
+    way = Steps(monkeypatch, ['a', 'ab'], [''], stand_in='ab')
+    assert way.found == 'a'
+    assert way.said == ['adding a']
+    assert way.done == ['further a,b,c,d', 'renoise a', 'screen a', 'further b,c,d', 'pairs', 'renoise a']
+    # A wrong first effect hides the pair; one that stands in as well is not taken.
+    assert Steps(monkeypatch, ['a', 'ab', ''], ['cd'], stand_in='ab').found == 'cd'
+    both = Steps(monkeypatch, ['a', 'cd'], ['cd'], stand_in='cd')
+    assert (both.found, both.done[-2:]) == ('a', ['pairs', 'renoise a'])
+    # Beside two effects there is none to look for.
+    three = Steps(monkeypatch, ['a', 'ab', 'abc'], ['', 'cd'], stand_in='abc')
+    assert (three.found, three.done.count('pairs')) == ('ab', 1)
+
+
+def test_an_effect_stands_in_if_it_explains_little_of_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fifth of what is beyond noise, while more than a tenth of the noise is left."""
+    search = nothing_found()
+    size = float(search.workspace.size)
+    asked = Asked(monkeypatch, steps, search, a=3.0 * size)
+    one, both = asked.fit(active('a', x=0.1)), (active('a', x=0.1), active('b', x=0.1))
+
+    def left(chi2: float, smaller: Fit) -> bool:
+        return search._stands_in(smaller, dataclasses.replace(asked.fit(*both), chi2=chi2))
+
+    assert left(2.61 * size, one)
+    assert not left(2.59 * size, one)
+    near = dataclasses.replace(one, chi2=1.12 * size)
+    assert left(1.101 * size, near)
+    assert not left(1.099 * size, near)
+    # The first effect is beside none, and nobody knows the noise of a rough machine.
+    assert not left(2.9 * size, dataclasses.replace(asked.fit(), chi2=3.0 * size))
+    monkeypatch.setattr(search.workspace, 'open_level', True)
+    assert not left(2.9 * size, one)
 
 
 def test_beyond_the_budget_nothing_is_added(monkeypatch: pytest.MonkeyPatch) -> None:

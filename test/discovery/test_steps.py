@@ -426,7 +426,7 @@ def test_an_alternative_that_comes_close_is_refitted_in_full(
     assert other.chi2 == pytest.approx(short, rel=1e-3)
     assert asked == ([3, 8] if again else [3])
     # After twice the budget there are none; beyond the budget two are tried.
-    search._begun = plant.simulations - 1001
+    search._begun = plant.simulations - 1401
     assert search.alternatives(null, fit, 0, gain) == []
 
 
