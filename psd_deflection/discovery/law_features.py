@@ -7,6 +7,7 @@ dot shows in one channel. So thousands of terms are scored without a simulation.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,7 +22,7 @@ from psd_deflection.discovery.workspace import Workspace, fine_means
 from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
 from psd_deflection.simulation.catalogue import sort_effects
 from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.laws import TARGETS, VARIABLES, Term, known
+from psd_deflection.simulation.laws import FORMS, TARGETS, VARIABLES, Term, known
 from psd_deflection.simulation.modes import mode_coefficients
 from psd_deflection.simulation.optics import dots_on_plate
 from psd_deflection.simulation.samples import SimulatedSamples
@@ -31,6 +32,8 @@ LOADS, POSE, DOTS = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta'), ('
 SOUGHT = (*(f'static_{n}' for n in POSE), *POSE, *DOTS, 'sum1', 'sum2')
 """The targets that are looked at. A law on a load does what one on the static pose does."""
 _BATCH = 64
+LEVELS = 24
+"""Thresholds that are tried of a form that jumps there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,6 +150,10 @@ def _spread(parts: Sequence[FloatArray]) -> float:
     return float(np.max(np.abs(np.concatenate(parts))))
 
 
+def _range(parts: Sequence[FloatArray]) -> float:
+    return float(np.ptp(np.concatenate(parts)))
+
+
 def _levels(parts: Sequence[FloatArray], count: int) -> list[float]:
     """Between the values that a variable takes, evenly by rank of the distinct ones."""
     whole = np.concatenate(parts)
@@ -178,8 +185,8 @@ def terms(found: Sequence[Response]) -> Iterator[Term]:
             yield Term('within', (name,), shapes={'threshold': share * size[name]})
         # Held loads take few values, and any threshold between two of them is the same.
         distinct = np.unique(np.concatenate(parts[name]))
-        few = [0.5 * (a + b) for a, b in itertools.pairwise(distinct.tolist())] if len(distinct) <= 24 else []
-        for level in few or _levels(parts[name], 24):
+        few = [0.5 * (a + b) for a, b in itertools.pairwise(distinct.tolist())] if len(distinct) <= LEVELS else []
+        for level in few or _levels(parts[name], LEVELS):
             yield Term('over', (name,), shapes={'threshold': level})
             yield Term('under', (name,), shapes={'threshold': level})
     for name in placed:
@@ -320,6 +327,20 @@ def with_better_times(found: Sequence[Response], target: str, term: Term) -> Ter
             if best:
                 term = Term(term.form, term.of, times=best[0].term.times)
     return term
+
+
+def with_better_level(found: Sequence[Response], s: Scored) -> Scored:
+    """The term with the threshold at which it explains most: no refit moves one at which the form jumps."""
+    if 'threshold' not in FORMS[s.term.form].fixed:
+        return s
+    best, reach = s, _range([r.known[s.term.of[0]] for r in found]) / LEVELS
+    for _ in range(3):
+        middle = best.term.shapes['threshold']
+        levels = (middle + reach * np.linspace(-1.0, 1.0, 17)).tolist()
+        tries = [dataclasses.replace(best.term, shapes={'threshold': level}) for level in levels]
+        best = max([best, *score(found, tries, (s.target,))], key=lambda t: t.gain)
+        reach /= 8.0
+    return best
 
 
 def _two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[int]:

@@ -29,6 +29,7 @@ from psd_deflection.discovery.law_features import (
     score,
     switchings,
     terms,
+    with_better_level,
     with_better_times,
 )
 from psd_deflection.discovery.search import BIC_ACCEPT, P_ACCEPT
@@ -186,7 +187,7 @@ class _Seeker:
             key = (s.target, s.term.form, s.term.of)
             if key not in seen and s.gain >= 0.3 * scored[0].gain and len(picked) < TRIED:
                 seen.add(key)
-                picked.append(s)
+                picked.append(with_better_level(self.found, s))
         quick = [self.trial([_on(s.target, s.term)], self.start.effects, 3) for s in picked]
         quick.sort(key=lambda t: t.cost)
         full = [self.trial(t.laws, t.beside, 8) for t in quick[:FOLLOWED]]
@@ -202,7 +203,8 @@ class _Seeker:
                     trial = again
                     continue
             scored = score(more, [t for t in self.listed if t.form != 'switched'])
-            tries = [self.trial(_with(trial.laws, s), trial.beside, 4) for s in scored[:2]]
+            better = [with_better_level(more, s) for s in scored[:2]]
+            tries = [self.trial(_with(trial.laws, s), trial.beside, 4) for s in better]
             best = min(tries, key=lambda t: t.cost, default=trial)
             if best.cost > trial.cost - BIC_ACCEPT:
                 break

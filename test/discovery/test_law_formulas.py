@@ -258,6 +258,24 @@ def test_times_that_show_are_terms_and_become_better(seen: tuple[Workspace, Fit]
     assert {t.of for t in switchings(found, ('y1',))} <= {(), ('x1',), ('y1',)}
 
 
+@pytest.mark.parametrize('form', ['over', 'under'])
+def test_a_level_at_which_a_dot_jumps_becomes_better(form: str) -> None:
+    (ringing,) = law_features.known_fine(Workspace([observed(4)]), (), 'y1')
+    level = float(np.quantile(ringing[np.abs(ringing) > 1e-6], 0.6))
+    law = Law('bump', 'psd', 'x1', (Term(form, ('y1',), 3e-5, {'threshold': level}),))
+    workspace = Workspace([observed(4, (ActiveEffect(effect_of(law), values_of(law)),))])
+    found = responses(workspace, refit(workspace, ()))
+    pitch = float(np.ptp(ringing)) / 24
+    for start in (level - 0.9 * pitch, level + 0.9 * pitch):
+        rough = score(found, [Term(form, ('y1',), shapes={'threshold': start})], ('x1',))[0]
+        better = law_features.with_better_level(found, rough)
+        assert better.gain > rough.gain
+        assert better.term.shapes['threshold'] == pytest.approx(level, abs=0.04 * pitch)
+        assert better.term.coefficient == pytest.approx(3e-5, rel=0.02)
+    kept = score(found, [Term('above', ('y1',), shapes={'threshold': level})], ('x1',))[0]
+    assert law_features.with_better_level(found, kept) is kept
+
+
 # Laws and their fits.
 
 

@@ -434,7 +434,7 @@ LIMITS: dict[Any, dict[str, Any]] = {
         'START_CELSIUS': 20.0,
         'SWINGS': (0.0, 0.5, 1.0, 0.5, 0.0, -0.5, -1.0, -0.5, 0.0),
     },
-    law_features: {'_BATCH': 64, 'MOST_TIMES': 12, 'REFINED': 4, 'TOGGLE_COST': 24.0},
+    law_features: {'_BATCH': 64, 'LEVELS': 24, 'MOST_TIMES': 12, 'REFINED': 4, 'TOGGLE_COST': 24.0},
     laws: {
         'TRIED': 12,
         'FOLLOWED': 3,
