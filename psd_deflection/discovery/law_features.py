@@ -150,10 +150,6 @@ def _spread(parts: Sequence[FloatArray]) -> float:
     return float(np.max(np.abs(np.concatenate(parts))))
 
 
-def _range(parts: Sequence[FloatArray]) -> float:
-    return float(np.ptp(np.concatenate(parts)))
-
-
 def _levels(parts: Sequence[FloatArray], count: int) -> list[float]:
     """Between the values that a variable takes, evenly by rank of the distinct ones."""
     whole = np.concatenate(parts)
@@ -330,16 +326,26 @@ def with_better_times(found: Sequence[Response], target: str, term: Term) -> Ter
 
 
 def with_better_level(found: Sequence[Response], s: Scored) -> Scored:
-    """The term with the threshold at which it explains most: no refit moves one at which the form jumps."""
+    """The term with the threshold at which it explains most: no refit moves one at which the form jumps.
+
+    It is the middle between the two values of the variable around it, which are as good; they are its uncertainty.
+    """
     if 'threshold' not in FORMS[s.term.form].fixed:
         return s
-    best, reach = s, _range([r.known[s.term.of[0]] for r in found]) / LEVELS
+    values = np.unique(np.concatenate([r.known[s.term.of[0]] for r in found]))
+    best, reach = s, float(np.ptp(values)) / LEVELS
     for _ in range(3):
         middle = best.term.shapes['threshold']
         levels = (middle + reach * np.linspace(-1.0, 1.0, 17)).tolist()
         tries = [dataclasses.replace(best.term, shapes={'threshold': level}) for level in levels]
         best = max([best, *score(found, tries, (s.target,))], key=lambda t: t.gain)
         reach /= 8.0
+    above = int(np.searchsorted(values, best.term.shapes['threshold']))
+    if 0 < above < len(values):
+        low, high = float(values[above - 1]), float(values[above])
+        between = {'threshold': 0.5 * (low + high)}
+        term = dataclasses.replace(best.term, shapes=between, sd={'threshold': (high - low) / math.sqrt(12.0)})
+        best = dataclasses.replace(best, term=term)
     return best
 
 

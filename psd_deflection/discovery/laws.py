@@ -135,7 +135,8 @@ def _fitted(law: Law, fit: Fit, covariance: FloatArray, index: int) -> Law:
         shapes = {k: values[f'{k}{i}'] for k in t.shapes}
         sizes = {'coefficient': values[f'c{i}'], **shapes}
         # What the recording does not determine has no standard deviation.
-        own = {k: v for k, v in own.items() if v < UNDETERMINED * abs(sizes[k])}
+        own = {k: v for k, v in own.items() if v < UNDETERMINED * abs(sizes[k]) and k not in FORMS[t.form].fixed}
+        own.update({k: t.sd[k] for k in FORMS[t.form].fixed if k in t.sd})
         out.append(dataclasses.replace(t, coefficient=values[f'c{i}'], shapes=shapes, sd=own))
     return dataclasses.replace(law, terms=tuple(out))
 

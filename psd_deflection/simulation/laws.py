@@ -294,9 +294,14 @@ class Term:
 
     def words(self) -> str:
         """The form, with numbers: ``max(load_fy - 10, 0)``."""
-        numbers = {k: f'{v:.4g} {self.shape_unit(k)}'.rstrip() for k, v in self.shapes.items()}
+        numbers = {k: f'{self._shape(k)} {self.shape_unit(k)}'.rstrip() for k in self.shapes}
         times = ', '.join(f'{t:.3f}' for t in self.times) + ' s'
         return FORMS[self.form].words.format(v=self.variable, times=times, **numbers)
+
+    def _shape(self, name: str) -> str:
+        value = f'{self.shapes[name]:.4g}'
+        known = name in FORMS[self.form].fixed and self.sd.get(name)
+        return f'({value} ± {self.sd[name]:.1g})' if known else value
 
 
 def unit_of(variables: Sequence[str]) -> str:

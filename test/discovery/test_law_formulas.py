@@ -272,8 +272,26 @@ def test_a_level_at_which_a_dot_jumps_becomes_better(form: str) -> None:
         assert better.gain > rough.gain
         assert better.term.shapes['threshold'] == pytest.approx(level, abs=0.04 * pitch)
         assert better.term.coefficient == pytest.approx(3e-5, rel=0.02)
+        assert 0.0 < better.term.sd['threshold'] < 0.04 * pitch
     kept = score(found, [Term('above', ('y1',), shapes={'threshold': level})], ('x1',))[0]
     assert law_features.with_better_level(found, kept) is kept
+
+
+def test_between_two_loads_any_level_is_as_good(seen: tuple[Workspace, Fit]) -> None:
+    """Its middle is told, and the width of what is between, as a standard deviation; the fit keeps both."""
+    workspace, fit = seen
+    found = responses(workspace, fit)
+    levels = np.unique(found[0].known['load_fx'])
+    low, high = levels[-2:].tolist()
+    start = score(found, [Term('over', ('load_fx',), shapes={'threshold': low + 0.1 * (high - low)})], ('x2',))[0]
+    better = law_features.with_better_level(found, start)
+    assert better.gain == pytest.approx(start.gain)
+    assert better.term.shapes['threshold'] == pytest.approx(0.5 * (low + high))
+    assert better.term.sd['threshold'] == pytest.approx((high - low) / math.sqrt(12.0))
+    seeker = laws._Seeker(workspace, fit, 3.0)
+    (law,) = seeker.trial([laws._on('x2', better.term)], fit.effects, 2).laws
+    assert law.terms[0].sd['threshold'] == better.term.sd['threshold']
+    assert f'> ({0.5 * (low + high):.4g} ± ' in law.expression
 
 
 # Laws and their fits.
