@@ -254,6 +254,6 @@ def _floats(columns: list[list[str]]) -> FloatArray:
         if '_' in together or not together.isascii():
             return np.array([[np.nan]])
     try:
-        return np.array([list(map(float, cells)) for cells in columns]).T
+        return np.stack([np.fromiter(map(float, cells), np.float64, len(cells)) for cells in columns], axis=1)
     except ValueError:
         return np.array([[np.nan]])

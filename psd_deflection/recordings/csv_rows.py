@@ -104,7 +104,7 @@ class CsvTable:
             data = rest + data
             cut = data.rfind(b'\n') + 1
             piece, rest = data[:cut], data[cut:]
-            text = piece.replace(b'\r\n', b'\n')
+            text = piece.replace(b'\r\n', b'\n') if b'\r' in piece else piece
             if len(rest) > MAX_LINE or text.translate(None, _PLAIN):
                 return
             if not text:
