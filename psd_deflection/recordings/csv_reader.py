@@ -141,7 +141,7 @@ class CsvRecording(Recording):
             for t_ns in rows.t_ns:
                 if last_t is not None:
                     passed = (t_ns - last_t) / self._step_ns + left_over
-                    steps = round(passed) or 1
+                    steps = max(1, round(passed))
                     left_over = 0.9 * (passed - steps)
                     seq += steps
                 last_t = t_ns

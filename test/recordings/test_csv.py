@@ -318,3 +318,11 @@ def test_an_unclosed_quote_is_reported(tmp_path: Path, row: str, why: str) -> No
     path.write_text('\n'.join([','.join(['t', *CHANNELS]), *rows, row]) + '\n')
     with pytest.raises(RecordingError, match=r'q\.csv:6: is no row of a CSV'):
         open_recording(path).samples  # noqa: B018
+
+
+def test_rows_that_follow_at_once_still_count_upwards(tmp_path: Path) -> None:
+    times = [0.0, 0.001, 0.002, 0.00201, 0.00202, 0.00203, 0.00204, *(0.003 + i / 1000 for i in range(60))]
+    recording = open_recording(write(tmp_path / 'a.csv', *rows([f'{t:.6f}' for t in times])))
+    seq = np.concatenate([b.seq for b in recording.blocks()])
+    assert len(seq) == len(times)
+    assert (np.diff(seq) >= 1).all()
