@@ -11,6 +11,7 @@ import itertools
 
 import numpy as np
 
+from psd_deflection.arithmetic import FIXED, Arithmetic
 from psd_deflection.records import FloatArray, RawChunk, SampleBlock
 
 
@@ -78,14 +79,13 @@ class BlockCutter:
         )
 
 
-def covariance(values: FloatArray) -> FloatArray:
+def covariance(values: FloatArray, by: Arithmetic = FIXED) -> FloatArray:
     """Unbiased sample covariance (c, c) of ``values`` (n, c); zeros if n < 2."""
     n, c = values.shape
     if n < 2:
         return np.zeros((c, c))
-    centred = values - values.sum(axis=0) / n
-    out: FloatArray = (centred.T @ centred) / (n - 1)
-    return out
+    centred = values - by.sum(values, 0) / n
+    return np.asarray(by.product(centred.T, centred) / (n - 1))
 
 
 def block_middle_ns(block: SampleBlock, block_size: int, period_ns: float) -> int:

@@ -208,6 +208,14 @@ class EstimatorConfig:
         choices=('widen', 'refuse', 'report'),
         before='report',
     )
+    arithmetic: str = parameter(
+        'fixed',
+        '',
+        'how the pipeline computes: in an order of its own, with the same bits on every processor (fixed), or by the '
+        'matrix and C libraries, whose last digits depend on the processor (library)',
+        choices=('fixed', 'library'),
+        before='library',
+    )
     wrench: str = parameter(
         'effects',
         '',

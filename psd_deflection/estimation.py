@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from math import cos, expm1, nan, sin
+from math import nan
 from typing import NamedTuple
 
 import numpy as np
 
+from psd_deflection.arithmetic import ARITHMETICS, Arithmetic
 from psd_deflection.calibration import dot_noise_variances
 from psd_deflection.calibration.health import FROZEN_BLOCKS, OpticsHealth, Verdict
 from psd_deflection.config import Rig
@@ -110,6 +111,7 @@ class Estimation:
 
     def __init__(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
         config = rig.estimator
+        self._by = ARITHMETICS[config.arithmetic]
         variances = dot_noise_variances(rig)
         self.variances = [tuple(float(v) / n for v in variances) for n in range(1, config.block_size + 1)]
         self.zero_variances: tuple[float, ...] = ()
@@ -261,7 +263,7 @@ class Estimation:
         if self.stamped.flat:
             allowed = np.diag(readings.variances) if readings.spread is None else readings.spread
             if factor is not None:
-                allowed = allowed + np.einsum('ik,jk->ij', factor, factor)
+                allowed = allowed + self._by.einsum('ik,jk->ij', factor, factor)
             pose = solution[:5]
             checked = self.stamped.check(readings.dots, solution.residual, allowed, pose, readings.some, agree_without)
         readings = readings._replace(checked=checked, factor=factor)
@@ -288,7 +290,7 @@ class Estimation:
         name, _, primary = self._solvers[number]
         solver = self._solver(number, readings.kept)
         dots, variances, spread, checked = readings.dots, readings.variances, readings.spread, readings.checked
-        rms = (sum(r * r for r in s.residual) / len(s.residual)) ** 0.5
+        rms = self._by.root(self._by.total(r * r for r in s.residual) / len(s.residual))
         covariance: tuple[float, ...] = s.covariance
         possible = () if checked is None or self._rig.estimator.consistency != 'widen' else checked.possible
         factor = readings.factor
@@ -299,17 +301,17 @@ class Estimation:
         if solver is not None and known and (spread is not None or any(possible) or factor is not None):
             gain = solver.gain(dots, variances, s)
             if spread is not None:
-                own = np.einsum('ic,ck,jk->ij', gain, spread, gain)
+                own = self._by.einsum('ic,ck,jk->ij', gain, spread, gain)
                 allowance = solver.allowance(dots, variances)
                 own = own if allowance is None else own + allowance
             else:
                 own = np.array(covariance).reshape(3, 3)
             noise = own
             if factor is not None:
-                own = own + _through(gain, factor)
+                own = own + _through(gain, factor, self._by)
             if any(possible):
                 # A check that was made with all PSDs tells nothing of some of them.
-                own = widened(own, gain, possible) if len(possible) == gain.shape[1] else own
+                own = widened(own, gain, possible, self._by) if len(possible) == gain.shape[1] else own
             if primary and own is not noise:
                 self.systematic = own - noise
             covariance = tuple(own.ravel().tolist())
@@ -339,7 +341,8 @@ class Estimation:
     def _from_one(self, psd: int, block: SeenBlock, readings: Readings) -> DeflectionEstimate | None:
         """The translation from the remaining detector ``psd`` (from 0), by the rule that ``degraded`` names."""
         config = self._rig.estimator
-        theta, variance = 0.0, config.twist_sd**2
+        by = self._by
+        theta, variance = 0.0, by.square(config.twist_sd)
         if config.degraded == 'none':
             return None
         if config.degraded == 'hold':
@@ -348,20 +351,20 @@ class Estimation:
                 return None
             age = max(block.t_ns - held.t_ns, 0) / 1e9
             theta = held.theta
-            variance = held.variance + config.twist_sd**2 * -expm1(-age / config.twist_hold)
+            variance = held.variance + by.square(config.twist_sd) * -by.expm1(-age / config.twist_hold)
         x, y = readings.dots[2 * psd : 2 * psd + 2]
         vx, vy = readings.variances[2 * psd : 2 * psd + 2]
         dx, dy, cov = self._one_psd.solve(psd, (x, y), (vx, vy), theta, variance)
         if self.spread is not None:
             gain = np.zeros((3, 2 * len(self._rig.psds)))
-            c, s = cos(theta), sin(theta)
+            c, s = by.cos(theta), by.sin(theta)
             gain[:2, 2 * psd : 2 * psd + 2] = [[-c, s], [-s, -c]]
-            own = np.array(cov).reshape(3, 3) + _through(gain, self.spread.factor(dx, dy, theta))
+            own = np.array(cov).reshape(3, 3) + _through(gain, self.spread.factor(dx, dy, theta), by)
             cov = tuple(own.ravel().tolist())
         return DeflectionEstimate(block.t_ns, block.index, ONE_PSD, dx, dy, theta, 0.0, 0.0, cov, 0.0, True)
 
 
-def _through(gain: FloatArray, factor: FloatArray) -> FloatArray:
+def _through(gain: FloatArray, factor: FloatArray, by: Arithmetic) -> FloatArray:
     """(3, 3): what dots that spread by ``factor`` (C, k) m do to an answer with ``gain`` (3, C)."""
-    moved = np.einsum('ij,jk->ik', gain, factor)
-    return np.asarray(np.einsum('ik,jk->ij', moved, moved))
+    moved = by.einsum('ij,jk->ik', gain, factor)
+    return by.einsum('ik,jk->ij', moved, moved)

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.arithmetic import ARITHMETICS
 from psd_deflection.averaging import BlockCutter, block_middle_ns, covariance
 from psd_deflection.calibration import Calibration, counts_to_volts
 from psd_deflection.calibration.health import OpticsHealth
@@ -90,6 +91,7 @@ class Pipeline:
         self.last_estimate: DeflectionEstimate | None = None
         self.last_spots: SpotMeans | None = None
         config = rig.estimator
+        self._by = ARITHMETICS[config.arithmetic]
         self._cutter = BlockCutter(config.block_size)
         self._period_ns = 1e9 / rig.converter.sample_rate_hz
         self._effects = effects_of_rig(rig)
@@ -167,7 +169,7 @@ class Pipeline:
         self.zero_refused = why_moving(recent, noise)
         if self.zero_refused:
             return None
-        means = [sum(column) / len(self._recent) for column in zip(*self._recent, strict=True)]
+        means = [self._by.total(column) / len(self._recent) for column in zip(*self._recent, strict=True)]
         values: dict[str, float | str | tuple[float, ...]] = dict(
             zip(ZEROS, zip(means[0::2], means[1::2], strict=True), strict=False)
         )
@@ -330,7 +332,7 @@ class Pipeline:
         volts = self._calibration.seen(block.volts)
         sums = volts[:, 2::3].astype(np.float64)
         samples = self.dots(block)
-        means: Dots = tuple((samples.sum(axis=0) / present).tolist())
+        means: Dots = tuple((self._by.sum(samples, 0) / present).tolist())
         if self._optics.refuses_frozen:
             self._count_still(volts)
         verdict = self._optics.judge(block, volts, means, sums, self._frozen)
@@ -391,8 +393,8 @@ class Pipeline:
             t_ns,
             block.index,
             answer.dots,
-            tuple((sums.sum(axis=0) / present).tolist()),
-            covariance(samples),
+            tuple((self._by.sum(sums, 0) / present).tolist()),
+            covariance(samples, self._by),
             present,
             size - present,
             status,

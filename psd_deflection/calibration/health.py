@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.arithmetic import ARITHMETICS
 from psd_deflection.config import Rig
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, FloatArray, SampleBlock, channel_names, dot_names
 
@@ -59,6 +60,7 @@ class OpticsHealth:
 
     def __init__(self, rig: Rig) -> None:
         config = rig.estimator
+        self._by = ARITHMETICS[config.arithmetic]
         self._psds = len(rig.psds)
         self._size = config.block_size
         self._min_samples = config.min_samples
@@ -168,7 +170,7 @@ class OpticsHealth:
         if len(volts) == self._size >= 10:
             # Third differences almost remove the link's own motion.
             rough = np.diff(volts, n=3, axis=0)
-            level = np.sqrt(np.einsum('ij,ij->j', rough, rough) / (len(rough) * _THIRD_DIFFERENCE))
+            level = np.sqrt(self._by.einsum('ij,ij->j', rough, rough) / (len(rough) * _THIRD_DIFFERENCE))
             for psd in range(1, self._psds + 1):
                 own = level[3 * psd - 3 : 3 * psd]
                 noisy = own[own > self._noise[psd - 1]]
@@ -186,9 +188,9 @@ class OpticsHealth:
         """
         out = []
         for psd in range(self._psds):
-            total = float(sums[:, psd].mean())
+            total = float(self._by.sum(sums[:, psd], 0)) / len(sums)
             share = max(total - self._nominal, 0.0) / total if total > self._sum_max else 0.0
-            out.append((share * max(self._half[2 * psd : 2 * psd + 2])) ** 2 / 3.0)
+            out.append(self._by.square(share * max(self._half[2 * psd : 2 * psd + 2])) / 3.0)
         return tuple(out)
 
 

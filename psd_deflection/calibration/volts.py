@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.arithmetic import ARITHMETICS
 from psd_deflection.calibration.sensors import Quadrant, Sensor, make_sensor
 from psd_deflection.calibration.wiring import Wiring
 from psd_deflection.config import Rig
@@ -102,4 +103,6 @@ def dot_noise_variances(rig: Rig) -> FloatArray:
     """
     step = rig.converter.volts_per_count
     channels = zip(rig.sensitivities.ravel().tolist(), rig.noises[:, :2].ravel().tolist(), strict=True)
-    return np.array([sensitivity**2 * (noise**2 + step**2 / 12.0) for sensitivity, noise in channels])
+    by = ARITHMETICS[rig.estimator.arithmetic]
+    rounding = by.square(step) / 12.0
+    return np.array([by.square(sensitivity) * (by.square(noise) + rounding) for sensitivity, noise in channels])

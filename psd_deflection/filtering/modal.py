@@ -21,16 +21,18 @@ from typing import NamedTuple
 
 import numpy as np
 
+from psd_deflection.arithmetic import FIXED, Arithmetic
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.uncertainty.block_fit import inverse
 
 
 @dataclass(frozen=True, slots=True)
 class Oscillator:
-    """One mode. ``frequency`` Hz, undamped, above 0; ``damping_ratio`` 0 or more, below 1."""
+    """One mode. ``frequency`` Hz, undamped, above 0; ``damping_ratio`` 0 or more, below 1; ``by``: what computes it."""
 
     frequency: float
     damping_ratio: float
+    by: Arithmetic = FIXED
 
     @property
     def w(self) -> float:
@@ -39,10 +41,10 @@ class Oscillator:
 
     def step(self, seconds: float) -> FloatArray:
         """Phi (4, 4): the state after ``seconds`` of its own motion."""
-        w, zeta = self.w, self.damping_ratio
-        root = math.sqrt(1.0 - zeta**2)
-        decay = math.exp(-zeta * w * seconds)
-        c, s = math.cos(root * w * seconds), math.sin(root * w * seconds) / root
+        w, zeta, by = self.w, self.damping_ratio, self.by
+        root = math.sqrt(1.0 - by.square(zeta))
+        decay = by.exp(-zeta * w * seconds)
+        c, s = by.cos(root * w * seconds), by.sin(root * w * seconds) / root
         kept, turned = decay * (c + zeta * s), decay * s
         out = np.zeros((4, 4))
         out[:2, :2] = [[kept, turned], [-turned, decay * (c - zeta * s)]]
@@ -51,14 +53,14 @@ class Oscillator:
 
     def pushed(self, seconds: FloatArray) -> FloatArray:
         """(n, 2, 4): the state ``seconds`` (n,) after u, or r/w, went from 0 to 1: columns of Phi; 0 before that."""
-        w, zeta = self.w, self.damping_ratio
-        root = math.sqrt(1.0 - zeta**2)
+        w, zeta, by = self.w, self.damping_ratio, self.by
+        root = math.sqrt(1.0 - by.square(zeta))
         since = np.maximum(seconds, 0.0)
-        decay = np.exp(-zeta * w * since)
-        c, s = np.cos(root * w * since), np.sin(root * w * since) / root
+        decay = by.exp_many(-zeta * w * since)
+        c, s = by.cos_many(root * w * since), by.sin_many(root * w * since) / root
         zero, one = np.zeros(len(since)), np.ones(len(since))
         rest = 1.0 - decay * (c + zeta * s)
-        lag = 2.0 * zeta - decay * (2.0 * zeta * c + (2.0 * zeta**2 - 1.0) * s)
+        lag = 2.0 * zeta - decay * (2.0 * zeta * c + (2.0 * by.square(zeta) - 1.0) * s)
         out = np.array([[rest, decay * s, one, zero], [w * since - lag, rest, w * since, one]]).transpose(2, 0, 1)
         return np.asarray(np.where(seconds[:, None, None] >= 0.0, out, 0.0))
 
@@ -68,12 +70,12 @@ class Oscillator:
         It is the integral of the column of Phi times itself, by Gauss-Legendre in pieces of an eighth of a
         period at most.
         """
-        nodes, weights = np.polynomial.legendre.leggauss(8)
+        nodes, weights = self.by.legendre(8)
         pieces = max(1, math.ceil(8.0 * float(seconds.max()) * self.frequency))
         shares = ((np.arange(pieces)[:, None] + 0.5 * (nodes + 1.0)) / pieces).ravel()
         pushed = self.pushed((seconds[:, None] * shares).ravel()).reshape(len(seconds), len(shares), 2, 4)
         parts = np.tile(0.5 * weights / pieces, pieces) * seconds[:, None]
-        return np.asarray(np.einsum('np,npci,npcj->ncij', parts, pushed, pushed))
+        return self.by.einsum('np,npci,npcj->ncij', parts, pushed, pushed)
 
 
 class Says(NamedTuple):
@@ -103,6 +105,7 @@ class BlockTables:
 
     def __init__(self, modes: tuple[Oscillator, ...], size: int, period: float) -> None:
         """``size``: N. ``period``: of a sample, s."""
+        by = self._by = modes[0].by
         self.size = size
         self._observed = np.empty((len(modes), size, 4))
         self._walk = np.empty((len(modes), 2, size, size))
@@ -117,8 +120,10 @@ class BlockTables:
             for s in range(size):
                 # Covariance of the state at sample s with itself, carried on to later samples.
                 for t in range(s, size):
-                    self._walk[a, :, s, t] = self._walk[a, :, t, s] = spreads[s + 1][:, :, 0] @ steps[t - s][0]
-                self._to_end[a, :, :, s] = spreads[s + 1][:, :, 0] @ steps[size - 1 - s].T
+                    self._walk[a, :, s, t] = self._walk[a, :, t, s] = by.product(
+                        spreads[s + 1][:, :, 0], steps[t - s][0]
+                    )
+                self._to_end[a, :, :, s] = by.product(spreads[s + 1][:, :, 0], steps[size - 1 - s].T)
 
     def fill(self, noise: FloatArray, rates: FloatArray) -> None:
         """Use this noise and these rates.
@@ -126,9 +131,9 @@ class BlockTables:
         ``noise`` (A, N, N): covariance of the readings in one block. ``rates`` (A, K, 2): Q_u
         and Q_r/w^2.
         """
-        self._covariance = noise[:, None] + np.einsum('akc,acnm->aknm', rates, self._walk)
-        self._reach = np.einsum('akc,acin->akin', rates, self._to_end)
-        self.added = np.einsum('akc,acij->akij', rates, self._spread)
+        self._covariance = noise[:, None] + self._by.einsum('akc,acnm->aknm', rates, self._walk)
+        self._reach = self._by.einsum('akc,acin->akin', rates, self._to_end)
+        self.added = self._by.einsum('akc,acij->akij', rates, self._spread)
         self._whole = self._of(np.arange(self.size))
 
     def says(self, slots: IntArray) -> Says:
@@ -141,16 +146,16 @@ class BlockTables:
         precision = inverse(covariance.reshape(-1, count, count)).reshape(covariance.shape)
         observed = self._observed[:, slots]
         reach = self._reach[..., slots]
-        pulled = np.einsum('ani,aknm->akim', observed, precision)
-        smoothed = np.einsum('akin,aknm->akim', reach, precision)
-        _, size = np.linalg.slogdet(covariance)
+        pulled = self._by.einsum('ani,aknm->akim', observed, precision)
+        smoothed = self._by.einsum('akin,aknm->akim', reach, precision)
+        size = self._by.log_det(covariance)
         return Says(
             observed,
             precision,
             pulled,
             smoothed,
-            np.einsum('akin,anj->akij', pulled, observed),
-            self.phi[:, None] - np.einsum('akin,anj->akij', smoothed, observed),
-            self.added - np.einsum('akin,akjn->akij', smoothed, reach),
+            self._by.einsum('akin,anj->akij', pulled, observed),
+            self.phi[:, None] - self._by.einsum('akin,anj->akij', smoothed, observed),
+            self.added - self._by.einsum('akin,akjn->akij', smoothed, reach),
             size,
         )

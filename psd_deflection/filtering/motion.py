@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from psd_deflection.arithmetic import ARITHMETICS, Arithmetic
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError
 from psd_deflection.filtering.inertia import Forced, Inertia
@@ -120,8 +121,9 @@ class ModalFilter:
             raise ConfigError(f'filter = {config.filter}: needs a block_size of {LARGEST} at most, not {size}')
         self._size = size
         self._period = 1.0 / rig.converter.sample_rate_hz
-        bending = Oscillator(dynamics.bending_frequency, dynamics.bending_damping_ratio)
-        torsion = Oscillator(dynamics.torsion_frequency, dynamics.torsion_damping_ratio)
+        by = self._by = ARITHMETICS[config.arithmetic]
+        bending = Oscillator(dynamics.bending_frequency, dynamics.bending_damping_ratio, by)
+        torsion = Oscillator(dynamics.torsion_frequency, dynamics.torsion_damping_ratio, by)
         self._modes = (bending, bending, torsion)
         self._w = np.array([mode.w for mode in self._modes])
         self._tables = BlockTables(self._modes, size, self._period)
@@ -155,9 +157,9 @@ class ModalFilter:
     def forget(self) -> None:
         """Know nothing: the next block starts anew."""
         self._x = np.zeros((3, 4))
-        self._p = np.tile(UNKNOWN**2 * np.eye(4), (3, 1, 1))
+        self._p = np.tile(UNKNOWN * UNKNOWN * np.eye(4), (3, 1, 1))
         if self._stated is not None:
-            self._p[:, 3, 3] = STEADY**2
+            self._p[:, 3, 3] = STEADY * STEADY
         self._shared = np.zeros((3, 4, 4))
         self._weights = np.full((3, self.levels), 1.0 / self.levels)
         self._index: int | None = None
@@ -171,7 +173,7 @@ class ModalFilter:
 
     def set_noise(self, gamma: FloatArray) -> None:
         """``gamma`` (C, C, N), m^2: covariance of reading c with reading d, so many samples later."""
-        turned = np.einsum('ac,cdl,bd->abl', self._gain, gamma, self._gain)
+        turned = self._by.einsum('ac,cdl,bd->abl', self._gain, gamma, self._gain)
         lags = np.arange(self._size)[:, None] - np.arange(self._size)
         behind = np.where(lags >= 0, turned.transpose(1, 0, 2)[..., np.abs(lags)], turned[..., np.abs(lags)])
         own = behind[range(3), range(3)]
@@ -180,8 +182,8 @@ class ModalFilter:
         if rates is None:
             seconds = self._size * self._period
             rates = np.zeros((3, self.levels, 2))
-            steps = own[:, 0, 0, None] / seconds * np.square(SMALLEST * STEP ** np.arange(STEPPED))
-            smooth = own[:, 0, 0, None] / seconds * np.square(SMALLEST * STEP ** np.arange(SMOOTH))
+            steps = own[:, 0, 0, None] / seconds * np.square(SMALLEST * self._by.power_many(STEP, np.arange(STEPPED)))
+            smooth = own[:, 0, 0, None] / seconds * np.square(SMALLEST * self._by.power_many(STEP, np.arange(SMOOTH)))
             rates[:, :STEPPED, 0] = steps
             rates[:, STEPPED:, 1] = smooth / (self._w[:, None] * seconds) ** 2
         self._rates = rates
@@ -237,10 +239,10 @@ class ModalFilter:
             self._begin_unseen()
         self.coasted += seconds
         phi = self._tables.phi
-        self._x = np.einsum('aij,aj->ai', phi, self._x)
-        added = np.einsum('ak,akij->aij', self._weights, self._tables.added)
-        self._p = np.einsum('aij,ajl,aml->aim', phi, self._p, phi) + added
-        self._shared = np.einsum('pij,pjl,pml->pim', phi[_FIRST], self._shared, phi[_SECOND])
+        self._x = self._by.einsum('aij,aj->ai', phi, self._x)
+        added = self._by.einsum('ak,akij->aij', self._weights, self._tables.added)
+        self._p = self._by.einsum('aij,ajl,aml->aim', phi, self._p, phi) + added
+        self._shared = self._by.einsum('pij,pjl,pml->pim', phi[_FIRST], self._shared, phi[_SECOND])
         self._taken = None
         if forced is not None:
             self._x = self._x + forced.at[:, -1]
@@ -275,13 +277,13 @@ class ModalFilter:
         """
         came, self._late_ones = self.inertia.late - self._late_ones, self.inertia.late
         taken = self._taken
-        kept = math.exp(-self._size * self._period / LATE_S)
+        kept = self._by.exp(-self._size * self._period / LATE_S)
         self._late = kept * self._late if taken is not None else np.zeros((3, 2))
         if taken is None or not came or (now := self._forced(self._t_ns)) is None:
             return
         more = now.at - taken.forced.at
         self._late += (1.0 - kept) * np.square(more[:, -1, :2])
-        self._x = self._x + more[:, -1] - np.einsum('ain,an->ai', taken.gain, more[..., 0])
+        self._x = self._x + more[:, -1] - self._by.einsum('ain,an->ai', taken.gain, more[..., 0])
         self._swung = self._swung + more[:, -1]
         self._p[:, 2, 2] += np.square(np.maximum(now.doubt - taken.forced.doubt, 0.0))
 
@@ -315,8 +317,8 @@ class ModalFilter:
         forced: Forced | None,
     ) -> None:
         says = self._tables.says(slots)
-        foretold = np.einsum('ani,ai->an', says.observed, self._x)
-        after = np.einsum('aij,aj->ai', self._tables.phi, self._x)
+        foretold = self._by.einsum('ani,ai->an', says.observed, self._x)
+        after = self._by.einsum('aij,aj->ai', self._tables.phi, self._x)
         p = self._p + self._unforeseen(self.coasted) if self.coasted > 0.0 else self._p
         if pushed is not None:
             foretold = foretold + pushed[0][:, slots]
@@ -331,32 +333,34 @@ class ModalFilter:
         miss = poses.T - foretold
         levels = self.levels
         # Of x0, one sample before the block: what the block says, then with what was known.
-        scaled = np.einsum('aknm,am->akn', says.precision, miss)
-        score = np.einsum('akin,an->aki', says.pulled, miss)
+        scaled = self._by.einsum('aknm,am->akn', says.precision, miss)
+        score = self._by.einsum('akin,an->aki', says.pulled, miss)
         known = inverse(p)
         posterior = inverse((known[:, None] + says.information).reshape(-1, 4, 4)).reshape(3, levels, 4, 4)
-        squares = np.einsum('an,akn->ak', miss, scaled) - np.einsum('aki,akij,akj->ak', score, posterior, score)
-        size = says.log_size - _log_det(posterior) + _log_det(p)[:, None]
-        prior = np.einsum('ak,kl->al', self._weights, self._changes)
-        log_weights = np.log(prior) - 0.5 * (size + squares)
-        weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
-        weights /= weights.sum(axis=1, keepdims=True)
-        carried = np.einsum('akij,akjl->akil', says.kept, posterior)
-        found = after[:, None] + np.einsum('akin,an->aki', says.smoothed, miss)
-        found += np.einsum('akij,akj->aki', carried, score)
-        covariance = np.einsum('akij,aklj->akil', carried, says.kept) + says.left
-        self._x = np.einsum('ak,aki->ai', weights, found)
+        squares = self._by.einsum('an,akn->ak', miss, scaled) - self._by.einsum(
+            'aki,akij,akj->ak', score, posterior, score
+        )
+        size = says.log_size - _log_det(posterior, self._by) + _log_det(p, self._by)[:, None]
+        prior = self._by.einsum('ak,kl->al', self._weights, self._changes)
+        log_weights = self._by.log_many(prior) - 0.5 * (size + squares)
+        weights = self._by.exp_many(log_weights - log_weights.max(axis=1, keepdims=True))
+        weights /= self._by.sum(weights, 1)[:, None]
+        carried = self._by.einsum('akij,akjl->akil', says.kept, posterior)
+        found = after[:, None] + self._by.einsum('akin,an->aki', says.smoothed, miss)
+        found += self._by.einsum('akij,akj->aki', carried, score)
+        covariance = self._by.einsum('akij,aklj->akil', carried, says.kept) + says.left
+        self._x = self._by.einsum('ak,aki->ai', weights, found)
         apart = found - self._x[:, None]
         spread = covariance + apart[..., :, None] * apart[..., None, :]
-        self._p = np.einsum('ak,akij->aij', weights, spread)
+        self._p = self._by.einsum('ak,akij->aij', weights, spread)
         self._p = 0.5 * (self._p + self._p.transpose(0, 2, 1))
-        mean = np.einsum('ak,akin->ain', weights, says.smoothed)
-        mean += np.einsum('akij,akjn->ain', weights[..., None, None] * carried, says.pulled)
-        own = self._tables.phi - np.einsum('ain,anj->aij', mean, says.observed)
+        mean = self._by.einsum('ak,akin->ain', weights, says.smoothed)
+        mean += self._by.einsum('akij,akjn->ain', weights[..., None, None] * carried, says.pulled)
+        own = self._tables.phi - self._by.einsum('ain,anj->aij', mean, says.observed)
         noise = self._noise[:, slots[:, None], slots]
-        both = np.einsum('pin,pnm->pim', mean[_FIRST], noise)
-        self._shared = np.einsum('pij,pjl,pml->pim', own[_FIRST], self._shared, own[_SECOND])
-        self._shared += np.einsum('pim,pjm->pij', both, mean[_SECOND])
+        both = self._by.einsum('pin,pnm->pim', mean[_FIRST], noise)
+        self._shared = self._by.einsum('pij,pjl,pml->pim', own[_FIRST], self._shared, own[_SECOND])
+        self._shared += self._by.einsum('pim,pjm->pij', both, mean[_SECOND])
         self._weights = weights
         self.coasted = 0.0
         self._taken = None
@@ -368,17 +372,17 @@ class ModalFilter:
             if pushed is not None:
                 # What a known load did was foreseen.
                 self._begin_unseen()
-            self._swung = np.einsum('aij,aj->ai', self._tables.phi, self._swung)
+            self._swung = self._by.einsum('aij,aj->ai', self._tables.phi, self._swung)
             if forced is not None:
                 self._swung = self._swung + forced.at[:, -1]
             self._unseen.add(self._x - self._swung, self._p, self._rate())
-        taken = np.einsum('ak,ak->a', weights, squares).tolist()
+        taken = self._by.einsum('ak,ak->a', weights, squares).tolist()
         so_far = zip(self.innovations.squares, taken, strict=True)
         self.innovations = Innovations(tuple(a + b for a, b in so_far), self.innovations.samples + len(slots))
 
     def _rate(self) -> FloatArray:
         """Process noise (A, 2) by what was seen last."""
-        return np.asarray(np.einsum('ak,akc->ac', self._weights, self._rates))
+        return self._by.einsum('ak,akc->ac', self._weights, self._rates)
 
     def _unforeseen(self, seconds: float) -> FloatArray:
         """What a load that nobody sees adds to the covariance (A, 4, 4) so long after the last sample."""
@@ -398,13 +402,13 @@ class ModalFilter:
 
     def _moved(self) -> Moved:
         """Of the end of the block, ``filter_ahead`` later."""
-        x = np.einsum('aij,aj->ai', self._later, self._x)
+        x = self._by.einsum('aij,aj->ai', self._later, self._x)
         if self.inertia.known and self._ahead > 0.0:
             x = x + self.inertia.forced(self._end_ns(), np.array([self._ahead])).at[:, 0]
-        p = np.einsum('aij,ajl,aml->aim', self._later, self._unsure(), self._later)
-        p += np.einsum('ac,acij->aij', self._rate(), self._later_spread)
+        p = self._by.einsum('aij,ajl,aml->aim', self._later, self._unsure(), self._later)
+        p += self._by.einsum('ac,acij->aij', self._rate(), self._later_spread)
         p += self._unforeseen(self.coasted + self._ahead)
-        shared = np.einsum('pij,pjl,pml->pim', self._later[_FIRST], self._shared, self._later[_SECOND])
+        shared = self._by.einsum('pij,pjl,pml->pim', self._later[_FIRST], self._shared, self._later[_SECOND])
         t_ns = self._t_ns + round(1e9 * (0.5 * (self._size - 1) * self._period + self._ahead))
         pose, velocity = np.diag(p[:, 0, 0]), np.diag(self._w**2 * p[:, 1, 1])
         for k, (a, b) in enumerate(_PAIRS):
@@ -416,11 +420,11 @@ class ModalFilter:
         """The motion so long (n,) after the last block's last sample."""
         steps = np.stack([[mode.step(s) for s in seconds.tolist()] for mode in self._modes])
         added = np.stack([mode.spreads(seconds) for mode in self._modes])
-        x = np.einsum('anij,aj->nai', steps, self._x)
+        x = self._by.einsum('anij,aj->nai', steps, self._x)
         if self.inertia.known:
             x = x + self.inertia.forced(self._end_ns(), seconds).at.transpose(1, 0, 2)
-        p = np.einsum('anij,ajl,anml->naim', steps, self._unsure(), steps)
-        p += np.einsum('ac,ancij->naij', self._rate(), added)
+        p = self._by.einsum('anij,ajl,anml->naim', steps, self._unsure(), steps)
+        p += self._by.einsum('ac,ancij->naij', self._rate(), added)
         p += np.stack([self._unforeseen(self.coasted + s) for s in seconds.tolist()])
         return Predicted(x[..., 0], self._w * x[..., 1], p[..., 0, 0], self._w**2 * p[..., 1, 1])
 
@@ -501,12 +505,12 @@ def joined_ns(seconds: float, ns: float) -> int:
     return 1_000_000_000 * int(seconds) + int(ns)
 
 
-def _log_det(matrices: FloatArray) -> FloatArray:
+def _log_det(matrices: FloatArray, by: Arithmetic) -> FloatArray:
     """log det of positive definite ``matrices`` (..., 4, 4), by elimination."""
     rest, out = matrices, np.zeros(matrices.shape[:-2])
     for _ in range(matrices.shape[-1]):
         pivot, row = rest[..., 0, 0], rest[..., 0, 1:]
-        out = out + np.log(pivot)
+        out = out + by.log_many(pivot)
         rest = rest[..., 1:, 1:] - row[..., :, None] * (row / pivot[..., None])[..., None, :]
     return np.asarray(out)
 

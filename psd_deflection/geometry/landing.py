@@ -12,8 +12,7 @@ the reference section. The plate is turned by R = Ry(omega) Rx(phi) Rz(theta) (t
 
 from __future__ import annotations
 
-from math import cos, sin
-
+from psd_deflection.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.geometry.plate import Number, Row, Turns, turns_of
 from psd_deflection.records import FloatArray
 
@@ -29,9 +28,18 @@ def _place(
 
 
 def landing(
-    lx: float, ly: float, height: float, dx: float, dy: float, theta: float, phi: float, omega: float
+    lx: float,
+    ly: float,
+    height: float,
+    dx: float,
+    dy: float,
+    theta: float,
+    phi: float,
+    omega: float,
+    arithmetic: Arithmetic = LIBRARY,
 ) -> tuple[float, float, Row, Row]:
     """(x, y, dx, dy) of one laser's dot: m; m/m for dX, dY and m/rad for the angles."""
+    sin, cos = arithmetic.sin, arithmetic.cos
     turns = cos(theta), sin(theta), cos(phi), sin(phi), cos(omega), sin(omega)
     _, _, cp, sp, co, so = turns
     ax, ay, x, y = _place(lx, ly, height, dx, dy, turns)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psd_deflection.arithmetic import ARITHMETICS, LIBRARY, Arithmetic
 from psd_deflection.config import Rig
 from psd_deflection.errors import SolverError
 from psd_deflection.records import FloatArray
@@ -25,7 +26,8 @@ class Geometry:
 
     ``centers`` (P, 2): c_i, m, in ``link_tip``. ``zeros`` (P, 2): m_i0, the dots before load, m.
     ``heights`` (P,): h_i, the sensitive surface above the reference section, m (``base_pair``: -L_i).
-    ``link_length``: L, m. ``slope_ratio``: k of phi = -k dY/L, omega = +k dX/L.
+    ``link_length``: L, m. ``slope_ratio``: k of phi = -k dY/L, omega = +k dX/L. ``arithmetic``: what solvers compute
+    with.
     """
 
     centers: FloatArray
@@ -33,13 +35,21 @@ class Geometry:
     heights: FloatArray
     link_length: float
     slope_ratio: float = 1.5
+    arithmetic: Arithmetic = LIBRARY
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Geometry:
         """The geometry that ``psd_N.center``, ``.zero``, ``.height`` and ``link`` of a parameter file
         describe.
         """
-        return cls(rig.centers, rig.zeros, rig.heights, rig.link.length, rig.link.slope_ratio)
+        return cls(
+            rig.centers,
+            rig.zeros,
+            rig.heights,
+            rig.link.length,
+            rig.link.slope_ratio,
+            ARITHMETICS[rig.estimator.arithmetic],
+        )
 
     @property
     def beams(self) -> FloatArray:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from psd_deflection.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.records import FloatArray
 
 
@@ -27,7 +28,9 @@ def design_matrix(beams: FloatArray) -> FloatArray:
     return a
 
 
-def gain_matrix(design: FloatArray, row_scaling: FloatArray | None = None) -> FloatArray:
+def gain_matrix(
+    design: FloatArray, row_scaling: FloatArray | None = None, arithmetic: Arithmetic = LIBRARY
+) -> FloatArray:
     """G (3, 2P) of x = G b: the pseudo-inverse of diag(Po) A, times diag(Po); W = Po^2.
 
     ``design`` (2P, 3); ``row_scaling`` (2P,): Po, None for ordinary least squares. The angle is scaled by the
@@ -37,8 +40,8 @@ def gain_matrix(design: FloatArray, row_scaling: FloatArray | None = None) -> Fl
         row_scaling = np.ones(len(design))
     length = float(np.abs(design[:, 2]).max())
     units = np.array([1.0, 1.0, length])
-    gain: FloatArray = np.linalg.pinv(row_scaling[:, None] * design / units) * row_scaling / units[:, None]
-    return gain
+    gain = arithmetic.pseudo_inverse(row_scaling[:, None] * design / units) * row_scaling / units[:, None]
+    return np.asarray(gain)
 
 
 class ConditionNumber(NamedTuple):

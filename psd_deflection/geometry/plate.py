@@ -18,11 +18,11 @@ call would dominate. ``crossings`` and ``flat_poses`` are the same formulas for 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import atan2, cos, sin
 from typing import Literal, TypeVar
 
 import numpy as np
 
+from psd_deflection.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.records import FloatArray
 
 Number = TypeVar('Number', float, FloatArray)
@@ -64,27 +64,41 @@ def _rows(
 
 
 def crossing(
-    lx: float, ly: float, height: float, dx: float, dy: float, theta: float, phi: float, omega: float
+    lx: float,
+    ly: float,
+    height: float,
+    dx: float,
+    dy: float,
+    theta: float,
+    phi: float,
+    omega: float,
+    arithmetic: Arithmetic = LIBRARY,
 ) -> tuple[float, float, Row, Row]:
     """(q_x, q_y, dq_x, dq_y) of one beam: m; m/m for dX, dY and m/rad for the angles."""
+    sin, cos = arithmetic.sin, arithmetic.cos
     turns = cos(theta), sin(theta), cos(phi), sin(phi), cos(omega), sin(omega)
     x, y, qx, qy = _point(lx, ly, height, dx, dy, turns)
     row_x, row_y = _rows(x, y, qx, qy, height, turns)
     return qx, qy, row_x, row_y
 
 
-def turns_of(theta: FloatArray, phi: FloatArray, omega: FloatArray) -> Turns[FloatArray]:
+def turns_of(
+    theta: FloatArray, phi: FloatArray, omega: FloatArray, arithmetic: Arithmetic = LIBRARY
+) -> Turns[FloatArray]:
     """Cosine and sine of each angle."""
-    return np.cos(theta), np.sin(theta), np.cos(phi), np.sin(phi), np.cos(omega), np.sin(omega)
+    sin, cos = arithmetic.sin_many, arithmetic.cos_many
+    return cos(theta), sin(theta), cos(phi), sin(phi), cos(omega), sin(omega)
 
 
-def crossings(poses: FloatArray, beams: FloatArray, heights: FloatArray) -> tuple[FloatArray, FloatArray]:
+def crossings(
+    poses: FloatArray, beams: FloatArray, heights: FloatArray, arithmetic: Arithmetic = LIBRARY
+) -> tuple[FloatArray, FloatArray]:
     """The plate points under the beams, (..., P, 2) m, and their derivatives by the pose, (..., P, 2, 5).
 
     ``poses`` (..., 5): dX, dY m, theta, phi, omega rad; ``beams`` (P, 2) or (..., P, 2) m; ``heights`` (P,) m.
     """
     dx, dy, theta, phi, omega = (poses[..., i, None] for i in range(5))
-    turns = turns_of(theta, phi, omega)
+    turns = turns_of(theta, phi, omega, arithmetic)
     x, y, qx, qy = _point(beams[..., 0], beams[..., 1], heights, dx, dy, turns)
     points = np.stack((qx, qy), axis=-1)
     jacobian = np.empty((*points.shape, 5))
@@ -94,10 +108,12 @@ def crossings(poses: FloatArray, beams: FloatArray, heights: FloatArray) -> tupl
     return points, jacobian
 
 
-def plate_points(poses: FloatArray, beams: FloatArray, heights: FloatArray) -> FloatArray:
+def plate_points(
+    poses: FloatArray, beams: FloatArray, heights: FloatArray, arithmetic: Arithmetic = LIBRARY
+) -> FloatArray:
     """The points of :func:`crossings` alone, (..., P, 2) m."""
     dx, dy, theta, phi, omega = (poses[..., i, None] for i in range(5))
-    qx, qy = points_under(beams[..., 0], beams[..., 1], heights, dx, dy, theta, phi, omega)
+    qx, qy = points_under(beams[..., 0], beams[..., 1], heights, dx, dy, theta, phi, omega, arithmetic)
     return np.stack((qx, qy), axis=-1)
 
 
@@ -110,11 +126,12 @@ def points_under(
     theta: FloatArray,
     phi: FloatArray,
     omega: FloatArray,
+    arithmetic: Arithmetic = LIBRARY,
 ) -> tuple[FloatArray, FloatArray]:
     """q_x and q_y, m, one array for each coordinate, of any shapes that broadcast; for long runs of
     samples.
     """
-    return _point(lx, ly, height, dx, dy, turns_of(theta, phi, omega))[2:]
+    return _point(lx, ly, height, dx, dy, turns_of(theta, phi, omega, arithmetic))[2:]
 
 
 def points_under_leaning(
@@ -128,6 +145,7 @@ def points_under_leaning(
     theta: FloatArray,
     phi: FloatArray,
     omega: FloatArray,
+    arithmetic: Arithmetic = LIBRARY,
 ) -> tuple[FloatArray, FloatArray]:
     """:func:`points_under` for beams that lean by ``slope_x`` and ``slope_y`` (m/m) along Z.
 
@@ -135,7 +153,7 @@ def points_under_leaning(
     beam is at l + slope (z - h). Each pass leaves the product of the plate's tilt and the slope, below 1e-3, of the
     error before it.
     """
-    turns = turns_of(theta, phi, omega)
+    turns = turns_of(theta, phi, omega, arithmetic)
     _, _, cp, sp, co, so = turns
     x, y, qx, qy = _point(lx, ly, height, dx, dy, turns)
     for _ in range(3):
@@ -145,49 +163,53 @@ def points_under_leaning(
     return qx, qy
 
 
-def flat_points(poses: FloatArray, beams: FloatArray) -> FloatArray:
+def flat_points(poses: FloatArray, beams: FloatArray, arithmetic: Arithmetic = LIBRARY) -> FloatArray:
     """q_i = R(-theta)(l_i - d), (..., P, 2) m: the points of a plate that does not tilt; ``poses`` (..., 3)."""
-    c = np.cos(poses[..., 2, None])
-    s = np.sin(poses[..., 2, None])
+    c = arithmetic.cos_many(poses[..., 2, None])
+    s = arithmetic.sin_many(poses[..., 2, None])
     ux = beams[..., 0] - poses[..., 0, None]
     uy = beams[..., 1] - poses[..., 1, None]
     return np.stack((c * ux + s * uy, c * uy - s * ux), axis=-1)
 
 
-def flat_pose(points: Sequence[float], beams: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
+def flat_pose(
+    points: Sequence[float], beams: Sequence[tuple[float, float]], arithmetic: Arithmetic = LIBRARY
+) -> tuple[float, float, float]:
     """(dX, dY, theta) of a flat plate whose ``points`` (q_1x, q_1y, q_2x, ...) are under ``beams``; m, rad.
 
     Unweighted: theta from the cross and dot products about the centroids, d from the centroids (the orthogonal
     Procrustes problem: Schoenemann 1966; Arun, Huang & Blostein 1987).
     """
     count = len(beams)
-    mx = sum(points[0::2]) / count
-    my = sum(points[1::2]) / count
-    nx = sum([lx for lx, _ in beams]) / count
-    ny = sum([ly for _, ly in beams]) / count
+    total = arithmetic.total
+    mx = total(points[0::2]) / count
+    my = total(points[1::2]) / count
+    nx = total([lx for lx, _ in beams]) / count
+    ny = total([ly for _, ly in beams]) / count
     along = across = 0.0
     for i, (lx, ly) in enumerate(beams):
         qx = points[2 * i] - mx
         qy = points[2 * i + 1] - my
         along += qx * (lx - nx) + qy * (ly - ny)
         across += qx * (ly - ny) - qy * (lx - nx)
-    theta = atan2(across, along)
-    c = cos(theta)
-    s = sin(theta)
+    theta = arithmetic.atan2(across, along)
+    c = arithmetic.cos(theta)
+    s = arithmetic.sin(theta)
     return nx - c * mx + s * my, ny - s * mx - c * my, theta
 
 
-def flat_poses(points: FloatArray, beams: FloatArray) -> FloatArray:
+def flat_poses(points: FloatArray, beams: FloatArray, arithmetic: Arithmetic = LIBRARY) -> FloatArray:
     """:func:`flat_pose` for arrays: (..., 3) of ``points`` and ``beams``, (..., P, 2) each."""
-    middle = beams.mean(axis=-2)
-    mean = points.mean(axis=-2)
+    middle = arithmetic.sum(beams, axis=-2) / beams.shape[-2]
+    mean = arithmetic.sum(points, axis=-2) / points.shape[-2]
     lx = beams[..., 0] - middle[..., 0, None]
     ly = beams[..., 1] - middle[..., 1, None]
     ux = points[..., 0] - mean[..., 0, None]
     uy = points[..., 1] - mean[..., 1, None]
-    theta = np.arctan2((ux * ly - uy * lx).sum(axis=-1), (ux * lx + uy * ly).sum(axis=-1))
-    c = np.cos(theta)
-    s = np.sin(theta)
+    across, along = arithmetic.sum(ux * ly - uy * lx, axis=-1), arithmetic.sum(ux * lx + uy * ly, axis=-1)
+    theta = arithmetic.atan2_many(across, along)
+    c = arithmetic.cos_many(theta)
+    s = arithmetic.sin_many(theta)
     mx, my = mean[..., 0], mean[..., 1]
     return np.stack((middle[..., 0] - c * mx + s * my, middle[..., 1] - s * mx - c * my, theta), axis=-1)
 
@@ -215,13 +237,19 @@ bounded; they are unknowns."""
 
 
 def reading_slopes(
-    beams: FloatArray, heights: FloatArray, pose: FloatArray, tilts: Tilts, slope_ratio: float, link_length: float
+    beams: FloatArray,
+    heights: FloatArray,
+    pose: FloatArray,
+    tilts: Tilts,
+    slope_ratio: float,
+    link_length: float,
+    arithmetic: Arithmetic = LIBRARY,
 ) -> FloatArray:
     """How the dots go with the unknowns at ``pose`` (5,): (2P, 3), (2P, 5) if the tilts are free; m/m and m/rad."""
     if tilts == 'none':
         heights, pose = np.zeros(len(beams)), np.array([*pose[:3], 0.0, 0.0])
-    jacobian = crossings(pose, beams, heights)[1].reshape(-1, 5)
+    jacobian = crossings(pose, beams, heights, arithmetic)[1].reshape(-1, 5)
     if tilts == 'free':
         return jacobian
     # A flat plate's readings do not go with tilts at rest, to first order.
-    return jacobian @ tie_matrix(slope_ratio, link_length)
+    return arithmetic.product(jacobian, tie_matrix(slope_ratio, link_length))

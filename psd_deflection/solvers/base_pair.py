@@ -54,6 +54,7 @@ class BasePairSolver(Solver):
         Raises ConfigError for another assumption, SolverError with the reason if an unknown cannot be seen.
         """
         self._count = check_twist(geometry)
+        self._arithmetic = geometry.arithmetic
         heights = np.asarray(geometry.heights, dtype=np.float64)
         for i, height in enumerate(heights.tolist()):
             if height >= 0.0:
@@ -118,18 +119,20 @@ class BasePairSolver(Solver):
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
         measured = [c + m for c, m in zip(self._centers, dots, strict=True)]
-        found = fit(self._model, (0.0,) * self._matrix.shape[1], measured, variances)
-        covariance = (self._matrix[:3] @ found.covariance @ self._matrix[:3].T).tolist()
-        return answer(found, (self._matrix @ found.parameters).tolist(), covariance)
+        found = fit(self._model, (0.0,) * self._matrix.shape[1], measured, variances, self._arithmetic)
+        by, spread = self._arithmetic, np.array(found.covariance)
+        covariance = by.product(by.product(self._matrix[:3], spread), self._matrix[:3].T).tolist()
+        return answer(found, by.product(self._matrix, np.array(found.parameters)).tolist(), covariance)
 
     def _model(self, x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
-        dx, dy, theta, phi, omega = [sum([a * b for a, b in zip(row, x, strict=True)]) for row in self._spread]
+        total = self._arithmetic.total
+        dx, dy, theta, phi, omega = [total([a * b for a, b in zip(row, x, strict=True)]) for row in self._spread]
         predicted: list[float] = []
         rows: list[Sequence[float]] = []
         for lx, ly, height in self._rows:
-            px, py, jx, jy = landing(lx, ly, height, dx, dy, theta, phi, omega)
+            px, py, jx, jy = landing(lx, ly, height, dx, dy, theta, phi, omega, self._arithmetic)
             predicted.append(px)
             predicted.append(py)
             for j in (jx, jy):
-                rows.append([sum([a * b for a, b in zip(j, column, strict=True)]) for column in self._columns])
+                rows.append([total([a * b for a, b in zip(j, column, strict=True)]) for column in self._columns])
         return predicted, rows

@@ -18,12 +18,12 @@ method starts there and doubles its digits each time. The covariance is (J^T W J
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import atan2, cos, sin
 from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.arithmetic import Arithmetic
 from psd_deflection.errors import SolverError
 from psd_deflection.geometry.layout import Geometry, check_twist
 from psd_deflection.geometry.plate import Number
@@ -52,6 +52,7 @@ class ExactSolver(Solver):
     def __init__(self, geometry: Geometry) -> None:
         """Bind to ``geometry``. Raises SolverError if the beams coincide."""
         self._count = check_twist(geometry)
+        self._arithmetic = geometry.arithmetic
         self._centers = np.asarray(geometry.centers, dtype=np.float64)
         self._beams = np.asarray(geometry.beams, dtype=np.float64)
         self._places = tuple(self._centers.ravel().tolist())
@@ -62,6 +63,7 @@ class ExactSolver(Solver):
         """One block; pure floats for two PSDs. See :class:`Solver`."""
         if self._count != 2:
             return self._solve_any(dots, variances)
+        by = self._arithmetic
         x1, y1, x2, y2 = dots
         vx1, vy1, vx2, vy2 = variances
         try:
@@ -78,9 +80,9 @@ class ExactSolver(Solver):
         qy = q1y - self._c2y - y2
         lx = l1x - self._l2x
         ly = l1y - self._l2y
-        theta = atan2(qx * ly - qy * lx, qx * lx + qy * ly)
-        c = cos(theta)
-        s = sin(theta)
+        theta = by.atan2(qx * ly - qy * lx, qx * lx + qy * ly)
+        c = by.cos(theta)
+        s = by.sin(theta)
         steps = 0
         status = SolverStatus.OK
         if mx != my:
@@ -90,6 +92,7 @@ class ExactSolver(Solver):
                 (mx - my) * lx * ly,
                 mx * qx * lx + my * qy * ly,
                 mx * qx * ly - my * qy * lx,
+                by,
             )
         if theta != theta or steps == _MAX_STEPS:
             status = SolverStatus.NOT_CONVERGED
@@ -140,21 +143,26 @@ class ExactSolver(Solver):
         """Any number of PSDs."""
         (qx, qy), (lx, ly) = (self._centers + np.reshape(dots, (-1, 2))).T, self._beams.T
         wx, wy = 1.0 / checked_variances(np.array(variances)).reshape(-1, 2).T
-        sum_x, sum_y = float(wx.sum()), float(wy.sum())
+        by = self._arithmetic
+
+        def dot(a: FloatArray, b: FloatArray) -> float:
+            return float(by.product(a, b))
+
+        sum_x, sum_y = float(by.sum(wx, 0)), float(by.sum(wy, 0))
         # Each axis is centred with its own weights.
-        xx, xy, xq = (a - wx @ a / sum_x for a in (lx, ly, qx))
-        yx, yy, yq = (a - wy @ a / sum_y for a in (lx, ly, qy))
-        along = float(wx @ (xq * xx) + wy @ (yq * yy))
-        across = float(wx @ (xq * xy) - wy @ (yq * yx))
-        difference = float(wx @ (xy * xy - xx * xx) + wy @ (yx * yx - yy * yy))
-        mixed = float(wx @ (xx * xy) - wy @ (yx * yy))
-        theta, c, s, steps = _newton(atan2(across, along), difference, mixed, along, across)
+        xx, xy, xq = (a - by.product(wx, a) / sum_x for a in (lx, ly, qx))
+        yx, yy, yq = (a - by.product(wy, a) / sum_y for a in (lx, ly, qy))
+        along = dot(wx, xq * xx) + dot(wy, yq * yy)
+        across = dot(wx, xq * xy) - dot(wy, yq * yx)
+        difference = dot(wx, xy * xy - xx * xx) + dot(wy, yx * yx - yy * yy)
+        mixed = dot(wx, xx * xy) - dot(wy, yx * yy)
+        theta, c, s, steps = _newton(by.atan2(across, along), difference, mixed, along, across, by)
         rx = xq - c * xx - s * xy
         ry = yq - c * yy + s * yx
         px, py = qx - rx, qy - ry
         fx, fy = float(c * lx[0] + s * ly[0] - px[0]), float(c * ly[0] - s * lx[0] - py[0])
-        mean_x, mean_y = float(wy @ px) / sum_y, float(wx @ py) / sum_x
-        vtt = 1.0 / float(wx @ (py - mean_y) ** 2 + wy @ (px - mean_x) ** 2)
+        mean_x, mean_y = dot(wy, px) / sum_y, dot(wx, py) / sum_x
+        vtt = 1.0 / (dot(wx, (py - mean_y) ** 2) + dot(wy, (px - mean_x) ** 2))
         vxt, vyt = mean_y * vtt, -mean_x * vtt
         covariance = turn_covariance(
             c, s, 1.0 / sum_x + mean_y * vxt, -mean_x * vxt, 1.0 / sum_y - mean_x * vyt, vxt, vyt, vtt
@@ -165,7 +173,7 @@ class ExactSolver(Solver):
 
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
         """In closed form. See :class:`Solver`."""
-        return flat_gain(self._places, dots, variances, solution)
+        return flat_gain(self._places, dots, variances, solution, self._arithmetic)
 
     def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
         """N blocks; vectorised for two PSDs. See :class:`Solver`."""
@@ -182,6 +190,7 @@ class ExactSolver(Solver):
 
     def _chunk(self, m: FloatArray, v: FloatArray, out: Solutions, part: slice) -> None:
         """The lines of :meth:`solve`, for arrays."""
+        by = self._arithmetic
         x1, y1, x2, y2 = m.T
         vx1, vy1, vx2, vy2 = v.T
         mx = 1.0 / (vx1 + vx2)
@@ -194,11 +203,11 @@ class ExactSolver(Solver):
         ly = self._l1y - self._l2y
         across = qx * ly - qy * lx
         along = qx * lx + qy * ly
-        theta = np.arctan2(across, along)
+        theta = by.atan2_many(across, along)
         if (mx == my).all():
             converged = np.isfinite(theta)
             # cos and sin of the arctangent with one square root.
-            size = np.hypot(along, across)
+            size = by.hypot_many(along, across)
             with np.errstate(invalid='ignore'):
                 c = np.where(size != 0.0, along / size, 1.0)
                 s = np.where(size != 0.0, across / size, 0.0)
@@ -209,9 +218,10 @@ class ExactSolver(Solver):
                 (mx - my) * lx * ly,
                 mx * qx * lx + my * qy * ly,
                 mx * qx * ly - my * qy * lx,
+                by,
             )
-            c = np.cos(theta)
-            s = np.sin(theta)
+            c = by.cos_many(theta)
+            s = by.sin_many(theta)
         dx, dy, residual, covariance = self._answer(c, s, (q1x, q1y, qx, qy), (mx, my), tuple(v.T))
         for where, values in (
             (out.pose, (dx, dy, theta)),
@@ -224,9 +234,10 @@ class ExactSolver(Solver):
 
 
 def _newton(
-    theta: float, difference: float, mixed: float, along: float, across: float
+    theta: float, difference: float, mixed: float, along: float, across: float, by: Arithmetic
 ) -> tuple[float, float, float, int]:
     """Minimise F from ``theta``: difference R - P, mixed Q, along A, across B of the module's text."""
+    sin, cos = by.sin, by.cos
     c = cos(theta)
     s = sin(theta)
     steps = 0
@@ -246,13 +257,18 @@ def _newton(
 
 
 def _newton_many(
-    theta: FloatArray, difference: FloatArray, mixed: FloatArray, along: FloatArray, across: FloatArray
+    theta: FloatArray,
+    difference: FloatArray,
+    mixed: FloatArray,
+    along: FloatArray,
+    across: FloatArray,
+    by: Arithmetic,
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """:func:`_newton` for n blocks, until the slowest ends; also returns which converged."""
     converged = np.zeros(theta.shape, dtype=bool)
     for _ in range(_MAX_STEPS):
-        c = np.cos(theta)
-        s = np.sin(theta)
+        c = by.cos_many(theta)
+        s = by.sin_many(theta)
         turned = c * c - s * s
         slope = difference * s * c + mixed * turned + along * s - across * c
         curvature = difference * turned - 4.0 * mixed * s * c + along * c + across * s

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from psd_deflection.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.geometry.linear import gain_matrix
 from psd_deflection.records import FloatArray
 from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
@@ -12,9 +13,11 @@ from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
 class FixedGain(Solver):
     """x = G (m - m_0) for a gain that does not depend on the noise; covariance G V G^T."""
 
-    def __init__(self, design: FloatArray, zeros: FloatArray, row_scaling: FloatArray) -> None:
+    def __init__(
+        self, design: FloatArray, zeros: FloatArray, row_scaling: FloatArray, arithmetic: Arithmetic = LIBRARY
+    ) -> None:
         """``design`` (2P, 3); ``zeros`` (P, 2) m, subtracted first; ``row_scaling`` (2P,)."""
-        gains = gain_matrix(design, row_scaling)
+        gains = gain_matrix(design, row_scaling, arithmetic)
         self._columns = tuple(
             (zero, *gain, *row)
             for zero, gain, row in zip(zeros.ravel().tolist(), gains.T.tolist(), design.tolist(), strict=True)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from psd_deflection.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.errors import SolverError
 from psd_deflection.solvers.interface import Solution, SolverStatus
 
@@ -49,7 +50,13 @@ def answer(found: Minimum, pose: Sequence[float], covariance: Sequence[Sequence[
     )
 
 
-def fit(model: Model, start: Sequence[float], measured: Sequence[float], variances: Sequence[float]) -> Minimum:
+def fit(
+    model: Model,
+    start: Sequence[float],
+    measured: Sequence[float],
+    variances: Sequence[float],
+    arithmetic: Arithmetic = LIBRARY,
+) -> Minimum:
     """One block. Raises SolverError if a variance is 0."""
     x = list(start)
     p = len(x)
@@ -70,7 +77,7 @@ def fit(model: Model, start: Sequence[float], measured: Sequence[float], varianc
                 line = normal[i]
                 for j in range(i + 1):
                     line[j] += wi * row[j]
-        inverse = _invert(normal)
+        inverse = _invert(normal, arithmetic)
         if inverse is None:
             nan = float('nan')
             return Minimum(x, [[nan] * p for _ in range(p)], residual, False, steps)
@@ -87,14 +94,15 @@ def fit(model: Model, start: Sequence[float], measured: Sequence[float], varianc
         if largest < LAST_STEP:
             # For so small a step the linear model of the residual is exact to the last digit.
             residual = [
-                r - sum([a * b for a, b in zip(row, step, strict=True)]) for r, row in zip(residual, rows, strict=True)
+                r - arithmetic.total([a * b for a, b in zip(row, step, strict=True)])
+                for r, row in zip(residual, rows, strict=True)
             ]
             return Minimum(x, inverse, residual, True, steps)
         if not largest < float('inf') or steps == MAX_STEPS:
             return Minimum(x, inverse, residual, False, steps)
 
 
-def _invert(lower: list[list[float]]) -> list[list[float]] | None:
+def _invert(lower: list[list[float]], arithmetic: Arithmetic) -> list[list[float]] | None:
     """The inverse of a symmetric positive matrix, given its lower half (Cholesky)."""
     p = len(lower)
     for i in range(p):
@@ -107,7 +115,7 @@ def _invert(lower: list[list[float]]) -> list[list[float]] | None:
             if i == j:
                 if not total > 0.0:
                     return None
-                line[i] = total**0.5
+                line[i] = arithmetic.root(total)
             else:
                 line[j] = total / other[j]
     # The inverse of the factor, below the diagonal; then its product with itself.

@@ -15,12 +15,12 @@ from __future__ import annotations
 import abc
 from dataclasses import dataclass
 from enum import IntEnum
-from math import cos, sin
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.config import Rig
 from psd_deflection.geometry.layout import Geometry
 from psd_deflection.geometry.plate import Tilts
@@ -144,21 +144,29 @@ class Solver(abc.ABC):
 
 
 def flat_gain(
-    centers: tuple[float, ...], dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution
+    centers: tuple[float, ...],
+    dots: tuple[float, ...],
+    variances: tuple[float, ...],
+    solution: Solution,
+    arithmetic: Arithmetic = LIBRARY,
 ) -> FloatArray:
     """:meth:`Solver.gain` of weighted least squares on a flat plate. ``centers``: (x1, y1, x2, y2, ...), m."""
     points = tuple(center + dot for center, dot in zip(centers, dots, strict=True))
-    return weighted_gain(points, solution.theta, variances, solution)
+    return weighted_gain(points, solution.theta, variances, solution, arithmetic)
 
 
 def weighted_gain(
-    points: tuple[float, ...], theta: float, variances: tuple[float, ...], solution: Solution
+    points: tuple[float, ...],
+    theta: float,
+    variances: tuple[float, ...],
+    solution: Solution,
+    arithmetic: Arithmetic = LIBRARY,
 ) -> FloatArray:
     """P A^T V^-1, P the solution's own covariance: the gain of least squares with the weights 1/``variances``.
 
     ``points``: q = (x1, y1, ...), m. The readings of a dot at q go with the pose as -R(-theta) and (q_y, -q_x).
     """
-    c, s = cos(theta), sin(theta)
+    c, s = arithmetic.cos(theta), arithmetic.sin(theta)
     xx, xy, xt, _, yy, yt, _, _, tt = solution.covariance
     rows: tuple[list[float], list[float], list[float]] = ([], [], [])
     for i in range(0, len(points), 2):

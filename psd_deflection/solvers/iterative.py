@@ -14,7 +14,6 @@ the angle, repeated until the angle no longer changes. d is then the mean of the
 
 from __future__ import annotations
 
-from math import cos, sin
 from typing import ClassVar
 
 import numpy as np
@@ -46,14 +45,16 @@ class IterativeSolver(Solver):
         """Bind to ``geometry``. Raises SolverError if the beams coincide."""
         self._count = check_twist(geometry)
         beams = np.asarray(geometry.beams)
-        middle = beams.mean(axis=0)
+        by = self._arithmetic = geometry.arithmetic
+        middle = by.sum(beams, axis=0) / len(beams)
         self._lx, self._ly = middle.tolist()
-        self._spread = float(((beams - middle) ** 2).sum())
+        self._spread = float(by.sum(((beams - middle) ** 2).ravel(), axis=0))
         self._rows = tuple(map(tuple, np.hstack((geometry.centers, beams - middle)).tolist()))
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
         count = self._count
+        sin, cos = self._arithmetic.sin, self._arithmetic.cos
         plate = [(r[0] + dots[2 * i], r[1] + dots[2 * i + 1], r[2], r[3]) for i, r in enumerate(self._rows)]
         mx = my = 0.0
         for qx, qy, _, _ in plate:
@@ -95,12 +96,13 @@ class IterativeSolver(Solver):
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
         """In closed form: the disagreement stays 0 if a dot moves. See :class:`Solver`."""
         count = self._count
-        c, s = cos(solution.theta), sin(solution.theta)
+        by = self._arithmetic
+        c, s = by.cos(solution.theta), by.sin(solution.theta)
         plate = [(r[0] + dots[2 * i], r[1] + dots[2 * i + 1], r[2], r[3]) for i, r in enumerate(self._rows)]
-        mx = sum(p[0] for p in plate) / count
-        my = sum(p[1] for p in plate) / count
+        mx = by.total(p[0] for p in plate) / count
+        my = by.total(p[1] for p in plate) / count
         # The beams are about their mean, so the dots' mean counts for nothing.
-        agreement = sum(c * (qx * lx + qy * ly) + s * (qx * ly - qy * lx) for qx, qy, lx, ly in plate)
+        agreement = by.total(c * (qx * lx + qy * ly) + s * (qx * ly - qy * lx) for qx, qy, lx, ly in plate)
         gx, gy = s * mx + c * my, s * my - c * mx
         rows: tuple[list[float], list[float], list[float]] = ([], [], [])
         for _, _, lx, ly in plate:

@@ -26,4 +26,6 @@ class OlsSolver(FixedGain):
     def __init__(self, geometry: Geometry) -> None:
         """Bind to ``geometry``. Raises SolverError if the beams coincide."""
         count = check_twist(geometry)
-        super().__init__(design_matrix(geometry.beams), np.asarray(geometry.zeros), np.ones(2 * count))
+        super().__init__(
+            design_matrix(geometry.beams), np.asarray(geometry.zeros), np.ones(2 * count), geometry.arithmetic
+        )

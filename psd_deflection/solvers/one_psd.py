@@ -8,8 +8,6 @@ estimated of the twist: it comes out as it went in.
 
 from __future__ import annotations
 
-from math import cos, sin
-
 import numpy as np
 
 from psd_deflection.geometry.layout import Geometry
@@ -21,6 +19,7 @@ class OnePsd:
     """Bound to ``geometry``; see the module's text."""
 
     def __init__(self, geometry: Geometry) -> None:
+        self._arithmetic = geometry.arithmetic
         self._centers = [(float(x), float(y)) for x, y in np.asarray(geometry.centers)]
         self._beams = [(float(x), float(y)) for x, y in np.asarray(geometry.beams)]
 
@@ -35,7 +34,7 @@ class OnePsd:
         qx = self._centers[psd][0] + dot[0]
         qy = self._centers[psd][1] + dot[1]
         lx, ly = self._beams[psd]
-        c, s = cos(theta), sin(theta)
+        c, s = self._arithmetic.cos(theta), self._arithmetic.sin(theta)
         vx, vy = variances
         # d(d)/d(theta) = -R'(theta) q
         gx = s * qx + c * qy

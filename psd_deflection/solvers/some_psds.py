@@ -43,7 +43,7 @@ class PoseOfFew(Solver):
         if end.status is not SolverStatus.OK:
             return end
         unknown = self.unknown(found, end)
-        covariance = np.array(found.covariance).reshape(3, 3) + np.einsum('i,j->ij', unknown, unknown)
+        covariance = np.add(np.reshape(found.covariance, (3, 3)), unknown[:, None] * unknown)
         return found._replace(covariance=tuple(covariance.ravel().tolist()))
 
     @staticmethod
@@ -54,7 +54,7 @@ class PoseOfFew(Solver):
     def allowance(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> FloatArray:
         """That of the unknown tilt. See :class:`Solver`."""
         unknown = self.unknown(self._middle.solve(dots, variances), self._end.solve(dots, variances))
-        return np.asarray(np.einsum('i,j->ij', unknown, unknown))
+        return np.asarray(unknown[:, None] * unknown)
 
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
         """That of the middle. See :class:`Solver`."""

@@ -56,6 +56,7 @@ class WlsSolver(Solver):
         beams, zeros = np.asarray(geometry.beams).tolist(), np.asarray(geometry.zeros).tolist()
         self._rows = tuple((lx, ly, x0, y0) for (lx, ly), (x0, y0) in zip(beams, zeros, strict=True))
         self._places = tuple(np.asarray(geometry.beams, dtype=np.float64).ravel().tolist())
+        self._arithmetic = geometry.arithmetic
         self._fixed = fixed_weights(geometry, weights, row_scaling)
 
     @classmethod
@@ -128,7 +129,7 @@ class WlsSolver(Solver):
         """In closed form: that of the beams' places without twist. See :class:`Solver`."""
         if self._fixed is not None:
             return self._fixed.gain(dots, variances, solution)
-        return weighted_gain(self._places, 0.0, variances, solution)
+        return weighted_gain(self._places, 0.0, variances, solution, self._arithmetic)
 
 
 def fixed_weights(geometry: Geometry, weights: Weights, row_scaling: tuple[float, ...]) -> FixedGain | None:
@@ -146,4 +147,5 @@ def fixed_weights(geometry: Geometry, weights: Weights, row_scaling: tuple[float
             f'wls.row_scaling = {list(row_scaling)}: must have {count} elements above 0, '
             'one for x and one for y of each PSD'
         )
-    return FixedGain(design_matrix(geometry.beams), np.asarray(geometry.zeros), np.array(row_scaling, dtype=np.float64))
+    scaling = np.array(row_scaling, dtype=np.float64)
+    return FixedGain(design_matrix(geometry.beams), np.asarray(geometry.zeros), scaling, geometry.arithmetic)

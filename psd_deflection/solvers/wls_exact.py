@@ -14,7 +14,6 @@ readings are combined as ``wls`` combines them, ``thesis`` weights included.
 
 from __future__ import annotations
 
-from math import asin, atan, cos, hypot, sin
 from typing import Any, ClassVar
 
 import numpy as np
@@ -43,6 +42,7 @@ class WlsExactSolver(Solver):
         row_scaling: tuple[float, ...] = THESIS_ROW_SCALING,
     ) -> None:
         """Bind to ``geometry``; same options and errors as :class:`WlsSolver`."""
+        self._arithmetic = geometry.arithmetic
         self._wls = WlsSolver(geometry, weights, row_scaling)
         self._rows = tuple((lx, ly) for lx, ly in np.asarray(geometry.beams).tolist())
         self._fixed = tuple([s * s for s in row_scaling]) if weights == 'thesis' else None
@@ -70,22 +70,23 @@ class WlsExactSolver(Solver):
         xy /= sum_x
         yx /= sum_y
         yy /= sum_y
+        by = self._arithmetic
         spread = mixed = 0.0
         for i, (lx, ly) in enumerate(self._rows):
             wx = w[2 * i]
             wy = w[2 * i + 1]
-            spread += wx * (ly - xy) ** 2 + wy * (lx - yx) ** 2
+            spread += wx * by.square(ly - xy) + wy * by.square(lx - yx)
             mixed += wx * (ly - xy) * lx - wy * (lx - yx) * ly
         kappa = mixed / spread
-        sine = (linear.theta + kappa) / hypot(1.0, kappa)
+        sine = (linear.theta + kappa) / by.hypot(1.0, kappa)
         if not -1.0 <= sine <= 1.0:
             status = SolverStatus.INADMISSIBLE if sine == sine else SolverStatus.NOT_CONVERGED
             return linear._replace(status=status)
-        theta = asin(sine) - atan(kappa)
-        c = cos(theta)
-        s = sin(theta)
+        theta = by.asin(sine) - by.atan(kappa)
+        c = by.cos(theta)
+        s = by.sin(theta)
         # (1 - cos) by the half angle: no digits are lost at small angles.
-        versine = 2.0 * sin(0.5 * theta) ** 2
+        versine = 2.0 * by.square(by.sin(0.5 * theta))
         fx = linear.dx + xy * (s - linear.theta) - xx * versine
         fy = linear.dy - yx * (s - linear.theta) - yy * versine
         # Derivative of this answer by the linear answer, in plate axes.

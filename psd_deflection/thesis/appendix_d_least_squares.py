@@ -41,7 +41,7 @@ class AppendixDOlsSolver(FixedGain):
         if check_twist(geometry) != 2:
             raise SolverError(f'{self.name} takes two PSDs; of more take exact, or pose if their heights differ')
         design = printed_design_matrix(geometry) * np.array([1.0, 1.0, -1.0])
-        super().__init__(design, np.zeros((2, 2)), np.array(row_scaling, dtype=np.float64))
+        super().__init__(design, np.zeros((2, 2)), np.array(row_scaling, dtype=np.float64), geometry.arithmetic)
 
 
 class AppendixDWlsSolver(AppendixDOlsSolver):

@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from psd_deflection.arithmetic import FIXED, Arithmetic
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.uncertainty.combinations import combinations_of
 
@@ -59,19 +60,19 @@ class Fitted(NamedTuple):
     misfit: bool
 
 
-def basis(size: int) -> FloatArray:
+def basis(size: int, by: Arithmetic = FIXED) -> FloatArray:
     """Orthonormal polynomials (N, K) over the places 0 ... N - 1; at most one order for each four samples."""
     orders = min(ORDER, (size - 1) // 4) + 1
-    u = (np.arange(size) - 0.5 * (size - 1)) / max(0.5 * (size - 1), 0.5)
+    u = np.asarray((np.arange(size) - 0.5 * (size - 1)) / max(0.5 * (size - 1), 0.5), dtype=np.float64)
     columns: list[FloatArray] = []
     column: FloatArray
     for k in range(orders):
-        column = np.asarray(u**k, dtype=np.float64)
+        column = by.power_many(u, k)
         # Twice: once leaves rounding that shows.
         for _ in range(2):
             for q in columns:
-                column = column - (q * column).sum() * q
-        columns.append(column / float((column * column).sum()) ** 0.5)
+                column = column - by.sum(q * column, 0) * q
+        columns.append(column / by.root(float(by.sum(column * column, 0))))
     return np.stack(columns, axis=1)
 
 
@@ -97,14 +98,14 @@ class _Terms(NamedTuple):
     share: list[list[float]]
 
 
-def _terms(q: FloatArray, precision: FloatArray, middle: FloatArray, whole: bool) -> _Terms:
+def _terms(q: FloatArray, precision: FloatArray, middle: FloatArray, whole: bool, by: Arithmetic) -> _Terms:
     samples, orders = q.shape
     told = min(orders, max(samples // 2, 1))
-    u = np.einsum('ast,tk->ask', precision, q)
-    information = np.einsum('sj,ask->ajk', q, u)
+    u = by.einsum('ast,tk->ask', precision, q)
+    information = by.einsum('sj,ask->ajk', q, u)
     inverted = inverse(information[:, :told, :told])
-    v = np.einsum('akk->ak', inverted).copy()
-    estimate = np.einsum('ask,akj->asj', u[:, :, :told], inverted)
+    v = np.diagonal(inverted, axis1=1, axis2=2).copy()
+    estimate = by.einsum('ask,akj->asj', u[:, :, :told], inverted)
     # In a whole block odd orders are 0 in the middle and uncorrelated with even ones.
     used = slice(2, told, 2) if whole else slice(1, told)
     own, mixed = information[:, 0, 0], information[:, 0, used]
@@ -119,18 +120,25 @@ class BlockFit:
     """Fits block after block; see the module's text. It remembers how much motion there was."""
 
     def __init__(
-        self, size: int, centers: FloatArray, beams: FloatArray, poly: bool = True, slopes: FloatArray | None = None
+        self,
+        size: int,
+        centers: FloatArray,
+        beams: FloatArray,
+        poly: bool = True,
+        slopes: FloatArray | None = None,
+        by: Arithmetic = FIXED,
     ) -> None:
         """``size``: N samples of a whole block. ``centers``, ``beams`` (P, 2) m, C = 2P.
 
         ``poly``: False gives the mean. ``slopes``: as :func:`combinations_of` takes them.
         """
         self._size = size
+        self._by = by
         self._poly = poly
-        self._q = basis(size) if poly else basis(size)[:, :1]
+        self._q = basis(size, by) if poly else basis(size, by)[:, :1]
         self._orders = self._q.shape[1]
         self._fft = 1 << (2 * size - 1).bit_length()
-        self._middle = _at_middle(self._q)
+        self._middle = _at_middle(self._q, by)
         self._count = 2 * len(centers)
         self._diagonal = np.arange(self._count)
         self._squares = np.zeros((self._count, self._orders))
@@ -142,12 +150,12 @@ class BlockFit:
 
     def set_geometry(self, centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None) -> None:
         """Use these places (P, 2), m, from now on; :meth:`set_noise` must follow."""
-        self._combinations = combinations_of(centers, beams, slopes)
+        self._combinations = combinations_of(centers, beams, slopes, by=self._by)
 
     def set_noise(self, gamma: FloatArray) -> None:
         """Use the autocovariance ``gamma`` (C, C, N) m^2 of the readings."""
-        turn, count = self._combinations.turn, self._count
-        turned = np.einsum('ac,cdl,bd->abl', turn, gamma, turn)
+        by, turn, count = self._by, self._combinations.turn, self._count
+        turned = by.einsum('ac,cdl,bd->abl', turn, gamma, turn)
         whole = np.zeros((count, count, self._fft))
         whole[:, :, : self._size] = turned
         # The covariance with an earlier sample is the transposed one with a later.
@@ -155,45 +163,46 @@ class BlockFit:
         self._spectrum = np.fft.fft(whole)[:, :, : self._fft // 2 + 1] * self._folds
         own = turned[self._diagonal, self._diagonal]
         self._precision = _precision(own, white=not self._poly or self._size > LARGEST)
-        self._whole = _terms(self._q, self._precision, self._middle, whole=True)
+        self._whole = _terms(self._q, self._precision, self._middle, True, by)
         self._bias, self._least = _BIAS * self._whole.v, 1e-9 * self._whole.v
         f = np.fft.rfft(self._whole.u, self._fft, axis=1)
-        self._of_whole = np.einsum('afk,abf,bfj->akbj', f, self._spectrum, np.conj(f)).real
+        self._of_whole = by.hermitian('afk,abf,bfj->akbj', f, self._spectrum)
 
     def fit(self, slots: IntArray, dots: FloatArray) -> Fitted:
         """The dots at the middle of the block. ``slots`` (n,): which samples are present. ``dots`` (n, C), m."""
+        by = self._by
         z = self._combinations.of(dots)
         # Of numbers about their mean: motion of millimetres leaves no rounding in what is left of it.
-        offset = z.sum(axis=1) / len(slots)
+        offset = by.sum(z, 1) / len(slots)
         z -= offset[:, None]
         whole = len(slots) == self._size
-        terms = self._whole if whole else _terms(self._q[slots], self._without(slots), self._middle, whole=False)
+        terms = self._whole if whole else _terms(self._q[slots], self._without(slots), self._middle, False, by)
         orders, told = self._orders, terms.v.shape[1]
-        seen = np.einsum('asj,as->aj', terms.all, z)
+        seen = by.einsum('asj,as->aj', terms.all, z)
         more = None
         if orders > 1:
             c = seen[:, orders : orders + told]
             motion = self._motion(c, terms.v)
-            x, more = _weights(terms, motion, self._middle)
+            x, more = _weights(terms, motion, self._middle, by)
             left = len(slots) - told
             # In units of the noise: a chi-square of n - K degrees of freedom.
-            squares = (z * seen[:, orders + told :]).sum(axis=1) - (seen[:, :told] * c).sum(axis=1)
+            squares = by.sum(z * seen[:, orders + told :], 1) - by.sum(seen[:, :told] * c, 1)
         else:
             x = np.array(terms.first)[:, None]
-        value = (x * seen[:, :orders]).sum(axis=1) + offset
+        value = by.sum(x * seen[:, :orders], 1) + offset
         if whole:
-            covariance = np.einsum('ak,akbj,bj->ab', x, self._of_whole, x)
+            covariance = by.einsum('ak,akbj,bj->ab', x, self._of_whole, x)
         else:
             weights = np.zeros((self._count, self._size))
-            weights[:, slots] = np.einsum('ask,ak->as', terms.u, x)
+            weights[:, slots] = by.einsum('ask,ak->as', terms.u, x)
             covariance = self._spread(weights)
         misfit = False
         if more is not None:
-            limit = left + _MISFIT * (2.0 * left) ** 0.5
+            limit = left + _MISFIT * by.root(2.0 * left)
             misfit = left > 0 and max(squares.tolist()) > limit
             if misfit:
-                rest = z - np.einsum('sk,ak->as', terms.q[:, :told], c)
-                more += np.where(squares > limit, _WIDEN**2 * (rest * rest).sum(axis=1) / left, 0.0)
+                rest = z - by.einsum('sk,ak->as', terms.q[:, :told], c)
+                more += np.where(squares > limit, _WIDEN * _WIDEN * by.sum(rest * rest, 1) / left, 0.0)
             covariance[self._diagonal, self._diagonal] += more
         return Fitted(*self._combinations.back(value.tolist(), covariance), misfit)
 
@@ -218,7 +227,8 @@ class BlockFit:
         cross = p[:, slots[:, None], gone]
         inner = inverse(p[:, gone[:, None], gone])
         return np.asarray(
-            p[:, slots[:, None], slots] - np.einsum('asg,atg->ast', np.einsum('asg,agh->ash', cross, inner), cross)
+            p[:, slots[:, None], slots]
+            - self._by.einsum('asg,atg->ast', self._by.einsum('asg,agh->ash', cross, inner), cross)
         )
 
     def _motion(self, c: FloatArray, v: FloatArray) -> FloatArray:
@@ -257,7 +267,7 @@ class BlockFit:
     def _spread(self, weights: FloatArray) -> FloatArray:
         """Covariance (C, C) of the weighted sums; ``weights`` (C, N)."""
         f = np.fft.rfft(weights, self._fft)
-        return np.asarray(np.einsum('af,abf,bf->ab', f, self._spectrum, np.conj(f)).real)
+        return self._by.hermitian('af,abf,bf->ab', f, self._spectrum)
 
 
 def inverse(matrices: FloatArray) -> FloatArray:
@@ -278,7 +288,7 @@ def inverse(matrices: FloatArray) -> FloatArray:
     return out
 
 
-def _weights(terms: _Terms, motion: FloatArray, middle: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _weights(terms: _Terms, motion: FloatArray, middle: FloatArray, by: Arithmetic) -> tuple[FloatArray, FloatArray]:
     """Weights (C, K) of the sums h in the middle, and the variance (C,), m^2, of the motion that they leave out.
 
     A few numbers: floats, of which numpy's calls would cost a multiple.
@@ -306,8 +316,8 @@ def _weights(terms: _Terms, motion: FloatArray, middle: FloatArray) -> tuple[Flo
     told = terms.v.shape[1]
     if told < motion.shape[1]:
         # So few samples cannot tell of these.
-        untold = middle[told:] - np.einsum('akj,aj->ak', terms.information[:, told:], x)
-        left_out += (untold * untold * motion[:, told:]).sum(axis=1)
+        untold = middle[told:] - by.einsum('akj,aj->ak', terms.information[:, told:], x)
+        left_out += by.sum(untold * untold * motion[:, told:], 1)
     return x, left_out
 
 
@@ -334,16 +344,15 @@ def _precision(gamma: FloatArray, white: bool) -> FloatArray:
     lags = np.abs(np.arange(size)[:, None] - np.arange(size))
     if not white:
         out = inverse(gamma[:, lags])
-        if np.isfinite(out).all() and (np.einsum('ass->as', out) > 0.0).all():
+        if np.isfinite(out).all() and (np.diagonal(out, axis1=1, axis2=2) > 0.0).all():
             return out
     return np.asarray(np.eye(size) / gamma[:, :1, None])
 
 
-def _at_middle(q: FloatArray) -> FloatArray:
+def _at_middle(q: FloatArray, by: Arithmetic) -> FloatArray:
     """The polynomials' values (K,) in the middle of the block, between two places where N is even."""
     size, orders = q.shape
     u = (np.arange(size) - 0.5 * (size - 1)) / max(0.5 * (size - 1), 0.5)
     # Each is a combination of powers of u; the middle is u = 0, its constant term.
-    powers = np.stack([u**k for k in range(orders)], axis=1)
-    middle: FloatArray = np.linalg.solve(powers.T @ powers, powers.T @ q)[0]
-    return middle
+    powers = np.stack([by.power_many(u, k) for k in range(orders)], axis=1)
+    return np.asarray(by.solve(by.product(powers.T, powers), by.product(powers.T, q))[0])

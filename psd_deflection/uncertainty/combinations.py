@@ -9,12 +9,16 @@ model leaves of the dots: a twist by 1 degree would move the dots' own by 15 um.
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Callable
 
 import numpy as np
 
+from psd_deflection.arithmetic import FIXED, Arithmetic
 from psd_deflection.geometry.linear import design_matrix
 from psd_deflection.records import FloatArray
+
+_HALF = math.sqrt(0.5)
 
 Left = Callable[[FloatArray], FloatArray]
 """What a model of the plate leaves of dots (n, C), m."""
@@ -48,19 +52,20 @@ class _BaseLine(Combinations):
 
     moving = still = 3
 
-    def __init__(self, centers: FloatArray, beams: FloatArray) -> None:
-        self.turn = combinations(beams)
+    def __init__(self, centers: FloatArray, beams: FloatArray, by: Arithmetic) -> None:
+        self._by = by
+        self.turn = combinations(beams, by)
         self._columns = [tuple(column) for column in self.turn.T.tolist()]
         apart = self._apart = centers[0] - centers[1]
-        self._across, self._along = (float(np.einsum('i,i->', row[:2], apart)) for row in (self.turn[2], self.turn[3]))
-        self._beams_apart = float(np.hypot(*(beams[0] - beams[1])))
-        self._base_line = self._beams_apart * 0.5**0.5
+        self._across, self._along = (float(by.einsum('i,i->', row[:2], apart)) for row in (self.turn[2], self.turn[3]))
+        self._beams_apart = float(by.hypot_many(*(beams[0] - beams[1])))
+        self._base_line = self._beams_apart * _HALF
 
     def of(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""
-        z = np.einsum('ac,sc->as', self.turn, dots)
+        z = self._by.einsum('ac,sc->as', self.turn, dots)
         # The length itself, not its first order: a twist by 1 degree would move that by 13 um.
-        z[3] = np.hypot(z[3] + self._along, z[2] + self._across) - self._base_line
+        z[3] = self._by.hypot_many(z[3] + self._along, z[2] + self._across) - self._base_line
         return np.asarray(z)
 
     def back(self, value: list[float], covariance: FloatArray) -> tuple[tuple[float, ...], FloatArray]:
@@ -68,47 +73,52 @@ class _BaseLine(Combinations):
         # From the length to the part along the base line at rest.
         x, y, twist, length = value[0], value[1], value[2], value[3] + self._base_line
         across = twist + self._across
-        along = max(length * length - across * across, 1e-4 * length * length) ** 0.5
+        along = self._by.root(max(length * length - across * across, 1e-4 * length * length))
         back = self.turn.copy()
         back[2] -= (across / along) * back[3]
         back[3] *= length / along
         longer = along - self._along
         dots = tuple([x * p + y * q + twist * r + longer * s for p, q, r, s in self._columns])
-        return dots, np.einsum('ac,ab,bd->cd', back, covariance, back)
+        return dots, self._by.einsum('ac,ab,bd->cd', back, covariance, back)
 
     def fixed(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""
         apart = dots[:, :2] - dots[:, 2:] + self._apart
-        return np.asarray((np.hypot(apart[:, 0], apart[:, 1]) - self._beams_apart) * 0.5**0.5)
+        return np.asarray((self._by.hypot_many(apart[:, 0], apart[:, 1]) - self._beams_apart) * _HALF)
 
 
 class _Several(Combinations):
     """Of more PSDs."""
 
-    def __init__(self, slopes: FloatArray, left: Left | None) -> None:
+    def __init__(self, slopes: FloatArray, left: Left | None, by: Arithmetic) -> None:
         """``slopes`` (C, unknowns): how each reading goes with each unknown at rest."""
+        self._by = by
         self._left = left
-        self.turn = _completed(slopes)
+        self.turn = _completed(slopes, by)
         self.moving = slopes.shape[1]
         self.still = len(slopes)
 
     def of(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""
-        return np.asarray(np.einsum('ac,sc->as', self.turn, dots))
+        return self._by.einsum('ac,sc->as', self.turn, dots)
 
     def back(self, value: list[float], covariance: FloatArray) -> tuple[tuple[float, ...], FloatArray]:
         """See :class:`Combinations`."""
-        dots = np.einsum('ac,a->c', self.turn, np.array(value))
-        return tuple(dots.tolist()), np.einsum('ac,ab,bd->cd', self.turn, covariance, self.turn)
+        dots = self._by.einsum('ac,a->c', self.turn, np.array(value))
+        return tuple(dots.tolist()), self._by.einsum('ac,ab,bd->cd', self.turn, covariance, self.turn)
 
     def fixed(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""
         left = dots if self._left is None else self._left(dots)
-        return np.asarray(np.einsum('c,sc->s', self.turn[self.moving], left))
+        return self._by.einsum('c,sc->s', self.turn[self.moving], left)
 
 
 def combinations_of(
-    centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None, left: Left | None = None
+    centers: FloatArray,
+    beams: FloatArray,
+    slopes: FloatArray | None = None,
+    left: Left | None = None,
+    by: Arithmetic = FIXED,
 ) -> Combinations:
     """Of the PSDs at ``centers`` (P, 2) m under ``beams`` (P, 2) m.
 
@@ -116,29 +126,29 @@ def combinations_of(
     the motion of a flat plate. ``left``: what the solver's model leaves of the dots; None: to first order.
     """
     if len(centers) == 2:
-        return _BaseLine(centers, beams)
-    return _Several(design_matrix(beams) if slopes is None else slopes, left)
+        return _BaseLine(centers, beams, by)
+    return _Several(design_matrix(beams) if slopes is None else slopes, left, by)
 
 
-def combinations(beams: FloatArray) -> FloatArray:
+def combinations(beams: FloatArray, by: Arithmetic = FIXED) -> FloatArray:
     """Orthogonal (4, 4): x and y of the middle, twist, base line, each of (x1, y1, x2, y2). ``beams`` (2, 2), m."""
-    along = (beams[0] - beams[1]) / np.hypot(*(beams[0] - beams[1]))
+    along = (beams[0] - beams[1]) / by.hypot_many(*(beams[0] - beams[1]))
     x, y = float(along[0]), float(along[1])
     rows = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0], [-y, x, y, -x], [x, y, -x, -y]])
-    return np.asarray(rows * 0.5**0.5)
+    return np.asarray(rows * _HALF)
 
 
-def _completed(slopes: FloatArray) -> FloatArray:
+def _completed(slopes: FloatArray, by: Arithmetic) -> FloatArray:
     """Orthogonal (C, C) whose first rows span the columns of ``slopes`` (C, k), of full rank."""
     count = len(slopes)
     rows: list[FloatArray] = []
     for candidate in (*slopes.T, *np.eye(count)):
-        row = candidate / np.sqrt((candidate * candidate).sum())
+        row = candidate / np.sqrt(by.sum(candidate * candidate, 0))
         # Twice: once leaves rounding that shows.
         for _ in range(2):
             for before in rows:
-                row = row - (before * row).sum() * before
-        left = float((row * row).sum()) ** 0.5
+                row = row - by.sum(before * row, 0) * before
+        left = by.root(float(by.sum(row * row, 0)))
         # Of the unit vectors, those that the rows so far span are left out.
         if len(rows) < slopes.shape[1] or left > _SPANNED:
             rows.append(row / left)

@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from psd_deflection.arithmetic import FIXED, Arithmetic
 from psd_deflection.records import FloatArray
 
 LIMIT = 25.0
@@ -87,7 +88,8 @@ class Consistency:
     lasts, m^2, or 0.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, by: Arithmetic = FIXED) -> None:
+        self._by = by
         self.held = 0.0
         self.mean = 0.0
         self.lasting = 0.0
@@ -101,7 +103,7 @@ class Consistency:
         the dots, m. ``covariance`` (4, 4) of the dots, m^2. ``limit``: chi-square beyond which they contradict.
         """
         x, y = apart
-        size = (2.0 * (x * x + y * y)) ** 0.5
+        size = self._by.root(2.0 * (x * x + y * y))
         if size == 0.0:
             return Checked(0.0, False, _NONE, _NONE)
         ax, ay = x / size, y / size
@@ -122,16 +124,16 @@ class Consistency:
         self.lasting = lasting if lasting > variance else 0.0
         # The limit's share: below it an error is not sure enough to be held, and may still be many standard deviations.
         doubtful = chi_square * LIMIT > WIDEN * limit
-        root = _MORE * max(self.held, self.lasting, r * r if doubtful else 0.0) ** 0.5
+        root = _MORE * self._by.root(max(self.held, self.lasting, r * r if doubtful else 0.0))
         errors = (r * one_x, r * one_y, -r * one_x, -r * one_y)
         possible = (root * one_x, root * one_y, -root * one_x, -root * one_y)
         return Checked(chi_square, self.held > 0.0, errors, possible)
 
 
-def widened(covariance: FloatArray, gain: FloatArray, errors: tuple[float, ...]) -> FloatArray:
+def widened(covariance: FloatArray, gain: FloatArray, errors: tuple[float, ...], by: Arithmetic = FIXED) -> FloatArray:
     """``covariance`` (3, 3) and what each of ``errors`` (2P,) alone would cause through ``gain`` (3, 2P)."""
     caused = gain * np.array(errors)
-    return np.asarray(covariance + np.einsum('ik,jk->ij', caused, caused))
+    return np.asarray(covariance + by.einsum('ik,jk->ij', caused, caused))
 
 
 class Suspect:

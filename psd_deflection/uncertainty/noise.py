@@ -21,10 +21,11 @@ the characteristic function of the noise at multiples of 2 pi/q).
 
 from __future__ import annotations
 
-from math import exp, pi
+from math import pi
 
 import numpy as np
 
+from psd_deflection.arithmetic import FIXED, Arithmetic
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.uncertainty.block_fit import LARGEST, basis, inverse
 from psd_deflection.uncertainty.combinations import Left, combinations_of
@@ -87,11 +88,13 @@ class StreamNoise:
         steps: FloatArray | float,
         slopes: FloatArray | None = None,
         left: Left | None = None,
+        by: Arithmetic = FIXED,
     ) -> None:
         """``size``: N. ``centers``, ``beams`` (P, 2) m. Of each reading (C,), or of all: ``variances`` m^2 of a sample
         by the rig file, ``steps`` m of the converter. ``slopes``, ``left``: as :func:`combinations_of` takes them.
         """
         self._size = size
+        self._by = by
         count = self._readings = 2 * len(centers)
         self._wanted = 4 + count * count * size
         self._stated = np.broadcast_to(variances, (count,))
@@ -100,7 +103,7 @@ class StreamNoise:
         self._step = float(self._steps.max())
         self.set_geometry(centers, beams, slopes, left)
         self._mean_of = _mean_weights(size)
-        self._q = basis(size)
+        self._q = basis(size, by)
         self._average: FloatArray | None = None
         self._sure = np.ones(size)
         self._count = 0
@@ -115,7 +118,7 @@ class StreamNoise:
         self, centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None, left: Left | None = None
     ) -> None:
         """Use these places, m, from now on."""
-        self._combinations = combinations_of(centers, beams, slopes, left)
+        self._combinations = combinations_of(centers, beams, slopes, left, self._by)
         self._moving = self._combinations.turn[: self._combinations.moving]
 
     @property
@@ -127,9 +130,17 @@ class StreamNoise:
         """Standard deviation (C,), m, of one sample."""
         return np.asarray(np.sqrt(self.gamma[range(self._readings), range(self._readings), 0]))
 
+    def _own(self, gamma: FloatArray) -> FloatArray:
+        """The autocovariance (C, N) of each reading with itself."""
+        return gamma[range(self._readings), range(self._readings)]
+
+    def _least(self) -> float:
+        """Variance, m^2, that a sample has at least."""
+        return self._by.square(self._step) / 12.0 + _LEAST
+
     def mean_sd(self) -> FloatArray:
         """Standard deviation (C,), m, of the mean of a whole block."""
-        return np.asarray(np.sqrt(np.einsum('ccl,l->c', self.gamma, self._mean_of)))
+        return np.asarray(np.sqrt(self._by.einsum('cl,l->c', self._own(self.gamma), self._mean_of)))
 
     def add(self, index: int, slots: IntArray, dots: FloatArray) -> bool:
         """A block's samples; True where they ended a segment that changed ``gamma``.
@@ -177,17 +188,17 @@ class StreamNoise:
         if self._average is None or not self.measured:
             return self._from_file()
         # Of the average: each segment alone is so uncertain that much would be taken off its colour.
-        return self._with_steps(_covariance(self._average, self._sure))
+        return self._with_steps(_covariance(self._average, self._sure, self._by))
 
     def _with_steps(self, gamma: FloatArray) -> FloatArray:
         out = gamma.copy()
         for c, (stated, step) in enumerate(zip(self._stated.tolist(), self._steps.tolist(), strict=True)):
-            rounding = step**2 / 12.0
+            rounding = self._by.square(step) / 12.0
             level = max(float(out[c, c, 0]), rounding)
             out[c, c, 0] = level
             # More than the rig file's noise does not dither with certainty: a reading on the edge between
             # two steps varies by half a step with next to no noise.
-            out[c, c] += undithered(min(level, stated) - rounding, step)
+            out[c, c] += undithered(min(level, stated) - rounding, step, self._by)
         return out
 
     def _close(self) -> bool:
@@ -200,12 +211,13 @@ class StreamNoise:
         places = np.concatenate([(index - start) * size + slots for index, slots, _ in blocks])
         dots = np.concatenate([d for _, _, d in blocks])
         series = np.column_stack((dots, self._combinations.fixed(dots)))
-        lags, sure = _autocovariance(places, series, SEGMENT_BLOCKS * size, size)
+        lags, sure = _autocovariance(places, series, SEGMENT_BLOCKS * size, size, self._by)
         self._seen += 1
-        rough = _roughness(places, np.column_stack((np.einsum('sc,ac->sa', dots, self._moving), series)), self._q)
+        moved = self._by.einsum('sc,ac->sa', dots, self._moving)
+        rough = _roughness(places, np.column_stack((moved, series)), self._q, self._by)
         count = self._readings
-        fixed = _covariance(lags[count:, count:], sure)[0, 0]
-        self._judge(lags[:count, :count], sure, fixed, rough + (self._step**2 / 12.0 + _LEAST))
+        fixed = _covariance(lags[count:, count:], sure, self._by)[0, 0]
+        self._judge(lags[:count, :count], sure, fixed, rough + self._least())
         self.gamma = self._in_use()
         return True
 
@@ -214,11 +226,10 @@ class StreamNoise:
 
         ``rough``: of the combinations that move, the readings and the combination that does not, m^2.
         """
-        moving = self._moving
-        turned = np.einsum('ac,cdl,ad->al', moving, _covariance(gamma, sure), moving)
-        least = self._step**2 / 12.0 + _LEAST
-        means = turned @ self._mean_of + least / self._size
-        fixed_mean = float(fixed @ self._mean_of) + least / self._size
+        moving, by, least = self._moving, self._by, self._least()
+        turned = by.einsum('ac,cdl,ad->al', moving, _covariance(gamma, sure, by), moving)
+        means = by.product(turned, self._mean_of) + least / self._size
+        fixed_mean = float(by.product(fixed, self._mean_of)) + least / self._size
         fixed_rough = float(rough[-1])
         still = bool((means * fixed_rough <= _MOTION * rough[: len(moving)] * fixed_mean).all())
         if not self.at_rest:
@@ -229,7 +240,7 @@ class StreamNoise:
                 self._into_average(_guess(fixed, rough[len(moving) : -1] / fixed_rough), np.ones(self._size))
             return
         before = self._average if self._average is not None else gamma
-        known = np.einsum('ac,cdl,ad,l->a', moving, before, moving, self._mean_of) + least / self._size
+        known = by.einsum('ac,cdl,ad,l->a', moving, before, moving, self._mean_of) + least / self._size
         ratio = means / known
         if (ratio > _RISEN).any():
             self._louder = self._louder + 1 if still else 0
@@ -265,7 +276,7 @@ def _mean_weights(size: int) -> FloatArray:
     return np.asarray(np.where(lags > 0, 2.0, 1.0) * (size - lags) / size**2)
 
 
-def _roughness(places: IntArray, series: FloatArray, q: FloatArray) -> FloatArray:
+def _roughness(places: IntArray, series: FloatArray, q: FloatArray, by: Arithmetic = FIXED) -> FloatArray:
     """Variance (c,) of ``series`` (n, c) about a polynomial in each block: the median over the blocks of a segment."""
     size, orders = q.shape
     blocks, slots = np.divmod(places, size)
@@ -273,40 +284,42 @@ def _roughness(places: IntArray, series: FloatArray, q: FloatArray) -> FloatArra
     here = np.zeros((SEGMENT_BLOCKS, size))
     whole[blocks, slots] = series
     here[blocks, slots] = 1.0
-    count = here.sum(axis=1)
+    count = by.sum(here, 1)
     enough = count >= orders + 2
     whole, here, count = whole[enough], here[enough], count[enough]
-    whole = (whole - whole.sum(axis=1, keepdims=True) / count[:, None, None]) * here[:, :, None]
-    gram = np.einsum('bsk,sj->bkj', here[:, :, None] * q, q)
-    h = np.einsum('bsc,sk->bkc', whole, q)
-    left = np.einsum('bsc,bsc->bc', whole, whole) - np.einsum(
-        'bkc,bkc->bc', h, np.einsum('bkj,bjc->bkc', inverse(gram), h)
+    whole = (whole - by.sum(whole, 1)[:, None] / count[:, None, None]) * here[:, :, None]
+    gram = by.einsum('bsk,sj->bkj', here[:, :, None] * q, q)
+    h = by.einsum('bsc,sk->bkc', whole, q)
+    left = by.einsum('bsc,bsc->bc', whole, whole) - by.einsum(
+        'bkc,bkc->bc', h, by.einsum('bkj,bjc->bkc', inverse(gram), h)
     )
     if not len(left):
         return np.zeros(series.shape[1])
     return np.asarray(np.median(left / (count - orders)[:, None], axis=0))
 
 
-def _autocovariance(places: IntArray, series: FloatArray, length: int, lags: int) -> tuple[FloatArray, FloatArray]:
+def _autocovariance(
+    places: IntArray, series: FloatArray, length: int, lags: int, by: Arithmetic = FIXED
+) -> tuple[FloatArray, FloatArray]:
     """(c, c, lags) of ``series`` (n, c) at ``places`` (n,) below ``length``, less mean and slope; gaps are left out.
 
     It need not be a covariance. The second is for :func:`_covariance`.
     """
     at = places - places.sum() / len(places)
-    centred = series - series.sum(axis=0) / len(series)
-    centred -= at[:, None] * (np.einsum('t,tc->c', at, centred) / float((at * at).sum()))
+    centred = series - by.sum(series, 0) / len(series)
+    centred -= at[:, None] * (by.einsum('t,tc->c', at, centred) / float(by.sum(at * at, 0)))
     count = series.shape[1]
     far = _FAR * lags
     padded = np.zeros((count + 1, 1 << (length + far - 1).bit_length()))
     padded[:count, places] = centred.T
     padded[count, places] = 1.0
     spectra = np.fft.rfft(padded)
-    pairs = np.fft.irfft(np.conj(spectra[:count, None]) * spectra[None, :count])[:, :, :far]
-    present = np.fft.irfft(np.abs(spectra[count]) ** 2)[:far]
+    pairs = np.fft.irfft(by.times_conjugate(spectra[:count, None], spectra[None, :count]))[:, :, :far]
+    present = np.fft.irfft(by.power_spectrum(spectra[count]))[:far]
     # Where two samples are never that far apart, nothing is known: taken as independent.
     each = np.where(present > 0.5, pairs / np.maximum(present, 1.0), 0.0)
     # Mean and slope were taken off: 2 of length / far degrees of freedom of what is slower than that.
-    slow = np.einsum('cdl,l->cd', each, _mean_weights(far))
+    slow = by.einsum('cdl,l->cd', each, _mean_weights(far))
     taken = (slow + slow.T)[:, :, None] / (length / far - 2)
     # Products with 0 for what is absent are those of a covariance whatever the samples are, and stay so over one
     # divisor: that of the lag at which gaps cost most, so that none is too small.
@@ -315,7 +328,7 @@ def _autocovariance(places: IntArray, series: FloatArray, length: int, lags: int
     return each[:, :, :lags] + taken, present / max(float(whole.min()), _PAIRS * float(whole[0]))
 
 
-def _covariance(each: FloatArray, sure: FloatArray) -> FloatArray:
+def _covariance(each: FloatArray, sure: FloatArray, by: Arithmetic = FIXED) -> FloatArray:
     """The autocovariance (c, c, N) ``each`` as the covariance of N samples.
 
     ``sure`` (N,): times it, it is one. As little of that is taken as makes it one.
@@ -325,34 +338,29 @@ def _covariance(each: FloatArray, sure: FloatArray) -> FloatArray:
     for share in _SHARES if size <= LARGEST else (1.0,):
         mixed = each * (1.0 + share * (sure - 1.0))
         mixed[range(count), range(count), 0] += own
-        if share == 1.0 or _positive(mixed):
+        if share == 1.0 or _positive(mixed, by):
             break
     return mixed
 
 
-def _positive(gamma: FloatArray) -> bool:
+def _positive(gamma: FloatArray, by: Arithmetic) -> bool:
     """Whether no weighted sum of N samples of each reading has a variance of 0 or below."""
     count, _, size = gamma.shape
     both = np.concatenate((gamma.transpose(1, 0, 2)[:, :, :0:-1], gamma), axis=2)
     lags = np.arange(size) - np.arange(size)[:, None] + size - 1
     whole = both[:, :, lags].transpose(0, 2, 1, 3).reshape(count * size, count * size)
-    try:
-        # Its last digits depend on the machine. The answer would only if a variance were 0 to 15 digits.
-        np.linalg.cholesky(whole)
-    except np.linalg.LinAlgError:
-        return False
-    return bool(np.isfinite(whole).all())
+    return bool(np.isfinite(whole).all()) and by.is_positive(whole)
 
 
-def undithered(variance: float, step: float) -> float:
+def undithered(variance: float, step: float, by: Arithmetic = FIXED) -> float:
     """Variance of the error that rounding to ``step`` leaves in the mean of many readings of that noise."""
     if step <= 0.0:
         return 0.0
-    decay = 4.0 * pi * pi * max(variance, 0.0) / step**2
+    decay = 4.0 * pi * pi * max(variance, 0.0) / by.square(step)
     total = 0.0
     for k in range(1, 200):
-        term = exp(-min(decay * k * k, 700.0)) / (k * k)
+        term = by.exp(-min(decay * k * k, 700.0)) / (k * k)
         total += term
         if term < 1e-9:
             break
-    return step**2 / (2.0 * pi * pi) * total
+    return by.square(step) / (2.0 * pi * pi) * total

@@ -18,6 +18,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from psd_deflection.arithmetic import FIXED, Arithmetic
 from psd_deflection.records import FloatArray
 from psd_deflection.uncertainty.block_fit import inverse
 from psd_deflection.uncertainty.consistency import Checked
@@ -41,9 +42,10 @@ _UNSEEN = 4e-4
 class Redundancy:
     """Checks the readings of block after block. It remembers who was wrong lately, and by how much."""
 
-    def __init__(self, psds: int, unknowns: int) -> None:
+    def __init__(self, psds: int, unknowns: int, by: Arithmetic = FIXED) -> None:
         """``psds``: P. ``unknowns``: p; with as many readings or fewer nothing is redundant."""
         self._psds = psds
+        self._by = by
         self.freedom = max(2 * psds - unknowns, 0)
         # Imported here: it takes a fifth of a second, and few rigs have more than two PSDs.
         from scipy.special import chdtri
@@ -60,7 +62,7 @@ class Redundancy:
         if not self.freedom:
             return False
         r = np.array(residual)
-        chi_square = float(np.einsum('i,ij,j->', r, _unexplained(slopes, covariance), r))
+        chi_square = float(self._by.einsum('i,ij,j->', r, _unexplained(slopes, covariance, self._by), r))
         return chi_square <= times * self._limit
 
     def check(
@@ -80,10 +82,10 @@ class Redundancy:
         none = (0.0,) * len(residual)
         if not self.freedom:
             return Checked(0.0, False, none, none, 0, 0)
-        q = _unexplained(slopes, covariance)
+        q = _unexplained(slopes, covariance, self._by)
         r = np.array(residual)
-        pull = np.einsum('ij,j->i', q, r)
-        chi_square = max(float((r * pull).sum()), 0.0)
+        pull = self._by.einsum('ij,j->i', q, r)
+        chi_square = max(float(self._by.sum(r * pull, 0)), 0.0)
         errors = self._errors(q, pull)
         contradict = chi_square > times * self._limit
         suspects: list[int] = []
@@ -156,11 +158,11 @@ def survival(chi_square: float, freedom: int) -> float:
     return float(chdtrc(freedom, chi_square)) if freedom else 1.0
 
 
-def _unexplained(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
+def _unexplained(slopes: FloatArray, covariance: FloatArray, by: Arithmetic) -> FloatArray:
     """Q (2P, 2P) of the module's text, 1/m^2."""
     weights = inverse(covariance[None])[0]
     # Each unknown in its own unit, so that the elimination sees numbers of one size.
-    scaled = slopes / np.sqrt((slopes * slopes).sum(axis=0))
-    seen = np.einsum('ij,jk->ik', weights, scaled)
-    normal = inverse(np.einsum('ji,jk->ik', scaled, seen)[None])[0]
-    return np.asarray(weights - np.einsum('ia,ab,jb->ij', seen, normal, seen))
+    scaled = slopes / np.sqrt(by.sum(slopes * slopes, 0))
+    seen = by.einsum('ij,jk->ik', weights, scaled)
+    normal = inverse(by.einsum('ji,jk->ik', scaled, seen)[None])[0]
+    return np.asarray(weights - by.einsum('ia,ab,jb->ij', seen, normal, seen))

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from psd_deflection.arithmetic import ARITHMETICS
 from psd_deflection.calibration import dot_noise_variances
 from psd_deflection.config import Rig
 from psd_deflection.geometry.plate import Tilts, flat_points, flat_poses, plate_points, reading_slopes, tied_pose
@@ -39,16 +40,17 @@ class PlateModel:
     def __init__(self, rig: Rig, kept: Sequence[int], tilts: Tilts) -> None:
         """``kept``: PSDs (from 0). ``tilts``: what the method says of the plate's tilts."""
         at = list(kept)
+        self._by = ARITHMETICS[rig.estimator.arithmetic]
         self._centers, self._heights = rig.centers[at], rig.heights[at]
         self.beams = self._centers + rig.zeros[at]
         self._tilts: Tilts = tilts
         self._link = rig.link.slope_ratio, rig.link.length
         self._tie = 0.0 if tilts == 'none' else rig.link.slope_ratio
-        self._gain = np.linalg.pinv(self.slopes_at((0.0,) * 5))
+        self._gain = self._by.pseudo_inverse(self.slopes_at((0.0,) * 5))
 
     def slopes_at(self, pose: Sequence[float]) -> FloatArray:
         """How the readings go with what is solved for (C, unknowns) at ``pose``: dX, dY m, theta, phi, omega rad."""
-        return reading_slopes(self.beams, self._heights, np.array(pose), self._tilts, *self._link)
+        return reading_slopes(self.beams, self._heights, np.array(pose), self._tilts, *self._link, self._by)
 
     def left(self, dots: FloatArray) -> FloatArray:
         """What the best pose leaves of ``dots`` (n, C), m, all readings of one weight."""
@@ -58,8 +60,9 @@ class PlateModel:
         # The slopes at rest are right to some per cent, so each step leaves some per cent of the error before it.
         for _ in range(_STEPS):
             pose = unknowns if self._tilts == 'free' else tied_pose(unknowns, self._tie, self._link[1])
-            left: FloatArray = (points - plate_points(pose, self.beams, heights)).reshape(len(dots), -1)
-            unknowns = unknowns + np.einsum('us,ns->nu', self._gain, left)
+            there = plate_points(pose, self.beams, heights, self._by)
+            left: FloatArray = (points - there).reshape(len(dots), -1)
+            unknowns = unknowns + self._by.einsum('us,ns->nu', self._gain, left)
         return left
 
     def residual(self, dots: tuple[float, ...], residual: tuple[float, ...]) -> tuple[float, ...]:
@@ -70,7 +73,7 @@ class PlateModel:
         if self._tilts != 'none':
             return residual
         points = self._centers + np.reshape(dots, (-1, 2))
-        left = points - flat_points(flat_poses(points, self.beams), self.beams)
+        left = points - flat_points(flat_poses(points, self.beams, self._by), self.beams, self._by)
         return tuple(left.ravel().tolist())
 
 
@@ -86,9 +89,10 @@ class SomePsds:
         self.columns = [2 * psd + axis for psd in at for axis in (0, 1)]
         self._model = PlateModel(rig, at, tilts)
         rest = self._model.slopes_at((0.0,) * 5)
-        self.fit = BlockFit(rig.estimator.block_size, rig.centers[at], self._model.beams, poly, rest)
+        by = ARITHMETICS[rig.estimator.arithmetic]
+        self.fit = BlockFit(rig.estimator.block_size, rig.centers[at], self._model.beams, poly, rest, by)
         # Of a plate whose tilt is not known, dots may contradict each other.
-        self._redundancy = Redundancy(len(at), 2 * len(at) if tilts == 'bounded' else rest.shape[1])
+        self._redundancy = Redundancy(len(at), 2 * len(at) if tilts == 'bounded' else rest.shape[1], by)
 
     def set_noise(self, gamma: FloatArray) -> None:
         """Use their part of the autocovariance of all readings."""
@@ -147,6 +151,7 @@ class StampedDots:
         """
         config = rig.estimator
         self.flat = flat
+        by = self._by = ARITHMETICS[config.arithmetic]
         poly = config.block_fit == 'poly'
         # What does not move with the link tells the noise.
         self._measures = flat and config.covariance != 'file'
@@ -158,13 +163,13 @@ class StampedDots:
         self._poly = poly
         self._all: PlateModel | None = None
         slopes = self._rest_slopes(rig)
-        self.noise = StreamNoise(config.block_size, rig.centers, self._beams, variances, steps, slopes, self._left)
+        self.noise = StreamNoise(config.block_size, rig.centers, self._beams, variances, steps, slopes, self._left, by)
         self._stated_sd = np.sqrt(variances)
-        self._fit = BlockFit(config.block_size, rig.centers, self._beams, poly, slopes)
+        self._fit = BlockFit(config.block_size, rig.centers, self._beams, poly, slopes, by)
         self._fit.set_noise(self.noise.gamma)
-        self._consistency = Consistency()
+        self._consistency = Consistency(self._by)
         self._suspect = Suspect(rig.centers, self._beams)
-        self._redundancy = None if slopes is None else Redundancy(len(rig.psds), slopes.shape[1])
+        self._redundancy = None if slopes is None else Redundancy(len(rig.psds), slopes.shape[1], self._by)
         self._some: dict[tuple[int, ...], SomePsds] = {}
         self._told: dict[tuple[int, ...], tuple[float, ...]] = {}
         self.left_out: tuple[int, ...] = ()
@@ -186,9 +191,9 @@ class StampedDots:
         self._fit.set_geometry(rig.centers, self._beams, slopes)
         self._fit.set_noise(self.noise.gamma)
         self._suspect = Suspect(rig.centers, self._beams)
-        self._consistency = Consistency()
+        self._consistency = Consistency(self._by)
         if slopes is not None:
-            self._redundancy = Redundancy(len(rig.psds), slopes.shape[1])
+            self._redundancy = Redundancy(len(rig.psds), slopes.shape[1], self._by)
             self._some, self._told = {}, {}
 
     @property

@@ -37,7 +37,8 @@ def test_a_beam_that_leans_meets_the_plate_where_its_ray_does(height: float) -> 
     plate = rotation(*pose[2:])
     origin = plate @ [0.0, 0.0, height] + [pose[0], pose[1], 0.0]
     want = hit(np.array([*PLACE, height]), np.array([*slopes, 1.0]), origin, plate)
-    got = points_under_leaning(*map(np.asarray, (*PLACE, *slopes, height, *pose)))
+    lx, ly, sx, sy, h, dx, dy, theta, phi, omega = (np.asarray(v) for v in (*PLACE, *slopes, height, *pose))
+    got = points_under_leaning(lx, ly, sx, sy, h, dx, dy, theta, phi, omega)
     # Three passes, each of which leaves 6e-4 of the error before it, of 10 um at first.
     assert np.array(got) == pytest.approx(want, abs=3e-14)
 
