@@ -36,6 +36,7 @@ def from_rig(state: RigState) -> Fields:
         'zero': {psd: state.parameters.get(f'{psd}.zero') for psd in ('psd_1', 'psd_2')},
         'hello': state.hello,
         'changed': state.changed,
+        'made_with': state.made_with,
     }
     return {'data': json.dumps(tree, default=_plain)}
 
@@ -52,7 +53,8 @@ def to_rig(fields: Mapping[str, Any]) -> RigState:
     kinds = {'version': str, 't_ns': int, 'block': int, 'parameters': dict, 'changed': dict}
     if not isinstance(tree, dict) or not all(isinstance(tree.get(name), kind) for name, kind in kinds.items()):
         raise ValueError('lacks one of ' + ', '.join(kinds))
-    hello = tree.get('hello')
+    hello, told = tree.get('hello'), tree.get('made_with')
+    made_with = told if isinstance(told, dict) else {}
     return RigState(
         tree['t_ns'],
         tree['block'],
@@ -60,4 +62,7 @@ def to_rig(fields: Mapping[str, Any]) -> RigState:
         hello if isinstance(hello, dict) else None,
         tree['changed'],
         tree['version'],
+        {name: value for name, value in made_with.items() if isinstance(value, str)}
+        if isinstance(made_with, dict)
+        else {},
     )

@@ -150,6 +150,13 @@ class Arithmetic:
         """log det (...) of positive definite ``a`` (..., n, n)."""
         return np.asarray(np.linalg.slogdet(a)[1])
 
+    def log_det_by_pivots(self, a: FloatArray) -> FloatArray:
+        """The same for small ``a``."""
+        out: FloatArray = np.zeros(a.shape[:-2])
+        for pivot in _pivots(a):
+            out = out + np.log(pivot)
+        return out
+
     def is_positive(self, a: FloatArray) -> bool:
         """Whether symmetric ``a`` (n, n) is positive definite."""
         try:
@@ -403,24 +410,24 @@ class FixedArithmetic(Arithmetic):
         return np.asarray(np.sqrt(x * x + y * y))
 
     def einsum(self, spec: str, *operands: AnyFloats) -> FloatArray:
-        """See :class:`Arithmetic`. The summed indices run in the order in which ``spec`` names them first."""
+        """See :class:`Arithmetic`. Factors from the left; sums as in :func:`in_pairs`, indices as ``spec`` has them."""
         turns, summed = _plan(spec)
         views = [(a if axes is None else a.transpose(axes))[at] for (axes, at), a in zip(turns, operands, strict=True)]
+        if summed == 1 and max([a.size for a in operands]) > _AT_ONCE:
+            # Row by row: the table of all products would not stay in the cache.
+            count = max([len(view) for view in views])
+            out = np.zeros(np.broadcast_shapes(*[view.shape[1:] for view in views]))
+            for row in range(count):
+                out += _product([view[row if len(view) > 1 else 0] for view in views])
+            return out
+        products = _product(views)
         if not summed:
-            return np.asarray(_product(views))
-        shape = np.broadcast_shapes(*[view.shape for view in views])
-        count = math.prod(shape[:summed])
-        if summed > 1 or math.prod(shape) <= _AT_ONCE:
-            return in_order(np.reshape(_product(views), (count, *shape[summed:])))
-        # Row by row: the table of all products would not stay in the cache.
-        out = np.zeros(shape[1:])
-        for row in range(count):
-            out += _product([view[row if len(view) > 1 else 0] for view in views])
-        return out
+            return np.asarray(products, dtype=np.float64)
+        return in_pairs(products if summed == 1 else products.reshape(-1, *products.shape[summed:]))
 
     def sum(self, values: FloatArray, axis: int) -> FloatArray:
         """See :class:`Arithmetic`."""
-        return in_order(values if axis == 0 else np.moveaxis(values, axis, 0))
+        return in_pairs(values if axis == 0 else np.moveaxis(values, axis, 0))
 
     def product(self, a: FloatArray, b: FloatArray) -> FloatArray:
         """See :class:`Arithmetic`."""
@@ -478,10 +485,11 @@ class FixedArithmetic(Arithmetic):
 
     def log_det(self, a: FloatArray) -> FloatArray:
         """See :class:`Arithmetic`."""
-        out: FloatArray = np.zeros(a.shape[:-2])
-        for pivot in _pivots(a):
-            out = out + self.log_many(pivot)
-        return out
+        return in_pairs(self.log_many(np.stack(_pivots(a))))
+
+    def log_det_by_pivots(self, a: FloatArray) -> FloatArray:
+        """See :class:`Arithmetic`."""
+        return self.log_det(a)
 
     def is_positive(self, a: FloatArray) -> bool:
         """See :class:`Arithmetic`."""
@@ -518,7 +526,7 @@ class FixedArithmetic(Arithmetic):
 
 
 _AT_ONCE = 1 << 15
-"""Products up to which a table of them is made."""
+"""Numbers of an operand up to which a table of all products is made."""
 _NEWTON_STEPS = 8
 _SWEEPS = 30
 """Jacobi's method doubles its digits in each sweep; ten are more than enough for a hundred unknowns."""
@@ -542,21 +550,29 @@ def _plan(spec: str) -> tuple[tuple[tuple[tuple[int, ...] | None, tuple[Any, ...
 
 
 def _product(factors: Sequence[AnyFloats]) -> AnyFloats:
-    """From the left."""
+    """From the left; the first index is the slowest in memory."""
     out = factors[0]
     for factor in factors[1:]:
-        out = out * factor
+        out = np.multiply(out, factor, order='C')
     return out
 
 
-def in_order(rows: AnyFloats) -> FloatArray:
-    """Sum of ``rows`` (n, ...), the first one first; zeros of none."""
-    if not len(rows):
-        return np.zeros(rows.shape[1:])
-    out = np.array(rows[0], dtype=np.float64)
-    for row in rows[1:]:
-        out += row
-    return out
+def in_pairs(rows: AnyFloats) -> FloatArray:
+    """Sum of ``rows`` (n, ...): the first half to the second until one row is left; zeros of none.
+
+    A row without a partner goes to the first pair. Adding in pairs rounds less than adding in turn, and takes fewer
+    calls.
+    """
+    rest = np.asarray(rows, dtype=np.float64)
+    if not len(rest):
+        return np.zeros(rest.shape[1:])
+    while (count := len(rest)) > 1:
+        half = count // 2
+        pairs = rest[:half] + rest[half : 2 * half]
+        if count & 1:
+            pairs[0] += rest[-1]
+        rest = pairs
+    return np.asarray(rest[0])
 
 
 def _orthogonal(a: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -567,14 +583,14 @@ def _orthogonal(a: FloatArray) -> tuple[FloatArray, FloatArray]:
     columns = np.array(a.T, dtype=np.float64)
     r = np.zeros((len(columns), len(columns)))
     for i, column in enumerate(columns):
-        size = sqrt(float(in_order(column * column)))
+        size = sqrt(float(in_pairs(column * column)))
         # Twice: once leaves rounding that shows.
         for _ in range(2):
             for j in range(i):
-                part = float(in_order(columns[j] * column))
+                part = float(in_pairs(columns[j] * column))
                 r[j, i] += part
                 column -= part * columns[j]
-        left = sqrt(float(in_order(column * column)))
+        left = sqrt(float(in_pairs(column * column)))
         r[i, i] = left if left > 1e-13 * size else 0.0
         column[:] = column / left if left > 1e-13 * size else 0.0
     return columns.T, r

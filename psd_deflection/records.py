@@ -13,6 +13,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -288,7 +289,8 @@ class RigState(NamedTuple):
 
     ``parameters``: all of them, flat, as they are from block ``block`` on. ``hello``: the device's, or None.
     ``changed``: the values of the :class:`ParameterChange` that it was sent for, {} if there was none.
-    ``version``: of the software. ``t_ns``: time of the change, 0 at the start.
+    ``version``: of the software. ``t_ns``: time of the change, 0 at the start. ``made_with``: what computes
+    (:mod:`psd_deflection.provenance`).
     """
 
     t_ns: int
@@ -297,6 +299,7 @@ class RigState(NamedTuple):
     hello: Mapping[str, object] | None
     changed: Mapping[str, object]
     version: str
+    made_with: Mapping[str, str] = MappingProxyType({})
 
 
 class DiagnosticEntry(NamedTuple):

@@ -32,7 +32,9 @@ from psd_deflection.cli._fleet import (
 from psd_deflection.cli._options import namespace_option, parquet_name
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show
+from psd_deflection.errors import printable
 from psd_deflection.fleet.parquet import Field, ParquetFile
+from psd_deflection.provenance import NAMES
 from psd_deflection.recordings.readers import open_recording
 from psd_deflection.recordings.readings_table import described, is_table
 from psd_deflection.recordings.summary import summary
@@ -145,6 +147,11 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     if found['version']:
         by = f', node {found["node"]}' if found['node'] else ''
         out.append(row('recorded by', f'psd_deflection {found["version"]}{by}'))
+    if found['made_with']:
+        told = [
+            f'{name} {printable(found["made_with"][name], 120)}' for name in NAMES[1:] if name in found['made_with']
+        ]
+        out.append(row('computed by', ', '.join(told)))
     if found['device_hello'] is not None:
         hello = {k: ' '.join(map(str, v)) if isinstance(v, list) else v for k, v in found['device_hello'].items()}
         out.append(row('device', ', '.join(f'{k} {v}' for k, v in hello.items())))

@@ -2,8 +2,10 @@
 
 With the recorded parameters (the default) the estimates are the published ones, bit for bit.
 --compare checks this and ends with status 1 if anything differs that the recording and its replay
-both hold; --strict also if one of them lacks a message of the other. With --params-file you see what
-another rig would have estimated from the same samples. --watch says since when the rig is not its model.
+both hold. If another version made the recording, rounding may differ: then a sentence says so, and
+the status is 0. --strict counts rounding too, and messages that only one side has. With --params-file
+you see what another rig would have estimated from the same samples. --watch says since when the rig
+is not its model.
 
 Of several recordings you get a table; REC may also be a pattern, or a .txt file that lists recordings and patterns.
 Then --out X.parquet takes the estimates of all.
@@ -61,10 +63,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='write the estimates: X.csv, X.mcap, X.rrd or a bag folder (X); of many recordings X.parquet',
     )
     parser.add_argument(
-        '--compare', action='store_true', help='compare with the recorded estimates; exit status 1 if a bit differs'
+        '--compare',
+        action='store_true',
+        help='compare with the recorded estimates; exit status 1 if a bit differs that no other version explains',
     )
     parser.add_argument(
-        '--strict', action='store_true', help='with --compare: what only one side holds is a difference too'
+        '--strict',
+        action='store_true',
+        help='with --compare: what only one side holds is a difference too, and so is rounding',
     )
     parser.add_argument(
         '--watch', action='store_true', help='test whether the rig stays its model, as the node does with watch: on'
@@ -170,7 +176,7 @@ def run(args: argparse.Namespace) -> int:
     text = comparison.summary()
     if comparison.different and args.params_file is None and not recording.parameters:
         text += '\n  the recording names no rig and was evaluated with the nominal one: give its own with --params-file'
-    if comparison.same and not comparison.identical:
+    if comparison.same_but_for_rounding and not comparison.identical:
         text += ' (--strict counts them as differences)'
     show_text(text, aside=args.json)
     return 0 if _agrees(comparison.counts(), args.strict) else DIFFERS
@@ -202,7 +208,7 @@ def _replayed(
 
 
 def _agrees(counts: Mapping[str, object], strict: bool) -> bool:
-    return bool(counts['identical'] or (counts['same'] and not strict))
+    return bool(counts['identical'] or (counts['same_but_for_rounding'] and not strict))
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.arithmetic import ARITHMETICS, Arithmetic
+from psd_deflection.arithmetic import ARITHMETICS
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError
 from psd_deflection.filtering.inertia import Forced, Inertia
@@ -340,7 +340,7 @@ class ModalFilter:
         squares = self._by.einsum('an,akn->ak', miss, scaled) - self._by.einsum(
             'aki,akij,akj->ak', score, posterior, score
         )
-        size = says.log_size - _log_det(posterior, self._by) + _log_det(p, self._by)[:, None]
+        size = says.log_size - self._by.log_det_by_pivots(posterior) + self._by.log_det_by_pivots(p)[:, None]
         prior = self._by.einsum('ak,kl->al', self._weights, self._changes)
         log_weights = self._by.log_many(prior) - 0.5 * (size + squares)
         weights = self._by.exp_many(log_weights - log_weights.max(axis=1, keepdims=True))
@@ -503,16 +503,6 @@ def split_ns(t_ns: int) -> tuple[float, float]:
 def joined_ns(seconds: float, ns: float) -> int:
     """The time that :func:`split_ns` split."""
     return 1_000_000_000 * int(seconds) + int(ns)
-
-
-def _log_det(matrices: FloatArray, by: Arithmetic) -> FloatArray:
-    """log det of positive definite ``matrices`` (..., 4, 4), by elimination."""
-    rest, out = matrices, np.zeros(matrices.shape[:-2])
-    for _ in range(matrices.shape[-1]):
-        pivot, row = rest[..., 0, 0], rest[..., 0, 1:]
-        out = out + by.log_many(pivot)
-        rest = rest[..., 1:, 1:] - row[..., :, None] * (row / pivot[..., None])[..., None, :]
-    return np.asarray(out)
 
 
 def _transitions(families: tuple[int, ...]) -> FloatArray:

@@ -19,6 +19,7 @@ from psd_deflection.config import Rig
 from psd_deflection.declarations import MonitorConfig
 from psd_deflection.errors import ConfigError
 from psd_deflection.monitor.feed import Feed
+from psd_deflection.provenance import provenance
 from psd_deflection.records import ParameterChange, Record, RigState, SpotMeans
 from psd_deflection.runner.fanout import Fanout, published, subscribed
 
@@ -143,4 +144,4 @@ class FeedBeside(Feed):
     def _tell(self, t_ns: int, block: int, changed: dict[str, object]) -> None:
         self._told = True
         self._present |= changed
-        self._fanout.put(RigState(t_ns, block, self._present, None, changed, __version__))
+        self._fanout.put(RigState(t_ns, block, self._present, None, changed, __version__, provenance()))

@@ -42,7 +42,14 @@ from psd_deflection.foreign_yaml import tree_of_file
 from psd_deflection.protocol.sequence import RecordedSequence
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.allowance import Warnings
-from psd_deflection.recordings.bag_writer import META_CHANGE, META_HELLO, META_NODE, META_PARAMETERS, META_SOFTWARE
+from psd_deflection.recordings.bag_writer import (
+    META_CHANGE,
+    META_HELLO,
+    META_MADE_WITH,
+    META_NODE,
+    META_PARAMETERS,
+    META_SOFTWARE,
+)
 from psd_deflection.recordings.clouds import CloudDecoder, joined_points
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.mcap_reader import McapReader, RawMessage
@@ -90,6 +97,7 @@ class BagRecording(Recording):
         self.hello = from_json(metadata[META_HELLO]) if META_HELLO in metadata else None
         software = metadata.get(META_SOFTWARE, {})
         self.version, self.node = software.get('version', ''), software.get(META_NODE, '')
+        self.made_with = metadata.get(META_MADE_WITH, {})
         self.changes = self._changes_in(metadata)
         if META_PARAMETERS not in metadata:
             self._take_rig_of_messages()
@@ -169,6 +177,7 @@ class BagRecording(Recording):
                 continue
             if not self.parameters:
                 self.parameters, self.version = state.parameters, state.version
+                self.made_with = state.made_with
                 self.rig_from_messages = True
                 present = dict(state.parameters)
             if self.hello is None:

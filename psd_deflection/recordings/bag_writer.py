@@ -26,6 +26,7 @@ from psd_deflection import __version__
 from psd_deflection.declarations import FRAME_PREFIX
 from psd_deflection.errors import RecordingError, creating
 from psd_deflection.files import HeldFolder
+from psd_deflection.provenance import provenance
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.bag_metadata import (
     DEFAULT_QOS,
@@ -45,6 +46,7 @@ CHUNK_NS = 500_000_000
 
 META_SOFTWARE = 'psd_deflection'
 META_NODE = 'node'
+META_MADE_WITH = 'psd_deflection.made_with'
 META_PARAMETERS = 'psd_deflection.parameters'
 META_HELLO = 'psd_deflection.device_hello'
 META_CHANGE = 'psd_deflection.change.'
@@ -177,6 +179,7 @@ class McapFile(_RecordSink):
             self._spool = vars(self._writer)[_CHUNK_INDICES] = spool
             self._writer.start(profile='ros2', library=f'psd_deflection {__version__}')
             self._writer.add_metadata(META_SOFTWARE, {'version': __version__, **({META_NODE: node} if node else {})})
+            self._writer.add_metadata(META_MADE_WITH, dict(provenance()))
             self._writer.add_metadata(META_PARAMETERS, parameters)
             if hello is not None:
                 self._writer.add_metadata(META_HELLO, hello)
@@ -238,7 +241,7 @@ class McapFile(_RecordSink):
             self._untold.append(self._state(change.t_ns, change.block, dict(change.values)))
 
     def _state(self, t_ns: int, block: int, changed: Mapping[str, object]) -> RigState:
-        return RigState(t_ns, block, dict(self._present), self._hello, changed, __version__)
+        return RigState(t_ns, block, dict(self._present), self._hello, changed, __version__, provenance())
 
     def _tell_rig(self, t_ns: int) -> None:
         """The rig as messages beside the metadata records: rosbag2 drops these when it converts a bag."""

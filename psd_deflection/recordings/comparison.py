@@ -3,18 +3,24 @@
 Messages are matched by topic and stamp. A recording may be partial: topics that it does not have, and the time
 before the first and after the last message of a topic, are not compared. A recorder other than ours may also miss
 messages in between. Both sides are read as streams, so that recordings of any length are compared in little memory.
+
+Messages whose numbers agree to far more digits than a measurement has differ by rounding: another version or library
+added up in another order. They are counted apart. Such a difference is a defect only if nothing that computes has
+changed since the recording was made (:mod:`psd_deflection.provenance`).
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from msg_adapters import DIAGNOSTICS, FILTERED, INPUTS, RIG, SAMPLES, pose_stamped, to_messages
 from psd_deflection.declarations import FRAME_PREFIX
 from psd_deflection.errors import RecordingError
+from psd_deflection.provenance import differences, provenance
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import ParameterChange, Record
@@ -23,9 +29,20 @@ _NOT_ESTIMATED = {DIAGNOSTICS, RIG, SAMPLES, *INPUTS}
 _LAG_NS = 2_000_000_000
 """How far the recorded side is read ahead of the replayed one."""
 
+ROUNDING = 1e-9
+"""Share of the largest number of a group (a vector, a quaternion; of a covariance the two standard deviations) by which
+rounding may change it."""
+_LEAST = {'geometry_msgs/msg/WrenchStamped': 1e-9, 'geometry_msgs/msg/TwistStamped': 1e-11}
+"""What rounding may change at least, by message type: N and N m; m/s and rad/s."""
+_LEAST_OF_OTHERS = 1e-13
+"""m and rad: a ten-thousandth of a nanometre."""
+
 
 class Comparison:
     """Feed it the replay's records in order, then call ``finish``.
+
+    ``different``: messages that differ, ``rounded`` of them by rounding alone. ``rounding_explained``: what computes is
+    not what computed the recording, as ``changed`` tells; so rounding may differ.
 
     ``only_recorded``, ``only_replayed``: messages that the other side lacks. ``missing``: how many of them neither the
     edges of the recording nor a topic that it does not have explains.
@@ -39,6 +56,9 @@ class Comparison:
             raise RecordingError(f'{recording.path}: holds no estimates to compare with')
         self.equal = 0
         self.different = 0
+        self.rounded = 0
+        by_library = recording.parameters.get('arithmetic', 'library') == 'library'
+        self.changed = differences(recording.made_with, provenance(), processor=by_library)
         self.only_recorded = 0
         self.only_replayed = 0
         self.missing = 0
@@ -50,6 +70,7 @@ class Comparison:
         self._complete = True
         self._recorded: dict[str, deque[tuple[int, bytes]]] = {t: deque() for t in topics}
         self._replayed: dict[str, deque[tuple[int, bytes]]] = {t: deque() for t in topics}
+        self._types: dict[str, str] = {}
         self._worst: dict[str, float] = {}
         self._first_difference = ''
         self._stream: Iterator[tuple[str, int, bytes]] = (
@@ -64,6 +85,12 @@ class Comparison:
         return self.equal > 0 and not (self.different or self.missing)
 
     @property
+    def same_but_for_rounding(self) -> bool:
+        """As ``same``, but rounding may differ if what computes has changed since the recording was made."""
+        explained = self.rounded if self.changed else 0
+        return self.equal + explained > 0 and self.different == explained and not self.missing
+
+    @property
     def identical(self) -> bool:
         """True if each side has every message of the other, and no bit differs."""
         return not (self.different or self.only_recorded or self.only_replayed)
@@ -76,6 +103,7 @@ class Comparison:
                 continue
             for topic, type_name, t_ns, fields in to_messages(record, self._frame_prefix):
                 if topic in self._replayed:
+                    self._types[topic] = type_name
                     self._replayed[topic].append((t_ns, cdr.encode(type_name, fields)))
                 elif topic not in _NOT_ESTIMATED:
                     # A solver that runs now but did not when the recording was made.
@@ -107,6 +135,8 @@ class Comparison:
             'identical': self.identical,
             'equal': self.equal,
             'different': self.different,
+            'rounded': self.rounded,
+            'same_but_for_rounding': self.same_but_for_rounding,
             'only_recorded': self.only_recorded,
             'only_replayed': self.only_replayed,
         }
@@ -122,13 +152,22 @@ class Comparison:
                 f'{self.only_replayed} only in the replay'
             )
         lines = [
-            f'compared: {self.equal} messages equal, {self.different} differ, '
+            f'compared: {self.equal} messages equal, {self._differences()}, '
             f'{self.only_recorded} only recorded, {self.only_replayed} only in the replay'
         ]
+        if self.rounded and self.changed:
+            lines.append(f'  rounding may differ: recorded with {"; ".join(self.changed)}')
+        elif self.rounded:
+            lines.append('  rounding differs although the same versions recorded it: please report this')
         lines += [f'  largest difference: {name} {value:.3g}' for name, value in sorted(self._worst.items())]
         if self._first_difference:
             lines.append(f'  first: {self._first_difference}')
         return '\n'.join(lines)
+
+    def _differences(self) -> str:
+        if self.different and self.rounded == self.different:
+            return f'{self.different} differ by rounding alone'
+        return f'{self.different} differ' + (f', {self.rounded} of them by rounding alone' if self.rounded else '')
 
     def _count_only_replayed(self, topic: str, t_ns: int) -> None:
         self.only_replayed += 1
@@ -186,6 +225,7 @@ class Comparison:
 
     def _differ(self, topic: str, t_ns: int, a: bytes, b: bytes) -> None:
         self.different += 1
+        self.rounded += self._by_rounding(topic, a, b)
         self._note(f'{topic} at {t_ns} ns')
         if topic == FILTERED or not topic.endswith('/deflection'):
             return
@@ -197,6 +237,14 @@ class Comparison:
         for name, difference in zip(('ΔX (m)', 'ΔY (m)', 'θ (rad)'), np.abs(old - new).tolist(), strict=True):
             self._worsen(f'{topic} {name}', difference)
 
+    def _by_rounding(self, topic: str, a: bytes, b: bytes) -> bool:
+        """Whether two messages agree but for rounding."""
+        name = self._types.get(topic, '')
+        try:
+            return agree(cdr.decode(name, a), cdr.decode(name, b), _LEAST.get(name, _LEAST_OF_OTHERS))
+        except (KeyError, ValueError):
+            return False
+
     def _worsen(self, name: str, difference: float) -> None:
         self._worst[name] = max(self._worst.get(name, 0.0), difference)
 
@@ -204,3 +252,35 @@ class Comparison:
 def _stamp(encoded: bytes, log_time: int) -> int:
     """The header's stamp, ns: all our messages begin with one."""
     return cdr.header_stamp_ns(encoded) if len(encoded) >= cdr.FRAME_AT else log_time
+
+
+def agree(a: object, b: object, least: float) -> bool:
+    """Whether two decoded values agree but for rounding; ``least``: what rounding may change at least."""
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        if set(a) != set(b):
+            return False
+        numbers = [name for name in a if isinstance(a[name], float) and isinstance(b[name], float)]
+        others = [name for name in a if name not in numbers]
+        return _group([a[name] for name in numbers], [b[name] for name in numbers], least) and all(
+            _covariance(a[name], b[name]) if name == 'covariance' else agree(a[name], b[name], least) for name in others
+        )
+    if isinstance(a, float) and isinstance(b, float):
+        return _group([a], [b], least)
+    return bool(np.array_equal(np.asarray(a), np.asarray(b)))
+
+
+def _group(a: list[float], b: list[float], least: float) -> bool:
+    """Whether numbers of one vector agree, by the largest of them."""
+    allowed = max([ROUNDING * abs(v) for v in a if math.isfinite(v)] + [least])
+    return all(v == w or (v != v and w != w) or abs(v - w) <= allowed for v, w in zip(a, b, strict=True))
+
+
+def _covariance(a: object, b: object) -> bool:
+    """Whether two covariances (k * k,) agree, each element by the standard deviations of its row and column."""
+    first, second = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    size = math.isqrt(first.size)
+    if first.shape != second.shape or size * size != first.size:
+        return False
+    sd = np.sqrt(np.abs(np.diag(first.reshape(size, size))))
+    near = np.abs(first - second).reshape(size, size) <= ROUNDING * sd[:, None] * sd
+    return bool((near.ravel() | (first == second) | (np.isnan(first) & np.isnan(second))).all())

@@ -56,6 +56,7 @@ class Recording(abc.ABC):
 
     ``path``: what was opened. ``parameters``: the flat parameter set it was made with, {} if it holds
     none. ``hello``: the device's, or None. ``version``: of the software that recorded, or ''.
+    ``made_with``: what computed it (:func:`psd_deflection.provenance.provenance`), {} if it does not say.
     ``node``: full name of the ROS node that recorded itself, or ''.
     ``rig_from_messages``: whether these come from messages, because the file lacks our metadata.
     ``changes``: of parameters during the run, in order. ``restarts``: of the device, each as the last sample
@@ -69,6 +70,7 @@ class Recording(abc.ABC):
         self.parameters: Mapping[str, Any] = {}
         self.hello: Mapping[str, Any] | None = None
         self.version = ''
+        self.made_with: Mapping[str, str] = {}
         self.node = ''
         self.rig_from_messages = False
         self.changes: Sequence[ParameterChange] = ()

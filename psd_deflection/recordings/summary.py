@@ -67,6 +67,7 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
         'bytes': sum(f.stat().st_size for f in files),
         'namespace': recording.namespace,
         'version': recording.version,
+        'made_with': dict(recording.made_with),
         'node': recording.node,
         'device_hello': recording.hello,
         'start_ns': first[1],

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from msg_adapters import to_messages
 from psd_deflection import __version__
+from psd_deflection.provenance import provenance
 from psd_deflection.recordings import cdr
 from psd_deflection.records import ENVIRONMENT, KNOWN_LOAD, ParameterChange, RigState
 from psd_deflection.runner.fanout import Wire
@@ -46,6 +47,7 @@ class RigPublisher:
 
     def _publish(self, changed: Mapping[str, object]) -> None:
         self._told = self._hello()
-        state = RigState(self._last.t_ns, self._last.block, self._session.rig.flat(), self._told, changed, __version__)
+        rig = self._session.rig.flat()
+        state = RigState(self._last.t_ns, self._last.block, rig, self._told, changed, __version__, provenance())
         for message in to_messages(state):
             self._wire.put(message.topic, message.type, cdr.encode(message.type, message.fields), time.time_ns())

@@ -1,0 +1,67 @@
+"""What computes: the versions and the processor on which the last digits of a number may depend.
+
+A recording keeps it, so that ``replay --compare`` can say why bits differ.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from types import MappingProxyType
+
+from psd_deflection import __version__
+from psd_deflection.errors import printable
+
+PROCESSOR = ('machine', 'processor', 'kernel', 'C library')
+"""Entries that the last digits depend on only with ``arithmetic: library``."""
+NAMES = ('psd_deflection', 'python', 'numpy', 'scipy', *PROCESSOR)
+_LONGEST = 120
+_OVERRIDES = ('OPENBLAS_CORETYPE', 'NPY_DISABLE_CPU_FEATURES', 'GLIBC_TUNABLES')
+"""Environment variables that choose other instructions than the processor's best."""
+
+
+@cache
+def provenance() -> Mapping[str, str]:
+    """Name and value of each; of this process."""
+    found = {'psd_deflection': __version__, 'python': platform.python_version()}
+    for name in ('numpy', 'scipy'):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = 'unknown'
+    found['machine'] = platform.machine()
+    found['processor'] = _processor()
+    if chosen := ' '.join(f'{name}={os.environ[name]}' for name in _OVERRIDES if os.environ.get(name)):
+        found['kernel'] = chosen
+    found['C library'] = ' '.join(platform.libc_ver()).strip() or sys.platform
+    return MappingProxyType(found)
+
+
+def differences(then: Mapping[str, str], now: Mapping[str, str], *, processor: bool) -> list[str]:
+    """What differs, in words: "numpy 2.3.1, now 2.4.0". ``processor``: also what belongs to the processor."""
+    if not then:
+        return ['a version that does not say what computed it']
+    return [
+        f'{name} {printable(then.get(name, "not stated"), _LONGEST)}, now {now.get(name, "not stated")}'
+        for name in NAMES
+        if then.get(name) != now.get(name) and (processor or name not in PROCESSOR)
+    ]
+
+
+def _processor() -> str:
+    """Its name as Linux has it; that of the machine where there is none."""
+    try:
+        lines = Path('/proc/cpuinfo').read_text(encoding='utf-8', errors='replace').splitlines()
+    except OSError:
+        lines = []
+    for key in ('model name', 'Hardware', 'CPU part'):
+        for line in lines:
+            name, _, value = line.partition(':')
+            if name.strip() == key and value.strip():
+                return value.strip()
+    return platform.processor() or platform.machine()
