@@ -81,6 +81,10 @@ class Arithmetic:
         """``x`` times itself."""
         return float(x**2)
 
+    def power(self, x: float, n: int) -> float:
+        """``x`` to the power ``n``, 1 or more."""
+        return float(x**n)
+
     def sin_many(self, x: FloatArray) -> FloatArray:
         """Sines of ``x`` rad."""
         return np.asarray(np.sin(x))
@@ -122,7 +126,7 @@ class Arithmetic:
         return np.asarray(values.sum(axis=axis))
 
     def product(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        """Matrix product of ``a`` (n, m) or (m,) and ``b`` (m, k) or (m,)."""
+        """Matrix product of ``a`` (..., n, m) or (m,) and ``b`` (m, k) or (m,); at most three indices."""
         return np.asarray(a @ b)
 
     def solve(self, a: FloatArray, b: FloatArray) -> FloatArray:
@@ -266,7 +270,10 @@ def _by_quarter(x: float, ahead: int) -> float:
 def _by_quarter_many(x: FloatArray, ahead: int) -> FloatArray:
     x = np.asarray(x, dtype=np.float64)
     if not bool((np.abs(x) < _FAR_ANGLE).all()):
-        x = np.where(np.isfinite(x), np.where(np.abs(x) < _FAR_ANGLE, x, np.fmod(x, _TURN)), np.nan)
+        known = np.isfinite(x)
+        within = np.where(known, x, 0.0)
+        within = np.where(np.abs(within) < _FAR_ANGLE, within, np.fmod(within, _TURN))
+        x = np.where(known, within, np.nan)
     k, r = _reduced(x)
     quarter = (np.nan_to_num(k).astype(np.int64) + ahead) & 3
     value = np.where(quarter & 1, _cos_near(r), _sin_near(r))
@@ -357,6 +364,13 @@ class FixedArithmetic(Arithmetic):
         """See :class:`Arithmetic`."""
         return x * x
 
+    def power(self, x: float, n: int) -> float:
+        """See :class:`Arithmetic`."""
+        out = x
+        for _ in range(n - 1):
+            out *= x
+        return out
+
     def sin_many(self, x: FloatArray) -> FloatArray:
         """See :class:`Arithmetic`."""
         return _by_quarter_many(x, 0)
@@ -431,7 +445,7 @@ class FixedArithmetic(Arithmetic):
 
     def product(self, a: FloatArray, b: FloatArray) -> FloatArray:
         """See :class:`Arithmetic`."""
-        left, right = 'am'[2 - np.ndim(a) :], 'mb'[: np.ndim(b)]
+        left, right = 'nam'[3 - np.ndim(a) :], 'mb'[: np.ndim(b)]
         return self.einsum(f'{left},{right}->{left[:-1]}{right[1:]}', a, b)
 
     def solve(self, a: FloatArray, b: FloatArray) -> FloatArray:

@@ -66,6 +66,7 @@ def landings(
     theta: FloatArray,
     phi: FloatArray,
     omega: FloatArray,
+    arithmetic: Arithmetic = LIBRARY,
 ) -> tuple[FloatArray, FloatArray]:
     """x and y, m, one array for each, of any shapes that broadcast; for long runs of samples."""
-    return _place(lx, ly, height, dx, dy, turns_of(theta, phi, omega))[2:]
+    return _place(lx, ly, height, dx, dy, turns_of(theta, phi, omega, arithmetic))[2:]

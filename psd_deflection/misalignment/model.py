@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psd_deflection.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.geometry.plate import points_under_leaning
 from psd_deflection.records import FloatArray
 
@@ -78,95 +79,104 @@ _NEWTON = 6
 """Steps that reach rounding anywhere on a detector."""
 
 
-def reading_of_place(p: FloatArray, psd: int, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+def reading_of_place(
+    p: FloatArray, psd: int, x: FloatArray, y: FloatArray, by: Arithmetic = LIBRARY
+) -> tuple[FloatArray, FloatArray]:
     """What PSD ``psd`` (0, 1) reads of a dot at (x, y), m; ``p`` (COUNT,)."""
     a, gx, gy, xy, yx = p[_PER_PSD * psd : _PER_PSD * psd + 5]
-    c, s = np.cos(a), np.sin(a)
+    c, s = by.cos_many(a), by.sin_many(a)
     u, v = c * x + s * y, c * y - s * x
     grown = 1.0 + p[_PER_PSD * psd + _CUBIC] * (u * u + v * v)
     u, v = u * grown, v * grown
     return (1.0 + gx) * (u + xy * v), (1.0 + gy) * (v + yx * u)
 
 
-def place_of_reading(p: FloatArray, psd: int, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+def place_of_reading(
+    p: FloatArray, psd: int, x: FloatArray, y: FloatArray, by: Arithmetic = LIBRARY
+) -> tuple[FloatArray, FloatArray]:
     """The inverse of :func:`reading_of_place`."""
     a, gx, gy, xy, yx = p[_PER_PSD * psd : _PER_PSD * psd + 5]
     k = p[_PER_PSD * psd + _CUBIC]
     x, y = x / (1.0 + gx), y / (1.0 + gy)
     det = 1.0 - xy * yx
     u, v = (x - xy * y) / det, (y - yx * x) / det
-    read = np.hypot(u, v)
+    read = by.hypot_many(u, v)
     true = read
     for _ in range(_NEWTON):
         true = true - (true * (1.0 + k * true**2) - read) / np.maximum(1.0 + 3.0 * k * true**2, 0.1)
     grown = 1.0 + k * true**2
     u, v = u / grown, v / grown
-    c, s = np.cos(a), np.sin(a)
+    c, s = by.cos_many(a), by.sin_many(a)
     return c * u - s * v, s * u + c * v
 
 
-def readings(p: FloatArray, pose: FloatArray, length: float) -> FloatArray:
+def readings(p: FloatArray, pose: FloatArray, length: float, by: Arithmetic = LIBRARY) -> FloatArray:
     """x1 y1 x2 y2, m, (4, n). ``p`` (COUNT,); ``pose`` (3, n): dX m, dY m, theta rad; ``length`` L, m."""
     out = np.empty((4, pose.shape[1]))
     for psd in range(2):
         center = p[_PER_PSD * psd + _CENTER : _PER_PSD * psd + _CENTER + 2]
-        m0 = place_of_reading(p, psd, p[ZERO + 2 * psd], p[ZERO + 2 * psd + 1])
-        place = _points(p, psd, center + m0, pose, length) - center[:, None]
-        out[2 * psd : 2 * psd + 2] = reading_of_place(p, psd, *place)
+        m0 = place_of_reading(p, psd, p[ZERO + 2 * psd], p[ZERO + 2 * psd + 1], by)
+        place = _points(p, psd, center + m0, pose, length, by) - center[:, None]
+        out[2 * psd : 2 * psd + 2] = reading_of_place(p, psd, place[0], place[1], by)
     return out
 
 
-def _points(p: FloatArray, psd: int, beam: FloatArray, pose: FloatArray, length: float) -> FloatArray:
+def _points(
+    p: FloatArray, psd: int, beam: FloatArray, pose: FloatArray, length: float, by: Arithmetic = LIBRARY
+) -> FloatArray:
     """Plate points (2, n) under the beam that is at ``beam`` (2,) on the plate at rest."""
     dx, dy, theta = pose
     k = p[SLOPE] / length
-    slope_x, slope_y = np.tan(p[_BEAMS + 2 * psd : _BEAMS + 2 * psd + 2])
+    slope_x, slope_y = by.tan_many(p[_BEAMS + 2 * psd : _BEAMS + 2 * psd + 2])
     height = p[_PER_PSD * psd + _HEIGHT]
-    return np.stack(points_under_leaning(beam[0], beam[1], slope_x, slope_y, height, dx, dy, theta, -k * dy, k * dx))
+    phi, omega = -k * dy, k * dx
+    return np.stack(points_under_leaning(beam[0], beam[1], slope_x, slope_y, height, dx, dy, theta, phi, omega, by))
 
 
-def by_parameters(p: FloatArray, pose: FloatArray, length: float) -> FloatArray:
+def by_parameters(p: FloatArray, pose: FloatArray, length: float, by: Arithmetic = LIBRARY) -> FloatArray:
     """Derivatives of the readings (4, COUNT, n) at ``p`` (COUNT,) and ``pose`` (3, n), by central differences."""
     out = np.zeros((4, COUNT, pose.shape[1]))
     for psd in range(2):
-        _psd_by_parameters(out[2 * psd : 2 * psd + 2], p, psd, pose, length)
+        _psd_by_parameters(out[2 * psd : 2 * psd + 2], p, psd, pose, length, by)
     return out
 
 
-def _psd_by_parameters(out: FloatArray, p: FloatArray, psd: int, pose: FloatArray, length: float) -> None:
+def _psd_by_parameters(
+    out: FloatArray, p: FloatArray, psd: int, pose: FloatArray, length: float, by: Arithmetic
+) -> None:
     """The rows ``out`` (2, COUNT, n) of one PSD.
 
     By parts, r = S(q - c) with q under l = c + m_0 and m_0 = S^-1(r_0), so that each is moved by itself.
     """
     first = _PER_PSD * psd
     at, zero = slice(first + _CENTER, first + _CENTER + 2), slice(ZERO + 2 * psd, ZERO + 2 * psd + 2)
-    m0 = np.array(place_of_reading(p, psd, *p[zero]))
+    m0 = np.array(place_of_reading(p, psd, p[zero][0], p[zero][1], by))
     beam = p[at] + m0
-    place = _points(p, psd, beam, pose, length) - p[at, None]
-    turned = by_place(p, psd, *place)
+    place = _points(p, psd, beam, pose, length, by) - p[at, None]
+    turned = by_place(p, psd, place[0], place[1], by)
 
     def moved_beam(d: FloatArray) -> FloatArray:
-        return _points(p, psd, beam + d, pose, length)
+        return _points(p, psd, beam + d, pose, length, by)
 
     def read_there(d: FloatArray) -> FloatArray:
-        return np.stack(reading_of_place(p + d, psd, *place))
+        return np.stack(reading_of_place(p + d, psd, place[0], place[1], by))
 
     def rest_place(d: FloatArray) -> FloatArray:
-        return np.array(place_of_reading(p + d, psd, *p[zero]))
+        return np.array(place_of_reading(p + d, psd, p[zero][0], p[zero][1], by))
 
     def point(d: FloatArray) -> FloatArray:
-        return _points(p + d, psd, beam, pose, length)
+        return _points(p + d, psd, beam, pose, length, by)
 
     # How the dot goes with the beam, and its reading with the beam.
     under = np.stack([_difference(moved_beam, 1e-6 * unit) for unit in np.eye(2)], axis=1)
-    read = np.einsum('ijn,jkn->ikn', turned, under)
+    read = by.einsum('ijn,jkn->ikn', turned, under)
     out[:, at] = read - turned
-    out[:, zero] = np.einsum('ijn,jk->ikn', read, np.linalg.inv(by_place(p, psd, *m0)))
+    out[:, zero] = by.einsum('ijn,jk->ikn', read, by.inverse_of(by_place(p, psd, m0[0], m0[1], by)))
     for i in (*range(first, first + _CENTER), first + _CUBIC):
-        away = np.einsum('ijn,j->in', read, _difference(rest_place, _step(i)))
+        away = by.einsum('ijn,j->in', read, _difference(rest_place, _step(i)))
         out[:, i] = _difference(read_there, _step(i)) + away
     for i in (first + _HEIGHT, _BEAMS + 2 * psd, _BEAMS + 2 * psd + 1, SLOPE):
-        out[:, i] = np.einsum('ijn,jn->in', turned, _difference(point, _step(i)))
+        out[:, i] = by.einsum('ijn,jn->in', turned, _difference(point, _step(i)))
 
 
 def _step(index: int) -> FloatArray:
@@ -190,11 +200,12 @@ def by_pose(p: FloatArray, pose: FloatArray, length: float) -> FloatArray:
     return np.stack(out, axis=1)
 
 
-def by_place(p: FloatArray, psd: int, x: FloatArray, y: FloatArray) -> FloatArray:
+def by_place(p: FloatArray, psd: int, x: FloatArray, y: FloatArray, by: Arithmetic = LIBRARY) -> FloatArray:
     """Derivatives (2, 2, ...) of :func:`reading_of_place` by x and y."""
     step = 1e-6
     columns = [
-        np.subtract(reading_of_place(p, psd, x + a, y + b), reading_of_place(p, psd, x - a, y - b)) / (2.0 * step)
+        np.subtract(reading_of_place(p, psd, x + a, y + b, by), reading_of_place(p, psd, x - a, y - b, by))
+        / (2.0 * step)
         for a, b in ((step, 0.0), (0.0, step))
     ]
     return np.stack(columns, axis=1)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from psd_deflection.arithmetic import ARITHMETICS
 from psd_deflection.config import Rig, check_two_psds
 from psd_deflection.errors import ConfigError, did_you_mean
 from psd_deflection.misalignment.model import ALL, INDEX, SLOPE, TOLERANCES, ZERO, place_of_reading, reading_of_place
@@ -90,7 +91,9 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
         center = v[INDEX[f'psd_{i + 1}.center_x']], v[INDEX[f'psd_{i + 1}.center_y']]
         # A laser that was not aimed at the true centre stands where the rig file has it.
         x, y = (z - (1.0 - aimed[i]) * (c - f) for z, c, f in zip(psd.zero, center, psd.center, strict=True))
-        v[ZERO + 2 * i : ZERO + 2 * i + 2] = reading_of_place(v, i, np.array(x), np.array(y))
+        v[ZERO + 2 * i : ZERO + 2 * i + 2] = reading_of_place(
+            v, i, np.array(x), np.array(y), ARITHMETICS[rig.estimator.arithmetic]
+        )
     return RigVector(v, clamp, others, any(label.startswith(TILT) for label in seen))
 
 
@@ -142,11 +145,12 @@ def known_of_rig(rig: Rig) -> Known:
         below = np.tril_indices(n, -1)
         correlation[below] = given
         correlation.T[below] = given
-        values, vectors = np.linalg.eigh(correlation)
+        by = ARITHMETICS[rig.estimator.arithmetic]
+        values, vectors = by.eigen(correlation)
         if values[0] < -1e-6 * n:
             raise ConfigError('calibration.correlations: contradict each other; take them from a calibration unchanged')
         # Rounding in the file leaves values a little below zero.
-        correlation = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        correlation = by.product(vectors * np.maximum(values, 0.0), vectors.T)
     own = [i for i, name in enumerate(names) if name in INDEX]
     at = np.array([INDEX[names[i]] for i in own], dtype=np.intp)
     joint = correlation * np.outer(sds, sds)

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from psd_deflection.arithmetic import ARITHMETICS, FIXED, Arithmetic
 from psd_deflection.config import Rig, check_two_psds
 from psd_deflection.misalignment.model import ZERO, by_parameters, by_place, place_of_reading, readings
 from psd_deflection.misalignment.rig import is_calibrated, known_of_rig, vector_of_rig
@@ -30,19 +31,20 @@ LEVELS = 5
 class ParameterSpread:
     """The spread of the dots that the calibration of one rig file leaves. Make it with :meth:`from_rig`."""
 
-    def __init__(self, values: FloatArray, covariance: FloatArray, length: float) -> None:
+    def __init__(self, values: FloatArray, covariance: FloatArray, length: float, by: Arithmetic = FIXED) -> None:
         """``values`` (COUNT,), ``covariance`` (COUNT, COUNT): as the readings' model has them; ``length``: L, m."""
+        self._by = by
         scale = _scale(covariance)
-        size, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+        size, vectors = by.eigen(covariance / np.outer(scale, scale))
         kept = size > 1e-14
         root = scale[:, None] * vectors[:, kept] * np.sqrt(size[kept])
         levels = np.linspace(-1.0, 1.0, LEVELS)
         points = np.stack(np.meshgrid(levels, levels, levels), axis=0).reshape(3, -1)
-        slopes = _dots_by_parameters(values, points * RANGE[:, None], length) @ root
+        slopes = by.product(_dots_by_parameters(values, points * RANGE[:, None], length, by), root)
         basis = np.stack([_terms(*point) for point in points.T.tolist()])
         self._shape = (4, root.shape[1])
         # Smooth as they are, a quartic gives them to 1e-4; a block has no time for differences.
-        self._quartic = np.linalg.lstsq(basis, slopes.reshape(len(basis), -1), rcond=None)[0]
+        self._quartic = by.least_squares(basis, slopes.reshape(len(basis), -1))
 
     @classmethod
     def from_rig(
@@ -60,13 +62,14 @@ class ParameterSpread:
         if zero_variances:
             covariance[ZERO:] = covariance[:, ZERO:] = 0.0
             covariance[ZERO:, ZERO:] = np.diag(zero_variances)
-        return cls(vector_of_rig(rig, effects).as_used, covariance, rig.link.length)
+        by = ARITHMETICS[rig.estimator.arithmetic]
+        return cls(vector_of_rig(rig, effects).as_used, covariance, rig.link.length, by)
 
     def factor(self, dx: float, dy: float, theta: float) -> FloatArray:
         """B (4, k), m, at a pose (m, m, rad): the corrected dots spread by B B^T."""
         across, twist = float(RANGE[0]), float(RANGE[2])
         terms = np.array(_terms(dx / across, dy / across, theta / twist))
-        return np.asarray(np.einsum('t,ti->i', terms, self._quartic).reshape(self._shape))
+        return self._by.einsum('t,ti->i', terms, self._quartic).reshape(self._shape)
 
 
 def _pairs() -> list[tuple[int, int]]:
@@ -89,14 +92,15 @@ def _terms(x: float, y: float, t: float) -> list[float]:
     return [second[a] * second[b] for a, b in _PAIRS]
 
 
-def _dots_by_parameters(p: FloatArray, pose: FloatArray, length: float) -> FloatArray:
+def _dots_by_parameters(p: FloatArray, pose: FloatArray, length: float, by: Arithmetic = FIXED) -> FloatArray:
     """S^-1 (df/dp), (n, 4, COUNT), at poses (3, n)."""
-    slopes = by_parameters(p, pose, length).transpose(2, 0, 1).copy()
-    read = readings(p, pose, length)
+    slopes = by_parameters(p, pose, length, by).transpose(2, 0, 1).copy()
+    read = readings(p, pose, length, by)
     for psd in range(2):
         own = slice(2 * psd, 2 * psd + 2)
-        turned = by_place(p, psd, *place_of_reading(p, psd, *read[own])).transpose(2, 0, 1)
-        slopes[:, own] = np.linalg.solve(turned, slopes[:, own])
+        x, y = place_of_reading(p, psd, read[2 * psd], read[2 * psd + 1], by)
+        turned = by_place(p, psd, x, y, by).transpose(2, 0, 1)
+        slopes[:, own] = by.solve(turned, slopes[:, own])
     return slopes
 
 

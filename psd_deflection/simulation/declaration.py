@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
+from psd_deflection.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.errors import ConfigError
 from psd_deflection.parameters import Parameter, check_value, shown
 from psd_deflection.records import MOST_PSDS, FloatArray
@@ -130,13 +131,14 @@ MOVES_FREQUENCY = EffectParameter(
 @dataclass(slots=True, eq=False)
 class Reading:
     """n readings during the correction: ``dots`` (2P, n) m, ``sums`` (P, n) V, ``warmer`` (n,) K,
-    ``t`` (n,) s. Changed in place.
+    ``t`` (n,) s. Changed in place. ``by``: what computes.
     """
 
     dots: FloatArray
     sums: FloatArray
     warmer: FloatArray
     t: FloatArray
+    by: Arithmetic = LIBRARY
 
 
 @dataclass(slots=True, eq=False)

@@ -20,10 +20,10 @@ def dots_on_plate(pose: FloatArray, beams: FloatArray, physics: Physics) -> Floa
     place = beams[0::2], beams[1::2]
     rest = physics.heights[:, None], pose[0], pose[1], pose[2], phi, omega
     if physics.slopes.any() and not physics.psds_at_base:
-        qx, qy = points_under_leaning(*place, physics.slopes[:, :1], physics.slopes[:, 1:], *rest)
+        qx, qy = points_under_leaning(*place, physics.slopes[:, :1], physics.slopes[:, 1:], *rest, physics.by)
     else:
         fall = landings if physics.psds_at_base else points_under
-        qx, qy = fall(*place, *rest)
+        qx, qy = fall(*place, *rest, physics.by)
     dots = np.empty_like(beams)
     np.subtract(qx, physics.centers[:, :1], out=dots[0::2])
     np.subtract(qy, physics.centers[:, 1:], out=dots[1::2])

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from psd_deflection.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.config import Rig
 from psd_deflection.mechanics import LinkStatics
 from psd_deflection.records import FloatArray
@@ -23,6 +24,7 @@ class Physics:
     ``beams``: l_i, on the plate if ``psds_at_base``; ``slopes``: how much each goes sideways along Z.
     ``half_area``: half width and height of the active areas. ``noise`` (3P,), V rms of each channel.
     ``dark`` (P, 3): x, y and sum of each PSD with its laser off, V.
+    ``by``: what computes; the simulator's is the libraries'.
     ``phase``: how long after each sample the quantities are taken, below ``period``, s.
     """
 
@@ -53,6 +55,7 @@ class Physics:
     psds_at_base: bool = False
     weight_per_length: float = 0.0
     constant_force: FloatArray = field(default_factory=lambda: np.zeros(2))
+    by: Arithmetic = LIBRARY
 
     @classmethod
     def of(cls, rig: Rig) -> Physics:
@@ -90,7 +93,12 @@ class Physics:
     def statics(self) -> LinkStatics:
         """The link with these constants."""
         return LinkStatics(
-            self.length, self.bending_stiffness, self.torsional_stiffness, self.clamp_bending, self.clamp_torsion
+            self.length,
+            self.bending_stiffness,
+            self.torsional_stiffness,
+            self.clamp_bending,
+            self.clamp_torsion,
+            self.by,
         )
 
     @property

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from psd_deflection.arithmetic import ARITHMETICS
 from psd_deflection.config import Rig
 from psd_deflection.errors import ConfigError
 from psd_deflection.simulation.declaration import POINTS, ActiveEffect, Traced
@@ -27,6 +28,7 @@ class TipLoads:
         self.zeroed = False
         self._seconds = rig.estimator.block_size / rig.converter.sample_rate_hz
         self._physics = Physics.of(rig)
+        self._physics.by = ARITHMETICS[rig.estimator.arithmetic]
         for active in effects:
             if active.effect.configure is not None:
                 active.effect.configure(self._physics, active.values)

@@ -24,7 +24,8 @@ def test_a_laser_on_the_plate_lands_where_its_ray_meets_the_surface(pose: np.nda
     want = hit(start, plate[:, 2], np.array([0.0, 0.0, height]), np.eye(3))
     x, y, by_x, by_y = landing(*PLACE, height, *pose.tolist())
     assert (x, y) == pytest.approx(want, abs=1e-15)
-    assert np.array(landings(*map(np.asarray, (*PLACE, height, *pose)))) == pytest.approx(want, abs=1e-15)
+    lx, ly, h, dx, dy, theta, phi, omega = (np.asarray(v) for v in (*PLACE, height, *pose))
+    assert np.array(landings(lx, ly, h, dx, dy, theta, phi, omega)) == pytest.approx(want, abs=1e-15)
     for i in range(5):
         step = 1e-6 * np.eye(5)[i]
         ahead, behind = (np.array(landing(*PLACE, height, *(pose + s).tolist())[:2]) for s in (step, -step))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
 from psd_deflection.simulation.modes import Filter, held_lag_coefficients
 from psd_deflection.simulation.samples import SimulatedSamples
@@ -22,7 +20,7 @@ def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:
     if not remembered:
         # Unloaded until now.
         remembered += [0.0, 0.0, 0.0]
-    amplitude, kept = values['amplitude'], math.exp(-block.seconds / values['time_constant'])
+    amplitude, kept = values['amplitude'], block.physics.by.exp(-block.seconds / values['time_constant'])
     for row in range(3):
         grown = block.pose[row] - amplitude * kept * remembered[row]
         block.pose[row] = grown / (1.0 + amplitude * (1.0 - kept))

@@ -16,7 +16,8 @@ def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
 
 
 def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:
-    c, s = math.cos(values['angle']), math.sin(values['angle'])
+    by = block.physics.by
+    c, s = by.cos(values['angle']), by.sin(values['angle'])
     fx, fy, _ = block.loads
     block.loads[:2] = c * fx + s * fy, c * fy - s * fx
 

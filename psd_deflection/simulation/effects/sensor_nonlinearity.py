@@ -20,7 +20,7 @@ def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
 def _correct(reading: Reading, values: Values) -> None:
     i = 2 * (int(values['psd']) - 1)
     k = values['k']
-    read = np.hypot(reading.dots[i], reading.dots[i + 1])
+    read = reading.by.hypot_many(reading.dots[i], reading.dots[i + 1])
     # With k < 0 the reading falls again farther out: no dot is sought where its slope is below a tenth.
     farthest = math.sqrt(0.3 / -k) if k < 0.0 else math.inf
     true = np.minimum(read, farthest)

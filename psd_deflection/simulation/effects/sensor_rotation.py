@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-import math
-
+from psd_deflection.arithmetic import Arithmetic
 from psd_deflection.records import FloatArray
 from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.simulation.samples import SimulatedSamples
 
 
-def _turn(dots: FloatArray, psd: float, angle: float) -> None:
+def _turn(dots: FloatArray, psd: float, angle: float, by: Arithmetic) -> None:
     i = 2 * (int(psd) - 1)
-    c, s = math.cos(angle), math.sin(angle)
+    c, s = by.cos(angle), by.sin(angle)
     x, y = dots[i].copy(), dots[i + 1].copy()
     dots[i] = c * x + s * y
     dots[i + 1] = c * y - s * x
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
-    _turn(samples.dots, values['psd'], values['angle'])
+    _turn(samples.dots, values['psd'], values['angle'], samples.physics.by)
 
 
 def _correct(reading: Reading, values: Values) -> None:
-    _turn(reading.dots, values['psd'], -values['angle'])
+    _turn(reading.dots, values['psd'], -values['angle'], reading.by)
 
 
 EFFECT = Effect(

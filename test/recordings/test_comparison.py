@@ -1,0 +1,135 @@
+"""Rounding is told from other differences, and who made the recording decides whether it may be there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+
+from psd_deflection.cli.main import main
+from psd_deflection.recordings import bag_writer
+from psd_deflection.recordings.comparison import agree
+from psd_deflection.recordings.readers import open_recording
+
+POSE = {'position': {'x': 1e-3, 'y': -2e-3, 'z': 0.0}, 'orientation': {'x': 0.0, 'y': 0.0, 'z': 1e-3, 'w': 1.0}}
+
+
+def changed(by: float, name: str = 'x') -> dict[str, dict[str, float]]:
+    """``POSE`` with one place changed by ``by`` m."""
+    return {**POSE, 'position': {**POSE['position'], name: POSE['position'][name] + by}}
+
+
+def test_numbers_agree_within_a_thousand_millionth_of_the_largest_of_their_vector() -> None:
+    assert agree(POSE, changed(1.9e-12), 1e-13)
+    assert agree(POSE, changed(1.9e-12, 'z'), 1e-13)
+    assert not agree(POSE, changed(2.1e-12), 1e-13)
+
+
+def test_the_least_counts_for_vectors_near_zero() -> None:
+    assert agree({'x': 0.0, 'y': 0.0}, {'x': 9e-14, 'y': 0.0}, 1e-13)
+    assert not agree({'x': 0.0, 'y': 0.0}, {'x': 1.1e-13, 'y': 0.0}, 1e-13)
+
+
+def test_texts_and_whole_numbers_must_be_the_same() -> None:
+    message = {'header': {'frame_id': 'a', 'sec': 3}, 'n': 5}
+    assert agree(message, {'header': {'frame_id': 'a', 'sec': 3}, 'n': 5}, 1.0)
+    assert not agree(message, {'header': {'frame_id': 'b', 'sec': 3}, 'n': 5}, 1.0)
+    assert not agree(message, {'header': {'frame_id': 'a', 'sec': 4}, 'n': 5}, 1.0)
+    assert not agree(message, {'header': {'frame_id': 'a', 'sec': 3}}, 1.0)
+
+
+def test_a_covariance_agrees_by_the_deviations_of_row_and_column() -> None:
+    whole = np.diag([1e-14, 4e-14, 1e6]).ravel()
+    for i, j, off in ((0, 0, 1e-23), (0, 1, 2e-23), (1, 2, 2e-13)):
+        for share, same in ((0.9, True), (1.1, False)):
+            other = whole.copy()
+            other[3 * i + j] += share * off
+            assert agree({'covariance': whole}, {'covariance': other}, 1.0) is same
+    assert not agree({'covariance': whole}, {'covariance': whole[:4]}, 1.0)
+
+
+def test_what_is_no_number_agrees_with_itself() -> None:
+    nan = float('nan')
+    assert agree({'x': nan}, {'x': nan}, 0.0)
+    assert not agree({'x': nan}, {'x': 1.0}, 0.0)
+    assert agree({'covariance': np.full(4, nan)}, {'covariance': np.full(4, nan)}, 0.0)
+
+
+def recorded(folder: Path, monkeypatch: pytest.MonkeyPatch, made_with: Mapping[str, str] | None, *rig: str) -> str:
+    """A simulated recording that says ``made_with``, or nothing, computed it."""
+    if made_with is not None:
+        monkeypatch.setattr(bag_writer, 'provenance', lambda: MappingProxyType(dict(made_with)))
+    name = str(folder / 'made')
+    assert main(['simulate', '--out', name, '--loads', 'steps:0,0,0;0,-10,0:1', *rig]) == 0
+    return name
+
+
+def disturbed(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
+    """From now on every answer's dX is off by that share."""
+    from psd_deflection.solvers.exact import ExactSolver
+
+    solve = ExactSolver.solve
+    monkeypatch.setattr(ExactSolver, 'solve', lambda *a: (s := solve(*a))._replace(dx=s.dx * (1.0 + share)))
+
+
+def test_rounding_of_another_version_is_told_and_is_no_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = recorded(tmp_path, monkeypatch, {'psd_deflection': '0.0.9', 'numpy': '1.26.4'})
+    disturbed(monkeypatch, 3e-16)
+    assert main(['replay', name, '--compare']) == 0
+    said = capsys.readouterr().out
+    assert 'differ by rounding alone' in said
+    assert 'rounding may differ: recorded with psd_deflection 0.0.9, now ' in said
+    assert 'numpy 1.26.4, now ' in said
+    assert main(['replay', name, '--compare', '--strict']) == 1
+
+
+def test_rounding_of_the_same_version_is_a_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = recorded(tmp_path, monkeypatch, None)
+    assert main(['replay', name, '--compare']) == 0
+    assert 'no bit differs' in capsys.readouterr().out
+    disturbed(monkeypatch, 3e-16)
+    assert main(['replay', name, '--compare']) == 1
+    assert 'rounding differs although the same versions recorded it: please report this' in capsys.readouterr().out
+
+
+def test_a_processor_explains_rounding_only_if_the_libraries_compute(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from psd_deflection.provenance import provenance
+
+    rig = tmp_path / 'rig.yaml'
+    rig.write_text('/**:\n  ros__parameters:\n    arithmetic: library\n')
+    for words, status in (((), 1), (('--params-file', str(rig)), 0)):
+        folder = tmp_path / f'of_{status}'
+        folder.mkdir()
+        with monkeypatch.context() as patch:
+            name = recorded(folder, patch, {**provenance(), 'processor': 'another'}, *words)
+            disturbed(patch, 3e-16)
+            assert main(['replay', name, '--compare']) == status
+
+
+def test_another_difference_of_another_version_is_a_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = recorded(tmp_path, monkeypatch, {'psd_deflection': '0.0.9'})
+    disturbed(monkeypatch, 1e-6)
+    assert main(['replay', name, '--compare']) == 1
+    assert 'by rounding alone, ' in capsys.readouterr().out
+
+
+def test_a_recording_says_what_computed_it_in_its_metadata_and_in_its_messages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = recorded(tmp_path, monkeypatch, {'psd_deflection': '7', 'numpy': '8', 'processor': 'a\x1b[2Jb'})
+    recording = open_recording(name)
+    assert dict(recording.made_with) == {'psd_deflection': '7', 'numpy': '8', 'processor': 'a\x1b[2Jb'}
+    capsys.readouterr()
+    assert main(['info', name]) == 0
+    assert 'computed by  numpy 8, processor a\\x1b[2Jb\n' in capsys.readouterr().out
