@@ -10,7 +10,9 @@
 # make fleet    FLEET_RECORDINGS=1000 simulated recordings through a local Dask cluster whose workers are killed (some minutes)
 # make firmware build the example firmware, run it in qemu, join it to the daemon (installs what it needs with apt-get)
 # make mutants  break the numerics line by line and see whether the tests notice (an hour; MUTANTS="--rooms solvers" for one room)
-# make golden   make the recordings in bags/ anew
+# make shaken   the numerics with another kernel of OpenBLAS, LAPACK a last bit off: does a test compare bits that nobody promised
+# make bits     record and replay as other processors would: does a bit differ (half a minute)
+# make golden   make those recordings of bags/ anew that have today's defaults
 # make colcon   build with colcon in a virtual environment of its own and look at what it installed
 # make docs     the documentation as a web site, in build/site
 # make axe      audit the web site with axe-core (needs Chromium)
@@ -54,7 +56,7 @@ BIN := $(VENV)/bin
 # A run needs the first of these, all the others need both.
 READY := $(VENV)/.installed $(VENV)/.for_tests
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak fleet firmware mutants golden docs notebooks axe page-soak shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak fleet firmware mutants shaken bits golden docs notebooks axe page-soak shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -160,6 +162,14 @@ mutants: $(READY)
 	test -x build/mutants/bin/python || $(PYTHON) -m venv build/mutants
 	$(call INSTALL,build/mutants) 'cosmic-ray>=8.4,<9'
 	build/mutants/bin/python -m tools.mutants --python $(abspath $(BIN)/python) $(MUTANTS)
+
+# The rooms of the numerics. The kernel: one that any processor of these ten years runs, and that is no machine's own.
+NUMERICS := budget calibrating calibration camera chains commissioning compensation discovery filtering geometry identification mechanics misalignment recordings simulation solvers thesis uncertainty validation watching
+shaken: $(READY)
+	OPENBLAS_CORETYPE=$${KERNEL:-Nehalem} $(BIN)/python -m pytest --shaken -n $(WORKERS) -m 'not browser and not statistics' $(PYTEST) $(NUMERICS:%=test/%) test/blind test/test_*.py
+
+bits: $(READY)
+	$(BIN)/python -m bench.bits
 
 golden: $(READY)
 	$(BIN)/python bags/make.py

@@ -41,6 +41,7 @@ def test_both_generators_show_the_nominal_rig_alike() -> None:
     assert np.abs(g.clean([]) - ours).max() < 2e-6
 
 
+@pytest.mark.repeatable
 def test_a_case_has_the_gap_it_says() -> None:
     effect = scaled(1, 'sensor_gain', 3.0, designs('one'))
     assert gap_of(designs('one'), effect) == pytest.approx(3.0, rel=0.04)

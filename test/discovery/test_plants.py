@@ -149,6 +149,7 @@ def test_channels_with_units_of_their_own() -> None:
     assert tree['effects'][0]['parameters']['c']['unit'] == 'N/mm^3'
 
 
+@pytest.mark.repeatable
 def test_the_answer_is_the_same_again() -> None:
     assert result(psd_deflection.discover_in(Spring(0.1), seed=3)) == result(
         psd_deflection.discover_in(Spring(0.1), seed=3)

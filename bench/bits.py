@@ -1,0 +1,180 @@
+"""The bits of a recording on other processors: ``make bits``; under a minute on two cores.
+
+The golden recordings with today's defaults are recorded again and replayed in processes that are told to compute as
+other processors would: four kernels of OpenBLAS, numpy with less and less of the instructions that this processor has,
+and the C library without fused multiply-add. What each setting recorded is replayed under each other one. The table
+counts the messages that differ. Ends with status 1 if one does.
+
+A kernel that this processor cannot run is left out, and said.
+"""
+
+from __future__ import annotations
+
+import argparse
+import concurrent.futures
+import hashlib
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+BAGS = ROOT / 'bags'
+NAMES = ('defaults', 'motion', 'calibrated', 'three_psds')
+KERNELS = {'Haswell': 'avx2', 'SkylakeX': 'avx512f', 'Zen': 'avx2', 'Nehalem': 'sse4_2'}
+"""Kernels of OpenBLAS, each with the instructions that it needs, as /proc/cpuinfo names them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """``environment``: what tells a process to compute so."""
+
+    name: str
+    environment: Mapping[str, str]
+
+
+def settings() -> tuple[list[Setting], list[str]]:
+    """Those that this processor can run, and the names of the others."""
+    flags = _flags()
+    there = [kernel for kernel, needs in KERNELS.items() if needs in flags]
+    out = [Setting(kernel, {'OPENBLAS_CORETYPE': kernel}) for kernel in there]
+    out += [Setting(name, {'NPY_DISABLE_CPU_FEATURES': ' '.join(off)}) for name, off in _numpy_features() if off]
+    if 'fma' in flags:
+        out.append(Setting('libc without FMA', {'GLIBC_TUNABLES': 'glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F'}))
+    return out, [kernel for kernel in KERNELS if kernel not in there]
+
+
+def _flags() -> set[str]:
+    try:
+        text = Path('/proc/cpuinfo').read_text(encoding='utf-8')
+    except OSError:
+        return set()
+    return set(next((line for line in text.splitlines() if line.startswith('flags')), '').split())
+
+
+def _numpy_features() -> list[tuple[str, list[str]]]:
+    """Sets of instructions that numpy chooses at run time and that this processor has, to be switched off."""
+    code = (
+        'import numpy; m = getattr(numpy, "_core", None) or numpy.core; u = m._multiarray_umath; '
+        'print(*[f for f in u.__cpu_dispatch__ if u.__cpu_features__.get(f)])'
+    )
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    have = done.stdout.split()
+    widest = [f for f in have if f.startswith(('AVX512', 'X86_V4'))]
+    return [('numpy without AVX-512', widest), ('numpy without AVX2', have)]
+
+
+def of_setting(setting: Setting, *words: str) -> str:
+    """What this module prints in a process of that setting."""
+    environment = {k: v for k, v in os.environ.items() if k not in ('OPENBLAS_CORETYPE', 'NPY_DISABLE_CPU_FEATURES')}
+    environment |= {**setting.environment, 'OMP_NUM_THREADS': '1'}
+    command = [sys.executable, '-m', 'bench.bits', *words]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f'{setting.name}: {" ".join(words)} ended with {done.returncode}:\n{done.stderr}')
+    return done.stdout
+
+
+def record(folder: Path) -> None:
+    """The golden recordings' samples through the pipeline of this process, recorded in ``folder``."""
+    from psd_deflection.pipeline import Pipeline
+    from psd_deflection.recordings.replay_engine import open_for_replay, replayed
+    from psd_deflection.recordings.sinks import open_sink
+
+    for name in NAMES:
+        recording, rig = open_for_replay(str(BAGS / name), None, None)
+        sink = open_sink(str(folder / name), rig.flat(), device_hello=recording.hello)
+        for records in replayed(recording, Pipeline(rig), None):
+            for one in records:
+                sink.put(one)
+        sink.close()
+
+
+def compare(folders: Sequence[str]) -> None:
+    """Print the messages that differ, of each of ``folders``, if this process replays what is in it."""
+    from psd_deflection.pipeline import Pipeline
+    from psd_deflection.recordings.comparison import Comparison
+    from psd_deflection.recordings.replay_engine import open_for_replay, replayed
+
+    for folder in folders:
+        differ = equal = 0
+        for name in NAMES:
+            recording, rig = open_for_replay(str(Path(folder) / name), None, None)
+            comparison = Comparison(recording)
+            for records in replayed(recording, Pipeline(rig), None):
+                comparison.add(records)
+            comparison.finish()
+            differ += comparison.different + comparison.only_recorded + comparison.only_replayed
+            equal += comparison.equal
+        print(differ, equal)
+
+
+def estimates_of(folder: Path) -> str:
+    """A number for all the messages of a setting's recordings but for the one that says what computed them."""
+    from msg_adapters import RIG
+    from psd_deflection.recordings.readers import open_recording
+
+    digest = hashlib.sha256()
+    for name in NAMES:
+        recording = open_recording(folder / name)
+        for message in recording.messages([t for t in recording.topics() if t != RIG]):
+            digest.update(message.channel.topic.encode() + message.cdr)
+    return digest.hexdigest()
+
+
+def table(jobs: int, folder: Path) -> bool:
+    """Print the table; whether no bit differs."""
+    every, left_out = settings()
+    places = {}
+    for i, setting in enumerate(every):
+        places[setting.name] = folder / str(i)
+        places[setting.name].mkdir()
+    with concurrent.futures.ThreadPoolExecutor(jobs) as pool:
+        list(pool.map(lambda s: of_setting(s, '--record', str(places[s.name])), every))
+        # What is the same message by message is replayed once for all.
+        first = {estimates_of(place): str(place) for place in reversed(places.values())}
+        kinds = {name: estimates_of(place) for name, place in places.items()}
+        answers = pool.map(lambda s: of_setting(s, '--compare', *first.values()), every)
+        differing = [
+            dict(zip(first, (tuple(map(int, line.split())) for line in answer.splitlines()), strict=True))
+            for answer in answers
+        ]
+    wide = max(len(setting.name) for setting in every)
+    print('messages that differ; recorded under: one row each, replayed under: one column each, in the same order')
+    total = 0
+    for setting in every:
+        counts = [found[kinds[setting.name]][0] for found in differing]
+        total += sum(counts)
+        print(f'{setting.name:<{wide}}  ' + ' '.join(f'{count:>5}' for count in counts))
+    equal = differing[0][kinds[every[0].name]][1]
+    print(
+        f'{len(every)} settings, {equal} messages each ({", ".join(NAMES)}): '
+        + ('no bit differs' if not total else f'{total} differ')
+    )
+    for kernel in left_out:
+        print(f'not tried: {kernel}, which this processor cannot run')
+    return total == 0
+
+
+def main() -> int:
+    """Print the table, or do one setting's part of it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1, help='processes at a time')
+    parser.add_argument('--record', type=Path, metavar='FOLDER', help=argparse.SUPPRESS)
+    parser.add_argument('--compare', nargs='+', metavar='FOLDER', help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.record is not None:
+        record(args.record)
+        return 0
+    if args.compare is not None:
+        compare(args.compare)
+        return 0
+    with tempfile.TemporaryDirectory() as folder:
+        return 0 if table(args.jobs, Path(folder)) else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())
