@@ -1,0 +1,1 @@
+"""What do arms of such links do? Links in series, joint offsets, shaped motions."""

@@ -1,0 +1,1 @@
+"""What every room needs: arithmetic, errors, files, foreign YAML, tables, pages, sequence numbers."""

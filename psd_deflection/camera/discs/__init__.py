@@ -1,0 +1,1 @@
+"""The thesis's target, three white discs: found, fitted at the rims, judged."""

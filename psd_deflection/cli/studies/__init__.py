@@ -1,0 +1,1 @@
+"""Commands that study a rig or its recordings."""

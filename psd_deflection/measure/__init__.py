@@ -1,0 +1,1 @@
+"""What does a block become? Samples to records, the same live and in replay."""

@@ -1,0 +1,1 @@
+"""Reads bags, MCAP, CSV and tables."""

@@ -1,0 +1,1 @@
+"""Writes bags, MCAP, CSV and Rerun."""

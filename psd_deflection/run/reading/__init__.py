@@ -1,0 +1,1 @@
+"""The reader thread: samples from the device, its clock, what it says of itself."""

@@ -1,1 +1,0 @@
-"""Threads, bounded queues and shutdown of a run."""

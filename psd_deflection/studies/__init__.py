@@ -1,0 +1,1 @@
+"""What do recordings tell? One folder a study."""

@@ -1,0 +1,1 @@
+"""The search for missing effects, and the verdict on what it found."""

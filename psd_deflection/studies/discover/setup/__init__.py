@@ -1,0 +1,1 @@
+"""What is wrong with a recording's set-up, before and beside the physics."""

@@ -1,1 +1,0 @@
-"""Whether the rig is still what its model says, while it runs."""
