@@ -15,14 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
-from psd_deflection.config import load_rig, replace_values
 from psd_deflection.devices.contract_frames import SimulatedFrames
+from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, SampleFrame
 from psd_deflection.devices.rig_feed import RigFeed
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.protocol.frames import FrameDecoder, HelloFrame, SampleFrame
-from psd_deflection.recordings.bag_writer import BagWriter
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.simulation.loads import LoadHistory, direct, sidebar, steps
+from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import FloatArray, RawChunk
-from psd_deflection.simulation.loads import LoadHistory, direct, sidebar, steps
+from psd_deflection.rig.config import load_rig, replace_values
 
 HERE = Path(__file__).resolve().parent
 START_NS = 1_767_225_600_000_000_000

@@ -11,12 +11,12 @@ import sys
 
 import numpy as np
 
-from psd_deflection.calibration import dot_noise_variances
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.detector import dot_noise_variances
+from psd_deflection.model.simulation.loads import constant, direct, sidebar
+from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import DeflectionEstimate, FloatArray, RawChunk
-from psd_deflection.simulation.loads import constant, direct, sidebar
-from psd_deflection.simulation.simulator import RigSimulator
+from psd_deflection.rig.config import Rig, load_rig
 
 SETTLED_S = 10.0
 """Time after the load step when the modes have decayed."""

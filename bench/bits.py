@@ -80,9 +80,9 @@ def of_setting(setting: Setting, *words: str) -> str:
 
 def record(folder: Path) -> None:
     """The golden recordings' samples through the pipeline of this process, recorded in ``folder``."""
-    from psd_deflection.pipeline import Pipeline
-    from psd_deflection.recordings.replay_engine import open_for_replay, replayed
-    from psd_deflection.recordings.sinks import open_sink
+    from psd_deflection.measure.pipeline import Pipeline
+    from psd_deflection.recordings.replay.engine import open_for_replay, replayed
+    from psd_deflection.recordings.write.sinks import open_sink
 
     for name in NAMES:
         recording, rig = open_for_replay(str(BAGS / name), None, None)
@@ -95,15 +95,15 @@ def record(folder: Path) -> None:
 
 def compare(folders: Sequence[str]) -> None:
     """Print the messages that differ, of each of ``folders``, if this process replays what is in it."""
-    from psd_deflection.pipeline import Pipeline
-    from psd_deflection.recordings.comparison import Comparison
-    from psd_deflection.recordings.replay_engine import open_for_replay, replayed
+    from psd_deflection.measure.pipeline import Pipeline
+    from psd_deflection.recordings.replay.comparison import ReplayComparison
+    from psd_deflection.recordings.replay.engine import open_for_replay, replayed
 
     for folder in folders:
         differ = equal = 0
         for name in NAMES:
             recording, rig = open_for_replay(str(Path(folder) / name), None, None)
-            comparison = Comparison(recording)
+            comparison = ReplayComparison(recording)
             for records in replayed(recording, Pipeline(rig), None):
                 comparison.add(records)
             comparison.finish()
@@ -115,7 +115,7 @@ def compare(folders: Sequence[str]) -> None:
 def estimates_of(folder: Path) -> str:
     """A number for all the messages of a setting's recordings but for the one that says what computed them."""
     from msg_adapters import RIG
-    from psd_deflection.recordings.readers import open_recording
+    from psd_deflection.recordings.read.readers import open_recording
 
     digest = hashlib.sha256()
     for name in NAMES:

@@ -17,11 +17,11 @@ from matplotlib.figure import Figure
 
 from bench import damping
 from bench.simulated_arm import SimulatedArm
-from psd_deflection.chains.chain_file import read_chain
-from psd_deflection.chains.transform import Transform
-from psd_deflection.compensation.arm import read_arm
-from psd_deflection.compensation.compensator import Compensator, CompensatorSettings, Observed, State
-from psd_deflection.pages import page, picture, table
+from psd_deflection.arms.chains.chain_file import read_chain
+from psd_deflection.arms.chains.transform import Transform
+from psd_deflection.arms.compensation.arm import read_arm
+from psd_deflection.arms.compensation.compensator import Compensator, CompensatorSettings, Observed, State
+from psd_deflection.base.pages import page, picture, table
 from psd_deflection.records import FloatArray
 
 ROOT = Path(__file__).resolve().parent.parent

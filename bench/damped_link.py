@@ -14,9 +14,9 @@ import numpy as np
 from bench.simulated_arm import LAG_S
 from blind import motion
 from blind.generator import RATE, Array
-from psd_deflection.compensation.damper import Damper, DamperSettings
-from psd_deflection.compensation.trajectory import Trajectory
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.arms.compensation.damper import Damper, DamperSettings
+from psd_deflection.arms.compensation.trajectory import Trajectory
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import RawChunk, TipMotion
 
 FREQUENCY, RATIO = motion.MODES[0]

@@ -20,9 +20,9 @@ from matplotlib.figure import Figure
 from bench import damped_link
 from bench.damped_link import Swung, swing
 from bench.simulated_arm import LAG_S, SimulatedArm
-from psd_deflection.chains.chain_file import read_chain
-from psd_deflection.compensation.trajectory import Trajectory, TrajectoryShaper, checked
-from psd_deflection.identification.shapers import KINDS, Shaper, shaper
+from psd_deflection.arms.chains.chain_file import read_chain
+from psd_deflection.arms.compensation.trajectory import Trajectory, TrajectoryShaper, checked
+from psd_deflection.arms.shapers import KINDS, Shaper, shaper
 from tools.program import ROOT
 
 FREQUENCY, RATIO = 12.0, 0.02

@@ -38,20 +38,20 @@ from scipy.signal import lsim
 from bench.live import make_recording
 from bench.rows import RESULTS, ROOT, Row, figure, in_turns, keep, tell
 from msg_adapters import SAMPLES, point_cloud2
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.discovery.discover import discover
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.protocol.frames import FrameDecoder, SampleFrame, encode
+from psd_deflection.devices.protocol.frames import FrameDecoder, SampleFrame, encode
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.simulation.effect_words import with_effects_of
+from psd_deflection.model.simulation.load_words import load_history
+from psd_deflection.model.simulation.samples import SimulatedSamples
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.recordings.conversion import Beside, convert
-from psd_deflection.recordings.observations import read_observation
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.replay_engine import replayed, rig_at_start
-from psd_deflection.recordings.simulated_recording import SimulatedRecording
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.replay.engine import replayed, rig_at_start
+from psd_deflection.recordings.replay.simulated_recording import SimulatedRecording
 from psd_deflection.records import CHANNELS, FloatArray, RawChunk
-from psd_deflection.simulation.effect_words import with_effects_of
-from psd_deflection.simulation.load_words import load_history
-from psd_deflection.simulation.samples import SimulatedSamples
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.studies.discover.discover import discover
+from psd_deflection.studies.discover.from_recordings import read_observation
 
 READ_FRAMES = 18
 """Frames of one read: the reader waits until a block is nearly whole."""

@@ -218,10 +218,10 @@ class Device:
     """Writes samples to a port by the clock; notes when the last byte of each block was written."""
 
     def __init__(self) -> None:
-        from psd_deflection.config import load_rig
         from psd_deflection.devices.contract_frames import SimulatedFrames
         from psd_deflection.devices.pseudo_terminal import PseudoTerminal
         from psd_deflection.devices.rig_feed import RigFeed
+        from psd_deflection.rig.config import load_rig
 
         self.port = PseudoTerminal()
         self.device = SimulatedFrames(RigFeed(load_rig(), lambda _, n: np.zeros((n, 3))))
@@ -341,12 +341,12 @@ def live(node: Node, seconds: float, settle: float, rounds: int) -> list[Row]:
 
 def make_recording(folder: Path, minutes: float) -> tuple[Path, int]:
     """Ten minutes as the daemon would have recorded them, without waiting for them."""
-    from psd_deflection.config import load_rig
-    from psd_deflection.pipeline import Pipeline
-    from psd_deflection.recordings.bag_writer import BagWriter
+    from psd_deflection.measure.pipeline import Pipeline
+    from psd_deflection.model.simulation.loads import CyclicLoads, thesis_load_cases
+    from psd_deflection.model.simulation.simulator import RigSimulator
+    from psd_deflection.recordings.write.bag_writer import BagWriter
     from psd_deflection.records import RawChunk
-    from psd_deflection.simulation.loads import CyclicLoads, thesis_load_cases
-    from psd_deflection.simulation.simulator import RigSimulator
+    from psd_deflection.rig.config import load_rig
 
     rig = load_rig()
     pipeline, simulator = Pipeline(rig), RigSimulator(rig, 1)

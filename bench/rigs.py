@@ -29,7 +29,7 @@ class Still:
     """A feed of one and the same reading."""
 
     def __init__(self) -> None:
-        from psd_deflection.config import load_rig
+        from psd_deflection.rig.config import load_rig
 
         self.rig = load_rig()
         self.taken = 0
@@ -68,9 +68,9 @@ def devices(count: int) -> None:
 
 def sessions(ports: list[str], seconds: float) -> None:
     """Child process, on one core: a session a port; prints samples, losses and the share of the core."""
-    from psd_deflection.config import load_rig
-    from psd_deflection.runner.realtime import settle
-    from psd_deflection.runner.session import Session
+    from psd_deflection.rig.config import load_rig
+    from psd_deflection.run.realtime import settle
+    from psd_deflection.run.session import Session
 
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     running = [Session(load_rig(None, {'port': port, 'keep_zero': False}), lambda _: None) for port in ports]

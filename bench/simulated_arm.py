@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from psd_deflection.chains.chain import Chain, EndEffector, TipDeflection
+from psd_deflection.arms.chains.chain import Chain, EndEffector, TipDeflection
 from psd_deflection.records import FloatArray
 
 LAG_S = 0.02

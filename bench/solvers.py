@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
+from psd_deflection.model.solvers import SOLVERS, Solver, make_solver
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers import SOLVERS, Solver, make_solver
-from psd_deflection.thesis.comparison import VARIANCES, dots_of, thesis_geometry
+from psd_deflection.studies.thesis.comparison import VARIANCES, dots_of, thesis_geometry
 
 STEP = np.radians(0.01)
 

@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from blind.measured import DATA
-from psd_deflection.discovery.plants import Model, Plant, plant_effect
+from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import Effect, EffectParameter
+from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 
 RATE = 100.0
 SUBSTEPS = 8

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from blind.measured import DATA
-from psd_deflection.discovery.plants import Model, Plant, plant_effect
+from psd_deflection.model.simulation.declaration import EffectParameter
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import EffectParameter
+from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 
 EI = 91.0
 """N m^2, fitted by those who measured."""

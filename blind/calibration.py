@@ -24,17 +24,17 @@ from tqdm import tqdm
 
 from blind import generator, misaligned
 from blind.generator import Array
-from psd_deflection.calibrating.calibrate import OPEN, Calibration, calibrate
-from psd_deflection.calibrating.check import check
-from psd_deflection.calibrating.dark import dark_levels, values_of_levels
-from psd_deflection.calibrating.fit import NAMES
-from psd_deflection.calibrating.observation import Run
-from psd_deflection.calibrating.result import values_of
-from psd_deflection.config import Rig, replace_values, rig_from_values
-from psd_deflection.parameter_files import flattened
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.simulation.catalogue import effects_to_values
 from psd_deflection.records import DeflectionEstimate, RawChunk
-from psd_deflection.simulation.catalogue import effects_to_values
+from psd_deflection.rig.config import Rig, replace_values, rig_from_values
+from psd_deflection.rig.parameter_files import flattened
+from psd_deflection.studies.calibrate.calibrate import OPEN, Calibration, calibrate
+from psd_deflection.studies.calibrate.check import check
+from psd_deflection.studies.calibrate.dark import dark_levels, values_of_levels
+from psd_deflection.studies.calibrate.fit import NAMES
+from psd_deflection.studies.calibrate.observation import CalibrationRun
+from psd_deflection.studies.calibrate.result import values_of
 
 HOLDS, SECONDS = 24, 2.5
 AFTER, AFTER_SECONDS = 8, 1.5
@@ -81,20 +81,20 @@ class Score(NamedTuple):
     like: list[str]
 
 
-def run_of(recorded: misaligned.Recorded) -> Run:
+def run_of(recorded: misaligned.Recorded) -> CalibrationRun:
     """As calibrate takes it."""
     t = np.arange(len(recorded.volts)) / generator.RATE
-    return Run('blind', t, recorded.volts, t[recorded.frames], recorded.reference)
+    return CalibrationRun('blind', t, recorded.volts, t[recorded.frames], recorded.reference)
 
 
 def darkened(rig: Rig, light: tuple[misaligned.Light, misaligned.Light], rng: np.random.Generator) -> Rig:
     """The rig file's content after a recording of ten seconds with both lasers off."""
     volts = misaligned.darkness(light, 10.0, rng)
-    run = Run('dark', np.arange(len(volts)) / generator.RATE, volts, np.zeros(0), np.zeros((0, 3)))
+    run = CalibrationRun('dark', np.arange(len(volts)) / generator.RATE, volts, np.zeros(0), np.zeros((0, 3)))
     return replace_values(rig, values_of_levels(dark_levels([run], rig)))
 
 
-def calibrated_rig(rig: Rig, run: Run) -> tuple[Rig, Calibration]:
+def calibrated_rig(rig: Rig, run: CalibrationRun) -> tuple[Rig, Calibration]:
     """The rig file's content after the calibration, and what was found."""
     found = calibrate([run], rig)
     values, effects = values_of(found, 'today')

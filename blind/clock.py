@@ -15,11 +15,11 @@ import numpy as np
 from tqdm import tqdm
 
 from blind.generator import Array
-from psd_deflection.calibration import dot_noise_variances
-from psd_deflection.config import load_rig
-from psd_deflection.solvers import solver_from_rig
-from psd_deflection.validation.clock import Offset, clock_offset
-from psd_deflection.validation.motion import Motion
+from psd_deflection.model.detector import dot_noise_variances
+from psd_deflection.model.solvers import solver_from_rig
+from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.validate.clock import Offset, clock_offset
+from psd_deflection.studies.validate.motion import Motion
 
 CENTERS = ((0.0, 0.07), (-0.1, 0.0))
 """m, of the thesis rig."""

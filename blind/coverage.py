@@ -19,9 +19,9 @@ import numpy.typing as npt
 
 from blind import generator
 from blind.generator import Array
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import DeflectionEstimate, RawChunk
+from psd_deflection.rig.config import Rig, load_rig
 
 SIZE = 20
 CHI_SQUARE_3 = 7.814728

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from blind.measured import DATA
-from psd_deflection.discovery.plants import Model, Plant, plant_effect
+from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import Effect, EffectParameter
+from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 
 MASS, VISCOUS, COULOMB, OFFSET, GAIN = 95.1089, 203.5034, 20.3935, -3.1648, 35.15065
 """kg, N s/m, N, N, N/V, as published."""

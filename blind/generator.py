@@ -1,4 +1,5 @@
-"""A second rig simulation, written from docs/simulation.md alone; imports nothing of ``psd_deflection.simulation``.
+"""A second rig simulation, written from docs/simulation.md alone; imports nothing of
+``psd_deflection.model.simulation``.
 
 Its methods are different: the motion is integrated by Runge-Kutta of order four at a fifth of a
 millisecond (as one matrix polynomial a step, the loads held over each sample), the optics intersect

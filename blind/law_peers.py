@@ -34,8 +34,8 @@ def export(folder: Path, first: int, count: int) -> None:
     # Imported here: the peers' Python need not have this package.
     from blind.law_forms import truth_of
     from blind.laws import drawn, observe, sized
-    from psd_deflection.discovery.law_features import known_values
-    from psd_deflection.discovery.workspace import Workspace
+    from psd_deflection.studies.discover.laws.law_features import known_values
+    from psd_deflection.studies.discover.search.workspace import Workspace
 
     folder.mkdir(parents=True, exist_ok=True)
     for law in drawn(first, count):

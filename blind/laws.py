@@ -26,11 +26,11 @@ from tqdm import tqdm
 
 from blind import generator, law_forms
 from blind.cases import designs, gap_of
-from psd_deflection.config import load_rig
-from psd_deflection.discovery.discover import Discovery, discover
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.result import result
-from psd_deflection.discovery.signatures import SignatureBank
+from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.discover.discover import Discovery, discover
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.result import result
+from psd_deflection.studies.discover.search.signatures import SignatureBank
 
 _BANK = SignatureBank()
 STAGES = tuple(law_forms.OF_STAGE)

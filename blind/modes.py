@@ -19,7 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from blind.generator import Array
-from psd_deflection.identification.modes import Mode, modes_of
+from psd_deflection.studies.identify.modes import Mode, modes_of
 
 RATE = 1000.0
 

@@ -29,9 +29,9 @@ from scipy.stats import chi2
 from tqdm import tqdm
 
 from blind.generator import EI, GJ, MM_PER_V, PLACES, RATE, SIGMA, Array, output
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import BaseAcceleration, RawChunk, TipMotion
+from psd_deflection.rig.config import Rig, load_rig
 
 LENGTH = 0.585
 GIVES = (LENGTH**3 / (3.0 * EI), LENGTH**3 / (3.0 * EI), LENGTH / GJ)

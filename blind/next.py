@@ -23,12 +23,12 @@ from tqdm import tqdm
 
 from blind.cases import DRAWS, EFFECTS, MIMICKED, gap_of, scaled
 from blind.generator import Array, Generator
-from psd_deflection.config import load_rig, replace_values
-from psd_deflection.discovery.discover import discover
-from psd_deflection.discovery.experiment import Limits, proposals
-from psd_deflection.discovery.loop import settle
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.planning import Plan
+from psd_deflection.rig.config import load_rig, replace_values
+from psd_deflection.studies.discover.discover import discover
+from psd_deflection.studies.discover.experiment import Limits, proposals
+from psd_deflection.studies.discover.loop import settle
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.planning import Plan
 
 RIG = load_rig()
 GAP = 4.0

@@ -37,7 +37,7 @@ from blind.generator import Array
 from blind.redone_page import Curves, page_of
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.cli.main import main as psd_deflection
-from psd_deflection.parameter_files import with_values
+from psd_deflection.rig.parameter_files import with_values
 
 ROOT = Path(__file__).resolve().parents[1]
 NOMINAL = ROOT / 'config' / 'thesis_rig.yaml'

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from blind.generator import Array
-from psd_deflection.pages import page, picture, table
+from psd_deflection.base.pages import page, picture, table
 
 SHOWN = (('theta', 2, 'θ / °', math.degrees(1.0)), ('dx', 0, 'ΔX / mm', 1e3), ('dy', 1, 'ΔY / mm', 1e3))
 """Axes in the order of the thesis: name, column, label, factor."""

@@ -22,11 +22,11 @@ from tqdm import tqdm
 from blind import score
 from blind.cases import Case, all_cases, designs, scaled, short_cases
 from blind.mistakes import observed
-from psd_deflection.config import load_rig, replace_values
-from psd_deflection.discovery.discover import Discovery, discover
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.result import result
-from psd_deflection.discovery.signatures import SignatureBank
+from psd_deflection.rig.config import load_rig, replace_values
+from psd_deflection.studies.discover.discover import Discovery, discover
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.result import result
+from psd_deflection.studies.discover.search.signatures import SignatureBank
 
 _BANKS: dict[str, SignatureBank] = {}
 

@@ -16,17 +16,17 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from scipy.optimize import brentq
 
-from psd_deflection.config import Rig, load_rig, replace_values
-from psd_deflection.discovery.discover import discover
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.result import sentence
+from psd_deflection.model.simulation import loads
+from psd_deflection.model.simulation.catalogue import catalogue
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
+from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation import loads
-from psd_deflection.simulation.catalogue import catalogue
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
-from psd_deflection.solvers import solver_from_rig
+from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.studies.discover.discover import discover
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.result import sentence
 
 SETTLE = 14.0
 """s under load before the figures are read: the modes have decayed, and creep is complete."""

@@ -21,8 +21,9 @@ import numpy as np
 from tqdm import tqdm
 
 from blind.generator import EI, GJ, LSB, MM_PER_V, SIGMA, Array, Generator
-from psd_deflection.config import load_rig
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.measure.watch import Alarm, Watch
+from psd_deflection.model.solvers.registry import solver_from_rig
 from psd_deflection.records import (
     AppliedLoad,
     BlockStatus,
@@ -32,8 +33,7 @@ from psd_deflection.records import (
     SpotMeans,
     TipLoad,
 )
-from psd_deflection.solvers.registry import solver_from_rig
-from psd_deflection.watching.watch import Alarm, Watch
+from psd_deflection.rig.config import load_rig
 
 RATE, LENGTH = 1000, 0.585
 BUMP, GAIN, SLIP = 5e-6, 0.02, 20e-6

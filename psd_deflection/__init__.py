@@ -13,8 +13,8 @@
     pd.discover([recording], rig)                        # the effects that the simulation lacks
     pd.discover_in(plant)                                # the same for a machine of yours that simulates itself
 
-SI units everywhere. What is refused raises a subclass of ``psd_deflection.errors.PsdDeflectionError``: one line with
-the file or argument, the value and its bound. The command ``psd-deflection`` does the same from a shell, and more.
+SI units everywhere. What is refused raises a subclass of ``psd_deflection.base.errors.PsdDeflectionError``: one line
+with the file or argument, the value and its bound. The command ``psd-deflection`` does the same from a shell, and more.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from psd_deflection.config import Rig
-    from psd_deflection.discovery.discover import Discovery
-    from psd_deflection.discovery.plants import Plant, PlantDiscovery
+    from psd_deflection.model.solvers.interface import Solutions
     from psd_deflection.recordings.estimates import EstimateSeries
     from psd_deflection.recordings.recording import Recording
-    from psd_deflection.recordings.simulated_recording import SimulatedRecording
-    from psd_deflection.solvers.interface import Solutions
+    from psd_deflection.recordings.replay.simulated_recording import SimulatedRecording
+    from psd_deflection.rig.config import Rig
+    from psd_deflection.studies.discover.discover import Discovery
+    from psd_deflection.studies.discover.plants import Plant, PlantDiscovery
 
 __version__ = '0.1.0'
 
@@ -47,10 +47,10 @@ def load_rig(path: str | Path | None = None, /, **overrides: object) -> Rig:
 
     ``overrides``: parameters that differ, with dots or as maps: ``load_rig(block_size=10, link={'length': 0.4})``,
     ``load_rig('my_rig.yaml', **{'psd_1.center': [0.0, 0.08]})``. ``psd-deflection params`` lists them.
-    Raises :class:`psd_deflection.errors.ConfigError`, which names file, parameter, value and bound.
+    Raises :class:`psd_deflection.base.errors.ConfigError`, which names file, parameter, value and bound.
     """
-    from psd_deflection.config import load_rig as of_file
-    from psd_deflection.parameter_files import flattened
+    from psd_deflection.rig.config import load_rig as of_file
+    from psd_deflection.rig.parameter_files import flattened
 
     return of_file(path, flattened(overrides, 'load_rig'))
 
@@ -58,9 +58,9 @@ def load_rig(path: str | Path | None = None, /, **overrides: object) -> Rig:
 def open(path: str | Path) -> Recording:
     """Open a recording: a bag folder, an ``.mcap`` or a ``.csv``. ``.samples`` is a numpy array of its samples.
 
-    Raises :class:`psd_deflection.errors.RecordingError` if it cannot be read.
+    Raises :class:`psd_deflection.base.errors.RecordingError` if it cannot be read.
     """
-    from psd_deflection.recordings.readers import open_recording
+    from psd_deflection.recordings.read.readers import open_recording
 
     return open_recording(path)
 
@@ -70,21 +70,21 @@ def solve(dots: npt.ArrayLike, rig: Rig | str | Path | None = None, solver: str 
 
     ``dots``: (2P,) or (n, 2P) of P PSDs: x1, y1, x2, y2 ... from each PSD's centre, m. ``rig``: the rig or its
     parameter file; by default the thesis rig. ``solver``: by default that of the rig;
-    :mod:`psd_deflection.solvers` has their names.
+    :mod:`psd_deflection.model.solvers` has their names.
 
     The result has ``pose`` (dX m, dY m, theta rad), ``tilt`` (phi, omega, rad), ``covariance`` of the pose (for means
     of one block, with the rig's noise), ``residual`` (m) and ``status`` (0: solved), each for one block or for n.
-    Raises :class:`psd_deflection.errors.ConfigError` for a bad argument, and
-    :class:`~psd_deflection.errors.SolverError` if the method cannot solve the rig.
+    Raises :class:`psd_deflection.base.errors.ConfigError` for a bad argument, and
+    :class:`~psd_deflection.base.errors.SolverError` if the method cannot solve the rig.
     """
     import dataclasses
 
     import numpy as np
 
-    from psd_deflection.calibration import dot_noise_variances
-    from psd_deflection.errors import ConfigError
+    from psd_deflection.base.errors import ConfigError
+    from psd_deflection.model.detector import dot_noise_variances
+    from psd_deflection.model.solvers import solver_from_rig
     from psd_deflection.records import dot_names
-    from psd_deflection.solvers import solver_from_rig
 
     known = _rig(rig)
     count = 2 * len(known.psds)
@@ -123,12 +123,12 @@ def simulate(
     ``effects:`` of a rig file, ``{'sensor_rotation': {'psd': 2, 'angle': 0.01}}``; ``psd-deflection effects`` lists
     them. ``temperature``: degrees Celsius, straight lines through these, evenly over the recording. The same
     ``seed`` gives the same noise.
-    Raises :class:`psd_deflection.errors.ConfigError` naming argument, value and bound.
+    Raises :class:`psd_deflection.base.errors.ConfigError` naming argument, value and bound.
     """
-    from psd_deflection.errors import ConfigError
-    from psd_deflection.recordings.simulated_recording import SimulatedRecording
-    from psd_deflection.simulation.effect_words import with_effects_of
-    from psd_deflection.simulation.load_words import load_history, load_table, temperature_table
+    from psd_deflection.base.errors import ConfigError
+    from psd_deflection.model.simulation.effect_words import with_effects_of
+    from psd_deflection.model.simulation.load_words import load_history, load_table, temperature_table
+    from psd_deflection.recordings.replay.simulated_recording import SimulatedRecording
 
     known = with_effects_of(_rig(rig), (), 'effects')
     rate = known.converter.sample_rate_hz
@@ -158,14 +158,14 @@ def replay(
     The result has numpy arrays (``t``, ``dx``, ``dy``, ``theta``, ``sd``, ``covariance``, ``wrench``), ``to_pandas()``
     and ``to_xarray()``. Blocks without an estimate (a laser lost) have no row. Warns (``UserWarning``) if the
     recording names no rig and none is given.
-    Raises :class:`psd_deflection.errors.RecordingError`, :class:`~psd_deflection.errors.ConfigError`,
-    :class:`~psd_deflection.errors.SolverError`.
+    Raises :class:`psd_deflection.base.errors.RecordingError`, :class:`~psd_deflection.base.errors.ConfigError`,
+    :class:`~psd_deflection.base.errors.SolverError`.
     """
     import warnings
 
-    from psd_deflection.config import replace_values
     from psd_deflection.recordings.recording import Recording
-    from psd_deflection.recordings.replay_engine import nominal_rig, replayed_estimates, rig_at_start
+    from psd_deflection.recordings.replay.engine import nominal_rig, replayed_estimates, rig_at_start
+    from psd_deflection.rig.config import replace_values
 
     opened = recording if isinstance(recording, Recording) else open(recording)
     known = rig_at_start(opened) if rig is None else _rig(rig)
@@ -184,13 +184,13 @@ def discover(
 
     ``recordings``: with loads; from :func:`open` or :func:`simulate`, or paths, or ``.yaml`` lists of them.
     ``rig``: the known rig, or its parameter file; by default the parameters in the recordings. The same
-    ``seed`` gives the same answer. ``psd_deflection.discovery.result`` turns the answer into
-    ``result.json`` and ``model.yaml``. Raises :class:`psd_deflection.errors.RecordingError` if a
-    recording cannot be read or holds no loads, :class:`~psd_deflection.errors.ConfigError` for a bad
+    ``seed`` gives the same answer. ``psd_deflection.studies.discover.result`` turns the answer into
+    ``result.json`` and ``model.yaml``. Raises :class:`psd_deflection.base.errors.RecordingError` if a
+    recording cannot be read or holds no loads, :class:`~psd_deflection.base.errors.ConfigError` for a bad
     parameter.
     """
-    from psd_deflection.discovery.discover import discover as of_observations
-    from psd_deflection.recordings.observations import read_observations
+    from psd_deflection.studies.discover.discover import discover as of_observations
+    from psd_deflection.studies.discover.from_recordings import read_observations
 
     known = None if rig is None else _rig(rig)
     return of_observations(read_observations(recordings, known, any_rate=True), known, seed=seed)
@@ -199,20 +199,20 @@ def discover(
 def discover_in(plant: Plant, *, seed: int = 0) -> PlantDiscovery:
     """Name the effects that the simulation of ``plant``, a machine of yours, lacks to explain what was measured.
 
-    ``plant``: a :class:`psd_deflection.discovery.plants.Plant`, which has measured tables, a simulation and a library
-    of effects that may be missing. Search, rules and answer are those of :func:`discover`;
-    ``psd_deflection.discovery.result.result`` and ``psd_deflection.discovery.report.report_html`` turn the answer into
-    ``result.json`` and a page. The same ``seed`` gives the same answer. Raises
-    :class:`psd_deflection.errors.ConfigError` if the plant contradicts itself.
+    ``plant``: a :class:`psd_deflection.studies.discover.plants.Plant`, which has measured tables, a simulation and a
+    library of effects that may be missing. Search, rules and answer are those of :func:`discover`;
+    ``psd_deflection.studies.discover.result.result`` and ``psd_deflection.studies.discover.report.report_html`` turn
+    the answer into ``result.json`` and a page. The same ``seed`` gives the same answer. Raises
+    :class:`psd_deflection.base.errors.ConfigError` if the plant contradicts itself.
     """
-    from psd_deflection.discovery.plants import discover_in as of_plant
+    from psd_deflection.studies.discover.plants import discover_in as of_plant
 
     return of_plant(plant, seed=seed)
 
 
 def _rig(rig: Rig | str | Path | None) -> Rig:
     """``rig``, or that of the parameter file, or the thesis rig."""
-    from psd_deflection.config import Rig
-    from psd_deflection.config import load_rig as of_file
+    from psd_deflection.rig.config import Rig
+    from psd_deflection.rig.config import load_rig as of_file
 
     return rig if isinstance(rig, Rig) else of_file(rig)

@@ -290,7 +290,7 @@ class RigState(NamedTuple):
     ``parameters``: all of them, flat, as they are from block ``block`` on. ``hello``: the device's, or None.
     ``changed``: the values of the :class:`ParameterChange` that it was sent for, {} if there was none.
     ``version``: of the software. ``t_ns``: time of the change, 0 at the start. ``made_with``: what computes
-    (:mod:`psd_deflection.provenance`).
+    (:mod:`psd_deflection.recordings.provenance`).
     """
 
     t_ns: int

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from psd_deflection.geometry import Geometry
+from psd_deflection.model.plate import Geometry
 
 Array = np.ndarray[Any, Any]
 

@@ -2,8 +2,9 @@
 
 Which bits LAPACK gives depends on the processor. A test that compares two of its answers exactly passes on the machine
 of its author and fails on another. Here it fails on every machine. What is promised bit for bit does not go through
-LAPACK (:mod:`psd_deflection.arithmetic`), so such tests pass all the same. A test that is marked ``repeatable`` asks
-whether the same computation gives the same answer again on one machine: there the same question has the same answer.
+LAPACK (:mod:`psd_deflection.base.arithmetic`), so such tests pass all the same. A test that is marked ``repeatable``
+asks whether the same computation gives the same answer again on one machine: there the same question has the same
+answer.
 """
 
 from __future__ import annotations

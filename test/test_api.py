@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import psd_deflection
-from psd_deflection.discovery.discover import Discovery
-from psd_deflection.errors import ConfigError, PsdDeflectionError, RecordingError, SolverError
+from psd_deflection.base.errors import ConfigError, PsdDeflectionError, RecordingError, SolverError
+from psd_deflection.studies.discover.discover import Discovery
 from tools.program import ROOT
 
 CLEAN = ROOT / 'bags' / 'clean'

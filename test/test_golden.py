@@ -10,9 +10,9 @@ import numpy.typing as npt
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.replay_engine import replayed, rig_at_start
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.replay.engine import replayed, rig_at_start
 from psd_deflection.records import DeflectionEstimate, SpotMeans
 
 BAGS = Path(__file__).parent.parent / 'bags'
@@ -95,7 +95,7 @@ def test_compare_names_the_largest_difference(tmp_path: Path, capsys: pytest.Cap
 def test_a_zero_that_was_taken_while_recording_is_taken_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from psd_deflection.recordings.bag_writer import BagWriter
+    from psd_deflection.recordings.write.bag_writer import BagWriter
     from psd_deflection.records import RawChunk
 
     recording = open_recording(BAGS / 'clean')

@@ -13,7 +13,7 @@ import yaml
 
 from msg_adapters import DIAGNOSTICS, INPUTS, TOPIC_TYPES
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.ros import names
 
 ROOT = Path(__file__).parent.parent

@@ -13,13 +13,15 @@ import pytest
 from scipy.stats import chi2
 
 from msg_adapters import point_cloud2, to_messages
+from psd_deflection.base.errors import ConfigError, PsdDeflectionError, RecordingError
 from psd_deflection.cli.main import main
-from psd_deflection.config import Rig, load_rig, replace_values
-from psd_deflection.errors import ConfigError, PsdDeflectionError, RecordingError
-from psd_deflection.geometry import Geometry
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.sinks import open_sink
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.simulation import loads
+from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.model.solvers import Solver, solver_from_rig
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import (
     MOST_PSDS,
     AppliedLoad,
@@ -33,10 +35,8 @@ from psd_deflection.records import (
     TipLoad,
     channel_names,
 )
-from psd_deflection.runner.session import zero_text
-from psd_deflection.simulation import loads
-from psd_deflection.simulation.simulator import RigSimulator
-from psd_deflection.solvers import Solver, solver_from_rig
+from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.run.session import zero_text
 from test.judges import RayPlane
 
 Counts = npt.NDArray[np.int32]

@@ -19,8 +19,8 @@ ROOT = Path(__file__).parent.parent
 BESIDE_THE_PACKAGE = {'bench', 'blind', 'data', 'docs'}
 """Folders of test/ that are no room of the package: what they test, or use, lies beside it."""
 
-TESTED_ELSEWHERE = {'errors', 'files', 'pages', 'parameters', 'records'}
-"""Rooms without a test file of their own: declarations, and the pages, which tests of the reports open in a browser."""
+TESTED_ELSEWHERE = {'records'}
+"""A room without tests of its own: it declares only."""
 
 EXECUTABLES: tuple[str, ...] = next(
     ast.literal_eval(line.value)

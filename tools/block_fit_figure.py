@@ -10,7 +10,7 @@ mpl.use('Agg')
 import matplotlib.pyplot as plt
 import numpy as np
 
-from psd_deflection.uncertainty.block_fit import basis
+from psd_deflection.measure.uncertainty.block_fit import basis
 
 SIZE, RATE = 20, 1000.0
 

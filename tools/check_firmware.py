@@ -12,9 +12,7 @@ import threading
 import time
 from pathlib import Path
 
-from psd_deflection.config import load_rig
-from psd_deflection.devices.serial_port import SerialPort
-from psd_deflection.protocol.frames import (
+from psd_deflection.devices.protocol.frames import (
     BadFrame,
     Frame,
     FrameDecoder,
@@ -28,8 +26,10 @@ from psd_deflection.protocol.frames import (
     StopFrame,
     encode,
 )
+from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.records import Record, SampleBlock
-from psd_deflection.runner.session import Session
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run.session import Session
 from tools.program import Program
 
 COMMAND = [

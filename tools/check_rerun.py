@@ -23,10 +23,10 @@ import rerun.chunk
 from PIL import Image
 
 import psd_deflection
-from psd_deflection.config import Rig, rig_from_values
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.rerun_writer import APPLICATION, POSE, TIMELINE, blueprint
+from psd_deflection.recordings.write.rerun_writer import APPLICATION, POSE, TIMELINE, blueprint
 from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.rig.config import Rig, rig_from_values
 from tools.program import Program
 
 BIN = Path(sys.executable).parent

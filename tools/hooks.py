@@ -16,15 +16,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from psd_deflection import errors
-from psd_deflection.cli.effects import explained
+from psd_deflection.base import errors
 from psd_deflection.cli.main import COMMANDS, main, make_parser
-from psd_deflection.declarations import PARAMETERS
-from psd_deflection.simulation.catalogue import catalogue
+from psd_deflection.cli.studies.effects import explained
+from psd_deflection.model.simulation.catalogue import catalogue
+from psd_deflection.rig.declarations import PARAMETERS
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ('psd_deflection', 'msg_adapters')
-OWN_EFFECTS = {path.stem for path in (ROOT / 'psd_deflection' / 'simulation' / 'effects').glob('[a-z]*.py')}
+OWN_EFFECTS = {path.stem for path in (ROOT / 'psd_deflection' / 'model' / 'simulation' / 'effects').glob('[a-z]*.py')}
 """Not those of whoever builds the site."""
 
 STATUS = {
@@ -39,9 +39,9 @@ WITHOUT_STATUS = ('DamagedError', 'RefusedError', 'SourceEndedError', '_FullErro
 
 READERS = (
     'msg_adapters',
-    'psd_deflection.recordings.clouds',
+    'psd_deflection.recordings.read.clouds',
     'psd_deflection.recordings.cdr',
-    'psd_deflection.recordings.bag_reader',
+    'psd_deflection.recordings.read.bag_reader',
 )
 """Whose ValueErrors say what is wrong with a recorded message; the reader puts file and topic before them."""
 

@@ -13,7 +13,7 @@ from scipy.signal import savgol_filter
 
 from blind import motion
 from blind.generator import RATE
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import TipMotion
 
 STEP, DARK, END = 3.095, (3.4, 3.6), 3.8

@@ -6,7 +6,7 @@ the function run until one fails. What they do not notice is tried by the slow t
 no test notices is listed; tools/mutants_equivalent.txt has those that nobody could notice, each with the reason, and
 they do not count.
 
-  python -m tools.mutants --count 32 --rooms solvers geometry
+  python -m tools.mutants --count 32 --rooms solvers plate
 """
 
 from __future__ import annotations
@@ -50,65 +50,75 @@ class Room(NamedTuple):
     slow: tuple[str, ...] = ()
 
 
-_PIPELINE = 'test/test_pipeline.py -k not(drift or rms_errors or rotation or crosstalk or nonlinearity or iterative)'
+_PIPELINE = (
+    'test/measure/test_pipeline.py -k not(drift or rms_errors or rotation or crosstalk or nonlinearity or iterative)'
+)
 _GOLDEN = 'test/test_golden.py'
 _SOLVERS = (
     *('sensitivity', 'truth', 'golden', 'interface', 'properties', 'degenerate', 'registry', 'gauss_newton', 'one_psd'),
 )
 _UNCERTAINTY = (*('formulas', 'consistency', 'combinations', 'stamped', 'redundancy', 'rest', 'block_fit', 'noise'),)
-_RUNS = ('test/test_pipeline.py', 'test/test_layouts.py')
+_RUNS = ('test/measure/test_pipeline.py', 'test/test_layouts.py')
 
 ROOMS: Mapping[str, Room] = {
     'solvers': Room(
-        ('psd_deflection/solvers',),
-        (*(f'test/solvers/test_{n}.py' for n in _SOLVERS), _GOLDEN),
-        slow=('test/solvers/test_audit.py', 'test/budget', *_RUNS),
+        ('psd_deflection/model/solvers',),
+        (*(f'test/model/solvers/test_{n}.py' for n in _SOLVERS), _GOLDEN),
+        slow=('test/model/solvers/test_audit.py', 'test/studies/budget', *_RUNS),
     ),
-    'geometry': Room(
-        ('psd_deflection/geometry',),
-        ('test/geometry',),
+    'plate': Room(
+        ('psd_deflection/model/plate',),
+        ('test/model/plate',),
         slow=(
-            *(f'test/solvers/test_{n}.py' for n in ('sensitivity', 'truth', 'golden')),
-            'test/simulation/test_simulator.py',
+            *(f'test/model/solvers/test_{n}.py' for n in ('sensitivity', 'truth', 'golden')),
+            'test/model/simulation/test_simulator.py',
         ),
     ),
-    'averaging': Room(('psd_deflection/averaging.py',), ('test/test_averaging.py', _GOLDEN)),
+    'averaging': Room(('psd_deflection/measure/averaging.py',), ('test/measure/test_averaging.py', _GOLDEN)),
     'timing': Room(
-        ('psd_deflection/timing.py',),
-        ('test/test_timing.py', 'test/runner/test_clock_watch.py'),
-        slow=('test/runner/test_acquisition.py', 'test/runner/test_pinger.py'),
+        ('psd_deflection/measure/timing.py',),
+        ('test/measure/test_timing.py', 'test/run/test_clock_watch.py'),
+        slow=('test/run/test_acquisition.py', 'test/run/test_pinger.py'),
     ),
     'pipeline': Room(
-        ('psd_deflection/pipeline.py', 'psd_deflection/estimation.py', 'psd_deflection/correction.py'),
+        (
+            'psd_deflection/measure/pipeline.py',
+            'psd_deflection/measure/estimation.py',
+            'psd_deflection/measure/correction.py',
+        ),
         (
             _PIPELINE,
-            'test/test_estimation.py',
-            'test/test_correction.py',
-            'test/misalignment/test_spread.py',
-            'test/uncertainty/test_pipeline_state.py',
-            'test/calibration/test_health.py',
-            'test/simulation/test_added_effect.py -k refused or heights',
+            'test/measure/test_estimation.py',
+            'test/measure/test_correction.py',
+            'test/model/misalignment/test_spread.py',
+            'test/measure/uncertainty/test_pipeline_state.py',
+            'test/measure/test_health.py',
+            'test/model/simulation/test_added_effect.py -k refused or heights',
             'test/test_more_psds.py -k psd_left or without_one or contradicts or on_itself or all_psds or the_last',
-            'test/filtering/test_motion.py -k anew or begun_at or noted or is_refused',
+            'test/measure/motion/test_motion.py -k anew or begun_at or noted or is_refused',
             _GOLDEN,
         ),
         slow=(
-            'test/test_pipeline.py -k drift or an_effect_in or iterative',
+            'test/measure/test_pipeline.py -k drift or an_effect_in or iterative',
             'test/test_more_psds.py',
-            'test/filtering/test_motion.py -k recorded or coast or ahead or foretold or stated',
-            'test/filtering/test_inertia.py',
-            'test/simulation/test_base_pair.py',
-            'test/simulation/test_effects.py -k correction or together or the_wrench',
+            'test/measure/motion/test_motion.py -k recorded or coast or ahead or foretold or stated',
+            'test/measure/motion/test_inertia.py',
+            'test/model/simulation/test_base_pair.py',
+            'test/model/simulation/test_effects.py -k correction or together or the_wrench',
         ),
     ),
-    'calibration': Room(('psd_deflection/calibration',), ('test/calibration', _GOLDEN), slow=_RUNS),
+    'detector': Room(
+        ('psd_deflection/model/detector', 'psd_deflection/measure/health.py', 'psd_deflection/rig/wiring.py'),
+        ('test/model/detector', 'test/measure/test_health.py', 'test/rig/test_wiring.py', _GOLDEN),
+        slow=_RUNS,
+    ),
     'uncertainty': Room(
-        ('psd_deflection/uncertainty',),
+        ('psd_deflection/measure/uncertainty',),
         (
-            *(f'test/uncertainty/test_{n}.py' for n in _UNCERTAINTY),
-            'test/test_pipeline.py -k zero or contradict',
+            *(f'test/measure/uncertainty/test_{n}.py' for n in _UNCERTAINTY),
+            'test/measure/test_pipeline.py -k zero or contradict',
             'test/test_more_psds.py -k contradicts or degree or tells_on_itself or one_after or from_the_memory',
-            'test/uncertainty/test_pipeline_state.py',
+            'test/measure/uncertainty/test_pipeline_state.py',
         ),
         slow=_RUNS,
     ),
@@ -121,49 +131,52 @@ ROOMS: Mapping[str, Room] = {
         ),
         slow=(
             *(f'test/recordings/test_{n}.py' for n in ('bag_writer', 'bag_reader', 'cdr', 'references')),
-            'test/chains/test_chain.py',
+            'test/arms/chains/test_chain.py',
         ),
     ),
     'protocol': Room(
-        ('psd_deflection/protocol',),
+        ('psd_deflection/devices/protocol', 'psd_deflection/base/sequence.py'),
         (
-            'test/protocol',
+            'test/devices/protocol',
+            'test/base/test_sequence.py',
             *(f'test/devices/test_{n}.py' for n in ('dataq', 'text_lines', 'thorlabs')),
             'test/recordings/test_bag_reader.py -k restart or wrap or again',
         ),
         slow=(
             *(f'test/devices/test_{n}.py' for n in ('source', 'survey')),
-            *(f'test/runner/test_{n}.py' for n in ('acquisition', 'hello', 'restarts')),
+            *(f'test/run/test_{n}.py' for n in ('acquisition', 'hello', 'restarts')),
         ),
     ),
     'effects': Room(
-        ('psd_deflection/simulation/effects',),
+        ('psd_deflection/model/simulation/effects',),
         (
-            'test/simulation/test_catalogue.py',
-            'test/simulation/test_effect_terms.py',
-            'test/simulation/test_effect_formulas.py',
-            'test/simulation/test_effects.py -k back or play or pieces or (wrench and (creep or friction or load))',
+            'test/model/simulation/test_catalogue.py',
+            'test/model/simulation/test_effect_terms.py',
+            'test/model/simulation/test_effect_formulas.py',
+            'test/model/simulation/test_effects.py -k back or play or pieces or (wrench and (creep or '
+            'friction or load))',
         ),
-        slow=('test/simulation/test_effects.py', 'test/simulation/test_simulator.py'),
+        slow=('test/model/simulation/test_effects.py', 'test/model/simulation/test_simulator.py'),
     ),
-    'discovery': Room(
-        ('psd_deflection/discovery',),
+    'discover': Room(
+        ('psd_deflection/studies/discover',),
         (
             *(
-                f'test/discovery/test_{n}.py'
+                f'test/studies/discover/test_{n}.py'
                 for n in (
                     *('formulas', 'law_formulas', 'plant_formulas', 'answers', 'rules', 'steps', 'parts'),
                     *('discover_parts', 'search_parts', 'limits', 'ties'),
                 )
             ),
             # Their pieces: a whole discovery of the catalogue takes seconds.
-            'test/discovery/test_discover.py -k stripped or refined or coarse or imagined',
-            'test/discovery/test_planning.py -k loop or words or every_proposal or pieces',
-            'test/discovery/test_setup.py -k put_right or other_unit or at_its or outliers or stuck',
+            'test/studies/discover/test_discover.py -k stripped or refined or coarse or imagined',
+            'test/studies/discover/test_planning.py -k loop or words or every_proposal or pieces',
+            'test/studies/discover/test_setup.py -k put_right or other_unit or at_its or outliers or stuck',
         ),
-        leave=('psd_deflection/discovery/report.py',),
+        leave=('psd_deflection/studies/discover/report.py',),
         slow=tuple(
-            f'test/discovery/test_{n}.py' for n in ('discover', 'plants', 'planning', 'setup', 'laws', 'readings')
+            f'test/studies/discover/test_{n}.py'
+            for n in ('discover', 'plants', 'planning', 'setup', 'laws', 'readings')
         ),
     ),
 }

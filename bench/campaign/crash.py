@@ -21,10 +21,10 @@ from pathlib import Path
 
 from rosbags.rosbag2 import Reader
 
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.repair import recover
-from psd_deflection.runner.session import Session
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.run.session import Session
 from tools.program import PSD_DEFLECTION, WAIT_S, Program
 
 ALLOWED_S = 1.0

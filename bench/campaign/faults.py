@@ -27,7 +27,7 @@ from sensor_msgs.msg import PointCloud2
 
 from bench.campaign.kinds import FAULTS, Fault
 from bench.campaign.line import DIGIT, VOLTS_PER_COUNT, Line, identities
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
 from tools.program import PSD_DEFLECTION, Program
 
 START_S = 300.0

@@ -57,7 +57,7 @@ def judged(target: Target, content: bytes) -> list[str]:
 
 def frames_target() -> tuple[Target, list[bytes]]:
     """The decoder: whole, and byte by byte, gives the same."""
-    from psd_deflection.protocol.frames import (
+    from psd_deflection.devices.protocol.frames import (
         BadFrame,
         FrameDecoder,
         HelloFrame,
@@ -94,7 +94,7 @@ def frames_target() -> tuple[Target, list[bytes]]:
 
 def _file_target(suffix: str, *steps: Callable[[Path], object]) -> Target:
     """Writes the input to a file, and reads that by each of ``steps``."""
-    from psd_deflection.errors import PsdDeflectionError
+    from psd_deflection.base.errors import PsdDeflectionError
 
     folder = Path(tempfile.mkdtemp(dir='/dev/shm' if Path('/dev/shm').is_dir() else None))
     path = folder / f'input{suffix}'
@@ -116,11 +116,11 @@ def _file_target(suffix: str, *steps: Callable[[Path], object]) -> Target:
 
 def bag_target() -> tuple[Target, list[bytes]]:
     """A lone ``.mcap``: everything that a command may ask of it; and ``recover``."""
-    from psd_deflection.config import load_rig
-    from psd_deflection.recordings.bag_writer import McapFile
-    from psd_deflection.recordings.readers import open_recording
+    from psd_deflection.recordings.read.readers import open_recording
     from psd_deflection.recordings.repair import recover
+    from psd_deflection.recordings.write.bag_writer import McapFile
     from psd_deflection.records import AppliedLoad
+    from psd_deflection.rig.config import load_rig
 
     with tempfile.TemporaryDirectory() as name:
         seed = Path(name) / 'seed.mcap'
@@ -141,7 +141,7 @@ def bag_target() -> tuple[Target, list[bytes]]:
 
 def csv_target() -> tuple[Target, list[bytes]]:
     """A CSV recording."""
-    from psd_deflection.recordings.readers import open_recording
+    from psd_deflection.recordings.read.readers import open_recording
 
     seed = b't,x1,y1,sum1,x2,y2,sum2,load_fx,load_fy,load_tz\n'
     seed += b''.join(b'%d.%03d,0,1e-3,5,-1,2,5,1,0,0\n' % (i // 1000, i % 1000) for i in range(30))
@@ -157,8 +157,8 @@ def csv_target() -> tuple[Target, list[bytes]]:
 
 def parameters_target() -> tuple[Target, list[bytes]]:
     """A parameter file, and the rig of it; the kept zero as well."""
-    from psd_deflection.config import load_rig
-    from psd_deflection.runner.zero_store import ZeroStore
+    from psd_deflection.rig.config import load_rig
+    from psd_deflection.run.zero_store import ZeroStore
 
     nominal = load_rig()
 
@@ -226,11 +226,11 @@ def hello_words(choices: Choices, good: Mapping[str, object]) -> dict[str, objec
 
 def hello_target() -> tuple[Target, list[bytes]]:
     """A HELLO of any words, as a frame, through the gate: what is taken is printable, bounded, and can be recorded."""
-    from psd_deflection.config import load_rig
-    from psd_deflection.errors import DeviceError
-    from psd_deflection.protocol.frames import FrameDecoder, HelloFrame, encode
+    from psd_deflection.base.errors import DeviceError
+    from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, encode
     from psd_deflection.records import CHANNELS
-    from psd_deflection.runner.hello import HelloGate
+    from psd_deflection.rig.config import load_rig
+    from psd_deflection.run.reading.hello import HelloGate
 
     rig = load_rig()
     good: dict[str, object] = {
@@ -325,10 +325,10 @@ def records_target() -> tuple[Target, list[bytes]]:
 
 def yaml_target() -> tuple[Target, list[bytes]]:
     """A parameter file and a ``metadata.yaml`` that are YAML, with anchors, aliases, merge keys and tags."""
-    from psd_deflection.config import load_rig
-    from psd_deflection.declarations import BY_NAME
-    from psd_deflection.errors import PsdDeflectionError
-    from psd_deflection.recordings.bag_reader import read_information
+    from psd_deflection.base.errors import PsdDeflectionError
+    from psd_deflection.recordings.read.bag_reader import read_information
+    from psd_deflection.rig.config import load_rig
+    from psd_deflection.rig.declarations import BY_NAME
 
     names = [*BY_NAME]
     tags = ('', '!!int ', '!!float ', '!!bool ', '!!timestamp ', '!!binary ', '!!set ', '!!python/name:os.system ')
@@ -383,7 +383,7 @@ TARGETS: dict[str, Callable[[], tuple[Target, list[bytes]]]] = {
 
 def corrupted(count: int) -> int:
     """Damage ``count`` sample frames; how many are accepted with another content than was sent."""
-    from psd_deflection.protocol.frames import BadFrame, FrameDecoder, SampleFrame, encode
+    from psd_deflection.devices.protocol.frames import BadFrame, FrameDecoder, SampleFrame, encode
 
     chance = random.Random(1)
     originals = []

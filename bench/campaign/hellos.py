@@ -19,8 +19,8 @@ import numpy as np
 
 from bench.campaign.fuzz import Choices, hello_words
 from bench.campaign.line import Line, hello_of, identities
-from psd_deflection.protocol.frames import HelloFrame, encode
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.devices.protocol.frames import HelloFrame, encode
+from psd_deflection.recordings.read.readers import open_recording
 from tools.program import PSD_DEFLECTION, Program
 
 BACKLOG = 20_000

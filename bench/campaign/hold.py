@@ -30,7 +30,7 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from bench.simulated_arm import SimulatedArm
-from psd_deflection.chains.chain_file import read_chain
+from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.records import FloatArray
 from tools.program import PSD_DEFLECTION, ROOT, Program
 

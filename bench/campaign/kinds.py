@@ -16,7 +16,7 @@ import serial
 from cobs import cobs
 
 from bench.campaign.line import Line, hello_of
-from psd_deflection.protocol.frames import encode
+from psd_deflection.devices.protocol.frames import encode
 
 Act = Callable[[Line, int], None]
 """What a fault does to the line, or to the node with that process id."""

@@ -21,8 +21,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.devices.pseudo_terminal import PseudoTerminal
-from psd_deflection.protocol.frames import (
+from psd_deflection.devices.protocol.frames import (
     FrameDecoder,
     HelloFrame,
     HelloRequestFrame,
@@ -33,6 +32,7 @@ from psd_deflection.protocol.frames import (
     StatusFrame,
     encode,
 )
+from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.records import CHANNELS
 
 RATE = 1000

@@ -6,7 +6,7 @@ import os
 import signal
 from pathlib import Path
 
-from psd_deflection.errors import RecordingError
+from psd_deflection.base.errors import RecordingError
 
 
 def length(name: str) -> int:

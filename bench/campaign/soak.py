@@ -27,10 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.campaign.line import hello_of
-from psd_deflection.config import load_rig
-from psd_deflection.devices.pseudo_terminal import PseudoTerminal
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.protocol.frames import (
+from psd_deflection.devices.protocol.frames import (
     FrameDecoder,
     FrameType,
     HelloRequestFrame,
@@ -40,9 +37,12 @@ from psd_deflection.protocol.frames import (
     StatusFrame,
     encode,
 )
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.devices.pseudo_terminal import PseudoTerminal
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.records import IntArray
-from psd_deflection.runner.acquisition import Acquisition, Arrival
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run.reading.acquisition import Acquisition, Arrival
 from tools.program import PSD_DEFLECTION, Program
 
 SKEW = 30e-6

@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from psd_deflection.errors import ConfigError
+from psd_deflection.base.errors import ConfigError
 
 MAX_FILE_BYTES = 1_000_000
 MAX_DEPTH = 50

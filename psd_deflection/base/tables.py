@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.errors import ConfigError, printable
+from psd_deflection.base.errors import ConfigError, printable
 
 if TYPE_CHECKING:
     import pandas

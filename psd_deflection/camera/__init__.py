@@ -1,1 +1,2 @@
-"""Camera frames -> reference poses of the tip: targets, sub-pixel fits, poses with covariance. No files, no devices."""
+"""Camera frames -> reference poses of the tip: targets, sub-pixel fits, poses with covariance. ``footage`` alone opens
+files and devices."""

@@ -29,7 +29,7 @@ class Status(StrEnum):
     HALF_TURN = 'turned too far since the last answer'
 
 
-class RefusedError(Exception):
+class NoPoseError(Exception):
     """This frame has no answer, for the reason ``status``."""
 
     def __init__(self, status: Status) -> None:

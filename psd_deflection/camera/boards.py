@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.camera.answer import RefusedError, Status, TargetPose
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
+from psd_deflection.camera.discs.rim_model import turned
 from psd_deflection.camera.lens import Lens
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.refine_corners import LEAST_REACH, refined
-from psd_deflection.camera.rim_model import turned
 from psd_deflection.camera.settings import CameraSettings
-from psd_deflection.errors import ConfigError
 from psd_deflection.records import FloatArray
 
 LEAST_CORNERS = 8
@@ -76,7 +76,7 @@ class Board:
         pixels, shared_blur = self._refined(image, points, pixels, lens, rotation, place)
         kept = np.isfinite(pixels[:, 0])
         if kept.sum() < max(LEAST_CORNERS, 0.6 * len(points)):
-            raise RefusedError(Status.MISFIT)
+            raise NoPoseError(Status.MISFIT)
         plane, points, pixels = plane[kept], points[kept], pixels[kept]
         good = np.ones(len(points), dtype=bool)
         for _ in range(3):
@@ -87,7 +87,7 @@ class Board:
                 break
             good = keep
             if good.sum() < max(LEAST_CORNERS, 0.75 * len(points)):
-                raise RefusedError(Status.MISFIT)
+                raise NoPoseError(Status.MISFIT)
         variance = float(np.sum(residual**2)) / (residual.size - 6)
         # Corners near each other have errors in common; an error of all of them shows in no residual.
         covariance = 2.0 * variance * inverse
@@ -122,11 +122,11 @@ class Board:
             edges.append(vector / np.linalg.norm(vector, axis=1)[:, None])
         free = self._free * lens.focal / float(place[2])
         if free < LEAST_REACH:
-            raise RefusedError(Status.SMALL)
+            raise NoPoseError(Status.SMALL)
         found = refined(image, pixels, np.stack(edges, axis=1), 0.95 * free, self._charuco is not None)
         blur = np.sort(np.nanmedian(found.blur, axis=0))
         if blur[1] > MOST_BLUR * free:
-            raise RefusedError(Status.BLURRED)
+            raise NoPoseError(Status.BLURRED)
         return found.pixels, math.sqrt(max(float(blur[1] ** 2 - blur[0] ** 2), 0.0))
 
     def corners(self, grey: Any) -> tuple[FloatArray, FloatArray]:
@@ -137,23 +137,23 @@ class Board:
             flat = [] if numbers is None else np.ravel(numbers).tolist()
             at, pixels = np.array([known[i] for i in flat]), found
             if len(flat) and len(set(flat)) < len(flat):
-                raise RefusedError(Status.DOUBLED)
+                raise NoPoseError(Status.DOUBLED)
         else:
             corners, numbers, _ = self._tags.detectMarkers(grey)
             markers = numbers
             flat = [] if numbers is None else np.ravel(numbers).tolist()
             if len(set(flat)) < len(flat):
-                raise RefusedError(Status.DOUBLED)
+                raise NoPoseError(Status.DOUBLED)
             ours = [(self._by_id[i], c) for i, c in zip(flat, corners, strict=True) if i in self._by_id]
             at = np.concatenate([a for a, _ in ours]) if ours else np.zeros((0, 3))
             pixels = np.concatenate([np.reshape(c, (4, 2)) for _, c in ours]) if ours else None
         if markers is None or len(markers) == 0:
-            raise RefusedError(Status.MISSING)
+            raise NoPoseError(Status.MISSING)
         if len(at) < LEAST_CORNERS or pixels is None:
-            raise RefusedError(Status.HIDDEN)
+            raise NoPoseError(Status.HIDDEN)
         plane = np.asarray(at, dtype=float)[:, :2] - self._middle
         if np.min(plane.std(axis=0) / self._spread) < LEAST_SPREAD:
-            raise RefusedError(Status.HIDDEN)
+            raise NoPoseError(Status.HIDDEN)
         return plane * [self._mirror, -1.0], np.reshape(pixels, (-1, 2)).astype(float)
 
     def _guess(self, plane: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -174,7 +174,7 @@ class Board:
         u_, _, vt = np.linalg.svd(np.column_stack([h[:, 0], h[:, 1], np.cross(h[:, 0], h[:, 1])]))
         rotation = u_ @ np.diag([1.0, 1.0, np.linalg.det(u_ @ vt)]) @ vt
         if float(np.sign(rotation[2, 2])) != -self._mirror or h[2, 2] <= 0.0:
-            raise RefusedError(Status.MISFIT)
+            raise NoPoseError(Status.MISFIT)
         return rotation, h[:, 2]
 
 
@@ -200,12 +200,12 @@ def _fitted(
         inverse = np.linalg.inv(jacobian.T @ jacobian + stiff)
         step = inverse @ (jacobian.T @ residual.ravel())
         if not np.all(np.isfinite(step)) or np.linalg.norm(step[:3]) > 1.0:
-            raise RefusedError(Status.MISFIT)
+            raise NoPoseError(Status.MISFIT)
         rotation, place = rotation @ turned(step[:3]), place + step[3:]
         if float(np.max(np.abs(jacobian @ step))) < 1e-4:
             break
     if place[2] <= 0.0:
-        raise RefusedError(Status.MISFIT)
+        raise NoPoseError(Status.MISFIT)
     return rotation, place, inverse, residual
 
 

@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from psd_deflection.base.errors import ConfigError, DeviceError, RecordingError
+from psd_deflection.base.foreign_yaml import tree_of_text
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.settings import CameraSettings, settings_from
-from psd_deflection.errors import ConfigError, DeviceError, RecordingError
-from psd_deflection.foreign_yaml import tree_of_text
-from psd_deflection.parameter_files import flattened, parameter_text
+from psd_deflection.rig.parameter_files import flattened, parameter_text
 
 FRAMES = 'frames.csv'
 SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.webp')

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from psd_deflection.camera.answer import RefusedError, Status
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.camera.answer import NoPoseError, Status
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.settings import CameraSettings
-from psd_deflection.errors import ConfigError
 from psd_deflection.records import FloatArray
 
 LEAST_IMAGES = 5
@@ -76,14 +76,14 @@ def calibrated(settings: CameraSettings, images: Iterable[tuple[str, Any]]) -> I
     for name, image in images:
         try:
             if image is None:
-                raise RefusedError(Status.UNREADABLE)
+                raise NoPoseError(Status.UNREADABLE)
             shape = (int(image.shape[1]), int(image.shape[0]))
             size = size or shape
             if shape != size:
                 left_out.append((name, f'has {shape[0]} x {shape[1]} pixels, the first has {size[0]} x {size[1]}'))
                 continue
             plane, seen = board.corners(image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8))
-        except RefusedError as error:
+        except NoPoseError as error:
             left_out.append((name, str(error.status)))
             continue
         points.append(np.column_stack([plane, np.zeros(len(plane))]).astype(np.float32))

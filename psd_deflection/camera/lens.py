@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from psd_deflection.errors import ConfigError
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
 
 AFFINE_FOCAL = 1000.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from psd_deflection.errors import ConfigError
+from psd_deflection.base.errors import ConfigError
 
 
 @functools.cache

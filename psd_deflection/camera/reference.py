@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from psd_deflection.camera.answer import FrameAnswer, RefusedError, Status, TargetPose
+from psd_deflection.camera.answer import FrameAnswer, NoPoseError, Status, TargetPose
 from psd_deflection.camera.lens import AFFINE_FOCAL, Lens
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.records import FloatArray
@@ -73,7 +73,7 @@ class CameraReference:
         found: TargetPose | Status
         try:
             found = self._locate(image)
-        except RefusedError as error:
+        except NoPoseError as error:
             found = error.status
         if self._rest is not None:
             return [self._answer(t_ns, found)]
@@ -100,12 +100,12 @@ class CameraReference:
 
     def _locate(self, image: Any) -> TargetPose:
         if image is None or image.ndim != 2 or min(image.shape) < 16:
-            raise RefusedError(Status.UNREADABLE)
+            raise NoPoseError(Status.UNREADABLE)
         if self._lens is None:
             self._shape = image.shape
             self._lens = self._settings.lens(image.shape)
         elif image.shape != self._shape:
-            raise RefusedError(Status.UNREADABLE)
+            raise NoPoseError(Status.UNREADABLE)
         if image.dtype == np.uint8:
             return self._target.locate(image, image, self._lens, 255.0)
         grey = (image >> 8).astype(np.uint8)

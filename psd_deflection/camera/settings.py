@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from psd_deflection.base.errors import ConfigError, did_you_mean
 from psd_deflection.camera.lens import Lens
-from psd_deflection.errors import ConfigError, did_you_mean
 
 TARGETS = ('circles', 'charuco', 'apriltag')
 VIEWS = ('outside', 'base')

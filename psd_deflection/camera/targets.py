@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from psd_deflection.camera.boards import Board
-from psd_deflection.camera.discs import Discs
+from psd_deflection.camera.discs.discs import Discs
 from psd_deflection.camera.reference import Target
 from psd_deflection.camera.settings import CameraSettings
 

@@ -6,13 +6,13 @@ import argparse
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from psd_deflection.base.errors import DaemonError
 from psd_deflection.cli._options import given_as_option
 from psd_deflection.cli._report import show
-from psd_deflection.errors import DaemonError
-from psd_deflection.monitor.start import need_server
+from psd_deflection.run.monitor.start import need_server
 
 if TYPE_CHECKING:
-    from psd_deflection.monitor.client import Daemon
+    from psd_deflection.run.monitor.client import Daemon
 
 
 def url_option(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,7 @@ def request(args: argparse.Namespace, path: str, body: Mapping[str, object]) -> 
     """Ask the daemon of ``args`` for something, and print its answer. Raises DaemonError."""
     need_server()
     # Imported here: only these commands and the page need aiohttp.
-    from psd_deflection.monitor.client import ask
+    from psd_deflection.run.monitor.client import ask
 
     show(ask(daemon_of(args), path, body))
     return 0
@@ -37,7 +37,7 @@ def request(args: argparse.Namespace, path: str, body: Mapping[str, object]) -> 
 
 def daemon_of(args: argparse.Namespace) -> Daemon:
     """The daemon that ``--url`` names, else the one of this user. Raises DaemonError, UsageError."""
-    from psd_deflection.monitor.client import find_daemon
+    from psd_deflection.run.monitor.client import find_daemon
 
     with given_as_option('url'):
         try:

@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from psd_deflection.base.errors import Failed, Warned
 from psd_deflection.cli._program import program
-from psd_deflection.errors import Failed, Warned
-from psd_deflection.runner.session import Session
+from psd_deflection.run.session import Session
 
 REFRESH_S = 0.25
 PLAIN_REFRESH_S = 5.0

@@ -12,13 +12,13 @@ from typing import TypeVar
 
 from tqdm import tqdm
 
+from psd_deflection.base.errors import SomeFailedError, UsageError
 from psd_deflection.cli._options import make_folder, make_writable
 from psd_deflection.cli._report import columns, print_json, save_all, show, show_text, warn
-from psd_deflection.errors import SomeFailedError, UsageError
-from psd_deflection.fleet.engines import FORMS, SERIAL, check_engine, open_engine
-from psd_deflection.fleet.listing import is_plain, listed
-from psd_deflection.fleet.parquet import ENDING, Field, ParquetFile, is_parquet
-from psd_deflection.fleet.tasks import Outcome, outcomes
+from psd_deflection.run.fleet.engines import FORMS, SERIAL, check_engine, open_engine
+from psd_deflection.run.fleet.listing import is_plain, listed
+from psd_deflection.run.fleet.parquet import ENDING, Field, ParquetFile, is_parquet
+from psd_deflection.run.fleet.tasks import Outcome, outcomes
 
 T = TypeVar('T')
 
@@ -126,7 +126,7 @@ def write_rows(
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class TaskResult:
     """What the task of one recording gives: the files of its folder, the cells of its row, warnings."""
 
     files: Mapping[str, str]
@@ -137,7 +137,7 @@ class Answer:
 def answer_each(
     args: argparse.Namespace,
     names: Sequence[str],
-    work: Callable[[str], Answer],
+    work: Callable[[str], TaskResult],
     fields: Sequence[Field],
     head: Sequence[str],
     line: Callable[[Mapping[str, object]], Sequence[str]],
@@ -148,7 +148,7 @@ def answer_each(
         out = stack.enter_context(ParquetFile(args.out, fields)) if is_parquet(args.out) else None
         folders = {} if out is not None else folders_of(names, make_writable(args.out))
 
-        def take(name: str, answer: Answer) -> None:
+        def take(name: str, answer: TaskResult) -> None:
             for warning in answer.warnings:
                 warn(f'{_short(name)}: {warning}')
             rows[name] = answer.cells

@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 import yaml
 
+from psd_deflection.base.errors import UsageError
 from psd_deflection.cli._options import given_as_option, in_the_world, whole, world_option
 from psd_deflection.cli._report import columns, save
-from psd_deflection.config import Rig, replace_values
-from psd_deflection.discovery.experiment import Limits
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.planning import Plan
-from psd_deflection.errors import UsageError
-from psd_deflection.recordings.observations import read_observation
-from psd_deflection.recordings.simulated_run import SimulatedRun
-from psd_deflection.recordings.sinks import open_sink
+from psd_deflection.model.simulation.effect_words import with_effects
+from psd_deflection.recordings.replay.simulated_run import SimulatedRun
+from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import AppliedLoad, Record, TemperatureReading
-from psd_deflection.simulation.effect_words import with_effects
+from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.studies.discover.experiment import Limits
+from psd_deflection.studies.discover.from_recordings import read_observation
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.planning import Plan
 
 SCRIPT, LISTED = 'next_loads.csv', 'next.yaml'
 HELP = """\

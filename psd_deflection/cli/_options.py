@@ -12,12 +12,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from psd_deflection.config import Rig, replace_values, rig_from_values
-from psd_deflection.declarations import BY_NAME
-from psd_deflection.errors import ConfigError, RecordingError, UsageError
-from psd_deflection.fleet.parquet import ENDING, is_parquet
-from psd_deflection.foreign_yaml import YamlError, parse_yaml
-from psd_deflection.parameter_files import read_parameter_file
+from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
+from psd_deflection.base.foreign_yaml import YamlError, parse_yaml
+from psd_deflection.rig.config import Rig, replace_values, rig_from_values
+from psd_deflection.rig.declarations import BY_NAME
+from psd_deflection.rig.parameter_files import read_parameter_file
+from psd_deflection.run.fleet.parquet import ENDING, is_parquet
 
 _FOREIGN = """
 .7z .arrow .avi .bag .bmp .bz2 .db .db3 .eps .feather .gif .gz .h5 .hdf .hdf5 .htm .html .jpeg .jpg .json .jsonl .log

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-import psd_deflection.monitor
+import psd_deflection.run.monitor
 from psd_deflection import __version__
-from psd_deflection.config import Rig
 from psd_deflection.records import AppliedLoad, FloatArray, ReferencePose, dot_names
+from psd_deflection.rig.config import Rig
 
-PAGE = Path(psd_deflection.monitor.__file__).parent / 'page'
+PAGE = Path(psd_deflection.run.monitor.__file__).parent / 'page'
 
 KEYS = {
     'shift': (('ΔX', 'dx', 1, True), ('ΔY', 'dy', 4, True)),

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.errors import RecordingError, printable
-from psd_deflection.files import replace_file
+from psd_deflection.base.errors import RecordingError, printable
+from psd_deflection.base.files import replace_file
 
 LONGEST_LINE = 2000
 """Characters of a line with words of a file or of a device in it."""

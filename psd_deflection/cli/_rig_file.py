@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli._report import warn
-from psd_deflection.errors import ConfigError
-from psd_deflection.parameter_files import parameter_text
+from psd_deflection.rig.parameter_files import parameter_text
 
 
 def rig_file(params_file: str | None, name: str, described: Callable[[], str], edit: Callable[[str, Path], str]) -> str:

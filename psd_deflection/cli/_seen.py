@@ -6,12 +6,12 @@ import argparse
 
 from psd_deflection.cli._progress import progress_of
 from psd_deflection.cli._report import warn
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.read.references import TrustedSamples, read_run
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.references import Run, read_run
-from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end
+from psd_deflection.recordings.replay.engine import nominal_rig, rig_at_end
+from psd_deflection.rig.config import Rig, load_rig
 
 
 def opened(args: argparse.Namespace) -> tuple[Recording, Rig]:
@@ -26,7 +26,7 @@ def opened(args: argparse.Namespace) -> tuple[Recording, Rig]:
     return recording.with_block_size(rig.estimator.block_size), rig
 
 
-def seen_in(recording: Recording, rig: Rig, *, quiet: bool) -> Run:
+def seen_in(recording: Recording, rig: Rig, *, quiet: bool) -> TrustedSamples:
     """Its trusted samples, with a progress bar unless ``quiet``. Raises RecordingError if there are none."""
     with progress_of(recording.blocks(), quiet=quiet) as bar:
         return read_run(recording, Pipeline(rig), bar)

@@ -14,7 +14,7 @@ import importlib.util
 from collections.abc import Sequence
 from typing import Any
 
-from psd_deflection.errors import ConfigError
+from psd_deflection.base.errors import ConfigError
 
 SHELLS = ('bash', 'zsh', 'tcsh')
 

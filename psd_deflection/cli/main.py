@@ -19,10 +19,10 @@ import sys
 import textwrap
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
+from types import ModuleType
 
 from psd_deflection import __version__
-from psd_deflection.cli._report import LONGEST_LINE
-from psd_deflection.errors import (
+from psd_deflection.base.errors import (
     EXIT_STATUSES,
     INTERRUPTED,
     MachineError,
@@ -33,6 +33,7 @@ from psd_deflection.errors import (
     did_you_mean,
     printable,
 )
+from psd_deflection.cli._report import LONGEST_LINE
 
 # Our matrices are small, or tall and narrow: more threads spin more than they compute. Before numpy is imported.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
@@ -67,7 +68,10 @@ COMMANDS: dict[str, str] = {
     'params': 'list every parameter with unit, bounds and default',
     'completion': 'print a completion script for bash, zsh or tcsh',
 }
-"""Command name to one-line summary; the module is ``psd_deflection.cli.NAME`` (``-`` as ``_``)."""
+"""Command name to one-line summary; the module is ``NAME.py`` (``-`` as ``_``) in ``cli`` or one of ``FOLDERS``."""
+
+FOLDERS = ('run', 'recordings', 'studies')
+"""Where commands lie, beside ``cli`` itself."""
 
 ROS_OPTIONS = ('-p', '--param', '-r', '--remap')
 """What ROS 2 takes behind --ros-args and people type without it."""
@@ -121,15 +125,28 @@ def make_parser(chosen: Collection[str], value: type[argparse.Action] | None = N
         if value is not None:
             sub.register('action', None, value)
         if name in chosen:
-            module = importlib.import_module('psd_deflection.cli.' + name.replace('-', '_'))
+            module = module_of(name)
             sub.description = module.__doc__
             module.add_arguments(sub)
             sub.set_defaults(run=module.run, refuse=sub.error)
     return parser
 
 
+def module_of(name: str) -> ModuleType:
+    """The module of a command: in one of the folders, or beside this file."""
+    file = name.replace('-', '_')
+    for folder in FOLDERS:
+        path = f'psd_deflection.cli.{folder}.{file}'
+        try:
+            return importlib.import_module(path)
+        except ModuleNotFoundError as error:
+            if error.name != path:
+                raise
+    return importlib.import_module(f'psd_deflection.cli.{file}')
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status (``psd_deflection.errors`` lists them)."""
+    """Run one command; returns the exit status (``psd_deflection.base.errors`` lists them)."""
     status = 0
     if sys.stderr is None:
         # `2>&-`: print() would write messages for the standard error to stdout.

@@ -12,9 +12,9 @@ from __future__ import annotations
 import argparse
 
 from psd_deflection.cli._report import print_json, show
-from psd_deflection.config import load_rig
-from psd_deflection.declarations import PARAMETERS
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.rig.config import load_rig
+from psd_deflection.rig.declarations import PARAMETERS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from psd_deflection import __version__
-from psd_deflection.config import Rig
+from psd_deflection.base.errors import DeviceError
 from psd_deflection.devices.device import (
     OUTPUT_LIMIT,
     WIRE_BITS,
@@ -25,10 +25,7 @@ from psd_deflection.devices.device import (
 )
 from psd_deflection.devices.port_search import candidate_ports, is_pattern, matching
 from psd_deflection.devices.port_source import PortSource
-from psd_deflection.devices.serial_port import SerialPort
-from psd_deflection.devices.source import REOPEN_S, Event, Received
-from psd_deflection.errors import DeviceError
-from psd_deflection.protocol.frames import (
+from psd_deflection.devices.protocol.frames import (
     PROTOCOL_VERSION,
     BadFrame,
     FrameDecoder,
@@ -42,7 +39,10 @@ from psd_deflection.protocol.frames import (
     StopFrame,
     encode,
 )
+from psd_deflection.devices.serial_port import SerialPort
+from psd_deflection.devices.source import REOPEN_S, Event, Received
 from psd_deflection.records import FLAG_DEVICE_DROPPED, FLAG_OVER_RANGE, MOST_PSDS, channel_names
+from psd_deflection.rig.config import Rig
 
 if TYPE_CHECKING:
     from psd_deflection.devices.rig_feed import RigFeed

@@ -1,7 +1,7 @@
 """DATAQ DI-1110, DI-2108 and DI-4108 in CDC mode: converters with a command line, no framing.
 
 Limits compared with our own frames, which ``describe`` reports too: the device neither numbers its samples
-nor sends times. A torn scan is detected by the marker channel (``protocol.dataq``) and counted; the loss of
+nor sends times. A torn scan is detected by the marker channel (``devices.protocol.dataq``) and counted; the loss of
 whole scans cannot be detected. Times are scan counts regressed on the host's clock.
 """
 
@@ -14,13 +14,10 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from psd_deflection import __version__
-from psd_deflection.config import Rig
+from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.devices.device import OUTPUT_LIMIT, Answer, Device, PowerUp, Probe
 from psd_deflection.devices.port_source import PortSource
-from psd_deflection.devices.serial_port import SerialPort
-from psd_deflection.devices.source import Clock, Event, PortClosedError, Received, Sample
-from psd_deflection.errors import ConfigError, DeviceError
-from psd_deflection.protocol.dataq import (
+from psd_deflection.devices.protocol.dataq import (
     ANALOG,
     CLOCK_HZ,
     COUNTER,
@@ -35,8 +32,11 @@ from psd_deflection.protocol.dataq import (
     plan_rate,
     scan_list,
 )
-from psd_deflection.protocol.frames import PROTOCOL_VERSION, BadFrame, HelloFrame
+from psd_deflection.devices.protocol.frames import PROTOCOL_VERSION, BadFrame, HelloFrame
+from psd_deflection.devices.serial_port import SerialPort
+from psd_deflection.devices.source import Clock, Event, PortClosedError, Received, Sample
 from psd_deflection.records import CHANNELS, FLAG_OVER_RANGE
+from psd_deflection.rig.config import Rig
 
 if TYPE_CHECKING:
     from psd_deflection.devices.rig_feed import RigFeed

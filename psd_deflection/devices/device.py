@@ -11,13 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
-from psd_deflection.declarations import LEAST_BITS, MOST_BITS
-from psd_deflection.protocol.text_lines import positive
+from psd_deflection.devices.protocol.text_lines import positive
+from psd_deflection.rig.declarations import LEAST_BITS, MOST_BITS
 
 if TYPE_CHECKING:
-    from psd_deflection.config import Rig
     from psd_deflection.devices.rig_feed import RigFeed
     from psd_deflection.devices.source import Source
+    from psd_deflection.rig.config import Rig
 
 PSDS = 'psds'
 """Key of a HELLO: the number of PSDs, 2 if it is absent."""

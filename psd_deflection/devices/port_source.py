@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from psd_deflection.base.errors import DeviceError
 from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import Source
-from psd_deflection.errors import DeviceError
 
 
 class PortSource(Source):

@@ -8,7 +8,7 @@ import tty
 from collections.abc import Iterator
 from pathlib import Path
 
-from psd_deflection.errors import ConfigError
+from psd_deflection.base.errors import ConfigError
 
 PORT_LINE = 'port: '
 """Start of the line in which a program that serves a simulated device prints its port."""

@@ -16,10 +16,10 @@ from collections.abc import Iterator
 from importlib.metadata import entry_points
 from types import MappingProxyType
 
-from psd_deflection.config import Rig
+from psd_deflection.base.errors import ConfigError, did_you_mean
 from psd_deflection.devices.device import Device
 from psd_deflection.devices.source import Source
-from psd_deflection.errors import ConfigError, did_you_mean
+from psd_deflection.rig.config import Rig
 
 GROUP = 'psd_deflection.sources'
 

@@ -12,14 +12,14 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from psd_deflection.config import Rig
+from psd_deflection.base.errors import ConfigError, DeviceError, RecordingError
 from psd_deflection.devices.device import PSDS, Device, described_psds
+from psd_deflection.devices.protocol.frames import PROTOCOL_VERSION, HelloFrame
 from psd_deflection.devices.source import Clock, Event, Received, Sample, Source, SourceEndedError
-from psd_deflection.errors import ConfigError, DeviceError, RecordingError
-from psd_deflection.protocol.frames import PROTOCOL_VERSION, HelloFrame
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import MOST_PSDS, SampleBlock, channel_names
+from psd_deflection.rig.config import Rig
 
 RATE_TOLERANCE = 2e-3
 """A recorded rate comes from stamps and is not round. If it differs by less than this, the rig's rate is used."""

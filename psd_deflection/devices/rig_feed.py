@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from psd_deflection.calibration import Wiring
-from psd_deflection.config import Rig
+from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.simulator import RigSimulator
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.wiring import Wiring
 
 BATCH = 50
 

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import serial
 
+from psd_deflection.base.errors import DeviceError
 from psd_deflection.devices.source import PortClosedError
-from psd_deflection.errors import DeviceError
 
 READ_SIZE = 4096
 MAX_EMPTY_READS = 1000

@@ -19,14 +19,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from psd_deflection.config import Rig, rig_from_values
+from psd_deflection.base.errors import ConfigError, PsdDeflectionError
 from psd_deflection.devices.device import OUTPUT_LIMIT, LineDevice, PowerUp
 from psd_deflection.devices.pseudo_terminal import PORT_LINE, PseudoTerminal, link_names, open_terminals
 from psd_deflection.devices.registry import SIMULATED, find_device
 from psd_deflection.devices.rig_feed import RigFeed
-from psd_deflection.errors import ConfigError, PsdDeflectionError
+from psd_deflection.model.simulation.loads import CyclicLoads, thesis_load_cases
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.loads import CyclicLoads, thesis_load_cases
+from psd_deflection.rig.config import Rig, rig_from_values
 
 CATCH_UP_NS = 20_000_000
 

@@ -19,8 +19,8 @@ from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import NamedTuple
 
-from psd_deflection.errors import DeviceError
-from psd_deflection.protocol.frames import BadFrame, Frame, HelloFrame
+from psd_deflection.base.errors import DeviceError
+from psd_deflection.devices.protocol.frames import BadFrame, Frame, HelloFrame
 
 
 class Clock(Enum):
@@ -44,7 +44,7 @@ class Clock(Enum):
 class Sample(NamedTuple):
     """One sample of a source that does not speak the frames of ``docs/protocol.md``.
 
-    ``flags``, ``seq``: as in ``protocol.frames.SampleFrame``. ``t``: in the unit of the source's
+    ``flags``, ``seq``: as in ``devices.protocol.frames.SampleFrame``. ``t``: in the unit of the source's
     :class:`Clock`. ``readings``: x1 y1 sum1 x2 y2 sum2 ...; volts if :attr:`Source.volts` is True, else
     converter counts (whole, of at most 32 bits).
     """

@@ -15,9 +15,9 @@ from typing import Any
 
 from serial.tools import list_ports
 
+from psd_deflection.base.errors import DeviceError
 from psd_deflection.devices.device import Answer, Device, Probe
 from psd_deflection.devices.serial_port import SerialPort
-from psd_deflection.errors import DeviceError
 
 COMMON_BAUD = 115_200
 ANSWER_S = 0.4

@@ -1,4 +1,5 @@
-"""Devices that send one line of text per sample (``protocol.text_lines``), such as an Arduino with a short sketch.
+"""Devices that send one line of text per sample (``devices.protocol.text_lines``), such as an Arduino with a short
+sketch.
 
 They number their samples and send their time, so losses are detected and times are the device's own.
 Limits compared with our own frames: without the checksum a corrupted digit goes unnoticed, the device accepts
@@ -15,8 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from psd_deflection import __version__
-from psd_deflection.calibration import Calibration
-from psd_deflection.config import Rig
+from psd_deflection.base.errors import DeviceError
 from psd_deflection.devices.device import (
     OUTPUT_LIMIT,
     Answer,
@@ -28,11 +28,8 @@ from psd_deflection.devices.device import (
     psds_of,
 )
 from psd_deflection.devices.port_source import PortSource
-from psd_deflection.devices.serial_port import SerialPort
-from psd_deflection.devices.source import Event, Received, Sample
-from psd_deflection.errors import DeviceError
-from psd_deflection.protocol.frames import PROTOCOL_VERSION, BadFrame, HelloFrame
-from psd_deflection.protocol.text_lines import (
+from psd_deflection.devices.protocol.frames import PROTOCOL_VERSION, BadFrame, HelloFrame
+from psd_deflection.devices.protocol.text_lines import (
     ELECTRODES,
     MAX_VOLTS,
     READINGS,
@@ -43,7 +40,11 @@ from psd_deflection.protocol.text_lines import (
     positive,
     with_check,
 )
+from psd_deflection.devices.serial_port import SerialPort
+from psd_deflection.devices.source import Event, Received, Sample
+from psd_deflection.model.detector import VoltsToDots
 from psd_deflection.records import FLAG_OVER_RANGE, MOST_PSDS, channel_names
+from psd_deflection.rig.config import Rig
 
 if TYPE_CHECKING:
     from psd_deflection.devices.rig_feed import RigFeed
@@ -59,7 +60,7 @@ class TextLines(PortSource):
         super().__init__(rig.acquisition.port)
         self._rig = rig
         self._baud = rig.acquisition.baud
-        self._electrodes: Calibration | None = None
+        self._electrodes: VoltsToDots | None = None
         self._scale: float | None = None
         self._decoder = LineDecoder()
         self._time = TimeExtender()
@@ -137,7 +138,7 @@ class TextLines(PortSource):
         self._scale = positive(info.get('volts_per_count'))
         electrodes = info.get('electrodes') is True
         self.volts = self._scale is None or electrodes
-        self._electrodes = Calibration.from_rig(self._rig) if electrodes else None
+        self._electrodes = VoltsToDots.from_rig(self._rig) if electrodes else None
 
     def _sample(self, line: Line) -> Event:
         readings = line.readings
@@ -156,7 +157,7 @@ class TextLines(PortSource):
         counts = tuple(int(r) for r in readings)
         return Sample(self._flags(readings), line.seq, self._time.extend(line), counts)
 
-    def _of_electrodes(self, line: Line, calibration: Calibration) -> Event:
+    def _of_electrodes(self, line: Line, calibration: VoltsToDots) -> Event:
         electrodes = np.array([line.readings]) * (self._scale or 1.0)
         if np.abs(electrodes).max() > MAX_VOLTS:
             return BadFrame('a reading is out of all bounds', 0)

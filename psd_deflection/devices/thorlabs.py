@@ -17,12 +17,9 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from psd_deflection.config import Rig
+from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.devices.device import OUTPUT_LIMIT, Answer, Device, PowerUp, Probe
-from psd_deflection.devices.serial_port import SerialPort
-from psd_deflection.devices.source import Clock, Event, Received, Sample, Source
-from psd_deflection.errors import ConfigError, DeviceError
-from psd_deflection.protocol.apt import (
+from psd_deflection.devices.protocol.apt import (
     DEVICE_ADDRESS,
     FULL_SCALE,
     HOST_ADDRESS,
@@ -32,12 +29,15 @@ from psd_deflection.protocol.apt import (
     AptDecoder,
     AptMessage,
     HardwareInfo,
-    Readings,
+    QuadrantReadings,
     encode_info,
     encode_readings,
 )
-from psd_deflection.protocol.frames import PROTOCOL_VERSION, BadFrame, HelloFrame
+from psd_deflection.devices.protocol.frames import PROTOCOL_VERSION, BadFrame, HelloFrame
+from psd_deflection.devices.serial_port import SerialPort
+from psd_deflection.devices.source import Clock, Event, Received, Sample, Source
 from psd_deflection.records import CHANNELS
+from psd_deflection.rig.config import Rig
 
 if TYPE_CHECKING:
     from psd_deflection.devices.rig_feed import RigFeed
@@ -142,14 +142,14 @@ class ThorlabsPair(Source):
             raise DeviceError(f'{self.name}: {good} of {TRIAL} readings were answered; are the cables good?')
         return good / ((time.monotonic_ns() - started) * 1e-9)
 
-    def _ask(self, events: list[Event]) -> tuple[Readings | None, Readings | None, int, int]:
+    def _ask(self, events: list[Event]) -> tuple[QuadrantReadings | None, QuadrantReadings | None, int, int]:
         """Return both readings, the time half-way and the number of bytes; malformed data go to ``events``."""
         asked = time.monotonic_ns()
         for port, decoder in zip(self._ports, self._decoders, strict=True):
             port.discard_input()
             decoder.reset()
             port.write(READINGS_REQUEST)
-        found: list[Readings | None] = [None, None]
+        found: list[QuadrantReadings | None] = [None, None]
         size = 0
         deadline = asked + round(ANSWER_S * 1e9)
         while None in found and (left := deadline - time.monotonic_ns()) > 0:
@@ -227,10 +227,10 @@ class ThorlabsPair(Source):
         }
 
 
-def _reading(messages: list[AptMessage], events: list[Event]) -> Readings | None:
+def _reading(messages: list[AptMessage], events: list[Event]) -> QuadrantReadings | None:
     found = None
     for message in messages:
-        if isinstance(message, Readings):
+        if isinstance(message, QuadrantReadings):
             found = message
         elif isinstance(message, BadFrame):
             events.append(message)

@@ -11,7 +11,7 @@ import itertools
 
 import numpy as np
 
-from psd_deflection.arithmetic import FIXED, Arithmetic
+from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.records import FloatArray, RawChunk, SampleBlock
 
 
@@ -93,7 +93,7 @@ def block_middle_ns(block: SampleBlock, block_size: int, period_ns: float) -> in
 
     Each sample gives an estimate of the time of slot (N-1)/2. The result is their mean, so a lost
     sample moves the stamp by no more than the clock's jitter. The mean of the remaining samples belongs to
-    another time: :mod:`psd_deflection.uncertainty.block_fit` gives the value at the stamp.
+    another time: :mod:`psd_deflection.measure.uncertainty.block_fit` gives the value at the stamp.
     """
     first = int(block.t_ns[0])
     slots = block.seq - block.index * block_size

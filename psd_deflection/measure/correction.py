@@ -14,16 +14,16 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from psd_deflection.arithmetic import ARITHMETICS
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError
-from psd_deflection.geometry.plate import flat_poses
+from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.plate.plate import flat_poses
+from psd_deflection.model.simulation.catalogue import effects_of_rig
+from psd_deflection.model.simulation.declaration import ActiveEffect, Reading, Use, Values
+from psd_deflection.model.simulation.optics import dots_on_plate
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import effects_of_rig
-from psd_deflection.simulation.declaration import ActiveEffect, Reading, Use, Values
-from psd_deflection.simulation.optics import dots_on_plate
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.samples import SimulatedSamples
+from psd_deflection.rig.config import Rig
 
 PASSES = 3
 """Fixed-point passes for the pose; each reduces the error by the relative size of the effect (< 1

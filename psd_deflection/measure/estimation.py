@@ -14,22 +14,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.arithmetic import ARITHMETICS, Arithmetic
-from psd_deflection.calibration import dot_noise_variances
-from psd_deflection.calibration.health import FROZEN_BLOCKS, OpticsHealth, Verdict
-from psd_deflection.config import Rig
-from psd_deflection.geometry import Geometry
-from psd_deflection.misalignment.spread import ParameterSpread
+from psd_deflection.base.arithmetic import ARITHMETICS, Arithmetic
+from psd_deflection.measure.health import FROZEN_BLOCKS, OpticsHealth, Verdict
+from psd_deflection.measure.uncertainty.consistency import ConsistencyCheck, widened
+from psd_deflection.measure.uncertainty.stamped import SomePsds, StampedDots
+from psd_deflection.model.detector import dot_noise_variances
+from psd_deflection.model.misalignment.spread import ParameterSpread
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.solvers import solver_from_rig
+from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.model.solvers.one_psd import NAME as ONE_PSD
+from psd_deflection.model.solvers.one_psd import OnePsd
+from psd_deflection.model.solvers.registry import psds_at_base, solver_class
+from psd_deflection.model.solvers.some_psds import solver_of_some
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, IntArray
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.solvers import solver_from_rig
-from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
-from psd_deflection.solvers.one_psd import NAME as ONE_PSD
-from psd_deflection.solvers.one_psd import OnePsd
-from psd_deflection.solvers.registry import psds_at_base, solver_class
-from psd_deflection.solvers.some_psds import solver_of_some
-from psd_deflection.uncertainty.consistency import Checked, widened
-from psd_deflection.uncertainty.stamped import SomePsds, StampedDots
+from psd_deflection.rig.config import Rig
 
 Dots = tuple[float, ...]
 Failure = tuple[BlockStatus, str]
@@ -62,7 +62,7 @@ class HeldTwist(NamedTuple):
     variance: float
 
 
-class Readings(NamedTuple):
+class BlockReadings(NamedTuple):
     """What a block is solved from.
 
     ``dots`` (C,) m; ``variances`` (C,) m^2; ``spread`` (C, C) m^2 of the dots, None if ``variances`` are all of it.
@@ -76,12 +76,12 @@ class Readings(NamedTuple):
     spread: FloatArray | None = None
     kept: tuple[int, ...] | None = None
     some: SomePsds | None = None
-    checked: Checked | None = None
+    checked: ConsistencyCheck | None = None
     factor: FloatArray | None = None
     wrong: int = 0
 
 
-class Answer(NamedTuple):
+class BlockSolution(NamedTuple):
     """What the primary solver makes of a block.
 
     ``dots`` (2P,) m: the block's value at its stamp. ``used``: what the estimate is made from; None if it comes from
@@ -89,7 +89,7 @@ class Answer(NamedTuple):
     """
 
     dots: Dots
-    used: Readings | None = None
+    used: BlockReadings | None = None
     estimate: DeflectionEstimate | None = None
     failure: Failure | None = None
 
@@ -147,48 +147,48 @@ class Estimation:
         """Variances (2P,), m^2, of the dots of a whole block of ``size`` samples at rest."""
         return self.stamped.mean_variances(size) if self.stamped.flat else self.variances[-1]
 
-    def solve(self, block: SeenBlock) -> Answer:
+    def solve(self, block: SeenBlock) -> BlockSolution:
         """The primary solver's estimate of a block whose verdict is OK or names sound detectors."""
         verdict = block.verdict
-        whole = Readings(block.means, self._variances_of(block))
+        whole = BlockReadings(block.means, self._variances_of(block))
         if verdict.status is BlockStatus.OK:
             if self.stamped.active:
                 fitted = self.stamped.fit(block.slots, block.samples)
                 whole = whole._replace(dots=fitted.dots, spread=self._spread_of(block, fitted.covariance))
             return self._agreed(block, whole, whole)
         if not verdict.sound:
-            return Answer(whole.dots)
+            return BlockSolution(whole.dots)
         if self._rig.estimator.covariance != 'file' and self.stamped.flat:
             whole = whole._replace(variances=self.stamped.mean_variances(len(block.slots)))
         others = self._some(verdict.sound, block, whole) if len(verdict.sound) > 1 else None
         if others is not None:
             return self._agreed(block, whole, others)
         if len(verdict.sound) == 1:
-            return Answer(whole.dots, None, self._from_one(verdict.sound[0], block, whole))
-        return Answer(whole.dots)
+            return BlockSolution(whole.dots, None, self._from_one(verdict.sound[0], block, whole))
+        return BlockSolution(whole.dots)
 
-    def others(self, block: SeenBlock, used: Readings) -> Iterator[DeflectionEstimate]:
+    def others(self, block: SeenBlock, used: BlockReadings) -> Iterator[DeflectionEstimate]:
         """The estimates of the other solvers."""
         for number in range(1, len(self._solvers)):
             solution, _ = self._solve(number, used)
             if solution is not None:
                 yield self._estimate(number, block, solution, used)
 
-    def left_out(self, used: Readings | None) -> tuple[int, ...]:
+    def left_out(self, used: BlockReadings | None) -> tuple[int, ...]:
         """The PSDs (from 1) without which a block was solved."""
         if used is None or used.kept is None:
             return ()
         return tuple(n for n in range(1, len(self._rig.psds) + 1) if n - 1 not in used.kept)
 
-    def _agreed(self, block: SeenBlock, whole: Readings, readings: Readings) -> Answer:
+    def _agreed(self, block: SeenBlock, whole: BlockReadings, readings: BlockReadings) -> BlockSolution:
         """The answer from ``readings``, without the PSD that contradicts the others if it can be told.
 
         ``whole``: the readings of all PSDs.
         """
         before = tuple(range(len(self._rig.psds))) if readings.kept is None else readings.kept
-        taken: dict[int, Readings | None] = {}
+        taken: dict[int, BlockReadings | None] = {}
 
-        def without(psd: int) -> Readings | None:
+        def without(psd: int) -> BlockReadings | None:
             # Once a block: a fit remembers the motion that it saw.
             if psd not in taken:
                 taken[psd] = self._some(tuple(p for p in before if p != psd), block, whole)
@@ -214,9 +214,9 @@ class Estimation:
         used, estimate, failure = found
         if estimate is not None:
             self.held = HeldTwist(block.t_ns, estimate.theta, estimate.variances[2])
-        return Answer(whole.dots, used, estimate, failure)
+        return BlockSolution(whole.dots, used, estimate, failure)
 
-    def _agree(self, readings: Readings) -> bool:
+    def _agree(self, readings: BlockReadings) -> bool:
         """Whether the readings of some PSDs agree with each other."""
         solution, _ = self._solve(0, readings)
         if solution is None or readings.some is None:
@@ -224,7 +224,7 @@ class Estimation:
         spread = np.diag(readings.variances) if readings.spread is None else readings.spread
         return self.stamped.agree(readings.some, readings.dots, solution.residual, spread, solution[:5])
 
-    def _some(self, kept: tuple[int, ...], block: SeenBlock, whole: Readings) -> Readings | None:
+    def _some(self, kept: tuple[int, ...], block: SeenBlock, whole: BlockReadings) -> BlockReadings | None:
         """The readings of the PSDs ``kept`` (from 0) alone; None if the primary method cannot do with them."""
         solver = self._solver(0, kept)
         if solver is None:
@@ -232,7 +232,7 @@ class Estimation:
         some = self.stamped.some(kept, solver.tilts)
         at = some.columns
         dots = tuple(whole.dots[i] for i in at)
-        readings = Readings(dots, tuple(whole.variances[i] for i in at), kept=kept, some=some)
+        readings = BlockReadings(dots, tuple(whole.variances[i] for i in at), kept=kept, some=some)
         if not self.stamped.active:
             return readings
         fitted = self.stamped.fit_some(some, block.slots, block.samples)
@@ -249,8 +249,8 @@ class Estimation:
         return self._some_solvers[key]
 
     def _primary(
-        self, block: SeenBlock, readings: Readings, agree_without: Callable[[int], bool] | None = None
-    ) -> tuple[Readings, DeflectionEstimate | None, Failure | None]:
+        self, block: SeenBlock, readings: BlockReadings, agree_without: Callable[[int], bool] | None = None
+    ) -> tuple[BlockReadings, DeflectionEstimate | None, Failure | None]:
         """The readings with their check, the primary solver's estimate, and why there is none.
 
         ``agree_without``: as :meth:`StampedDots.check` has it.
@@ -259,7 +259,7 @@ class Estimation:
         if solution is None:
             return readings, None, (BlockStatus.NOT_SOLVED, failure)
         factor = None if self.spread is None else self.spread.factor(solution.dx, solution.dy, solution.theta)
-        checked: Checked | None = None
+        checked: ConsistencyCheck | None = None
         if self.stamped.flat:
             allowed = np.diag(readings.variances) if readings.spread is None else readings.spread
             if factor is not None:
@@ -274,7 +274,7 @@ class Estimation:
             return readings, None, (BlockStatus.INCONSISTENT, reason)
         return readings, self._estimate(0, block, solution, readings), None
 
-    def _solve(self, number: int, readings: Readings) -> tuple[Solution | None, str]:
+    def _solve(self, number: int, readings: BlockReadings) -> tuple[Solution | None, str]:
         """The answer of solver ``number``, or None and the reason."""
         name = self._solvers[number][0]
         solver = self._solver(number, readings.kept)
@@ -285,7 +285,7 @@ class Estimation:
             return None, f'{name}: {s.status.name.lower().replace("_", " ")}'
         return s, ''
 
-    def _estimate(self, number: int, block: SeenBlock, s: Solution, readings: Readings) -> DeflectionEstimate:
+    def _estimate(self, number: int, block: SeenBlock, s: Solution, readings: BlockReadings) -> DeflectionEstimate:
         """An answer with its covariance."""
         name, _, primary = self._solvers[number]
         solver = self._solver(number, readings.kept)
@@ -338,7 +338,7 @@ class Estimation:
         more = 4.0 if block.verdict.half_light else 1.0
         return tuple(more * v + b for v, b in zip(variances, background, strict=True))
 
-    def _from_one(self, psd: int, block: SeenBlock, readings: Readings) -> DeflectionEstimate | None:
+    def _from_one(self, psd: int, block: SeenBlock, readings: BlockReadings) -> DeflectionEstimate | None:
         """The translation from the remaining detector ``psd`` (from 0), by the rule that ``degraded`` names."""
         config = self._rig.estimator
         by = self._by

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.arithmetic import ARITHMETICS
-from psd_deflection.config import Rig
+from psd_deflection.base.arithmetic import ARITHMETICS
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, FloatArray, SampleBlock, channel_names, dot_names
+from psd_deflection.rig.config import Rig
 
 FROZEN_BLOCKS = 5
 """Blocks in a row in which x, y and sum do not change by one bit, which noise would prevent."""

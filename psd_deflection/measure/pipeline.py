@@ -18,16 +18,19 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.arithmetic import ARITHMETICS
-from psd_deflection.averaging import BlockCutter, block_middle_ns, covariance
-from psd_deflection.calibration import Calibration, counts_to_volts
-from psd_deflection.calibration.health import OpticsHealth
-from psd_deflection.config import Rig, replace_values
-from psd_deflection.correction import Correction
-from psd_deflection.declarations import ZEROS
-from psd_deflection.errors import ConfigError
-from psd_deflection.estimation import Answer, Dots, Estimation, HeldTwist, SeenBlock
-from psd_deflection.filtering.motion import INERTIA, STATE, ModalFilter, joined_ns, split_ns
+from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.measure.averaging import BlockCutter, block_middle_ns, covariance
+from psd_deflection.measure.correction import Correction
+from psd_deflection.measure.estimation import BlockSolution, Dots, Estimation, HeldTwist, SeenBlock
+from psd_deflection.measure.health import OpticsHealth
+from psd_deflection.measure.motion.motion import INERTIA, STATE, ModalFilter, joined_ns, split_ns
+from psd_deflection.measure.uncertainty.rest import why_moving
+from psd_deflection.measure.uncertainty.stamped import FIT, HELD_RESIDUAL, NOISE, REDUNDANCY, SOME
+from psd_deflection.model.detector import VoltsToDots, counts_to_volts
+from psd_deflection.model.simulation.catalogue import effects_of_rig
+from psd_deflection.model.simulation.tip_load import TipLoads
+from psd_deflection.model.solvers.interface import SolverStatus
 from psd_deflection.records import (
     ENVIRONMENT,
     KNOWN_LOAD,
@@ -46,11 +49,8 @@ from psd_deflection.records import (
     TipLoad,
     TipMotion,
 )
-from psd_deflection.simulation.catalogue import effects_of_rig
-from psd_deflection.simulation.tip_load import TipLoads
-from psd_deflection.solvers.interface import SolverStatus
-from psd_deflection.uncertainty.rest import why_moving
-from psd_deflection.uncertainty.stamped import FIT, HELD_RESIDUAL, NOISE, REDUNDANCY, SOME
+from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.rig.declarations import ZEROS
 
 ZERO_BLOCKS = 25
 """Number of blocks that :meth:`Pipeline.zero` averages: half a second."""
@@ -115,7 +115,7 @@ class Pipeline:
 
     def _take(self, rig: Rig) -> None:
         self.rig = rig
-        self._calibration = Calibration.from_rig(rig)
+        self._calibration = VoltsToDots.from_rig(rig)
         self._correction = Correction(rig, self._effects)
         self._optics = OpticsHealth(rig)
 
@@ -340,7 +340,7 @@ class Pipeline:
         t_ns = block_middle_ns(block, size, self._period_ns)
         slots = block.seq - block.index * size
         seen = SeenBlock(t_ns, block.index, slots, samples, means, sums, verdict, self._frozen)
-        answer = self.estimation.solve(seen) if status is BlockStatus.OK or verdict.sound else Answer(means)
+        answer = self.estimation.solve(seen) if status is BlockStatus.OK or verdict.sound else BlockSolution(means)
         used, best = answer.used, answer.estimate
         degraded = status is not BlockStatus.OK
         if answer.failure is not None:

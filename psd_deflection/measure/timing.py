@@ -4,7 +4,7 @@ Theory of operation. A byte cannot arrive before it was sent: host time minus de
 clocks' offset plus a delay. The delay is never negative and often far above its minimum. So only
 the smallest delay of each second of device time is kept (``WINDOW_S`` of them). The fitted line is
 the lower edge of these points: the edge of their lower convex hull that spans their middle.
-(``test/test_timing.py`` checks that stamps stay within 50 us of the true times.) Until there are
+(``test/measure/test_timing.py`` checks that stamps stay within 50 us of the true times.) Until there are
 ``FIT_AFTER_S`` points, a one-sided filter is used instead (Olson, "A passive solution to the sensor
 synchronization problem", IROS 2010). It takes the smallest delay so far, after raising each older
 one by the most that the clocks may have drifted apart since (``MAX_SKEW``). A clock that is off by more than

@@ -23,9 +23,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from psd_deflection.config import Rig
-from psd_deflection.declarations import ZEROS
-from psd_deflection.parameter_files import EFFECTS_PREFIX
 from psd_deflection.records import (
     AppliedLoad,
     BlockStatus,
@@ -36,6 +33,9 @@ from psd_deflection.records import (
     TipLoad,
     dot_names,
 )
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.declarations import ZEROS
+from psd_deflection.rig.parameter_files import EFFECTS_PREFIX
 
 WINDOW_S = 0.5
 LEARN = 4

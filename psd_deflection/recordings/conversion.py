@@ -9,12 +9,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from psd_deflection.config import Rig
-from psd_deflection.pipeline import Pipeline, PipelineCounters
+from psd_deflection.measure.pipeline import Pipeline, PipelineCounters
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.replay_engine import replayed
-from psd_deflection.recordings.sinks import is_csv, open_sink
+from psd_deflection.recordings.replay.engine import replayed
+from psd_deflection.recordings.write.sinks import is_csv, open_sink
 from psd_deflection.records import AppliedLoad, ParameterChange, Record, ReferencePose, SampleBlock, TemperatureReading
+from psd_deflection.rig.config import Rig
 
 Convertible = SampleBlock | ParameterChange | AppliedLoad | ReferencePose | TemperatureReading
 

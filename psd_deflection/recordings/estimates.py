@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psd_deflection.base.tables import Column, Table, columns_of, html_table
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.tables import Column, Table, columns_of, html_table
 
 if TYPE_CHECKING:
     import pandas

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.averaging import BlockCutter
-from psd_deflection.errors import RecordingError, printable
+from psd_deflection.base.errors import RecordingError, printable
+from psd_deflection.base.tables import Column, Table, columns_of, html_table
+from psd_deflection.measure.averaging import BlockCutter
 from psd_deflection.recordings.estimates import EstimateSeries
-from psd_deflection.recordings.mcap_reader import RawMessage
+from psd_deflection.recordings.read.mcap_reader import RawMessage
 from psd_deflection.records import (
     RESTART,
     AppliedLoad,
@@ -31,7 +32,6 @@ from psd_deflection.records import (
     TemperatureReading,
     channel_names,
 )
-from psd_deflection.tables import Column, Table, columns_of, html_table
 
 if TYPE_CHECKING:
     import pandas
@@ -56,7 +56,7 @@ class Recording(abc.ABC):
 
     ``path``: what was opened. ``parameters``: the flat parameter set it was made with, {} if it holds
     none. ``hello``: the device's, or None. ``version``: of the software that recorded, or ''.
-    ``made_with``: what computed it (:func:`psd_deflection.provenance.provenance`), {} if it does not say.
+    ``made_with``: what computed it (:func:`psd_deflection.recordings.provenance.provenance`), {} if it does not say.
     ``node``: full name of the ROS node that recorded itself, or ''.
     ``rig_from_messages``: whether these come from messages, because the file lacks our metadata.
     ``changes``: of parameters during the run, in order. ``restarts``: of the device, each as the last sample

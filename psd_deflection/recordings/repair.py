@@ -17,11 +17,13 @@ from mcap.records import Channel, McapRecord, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from psd_deflection import __version__
-from psd_deflection.errors import RecordingError
-from psd_deflection.files import HeldFolder
-from psd_deflection.foreign_yaml import YamlError, parse_yaml
-from psd_deflection.recordings.allowance import DamagedError
-from psd_deflection.recordings.bag_metadata import (
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.files import HeldFolder
+from psd_deflection.base.foreign_yaml import YamlError, parse_yaml
+from psd_deflection.recordings.read.allowance import DamagedError
+from psd_deflection.recordings.read.bag_reader import files_in, read_information
+from psd_deflection.recordings.read.mcap_reader import MAGIC, McapReader
+from psd_deflection.recordings.write.bag_metadata import (
     DEFAULT_QOS,
     FileCount,
     Qos,
@@ -30,9 +32,7 @@ from psd_deflection.recordings.bag_metadata import (
     totals,
     write_metadata,
 )
-from psd_deflection.recordings.bag_reader import files_in, read_information
-from psd_deflection.recordings.bag_writer import CHUNK_NS, CUSTOM
-from psd_deflection.recordings.mcap_reader import MAGIC, McapReader
+from psd_deflection.recordings.write.bag_writer import CHUNK_NS, CUSTOM
 
 _MAX_QOS_TEXT = 10_000
 

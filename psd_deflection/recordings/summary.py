@@ -6,10 +6,10 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from msg_adapters import DEFLECTION, LOAD, SAMPLES
-from psd_deflection.config import left_as_in_the_thesis
-from psd_deflection.declarations import BY_NAME
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import SampleBlock
+from psd_deflection.rig.config import left_as_in_the_thesis
+from psd_deflection.rig.declarations import BY_NAME
 
 NO_PARAMETERS = 'parameters: the nominal rig is taken if no rig file is given'
 

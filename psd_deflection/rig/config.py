@@ -15,7 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.declarations import (
+from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.base.tables import html_table
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.declarations import (
     ACQUISITION,
     AMPLIFIER,
     BEAMS,
@@ -46,11 +49,8 @@ from psd_deflection.declarations import (
     MonitorConfig,
     PsdConfig,
 )
-from psd_deflection.errors import ConfigError, did_you_mean
-from psd_deflection.parameter_files import EFFECTS_PREFIX, read_parameter_file
-from psd_deflection.parameters import Parameter, Section, Value, check_value, shown
-from psd_deflection.records import FloatArray
-from psd_deflection.tables import html_table
+from psd_deflection.rig.parameter_files import EFFECTS_PREFIX, read_parameter_file
+from psd_deflection.rig.parameters import Parameter, Section, Value, check_value, shown
 
 _ORDERED = (
     ('link.inner_radius', 'less than', 'link.outer_radius'),

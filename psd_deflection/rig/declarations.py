@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.parameters import Parameter, Section, parameter
 from psd_deflection.records import MOST_PSDS
+from psd_deflection.rig.parameters import Parameter, Section, parameter
 
 FRAME_PREFIX = 'frame_prefix'
 SIMULATED = 'simulated'

@@ -1,6 +1,6 @@
 """Parameter files of ROS 2 (``/**: ros__parameters:``), read and edited without ROS.
 
-What a file says comes out as flat values (``link.length``); :mod:`psd_deflection.config` checks them.
+What a file says comes out as flat values (``link.length``); :mod:`psd_deflection.rig.config` checks them.
 """
 
 from __future__ import annotations
@@ -10,15 +10,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.errors import ConfigError, printable
-from psd_deflection.foreign_yaml import YamlError, edited, text_of_file, tree_of_text
+from psd_deflection.base.errors import ConfigError, printable
+from psd_deflection.base.foreign_yaml import YamlError, edited, text_of_file, tree_of_text
 
 MAX_KEYS = 10_000
 LONGEST_SOURCE = 4000
 """Characters of the line that says where values come from, with names of recordings in it."""
 
 EFFECTS_PREFIX = 'effects.'
-"""Keys below it describe simulated effects; ``psd_deflection.simulation`` checks them."""
+"""Keys below it describe simulated effects; ``psd_deflection.model.simulation`` checks them."""
 
 
 def read_parameter_file(path: str | Path, node_name: str = 'estimator') -> dict[str, object]:

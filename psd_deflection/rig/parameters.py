@@ -9,7 +9,7 @@ A field of a section declares one, once::
     LINK = Section(LinkConfig, 'link.')
 
 The parameter files, the command line, the node and the documentation read what the sections of
-:mod:`psd_deflection.declarations` declare. :func:`check_value` is the one place that validates a value.
+:mod:`psd_deflection.rig.declarations` declare. :func:`check_value` is the one place that validates a value.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any, Generic, Literal, TypeVar, cast
 
 import numpy as np
 
-from psd_deflection.errors import ConfigError
+from psd_deflection.base.errors import ConfigError
 
 Kind = Literal['double', 'integer', 'bool', 'string', 'double_array', 'string_array']
 Value = float | int | bool | str | list[float] | list[str]

@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.config import Rig
+from psd_deflection.rig.config import Rig
 
 Number = TypeVar('Number', np.float32, np.float64)
 

@@ -25,13 +25,13 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 
 from msg_adapters import DIAGNOSTICS, REFERENCE, REFERENCE_WITH_COVARIANCE, TOPIC_TYPES, to_messages
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.camera.answer import FrameAnswer, Status
+from psd_deflection.camera.footage import decoded, of_ros_image
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import settings_from
 from psd_deflection.camera.targets import target_of
-from psd_deflection.errors import ConfigError
-from psd_deflection.footage import decoded, of_ros_image
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport, Record, ReferencePose
 from psd_deflection.ros.wires import message_class, relative

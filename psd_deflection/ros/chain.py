@@ -24,22 +24,22 @@ from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters import DEFLECTION_WITH_COVARIANCE, DIAGNOSTICS, END_EFFECTOR, TOPIC_TYPES, to_messages
 from msg_adapters.pose_with_covariance_stamped import from_end_effector
-from psd_deflection.chains.chain_file import ChainFile
-from psd_deflection.chains.transform import Transform
-from psd_deflection.errors import PsdDeflectionError, Warned
+from psd_deflection.arms.chains.chain_file import ChainFile
+from psd_deflection.arms.chains.transform import Transform
+from psd_deflection.base.errors import PsdDeflectionError, Warned
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.names import BASE, END, END_REST, JOINT_STATES, RECORD, REST, TF, TF_STATIC, TIP, ZERO
 from psd_deflection.ros.running import SPIN_S, executor_of, ros
 from psd_deflection.ros.transforms import installed, static_transforms, transform_message
 from psd_deflection.ros.wires import InputRecorder, PublisherWire, message_class, qos, relative, topics_of
-from psd_deflection.runner.chain import ChainSession, Composed
-from psd_deflection.runner.diagnostics import ERROR, OK, WARN, HealthReporter
-from psd_deflection.runner.fanout import subscribed
-from psd_deflection.runner.realtime import Watchdog, settle
-from psd_deflection.runner.rig_publisher import RigPublisher
-from psd_deflection.runner.session import Session, why_no_zero, zero_text
-from psd_deflection.runner.signals import Signals, StopRequestedError
+from psd_deflection.run.chain import ChainSession, Composed
+from psd_deflection.run.diagnostics import ERROR, OK, WARN, HealthReporter
+from psd_deflection.run.fanout import subscribed
+from psd_deflection.run.realtime import Watchdog, settle
+from psd_deflection.run.rig_publisher import RigPublisher
+from psd_deflection.run.session import Session, why_no_zero, zero_text
+from psd_deflection.run.signals import Signals, StopRequestedError
 
 NODE_NAME = 'chain'
 _KIND = TOPIC_TYPES[DEFLECTION_WITH_COVARIANCE]

@@ -24,17 +24,17 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from msg_adapters import DEFLECTION_WITH_COVARIANCE, DIAGNOSTICS, END_EFFECTOR, TOPIC_TYPES, to_messages
-from psd_deflection.chains.transform import Transform
-from psd_deflection.compensation.arm import Arm
-from psd_deflection.compensation.compensator import Compensator, CompensatorSettings, Observed, State
-from psd_deflection.errors import Warned
+from psd_deflection.arms.chains.transform import Transform
+from psd_deflection.arms.compensation.arm import Arm
+from psd_deflection.arms.compensation.compensator import Compensator, CompensatorSettings, Observed, State
+from psd_deflection.base.errors import Warned
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.names import JOINT_STATES
 from psd_deflection.ros.running import SPIN_S, executor_of, ros
 from psd_deflection.ros.wires import message_class, qos, relative
-from psd_deflection.runner.diagnostics import ERROR, OK, WARN
-from psd_deflection.runner.repeats import Repeats
+from psd_deflection.run.diagnostics import ERROR, OK, WARN
+from psd_deflection.run.repeats import Repeats
 
 NODE_NAME = 'compensator'
 ENABLE = '~/enable'

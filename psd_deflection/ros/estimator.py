@@ -27,23 +27,23 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters import DEFLECTION, DIAGNOSTICS, to_messages
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError, Failed, PsdDeflectionError, Warned
-from psd_deflection.monitor.start import Views, start_views
+from psd_deflection.base.errors import ConfigError, Failed, PsdDeflectionError, Warned
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
+from psd_deflection.rig.config import Rig
 from psd_deflection.ros.log import NodeLog
 from psd_deflection.ros.names import RECORD, ZERO
 from psd_deflection.ros.parameters import LiveParameters
 from psd_deflection.ros.running import SPIN_S, executor_of, ros
 from psd_deflection.ros.transforms import TransformPublisher, installed
 from psd_deflection.ros.wires import InputRecorder, PublisherWire, VoltsPublisher, topics_of
-from psd_deflection.runner.diagnostics import STALE, HealthReporter
-from psd_deflection.runner.fanout import subscribed
-from psd_deflection.runner.realtime import Watchdog, settle
-from psd_deflection.runner.rig_publisher import RigPublisher
-from psd_deflection.runner.session import Session, why_no_zero, zero_text
-from psd_deflection.runner.signals import Signals, StopRequestedError
+from psd_deflection.run.diagnostics import STALE, HealthReporter
+from psd_deflection.run.fanout import subscribed
+from psd_deflection.run.monitor.start import Views, start_views
+from psd_deflection.run.realtime import Watchdog, settle
+from psd_deflection.run.rig_publisher import RigPublisher
+from psd_deflection.run.session import Session, why_no_zero, zero_text
+from psd_deflection.run.signals import Signals, StopRequestedError
 
 if TYPE_CHECKING:
     from psd_deflection.ros.markers import RigMarkers

@@ -20,7 +20,7 @@ from rclpy.logging import LoggingSeverity, get_logging_directory
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from psd_deflection.errors import Failed, Warned
+from psd_deflection.base.errors import Failed, Warned
 
 MOST_LINES = 1000
 """Lines that wait for a slow disk; further ones are not in the file."""

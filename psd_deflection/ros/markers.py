@@ -19,12 +19,12 @@ from rclpy.node import Node
 from visualization_msgs.msg import Marker, MarkerArray
 
 from msg_adapters.orientation import quaternion
-from psd_deflection.config import Rig
-from psd_deflection.geometry.scene import Vector, bend, tip_boxes
+from psd_deflection.model.plate.scene import Vector, bend, tip_boxes
 from psd_deflection.records import DeflectionEstimate, SpotMeans
+from psd_deflection.rig.config import Rig
 from psd_deflection.ros.names import BASE, MARKERS, MARKERS_AT_REST
 from psd_deflection.ros.wires import qos, relative
-from psd_deflection.runner.session import Session
+from psd_deflection.run.session import Session
 
 PERIOD_S = 0.1
 LIFETIME_S = 1.0

@@ -19,13 +19,13 @@ from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from psd_deflection.config import Rig, replace_values, rig_from_values
-from psd_deflection.declarations import BY_NAME, QOS_OVERRIDES_PREFIX, ROS_OWN, SIMULATED
+from psd_deflection.base.errors import ConfigError, did_you_mean
 from psd_deflection.devices.registry import source_names
-from psd_deflection.errors import ConfigError, did_you_mean
-from psd_deflection.parameters import Parameter
-from psd_deflection.runner.session import Session
-from psd_deflection.solvers.registry import SOLVERS, check_live, solver_class
+from psd_deflection.model.solvers.registry import SOLVERS, check_live, solver_class
+from psd_deflection.rig.config import Rig, replace_values, rig_from_values
+from psd_deflection.rig.declarations import BY_NAME, QOS_OVERRIDES_PREFIX, ROS_OWN, SIMULATED
+from psd_deflection.rig.parameters import Parameter
+from psd_deflection.run.session import Session
 
 SOURCE = 'ROS parameters'
 

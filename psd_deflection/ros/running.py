@@ -10,8 +10,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from psd_deflection.errors import ConfigError
-from psd_deflection.runner.signals import Signals
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.run.signals import Signals
 
 SPIN_S = 0.1
 """Longest time until a signal takes effect, s."""

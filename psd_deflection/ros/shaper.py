@@ -19,15 +19,15 @@ from rclpy.time import Time
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from msg_adapters import DIAGNOSTICS, TOPIC_TYPES, to_messages
-from psd_deflection.compensation.trajectory import QUANTITIES, Trajectory, TrajectoryShaper, checked
-from psd_deflection.errors import ConfigError, Warned, printable
+from psd_deflection.arms.compensation.trajectory import QUANTITIES, Trajectory, TrajectoryShaper, checked
+from psd_deflection.base.errors import ConfigError, Warned, printable
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.names import JOINT_STATES
 from psd_deflection.ros.running import SPIN_S, executor_of, ros
 from psd_deflection.ros.wires import message_class, qos
-from psd_deflection.runner.diagnostics import OK, WARN
-from psd_deflection.runner.repeats import Repeats
+from psd_deflection.run.diagnostics import OK, WARN
+from psd_deflection.run.repeats import Repeats
 
 NODE_NAME = 'shaper'
 GIVEN, SHAPED = '~/trajectory', '~/shaped'

@@ -15,12 +15,12 @@ from geometry_msgs.msg import Quaternion, TransformStamped
 from rclpy.node import Node
 
 from msg_adapters.orientation import quaternion
-from psd_deflection.config import Rig
-from psd_deflection.geometry.scene import Vector
+from psd_deflection.model.plate.scene import Vector
+from psd_deflection.model.solvers.registry import psds_at_base
 from psd_deflection.records import DeflectionEstimate, Record
+from psd_deflection.rig.config import Rig
 from psd_deflection.ros.names import BASE, PSDS, REST, TF, TF_STATIC, TIP
 from psd_deflection.ros.wires import qos
-from psd_deflection.solvers.registry import psds_at_base
 
 _UPRIGHT = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
 

@@ -17,12 +17,12 @@ from msg_adapters import (
     TOPIC_TYPES,
     vector3_stamped,
 )
-from psd_deflection.config import Rig
 from psd_deflection.recordings import cdr
 from psd_deflection.records import Record, SampleBlock, TemperatureReading
+from psd_deflection.rig.config import Rig
 from psd_deflection.ros.names import VOLTS, delivery
-from psd_deflection.runner.fanout import published
-from psd_deflection.runner.session import Session
+from psd_deflection.run.fanout import published
+from psd_deflection.run.session import Session
 
 MAX_INPUT_BYTES = 4096
 """Maximum size of a message of another node that we record, bytes; valid ones have some hundred bytes."""

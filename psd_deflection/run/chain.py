@@ -15,10 +15,9 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from psd_deflection.chains.chain import EndEffector
-from psd_deflection.chains.chain_file import ChainFile
-from psd_deflection.chains.joining import Joined, Joiner
-from psd_deflection.config import Rig
+from psd_deflection.arms.chains.chain import EndEffector
+from psd_deflection.arms.chains.chain_file import ChainFile
+from psd_deflection.arms.chains.joining import Joined, Joiner
 from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
@@ -27,9 +26,10 @@ from psd_deflection.records import (
     Record,
     SpotMeans,
 )
-from psd_deflection.runner.processing import Spokesman
-from psd_deflection.runner.session import Session
-from psd_deflection.runner.simulated_rig import simulates, started_early
+from psd_deflection.rig.config import Rig
+from psd_deflection.run.processing import Spokesman
+from psd_deflection.run.session import Session
+from psd_deflection.run.simulated_rig import simulates, started_early
 
 SILENT_S = 0.5
 """A link whose last estimate is older than this is reported as missing, although its blocks come no more."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from msg_adapters import ACCELERATION
-from psd_deflection.filtering.inertia import HOLD_NS
-from psd_deflection.filtering.motion import AXES, Innovations
+from psd_deflection.measure.motion.inertia import HOLD_NS
+from psd_deflection.measure.motion.motion import AXES, Innovations
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
-from psd_deflection.runner.session import Session
+from psd_deflection.run.session import Session
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 

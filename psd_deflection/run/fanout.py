@@ -15,10 +15,10 @@ from msg_adapters import (
     solver_topic,
     spot_topics,
 )
-from psd_deflection.config import Rig
+from psd_deflection.model.solvers.one_psd import NAME as ONE_PSD
 from psd_deflection.recordings import cdr
 from psd_deflection.records import ParameterChange, Record
-from psd_deflection.solvers.one_psd import NAME as ONE_PSD
+from psd_deflection.rig.config import Rig
 
 
 def published(rig: Rig) -> dict[str, str]:

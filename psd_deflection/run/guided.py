@@ -7,15 +7,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from psd_deflection.calibration import counts_to_volts
-from psd_deflection.commissioning.checkup import Checkup, check
-from psd_deflection.commissioning.guide import Guide, Phase
-from psd_deflection.commissioning.levels import levels
-from psd_deflection.config import Rig, replace_values
-from psd_deflection.errors import DeviceError
-from psd_deflection.mechanics import LinkStatics
-from psd_deflection.runner.acquisition import Acquisition, Arrival, Ended
-from psd_deflection.runner.simulated_rig import SimulatedRigProcess, simulates
+from psd_deflection.base.errors import DeviceError
+from psd_deflection.model.detector import counts_to_volts
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.run.reading.acquisition import Acquisition, Arrival, Ended
+from psd_deflection.run.simulated_rig import SimulatedRigProcess, simulates
+from psd_deflection.studies.check.checkup import Checkup, check
+from psd_deflection.studies.check.guide import Guide, Phase
+from psd_deflection.studies.check.levels import levels
 
 LOOK_S = 0.2
 SILENT_LOOKS = 50

@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Protocol, TypeVar
 
-from psd_deflection.config import rig_from_values
-from psd_deflection.runner.realtime import Watchdog, settle
-from psd_deflection.runner.session import Session
-from psd_deflection.runner.signals import Signals, StopRequestedError
+from psd_deflection.rig.config import rig_from_values
+from psd_deflection.run.realtime import Watchdog, settle
+from psd_deflection.run.session import Session
+from psd_deflection.run.signals import Signals, StopRequestedError
 
 LOOK_S = 0.1
 

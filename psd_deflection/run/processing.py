@@ -16,10 +16,10 @@ from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
-from psd_deflection.errors import Warned
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.base.errors import Warned
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import Record
-from psd_deflection.runner.acquisition import Arrival, Item, Restarted
+from psd_deflection.run.reading.acquisition import Arrival, Item, Restarted
 
 T = TypeVar('T')
 

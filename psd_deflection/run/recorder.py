@@ -22,11 +22,11 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from pathlib import Path
 
-from psd_deflection.config import Rig
-from psd_deflection.declarations import AcquisitionConfig
-from psd_deflection.errors import Failed, RecordingError, Warned
-from psd_deflection.recordings.bag_writer import BagWriter
+from psd_deflection.base.errors import Failed, RecordingError, Warned
+from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import ParameterChange
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.declarations import AcquisitionConfig
 
 MESSAGES_PER_BLOCK = 100
 """The recorder's queue holds this many messages for each block of ``queue_blocks``. A block makes about

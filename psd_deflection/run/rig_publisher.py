@@ -7,11 +7,11 @@ from collections.abc import Mapping
 
 from msg_adapters import to_messages
 from psd_deflection import __version__
-from psd_deflection.provenance import provenance
 from psd_deflection.recordings import cdr
+from psd_deflection.recordings.provenance import provenance
 from psd_deflection.records import ENVIRONMENT, KNOWN_LOAD, ParameterChange, RigState
-from psd_deflection.runner.fanout import Wire
-from psd_deflection.runner.session import Session
+from psd_deflection.run.fanout import Wire
+from psd_deflection.run.session import Session
 
 
 class RigPublisher:

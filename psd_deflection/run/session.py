@@ -16,22 +16,22 @@ from functools import partial
 from pathlib import Path
 
 from msg_adapters import ACCELERATION, LOAD, TOPIC_TYPES, accel_stamped, from_fields, to_messages
-from psd_deflection.config import Rig, left_as_in_the_thesis, replace_values
-from psd_deflection.declarations import ZEROS
-from psd_deflection.errors import Failed, Warned, printable
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.base.errors import Failed, Warned, printable
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.solvers.registry import check_arrangement, check_live
 from psd_deflection.recordings import cdr
 from psd_deflection.records import AppliedLoad, BaseAcceleration, ParameterChange, Record
-from psd_deflection.runner.acquisition import Acquisition
-from psd_deflection.runner.fanout import Fanout
-from psd_deflection.runner.processing import Processing, RecordSink
-from psd_deflection.runner.realtime import lock_memory
-from psd_deflection.runner.recorder import Recorder
-from psd_deflection.runner.repeats import Repeats
-from psd_deflection.runner.simulated_rig import SimulatedRigProcess, simulates
-from psd_deflection.runner.watcher import Watcher, WatcherWire
-from psd_deflection.runner.zero_store import ZeroStore
-from psd_deflection.solvers.registry import check_arrangement, check_live
+from psd_deflection.rig.config import Rig, left_as_in_the_thesis, replace_values
+from psd_deflection.rig.declarations import ZEROS
+from psd_deflection.run.fanout import Fanout
+from psd_deflection.run.processing import Processing, RecordSink
+from psd_deflection.run.reading.acquisition import Acquisition
+from psd_deflection.run.realtime import lock_memory
+from psd_deflection.run.recorder import Recorder
+from psd_deflection.run.repeats import Repeats
+from psd_deflection.run.simulated_rig import SimulatedRigProcess, simulates
+from psd_deflection.run.watcher import Watcher, WatcherWire
+from psd_deflection.run.zero_store import ZeroStore
 
 HUNG_S = 5.0
 """A thread that has completed no round for this long hangs: the watchdog gets no more signals."""

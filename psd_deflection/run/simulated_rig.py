@@ -9,10 +9,10 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 
-from psd_deflection.config import Rig
+from psd_deflection.base.errors import DeviceError
 from psd_deflection.devices.pseudo_terminal import PORT_LINE
 from psd_deflection.devices.registry import SIMULATED
-from psd_deflection.errors import DeviceError
+from psd_deflection.rig.config import Rig
 
 START_S = 60.0
 

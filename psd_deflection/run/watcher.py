@@ -15,13 +15,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from msg_adapters import INPUTS, SAMPLES
-from psd_deflection.config import Rig
-from psd_deflection.errors import Failed, RecordingError, Warned
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.bag_writer import BagWriter
+from psd_deflection.base.errors import Failed, RecordingError, Warned
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.measure.watch import Alarm, Watch
+from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import AppliedLoad, DiagnosticEntry, ParameterChange, Record, SampleBlock
-from psd_deflection.runner.recorder import missing_room, new_folder
-from psd_deflection.watching.watch import Alarm, Watch
+from psd_deflection.rig.config import Rig
+from psd_deflection.run.recorder import missing_room, new_folder
 
 SEGMENT_NS = 30_000_000_000
 AFTER_NS = 60_000_000_000

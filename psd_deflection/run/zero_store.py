@@ -18,11 +18,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.config import Rig, replace_values
-from psd_deflection.declarations import BY_NAME
-from psd_deflection.errors import ConfigError, Failed, Warned
-from psd_deflection.files import replace_file
-from psd_deflection.parameters import check_value
+from psd_deflection.base.errors import ConfigError, Failed, Warned
+from psd_deflection.base.files import replace_file
+from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.rig.declarations import BY_NAME
+from psd_deflection.rig.parameters import check_value
 
 MAX_BYTES = 10_000
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from psd_deflection.identification.shapers import KINDS, TOLERATED, recommended, shaper
+from psd_deflection.arms.shapers import KINDS, TOLERATED, recommended, shaper
 
 RATE = 1000.0
 

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.arithmetic import ARITHMETICS, FIXED, LIBRARY, Arithmetic, FixedArithmetic, in_pairs
+from psd_deflection.base.arithmetic import ARITHMETICS, FIXED, LIBRARY, Arithmetic, FixedArithmetic, in_pairs
 from psd_deflection.records import FloatArray
 
-PACKAGE = Path(__file__).parent.parent / 'psd_deflection'
+PACKAGE = Path(__file__).parents[2] / 'psd_deflection'
 ANGLES = np.concatenate((np.linspace(-7.0, 7.0, 4001), 1e-3 * np.linspace(-1.0, 1.0, 501), [9e5, -9e5]))
 
 
@@ -205,31 +205,31 @@ def test_nodes_and_weights_of_gauss_and_legendre(count: int) -> None:
 
 # What a block or a rig goes through on its way to an estimate. Rooms whole, but for what the table below names.
 PIPELINE = (
-    'averaging.py', 'pipeline.py', 'estimation.py', 'correction.py', 'calibration/volts.py', 'calibration/health.py',
-    'filtering', 'uncertainty', 'solvers', 'geometry/plate.py', 'geometry/landing.py', 'geometry/layout.py',
-    'geometry/linear.py', 'misalignment/model.py', 'misalignment/spread.py', 'misalignment/rig.py',
-    'mechanics/statics.py', 'simulation/optics.py', 'simulation/physics.py', 'simulation/tip_load.py',
-    'simulation/effects/ambient_light.py', 'simulation/effects/axis_crosstalk.py', 'simulation/effects/sensor_gain.py',
-    'simulation/effects/sensor_nonlinearity.py', 'simulation/effects/sensor_rotation.py',
-    'simulation/effects/thermal_drift.py', 'simulation/effects/sensor_position.py',
-    'simulation/effects/plane_tilt.py',
+    'averaging.py', 'pipeline.py', 'estimation.py', 'correction.py', 'model/detector/volts.py', 'measure/health.py',
+    'filtering', 'uncertainty', 'solvers', 'model/plate/plate.py', 'model/plate/landing.py', 'model/plate/layout.py',
+    'model/plate/linear.py', 'model/misalignment/model.py', 'model/misalignment/spread.py', 'model/misalignment/rig.py',
+    'model/link/statics.py', 'model/simulation/optics.py', 'model/simulation/physics.py', 'model/simulation/tip_load.py',
+    'model/simulation/effects/ambient_light.py', 'model/simulation/effects/axis_crosstalk.py', 'model/simulation/effects/sensor_gain.py',
+    'model/simulation/effects/sensor_nonlinearity.py', 'model/simulation/effects/sensor_rotation.py',
+    'model/simulation/effects/thermal_drift.py', 'model/simulation/effects/sensor_position.py',
+    'model/simulation/effects/plane_tilt.py',
 )  # fmt: skip
 NOT_OF_A_BLOCK = {
     # (file, function): why it may use what depends on the processor.
-    ('geometry/linear.py', 'condition_number'): 'told to people, by design alone',
-    ('geometry/linear.py', 'error_bound'): 'told to people, by design alone',
-    ('geometry/layout.py', 'check_twist'): 'compares with a bound',
-    ('solvers/base_pair.py', '_refuse_what_is_unseen'): 'compares with a bound',
-    ('solvers/pose.py', '__init__'): 'compares with a bound',
-    ('uncertainty/stamped.py', '_p_value'): 'told in /diagnostics alone',
-    ('uncertainty/rest.py', 'why_moving'): 'compares with a bound; what it decides is recorded',
+    ('model/plate/linear.py', 'condition_number'): 'told to people, by design alone',
+    ('model/plate/linear.py', 'error_bound'): 'told to people, by design alone',
+    ('model/plate/layout.py', 'check_twist'): 'compares with a bound',
+    ('model/solvers/base_pair.py', '_refuse_what_is_unseen'): 'compares with a bound',
+    ('model/solvers/pose.py', '__init__'): 'compares with a bound',
+    ('measure/uncertainty/stamped.py', '_p_value'): 'told in /diagnostics alone',
+    ('measure/uncertainty/rest.py', 'why_moving'): 'compares with a bound; what it decides is recorded',
     ('pipeline.py', 'zero'): 'what it finds is recorded and not computed again',
     ('averaging.py', 'block_middle_ns'): 'adds whole numbers',
-    ('uncertainty/noise.py', '_autocovariance'): 'adds whole numbers',
-    ('calibration/health.py', '__init__'): 'a whole number to the power of one',
-    ('uncertainty/consistency.py', '__init__'): 'the suspect is told in /diagnostics alone',
-    ('uncertainty/consistency.py', 'add'): 'the suspect is told in /diagnostics alone',
-    ('uncertainty/stamped.py', 'noise_words'): 'told in /diagnostics alone',
+    ('measure/uncertainty/noise.py', '_autocovariance'): 'adds whole numbers',
+    ('measure/health.py', '__init__'): 'a whole number to the power of one',
+    ('measure/uncertainty/consistency.py', '__init__'): 'the suspect is told in /diagnostics alone',
+    ('measure/uncertainty/consistency.py', 'add'): 'the suspect is told in /diagnostics alone',
+    ('measure/uncertainty/stamped.py', 'noise_words'): 'told in /diagnostics alone',
 }
 MATRICES = {'linalg', 'einsum', 'dot', 'vdot', 'inner', 'matmul', 'tensordot', 'trace', 'polyfit', 'convolve'}
 FUNCTIONS = {

@@ -10,12 +10,12 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.budget.inputs import read_inputs
-from psd_deflection.config import load_rig
-from psd_deflection.errors import ConfigError, PsdDeflectionError, RecordingError
-from psd_deflection.foreign_yaml import MAX_DEPTH, MAX_FILE_BYTES, MAX_NODES, YamlError, parse_yaml, read_text
-from psd_deflection.recordings.bag_reader import read_information
-from psd_deflection.recordings.observations import read_observations
+from psd_deflection.base.errors import ConfigError, PsdDeflectionError, RecordingError
+from psd_deflection.base.foreign_yaml import MAX_DEPTH, MAX_FILE_BYTES, MAX_NODES, YamlError, parse_yaml, read_text
+from psd_deflection.recordings.read.bag_reader import read_information
+from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.budget.inputs import read_inputs
+from psd_deflection.studies.discover.from_recordings import read_observations
 
 TAGS = [
     'x: !!bool foo',

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.protocol.sequence import WRAP, RecordedSequence, SequenceExtender, Step
+from psd_deflection.base.sequence import WRAP, RecordedSequence, SequenceExtender, Step
 
 
 def test_the_next_one_a_gap_and_a_repeat() -> None:

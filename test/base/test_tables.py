@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from psd_deflection.errors import ConfigError
-from psd_deflection.tables import Column, Table, columns_of, html_table
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.tables import Column, Table, columns_of, html_table
 
 T = Column('t', np.arange(3) * 0.5, 's', 'time')
 TABLE = Table(T, columns_of(np.arange(6.0).reshape(3, 2), ('a', 'b'), ('m', ''), ('one', 'two')), {'path': 'somewhere'})

@@ -18,9 +18,9 @@ from bench.campaign.faults import Row, report
 from bench.campaign.fuzz import GRAMMARS, TARGETS, corrupted, judged
 from bench.campaign.kinds import FAULTS
 from bench.campaign.line import DIGIT, VOLTS_PER_COUNT, Line, identities
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.protocol.frames import FrameDecoder, HelloRequestFrame, SampleFrame, encode
-from psd_deflection.runner.acquisition import Acquisition
+from psd_deflection.devices.protocol.frames import FrameDecoder, HelloRequestFrame, SampleFrame, encode
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.run.reading.acquisition import Acquisition
 from test.heard import WAIT_S
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -12,10 +12,10 @@ from scipy.integrate import solve_ivp
 from blind import generator, run, score
 from blind.cases import MISTAKES, Case, all_cases, designs, gap_of, scaled, short_cases
 from blind.mistakes import observed
-from psd_deflection.config import load_rig
-from psd_deflection.discovery.observation import Observation
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.discover.observation import Observation
 
 
 def test_the_second_generator_agrees_with_an_adaptive_integrator() -> None:

@@ -12,9 +12,9 @@ from blind import emps, foreign
 from blind.arm import Arm
 from blind.boom import Boom
 from blind.measured import DATA
-from psd_deflection.discovery.fit import refit
-from psd_deflection.discovery.plants import Model, PlantComparison, PlantDiscovery, discover_in
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.discover.plants import Model, PlantComparison, PlantDiscovery, discover_in
+from psd_deflection.studies.discover.search.fit import refit
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason='the data that others measured are not here')
 

@@ -10,9 +10,9 @@ import pytest
 from blind import law_forms
 from blind.cases import designs, gap_of
 from blind.laws import drawn, judged, observe, sized, summary
-from psd_deflection.discovery.fit import refit
-from psd_deflection.discovery.laws import find_law
-from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.studies.discover.laws.laws import find_law
+from psd_deflection.studies.discover.search.fit import refit
+from psd_deflection.studies.discover.search.workspace import Workspace
 
 
 def test_laws_are_drawn_over_stages_and_forms_and_each_is_its_own() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from blind.render import Pose, Scene, board, developed
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.camera.answer import Status
 from psd_deflection.camera.boards import board_of, board_size
 from psd_deflection.camera.intrinsics import calibrated
@@ -19,7 +20,6 @@ from psd_deflection.camera.print_target import printed, sizes
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.camera.targets import target_of
-from psd_deflection.errors import ConfigError
 
 SMALL = Scene(width=400, height=320, focal=1000.0, centre=(195.0, 162.0), distance=0.25, distortion=(-0.1, 0.05))
 BOARD = CameraSettings(

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from psd_deflection.errors import ConfigError, DeviceError, RecordingError
-from psd_deflection.footage import Footage, of_ros_image, read_settings
+from psd_deflection.base.errors import ConfigError, DeviceError, RecordingError
+from psd_deflection.camera.footage import Footage, of_ros_image, read_settings
 
 
 def folder(path: Path, table: str) -> str:

@@ -15,7 +15,7 @@ MODULE = '''"""Print the square of a number.
   psd-deflection made-up --size 3
 """
 
-from psd_deflection.errors import ConfigError
+from psd_deflection.base.errors import ConfigError
 
 
 def add_arguments(parser):

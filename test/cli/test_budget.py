@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psd_deflection.budget.chain import Chain, measure
-from psd_deflection.budget.evaluate import CAUSES
-from psd_deflection.budget.inputs import INPUTS
 from psd_deflection.cli.main import main
-from psd_deflection.config import load_rig
-from psd_deflection.mechanics import LinkStatics
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.budget.chain import MeasuringChain, measure
+from psd_deflection.studies.budget.evaluate import CAUSES
+from psd_deflection.studies.budget.inputs import INPUTS
 
 RIG = str(Path(__file__).parent.parent.parent / 'config' / 'thesis_rig.yaml')
 
@@ -63,7 +63,7 @@ def test_the_default_load_fits_the_rig(tmp_path: Path, capsys: pytest.CaptureFix
     assert load == [0.0, load[1], pytest.approx(0.8 * load[1])]
     # A dot moves half of the way to its edge, to two figures of the load.
     rig = load_rig(path)
-    places, zeros = measure(Chain.of(rig), np.array(LinkStatics.from_rig(rig).deflection(*load)))
+    places, zeros = measure(MeasuringChain.of(rig), np.array(LinkStatics.from_rig(rig).deflection(*load)))
     moved = np.abs(places[0] - zeros[0]) / (np.array([[0.002], [0.005]]) - np.sign(places[0] - zeros[0]) * zeros[0])
     assert 0.45 < moved.max() < 0.51
     # The same load is taken where the design leaves k free.

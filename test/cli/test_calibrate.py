@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.config import load_rig
+from psd_deflection.rig.config import load_rig
 
 RIG = Path(__file__).parents[2] / 'config' / 'thesis_rig.yaml'
 HIDDEN = [

@@ -12,7 +12,7 @@ import pytest
 
 from blind.render import Pose, Scene, photograph, seen_at
 from psd_deflection.cli.main import main
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
 
 POSES = [Pose(), Pose(), Pose(1e-3, -2e-3, 0.02), Pose(-2e-3, 1e-3, -0.01)]
 

@@ -74,7 +74,7 @@ def test_ros_arguments_go_through_untouched(monkeypatch: pytest.MonkeyPatch) -> 
         taken.append(args.ros_arguments)
         return 0
 
-    monkeypatch.setattr('psd_deflection.cli.estimator.run', run)
+    monkeypatch.setattr('psd_deflection.cli.run.estimator.run', run)
     ros = ['--ros-args', '-p', 'port:=/dev/ttyACM0', '--remap', 'a:=b', '--no-such-option']
     assert main(['estimator', *ros]) == 0
     assert taken == [ros]

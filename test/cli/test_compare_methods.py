@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.solvers import SOLVERS
-from psd_deflection.thesis.comparison import CAUSES, methods
-from psd_deflection.thesis.figures import FIGURES
+from psd_deflection.model.solvers import SOLVERS
+from psd_deflection.studies.thesis.comparison import CAUSES, methods
+from psd_deflection.studies.thesis.figures import FIGURES
 
 DOCS = Path(__file__).parents[2] / 'docs'
 

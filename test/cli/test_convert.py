@@ -9,7 +9,7 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from psd_deflection.cli.main import main
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
 from test.recordings.making import HELLO, write_bag
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.thesis.scaling import ERRATA_B1, ERRATA_B2, MATERIALS
+from psd_deflection.studies.thesis.scaling import ERRATA_B1, ERRATA_B2, MATERIALS
 
 RIG = str(Path(__file__).parents[2] / 'config' / 'thesis_rig.yaml')
 

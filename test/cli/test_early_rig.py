@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection.cli.estimator import simulates_at_once
-from psd_deflection.config import load_rig
-from psd_deflection.runner import simulated_rig
-from psd_deflection.runner.simulated_rig import SimulatedRigProcess, started_early
+from psd_deflection.cli.run.estimator import simulates_at_once
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run import simulated_rig
+from psd_deflection.run.simulated_rig import SimulatedRigProcess, started_early
 
 ROOT = Path(__file__).parent.parent.parent
 

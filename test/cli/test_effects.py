@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.simulation.catalogue import catalogue
+from psd_deflection.model.simulation.catalogue import catalogue
 
 
 def test_the_list_has_every_effect(capsys: pytest.CaptureFixture[str]) -> None:
@@ -46,7 +46,7 @@ def test_programs_get_the_declaration(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_what_is_corrected_is_said() -> None:
-    from psd_deflection.cli.effects import corrected
+    from psd_deflection.cli.studies.effects import corrected
 
     said = {name: corrected(catalogue()[name]) for name in ('plane_tilt', 'refraction', 'creep', 'bending_stiffness')}
     assert said == {'plane_tilt': 'reading', 'refraction': 'reading', 'creep': 'wrench', 'bending_stiffness': 'wrench'}

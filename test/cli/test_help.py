@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from psd_deflection.base.errors import EXIT_STATUSES
 from psd_deflection.cli.main import COMMANDS, main, make_parser
-from psd_deflection.errors import EXIT_STATUSES
 
 ROOT = Path(__file__).parent.parent.parent
 OURS = 'psd-deflection '

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.config import load_rig
+from psd_deflection.rig.config import load_rig
 
 
 @pytest.fixture(scope='module')

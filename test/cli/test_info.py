@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.config import load_rig
-from psd_deflection.recordings.bag_writer import BagWriter
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import SampleBlock
+from psd_deflection.rig.config import load_rig
 from test.recordings.making import HELLO, T0, block, write_bag
 
 

@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 from mcap.writer import Writer
 
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.cli import _report
 from psd_deflection.cli._options import FOREIGN
 from psd_deflection.cli.main import main
-from psd_deflection.errors import RecordingError
 
 ROOT = Path(__file__).parent.parent.parent
 CLEAN = str(ROOT / 'bags' / 'clean')
@@ -162,9 +162,9 @@ def signals() -> Iterator[None]:
 @pytest.mark.parametrize(
     ('argv', 'sink'),
     [
-        (['simulate', '--loads', 'thesis'], 'psd_deflection.recordings.csv_writer.CsvSampleSink.put'),
-        (['convert', CLEAN], 'psd_deflection.recordings.csv_writer.CsvSampleSink.put'),
-        (['replay', CLEAN], 'psd_deflection.cli.replay.Totals.add'),
+        (['simulate', '--loads', 'thesis'], 'psd_deflection.recordings.write.csv_writer.CsvSampleSink.put'),
+        (['convert', CLEAN], 'psd_deflection.recordings.write.csv_writer.CsvSampleSink.put'),
+        (['replay', CLEAN], 'psd_deflection.cli.recordings.replay.Totals.add'),
     ],
     ids=lambda v: v[0] if isinstance(v, list) else '',
 )
@@ -198,7 +198,7 @@ def test_an_existing_output_is_not_moved(
     out.write_text('mine')
     status, err = refused(capsys, 'convert', CLEAN, '--out', 'out.csv')
     assert (status, 'never overwritten' in err) == (4, True)
-    monkeypatch.setattr('psd_deflection.cli.simulate.run', interrupted)
+    monkeypatch.setattr('psd_deflection.cli.recordings.simulate.run', interrupted)
     for name in ('out.csv', 'none.csv'):
         assert main(['simulate', '--out', name]) == 130
         assert capsys.readouterr().err == 'psd-deflection: interrupted\n'
@@ -372,7 +372,7 @@ def test_a_machine_that_gives_no_more_is_one_line(
     def fail(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr('psd_deflection.cli.info.open_recording', fail)
+    monkeypatch.setattr('psd_deflection.cli.recordings.info.open_recording', fail)
     assert main(['info', 'x.csv']) == 71
     said = capsys.readouterr().err
     assert why in said
@@ -383,7 +383,7 @@ def test_another_error_of_ours_is_still_a_traceback(monkeypatch: pytest.MonkeyPa
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError('a defect')
 
-    monkeypatch.setattr('psd_deflection.cli.info.open_recording', fail)
+    monkeypatch.setattr('psd_deflection.cli.recordings.info.open_recording', fail)
     with pytest.raises(RuntimeError, match='a defect'):
         main(['info', 'x.csv'])
 

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.cli.plot import Drawn, default_out, draw_recording
-from psd_deflection.monitor.spectrum import Spectrum
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.replay_engine import replayed, rig_at_start
+from psd_deflection.cli.recordings.plot import Drawn, default_out, draw_recording
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.replay.engine import replayed, rig_at_start
 from psd_deflection.records import FloatArray, ParameterChange
+from psd_deflection.run.monitor.spectrum import Spectrum
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
 
@@ -153,7 +153,7 @@ def test_losses_and_missing_estimates_are_marked() -> None:
 def test_blocks_cut_by_start_and_stop_have_lost_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from matplotlib.figure import Figure
 
-    from psd_deflection.cli.plot import _mark_losses
+    from psd_deflection.cli.recordings.plot import _mark_losses
     from psd_deflection.records import SampleBlock
 
     recording = open_recording(BAGS / 'clean')

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from psd_deflection.arms.shapers import Shaper, in_series, recommended, shaper
 from psd_deflection.cli.main import main, make_parser
-from psd_deflection.cli.shaper import shaper_of
-from psd_deflection.identification.shapers import Shaper, in_series, recommended, shaper
+from psd_deflection.cli.run.shaper import shaper_of
 
 CONFIG = Path(__file__).parents[2] / 'config'
 RIG = str(CONFIG / 'thesis_rig.yaml')

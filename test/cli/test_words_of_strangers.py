@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection.cli import info
 from psd_deflection.cli.main import main
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.cli.recordings import info
+from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 
 CLEAN = Path(__file__).parent.parent.parent / 'bags' / 'clean'

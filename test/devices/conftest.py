@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.config import Rig
+from psd_deflection.base.errors import DeviceError
 from psd_deflection.devices import LineDevice, PortClosedError, dataq, text_lines, thorlabs
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.devices.rig_feed import RigFeed
 from psd_deflection.devices.serve import serve
-from psd_deflection.errors import DeviceError
 from psd_deflection.records import FloatArray
-from psd_deflection.runner import acquisition
-from psd_deflection.runner.acquisition import Acquisition, Arrival
+from psd_deflection.rig.config import Rig
+from psd_deflection.run.reading import acquisition
+from psd_deflection.run.reading.acquisition import Acquisition, Arrival
 from test.heard import WAIT_S
 
 

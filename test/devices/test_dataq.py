@@ -12,12 +12,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from psd_deflection.config import load_rig
+from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.devices import PowerUp
 from psd_deflection.devices.dataq import SimulatedDataq
-from psd_deflection.devices.registry import make_source
-from psd_deflection.errors import ConfigError, DeviceError
-from psd_deflection.protocol.dataq import (
+from psd_deflection.devices.protocol.dataq import (
     MODELS,
     VOLTS_PER_COUNT,
     ScanDecoder,
@@ -26,7 +24,9 @@ from psd_deflection.protocol.dataq import (
     plan_rate,
     scan_list,
 )
-from psd_deflection.protocol.frames import BadFrame
+from psd_deflection.devices.protocol.frames import BadFrame
+from psd_deflection.devices.registry import make_source
+from psd_deflection.rig.config import load_rig
 
 # x1 = 1, y1 = -2, sum1 = 16384, x2 = 256, y2 = -32767, sum2 = 16384, then the counter at zero.
 SCAN = bytes.fromhex('0100 feff 0040 0001 0180 0040 0080')

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from psd_deflection.config import load_rig
+from psd_deflection.devices.protocol.text_lines import Description, Line, parse
 from psd_deflection.devices.registry import DEVICES
-from psd_deflection.protocol.text_lines import Description, Line, parse
+from psd_deflection.rig.config import load_rig
 
 PAGES = Path(__file__).parent.parent.parent / 'docs' / 'devices'
 

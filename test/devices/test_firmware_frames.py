@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.protocol.frames import HelloFrame, PingFrame, SampleFrame, StatusFrame, encode
+from psd_deflection.devices.protocol.frames import HelloFrame, PingFrame, SampleFrame, StatusFrame, encode
 
 FIRMWARE = Path(__file__).parent.parent.parent / 'docs' / 'firmware'
 CC = shutil.which('cc') or shutil.which('gcc') or shutil.which('clang')

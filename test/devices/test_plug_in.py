@@ -13,15 +13,15 @@ from typing import Any
 
 import pytest
 
+from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.cli.main import main
-from psd_deflection.config import load_rig
 from psd_deflection.devices import PowerUp
 from psd_deflection.devices.registry import SIMULATED, find_device, known_devices, make_source, source_names
 from psd_deflection.devices.serve import simulated_devices
-from psd_deflection.errors import ConfigError, DeviceError
-from psd_deflection.runner.session import Session
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run.session import Session
 from test.heard import WAIT_S
-from test.runner.conftest import Estimates
+from test.run.conftest import Estimates
 
 PAGE = Path(__file__).parent.parent.parent / 'docs' / 'devices' / 'README.md'
 NAME = 'my_converter'

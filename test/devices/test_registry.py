@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from psd_deflection.config import load_rig, rig_from_values
 from psd_deflection.devices import PowerUp, survey
 from psd_deflection.devices.registry import DEVICES, SIMULATED, find_device
+from psd_deflection.rig.config import load_rig, rig_from_values
 
 ROOT = Path(__file__).parent.parent.parent
 

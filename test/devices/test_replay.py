@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import psd_deflection
-from psd_deflection.config import load_rig
+from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.devices.registry import make_source
 from psd_deflection.devices.replay import Pacer, Replay
 from psd_deflection.devices.source import Sample, SourceEndedError
-from psd_deflection.errors import ConfigError, DeviceError
-from psd_deflection.runner.acquisition import Acquisition, Arrival, Ended
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run.reading.acquisition import Acquisition, Arrival, Ended
 from test.heard import WAIT_S
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'

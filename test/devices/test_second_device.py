@@ -11,9 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection.config import load_rig
-from psd_deflection.devices.serial_port import SerialPort
-from psd_deflection.protocol.frames import (
+from psd_deflection.devices.protocol.frames import (
     BadFrame,
     Frame,
     FrameDecoder,
@@ -28,10 +26,12 @@ from psd_deflection.protocol.frames import (
     StopFrame,
     encode,
 )
+from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock
-from psd_deflection.runner.session import Session
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run.session import Session
 from test.heard import WAIT_S
-from test.runner.conftest import Estimates
+from test.run.conftest import Estimates
 
 EMULATOR = Path(__file__).parent / 'second_device.py'
 PAGE = Path(__file__).parent.parent.parent / 'docs' / 'protocol.md'

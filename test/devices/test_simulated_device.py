@@ -11,16 +11,12 @@ from typing import cast
 import numpy as np
 import pytest
 
-from psd_deflection.config import load_rig
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.devices import PowerUp
 from psd_deflection.devices import serve as module
 from psd_deflection.devices.contract_frames import SimulatedFrames
 from psd_deflection.devices.device import converter_parameters
-from psd_deflection.devices.pseudo_terminal import PseudoTerminal, link_names, open_terminals
-from psd_deflection.devices.rig_feed import RigFeed
-from psd_deflection.devices.serve import serve
-from psd_deflection.errors import ConfigError
-from psd_deflection.protocol.frames import (
+from psd_deflection.devices.protocol.frames import (
     Frame,
     FrameDecoder,
     HelloFrame,
@@ -33,7 +29,11 @@ from psd_deflection.protocol.frames import (
     StopFrame,
     encode,
 )
+from psd_deflection.devices.pseudo_terminal import PseudoTerminal, link_names, open_terminals
+from psd_deflection.devices.rig_feed import RigFeed
+from psd_deflection.devices.serve import serve
 from psd_deflection.records import CHANNELS, FLAG_OVER_RANGE, FloatArray
+from psd_deflection.rig.config import load_rig
 
 MS = 1_000_000
 

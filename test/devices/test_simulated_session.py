@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from psd_deflection.config import load_rig
-from psd_deflection.errors import ConfigError, DeviceError
-from psd_deflection.runner.session import Session
+from psd_deflection.base.errors import ConfigError, DeviceError
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run.session import Session
 from test.heard import WAIT_S
-from test.runner.conftest import Estimates
+from test.run.conftest import Estimates
 
 SLOW: dict[str, object] = {'converter.sample_rate_hz': 25.0, 'block_size': 2, 'min_samples': 1}
 

@@ -11,7 +11,6 @@ import pytest
 import yaml
 
 from psd_deflection.cli.main import main
-from psd_deflection.config import load_rig
 from psd_deflection.devices import survey as port_survey
 from psd_deflection.devices.contract_frames import SimulatedFrames
 from psd_deflection.devices.dataq import SimulatedDataq
@@ -20,7 +19,8 @@ from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.survey import serial_ports, survey
 from psd_deflection.devices.text_lines import SimulatedLines
 from psd_deflection.devices.thorlabs import SharedRig, SimulatedAligner
-from psd_deflection.parameter_files import read_parameter_file
+from psd_deflection.rig.config import load_rig
+from psd_deflection.rig.parameter_files import read_parameter_file
 
 
 @pytest.fixture(autouse=True)

@@ -10,15 +10,15 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from psd_deflection.config import load_rig
+from psd_deflection.base.errors import DeviceError
 from psd_deflection.devices import PowerUp
+from psd_deflection.devices.protocol.frames import BadFrame
+from psd_deflection.devices.protocol.text_lines import Description, Line, LineDecoder, TimeExtender, parse, with_check
 from psd_deflection.devices.registry import make_source
 from psd_deflection.devices.source import Sample
 from psd_deflection.devices.text_lines import SimulatedLines
-from psd_deflection.errors import DeviceError
-from psd_deflection.protocol.frames import BadFrame
-from psd_deflection.protocol.text_lines import Description, Line, LineDecoder, TimeExtender, parse, with_check
 from psd_deflection.records import FLAG_OVER_RANGE, channel_names
+from psd_deflection.rig.config import load_rig
 
 VALUES = (0.1, -0.2, 5.0, 0.0, 1.5, 4.75)
 LINE = Line(7, 7000, VALUES)

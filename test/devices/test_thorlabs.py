@@ -12,22 +12,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.devices.registry import make_source
-from psd_deflection.devices.source import PortClosedError
-from psd_deflection.devices.thorlabs import SharedRig, SimulatedAligner
-from psd_deflection.errors import ConfigError, DeviceError
-from psd_deflection.protocol.apt import (
+from psd_deflection.base.errors import ConfigError, DeviceError
+from psd_deflection.devices.protocol.apt import (
     INFO_REQUEST,
     READINGS_REQUEST,
     AptDecoder,
     HardwareInfo,
-    Readings,
+    QuadrantReadings,
     encode_info,
     encode_readings,
     readings_of,
 )
-from psd_deflection.protocol.frames import BadFrame
+from psd_deflection.devices.protocol.frames import BadFrame
+from psd_deflection.devices.registry import make_source
+from psd_deflection.devices.source import PortClosedError
+from psd_deflection.devices.thorlabs import SharedRig, SimulatedAligner
+from psd_deflection.rig.config import Rig, load_rig
 
 # Submessage 3; x = 8191, y = -16384, sum = 32768 counts (5 V); the position outputs do not matter.
 REPLY = bytes.fromhex('7208 0c00 81 50  0300 ff1f 00c0 0080 0000 0000')
@@ -37,7 +37,7 @@ X, Y = 8191 / 32767 * 10.0 * 2.0, -16384 / 32767 * 10.0 * 2.0
 
 def is_reply(reading: object) -> bool:
     return (
-        isinstance(reading, Readings)
+        isinstance(reading, QuadrantReadings)
         and reading.x == pytest.approx(X, rel=1e-4)
         and reading.y == pytest.approx(Y, rel=1e-4)
         and reading.total == pytest.approx(5.0, rel=1e-4)
@@ -89,7 +89,7 @@ def test_what_is_thrown_away_is_counted() -> None:
 
 
 def test_without_light_no_place_is_made_up() -> None:
-    assert readings_of(20000, -20000, 0) == Readings(0.0, 0.0, 0.0)
+    assert readings_of(20000, -20000, 0) == QuadrantReadings(0.0, 0.0, 0.0)
     assert readings_of(3, -3, 300)[:2] == (0.0, 0.0)
     # 0.05 V are 327.7 counts.
     assert readings_of(3, -3, 327)[:2] == (0.0, 0.0)
@@ -106,8 +106,15 @@ def test_messages_come_out_however_the_stream_was_cut(cuts: list[int]) -> None:
     decoder = AptDecoder()
     places = sorted({0, len(STREAM), *cuts})
     got = [m for a, b in itertools.pairwise(places) for m in decoder.feed(STREAM[a:b])]
-    assert [type(m) for m in got] == [BadFrame, Readings, Readings, BadFrame, Readings, Readings]
-    assert all(is_reply(m) for m in got if isinstance(m, Readings))
+    assert [type(m) for m in got] == [
+        BadFrame,
+        QuadrantReadings,
+        QuadrantReadings,
+        BadFrame,
+        QuadrantReadings,
+        QuadrantReadings,
+    ]
+    assert all(is_reply(m) for m in got if isinstance(m, QuadrantReadings))
     assert got[0] == BadFrame('no APT header', 3)
     assert got[3] == BadFrame('length does not fit the message', 8)
 

@@ -21,9 +21,9 @@ from typing import Any
 
 import pytest
 
-from psd_deflection import errors
+from psd_deflection.base import errors
 from psd_deflection.cli.main import COMMANDS, main, make_parser
-from psd_deflection.simulation.catalogue import catalogue
+from psd_deflection.model.simulation.catalogue import catalogue
 from tools import run_commands
 from tools.program import ROOT
 from tools.run_commands import FENCE, JOURNEY, PAGES, Command
@@ -323,7 +323,10 @@ def test_every_effect_is_on_its_page(hooks: Any) -> None:
 
 
 def test_what_docstrings_say_for_sphinx_is_not_shown(hooks: Any) -> None:
-    html = '<p>Raises :class:<code>~psd_deflection.errors.ConfigError</code>; see :meth:<code>Pipeline.zero</code>.</p>'
+    html = (
+        '<p>Raises :class:<code>~psd_deflection.base.errors.ConfigError</code>; see '
+        ':meth:<code>Pipeline.zero</code>.</p>'
+    )
     assert hooks.on_page_content(html) == '<p>Raises <code>ConfigError</code>; see <code>Pipeline.zero</code>.</p>'
 
 

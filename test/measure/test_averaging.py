@@ -9,7 +9,7 @@ import numpy.typing as npt
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.averaging import BlockCutter, block_middle_ns, covariance
+from psd_deflection.measure.averaging import BlockCutter, block_middle_ns, covariance
 from psd_deflection.records import RawChunk, SampleBlock
 
 

@@ -7,9 +7,9 @@ import cmath
 import numpy as np
 import pytest
 
-from psd_deflection.config import load_rig
-from psd_deflection.correction import Correction
+from psd_deflection.measure.correction import Correction
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import load_rig
 
 REST = np.zeros((2, 4))
 

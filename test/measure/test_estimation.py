@@ -11,12 +11,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from psd_deflection.config import load_rig
-from psd_deflection.estimation import Estimation, Readings
-from psd_deflection.misalignment.model import INDEX
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.estimation import BlockReadings, Estimation
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.misalignment.model import INDEX
+from psd_deflection.model.solvers.interface import SolverStatus
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, RawChunk, SpotMeans
-from psd_deflection.solvers.interface import SolverStatus
+from psd_deflection.rig.config import load_rig
 
 MEAN = {'block_fit': 'mean', 'covariance': 'file'}
 
@@ -231,17 +231,17 @@ def test_a_solver_that_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     estimation = Estimation(load_rig(overrides={'solver': 'wls'}), ())
     failed = SimpleNamespace(status=SolverStatus.NOT_CONVERGED)
     monkeypatch.setattr(type(estimation.primary), 'solve', lambda *_: failed)
-    assert estimation._solve(0, Readings((0.0,) * 4, (1e-12,) * 4)) == (None, 'wls: not converged')
+    assert estimation._solve(0, BlockReadings((0.0,) * 4, (1e-12,) * 4)) == (None, 'wls: not converged')
 
 
 def test_readings_that_the_primary_solver_cannot_solve_do_not_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     estimation = Estimation(load_rig(), ())
     asked: list[int] = []
 
-    def fails(number: int, readings: Readings) -> tuple[None, str]:
+    def fails(number: int, readings: BlockReadings) -> tuple[None, str]:
         asked.append(number)
         return None, 'not converged'
 
     monkeypatch.setattr(estimation, '_solve', fails)
-    assert not estimation._agree(Readings((0.0,) * 4, (1e-12,) * 4))
+    assert not estimation._agree(BlockReadings((0.0,) * 4, (1e-12,) * 4))
     assert asked == [0]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.geometry import Geometry
-from psd_deflection.pipeline import FROZEN, HELD, Pipeline
+from psd_deflection.measure.pipeline import FROZEN, HELD, Pipeline
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.solvers.one_psd import OnePsd
 from psd_deflection.records import BlockStatus, Counts, DeflectionEstimate, ParameterChange, Record, SpotMeans, TipLoad
-from psd_deflection.solvers.one_psd import OnePsd
-from test.test_pipeline import STEP, chunk_of, still
+from psd_deflection.rig.config import Rig, load_rig
+from test.measure.test_pipeline import STEP, chunk_of, still
 
 POSE = (4e-4, -3e-4, 0.004)
 SIZE = 20

@@ -12,10 +12,11 @@ import numpy.typing as npt
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.mechanics import LinkStatics
-from psd_deflection.pipeline import FROZEN, Pipeline
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.measure.pipeline import FROZEN, Pipeline
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.model.simulation.loads import direct, sidebar
+from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.records import (
     ENVIRONMENT,
     KNOWN_LOAD,
@@ -32,9 +33,8 @@ from psd_deflection.records import (
     TipLoad,
     TipMotion,
 )
-from psd_deflection.runner.session import why_no_zero
-from psd_deflection.simulation.loads import direct, sidebar
-from psd_deflection.simulation.simulator import RigSimulator
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.run.session import why_no_zero
 
 STEP = 10.0 / 32768
 

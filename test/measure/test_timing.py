@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from psd_deflection.timing import ClockMap, ClockState, lower_line
+from psd_deflection.measure.timing import ClockMap, ClockState, lower_line
 
 MS = 1_000_000
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from blind.watch import SIZES, WITHIN_S, one, quiet, table
-from psd_deflection.config import load_rig
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.measure.watch import Watch
+from psd_deflection.model.solvers.registry import solver_from_rig
 from psd_deflection.records import (
     AppliedLoad,
     BlockStatus,
@@ -19,8 +20,7 @@ from psd_deflection.records import (
     SpotMeans,
     TipLoad,
 )
-from psd_deflection.solvers.registry import solver_from_rig
-from psd_deflection.watching.watch import Watch
+from psd_deflection.rig.config import load_rig
 
 RIG = load_rig()
 SOLVER = solver_from_rig('exact', RIG)

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.config import load_rig
-from psd_deflection.recordings.bag_writer import BagWriter, McapFile
+from psd_deflection.recordings.write.bag_writer import BagWriter, McapFile
 from psd_deflection.records import (
     AppliedLoad,
     BaseAcceleration,
@@ -26,6 +25,7 @@ from psd_deflection.records import (
     TipLoad,
     TipMotion,
 )
+from psd_deflection.rig.config import load_rig
 
 T0 = 1_760_000_000_123_456_789
 STEP = 1_000_000

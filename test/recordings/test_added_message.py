@@ -53,8 +53,8 @@ import sys
 from msg_adapters import INPUTS, TOPIC_TYPES, from_fields, humidity
 from psd_deflection.cli.main import main
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.bag_writer import BagWriter
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.write.bag_writer import BagWriter
+from psd_deflection.recordings.read.readers import open_recording
 
 assert humidity.__file__.startswith(sys.argv[2]), humidity.__file__
 with BagWriter(sys.argv[1], rig_values={}) as bag:

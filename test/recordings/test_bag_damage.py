@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from msg_adapters import MESSAGE_TYPES, to_messages
-from psd_deflection.errors import RecordingError
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.bag_reader import BagRecording
+from psd_deflection.recordings.read.bag_reader import BagRecording
 from psd_deflection.records import SampleBlock
 
 from .making import HELLO, assert_same, run, write_mcap

@@ -17,11 +17,10 @@ from rosbags.typesys import Stores, get_typestore
 
 import psd_deflection
 from msg_adapters import LOAD, MESSAGE_TYPES, SAMPLES, to_messages
-from psd_deflection.config import load_rig
-from psd_deflection.errors import RecordingError
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.bag_writer import META_CHANGE, BagWriter, McapFile
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.write.bag_writer import META_CHANGE, BagWriter, McapFile
 from psd_deflection.records import (
     CHANNELS,
     AppliedLoad,
@@ -31,6 +30,7 @@ from psd_deflection.records import (
     SampleBlock,
     TemperatureReading,
 )
+from psd_deflection.rig.config import load_rig
 
 from .making import HELLO, STEP, T0, assert_same, block, run, write_mcap
 

@@ -20,11 +20,11 @@ from rosbags.rosbag2 import Reader
 
 from msg_adapters import RIG, TOPIC_TYPES, to_messages
 from psd_deflection import __version__
-from psd_deflection.config import load_rig
-from psd_deflection.errors import RecordingError
-from psd_deflection.files import HeldFolder
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.files import HeldFolder
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.bag_writer import META_HELLO, META_PARAMETERS, META_SOFTWARE, BagWriter, McapFile
+from psd_deflection.recordings.write.bag_writer import META_HELLO, META_PARAMETERS, META_SOFTWARE, BagWriter, McapFile
+from psd_deflection.rig.config import load_rig
 
 from .making import T0, block, run
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.recordings import bag_writer
-from psd_deflection.recordings.comparison import agree
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.replay.comparison import agree
+from psd_deflection.recordings.write import bag_writer
 
 POSE = {'position': {'x': 1e-3, 'y': -2e-3, 'z': 0.0}, 'orientation': {'x': 0.0, 'y': 0.0, 'z': 1e-3, 'w': 1.0}}
 
@@ -69,7 +69,7 @@ def recorded(folder: Path, monkeypatch: pytest.MonkeyPatch, made_with: Mapping[s
 
 def disturbed(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
     """From now on every answer's dX is off by that share."""
-    from psd_deflection.solvers.exact import ExactSolver
+    from psd_deflection.model.solvers.exact import ExactSolver
 
     solve = ExactSolver.solve
     monkeypatch.setattr(ExactSolver, 'solve', lambda *a: (s := solve(*a))._replace(dx=s.dx * (1.0 + share)))
@@ -102,7 +102,7 @@ def test_rounding_of_the_same_version_is_a_failure(
 def test_a_processor_explains_rounding_only_if_the_libraries_compute(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from psd_deflection.provenance import provenance
+    from psd_deflection.recordings.provenance import provenance
 
     rig = tmp_path / 'rig.yaml'
     rig.write_text('/**:\n  ros__parameters:\n    arithmetic: library\n')

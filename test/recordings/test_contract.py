@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from msg_adapters import TOPIC_TYPES
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
 
 ROOT = Path(__file__).resolve().parents[2]
 BAGS = sorted(p.parent for p in (ROOT / 'bags').glob('*/metadata.yaml'))

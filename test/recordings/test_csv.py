@@ -13,10 +13,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from psd_deflection.errors import RecordingError
-from psd_deflection.recordings.csv_reader import CsvRecording
-from psd_deflection.recordings.csv_writer import CsvEstimateSink, CsvSampleSink, seconds
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.recordings.read.csv_reader import CsvRecording
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.write.csv_writer import CsvEstimateSink, CsvSampleSink, seconds
 from psd_deflection.records import (
     CHANNELS,
     AppliedLoad,

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.errors import RecordingError
-from psd_deflection.recordings import csv_rows
-from psd_deflection.recordings.csv_rows import CsvTable
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.recordings.read import csv_rows
+from psd_deflection.recordings.read.csv_rows import CsvTable
 
 TIMES = st.lists(
     st.one_of(

@@ -7,7 +7,7 @@ import platform
 import numpy as np
 
 from psd_deflection import __version__
-from psd_deflection.provenance import NAMES, PROCESSOR, differences, provenance
+from psd_deflection.recordings.provenance import NAMES, PROCESSOR, differences, provenance
 
 
 def test_versions_and_processor_are_there() -> None:

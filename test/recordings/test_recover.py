@@ -13,13 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import Reader
 
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.cli.main import main
-from psd_deflection.config import load_rig
-from psd_deflection.errors import RecordingError
-from psd_deflection.recordings.bag_writer import BagWriter, McapFile
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.repair import recover
+from psd_deflection.recordings.write.bag_writer import BagWriter, McapFile
 from psd_deflection.records import ParameterChange
+from psd_deflection.rig.config import load_rig
 
 from .making import STEP, block, run
 

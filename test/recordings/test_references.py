@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psd_deflection.errors import RecordingError
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.references import read_references, references_in
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.read.references import read_references, references_in
 from test.recordings.making import write_bag
 
 

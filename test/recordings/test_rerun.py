@@ -15,13 +15,13 @@ import pytest
 
 import psd_deflection
 from psd_deflection.cli.main import main
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings import rerun_writer
-from psd_deflection.recordings.replay_engine import replayed, rig_at_start
-from psd_deflection.recordings.rerun_writer import POSE, RerunFile, Row
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.recordings.replay.engine import replayed, rig_at_start
+from psd_deflection.recordings.write import rerun_writer
+from psd_deflection.recordings.write.rerun_writer import POSE, RerunFile, Row
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
-FIND = 'psd_deflection.recordings.rerun_writer.importlib.util.find_spec'
+FIND = 'psd_deflection.recordings.write.rerun_writer.importlib.util.find_spec'
 
 
 @pytest.fixture

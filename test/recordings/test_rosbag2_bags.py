@@ -13,15 +13,15 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
 
 from msg_adapters import RIG, SAMPLES
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.cli.main import main
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.errors import RecordingError
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.bag_writer import BagWriter
-from psd_deflection.recordings.mcap_reader import McapReader
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.replay_engine import rig_at_end, rig_at_start
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.recordings.read.mcap_reader import McapReader
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.replay.engine import rig_at_end, rig_at_start
+from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import RawChunk
+from psd_deflection.rig.config import Rig, load_rig
 
 from .making import HELLO
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection.recordings.bag_writer import BagWriter, McapFile
-from psd_deflection.recordings.csv_writer import CsvEstimateSink, CsvSampleSink
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.sinks import open_sink
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.write.bag_writer import BagWriter, McapFile
+from psd_deflection.recordings.write.csv_writer import CsvEstimateSink, CsvSampleSink
+from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import AppliedLoad
 
 from .making import run

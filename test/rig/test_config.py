@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection.config import left_as_in_the_thesis, load_rig, replace_values, rig_as_recorded, rig_from_values
-from psd_deflection.errors import ConfigError
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.rig.config import left_as_in_the_thesis, load_rig, replace_values, rig_as_recorded, rig_from_values
 
-RIG = Path(__file__).parent.parent / 'config' / 'thesis_rig.yaml'
+RIG = Path(__file__).parents[2] / 'config' / 'thesis_rig.yaml'
 
 
 def test_the_shipped_rig_file_is_the_default() -> None:

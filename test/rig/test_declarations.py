@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from psd_deflection.config import Rig, load_rig, replace_values, rig_from_values
-from psd_deflection.declarations import BY_NAME, LINK, PARAMETERS, LinkConfig
-from psd_deflection.errors import ConfigError
-from psd_deflection.parameters import Parameter, Section, Value, check_value, parameter
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.rig.config import Rig, load_rig, replace_values, rig_from_values
+from psd_deflection.rig.declarations import BY_NAME, LINK, PARAMETERS, LinkConfig
+from psd_deflection.rig.parameters import Parameter, Section, Value, check_value, parameter
 
 
 @dataclass(frozen=True, slots=True)

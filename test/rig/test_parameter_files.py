@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection.config import load_rig
-from psd_deflection.errors import ConfigError
-from psd_deflection.parameter_files import flat_parameters, read_parameter_file, with_effects_section, with_values
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.rig.config import load_rig
+from psd_deflection.rig.parameter_files import flat_parameters, read_parameter_file, with_effects_section, with_values
 
 
 @pytest.mark.parametrize(

@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psd_deflection.calibration import Calibration, Wiring
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli.main import main
-from psd_deflection.config import Rig, load_rig, rig_as_recorded, rig_from_values
 from psd_deflection.devices.rig_feed import RigFeed
-from psd_deflection.errors import ConfigError
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.detector import VoltsToDots
+from psd_deflection.model.simulation.loads import constant
+from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import DeflectionEstimate, RawChunk, SampleBlock
-from psd_deflection.simulation.loads import constant
-from psd_deflection.simulation.simulator import RigSimulator
+from psd_deflection.rig.config import Rig, load_rig, rig_as_recorded, rig_from_values
+from psd_deflection.rig.wiring import Wiring
 
 PAIRS = list(itertools.product(('x', '-x'), ('y', '-y')))
 AXES = [*PAIRS, *((y, x) for x, y in PAIRS)]
@@ -52,7 +53,7 @@ def test_there_are_128_wirings_of_two_detectors_and_each_is_undone() -> None:
 def test_each_axis_is_the_channel_that_the_rig_file_names() -> None:
     rig = rig_from_values({'psd_1.axes': ['-y', 'x'], 'psd_2.axes': ['x', '-y'], 'psds_exchanged': True})
     device = np.array([[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]], dtype=np.float32)
-    assert Calibration.from_rig(rig).seen(device).tolist() == [[-5.0, 4.0, 6.0, 1.0, -2.0, 3.0]]
+    assert VoltsToDots.from_rig(rig).seen(device).tolist() == [[-5.0, 4.0, 6.0, 1.0, -2.0, 3.0]]
 
 
 @pytest.mark.parametrize('wiring', [WIRINGS[1], WIRINGS[22], WIRINGS[77], WIRINGS[127]], ids=str)

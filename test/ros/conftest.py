@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from test.runner.conftest import ScriptedDevice
+from test.run.conftest import ScriptedDevice
 from tools.program import PSD_DEFLECTION, WAIT_S, Program
 
 rclpy = pytest.importorskip('rclpy', reason='the ROS tests need rclpy: pip install .[ros]')
@@ -54,7 +54,7 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
 PATIENT = f"""
 import sys
 from psd_deflection.cli.main import main
-from psd_deflection.runner import acquisition
+from psd_deflection.run.reading import acquisition
 acquisition.SILENCE_S = {WAIT_S}
 sys.exit(main())
 """
@@ -64,7 +64,7 @@ HANGING_DISK = """
 import sys
 from pathlib import Path
 from psd_deflection.cli.main import main
-from psd_deflection.runner import recorder
+from psd_deflection.run import recorder
 new_folder = recorder.new_folder
 def hanging(parent):
     answer = parent.parent / 'answer'

@@ -19,11 +19,11 @@ from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 
-from psd_deflection.chains.chain import TipDeflection  # noqa: E402
-from psd_deflection.chains.chain_file import read_chain  # noqa: E402
-from psd_deflection.recordings.readers import open_recording  # noqa: E402
+from psd_deflection.arms.chains.chain import TipDeflection  # noqa: E402
+from psd_deflection.arms.chains.chain_file import read_chain  # noqa: E402
+from psd_deflection.recordings.read.readers import open_recording  # noqa: E402
 from psd_deflection.ros.chain import chain_transforms  # noqa: E402
-from psd_deflection.runner.chain import Composed  # noqa: E402
+from psd_deflection.run.chain import Composed  # noqa: E402
 from test.ros.conftest import BLOCK_NS, WARNINGS, stamp  # noqa: E402
 from tools.program import PSD_DEFLECTION, ROOT, Program  # noqa: E402
 

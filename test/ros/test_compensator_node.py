@@ -43,7 +43,7 @@ sys.exit(main())
 
 @pytest.fixture
 def compensator(domain: int) -> Iterator[Program]:
-    # A busy machine is late; test/compensation has the default of 0.08 s.
+    # A busy machine is late; test/arms/compensation has the default of 0.08 s.
     command = [*PSD_DEFLECTION, *ARGUMENTS, '--stale', '0.5']
     one = Program(command, env={'PYTHONWARNINGS': WARNINGS})
     yield one

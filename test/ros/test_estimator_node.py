@@ -46,8 +46,8 @@ from visualization_msgs.msg import MarkerArray  # noqa: E402
 
 from msg_adapters import point_cloud2  # noqa: E402
 from psd_deflection.cli.main import main  # noqa: E402
-from psd_deflection.declarations import PARAMETERS  # noqa: E402
-from psd_deflection.recordings.readers import open_recording  # noqa: E402
+from psd_deflection.recordings.read.readers import open_recording  # noqa: E402
+from psd_deflection.rig.declarations import PARAMETERS  # noqa: E402
 from test.ros.conftest import BLOCK_NS, HANGING_DISK, stamp  # noqa: E402
 
 MS = 1_000_000

@@ -18,7 +18,7 @@ from geometry_msgs.msg import AccelStamped, PoseWithCovarianceStamped, TwistStam
 from std_srvs.srv import SetBool  # noqa: E402
 
 from psd_deflection.cli.main import main  # noqa: E402
-from psd_deflection.recordings.readers import open_recording  # noqa: E402
+from psd_deflection.recordings.read.readers import open_recording  # noqa: E402
 from psd_deflection.records import KNOWN_LOAD  # noqa: E402
 from test.ros.conftest import BLOCK_NS, stamp  # noqa: E402
 

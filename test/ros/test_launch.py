@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from psd_deflection.cli.main import make_parser
-from psd_deflection.declarations import BY_NAME
+from psd_deflection.rig.declarations import BY_NAME
 
 LAUNCH = Path(__file__).parent.parent.parent / 'launch'
 FILE = LAUNCH / 'estimator.launch.py'

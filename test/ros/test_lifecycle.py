@@ -30,9 +30,9 @@ from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
+from psd_deflection.base.errors import ConfigError, DeviceError  # noqa: E402
 from psd_deflection.devices.serial_port import SerialPort  # noqa: E402
-from psd_deflection.errors import ConfigError, DeviceError  # noqa: E402
-from psd_deflection.recordings.readers import open_recording  # noqa: E402
+from psd_deflection.recordings.read.readers import open_recording  # noqa: E402
 from psd_deflection.ros import estimator  # noqa: E402
 from test.heard import WAIT_S  # noqa: E402
 from test.ros.conftest import PATIENT, stamp  # noqa: E402

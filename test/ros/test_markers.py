@@ -17,8 +17,8 @@ from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
 
-from psd_deflection.config import load_rig  # noqa: E402
 from psd_deflection.records import BlockStatus, DeflectionEstimate, SpotMeans  # noqa: E402
+from psd_deflection.rig.config import load_rig  # noqa: E402
 from psd_deflection.ros.markers import at_rest, moving  # noqa: E402
 
 RIG = load_rig()

@@ -15,7 +15,7 @@ from rclpy.duration import Duration  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
 from bench.damping import END, FREQUENCY, MOVE_S, NAMES, RATIO, START, move, played  # noqa: E402
-from psd_deflection.compensation.trajectory import checked  # noqa: E402
+from psd_deflection.arms.compensation.trajectory import checked  # noqa: E402
 from test.ros.conftest import WARNINGS, stamp  # noqa: E402
 from tools.program import PSD_DEFLECTION, ROOT, Program  # noqa: E402
 

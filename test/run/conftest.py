@@ -11,9 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.devices.pseudo_terminal import PseudoTerminal
-from psd_deflection.protocol.frames import (
+from psd_deflection.devices.protocol.frames import (
     FrameDecoder,
     GoodFrame,
     HelloFrame,
@@ -21,8 +19,10 @@ from psd_deflection.protocol.frames import (
     SampleFrame,
     encode,
 )
+from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.records import CHANNELS, DeflectionEstimate, Record
-from psd_deflection.runner import acquisition
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.run.reading import acquisition
 from test.heard import WAIT_S
 
 HELLO = HelloFrame(

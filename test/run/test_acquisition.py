@@ -15,16 +15,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from psd_deflection.config import Rig, load_rig
+from psd_deflection.base.errors import DeviceError, Warned
 from psd_deflection.devices import contract_frames
+from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, PongFrame, encode
 from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import Clock, Event, Received, Sample, Source, SourceEndedError
-from psd_deflection.errors import DeviceError, Warned
-from psd_deflection.protocol.frames import FrameDecoder, HelloFrame, PongFrame, encode
 from psd_deflection.records import RESTART
-from psd_deflection.runner import acquisition as module
-from psd_deflection.runner.acquisition import Acquisition, Arrival, Ended, Item, Restarted
-from psd_deflection.runner.pinger import UNANSWERED
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.run.reading import acquisition as module
+from psd_deflection.run.reading.acquisition import Acquisition, Arrival, Ended, Item, Restarted
+from psd_deflection.run.reading.pinger import UNANSWERED
 from test.heard import WAIT_S
 
 HELLO_INFO: dict[str, object] = {

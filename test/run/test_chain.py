@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psd_deflection.chains.chain_file import ChainFile, read_chain
-from psd_deflection.chains.joining import PATIENCE
-from psd_deflection.errors import DeviceError
-from psd_deflection.protocol.frames import SampleFrame
-from psd_deflection.runner.chain import ChainSession, Composed
+from psd_deflection.arms.chains.chain_file import ChainFile, read_chain
+from psd_deflection.arms.chains.joining import PATIENCE
+from psd_deflection.base.errors import DeviceError
+from psd_deflection.devices.protocol.frames import SampleFrame
+from psd_deflection.run.chain import ChainSession, Composed
 from test.heard import WAIT_S
-from test.runner.conftest import ScriptedDevice
+from test.run.conftest import ScriptedDevice
 
 Sample = Callable[..., SampleFrame]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from psd_deflection.devices.protocol.frames import BadFrame, SampleFrame
 from psd_deflection.devices.source import Sample
-from psd_deflection.protocol.frames import BadFrame, SampleFrame
-from psd_deflection.runner.clock_watch import ClockWatch
+from psd_deflection.run.reading.clock_watch import ClockWatch
 
 COUNTS = (0, 0, 16384, 0, 0, 16384)
 MS = 1_000_000

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from psd_deflection.commissioning.checkup import WRONG
-from psd_deflection.config import load_rig
-from psd_deflection.errors import DeviceError
-from psd_deflection.runner.guided import run_guided
+from psd_deflection.base.errors import DeviceError
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run.guided import run_guided
+from psd_deflection.studies.check.checkup import WRONG
 
 
 def test_the_simulated_rig_and_hand_show_a_wrong_wiring() -> None:

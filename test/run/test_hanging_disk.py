@@ -15,20 +15,20 @@ from typing import Any
 
 import pytest
 
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.files import HeldFolder
 from psd_deflection.cli.main import main
-from psd_deflection.config import load_rig
-from psd_deflection.errors import RecordingError
-from psd_deflection.files import HeldFolder
-from psd_deflection.protocol.frames import SampleFrame
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.devices.protocol.frames import SampleFrame
+from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.records import DeflectionEstimate, Record
-from psd_deflection.runner import recorder as recorder_module
-from psd_deflection.runner import session as session_module
-from psd_deflection.runner.diagnostics import WARN, HealthReporter
-from psd_deflection.runner.recorder import Recorder
-from psd_deflection.runner.session import Session
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run import recorder as recorder_module
+from psd_deflection.run import session as session_module
+from psd_deflection.run.diagnostics import WARN, HealthReporter
+from psd_deflection.run.recorder import Recorder
+from psd_deflection.run.session import Session
 from test.heard import WAIT_S
-from test.runner.conftest import ScriptedDevice
+from test.run.conftest import ScriptedDevice
 
 Sample = Callable[..., SampleFrame]
 BLOCKS = 50
@@ -232,7 +232,7 @@ def test_a_recording_that_ends_by_itself_is_not_taken_for_one_that_runs(
     first = live.record(True)
     disk.hang('close')
     with monkeypatch.context() as broken:
-        broken.setattr('psd_deflection.recordings.bag_writer.BagWriter.write_encoded', gone)
+        broken.setattr('psd_deflection.recordings.write.bag_writer.BagWriter.write_encoded', gone)
         live.flow()
         assert disk.is_reached()
     assert live.session.recorder.folder is None

@@ -15,15 +15,15 @@ from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.config import Rig, load_rig
+from psd_deflection.base.errors import DeviceError
+from psd_deflection.devices.protocol.frames import HelloFrame, SampleFrame
+from psd_deflection.devices.protocol.words import MAX_TEXT
 from psd_deflection.devices.source import Received, Source
-from psd_deflection.errors import DeviceError
-from psd_deflection.protocol.frames import HelloFrame, SampleFrame
-from psd_deflection.protocol.words import MAX_TEXT
 from psd_deflection.records import CHANNELS, channel_names
-from psd_deflection.runner import acquisition as module
-from psd_deflection.runner.acquisition import Acquisition, Arrival
-from psd_deflection.runner.hello import AnotherDeviceError, HelloGate
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.run.reading import acquisition as module
+from psd_deflection.run.reading.acquisition import Acquisition, Arrival
+from psd_deflection.run.reading.hello import AnotherDeviceError, HelloGate
 
 VOLTS = 10.0 / 32768
 GOOD: dict[str, object] = {

@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import pytest
 
 from psd_deflection.devices.source import PortClosedError, Source
-from psd_deflection.runner.pinger import PING_S, UNANSWERED, Pinger
+from psd_deflection.run.reading.pinger import PING_S, UNANSWERED, Pinger
 
 
 @pytest.fixture

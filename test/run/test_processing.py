@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.config import load_rig
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import DeflectionEstimate, RawChunk, Record
-from psd_deflection.runner import processing as module
-from psd_deflection.runner.acquisition import Arrival, Ended, Item
-from psd_deflection.runner.processing import Processing
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run import processing as module
+from psd_deflection.run.processing import Processing
+from psd_deflection.run.reading.acquisition import Arrival, Ended, Item
 from test.heard import WAIT_S
 
 MS = 1_000_000

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from psd_deflection.runner.processing import Spokesman
-from psd_deflection.runner.realtime import Watchdog, lock_memory, prefer_reader
+from psd_deflection.run.processing import Spokesman
+from psd_deflection.run.realtime import Watchdog, lock_memory, prefer_reader
 
 
 class Systemd:

@@ -14,15 +14,15 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from msg_adapters import to_messages
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.errors import RecordingError
-from psd_deflection.files import HeldFolder
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.files import HeldFolder
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.repair import recover
 from psd_deflection.records import ParameterChange, SampleBlock
-from psd_deflection.runner import recorder as module
-from psd_deflection.runner.recorder import Recorder
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.run import recorder as module
+from psd_deflection.run.recorder import Recorder
 from test.heard import WAIT_S
 from test.recordings.making import block
 
@@ -152,7 +152,7 @@ def test_no_error_ends_a_recording_in_silence(tmp_path: Path, monkeypatch: pytes
 
     run = Run(rig_for(tmp_path))
     run.put(3)
-    monkeypatch.setattr('psd_deflection.recordings.bag_writer.BagWriter.write_encoded', fails)
+    monkeypatch.setattr('psd_deflection.recordings.write.bag_writer.BagWriter.write_encoded', fails)
     run.put(1)
     assert "KeyError: 'no such type'" in run.heard()
     assert run.recorder.folder is None

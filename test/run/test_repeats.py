@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from psd_deflection.runner.repeats import FIRST_WAIT_S, LONGEST_WAIT_S, Repeats
+from psd_deflection.run.repeats import FIRST_WAIT_S, LONGEST_WAIT_S, Repeats
 
 
 def test_a_line_a_second_for_a_day_is_few_lines_and_none_is_forgotten() -> None:

@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from psd_deflection.base.sequence import SequenceExtender, Step
 from psd_deflection.cli.main import main
-from psd_deflection.config import load_rig
+from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.devices.registry import make_source
 from psd_deflection.devices.source import Event, SourceEndedError
-from psd_deflection.protocol.frames import SampleFrame
-from psd_deflection.protocol.sequence import SequenceExtender, Step
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.runner import processing
-from psd_deflection.runner.session import Session
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run import processing
+from psd_deflection.run.session import Session
 from test.heard import WAIT_S
-from test.runner.conftest import Estimates, ScriptedDevice
+from test.run.conftest import Estimates, ScriptedDevice
 
 Sample = Callable[..., SampleFrame]
 

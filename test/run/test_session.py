@@ -10,17 +10,17 @@ from pathlib import Path
 import pytest
 
 from msg_adapters import REFERENCE, to_messages
-from psd_deflection.config import load_rig
-from psd_deflection.protocol.frames import SampleFrame
+from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.records import AppliedLoad, Record, ReferencePose
-from psd_deflection.runner import processing
-from psd_deflection.runner import session as module
-from psd_deflection.runner.diagnostics import STALE, WARN, HealthReporter
-from psd_deflection.runner.session import Session
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run import processing
+from psd_deflection.run import session as module
+from psd_deflection.run.diagnostics import STALE, WARN, HealthReporter
+from psd_deflection.run.session import Session
 from test.heard import WAIT_S
-from test.runner.conftest import Estimates, ScriptedDevice
+from test.run.conftest import Estimates, ScriptedDevice
 
 Sample = Callable[..., SampleFrame]
 

@@ -7,8 +7,8 @@ from typing import Any, cast
 
 import pytest
 
-from psd_deflection.config import Rig, replace_values
-from psd_deflection.runner.session import Session
+from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.run.session import Session
 from test.heard import WAIT_S
 
 ALLOWED_S = 2.0

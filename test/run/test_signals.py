@@ -13,10 +13,10 @@ from typing import Any, cast
 import pytest
 
 from psd_deflection.cli._display import Display, live_line
-from psd_deflection.monitor.start import start_views
-from psd_deflection.runner.headless import run_headless
-from psd_deflection.runner.session import Session
-from psd_deflection.runner.signals import Signals, StopRequestedError
+from psd_deflection.run.headless import run_headless
+from psd_deflection.run.monitor.start import start_views
+from psd_deflection.run.session import Session
+from psd_deflection.run.signals import Signals, StopRequestedError
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -24,7 +24,7 @@ def test_a_signal_ends_the_waiting_for_a_silent_device(
     device: Any, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     device.answer = b''
-    monkeypatch.setattr('psd_deflection.runner.acquisition.SILENCE_S', 60.0)
+    monkeypatch.setattr('psd_deflection.run.reading.acquisition.SILENCE_S', 60.0)
     # Under nohup the tests themselves are started with SIGHUP ignored.
     before = signal.signal(number, signal.SIG_DFL)
 

@@ -11,22 +11,22 @@ import numpy as np
 import pytest
 
 from msg_adapters import LOAD, to_messages
-from psd_deflection.config import load_rig
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.protocol.frames import SampleFrame
+from psd_deflection.devices.protocol.frames import SampleFrame
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.observations import read_observation
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.replay_engine import replayed_estimates, rig_at_start
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.replay.engine import replayed_estimates, rig_at_start
 from psd_deflection.records import AppliedLoad, DeflectionEstimate, FloatArray, RawChunk
-from psd_deflection.runner import watcher as module
-from psd_deflection.runner.diagnostics import OK, WARN, HealthReporter
-from psd_deflection.runner.fanout import Fanout
-from psd_deflection.runner.session import Session
-from psd_deflection.runner.watcher import Watcher, WatcherWire
-from psd_deflection.simulation.simulator import RigSimulator
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run import watcher as module
+from psd_deflection.run.diagnostics import OK, WARN, HealthReporter
+from psd_deflection.run.fanout import Fanout
+from psd_deflection.run.session import Session
+from psd_deflection.run.watcher import Watcher, WatcherWire
+from psd_deflection.studies.discover.from_recordings import read_observation
 from test.heard import WAIT_S
-from test.runner.conftest import Estimates, ScriptedDevice
+from test.run.conftest import Estimates, ScriptedDevice
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -143,7 +143,7 @@ def test_nothing_is_written_unasked(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_a_disk_without_room_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = SimpleNamespace(free=1_000_000)
-    monkeypatch.setattr('psd_deflection.runner.recorder.shutil', cast(Any, SimpleNamespace(disk_usage=lambda _: usage)))
+    monkeypatch.setattr('psd_deflection.run.recorder.shutil', cast(Any, SimpleNamespace(disk_usage=lambda _: usage)))
     chain = Chain(tmp_path)
     chain.load(0.0, 0.0, 0.0)
     chain.feed(8.0)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection.config import Rig, load_rig, replace_values
-from psd_deflection.errors import Warned
-from psd_deflection.runner.zero_store import ZeroStore
+from psd_deflection.base.errors import Warned
+from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.run.zero_store import ZeroStore
 
 ZERO = {'psd_1.zero': [1e-4, -2e-4], 'psd_2.zero': [3e-5, 0.0]}
 

@@ -24,9 +24,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from psd_deflection.chains.transform import IDENTITY, Transform, cross_matrix, shift, turn
-from psd_deflection.errors import ConfigError
-from psd_deflection.mechanics.statics import LinkStatics
+from psd_deflection.arms.chains.transform import IDENTITY, Transform, cross_matrix, shift, turn
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.link.statics import LinkStatics
 from psd_deflection.records import FloatArray
 
 SLOPES = ('ratio', 'end_force')

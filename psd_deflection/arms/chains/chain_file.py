@@ -28,15 +28,15 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.chains.chain import Chain, ChainLink
-from psd_deflection.chains.transform import Transform, of_position_and_angles
-from psd_deflection.config import Rig, replace_values, rig_from_values
-from psd_deflection.declarations import FRAME_PREFIX
-from psd_deflection.errors import ConfigError, did_you_mean
-from psd_deflection.foreign_yaml import tree_of_file
-from psd_deflection.mechanics.statics import LinkStatics
-from psd_deflection.parameter_files import flattened, read_parameter_file
+from psd_deflection.arms.chains.chain import Chain, ChainLink
+from psd_deflection.arms.chains.transform import Transform, of_position_and_angles
+from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.base.foreign_yaml import tree_of_file
+from psd_deflection.model.link.statics import LinkStatics
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig, replace_values, rig_from_values
+from psd_deflection.rig.declarations import FRAME_PREFIX
+from psd_deflection.rig.parameter_files import flattened, read_parameter_file
 
 MOST_LINKS = 32
 BASE_FRAME = 'base_link'

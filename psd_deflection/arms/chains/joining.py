@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.chains.chain import TipDeflection
+from psd_deflection.arms.chains.chain import TipDeflection
 from psd_deflection.records import DeflectionEstimate, FloatArray
 
 KEPT = 64

@@ -18,9 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.chains.transform import Transform
-from psd_deflection.compensation.arm import Arm
-from psd_deflection.errors import ConfigError
+from psd_deflection.arms.chains.transform import Transform
+from psd_deflection.arms.compensation.arm import Arm
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
 
 AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')

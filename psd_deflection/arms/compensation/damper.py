@@ -16,8 +16,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from psd_deflection.compensation.compensator import State
-from psd_deflection.errors import ConfigError
+from psd_deflection.arms.compensation.compensator import State
+from psd_deflection.base.errors import ConfigError
 
 OBSERVER = 0.3
 """Share of what the observer did not foretell that it believes."""

@@ -19,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import PPoly
 
-from psd_deflection.compensation.arm import JointLimits
-from psd_deflection.errors import ConfigError
-from psd_deflection.identification.shapers import Shaper
+from psd_deflection.arms.compensation.arm import JointLimits
+from psd_deflection.arms.shapers import Shaper
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
 
 MOST_POINTS = 10_000

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.camera.answer import RefusedError, Status, TargetPose
-from psd_deflection.camera.find_discs import MIN_RADIUS, Region, find_discs
+from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
+from psd_deflection.camera.discs.find_discs import MIN_RADIUS, Region, find_discs
+from psd_deflection.camera.discs.rim_fit import Fitter
+from psd_deflection.camera.discs.rim_model import PosePrior, turned
 from psd_deflection.camera.lens import Lens
-from psd_deflection.camera.rim_fit import Fitter
-from psd_deflection.camera.rim_model import Prior, turned
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.records import FloatArray
 
@@ -52,14 +52,14 @@ class Discs:
         """The target in one image; ``grey`` is its 8-bit form. Raises RefusedError."""
         regions = find_discs(grey, self._spacing / self._radius)
         if min(r.axes[0] for r in regions) < MIN_RADIUS:
-            raise RefusedError(Status.SMALL)
+            raise NoPoseError(Status.SMALL)
         if regions[1].axes[0] < math.cos(_OBLIQUE) * regions[1].axes[1]:
-            raise RefusedError(Status.OBLIQUE)
+            raise NoPoseError(Status.OBLIQUE)
         apart = np.subtract(regions[0].centre, regions[2].centre)
         upright = float(apart @ self._up) / math.hypot(*apart.tolist())
         if self._answered and abs(upright) < _UNSURE:
             # The target looks the same after half a turn.
-            raise RefusedError(Status.HALF_TURN)
+            raise NoPoseError(Status.HALF_TURN)
         if upright < 0.0:
             regions = regions[::-1]
         found = self._fit(image, regions, lens, full_scale)
@@ -71,9 +71,9 @@ class Discs:
         rays = lens.rays(np.array([r.centre for r in regions]))
         frontal = self._frontal(rays)
         if self._rest is None:
-            prior = Prior(frontal, FIRST_TILT_SD if lens.known else AFFINE_TILT_SD, np.zeros(2))
+            prior = PosePrior(frontal, FIRST_TILT_SD if lens.known else AFFINE_TILT_SD, np.zeros(2))
         else:
-            prior = Prior(self._rest.rotation, MOTION_TILT_SD, self._rest.keystone)
+            prior = PosePrior(self._rest.rotation, MOTION_TILT_SD, self._rest.keystone)
         if self._plate is None:
             guesses = [frontal @ turned(sign * self._tilt(regions[1], frontal)) for sign in (1.0, -1.0)]
         else:
@@ -83,12 +83,12 @@ class Discs:
             guesses = [self._plate @ turned(np.array([0.0, 0.0, angle]))]
         if self._fitter is None:
             self._fitter = Fitter(lens, image.shape, self._centres, self._radius)
-        fits, reason = [], RefusedError(Status.MISFIT)
+        fits, reason = [], NoPoseError(Status.MISFIT)
         for guess in guesses:
             try:
                 place = self._place(rays, guess)
                 fits.append(self._fitter.fit(image, guess, place, prior, full_scale))
-            except RefusedError as error:
+            except NoPoseError as error:
                 reason = error
         if not fits:
             raise reason
@@ -126,5 +126,5 @@ class Discs:
         far = -float((off * (right - at)).sum() / (off * off).sum())
         place = np.array([*(at + ray * far).tolist(), far])
         if place[2] <= 0.0:
-            raise RefusedError(Status.MISFIT)
+            raise NoPoseError(Status.MISFIT)
         return np.asarray(place)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from psd_deflection.camera.answer import RefusedError, Status
+from psd_deflection.camera.answer import NoPoseError, Status
 from psd_deflection.camera.opencv import opencv
 
 CLEAR = 8.0
@@ -77,7 +77,7 @@ def find_discs(grey: Any, ratio: float) -> list[Region]:
         small = opencv().resize(grey[: rows * by, : columns * by], (columns, rows), interpolation=opencv().INTER_AREA)
         try:
             found = _found([next(_binaries(small, smooth=False))], ratio, CLEAR / by)
-        except RefusedError as error:
+        except NoPoseError as error:
             if error.status is Status.DOUBLED:
                 raise
         else:
@@ -92,13 +92,13 @@ def _found(binaries: Iterable[Any], ratio: float, clear: float) -> list[Region]:
         regions = _regions(binary)
         lines = _lines([r for r in regions if r.round and not r.at_border], ratio)
         if len(lines) > 1:
-            raise RefusedError(Status.DOUBLED)
+            raise NoPoseError(Status.DOUBLED)
         if lines:
             if _crowded(lines[0], regions, clear):
-                raise RefusedError(Status.DOUBLED)
+                raise NoPoseError(Status.DOUBLED)
             return lines[0]
         best = max(best, _why(regions, ratio), key=lambda b: b[0])
-    raise RefusedError(best[1])
+    raise NoPoseError(best[1])
 
 
 def _binaries(grey: Any, *, smooth: bool = True) -> Iterator[Any]:
@@ -109,7 +109,7 @@ def _binaries(grey: Any, *, smooth: bool = True) -> Iterator[Any]:
     share = np.cumsum(np.bincount(grey[::thin, ::thin].ravel(), minlength=256))
     low, high = np.searchsorted(share, (0.02 * share[-1], 0.998 * share[-1])).tolist()
     if high - low < _MIN_CONTRAST:
-        raise RefusedError(Status.MISSING)
+        raise NoPoseError(Status.MISSING)
     # Noise of a pixel must not fray the outline; the sub-pixel fit sees the image as it is.
     if smooth:
         grey = cv2.blur(grey, (3, 3))

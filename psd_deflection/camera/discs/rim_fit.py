@@ -9,16 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.camera.answer import RefusedError, Status, TargetPose
-from psd_deflection.camera.lens import Lens
-from psd_deflection.camera.rim_judge import Judge
-from psd_deflection.camera.rim_model import (
+from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
+from psd_deflection.camera.discs.rim_judge import Judge
+from psd_deflection.camera.discs.rim_model import (
     LIGHTS,
     ROOT_2PI,
     THINNED,
     Normal,
     Pixels,
-    Prior,
+    PosePrior,
     Rims,
     Shape,
     after,
@@ -30,6 +29,7 @@ from psd_deflection.camera.rim_model import (
     moved,
     width,
 )
+from psd_deflection.camera.lens import Lens
 from psd_deflection.records import FloatArray
 
 _STEPS = 15
@@ -59,7 +59,9 @@ class Fitter:
         self._judge = Judge(lens, self._columns, centres)
         self._blur = np.eye(2)
 
-    def fit(self, image: Any, rotation: FloatArray, place: FloatArray, prior: Prior, full_scale: float) -> TargetPose:
+    def fit(
+        self, image: Any, rotation: FloatArray, place: FloatArray, prior: PosePrior, full_scale: float
+    ) -> TargetPose:
         """The pose, from a first guess that is good to a pixel or two, and from the blur of the last answer.
 
         ``image`` (rows, columns): grey levels; ``full_scale``: where the camera saturates. Raises RefusedError.
@@ -104,7 +106,7 @@ class Fitter:
         reach = self._radius * np.sqrt(np.stack([yy, xx], axis=1) / (xx * yy - xy * xy)[:, None])
         limits = (self._columns - half - 3, self._rows - half - 3)
         if (middles - reach).min() < half + 2 or (middles + reach > limits).any():
-            raise RefusedError(Status.OUTSIDE)
+            raise NoPoseError(Status.OUTSIDE)
         # Wide enough for the direction in which the picture is the longest.
         bands = half * np.sqrt((xx + yy) / 2 + np.hypot((xx - yy) / 2, xy))
         starts = np.floor(middles - reach - half - 1)
@@ -158,7 +160,7 @@ class Fitter:
         forward = inverse[:2, :2] - self._centres[:, :, None] * inverse[2, :2]
         return np.asarray((forward * far[:, None, None]) @ bends)
 
-    def _converge(self, rims: Rims, shape: Shape, prior: Prior) -> tuple[Shape, tuple[float, float] | None]:
+    def _converge(self, rims: Rims, shape: Shape, prior: PosePrior) -> tuple[Shape, tuple[float, float] | None]:
         """The shape by some of the pixels, and the noise outside and inside."""
         for _ in range(_STEPS):
             normal = self._linearise(rims, shape, None)
@@ -168,7 +170,9 @@ class Fitter:
                 break
         return shape, _noise(normal, rims, step)
 
-    def _stepped(self, normal: Normal, shape: Shape, prior: Prior, count: int) -> tuple[Shape, FloatArray, FloatArray]:
+    def _stepped(
+        self, normal: Normal, shape: Shape, prior: PosePrior, count: int
+    ) -> tuple[Shape, FloatArray, FloatArray]:
         """The shape after a Gauss-Newton step, the step and the standard deviations."""
         variance = max(normal.squares / max(count - 30, 1), 1e-9)
         stiff, pull = beforehand(shape, prior)
@@ -176,7 +180,7 @@ class Fitter:
         gradient = normal.gradient / variance + stiff * pull
         step = inverse @ gradient
         if not np.isfinite(step).all():
-            raise RefusedError(Status.MISFIT)
+            raise NoPoseError(Status.MISFIT)
         step *= min(1.0, 0.2 / max(*np.abs(step[:3]).tolist(), 1e-12))
         light = shape.light + normal.back[:, :, -1] - normal.back[:, :, :-1] @ step
         deviation = np.sqrt(np.maximum(inverse.diagonal(), 0.0))

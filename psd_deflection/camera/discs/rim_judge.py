@@ -7,15 +7,14 @@ import math
 
 import numpy as np
 
-from psd_deflection.camera.answer import RefusedError, Status, TargetPose
-from psd_deflection.camera.lens import Lens
-from psd_deflection.camera.rim_model import (
+from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
+from psd_deflection.camera.discs.rim_model import (
     LIGHTS,
     ROOT_2PI,
     THINNED,
     Normal,
     Pixels,
-    Prior,
+    PosePrior,
     Rims,
     Shape,
     after,
@@ -24,6 +23,7 @@ from psd_deflection.camera.rim_model import (
     motion_of,
     spread,
 )
+from psd_deflection.camera.lens import Lens
 from psd_deflection.records import FloatArray, IntArray
 
 _HALF_OCTANT = math.tan(math.pi / 8)
@@ -77,20 +77,20 @@ class Judge:
         rims: Rims,
         shape: Shape,
         step: FloatArray,
-        prior: Prior,
+        prior: PosePrior,
         pixel_radius: float,
         full_scale: float,
     ) -> TargetPose:
         """The pose with the covariance that the residuals show. Raises RefusedError if they show another picture."""
         contrast = shape.light[:, 3] - shape.light[:, 0]
         if contrast.min() <= 0.0 or contrast.min() < 0.3 * contrast.max():
-            raise RefusedError(Status.HIDDEN)
+            raise NoPoseError(Status.HIDDEN)
         motion = motion_of(shape.blur)
         sharp = math.sqrt(spread(shape.blur)[0])
         if math.sqrt(12.0) * motion > MOST_BLUR * pixel_radius:
-            raise RefusedError(Status.BLURRED)
+            raise NoPoseError(Status.BLURRED)
         if sharp > MOST_DEFOCUS * pixel_radius:
-            raise RefusedError(Status.DEFOCUSED)
+            raise NoPoseError(Status.DEFOCUSED)
         count = len(rims.level)
         stiff, pull = beforehand(shape, prior)
         left = normal.squares - float(step @ (2.0 * normal.gradient - normal.hessian @ step))
@@ -102,10 +102,10 @@ class Judge:
         sector = _sectors(normal.side, rims)
         relative = raw / float(contrast.mean())
         if motion > _DOUBLED_FROM * max(sharp, 0.5) and _doubled(normal, relative, shape.blur):
-            raise RefusedError(Status.GHOST)
+            raise NoPoseError(Status.GHOST)
         misfit = _misfit(normal.z, relative, sector, rims, full_scale)
         if misfit > MOST_MISFIT + MISFIT_OF_BLUR * min(max(motion / sharp - 0.5, 0.0), 1.5):
-            raise RefusedError(Status.MISFIT)
+            raise NoPoseError(Status.MISFIT)
         # What the model does not say: a level that is off by the misfit moves the rim by that over the steepest rise.
         # It may be one disc's alone, and moves a rim more easily than it bends one.
         wrong = 4.0 * misfit * ROOT_2PI * math.hypot(sharp, motion)
@@ -169,9 +169,9 @@ def _misfit(z: Pixels, raw: Pixels, sector: IntArray, rims: Rims, full_scale: fl
     if rims.level.max() >= full_scale - 1.0:
         worst = _unevenness(z, raw, rims, full_scale)
         if worst > UNEVEN:
-            raise RefusedError(Status.SATURATED)
+            raise NoPoseError(Status.SATURATED)
     if math.sqrt(float(raw @ raw) / len(raw)) > MOST_NOISE:
-        raise RefusedError(Status.MISFIT)
+        raise NoPoseError(Status.MISFIT)
     zone = np.clip((z + 3.0) * (_ZONES / 6.0), 0, _ZONES - 1).astype(int)
     cell = sector * _ZONES + zone
     count = np.bincount(cell, minlength=parts * _ZONES).reshape(parts, _ZONES).astype(float)
@@ -186,7 +186,7 @@ def _misfit(z: Pixels, raw: Pixels, sector: IntArray, rims: Rims, full_scale: fl
     usual = within * np.sqrt(2.0 / np.maximum(filled.sum(axis=1), 1)) / np.maximum(count.sum(axis=1) / _ZONES, 1.0)
     # A rim that something covers in part has sectors of another picture.
     if np.any(by_sector > HIDDEN_SECTOR**2 + 6.0 * usual):
-        raise RefusedError(Status.HIDDEN)
+        raise NoPoseError(Status.HIDDEN)
     return math.hypot(math.sqrt(max(float(excess.sum() / max(filled.sum(), 1)), 0.0)), worst)
 
 

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.camera.answer import RefusedError, Status, plane_of
+from psd_deflection.camera.answer import NoPoseError, Status, plane_of
 from psd_deflection.camera.lens import AFFINE_FOCAL
 from psd_deflection.records import FloatArray, IntArray
 
@@ -47,7 +47,7 @@ ROOT_2PI = math.sqrt(2.0 * math.pi)
 Pixels = npt.NDArray[np.float32]
 
 
-class Prior(NamedTuple):
+class PosePrior(NamedTuple):
     """What is known of the pose beforehand: tilts about the target's X and Y against ``rotation``, one ``sd``, rad.
 
     ``keystone``: what is expected of it, in the axes of ``rotation``, if the lens is not known.
@@ -120,7 +120,7 @@ def covariance_of(normal: Normal, variance: float, stiff: FloatArray) -> FloatAr
     try:
         return np.asarray(np.linalg.inv(hessian), dtype=float)
     except np.linalg.LinAlgError:
-        raise RefusedError(Status.MISFIT) from None
+        raise NoPoseError(Status.MISFIT) from None
 
 
 def after(normal: Normal, rims: Rims, step: FloatArray, ways: FloatArray) -> Pixels:
@@ -159,12 +159,12 @@ def below(z: Pixels, bell: Pixels) -> Pixels:
     return tail
 
 
-def expected(prior: Prior, rotation: FloatArray) -> FloatArray:
+def expected(prior: PosePrior, rotation: FloatArray) -> FloatArray:
     """The keystone that ``prior`` expects, in the axes of ``rotation``."""
     return np.asarray((rotation.T @ prior.rotation)[:2, :2] @ prior.keystone)
 
 
-def beforehand(shape: Shape, prior: Prior) -> tuple[FloatArray, FloatArray]:
+def beforehand(shape: Shape, prior: PosePrior) -> tuple[FloatArray, FloatArray]:
     """What is known without this image: inverse variances of the parameters; how far each is from what is expected."""
     size = 10 + shape.skew.size
     stiff, pull = np.zeros((2, size + shape.keystone.size))

@@ -18,12 +18,12 @@ from pathlib import Path
 from psd_deflection.cli._options import namespace_option, recording_name
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show, warn
-from psd_deflection.config import load_rig
 from psd_deflection.recordings.conversion import Beside, convert, convert_computed
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.replay_engine import nominal_rig, open_for_replay
-from psd_deflection.recordings.sinks import is_for_viewing
+from psd_deflection.recordings.replay.engine import nominal_rig, open_for_replay
+from psd_deflection.recordings.write.sinks import is_for_viewing
+from psd_deflection.rig.config import load_rig
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

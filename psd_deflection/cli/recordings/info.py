@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from msg_adapters import SAMPLES
+from psd_deflection.base.errors import printable
 from psd_deflection.cli._fleet import (
     ERROR,
     executor_option,
@@ -32,12 +33,11 @@ from psd_deflection.cli._fleet import (
 from psd_deflection.cli._options import namespace_option, parquet_name
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show
-from psd_deflection.errors import printable
-from psd_deflection.fleet.parquet import Field, ParquetFile
-from psd_deflection.provenance import NAMES
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.readings_table import described, is_table
+from psd_deflection.recordings.provenance import NAMES
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.read.readings_table import described, is_table
 from psd_deflection.recordings.summary import summary
+from psd_deflection.run.fleet.parquet import Field, ParquetFile
 
 _EPOCH_FROM_NS = 10**18
 """September 2001; smaller times do not count from the epoch."""

@@ -21,17 +21,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from psd_deflection.base.errors import RecordingError, UsageError, printable
 from psd_deflection.cli._options import PICTURES, namespace_option, need_folder, number, picture_name
 from psd_deflection.cli._plot_page import plot_page
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, save, save_figure, show, warn
-from psd_deflection.config import Rig
-from psd_deflection.errors import RecordingError, UsageError, printable
-from psd_deflection.monitor.feed import is_zero
-from psd_deflection.monitor.spectrum import Spectrum
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.replay_engine import nominal_rig, open_for_replay, replayed
+from psd_deflection.recordings.replay.engine import nominal_rig, open_for_replay, replayed
 from psd_deflection.records import (
     AppliedLoad,
     BlockStatus,
@@ -43,6 +40,9 @@ from psd_deflection.records import (
     SpotMeans,
     dot_names,
 )
+from psd_deflection.rig.config import Rig
+from psd_deflection.run.monitor.feed import is_zero
+from psd_deflection.run.monitor.spectrum import Spectrum
 
 SPECTRUM_OF_S = 600.0
 """The spectrum is of the last ten minutes: it does not get better after that, only slower."""

@@ -29,22 +29,22 @@ from typing import Any
 
 import numpy as np
 
+from psd_deflection.base.errors import UsageError
+from psd_deflection.base.tables import Column
 from psd_deflection.cli._fleet import absolute, executor_option, recordings_argument, run_each, several, tell_each
 from psd_deflection.cli._options import namespace_option, recording_name, refuse
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show, show_text, warn
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.errors import UsageError
-from psd_deflection.fleet.parquet import ENDING, Field, ParquetFile, is_parquet
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.comparison import Comparison
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.replay_engine import GatheredEstimates, nominal_rig, open_for_replay, replayed
-from psd_deflection.recordings.sinks import Sink, open_sink
-from psd_deflection.recordings.watched import WatchedReplay
+from psd_deflection.recordings.replay.comparison import ReplayComparison
+from psd_deflection.recordings.replay.engine import GatheredEstimates, nominal_rig, open_for_replay, replayed
+from psd_deflection.recordings.replay.watched import WatchedReplay
+from psd_deflection.recordings.write.sinks import Sink, open_sink
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock
-from psd_deflection.tables import Column
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.run.fleet.parquet import ENDING, Field, ParquetFile, is_parquet
 
 DIFFERS = 1
 HEAD = ('state', 'seconds', 'samples', 'lost', 'blocks', 'estimates', 'refused')
@@ -116,14 +116,14 @@ class Totals:
 
 
 @dataclass
-class Replay:
+class ReplayTask:
     """One recording through the pipeline."""
 
     recording: Recording
     rig: Rig
     pipeline: Pipeline
     totals: Totals
-    comparison: Comparison | None
+    comparison: ReplayComparison | None
     warnings: list[str]
     seconds: float = 0.0
 
@@ -153,7 +153,7 @@ def run(args: argparse.Namespace) -> int:
     path = args.recordings[0]
     recording, rig = open_for_replay(path, args.params_file, args.namespace)
     with told('looking for what was recorded', quiet=args.json):
-        comparison = Comparison(recording) if args.compare else None
+        comparison = ReplayComparison(recording) if args.compare else None
     sink: Sink | None = None
     if args.out is not None:
         sink = open_sink(args.out, rig.flat(), device_hello=recording.hello)
@@ -186,10 +186,10 @@ def _replayed(
     recording: Recording,
     rig: Rig,
     params_file: str | None,
-    comparison: Comparison | None,
+    comparison: ReplayComparison | None,
     takers: Iterable[Callable[[Record], None]],
     blocks: Iterable[SampleBlock] | None = None,
-) -> Replay:
+) -> ReplayTask:
     """Every record to each of ``takers``; ``comparison`` is finished."""
     pipeline, totals = Pipeline(rig), Totals(recording)
     began = time.perf_counter()
@@ -204,7 +204,7 @@ def _replayed(
     warnings = [*recording.warnings, *nominal_rig(recording, params_file), *_rate_warning(recording, rig)]
     if comparison is not None:
         comparison.finish()
-    return Replay(recording, rig, pipeline, totals, comparison, warnings, seconds)
+    return ReplayTask(recording, rig, pipeline, totals, comparison, warnings, seconds)
 
 
 def _agrees(counts: Mapping[str, object], strict: bool) -> bool:
@@ -224,7 +224,7 @@ def replay_of(path: str, *, params_file: str | None, namespace: str | None, comp
     """The task for one of many recordings."""
     recording, rig = open_for_replay(path, params_file, namespace)
     gathered = GatheredEstimates()
-    comparison = Comparison(recording) if compare else None
+    comparison = ReplayComparison(recording) if compare else None
     done = _replayed(recording, rig, params_file, comparison, [gathered.add] if columns else [])
     return Replayed(done.summary(), done.warnings, _columns(gathered.series()) if columns else [])
 
@@ -301,7 +301,7 @@ def _rate_warning(recording: Recording, rig: Rig) -> list[str]:
     ]
 
 
-def _print_summary(args: argparse.Namespace, done: Replay) -> None:
+def _print_summary(args: argparse.Namespace, done: ReplayTask) -> None:
     totals, counters = done.totals, done.pipeline.counters
     path = args.recordings[0]
     poses = np.array(totals.poses).reshape(-1, 3)

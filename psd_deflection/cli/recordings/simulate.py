@@ -21,17 +21,17 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from psd_deflection.cli import serve
+from psd_deflection.base.errors import UsageError
 from psd_deflection.cli._options import given_as_option, in_the_world, recording_name, refuse, seed, world_option
 from psd_deflection.cli._report import print_json, show
-from psd_deflection.config import load_rig
-from psd_deflection.errors import UsageError
-from psd_deflection.recordings.simulated_run import BAG_START_NS, SimulatedRun
-from psd_deflection.recordings.sinks import is_csv, open_sink
+from psd_deflection.cli.run import serve
+from psd_deflection.model.simulation.catalogue import effects_of_rig
+from psd_deflection.model.simulation.effect_words import with_effects
+from psd_deflection.model.simulation.load_words import HELP, load_history, temperature_history
+from psd_deflection.recordings.replay.simulated_run import BAG_START_NS, SimulatedRun
+from psd_deflection.recordings.write.sinks import is_csv, open_sink
 from psd_deflection.records import AppliedLoad, Record, ReferencePose, SampleBlock, TemperatureReading
-from psd_deflection.simulation.catalogue import effects_of_rig
-from psd_deflection.simulation.effect_words import with_effects
-from psd_deflection.simulation.load_words import HELP, load_history, temperature_history
+from psd_deflection.rig.config import load_rig
 
 LEAST_SAMPLES = 2
 """Fewer tell no sample rate: such a CSV could not be read again."""

@@ -30,7 +30,10 @@ from typing import Any
 
 from tqdm import tqdm
 
+from psd_deflection.base.errors import RecordingError, UsageError
+from psd_deflection.base.files import replace_file
 from psd_deflection.camera.answer import FrameAnswer, Status
+from psd_deflection.camera.footage import Footage, Frame, read_image, read_settings, read_values
 from psd_deflection.camera.intrinsics import calibrated
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.preview import preview
@@ -40,11 +43,8 @@ from psd_deflection.camera.settings import TARGETS, CameraSettings
 from psd_deflection.camera.targets import target_of
 from psd_deflection.cli._options import FOREIGN, need_folder, picture_name, whole
 from psd_deflection.cli._report import print_json, show, warn
-from psd_deflection.errors import RecordingError, UsageError
-from psd_deflection.files import replace_file
-from psd_deflection.footage import Footage, Frame, read_image, read_settings, read_values
-from psd_deflection.recordings.csv_writer import CsvReferenceFile
-from psd_deflection.recordings.reference_sink import ReferenceSink
+from psd_deflection.recordings.write.csv_writer import CsvReferenceFile
+from psd_deflection.recordings.write.reference_sink import ReferenceSink
 
 PREVIEW_S = 1.0
 

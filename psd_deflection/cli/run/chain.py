@@ -23,14 +23,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
 
-from psd_deflection.chains.chain import SLOPES
-from psd_deflection.chains.chain_file import read_chain
+from psd_deflection.arms.chains.chain import SLOPES
+from psd_deflection.arms.chains.chain_file import read_chain
+from psd_deflection.base.errors import ConfigError, RecordingError, UsageError, creating
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import need_folder, whole
 from psd_deflection.cli._report import print_json
-from psd_deflection.errors import ConfigError, RecordingError, UsageError, creating
-from psd_deflection.runner.chain import ChainSession, Composed
-from psd_deflection.runner.headless import run_until_signal
+from psd_deflection.run.chain import ChainSession, Composed
+from psd_deflection.run.headless import run_until_signal
 
 AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 COLUMNS = ('t', *AXES, *(f'sd_{axis}' for axis in AXES), 'missing')

@@ -18,11 +18,11 @@ from __future__ import annotations
 import argparse
 import importlib.util
 
+from psd_deflection.arms.compensation.arm import read_arm
+from psd_deflection.arms.compensation.compensator import CompensatorSettings
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import given_as_option, number
-from psd_deflection.compensation.arm import read_arm
-from psd_deflection.compensation.compensator import CompensatorSettings
-from psd_deflection.errors import ConfigError
 
 _NUMBERS = {
     'max-offset': ('largest offset of a joint, rad or m', 1e-9, 10.0),

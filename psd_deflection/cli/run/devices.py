@@ -15,12 +15,12 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 
+from psd_deflection.base.errors import DeviceError
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, show, show_text
 from psd_deflection.devices.device import Device
 from psd_deflection.devices.registry import known_devices
 from psd_deflection.devices.survey import Port, suggestions, survey
-from psd_deflection.errors import DeviceError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

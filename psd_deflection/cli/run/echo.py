@@ -22,14 +22,14 @@ from collections.abc import Mapping
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
+from psd_deflection.base.errors import DaemonError
 from psd_deflection.cli._daemon import daemon_of, url_option
 from psd_deflection.cli._options import whole
 from psd_deflection.cli._report import print_json, show
-from psd_deflection.errors import DaemonError
-from psd_deflection.monitor.start import need_server
+from psd_deflection.run.monitor.start import need_server
 
 if TYPE_CHECKING:
-    from psd_deflection.monitor.client import Daemon
+    from psd_deflection.run.monitor.client import Daemon
 
 MDEG = 180e3 / math.pi
 SHOWN = (('dx', 'ΔX', 1e6, 'µm'), ('dy', 'ΔY', 1e6, 'µm'), ('theta', 'θ', MDEG, 'mdeg'))
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 async def _echo(daemon: Daemon, count: int | None, as_json: bool) -> None:
-    from psd_deflection.monitor.client import messages
+    from psd_deflection.run.monitor.client import messages
 
     told = messages(daemon)
     try:

@@ -20,14 +20,14 @@ import argparse
 import importlib.util
 from collections.abc import Mapping, Sequence
 
+from psd_deflection.base.errors import ConfigError, UsageError
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import given_as_option, given_parameters, over_file, parameter_option
 from psd_deflection.devices.registry import DEVICES, source_names
-from psd_deflection.errors import ConfigError, UsageError
-from psd_deflection.monitor.start import start_views
-from psd_deflection.runner.headless import run_headless
-from psd_deflection.runner.simulated_rig import simulates, started_early
-from psd_deflection.solvers.registry import SOLVERS, check_live
+from psd_deflection.model.solvers.registry import SOLVERS, check_live
+from psd_deflection.run.headless import run_headless
+from psd_deflection.run.monitor.start import start_views
+from psd_deflection.run.simulated_rig import simulates, started_early
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

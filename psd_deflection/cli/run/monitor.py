@@ -21,22 +21,22 @@ import signal
 import threading
 from collections.abc import Iterator
 
+from psd_deflection.base.errors import UsageError
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import given_parameters, namespace_option, over_file, parameter_option, refuse
 from psd_deflection.cli._report import warn
-from psd_deflection.config import replace_values
-from psd_deflection.declarations import MONITOR
-from psd_deflection.errors import UsageError
-from psd_deflection.monitor.feed import Feed
-from psd_deflection.monitor.foxglove import FeedBeside, FoxgloveServer
-from psd_deflection.monitor.shown import ShownRecording
-from psd_deflection.monitor.start import need_server, start_views
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.replay_engine import nominal_rig, open_for_replay, replayed
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.replay.engine import nominal_rig, open_for_replay, replayed
 from psd_deflection.records import Record
-from psd_deflection.runner.headless import run_headless
-from psd_deflection.runner.simulated_rig import simulates, started_early
+from psd_deflection.rig.config import replace_values
+from psd_deflection.rig.declarations import MONITOR
+from psd_deflection.run.headless import run_headless
+from psd_deflection.run.monitor.feed import Feed
+from psd_deflection.run.monitor.foxglove import FeedBeside, FoxgloveServer
+from psd_deflection.run.monitor.shown import ShownRecording
+from psd_deflection.run.monitor.start import need_server, start_views
+from psd_deflection.run.simulated_rig import simulates, started_early
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
-    from psd_deflection.monitor.server import MonitorServer
+    from psd_deflection.run.monitor.server import MonitorServer
 
     opened, rig = open_for_replay(args.recording, args.params_file, args.namespace)
     if args.params_file is None:

@@ -9,11 +9,11 @@ import sys
 
 from psd_deflection.cli._options import given_as_option, in_the_world, number, whole
 from psd_deflection.cli._program import program
-from psd_deflection.config import load_rig
 from psd_deflection.devices.device import PowerUp
 from psd_deflection.devices.pseudo_terminal import PORT_LINE, link_names, open_terminals
 from psd_deflection.devices.registry import SIMULATED
 from psd_deflection.devices.serve import serve_all, simulated_devices, stopped_by_signals
+from psd_deflection.rig.config import load_rig
 
 OF_A_DEVICE = {'device': None, 'link': None, 'skew_ppm': 0.0, 'first_seq': 0}
 """Options of a device, and what they are if they are not given."""

@@ -17,14 +17,14 @@ from __future__ import annotations
 import argparse
 import importlib.util
 
+from psd_deflection.arms.compensation.arm import read_limits
+from psd_deflection.arms.compensation.trajectory import TrajectoryShaper
+from psd_deflection.arms.shapers import KINDS, Shaper, in_series, recommended, shaper
+from psd_deflection.base.errors import ConfigError, UsageError
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import number
-from psd_deflection.compensation.arm import read_limits
-from psd_deflection.compensation.trajectory import TrajectoryShaper
-from psd_deflection.config import rig_from_values
-from psd_deflection.errors import ConfigError, UsageError
-from psd_deflection.identification.shapers import KINDS, Shaper, in_series, recommended, shaper
-from psd_deflection.parameter_files import read_parameter_file
+from psd_deflection.rig.config import rig_from_values
+from psd_deflection.rig.parameter_files import read_parameter_file
 
 MODES = ('bending', 'torsion')
 RECOMMENDED, NONE = 'recommended', 'none'

@@ -16,9 +16,9 @@ from __future__ import annotations
 import argparse
 import time
 
+from psd_deflection.base.errors import DaemonError
 from psd_deflection.cli._daemon import request, url_option
 from psd_deflection.cli._options import number
-from psd_deflection.errors import DaemonError
 
 ASK_AGAIN_S = 0.25
 MOVES = 'the link moves'

@@ -23,14 +23,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from psd_deflection.budget import optics
-from psd_deflection.budget.computation import stop_window
-from psd_deflection.budget.environment import averaging_gain
-from psd_deflection.budget.estimate import METHODS, method_of
-from psd_deflection.budget.evaluate import CAUSES, Budget, evaluate, monte_carlo
-from psd_deflection.budget.inputs import INPUTS, read_inputs
-from psd_deflection.budget.load import default_load
-from psd_deflection.budget.term import Contribution, Kind, Situation
+from psd_deflection.base.errors import UsageError
 from psd_deflection.cli._options import (
     PICTURES,
     given_as_option,
@@ -42,9 +35,16 @@ from psd_deflection.cli._options import (
     whole,
 )
 from psd_deflection.cli._report import columns, print_json, save_figure, show, show_text
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.errors import UsageError
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.studies.budget import optics
+from psd_deflection.studies.budget.computation import stop_window
+from psd_deflection.studies.budget.environment import averaging_gain
+from psd_deflection.studies.budget.estimate import METHODS, method_of
+from psd_deflection.studies.budget.evaluate import CAUSES, Budget, evaluate, monte_carlo
+from psd_deflection.studies.budget.inputs import INPUTS, read_inputs
+from psd_deflection.studies.budget.load import default_load
+from psd_deflection.studies.budget.term import Contribution, Kind, Situation
 
 MICRO_MILLIDEGREE = np.array([1e6, 1e6, math.degrees(1e3)])
 

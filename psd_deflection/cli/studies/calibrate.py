@@ -37,23 +37,10 @@ from typing import Any
 from tqdm import tqdm
 
 from psd_deflection import __version__
-from psd_deflection.calibrating import check as checking
-from psd_deflection.calibrating.calibrate import Calibration, calibrate
-from psd_deflection.calibrating.dark import (
-    DarkLevel,
-    dark_levels,
-    result_of_levels,
-    source_of_levels,
-    values_of_levels,
-    words_of_level,
-)
-from psd_deflection.calibrating.fit import NAMES
-from psd_deflection.calibrating.observation import Run
-from psd_deflection.calibrating.report import report_html
-from psd_deflection.calibrating.result import REPORTED, UNITS, result, sentence, source_of, values_of
+from psd_deflection.base.errors import ConfigError, UsageError
 from psd_deflection.cli._fleet import (
     ERROR,
-    Answer,
+    TaskResult,
     absolute,
     answer_each,
     each_for_itself,
@@ -64,16 +51,29 @@ from psd_deflection.cli._options import make_writable, namespace_option, number
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save_all, show, warn
 from psd_deflection.cli._rig_file import rig_file
-from psd_deflection.config import Rig, load_rig, replace_values
-from psd_deflection.discovery.result import model_yaml
-from psd_deflection.errors import ConfigError, UsageError
-from psd_deflection.fleet.parquet import Field
-from psd_deflection.misalignment.rig import is_calibrated
-from psd_deflection.parameter_files import with_effects_section, with_values
-from psd_deflection.recordings.calibration_runs import read_run, read_runs
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.replay_engine import nominal_rig, rig_at_end
-from psd_deflection.simulation.catalogue import effects_of_rig, effects_to_values
+from psd_deflection.model.misalignment.rig import is_calibrated
+from psd_deflection.model.simulation.catalogue import effects_of_rig, effects_to_values
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.replay.engine import nominal_rig, rig_at_end
+from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.rig.parameter_files import with_effects_section, with_values
+from psd_deflection.run.fleet.parquet import Field
+from psd_deflection.studies.calibrate import check as checking
+from psd_deflection.studies.calibrate.calibrate import Calibration, calibrate
+from psd_deflection.studies.calibrate.dark import (
+    DarkLevel,
+    dark_levels,
+    result_of_levels,
+    source_of_levels,
+    values_of_levels,
+    words_of_level,
+)
+from psd_deflection.studies.calibrate.fit import NAMES
+from psd_deflection.studies.calibrate.from_recordings import read_run, read_runs
+from psd_deflection.studies.calibrate.observation import CalibrationRun
+from psd_deflection.studies.calibrate.report import report_html
+from psd_deflection.studies.calibrate.result import REPORTED, UNITS, result, sentence, source_of, values_of
+from psd_deflection.studies.discover.result import model_yaml
 
 MOST_EXPOSURE = 0.02
 """s. The polynomial that is fitted to the samples about a reference is 21 samples long."""
@@ -138,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
         return _check(args)
     if args.out is None:
         raise UsageError('--out DIR (a calibration) or --check RIG.yaml (of an older one) is needed')
-    asked = Asked(
+    asked = CalibrationOptions(
         absolute(args.params_file),
         args.namespace,
         args.exposure,
@@ -181,7 +181,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class CalibrationOptions:
     """What is asked of each calibration, as the options say it; goes to a worker. ``date``: of the calibration."""
 
     params_file: str | None
@@ -201,11 +201,11 @@ class Asked:
             tell(warning)
         return rig_at_end(recording)
 
-    def runs(self, recordings: Sequence[str], rig: Rig) -> list[Run]:
+    def runs(self, recordings: Sequence[str], rig: Rig) -> list[CalibrationRun]:
         """The recordings with their references."""
         return read_runs(recordings, rig, references=self.references, exposure=self.exposure, namespace=self.namespace)
 
-    def levels(self, rig: Rig, runs: Sequence[Run]) -> list[DarkLevel]:
+    def levels(self, rig: Rig, runs: Sequence[CalibrationRun]) -> list[DarkLevel]:
         """What the recordings of --dark tell, if there are any; ``runs``: with the lasers on."""
         if not self.dark:
             return []
@@ -220,7 +220,7 @@ class Asked:
         }
 
 
-def answer_of(path: str, asked: Asked) -> Answer:
+def answer_of(path: str, asked: CalibrationOptions) -> TaskResult:
     """The task for one of many recordings."""
     warnings: list[str] = []
     rig = asked.rig([path], warnings.append)
@@ -237,7 +237,7 @@ def answer_of(path: str, asked: Asked) -> Answer:
         **{f'sd {name}': one['sd'] for name, one in tree['parameters'].items()},
         'result': files['calibration.json'],
     }
-    return Answer(files, cells, warnings)
+    return TaskResult(files, cells, warnings)
 
 
 def _fields() -> list[Field]:
@@ -256,7 +256,7 @@ def _fields() -> list[Field]:
     ]
 
 
-def _each(args: argparse.Namespace, names: list[str], asked: Asked) -> int:
+def _each(args: argparse.Namespace, names: list[str], asked: CalibrationOptions) -> int:
     if args.reference:
         raise UsageError('--reference: not with --each, which takes the reference that is in each recording')
     if args.dark:
@@ -291,7 +291,7 @@ def _rig_yaml(params_file: str | None, rig: Rig, found: Calibration, date: str) 
     )
 
 
-def _dark_alone(args: argparse.Namespace, asked: Asked, rig: Rig, levels: Sequence[DarkLevel]) -> int:
+def _dark_alone(args: argparse.Namespace, asked: CalibrationOptions, rig: Rig, levels: Sequence[DarkLevel]) -> int:
     """Write the dark levels into the rig file and change nothing else."""
     source = f'Dark levels by psd-deflection {__version__}, {asked.date}, from {source_of_levels(levels)}'
     text = rig_file(

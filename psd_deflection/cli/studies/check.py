@@ -27,22 +27,22 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.calibration import Wiring
+from psd_deflection.base.errors import printable
 from psd_deflection.cli._options import given_parameters, in_the_world, parameter_option, refuse, world_option
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import LONGEST_LINE, columns, print_json, show
-from psd_deflection.commissioning.checkup import CANNOT_TELL, RIGHT, Checkup, check
-from psd_deflection.commissioning.guide import Guide
-from psd_deflection.commissioning.levels import levels
-from psd_deflection.commissioning.responses import responses
-from psd_deflection.commissioning.wirings import DOTS, WIRINGS, line, on_channels
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.errors import printable
-from psd_deflection.recordings.observations import read_observation
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.replay_engine import rig_at_end
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.replay.engine import rig_at_end
 from psd_deflection.records import CHANNELS
-from psd_deflection.runner.guided import run_guided
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.run.guided import run_guided
+from psd_deflection.studies.check.checkup import CANNOT_TELL, RIGHT, Checkup, check
+from psd_deflection.studies.check.guide import Guide
+from psd_deflection.studies.check.levels import levels
+from psd_deflection.studies.check.responses import responses
+from psd_deflection.studies.check.wirings import DOTS, WIRINGS, line, on_channels
+from psd_deflection.studies.discover.from_recordings import read_observation
 
 NAMES = {
     'channel_sign': 'sign turned',

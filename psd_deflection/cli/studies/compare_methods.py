@@ -22,10 +22,10 @@ import numpy as np
 
 from psd_deflection.cli._options import make_folder
 from psd_deflection.cli._report import print_json, save_figure, show
-from psd_deflection.geometry import Geometry
-from psd_deflection.geometry.linear import condition_number, design_matrix, error_bound
-from psd_deflection.solvers import make_solver
-from psd_deflection.thesis.comparison import (
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.plate.linear import condition_number, design_matrix, error_bound
+from psd_deflection.model.solvers import make_solver
+from psd_deflection.studies.thesis.comparison import (
     CAUSES,
     CONDITIONS,
     DIRECT,
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
         show(*error_table(), '', *linear_table(), '', *cause_table())
     if args.out is not None:
         # matplotlib takes a second to import; who only reads the tables need not wait for it.
-        from psd_deflection.thesis.figures import drawn
+        from psd_deflection.studies.thesis.figures import drawn
 
         for name, figure in drawn():
             path = Path(args.out) / f'{name}.png'

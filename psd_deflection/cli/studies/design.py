@@ -19,17 +19,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from psd_deflection.budget.load import default_load
+from psd_deflection.base.errors import UsageError
 from psd_deflection.cli._options import PICTURES, given_as_option, need_folder, picture_name, refuse
 from psd_deflection.cli._report import columns, print_json, save_figure, show, show_text
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.errors import UsageError
-from psd_deflection.geometry import placement
-from psd_deflection.geometry.linear import condition_number, design_matrix
-from psd_deflection.mechanics import LinkStatics
-from psd_deflection.mechanics.section import TubeSection
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.model.link.section import TubeSection
+from psd_deflection.model.plate import placement
+from psd_deflection.model.plate.linear import condition_number, design_matrix
 from psd_deflection.records import FloatArray
-from psd_deflection.thesis import scaling
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.studies.budget.load import default_load
+from psd_deflection.studies.thesis import scaling
 
 TILTED = np.array([0.0, 0.0, 0.0, math.radians(0.3), math.radians(0.1)])
 """Where observability of tilt is stated: φ 0.3 deg, ω 0.1 deg. At rest coplanar sensors see none."""

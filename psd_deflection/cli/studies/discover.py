@@ -40,10 +40,11 @@ from typing import Any
 from tqdm import tqdm
 
 from psd_deflection import __version__
+from psd_deflection.base.errors import UsageError
 from psd_deflection.cli import _next
 from psd_deflection.cli._fleet import (
     ERROR,
-    Answer,
+    TaskResult,
     absolute,
     answer_each,
     each_for_itself,
@@ -54,21 +55,20 @@ from psd_deflection.cli._options import make_folder, make_writable, namespace_op
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import save, save_all, show, show_text, warn
 from psd_deflection.cli._rig_file import rig_file
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.discovery.discover import Discovery, discover
-from psd_deflection.discovery.loop import Settled, next_of, settle
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.plants import discover_in
-from psd_deflection.discovery.readings import Readings, ReadingsPlant
-from psd_deflection.discovery.report import report_html
-from psd_deflection.discovery.result import model_yaml, result, sentence
-from psd_deflection.errors import UsageError
-from psd_deflection.fleet.parquet import Field
-from psd_deflection.parameter_files import with_effects_section, with_values
-from psd_deflection.recordings.observations import read_observations, read_tables
-from psd_deflection.simulation.catalogue import FOLDERS, effect_folders, effect_names, effects_to_values
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.laws import Law, effect_of, law_text, values_of
+from psd_deflection.model.simulation.catalogue import FOLDERS, effect_folders, effect_names, effects_to_values
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.laws import Law, effect_of, law_text, values_of
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.rig.parameter_files import with_effects_section, with_values
+from psd_deflection.run.fleet.parquet import Field
+from psd_deflection.studies.discover.discover import Discovery, discover
+from psd_deflection.studies.discover.from_recordings import read_observations, read_tables
+from psd_deflection.studies.discover.loop import Settled, next_of, settle
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.plants import discover_in
+from psd_deflection.studies.discover.readings import Readings, ReadingsPlant
+from psd_deflection.studies.discover.report import report_html
+from psd_deflection.studies.discover.result import model_yaml, result, sentence
 
 STEPS = 8
 """Steps that the progress bar counts: described, signatures, adding, weighing, alternatives, where, report, done.
@@ -132,7 +132,7 @@ def run(args: argparse.Namespace) -> int:
     if args.params_file is not None:
         # Before the search, which takes its time.
         load_rig(args.params_file)
-    asked = Asked(absolute(args.params_file), args.namespace, args.seed, tuple(args.without), args.adopt)
+    asked = SearchOptions(absolute(args.params_file), args.namespace, args.seed, tuple(args.without), args.adopt)
     names = each_for_itself(args)
     if names is not None:
         refuse(args, {'next': False}, 'is not for --each')
@@ -237,7 +237,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class SearchOptions:
     """What is asked of each search, as the options say it; goes to a worker."""
 
     params_file: str | None
@@ -285,7 +285,7 @@ class Asked:
         }
 
 
-def _tables(args: argparse.Namespace, asked: Asked, tables: Sequence[Readings]) -> int:
+def _tables(args: argparse.Namespace, asked: SearchOptions, tables: Sequence[Readings]) -> int:
     """The search in tables of readings."""
     refuse(args, {'next': False, 'adopt': None}, 'is for recordings: a table of readings has no times')
     make_writable(args.out)
@@ -311,7 +311,7 @@ def _tables(args: argparse.Namespace, asked: Asked, tables: Sequence[Readings]) 
     return 0
 
 
-def answer_of(path: str, asked: Asked) -> Answer:
+def answer_of(path: str, asked: SearchOptions) -> TaskResult:
     """The task for one of many recordings."""
     warnings: list[str] = []
     observations = asked.read([path], warnings.append)
@@ -330,10 +330,10 @@ def answer_of(path: str, asked: Asked) -> Answer:
         'simulations': found.simulations,
         'result': files['result.json'],
     }
-    return Answer(files, cells, warnings)
+    return TaskResult(files, cells, warnings)
 
 
-def _each(args: argparse.Namespace, names: list[str], asked: Asked) -> int:
+def _each(args: argparse.Namespace, names: list[str], asked: SearchOptions) -> int:
     if args.adopt is not None:
         raise UsageError(f'--adopt {args.adopt}: not with --each, which may find many laws; adopt one by itself')
     return answer_each(args, names, partial(answer_of, asked=asked), FIELDS, HEAD, _line)

@@ -13,10 +13,10 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from psd_deflection.base.errors import UsageError, did_you_mean
 from psd_deflection.cli._report import columns, print_json, show, show_text
-from psd_deflection.errors import UsageError, did_you_mean
-from psd_deflection.simulation.catalogue import catalogue
-from psd_deflection.simulation.declaration import STAGES, Effect, EffectParameter
+from psd_deflection.model.simulation.catalogue import catalogue
+from psd_deflection.model.simulation.declaration import STAGES, Effect, EffectParameter
 
 _KINDS = {
     'amplitude': 'switches the effect on',

@@ -20,21 +20,21 @@ from pathlib import Path
 import numpy as np
 
 from psd_deflection import __version__
-from psd_deflection.calibration import dot_noise_variances
 from psd_deflection.cli._options import make_folder, namespace_option
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save, show
 from psd_deflection.cli._rig_file import rig_file
 from psd_deflection.cli._seen import opened, seen_in
-from psd_deflection.config import Rig
-from psd_deflection.discovery.result import model_yaml
-from psd_deflection.identification.modes import modes_of
-from psd_deflection.identification.report import Identified, as_json, report_html, sentences
-from psd_deflection.parameter_files import with_values
-from psd_deflection.recordings.grid import digest_of
+from psd_deflection.model.detector import dot_noise_variances
+from psd_deflection.model.simulation.catalogue import effects_of_rig
+from psd_deflection.model.solvers.registry import solver_from_rig
+from psd_deflection.recordings.read.grid import digest_of
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.simulation.catalogue import effects_of_rig
-from psd_deflection.solvers.registry import solver_from_rig
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.parameter_files import with_values
+from psd_deflection.studies.discover.result import model_yaml
+from psd_deflection.studies.identify.modes import modes_of
+from psd_deflection.studies.identify.report import Identified, as_json, report_html, sentences
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -19,19 +19,19 @@ from pathlib import Path
 
 import numpy as np
 
-from psd_deflection.calibration import dot_noise_variances
+from psd_deflection.base.errors import ConfigError, SolverError
 from psd_deflection.cli._options import make_folder, namespace_option, number
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import columns, print_json, save, show, show_text
 from psd_deflection.cli._seen import opened, seen_in
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError, SolverError
-from psd_deflection.recordings.references import read_references, references_of
+from psd_deflection.model.detector import dot_noise_variances
+from psd_deflection.model.solvers.registry import SOLVERS, solver_from_rig
+from psd_deflection.recordings.read.references import read_references, references_of
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.solvers.registry import SOLVERS, solver_from_rig
-from psd_deflection.validation.agreement import validate
-from psd_deflection.validation.motion import Motion, Solve
-from psd_deflection.validation.report import as_json, report_html, rows, sentences
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.validate.agreement import validate
+from psd_deflection.studies.validate.motion import Motion, Solve
+from psd_deflection.studies.validate.report import as_json, report_html, rows, sentences
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

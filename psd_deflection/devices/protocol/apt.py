@@ -18,7 +18,7 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple
 
-from psd_deflection.protocol.frames import BadFrame
+from psd_deflection.devices.protocol.frames import BadFrame
 
 HOST_ADDRESS, DEVICE_ADDRESS, LONG = 0x01, 0x50, 0x80
 READINGS_REQUEST = bytes((0x71, 0x08, 0x03, 0x00, DEVICE_ADDRESS, HOST_ADDRESS))
@@ -40,7 +40,7 @@ SUM_FLOOR = 0.05
 """V. Below this sum there is too little light to divide by."""
 
 
-class Readings(NamedTuple):
+class QuadrantReadings(NamedTuple):
     """``x``, ``y``: 10 V at the edge of the active area, 0 if ``total`` is too low; ``total`` V."""
 
     x: float
@@ -56,19 +56,19 @@ class HardwareInfo(NamedTuple):
     firmware: str
 
 
-AptMessage = Readings | HardwareInfo | BadFrame
+AptMessage = QuadrantReadings | HardwareInfo | BadFrame
 
 
-def readings_of(x_difference: int, y_difference: int, total: int) -> Readings:
+def readings_of(x_difference: int, y_difference: int, total: int) -> QuadrantReadings:
     """Converts raw numbers to the volts of the rig's amplifier: x 10 V / sum.
 
     Without light the quotient would be noise, so x and y are then 0; the low sum shows the reason.
     """
     volts = total * SUM_VOLTS
     if volts < SUM_FLOOR:
-        return Readings(0.0, 0.0, volts)
+        return QuadrantReadings(0.0, 0.0, volts)
     scale = DIFFERENCE_VOLTS * FULL_SCALE / volts
-    return Readings(x_difference * scale, y_difference * scale, volts)
+    return QuadrantReadings(x_difference * scale, y_difference * scale, volts)
 
 
 def encode_readings(x_difference: int, y_difference: int, total: int) -> bytes:

@@ -23,7 +23,7 @@ import struct
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from psd_deflection.protocol.frames import BadFrame
+from psd_deflection.devices.protocol.frames import BadFrame
 
 CLOCK_HZ = 60_000_000
 """Scan rate = CLOCK_HZ / (srate * dec), counted in scans or in conversions: devices differ, see ``plan_rate``."""

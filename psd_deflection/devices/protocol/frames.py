@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from cobs import cobs
 
-from psd_deflection.protocol.words import device_words
+from psd_deflection.devices.protocol.words import device_words
 from psd_deflection.records import MOST_PSDS
 
 PROTOCOL_VERSION = 1
@@ -75,7 +75,7 @@ class StatusFrame(NamedTuple):
 class HelloFrame(NamedTuple):
     """HELLO: protocol version, and the device's description of itself (empty for another version).
 
-    ``info`` of a decoded frame holds printable texts and finite numbers only (``protocol.words``).
+    ``info`` of a decoded frame holds printable texts and finite numbers only (``devices.protocol.words``).
     """
 
     version: int

@@ -20,9 +20,9 @@ import json
 import re
 from typing import NamedTuple
 
-from psd_deflection.protocol.frames import BadFrame
-from psd_deflection.protocol.sequence import WRAP
-from psd_deflection.protocol.words import device_words, finite
+from psd_deflection.base.sequence import WRAP
+from psd_deflection.devices.protocol.frames import BadFrame
+from psd_deflection.devices.protocol.words import device_words, finite
 from psd_deflection.records import MOST_PSDS
 
 MAX_LINE = 400

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.filtering.modal import Oscillator
+from psd_deflection.measure.motion.modal import Oscillator
 from psd_deflection.records import BaseAcceleration, FloatArray
 
 HOLD_NS = 100_000_000
@@ -34,7 +34,8 @@ LARGEST = 1e4
 
 
 class Forced(NamedTuple):
-    """What accelerations do from rest: ``at`` (3, n, 4) the state of :mod:`psd_deflection.filtering.modal` at n times.
+    """What accelerations do from rest: ``at`` (3, n, 4) the state of :mod:`psd_deflection.measure.motion.modal` at n
+    times.
 
     u and r in it are 0. ``doubt`` (3,): by how much the static deflection may differ from the model, for the changes
     in this time: one standard deviation, m, m, rad.

@@ -21,9 +21,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.arithmetic import FIXED, Arithmetic
+from psd_deflection.base.arithmetic import FIXED, Arithmetic
+from psd_deflection.measure.uncertainty.block_fit import inverse
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.uncertainty.block_fit import inverse
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,14 +17,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.arithmetic import ARITHMETICS
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError
-from psd_deflection.filtering.inertia import Forced, Inertia
-from psd_deflection.filtering.modal import BlockTables, Oscillator
-from psd_deflection.filtering.unseen import UnseenLoads
+from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.measure.motion.inertia import Forced, Inertia
+from psd_deflection.measure.motion.modal import BlockTables, Oscillator
+from psd_deflection.measure.motion.unseen import UnseenLoads
+from psd_deflection.measure.uncertainty.block_fit import LARGEST, inverse
 from psd_deflection.records import AppliedLoad, FloatArray, IntArray
-from psd_deflection.uncertainty.block_fit import LARGEST, inverse
+from psd_deflection.rig.config import Rig
 
 STEPPED, SMOOTH = 13, 10
 """Rates that are tried of a load that wanders by steps, and of one whose rate of change wanders; K together."""
@@ -50,7 +50,7 @@ INERTIA = 'state.inertia'
 """The same of :meth:`ModalFilter.inertia_memory`."""
 
 
-class Moved(NamedTuple):
+class TipState(NamedTuple):
     """The tip at ``t_ns``: ``pose`` (3,) m, m, rad; ``velocity`` (3,) m/s, m/s, rad/s; their covariances (3, 3).
 
     ``coasted``: time since the last sample that was used, s.
@@ -199,7 +199,7 @@ class ModalFilter:
         """A known load that acts from its stamp on. One from before the samples that were used is seen in them."""
         self._loads.append(load)
 
-    def block(self, index: int, t_ns: int, slots: IntArray | None, poses: FloatArray | None) -> Moved | None:
+    def block(self, index: int, t_ns: int, slots: IntArray | None, poses: FloatArray | None) -> TipState | None:
         """The motion at the end of block ``index``, or None if nothing is known.
 
         ``t_ns``: time of the block's middle. ``slots`` (n,), ``poses`` (n, 3) m, m, rad: the samples that can be used,
@@ -400,7 +400,7 @@ class ModalFilter:
         p[:, 1, 1] += np.square(self.inertia.unsure(self._end_ns()))
         return p
 
-    def _moved(self) -> Moved:
+    def _moved(self) -> TipState:
         """Of the end of the block, ``filter_ahead`` later."""
         x = self._by.einsum('aij,aj->ai', self._later, self._x)
         if self.inertia.known and self._ahead > 0.0:
@@ -414,7 +414,7 @@ class ModalFilter:
         for k, (a, b) in enumerate(_PAIRS):
             pose[a, b] = pose[b, a] = shared[k, 0, 0]
             velocity[a, b] = velocity[b, a] = self._w[a] * self._w[b] * shared[k, 1, 1]
-        return Moved(t_ns, x[:, 0], self._w * x[:, 1], pose, velocity, self.coasted)
+        return TipState(t_ns, x[:, 0], self._w * x[:, 1], pose, velocity, self.coasted)
 
     def predicted(self, seconds: FloatArray) -> Predicted:
         """The motion so long (n,) after the last block's last sample."""

@@ -17,7 +17,7 @@ import math
 
 import numpy as np
 
-from psd_deflection.filtering.modal import Oscillator
+from psd_deflection.measure.motion.modal import Oscillator
 from psd_deflection.records import FloatArray
 
 GROWTH = 1.5
@@ -36,8 +36,8 @@ LARGER = 2.0
 class UnseenLoads:
     """Holds the misses of lately for spans of up to ``longest`` s of A axes with these modes.
 
-    ``variances`` (A, H, 4): to add after each of the H spans, of the state as :mod:`psd_deflection.filtering.modal`
-    has it.
+    ``variances`` (A, H, 4): to add after each of the H spans, of the state as
+    :mod:`psd_deflection.measure.motion.modal` has it.
     """
 
     def __init__(self, modes: tuple[Oscillator, ...], seconds: float, longest: float) -> None:

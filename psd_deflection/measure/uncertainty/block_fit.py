@@ -15,8 +15,8 @@ autocovariance Gamma, plus sum_k (q_k(middle) - w^T q_k)^2 tau_k^2 for the motio
 leave out. A motion that order 4 cannot follow (a load that is switched inside the block) shows in
 what is left of the samples: then their rms is added as an error that does not average out.
 
-The readings are turned into orthogonal combinations first (:mod:`psd_deflection.uncertainty.combinations`), so that
-motion is sought where the link moves the dots.
+The readings are turned into orthogonal combinations first (:mod:`psd_deflection.measure.uncertainty.combinations`), so
+that motion is sought where the link moves the dots.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.arithmetic import FIXED, Arithmetic
+from psd_deflection.base.arithmetic import FIXED, Arithmetic
+from psd_deflection.measure.uncertainty.combinations import combinations_of
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.uncertainty.combinations import combinations_of
 
 ORDER = 4
 """Highest order: it follows a quarter period inside a block to 1e-4 of the amplitude."""

@@ -14,8 +14,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from psd_deflection.arithmetic import FIXED, Arithmetic
-from psd_deflection.geometry.linear import design_matrix
+from psd_deflection.base.arithmetic import FIXED, Arithmetic
+from psd_deflection.model.plate.linear import design_matrix
 from psd_deflection.records import FloatArray
 
 _HALF = math.sqrt(0.5)

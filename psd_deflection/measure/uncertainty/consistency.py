@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.arithmetic import FIXED, Arithmetic
+from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.records import FloatArray
 
 LIMIT = 25.0
@@ -63,7 +63,7 @@ _NEAR = 0.02
 """How near to -1 the slope of an inverted reading on what it should be must be."""
 
 
-class Checked(NamedTuple):
+class ConsistencyCheck(NamedTuple):
     """One block's answer.
 
     ``chi_square`` of this block. ``contradict``: this block or one shortly before is beyond ``LIMIT``.
@@ -96,7 +96,7 @@ class Consistency:
 
     def check(
         self, apart: tuple[float, float], residual: tuple[float, ...], covariance: FloatArray, *, limit: float = LIMIT
-    ) -> Checked:
+    ) -> ConsistencyCheck:
         """Check one block.
 
         ``apart``: centre of PSD 1 and its dot less those of PSD 2, m. ``residual`` (4,): what the solver leaves of
@@ -105,7 +105,7 @@ class Consistency:
         x, y = apart
         size = self._by.root(2.0 * (x * x + y * y))
         if size == 0.0:
-            return Checked(0.0, False, _NONE, _NONE)
+            return ConsistencyCheck(0.0, False, _NONE, _NONE)
         ax, ay = x / size, y / size
         x1, y1, x2, y2 = residual
         r = ax * (x1 - x2) + ay * (y1 - y2)
@@ -127,7 +127,7 @@ class Consistency:
         root = _MORE * self._by.root(max(self.held, self.lasting, r * r if doubtful else 0.0))
         errors = (r * one_x, r * one_y, -r * one_x, -r * one_y)
         possible = (root * one_x, root * one_y, -root * one_x, -root * one_y)
-        return Checked(chi_square, self.held > 0.0, errors, possible)
+        return ConsistencyCheck(chi_square, self.held > 0.0, errors, possible)
 
 
 def widened(covariance: FloatArray, gain: FloatArray, errors: tuple[float, ...], by: Arithmetic = FIXED) -> FloatArray:

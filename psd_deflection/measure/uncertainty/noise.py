@@ -25,10 +25,10 @@ from math import pi
 
 import numpy as np
 
-from psd_deflection.arithmetic import FIXED, Arithmetic
+from psd_deflection.base.arithmetic import FIXED, Arithmetic
+from psd_deflection.measure.uncertainty.block_fit import LARGEST, basis, inverse
+from psd_deflection.measure.uncertainty.combinations import Left, combinations_of
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.uncertainty.block_fit import LARGEST, basis, inverse
-from psd_deflection.uncertainty.combinations import Left, combinations_of
 
 SEGMENT_BLOCKS = 50
 """Blocks of one segment: a second at 50 blocks a second."""

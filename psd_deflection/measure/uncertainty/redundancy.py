@@ -18,10 +18,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from psd_deflection.arithmetic import FIXED, Arithmetic
+from psd_deflection.base.arithmetic import FIXED, Arithmetic
+from psd_deflection.measure.uncertainty.block_fit import inverse
+from psd_deflection.measure.uncertainty.consistency import ConsistencyCheck
 from psd_deflection.records import FloatArray
-from psd_deflection.uncertainty.block_fit import inverse
-from psd_deflection.uncertainty.consistency import Checked
 
 CONTRADICTS, DOUBTFUL = 5.7330e-7, 0.01
 """Shares of sound blocks that are taken for contradictory, and for doubtful: those of two PSDs (``consistency``)."""
@@ -72,7 +72,7 @@ class Redundancy:
         covariance: FloatArray,
         times: float,
         agree_without: Callable[[int], bool] | None = None,
-    ) -> Checked:
+    ) -> ConsistencyCheck:
         """Check one block: ``residual`` (2P,) m, ``slopes`` (2P, p), ``covariance`` (2P, 2P) m^2.
 
         ``times``: by how much more chi-square may be, while the noise is not known. ``agree_without``: whether the
@@ -81,7 +81,7 @@ class Redundancy:
         """
         none = (0.0,) * len(residual)
         if not self.freedom:
-            return Checked(0.0, False, none, none, 0, 0)
+            return ConsistencyCheck(0.0, False, none, none, 0, 0)
         q = _unexplained(slopes, covariance, self._by)
         r = np.array(residual)
         pull = self._by.einsum('ij,j->i', q, r)
@@ -101,9 +101,11 @@ class Redundancy:
             self._wrong = self._wrong if self._left > 0 and agree_without(self._wrong) else 0
         possible = self._possible(q, errors, suspects, chi_square, contradict and not self._wrong, times)
         if self._wrong:
-            return Checked(chi_square, True, tuple(errors), none, self._wrong, self.freedom)
+            return ConsistencyCheck(chi_square, True, tuple(errors), none, self._wrong, self.freedom)
         held = bool(self._held.any())
-        return Checked(chi_square, contradict or held, tuple(errors), tuple(possible.tolist()), 0, self.freedom)
+        return ConsistencyCheck(
+            chi_square, contradict or held, tuple(errors), tuple(possible.tolist()), 0, self.freedom
+        )
 
     def _errors(self, q: FloatArray, pull: FloatArray) -> list[float]:
         """The error (2P,) m of each PSD if it alone is wrong; with one degree of freedom of each reading."""

@@ -1,9 +1,9 @@
 """The dots of one block at its stamp and how sure they are: by the rule that the rig asks for.
 
-Joins what is measured of the noise (:mod:`psd_deflection.uncertainty.noise`), the fit through the block
-(:mod:`psd_deflection.uncertainty.block_fit`) and the check of the readings against each other
-(:mod:`psd_deflection.uncertainty.consistency`, of more than two PSDs :mod:`psd_deflection.uncertainty.redundancy`), and
-tells what they remember.
+Joins what is measured of the noise (:mod:`psd_deflection.measure.uncertainty.noise`), the fit through the block
+(:mod:`psd_deflection.measure.uncertainty.block_fit`) and the check of the readings against each other
+(:mod:`psd_deflection.measure.uncertainty.consistency`, of more than two PSDs
+:mod:`psd_deflection.measure.uncertainty.redundancy`), and tells what they remember.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from psd_deflection.arithmetic import ARITHMETICS
-from psd_deflection.calibration import dot_noise_variances
-from psd_deflection.config import Rig
-from psd_deflection.geometry.plate import Tilts, flat_points, flat_poses, plate_points, reading_slopes, tied_pose
+from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.measure.uncertainty.block_fit import BlockFit, Fitted
+from psd_deflection.measure.uncertainty.combinations import Left
+from psd_deflection.measure.uncertainty.consistency import LIMIT, UNMEASURED, Consistency, ConsistencyCheck, Suspect
+from psd_deflection.measure.uncertainty.noise import StreamNoise
+from psd_deflection.measure.uncertainty.redundancy import Redundancy, survival
+from psd_deflection.model.detector import dot_noise_variances
+from psd_deflection.model.plate.plate import Tilts, flat_points, flat_poses, plate_points, reading_slopes, tied_pose
 from psd_deflection.records import FloatArray, IntArray, dot_names
-from psd_deflection.uncertainty.block_fit import BlockFit, Fitted
-from psd_deflection.uncertainty.combinations import Left
-from psd_deflection.uncertainty.consistency import LIMIT, UNMEASURED, Checked, Consistency, Suspect
-from psd_deflection.uncertainty.noise import StreamNoise
-from psd_deflection.uncertainty.redundancy import Redundancy, survival
+from psd_deflection.rig.config import Rig
 
 NOISE, FIT, HELD_RESIDUAL = 'state.noise', 'state.block_fit', 'state.residual'
 REDUNDANCY, SOME = 'state.redundancy', 'state.psds.'
@@ -106,7 +106,7 @@ class SomePsds:
         pose: Sequence[float],
         times: float,
         agree_without: Callable[[int], bool] | None,
-    ) -> Checked:
+    ) -> ConsistencyCheck:
         """As :meth:`StampedDots.check`; ``times``: as :meth:`Redundancy.check`."""
         slopes = self._model.slopes_at(pose)
         return self._redundancy.check(self._model.residual(dots, residual), slopes, covariance, times, agree_without)
@@ -242,7 +242,7 @@ class StampedDots:
         pose: Sequence[float] = (),
         some: SomePsds | None = None,
         agree_without: Callable[[int], bool] | None = None,
-    ) -> Checked:
+    ) -> ConsistencyCheck:
         """Hold the readings of a block against each other; ``pose``: dX, dY m, theta, phi, omega rad.
 
         ``some``: it is theirs. ``agree_without``: as :meth:`Redundancy.check` has it. :attr:`Checked.wrong` counts
@@ -291,7 +291,7 @@ class StampedDots:
             some.set_noise(self.noise.gamma)
         return True
 
-    def suspect(self, index: int, dots: tuple[float, ...], checked: Checked) -> None:
+    def suspect(self, index: int, dots: tuple[float, ...], checked: ConsistencyCheck) -> None:
         """Take a block into the search for a wrong reading: each that contradicts itself, of the others some."""
         if len(dots) == 4 and (checked.contradict or index % 10 == 0):
             self._suspect.add(dots, checked.errors)

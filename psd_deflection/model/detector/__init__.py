@@ -1,6 +1,6 @@
 """Counts to volts to metres; the sensor types."""
 
-from psd_deflection.calibration.sensors import (
+from psd_deflection.model.detector.sensors import (
     Duolateral,
     Pincushion,
     Quadrant,
@@ -8,17 +8,15 @@ from psd_deflection.calibration.sensors import (
     Tetralateral,
     make_sensor,
 )
-from psd_deflection.calibration.volts import Calibration, counts_to_volts, dot_noise_variances
-from psd_deflection.calibration.wiring import Wiring
+from psd_deflection.model.detector.volts import VoltsToDots, counts_to_volts, dot_noise_variances
 
 __all__ = [
-    'Calibration',
     'Duolateral',
     'Pincushion',
     'Quadrant',
     'Sensor',
     'Tetralateral',
-    'Wiring',
+    'VoltsToDots',
     'counts_to_volts',
     'dot_noise_variances',
     'make_sensor',

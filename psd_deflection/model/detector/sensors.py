@@ -19,9 +19,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from psd_deflection.declarations import PsdConfig
-from psd_deflection.errors import ConfigError
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.declarations import PsdConfig
 
 
 class Sensor(abc.ABC):

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.arithmetic import ARITHMETICS
-from psd_deflection.calibration.sensors import Quadrant, Sensor, make_sensor
-from psd_deflection.calibration.wiring import Wiring
-from psd_deflection.config import Rig
+from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.model.detector.sensors import Quadrant, Sensor, make_sensor
 from psd_deflection.records import Counts, FloatArray, dot_channels
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.wiring import Wiring
 
 LEAST_LASER = 0.1
 """Least light of a laser, as a share of the other light: with the laser off noise must not be divided by noise."""
@@ -27,7 +27,7 @@ def counts_to_volts(counts: Counts, volts_per_count: float) -> npt.NDArray[np.fl
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class VoltsToDots:
     """Readings to the places of the dots.
 
     ``sensitivities``: m/V on x1, y1, x2, y2 ..., at the centre. ``sensors``: one for each PSD. ``wiring``: which
@@ -41,7 +41,7 @@ class Calibration:
     dark: tuple[tuple[int, tuple[float, float, float]], ...] = ()
 
     @classmethod
-    def from_rig(cls, rig: Rig) -> Calibration:
+    def from_rig(cls, rig: Rig) -> VoltsToDots:
         """The calibration of the rig's parameters."""
         return cls(
             sensitivities=tuple(rig.sensitivities.ravel().tolist()),

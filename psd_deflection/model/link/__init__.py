@@ -3,6 +3,6 @@
 The real-time path needs only :class:`LinkStatics`; ``section`` serves ``psd-deflection design``.
 """
 
-from psd_deflection.mechanics.statics import LinkStatics
+from psd_deflection.model.link.statics import LinkStatics
 
 __all__ = ['LinkStatics']

@@ -15,9 +15,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from psd_deflection.arithmetic import LIBRARY, Arithmetic
-from psd_deflection.config import Rig
+from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """Parameters of a rig and a pose -> the four readings; the one model that calibration fits and propagates.
 
 Of PSD i with centre c and height h, in the order in which it happens: the beam crosses the plate at q
-(:mod:`psd_deflection.geometry.plate`, tilts phi = -k dY/L and omega = k dX/L, leaning beams), m = q - c, and then
+(:mod:`psd_deflection.model.plate.plate`, tilts phi = -k dY/L and omega = k dX/L, leaning beams), m = q - c, and then
 
     u = Rz(-rotation) m,    v = u (1 + nonlinearity |u|^2),
     x = (1 + gain_x)(v_x + crosstalk_xy v_y),    y = (1 + gain_y)(v_y + crosstalk_yx v_x).
@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.arithmetic import LIBRARY, Arithmetic
-from psd_deflection.geometry.plate import points_under_leaning
+from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
+from psd_deflection.model.plate.plate import points_under_leaning
 from psd_deflection.records import FloatArray
 
 

@@ -7,13 +7,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.arithmetic import ARITHMETICS
-from psd_deflection.config import Rig, check_two_psds
-from psd_deflection.errors import ConfigError, did_you_mean
-from psd_deflection.misalignment.model import ALL, INDEX, SLOPE, TOLERANCES, ZERO, place_of_reading, reading_of_place
+from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.model.misalignment.model import (
+    ALL,
+    INDEX,
+    SLOPE,
+    TOLERANCES,
+    ZERO,
+    place_of_reading,
+    reading_of_place,
+)
+from psd_deflection.model.simulation.catalogue import effects_of_rig, make_active, sort_effects
+from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import effects_of_rig, make_active, sort_effects
-from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.rig.config import Rig, check_two_psds
 
 _OF_PSD = {
     'sensor_rotation': {'angle': 'rotation'},

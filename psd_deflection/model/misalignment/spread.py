@@ -2,7 +2,7 @@
 
 The readings are r = f(pose; p). The pipeline takes the effects of p off the dots, so an error of p moves the corrected
 dots by -S^-1 (df/dp) dp, S = d(reading)/d(place on the detector). With the covariance P of p and a solver's
-gain K (:meth:`psd_deflection.solvers.interface.Solver.gain`) the estimate's covariance grows by
+gain K (:meth:`psd_deflection.model.solvers.interface.Solver.gain`) the estimate's covariance grows by
 
     K B B^T K^T,    B = S^-1 (df/dp) P^(1/2).
 
@@ -16,12 +16,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from psd_deflection.arithmetic import ARITHMETICS, FIXED, Arithmetic
-from psd_deflection.config import Rig, check_two_psds
-from psd_deflection.misalignment.model import ZERO, by_parameters, by_place, place_of_reading, readings
-from psd_deflection.misalignment.rig import is_calibrated, known_of_rig, vector_of_rig
+from psd_deflection.base.arithmetic import ARITHMETICS, FIXED, Arithmetic
+from psd_deflection.model.misalignment.model import ZERO, by_parameters, by_place, place_of_reading, readings
+from psd_deflection.model.misalignment.rig import is_calibrated, known_of_rig, vector_of_rig
+from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.rig.config import Rig, check_two_psds
 
 RANGE: FloatArray = np.array([0.006, 0.006, 0.06])
 """Poses (m, m, rad) within which the quartic is fitted: about what detectors of 10 mm see."""

@@ -6,6 +6,6 @@ beams and on surfaces of any direction. ``linear``: design and gain matrices, co
 ``placement``: the best places for the sensors.
 """
 
-from psd_deflection.geometry.layout import Geometry
+from psd_deflection.model.plate.layout import Geometry
 
 __all__ = ['Geometry']

@@ -12,8 +12,8 @@ the reference section. The plate is turned by R = Ry(omega) Rx(phi) Rz(theta) (t
 
 from __future__ import annotations
 
-from psd_deflection.arithmetic import LIBRARY, Arithmetic
-from psd_deflection.geometry.plate import Number, Row, Turns, turns_of
+from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
+from psd_deflection.model.plate.plate import Number, Row, Turns, turns_of
 from psd_deflection.records import FloatArray
 
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.arithmetic import ARITHMETICS, LIBRARY, Arithmetic
-from psd_deflection.config import Rig
-from psd_deflection.errors import SolverError
+from psd_deflection.base.arithmetic import ARITHMETICS, LIBRARY, Arithmetic
+from psd_deflection.base.errors import SolverError
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig
 
 SMALLEST_BASE_LINE = 1e-6
 """m. Beams closer together than the noise of a dot count as one beam."""

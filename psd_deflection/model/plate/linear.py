@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.arithmetic import LIBRARY, Arithmetic
+from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.records import FloatArray
 
 

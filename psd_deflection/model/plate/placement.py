@@ -23,8 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.errors import ConfigError
-from psd_deflection.geometry.plate import crossings, tie_matrix, tied_pose
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.plate.plate import crossings, tie_matrix, tied_pose
 from psd_deflection.records import FloatArray
 
 SCALE = 0.1

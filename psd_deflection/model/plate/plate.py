@@ -22,7 +22,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from psd_deflection.arithmetic import LIBRARY, Arithmetic
+from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.records import FloatArray
 
 Number = TypeVar('Number', float, FloatArray)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from psd_deflection.config import Rig
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig
 
 Vector = tuple[float, float, float]
 Box = tuple[Vector, Vector]

@@ -1,6 +1,6 @@
 """The list of effects, how an effect is loaded, and how a rig file switches it on.
 
-An effect is one file with one :class:`~psd_deflection.simulation.declaration.Effect` called
+An effect is one file with one :class:`~psd_deflection.model.simulation.declaration.Effect` called
 ``EFFECT``; the file has the effect's name. Adding a file to ``effects/`` or to a folder of
 ``$PSD_DEFLECTION_EFFECTS`` adds an effect; in such a folder it may also be a law in YAML (:mod:`.laws`).
 So does an entry point of the group ``psd_deflection.effects`` of another package. In a rig file the
@@ -24,10 +24,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError, did_you_mean
-from psd_deflection.simulation import effects as ours
-from psd_deflection.simulation.declaration import PSD, ActiveEffect, Effect
+from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.model.simulation import effects as ours
+from psd_deflection.model.simulation.declaration import PSD, ActiveEffect, Effect
+from psd_deflection.rig.config import Rig
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -92,7 +92,7 @@ def effect_names() -> list[str]:
 def _of_file(path: Path) -> object:
     if path.suffix == '.yaml':
         # Imported here: it needs the filters, which a rig without laws does not.
-        from psd_deflection.simulation.laws import effect_of, read_law
+        from psd_deflection.model.simulation.laws import effect_of, read_law
 
         return effect_of(read_law(path))
     spec = importlib.util.spec_from_file_location(f'{__name__}.{path.stem}', path)

@@ -12,12 +12,12 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
-from psd_deflection.arithmetic import LIBRARY, Arithmetic
-from psd_deflection.errors import ConfigError
-from psd_deflection.parameters import Parameter, check_value, shown
+from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import MOST_PSDS, FloatArray
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.samples import SimulatedSamples
+from psd_deflection.rig.parameters import Parameter, check_value, shown
 
 Stage = Literal['load', 'link', 'optics', 'psd', 'electronics']
 Point = Literal['configure', 'load', 'static', 'pose', 'beam', 'dots', 'volts', 'output']

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from psd_deflection.config import Rig, replace_values
-from psd_deflection.errors import ConfigError
-from psd_deflection.parameter_files import EFFECTS_PREFIX, flattened
-from psd_deflection.parameters import shown
-from psd_deflection.simulation.catalogue import effects_of_rig
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.simulation.catalogue import effects_of_rig
+from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.rig.parameter_files import EFFECTS_PREFIX, flattened
+from psd_deflection.rig.parameters import shown
 
 
 def with_effects(rig: Rig, words: Sequence[str], source: str) -> Rig:

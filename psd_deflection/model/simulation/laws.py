@@ -29,10 +29,9 @@ import numpy as np
 import yaml
 from scipy.signal import lfilter
 
-from psd_deflection.errors import ConfigError, did_you_mean
-from psd_deflection.foreign_yaml import tree_of_file
-from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import (
+from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.base.foreign_yaml import tree_of_file
+from psd_deflection.model.simulation.declaration import (
     STAGES,
     Effect,
     EffectParameter,
@@ -43,9 +42,10 @@ from psd_deflection.simulation.declaration import (
     Use,
     Values,
 )
-from psd_deflection.simulation.hysteresis import play
-from psd_deflection.simulation.modes import mode_coefficients
-from psd_deflection.simulation.samples import SimulatedSamples
+from psd_deflection.model.simulation.hysteresis import play
+from psd_deflection.model.simulation.modes import mode_coefficients
+from psd_deflection.model.simulation.samples import SimulatedSamples
+from psd_deflection.records import FloatArray
 
 Kind = Literal['static', 'switched', 'rate', 'history', 'resonance', 'variance']
 
@@ -69,7 +69,7 @@ _LOADS, _POSE, _DOTS = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta'),
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class LawTarget:
     """A quantity that a law adds to: row ``row`` of the samples at ``point``. ``variables``: what is known there."""
 
     stage: Stage
@@ -80,13 +80,13 @@ class Target:
 
 
 _ALWAYS = ('temperature', 'time')
-TARGETS: Mapping[str, Target] = {
-    **{n: Target('load', 'load', i, VARIABLES[n], (*_LOADS, *_ALWAYS)) for i, n in enumerate(_LOADS)},
-    **{f'static_{n}': Target('link', 'static', i, VARIABLES[n], (*_LOADS, *_ALWAYS)) for i, n in enumerate(_POSE)},
-    **{n: Target('link', 'pose', i, VARIABLES[n], (*_LOADS, *_POSE, *_ALWAYS)) for i, n in enumerate(_POSE)},
-    **{f'beam_{n}': Target('optics', 'dots', i, 'm', tuple(VARIABLES)) for i, n in enumerate(_DOTS)},
-    **{n: Target('psd', 'dots', i, 'm', tuple(VARIABLES)) for i, n in enumerate(_DOTS)},
-    **{f'sum{i + 1}': Target('psd', 'dots', 4 + i, 'V', tuple(VARIABLES)) for i in range(2)},
+TARGETS: Mapping[str, LawTarget] = {
+    **{n: LawTarget('load', 'load', i, VARIABLES[n], (*_LOADS, *_ALWAYS)) for i, n in enumerate(_LOADS)},
+    **{f'static_{n}': LawTarget('link', 'static', i, VARIABLES[n], (*_LOADS, *_ALWAYS)) for i, n in enumerate(_POSE)},
+    **{n: LawTarget('link', 'pose', i, VARIABLES[n], (*_LOADS, *_POSE, *_ALWAYS)) for i, n in enumerate(_POSE)},
+    **{f'beam_{n}': LawTarget('optics', 'dots', i, 'm', tuple(VARIABLES)) for i, n in enumerate(_DOTS)},
+    **{n: LawTarget('psd', 'dots', i, 'm', tuple(VARIABLES)) for i, n in enumerate(_DOTS)},
+    **{f'sum{i + 1}': LawTarget('psd', 'dots', 4 + i, 'V', tuple(VARIABLES)) for i in range(2)},
 }
 """What a law may act on. ``static_dx`` is what the link swings towards, ``dx`` where it is; ``beam_x1`` moves a laser's
 beam sideways."""
@@ -229,7 +229,7 @@ FORMS: Mapping[str, Form] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Term:
+class LawTerm:
     """``coefficient`` times a form of the product of the variables ``of``; ``sd``: of coefficient and shapes.
 
     ``times``: when a ``switched`` term goes on, off, on ..., s.
@@ -321,7 +321,7 @@ class Law:
     name: str
     stage: Stage
     acts_on: str
-    terms: tuple[Term, ...]
+    terms: tuple[LawTerm, ...]
     summary: str = ''
 
     @property
@@ -357,10 +357,10 @@ def known(samples: SimulatedSamples, name: str) -> FloatArray:
     return np.asarray(rows)
 
 
-def _with_values(terms: Sequence[Term], values: Values) -> list[Term]:
+def _with_values(terms: Sequence[LawTerm], values: Values) -> list[LawTerm]:
     """The terms with the coefficients and shapes of a rig file."""
     return [
-        Term(t.form, t.of, values[f'c{i}'], {k: values[f'{k}{i}'] for k in t.shapes}, t.times)
+        LawTerm(t.form, t.of, values[f'c{i}'], {k: values[f'{k}{i}'] for k in t.shapes}, t.times)
         for i, t in enumerate(terms, 1)
     ]
 
@@ -550,7 +550,7 @@ def _number(path: Path, key: str, body: Mapping[str, object], default: float | N
     return number
 
 
-def _term(path: Path, at: str, body: object, acts_on: str) -> Term:
+def _term(path: Path, at: str, body: object, acts_on: str) -> LawTerm:
     if not isinstance(body, dict):
         raise ConfigError(f'{path}: {at} = {body!r}: must be a map with form, of and coefficient')
     name = _one_of(path, f'{at}.form', body.get('form'), FORMS)
@@ -573,4 +573,4 @@ def _term(path: Path, at: str, body: object, acts_on: str) -> Term:
         shapes[key] = value
     listed = body.get('sd', {})
     sd = {k: _number(path, f'{at}.sd.{k}', listed) for k in listed} if isinstance(listed, dict) else {}
-    return Term(name, tuple(of), _number(path, f'{at}.coefficient', body), shapes, tuple(map(float, times)), sd)
+    return LawTerm(name, tuple(of), _number(path, f'{at}.coefficient', body), shapes, tuple(map(float, times)), sd)

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.errors import ConfigError
-from psd_deflection.parameters import shown
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.simulation import loads
+from psd_deflection.model.simulation.loads import LoadHistory
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation import loads
-from psd_deflection.simulation.loads import LoadHistory
+from psd_deflection.rig.parameters import shown
 
 HELP = """\
 load histories (a load is FX,FY,TZ in N, N, N m; DWELL and SECONDS in s):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from psd_deflection.errors import RecordingError
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.records import FloatArray
 
 SIDEBAR_ARM = 0.585

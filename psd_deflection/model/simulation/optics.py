@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from psd_deflection.geometry.landing import landings
-from psd_deflection.geometry.plate import points_under, points_under_leaning
+from psd_deflection.model.plate.landing import landings
+from psd_deflection.model.plate.plate import points_under, points_under_leaning
+from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.physics import Physics
 
 
 def dots_on_plate(pose: FloatArray, beams: FloatArray, physics: Physics) -> FloatArray:

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from psd_deflection.arithmetic import LIBRARY, Arithmetic
-from psd_deflection.config import Rig
-from psd_deflection.mechanics import LinkStatics
+from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.model.solvers.registry import psds_at_base
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.registry import psds_at_base
+from psd_deflection.rig.config import Rig
 
 
 @dataclass(slots=True)

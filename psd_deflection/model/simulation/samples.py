@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.physics import Physics
 
 
 def _none() -> FloatArray:

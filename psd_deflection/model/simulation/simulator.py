@@ -4,7 +4,7 @@ Theory of operation. A :class:`SimulatedSamples` holds consecutive samples, one 
 the stages in order. The simulator keeps the state between steps (modes, hysteresis, delays), so a
 history cut anywhere gives the same samples bit for bit. For this reason every operation is
 elementwise or a recursive filter, and the noise is drawn sample by sample. Effects act at named
-points (:data:`~psd_deflection.simulation.declaration.Point`).
+points (:data:`~psd_deflection.model.simulation.declaration.Point`).
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.calibration import Wiring
-from psd_deflection.config import Rig
+from psd_deflection.model.simulation.catalogue import effects_of_rig
+from psd_deflection.model.simulation.declaration import ActiveEffect, State
+from psd_deflection.model.simulation.modes import Filter, mode_coefficients
+from psd_deflection.model.simulation.optics import dots_on_plate
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.samples import SimulatedSamples, no_samples_between
+from psd_deflection.model.solvers.registry import check_arrangement
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import effects_of_rig
-from psd_deflection.simulation.declaration import ActiveEffect, State
-from psd_deflection.simulation.modes import Filter, mode_coefficients
-from psd_deflection.simulation.optics import dots_on_plate
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.samples import SimulatedSamples, no_samples_between
-from psd_deflection.solvers.registry import check_arrangement
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.wiring import Wiring
 
 PIECE = 8192
 """Samples of a piece of :meth:`ForwardModel.expect_in_pieces`: an array of them is 64 KB."""

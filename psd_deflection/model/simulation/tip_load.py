@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from psd_deflection.arithmetic import ARITHMETICS
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError
-from psd_deflection.simulation.declaration import POINTS, ActiveEffect, Traced
-from psd_deflection.simulation.physics import Physics
+from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.simulation.declaration import POINTS, ActiveEffect, Traced
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.rig.config import Rig
 
 
 class TipLoads:

@@ -1,7 +1,7 @@
 """From dots to the pose of the tip: one algorithm a file, one interface (``interface``)."""
 
-from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus
-from psd_deflection.solvers.registry import SOLVERS, make_solver, solver_from_rig
+from psd_deflection.model.solvers.interface import Solution, Solutions, Solver, SolverStatus
+from psd_deflection.model.solvers.registry import SOLVERS, make_solver, solver_from_rig
 
 __all__ = [
     'SOLVERS',

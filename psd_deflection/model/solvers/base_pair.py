@@ -22,14 +22,14 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError, SolverError
-from psd_deflection.geometry.landing import landing
-from psd_deflection.geometry.layout import SMALLEST_BASE_LINE, Geometry, check_twist
-from psd_deflection.geometry.plate import tie_matrix
-from psd_deflection.solvers.beam import slope_per_metre
-from psd_deflection.solvers.gauss_newton import answer, fit
-from psd_deflection.solvers.interface import Solution, Solver
+from psd_deflection.base.errors import ConfigError, SolverError
+from psd_deflection.model.plate.landing import landing
+from psd_deflection.model.plate.layout import SMALLEST_BASE_LINE, Geometry, check_twist
+from psd_deflection.model.plate.plate import tie_matrix
+from psd_deflection.model.solvers.beam import slope_per_metre
+from psd_deflection.model.solvers.gauss_newton import answer, fit
+from psd_deflection.model.solvers.interface import Solution, Solver
+from psd_deflection.rig.config import Rig
 
 Assume = Literal['beam', 'no_twist', 'nothing']
 

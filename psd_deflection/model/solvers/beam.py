@@ -14,13 +14,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from psd_deflection.config import Rig
-from psd_deflection.errors import SolverError
-from psd_deflection.geometry.layout import Geometry, check_twist
-from psd_deflection.geometry.plate import Tilts, crossing, flat_pose
+from psd_deflection.base.errors import SolverError
+from psd_deflection.model.plate.layout import Geometry, check_twist
+from psd_deflection.model.plate.plate import Tilts, crossing, flat_pose
+from psd_deflection.model.solvers.gauss_newton import answer, fit
+from psd_deflection.model.solvers.interface import Solution, Solver, flat_gain
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.gauss_newton import answer, fit
-from psd_deflection.solvers.interface import Solution, Solver, flat_gain
+from psd_deflection.rig.config import Rig
 
 
 class BeamSolver(Solver):

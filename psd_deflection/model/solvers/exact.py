@@ -23,13 +23,13 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.arithmetic import Arithmetic
-from psd_deflection.errors import SolverError
-from psd_deflection.geometry.layout import Geometry, check_twist
-from psd_deflection.geometry.plate import Number
+from psd_deflection.base.arithmetic import Arithmetic
+from psd_deflection.base.errors import SolverError
+from psd_deflection.model.plate.layout import Geometry, check_twist
+from psd_deflection.model.plate.plate import Number
+from psd_deflection.model.solvers.interface import Solution, Solutions, Solver, SolverStatus, flat_gain
+from psd_deflection.model.solvers.plane import Four, Nine, checked_variances, turn_covariance
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.interface import Solution, Solutions, Solver, SolverStatus, flat_gain
-from psd_deflection.solvers.plane import Four, Nine, checked_variances, turn_covariance
 
 _MAX_STEPS = 30
 _LAST_STEP = 1e-10

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from psd_deflection.arithmetic import LIBRARY, Arithmetic
-from psd_deflection.geometry.linear import gain_matrix
+from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
+from psd_deflection.model.plate.linear import gain_matrix
+from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
 
 
 class FixedGain(Solver):

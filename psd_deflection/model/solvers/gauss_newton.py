@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from psd_deflection.arithmetic import LIBRARY, Arithmetic
-from psd_deflection.errors import SolverError
-from psd_deflection.solvers.interface import Solution, SolverStatus
+from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
+from psd_deflection.base.errors import SolverError
+from psd_deflection.model.solvers.interface import Solution, SolverStatus
 
 Model = Callable[[Sequence[float]], tuple[list[float], list[Sequence[float]]]]
 """Parameters (p) to predicted readings (m) and rows of derivatives (m of p)."""

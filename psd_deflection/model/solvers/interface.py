@@ -20,12 +20,12 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.arithmetic import LIBRARY, Arithmetic
-from psd_deflection.config import Rig
-from psd_deflection.geometry.layout import Geometry
-from psd_deflection.geometry.plate import Tilts
+from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
+from psd_deflection.model.plate.layout import Geometry
+from psd_deflection.model.plate.plate import Tilts
+from psd_deflection.model.solvers.plane import checked_variances
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.plane import checked_variances
+from psd_deflection.rig.config import Rig
 
 _STEP = 1e-8
 """m. Of differences: far above rounding, far below what bends the answer."""
@@ -80,7 +80,7 @@ class Solutions:
 class Solver(abc.ABC):
     """One method, bound to one geometry; holds no state between blocks.
 
-    ``name``: as in the registry. ``budgeted_as``: the model of the error budget (``budget.estimate.METHODS``)
+    ``name``: as in the registry. ``budgeted_as``: the model of the error budget (``studies.budget.estimate.METHODS``)
     whose errors the method has; '' if there is none. ``psds_at``: ``tip`` (on the plate, lasers at the base) or
     ``base`` (lasers on the plate). ``tilts``: what it says of the plate's tilts.
     """

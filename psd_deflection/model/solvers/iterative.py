@@ -18,10 +18,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from psd_deflection.geometry.layout import Geometry, check_twist
+from psd_deflection.model.plate.layout import Geometry, check_twist
+from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.model.solvers.plane import Covariance, turn_covariance
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
-from psd_deflection.solvers.plane import Covariance, turn_covariance
 
 _MAX_TRIALS = 50
 _LAST_STEP = 1e-8

@@ -25,12 +25,12 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError, SolverError
-from psd_deflection.geometry.layout import Geometry, check_twist
-from psd_deflection.solvers.exact import ExactSolver
-from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
-from psd_deflection.solvers.plane import Covariance, turn_covariance
+from psd_deflection.base.errors import ConfigError, SolverError
+from psd_deflection.model.plate.layout import Geometry, check_twist
+from psd_deflection.model.solvers.exact import ExactSolver
+from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.model.solvers.plane import Covariance, turn_covariance
+from psd_deflection.rig.config import Rig
 
 Angles = Literal['rotation', 'azimuth']
 

@@ -1,6 +1,6 @@
 """``ols``: ordinary least squares on the linearised plate, with the corrected design matrix.
 
-The thesis's section 4.2 (4.24, x = A+ b) with the corrected rows of ``geometry.linear`` and the pre-load
+The thesis's section 4.2 (4.24, x = A+ b) with the corrected rows of ``model.plate.linear`` and the pre-load
 readings subtracted. On exact data of a flat plate it gives theta' = sin theta and
 d' = R(-theta) d + (1 - cos theta) lbar, lbar the mean of the l_i: the turn of d that it leaves out,
 not the sine, is its largest error (43 um at 1 degree and 2 mm).
@@ -12,9 +12,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from psd_deflection.geometry.layout import Geometry, check_twist
-from psd_deflection.geometry.linear import design_matrix
-from psd_deflection.solvers.fixed_gain import FixedGain
+from psd_deflection.model.plate.layout import Geometry, check_twist
+from psd_deflection.model.plate.linear import design_matrix
+from psd_deflection.model.solvers.fixed_gain import FixedGain
 
 
 class OlsSolver(FixedGain):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from psd_deflection.geometry.layout import Geometry
+from psd_deflection.model.plate.layout import Geometry
 
 NAME = 'one_psd'
 

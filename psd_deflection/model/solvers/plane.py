@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from psd_deflection.errors import SolverError
-from psd_deflection.geometry.plate import Number
+from psd_deflection.base.errors import SolverError
+from psd_deflection.model.plate.plate import Number
 from psd_deflection.records import FloatArray
 
 Four = tuple[Number, Number, Number, Number]

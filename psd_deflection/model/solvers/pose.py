@@ -14,12 +14,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from psd_deflection.errors import SolverError
-from psd_deflection.geometry.layout import SMALLEST_BASE_LINE, Geometry, check_twist
-from psd_deflection.geometry.plate import Tilts, crossing, crossings, flat_poses
+from psd_deflection.base.errors import SolverError
+from psd_deflection.model.plate.layout import SMALLEST_BASE_LINE, Geometry, check_twist
+from psd_deflection.model.plate.plate import Tilts, crossing, crossings, flat_poses
+from psd_deflection.model.solvers.gauss_newton import answer, fit
+from psd_deflection.model.solvers.interface import Solution, Solver
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.gauss_newton import answer, fit
-from psd_deflection.solvers.interface import Solution, Solver
 
 
 class PoseSolver(Solver):

@@ -1,6 +1,6 @@
 """The solver names that ``solver:`` and ``solvers:`` of a rig file may contain.
 
-To add a method, write a class (see :class:`~psd_deflection.solvers.interface.Solver`) and add a line here. The
+To add a method, write a class (see :class:`~psd_deflection.model.solvers.interface.Solver`) and add a line here. The
 class declares which parameters are its options and how its errors are budgeted. The module is imported only when
 the method is used.
 """
@@ -11,10 +11,10 @@ import importlib
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError, did_you_mean
-from psd_deflection.geometry.layout import Geometry
-from psd_deflection.solvers.interface import Solver
+from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.model.plate.layout import Geometry
+from psd_deflection.model.solvers.interface import Solver
+from psd_deflection.rig.config import Rig
 
 
 class Entry(NamedTuple):
@@ -26,19 +26,21 @@ class Entry(NamedTuple):
 
 SOLVERS: MappingProxyType[str, Entry] = MappingProxyType(
     {
-        'exact': Entry('psd_deflection.solvers.exact:ExactSolver'),
-        'wls': Entry('psd_deflection.solvers.wls:WlsSolver'),
-        'iterative': Entry('psd_deflection.solvers.iterative:IterativeSolver'),
-        'beam': Entry('psd_deflection.solvers.beam:BeamSolver'),
-        'wls_exact': Entry('psd_deflection.solvers.wls_exact:WlsExactSolver'),
-        'ols': Entry('psd_deflection.solvers.ols:OlsSolver'),
-        'minimum_tilt': Entry('psd_deflection.solvers.minimum_tilt:MinimumTiltSolver'),
-        'pose': Entry('psd_deflection.solvers.pose:PoseSolver'),
-        'base_pair': Entry('psd_deflection.solvers.base_pair:BasePairSolver'),
-        'iterative_printed': Entry('psd_deflection.thesis.iterative_printed:IterativePrintedSolver', 'iterative'),
-        'appendix_d': Entry('psd_deflection.thesis.appendix_d:AppendixDSolver', 'iterative'),
-        'appendix_d_ols': Entry('psd_deflection.thesis.appendix_d_least_squares:AppendixDOlsSolver', 'ols'),
-        'appendix_d_wls': Entry('psd_deflection.thesis.appendix_d_least_squares:AppendixDWlsSolver', 'wls'),
+        'exact': Entry('psd_deflection.model.solvers.exact:ExactSolver'),
+        'wls': Entry('psd_deflection.model.solvers.wls:WlsSolver'),
+        'iterative': Entry('psd_deflection.model.solvers.iterative:IterativeSolver'),
+        'beam': Entry('psd_deflection.model.solvers.beam:BeamSolver'),
+        'wls_exact': Entry('psd_deflection.model.solvers.wls_exact:WlsExactSolver'),
+        'ols': Entry('psd_deflection.model.solvers.ols:OlsSolver'),
+        'minimum_tilt': Entry('psd_deflection.model.solvers.minimum_tilt:MinimumTiltSolver'),
+        'pose': Entry('psd_deflection.model.solvers.pose:PoseSolver'),
+        'base_pair': Entry('psd_deflection.model.solvers.base_pair:BasePairSolver'),
+        'iterative_printed': Entry(
+            'psd_deflection.studies.thesis.iterative_printed:IterativePrintedSolver', 'iterative'
+        ),
+        'appendix_d': Entry('psd_deflection.studies.thesis.appendix_d:AppendixDSolver', 'iterative'),
+        'appendix_d_ols': Entry('psd_deflection.studies.thesis.appendix_d_least_squares:AppendixDOlsSolver', 'ols'),
+        'appendix_d_wls': Entry('psd_deflection.studies.thesis.appendix_d_least_squares:AppendixDWlsSolver', 'wls'),
     }
 )
 """The default first."""

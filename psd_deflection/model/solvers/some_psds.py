@@ -14,14 +14,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from psd_deflection.config import Rig
-from psd_deflection.errors import SolverError
-from psd_deflection.geometry.layout import Geometry
-from psd_deflection.geometry.plate import Tilts
+from psd_deflection.base.errors import SolverError
+from psd_deflection.model.plate.layout import Geometry
+from psd_deflection.model.plate.plate import Tilts
+from psd_deflection.model.solvers.beam import BeamSolver
+from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.model.solvers.registry import make_solver, solver_class
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.beam import BeamSolver
-from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
-from psd_deflection.solvers.registry import make_solver, solver_class
+from psd_deflection.rig.config import Rig
 
 
 class PoseOfFew(Solver):

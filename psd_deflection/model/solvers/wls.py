@@ -1,6 +1,6 @@
 """``wls``: weighted least squares on the linearised plate, with the corrected design matrix.
 
-The thesis's section 4.3 with the corrected rows of ``geometry.linear`` and the pre-load readings
+The thesis's section 4.3 with the corrected rows of ``model.plate.linear`` and the pre-load readings
 subtracted. The weights are the inverse variances. The thesis's own choice, rows scaled by
 Po = [0.03, 0.5, 10, 0.1], makes W = Po^2 (its 4.25 and its code differ on that). This choice is
 kept under the name ``thesis``. It does not describe the noise: it takes dX from x2 alone and dY
@@ -16,13 +16,13 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError, SolverError
-from psd_deflection.geometry.layout import Geometry, check_twist
-from psd_deflection.geometry.linear import design_matrix
+from psd_deflection.base.errors import ConfigError, SolverError
+from psd_deflection.model.plate.layout import Geometry, check_twist
+from psd_deflection.model.plate.linear import design_matrix
+from psd_deflection.model.solvers.fixed_gain import FixedGain
+from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus, weighted_gain
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.fixed_gain import FixedGain
-from psd_deflection.solvers.interface import Solution, Solver, SolverStatus, weighted_gain
+from psd_deflection.rig.config import Rig
 
 THESIS_ROW_SCALING = (0.03, 0.5, 10.0, 0.1)
 """Po of x1, y1, x2, y2 for the thesis's loads on the sidebar (section 5.5, Figs 5.12-5.20)."""

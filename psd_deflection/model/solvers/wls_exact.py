@@ -18,11 +18,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from psd_deflection.config import Rig
-from psd_deflection.geometry.layout import Geometry
-from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
-from psd_deflection.solvers.plane import turn_covariance
-from psd_deflection.solvers.wls import THESIS_ROW_SCALING, Weights, WlsSolver
+from psd_deflection.model.plate.layout import Geometry
+from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.model.solvers.plane import turn_covariance
+from psd_deflection.model.solvers.wls import THESIS_ROW_SCALING, Weights, WlsSolver
+from psd_deflection.rig.config import Rig
 
 
 class WlsExactSolver(Solver):

@@ -37,12 +37,16 @@ from msg_adapters import (
     wrench_stamped,
 )
 from msg_adapters.header import header, stamp_ns
-from psd_deflection.errors import ConfigError, RecordingError
-from psd_deflection.foreign_yaml import tree_of_file
-from psd_deflection.protocol.sequence import RecordedSequence
+from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.base.foreign_yaml import tree_of_file
+from psd_deflection.base.sequence import RecordedSequence
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.allowance import Warnings
-from psd_deflection.recordings.bag_writer import (
+from psd_deflection.recordings.estimates import EstimateSeries
+from psd_deflection.recordings.read.allowance import Warnings
+from psd_deflection.recordings.read.clouds import CloudDecoder, joined_points
+from psd_deflection.recordings.read.mcap_reader import McapReader, RawMessage
+from psd_deflection.recordings.recording import Recording, from_json
+from psd_deflection.recordings.write.bag_writer import (
     META_CHANGE,
     META_HELLO,
     META_MADE_WITH,
@@ -50,10 +54,6 @@ from psd_deflection.recordings.bag_writer import (
     META_PARAMETERS,
     META_SOFTWARE,
 )
-from psd_deflection.recordings.clouds import CloudDecoder, joined_points
-from psd_deflection.recordings.estimates import EstimateSeries
-from psd_deflection.recordings.mcap_reader import McapReader, RawMessage
-from psd_deflection.recordings.recording import Recording, from_json
 from psd_deflection.records import (
     AppliedLoad,
     BaseAcceleration,

@@ -15,11 +15,11 @@ import numpy.typing as npt
 
 from msg_adapters import point_cloud2
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.allowance import MAX_FIELDS
+from psd_deflection.recordings.read.allowance import MAX_FIELDS
 from psd_deflection.records import IntArray, channel_names
 
 
-class _Layout(NamedTuple):
+class _CloudLayout(NamedTuple):
     """The common bytes of messages of one kind, and the offsets of the other parts."""
 
     width_at: int
@@ -36,7 +36,7 @@ class CloudDecoder:
 
     def __init__(self) -> None:
         # Our messages have two layouts, with and without flags.
-        self._layouts: list[_Layout] = []
+        self._layouts: list[_CloudLayout] = []
 
     def decode(self, message: bytes) -> tuple[int, npt.NDArray[np.void]]:
         """(header.stamp in ns, the points). Raises ValueError if it is not a PointCloud2."""
@@ -65,14 +65,16 @@ def _declared_fields(message: bytes) -> int:
         return 0
 
 
-def _learn(message: bytes, dtype: np.dtype[np.void]) -> _Layout:
+def _learn(message: bytes, dtype: np.dtype[np.void]) -> _CloudLayout:
     """Offsets of the parts that change from one message to the next; ``message`` must be valid."""
     width_at = cdr.after_text(message, cdr.FRAME_AT) + 4
     at = width_at + 8
     for _ in range(cdr.u32(message, width_at + 4)):
         at = cdr.after_text(message, at) + 12
     row_step_at = at + 8
-    return _Layout(width_at, row_step_at, message[cdr.FRAME_AT : width_at], message[width_at + 4 : row_step_at], dtype)
+    return _CloudLayout(
+        width_at, row_step_at, message[cdr.FRAME_AT : width_at], message[width_at + 4 : row_step_at], dtype
+    )
 
 
 class Samples(NamedTuple):

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
-from psd_deflection.errors import RecordingError
-from psd_deflection.recordings.csv_rows import NUMBER, CsvTable, Rows
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.recordings.estimates import EstimateSeries
-from psd_deflection.recordings.mcap_reader import RawMessage
+from psd_deflection.recordings.read.csv_rows import NUMBER, CsvRows, CsvTable
+from psd_deflection.recordings.read.mcap_reader import RawMessage
 from psd_deflection.recordings.recording import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN, Recording
 from psd_deflection.records import (
     MOST_PSDS,
@@ -148,7 +148,7 @@ class CsvRecording(Recording):
                 seqs.append(seq)
             yield from self._chunk(rows, seqs)
 
-    def _chunk(self, rows: Rows, seqs: list[int]) -> Iterator[RawChunk]:
+    def _chunk(self, rows: CsvRows, seqs: list[int]) -> Iterator[RawChunk]:
         """One chunk of ``rows``. Before it raises RecordingError, one of those before the bad row."""
         width, channels = len(self._source.header), len(self._channels)
         volts = _floats([rows.cells[self._columns[c] :: width] for c in self._channels])

@@ -14,7 +14,7 @@ from operator import lt
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TextIO
 
-from psd_deflection.errors import RecordingError
+from psd_deflection.base.errors import RecordingError
 
 MAX_LINE = 10_000
 """Maximum characters of a line; a longer line is not a row of samples."""
@@ -41,7 +41,7 @@ _TOGETHER = 500
 """Number of rows that are handed on at once: numpy's cost is per call."""
 
 
-class Rows(NamedTuple):
+class CsvRows(NamedTuple):
     """Rows that follow each other: number of the line and time, ns, of each; ``cells``: those of all rows in turn."""
 
     lines: Sequence[int]
@@ -64,7 +64,7 @@ class CsvTable:
         """The error that says so of this file."""
         return RecordingError(f'{self.path}{"" if line is None else f":{line}"}: {why}')
 
-    def rows(self) -> Iterator[Rows]:
+    def rows(self) -> Iterator[CsvRows]:
         """All rows behind the header, which has a column ``t``; before an error, those before the bad row."""
         last, line = -1, 0
         try:
@@ -93,7 +93,7 @@ class CsvTable:
             return 0
         return len(first)
 
-    def _plain(self, stream: BinaryIO) -> Iterator[tuple[int, Rows]]:
+    def _plain(self, stream: BinaryIO) -> Iterator[tuple[int, CsvRows]]:
         """Plain rows with rising times from where ``stream`` is, with their size in bytes, up to the first that is not.
 
         The numbers of their lines are left out.
@@ -117,7 +117,7 @@ class CsvTable:
             t_ns = self._many_nanoseconds(cells[at::width])
             if t_ns is None or not all(map(lt, t_ns, t_ns[1:])):
                 return
-            yield len(piece), Rows((), t_ns, cells)
+            yield len(piece), CsvRows((), t_ns, cells)
 
     def _many_nanoseconds(self, cells: list[str]) -> list[int] | None:
         """Times in ns; None if one is not written as seconds with up to nine decimals."""
@@ -132,7 +132,7 @@ class CsvTable:
             return [scale * t for t in map(int, whole)]
         return [self._nanoseconds(cell, 0) for cell in cells]
 
-    def _any(self, begin: int, line: int, last: int) -> Iterator[Rows]:
+    def _any(self, begin: int, line: int, last: int) -> Iterator[CsvRows]:
         """The rows from byte ``begin`` on, behind line number ``line`` and time ``last``, ns."""
         width, at = len(self.header), self.header.index('t')
         lines: list[int] = []
@@ -152,16 +152,16 @@ class CsvTable:
                 times.append(t_ns)
                 together += cells
                 if len(lines) == _TOGETHER:
-                    full = Rows(lines, times, together)
+                    full = CsvRows(lines, times, together)
                     lines, times, together = [], [], []
                     yield full
         except RecordingError:
             # Rows before the bad one are good.
             if lines:
-                yield Rows(lines, times, together)
+                yield CsvRows(lines, times, together)
             raise
         if lines:
-            yield Rows(lines, times, together)
+            yield CsvRows(lines, times, together)
 
     def _cells(self, begin: int | None, line: int) -> Iterator[tuple[int, list[str]]]:
         """(line number, cells) of every line that is not blank, from byte ``begin`` on, behind line number ``line``.

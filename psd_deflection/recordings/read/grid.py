@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from psd_deflection.errors import RecordingError
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.records import FloatArray, IntArray
 
 MAX_SAMPLES = 20_000_000

@@ -2,7 +2,7 @@
 
 It differs from the readers of the ``mcap`` package in two ways. If a file lost its end, or a chunk is
 damaged, everything else is read, with a warning. Every size that a file declares is compared with the
-file's own size or with the :mod:`~psd_deflection.recordings.allowance` before it is used. ``mcap.records``
+file's own size or with the :mod:`~psd_deflection.recordings.read.allowance` before it is used. ``mcap.records``
 parses the content of a record.
 The format: https://mcap.dev/spec.
 """
@@ -24,8 +24,8 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
 
-from psd_deflection.errors import RecordingError
-from psd_deflection.recordings.allowance import MAX_CHUNK_BYTES, Allowance, DamagedError, Warnings
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.recordings.read.allowance import MAX_CHUNK_BYTES, Allowance, DamagedError, Warnings
 
 MAGIC = b'\x89MCAP0\r\n'
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 
-from psd_deflection.errors import RecordingError, did_you_mean
-from psd_deflection.recordings.bag_reader import BagRecording
-from psd_deflection.recordings.csv_reader import CsvRecording
-from psd_deflection.recordings.mcap_reader import MAGIC
+from psd_deflection.base.errors import RecordingError, did_you_mean
+from psd_deflection.recordings.read.bag_reader import BagRecording
+from psd_deflection.recordings.read.csv_reader import CsvRecording
+from psd_deflection.recordings.read.mcap_reader import MAGIC
 from psd_deflection.recordings.recording import Recording
 
 MOST_NAMES = 1000

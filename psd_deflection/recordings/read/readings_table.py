@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from psd_deflection.errors import RecordingError
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.recordings.recording import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN, Recording
 from psd_deflection.records import FloatArray
 

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from psd_deflection.errors import RecordingError, printable
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.csv_rows import MAX_LINE, MAX_SECONDS
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.base.errors import RecordingError, printable
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.recordings.read.csv_rows import MAX_LINE, MAX_SECONDS
+from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.replay_engine import replayed
+from psd_deflection.recordings.replay.engine import replayed
 from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
@@ -52,7 +52,7 @@ class References:
 
 
 @dataclass(frozen=True)
-class Run:
+class TrustedSamples:
     """All trusted samples of a recording.
 
     ``t_ns`` int64 (n,). ``dots`` (n, 4), m, calibrated and corrected. ``estimate_sd`` (3,): median standard deviation
@@ -162,7 +162,7 @@ def _number(path: Path, line: int, cell: str) -> float:
     return value
 
 
-def read_run(recording: Recording, pipeline: Pipeline, blocks: Iterable[SampleBlock] | None = None) -> Run:
+def read_run(recording: Recording, pipeline: Pipeline, blocks: Iterable[SampleBlock] | None = None) -> TrustedSamples:
     """The samples of all blocks that ``pipeline``, made with the recording's block size, trusts.
 
     ``blocks``: the recording's, for a caller that counts them. Raises RecordingError if it trusts none.
@@ -182,7 +182,7 @@ def read_run(recording: Recording, pipeline: Pipeline, blocks: Iterable[SampleBl
                 deviations.append(np.array(record.covariance).reshape(3, 3).diagonal())
     if not times:
         raise RecordingError(f'{recording.path}: no block has an estimate, so there is nothing to compare')
-    return Run(
+    return TrustedSamples(
         np.concatenate(times).astype(np.int64),
         np.concatenate(dots),
         np.sqrt(np.median(np.array(deviations), axis=0)) if deviations else np.full(3, np.nan),

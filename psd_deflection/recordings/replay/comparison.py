@@ -6,7 +6,7 @@ messages in between. Both sides are read as streams, so that recordings of any l
 
 Messages whose numbers agree to far more digits than a measurement has differ by rounding: another version or library
 added up in another order. They are counted apart. Such a difference is a defect only if nothing that computes has
-changed since the recording was made (:mod:`psd_deflection.provenance`).
+changed since the recording was made (:mod:`psd_deflection.recordings.provenance`).
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from msg_adapters import DIAGNOSTICS, FILTERED, INPUTS, RIG, SAMPLES, pose_stamped, to_messages
-from psd_deflection.declarations import FRAME_PREFIX
-from psd_deflection.errors import RecordingError
-from psd_deflection.provenance import differences, provenance
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.recordings import cdr
+from psd_deflection.recordings.provenance import differences, provenance
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import ParameterChange, Record
+from psd_deflection.rig.declarations import FRAME_PREFIX
 
 _NOT_ESTIMATED = {DIAGNOSTICS, RIG, SAMPLES, *INPUTS}
 _LAG_NS = 2_000_000_000
@@ -38,7 +38,7 @@ _LEAST_OF_OTHERS = 1e-13
 """m and rad: a ten-thousandth of a nanometre."""
 
 
-class Comparison:
+class ReplayComparison:
     """Feed it the replay's records in order, then call ``finish``.
 
     ``different``: messages that differ, ``rounded`` of them by rounding alone. ``rounding_explained``: what computes is

@@ -13,12 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from msg_adapters import DEFLECTION
-from psd_deflection.config import Rig, load_rig, replace_values, rig_as_recorded
-from psd_deflection.declarations import BY_NAME
-from psd_deflection.errors import ConfigError
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.estimates import EstimateSeries
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.summary import NO_PARAMETERS
 from psd_deflection.records import (
@@ -30,6 +28,8 @@ from psd_deflection.records import (
     SampleBlock,
     TipLoad,
 )
+from psd_deflection.rig.config import Rig, load_rig, replace_values, rig_as_recorded
+from psd_deflection.rig.declarations import BY_NAME
 
 
 def rig_at_start(recording: Recording) -> Rig:

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
-from psd_deflection.calibration import counts_to_volts
-from psd_deflection.config import Rig
+from psd_deflection.model.detector import counts_to_volts
+from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.recordings.estimates import EstimateSeries
-from psd_deflection.recordings.mcap_reader import RawMessage
+from psd_deflection.recordings.read.mcap_reader import RawMessage
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import AppliedLoad, FloatArray, RawChunk, ReferencePose, TemperatureReading
-from psd_deflection.simulation.simulator import RigSimulator
+from psd_deflection.rig.config import Rig
 
 
 class SimulatedRecording(Recording):

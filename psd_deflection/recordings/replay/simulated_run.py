@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.config import Rig
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import (
     AppliedLoad,
     FloatArray,
@@ -17,7 +17,7 @@ from psd_deflection.records import (
     ReferencePose,
     TemperatureReading,
 )
-from psd_deflection.simulation.simulator import RigSimulator
+from psd_deflection.rig.config import Rig
 
 CHUNK_SECONDS = 1.0
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from psd_deflection.config import Rig, replace_values
-from psd_deflection.declarations import BY_NAME
+from psd_deflection.measure.watch import Alarm, Watch
+from psd_deflection.model.simulation.catalogue import effects_of_rig
+from psd_deflection.model.simulation.tip_load import TipLoads
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import ParameterChange, Record, SampleBlock
-from psd_deflection.simulation.catalogue import effects_of_rig
-from psd_deflection.simulation.tip_load import TipLoads
-from psd_deflection.watching.watch import Alarm, Watch
+from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.rig.declarations import BY_NAME
 
 
 class WatchedReplay:

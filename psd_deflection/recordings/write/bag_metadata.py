@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from psd_deflection.files import HeldFolder
+from psd_deflection.base.files import HeldFolder
 
 METADATA_VERSION = 9
 

@@ -2,7 +2,7 @@
 
 A crash must cost at most a second. So chunks span less than half a second of log time and are handed
 to the operating system when they end (``durable``: written to the disk). Parameters, version and hello are at
-the front of every file. After a crash, :mod:`psd_deflection.recordings.bag_reader` reads the file up to the
+the front of every file. After a crash, :mod:`psd_deflection.recordings.read.bag_reader` reads the file up to the
 cut, and :mod:`psd_deflection.recordings.repair` repairs it.
 """
 
@@ -23,12 +23,11 @@ from mcap.writer import CompressionType, Writer
 
 from msg_adapters import LATCHED, MESSAGE_TYPES, to_messages
 from psd_deflection import __version__
-from psd_deflection.declarations import FRAME_PREFIX
-from psd_deflection.errors import RecordingError, creating
-from psd_deflection.files import HeldFolder
-from psd_deflection.provenance import provenance
+from psd_deflection.base.errors import RecordingError, creating
+from psd_deflection.base.files import HeldFolder
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.bag_metadata import (
+from psd_deflection.recordings.provenance import provenance
+from psd_deflection.recordings.write.bag_metadata import (
     DEFAULT_QOS,
     LATCHED_QOS,
     FileCount,
@@ -40,6 +39,7 @@ from psd_deflection.recordings.bag_metadata import (
     write_metadata,
 )
 from psd_deflection.records import ParameterChange, Record, RigState
+from psd_deflection.rig.declarations import FRAME_PREFIX
 
 CHUNK_NS = 500_000_000
 """Largest log time that a chunk spans: together with the queues, a crash costs less than a second."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from psd_deflection.recordings.bag_writer import BagWriter, McapFile
+from psd_deflection.recordings.write.bag_writer import BagWriter, McapFile
 from psd_deflection.records import ReferencePose, ReferenceWithCovariance
 
 

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError, RecordingError, creating
-from psd_deflection.geometry.scene import bend, tip_boxes
+from psd_deflection.base.errors import ConfigError, RecordingError, creating
+from psd_deflection.model.plate.scene import bend, tip_boxes
 from psd_deflection.records import DeflectionEstimate, Record, SpotMeans, TipLoad
+from psd_deflection.rig.config import Rig
 
 APPLICATION = 'psd_deflection'
 TIMELINE = 'time'

@@ -6,11 +6,11 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Protocol
 
-from psd_deflection.config import rig_from_values
-from psd_deflection.recordings.bag_writer import BagWriter, McapFile
-from psd_deflection.recordings.csv_writer import CsvEstimateSink, CsvSampleSink
-from psd_deflection.recordings.rerun_writer import RerunFile
+from psd_deflection.recordings.write.bag_writer import BagWriter, McapFile
+from psd_deflection.recordings.write.csv_writer import CsvEstimateSink, CsvSampleSink
+from psd_deflection.recordings.write.rerun_writer import RerunFile
 from psd_deflection.records import Record
+from psd_deflection.rig.config import rig_from_values
 
 
 class Sink(Protocol):

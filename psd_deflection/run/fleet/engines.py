@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from typing import Any, Protocol, TypeVar
 
-from psd_deflection.errors import ConfigError, DaemonError, UsageError
+from psd_deflection.base.errors import ConfigError, DaemonError, UsageError
 
 T = TypeVar('T')
 

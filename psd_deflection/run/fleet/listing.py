@@ -6,7 +6,7 @@ import glob
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from psd_deflection.errors import RecordingError
+from psd_deflection.base.errors import RecordingError
 
 LIST = '.txt'
 """Ending of a file with one recording or pattern a line."""

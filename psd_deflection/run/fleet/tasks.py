@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from psd_deflection import __version__
-from psd_deflection.errors import PsdDeflectionError
-from psd_deflection.fleet.engines import Engine
+from psd_deflection.base.errors import PsdDeflectionError
+from psd_deflection.run.fleet.engines import Engine
 
 T = TypeVar('T')
 

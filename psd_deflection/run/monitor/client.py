@@ -12,9 +12,9 @@ from urllib.parse import parse_qs, urlsplit
 
 import aiohttp
 
-from psd_deflection.errors import ConfigError, DaemonError
-from psd_deflection.monitor.served import served_pages
-from psd_deflection.monitor.server import TOKEN_HEADER, TOKEN_VARIABLE
+from psd_deflection.base.errors import ConfigError, DaemonError
+from psd_deflection.run.monitor.served import served_pages
+from psd_deflection.run.monitor.server import TOKEN_HEADER, TOKEN_VARIABLE
 
 DEFAULT_URL = 'http://127.0.0.1:8790/'
 ANSWER_S = 10.0

@@ -9,7 +9,6 @@ import math
 import queue
 from typing import NamedTuple, TypeGuard
 
-from psd_deflection.declarations import ZEROS
 from psd_deflection.records import (
     AppliedLoad,
     DeflectionEstimate,
@@ -20,6 +19,7 @@ from psd_deflection.records import (
     SpotMeans,
     dot_names,
 )
+from psd_deflection.rig.declarations import ZEROS
 
 QUEUE_ITEMS = 2000
 """Ten seconds at 100 blocks/s and two items per block."""

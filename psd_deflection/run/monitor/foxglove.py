@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 
 from msg_adapters import MESSAGE_TYPES, RIG, TOPIC_TYPES
 from psd_deflection import __version__
-from psd_deflection.config import Rig
-from psd_deflection.declarations import MonitorConfig
-from psd_deflection.errors import ConfigError
-from psd_deflection.monitor.feed import Feed
-from psd_deflection.provenance import provenance
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.recordings.provenance import provenance
 from psd_deflection.records import ParameterChange, Record, RigState, SpotMeans
-from psd_deflection.runner.fanout import Fanout, published, subscribed
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.declarations import MonitorConfig
+from psd_deflection.run.fanout import Fanout, published, subscribed
+from psd_deflection.run.monitor.feed import Feed
 
 if TYPE_CHECKING:
     import foxglove

@@ -13,7 +13,7 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from psd_deflection.runner.zero_store import state_folder
+from psd_deflection.run.zero_store import state_folder
 
 MAX_BYTES = 10_000
 

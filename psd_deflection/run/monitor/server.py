@@ -28,14 +28,14 @@ from typing import Any
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from psd_deflection import __version__
-from psd_deflection.declarations import MonitorConfig
-from psd_deflection.errors import ConfigError
-from psd_deflection.monitor import access
-from psd_deflection.monitor.feed import BlockResult, Feed, mark_json, reference_json, row_columns, row_json
-from psd_deflection.monitor.served import Served, announce, withdraw
-from psd_deflection.monitor.shown import RefusedError, Shown
-from psd_deflection.monitor.spectrum import Spectrum, density_json
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import BlockStatus, DiagnosticReport, ReferencePose, SampleBlock
+from psd_deflection.rig.declarations import MonitorConfig
+from psd_deflection.run.monitor import access
+from psd_deflection.run.monitor.feed import BlockResult, Feed, mark_json, reference_json, row_columns, row_json
+from psd_deflection.run.monitor.served import Served, announce, withdraw
+from psd_deflection.run.monitor.shown import RefusedError, Shown
+from psd_deflection.run.monitor.spectrum import Spectrum, density_json
 
 PAGE = Path(__file__).parent / 'page'
 TOKEN_VARIABLE = 'PSD_DEFLECTION_MONITOR_TOKEN'
@@ -74,7 +74,7 @@ HEADERS = {
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 # aiohttp logs each malformed request with a traceback: an attacker could fill the journal.
-_UNHEARD = logging.getLogger('psd_deflection.monitor.http')
+_UNHEARD = logging.getLogger('psd_deflection.run.monitor.http')
 _UNHEARD.disabled = True
 
 

@@ -11,10 +11,8 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from typing import Any, Protocol
 
-from psd_deflection.config import Rig
-from psd_deflection.errors import PsdDeflectionError
-from psd_deflection.monitor.feed import QUEUE_ITEMS, Feed
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.base.errors import PsdDeflectionError
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import (
     RESTART,
     AppliedLoad,
@@ -25,8 +23,10 @@ from psd_deflection.records import (
     ReferencePose,
     SpotMeans,
 )
-from psd_deflection.runner.diagnostics import ERROR, OK, WARN, HealthReporter
-from psd_deflection.runner.session import Session, load_text, why_no_zero, zero_text
+from psd_deflection.rig.config import Rig
+from psd_deflection.run.diagnostics import ERROR, OK, WARN, HealthReporter
+from psd_deflection.run.monitor.feed import QUEUE_ITEMS, Feed
+from psd_deflection.run.session import Session, load_text, why_no_zero, zero_text
 
 LONGEST_WAIT_S = 2.0
 """Longest wait for a pause in a recording, s."""

@@ -12,9 +12,9 @@ from collections import deque
 
 import numpy as np
 
-from psd_deflection.calibration import Calibration
-from psd_deflection.config import Rig
+from psd_deflection.model.detector import VoltsToDots
 from psd_deflection.records import FloatArray, SampleBlock
+from psd_deflection.rig.config import Rig
 
 SEGMENT = 1024
 SECONDS = 4.0
@@ -25,7 +25,7 @@ class Spectrum:
 
     def __init__(self, rig: Rig, seconds: float | None = SECONDS) -> None:
         self.rate_hz = rig.converter.sample_rate_hz
-        self._calibration = Calibration.from_rig(rig)
+        self._calibration = VoltsToDots.from_rig(rig)
         # At low rates it takes longer until there are two segments.
         self.seconds = None if seconds is None else max(seconds, 2.0 * SEGMENT / self.rate_hz)
         samples = None if self.seconds is None else self.seconds * self.rate_hz

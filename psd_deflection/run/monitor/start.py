@@ -7,18 +7,18 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from psd_deflection.errors import ConfigError
-from psd_deflection.monitor.feed import Feed
-from psd_deflection.monitor.foxglove import FoxgloveServer
-from psd_deflection.monitor.shown import ShownSession
-from psd_deflection.runner.diagnostics import HealthReporter
-from psd_deflection.runner.fanout import Fanout
-from psd_deflection.runner.processing import RecordSink
-from psd_deflection.runner.rig_publisher import RigPublisher
-from psd_deflection.runner.session import Session
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.run.diagnostics import HealthReporter
+from psd_deflection.run.fanout import Fanout
+from psd_deflection.run.monitor.feed import Feed
+from psd_deflection.run.monitor.foxglove import FoxgloveServer
+from psd_deflection.run.monitor.shown import ShownSession
+from psd_deflection.run.processing import RecordSink
+from psd_deflection.run.rig_publisher import RigPublisher
+from psd_deflection.run.session import Session
 
 if TYPE_CHECKING:
-    from psd_deflection.monitor.server import MonitorServer
+    from psd_deflection.run.monitor.server import MonitorServer
 
 
 def need_server() -> None:
@@ -63,7 +63,7 @@ def start_views(session: Session, say: Callable[[str], None], *, reports: bool =
 def _start_page(session: Session, say: Callable[[str], None]) -> MonitorServer:
     need_server()
     # Imported here: only the page needs aiohttp.
-    from psd_deflection.monitor.server import MonitorServer
+    from psd_deflection.run.monitor.server import MonitorServer
 
     feed = Feed()
     server = MonitorServer(ShownSession(session), feed, session.rig.monitor, say)

@@ -18,20 +18,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from psd_deflection.config import Rig
+from psd_deflection.base.errors import DeviceError, Failed, Warned
+from psd_deflection.base.sequence import SequenceExtender, Step
+from psd_deflection.devices.protocol.frames import BadFrame, BadReason, HelloFrame, PongFrame, SampleFrame, StatusFrame
 from psd_deflection.devices.registry import make_source
 from psd_deflection.devices.source import Clock, Event, Sample, Source, SourceEndedError
-from psd_deflection.errors import DeviceError, Failed, Warned
-from psd_deflection.protocol.frames import BadFrame, BadReason, HelloFrame, PongFrame, SampleFrame, StatusFrame
-from psd_deflection.protocol.sequence import SequenceExtender, Step
+from psd_deflection.measure.timing import ClockState
 from psd_deflection.records import FLAG_DEVICE_DROPPED, RESTART, IntArray, ParameterChange, RawChunk
-from psd_deflection.runner.clock_watch import ClockWatch
-from psd_deflection.runner.counters import AWAY, BY_DEVICE, DAMAGED, UNSEEN, AcquisitionCounters
-from psd_deflection.runner.hello import AnotherDeviceError, HelloGate
-from psd_deflection.runner.pinger import Pinger
-from psd_deflection.runner.realtime import prefer_reader
-from psd_deflection.runner.repeats import Repeats
-from psd_deflection.timing import ClockState
+from psd_deflection.rig.config import Rig
+from psd_deflection.run.reading.clock_watch import ClockWatch
+from psd_deflection.run.reading.counters import AWAY, BY_DEVICE, DAMAGED, UNSEEN, AcquisitionCounters
+from psd_deflection.run.reading.hello import AnotherDeviceError, HelloGate
+from psd_deflection.run.reading.pinger import Pinger
+from psd_deflection.run.realtime import prefer_reader
+from psd_deflection.run.repeats import Repeats
 
 SILENCE_S = 2.0
 """A device that sends no sample for this long is reported, and asked for samples again."""

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from psd_deflection.base.sequence import NEARBY, WRAP
+from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.devices.source import Event, Sample
-from psd_deflection.protocol.frames import SampleFrame
-from psd_deflection.protocol.sequence import NEARBY, WRAP
+from psd_deflection.measure.timing import ClockMap, ClockState
 from psd_deflection.records import IntArray
-from psd_deflection.timing import ClockMap, ClockState
 
 TORN_US = 50_000
 """If device time and sample numbers disagree by more than this, the clock jumped or the device paused."""

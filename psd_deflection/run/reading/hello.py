@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from psd_deflection.config import Rig
+from psd_deflection.base.errors import DeviceError
 from psd_deflection.devices.device import psds_of
-from psd_deflection.errors import DeviceError
-from psd_deflection.protocol.frames import PROTOCOL_VERSION, HelloFrame
-from psd_deflection.protocol.words import device_words, finite
+from psd_deflection.devices.protocol.frames import PROTOCOL_VERSION, HelloFrame
+from psd_deflection.devices.protocol.words import device_words, finite
 from psd_deflection.records import channel_names
+from psd_deflection.rig.config import Rig
 
 
 class AnotherDeviceError(DeviceError):

@@ -4,7 +4,7 @@ Theory of operation. A sensor is at C = (c + error, h + error) on the plate, its
 tilted by R_s = Ry Rx Rz. Its beam was set so that the dot lies at m_0 before load: it passes through
 C + R_s (m_0, 0) and runs along (u_x, u_y, 1). Under load the plate is at d + R(.), with the tilts of
 a cantilever, so the dot is where the beam meets the plane through d + R C with normal R R_s e_z.
-Nothing is linearised: every error of the budget is a field of :class:`Chain`, and its effect is
+Nothing is linearised: every error of the budget is a field of :class:`MeasuringChain`, and its effect is
 computed exactly. Changes after the zero was stored (``..._shift``) act on the loaded reading only.
 
 Arrays have a leading axis of n trials or of 1, then P sensors, then x and y.
@@ -17,10 +17,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import ndtr
 
-from psd_deflection.config import Rig
-from psd_deflection.geometry.plate import tied_pose
-from psd_deflection.geometry.rays import hit, lifted, rotation
+from psd_deflection.model.plate.plate import tied_pose
+from psd_deflection.model.plate.rays import hit, lifted, rotation
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig
 
 
 def _none(*shape: int) -> FloatArray:
@@ -28,7 +28,7 @@ def _none(*shape: int) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chain:
+class MeasuringChain:
     """A rig as its parameter file describes it (first group of fields), and its errors.
 
     ``centers`` (P, 2), ``heights`` (P,), ``zeros`` (P, 2), ``half_area`` (P, 2), ``link_length``: m.
@@ -70,14 +70,14 @@ class Chain:
     """m, added to the stored zero."""
 
     @classmethod
-    def of(cls, rig: Rig) -> Chain:
+    def of(cls, rig: Rig) -> MeasuringChain:
         """The nominal rig."""
         half_area = np.array([p.active_area for p in rig.psds]) / 2.0
         slope_ratio = np.array([rig.link.slope_ratio])
         return cls(rig.centers, rig.heights, rig.zeros, half_area, rig.link.length, slope_ratio)
 
 
-def dots(chain: Chain, pose: FloatArray, dz: float = 0.0) -> FloatArray:
+def dots(chain: MeasuringChain, pose: FloatArray, dz: float = 0.0) -> FloatArray:
     """(n, P, 2), m: the dots in each sensor's own axes at ``pose`` (3,): dX, dY, theta.
 
     ``dz``: the tip's shortening, m; it affects inclined beams only.
@@ -109,13 +109,13 @@ def clipped(places: FloatArray, diameter: FloatArray, half_area: FloatArray) -> 
     return np.asarray(places + deviation * pull)
 
 
-def _read(chain: Chain, places: FloatArray) -> FloatArray:
+def _read(chain: MeasuringChain, places: FloatArray) -> FloatArray:
     places = clipped(places, chain.spot_diameter, chain.half_area)
     places = places * (1.0 + chain.nonlinearity[..., None] * np.sum(places**2, axis=-1, keepdims=True))
     return np.asarray(places / (1.0 + chain.background[..., None]) * (1.0 + chain.gain))
 
 
-def measure(chain: Chain, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+def measure(chain: MeasuringChain, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Readings and stored zeros, (n, P, 2) each, m, at ``pose`` (3,)."""
     readings = _read(chain, dots(chain, pose)) + chain.reading_shift
     zeros = _read(chain, chain.zeros[None]) + chain.zero_shift

@@ -12,10 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from psd_deflection.budget.chain import Chain, measure
-from psd_deflection.budget.term import Cause, Contribution, Kind, Situation
-from psd_deflection.errors import ConfigError
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.budget.chain import MeasuringChain, measure
+from psd_deflection.studies.budget.term import Cause, Contribution, Kind, Situation
 
 
 def stop_window(beams: FloatArray, tolerance: float) -> float:
@@ -59,11 +59,11 @@ class Computation(Cause):
             return _iteration(at)
         return Contribution(perfect_answer(at) - at.pose, np.zeros((3, 3)))
 
-    def without(self, chain: Chain, at: Situation) -> Chain:
+    def without(self, chain: MeasuringChain, at: Situation) -> MeasuringChain:
         """As declared: the chain is unchanged."""
         return chain
 
-    def perturb(self, chain: Chain, at: Situation, count: int, random: np.random.Generator) -> Chain:
+    def perturb(self, chain: MeasuringChain, at: Situation, count: int, random: np.random.Generator) -> MeasuringChain:
         """As declared."""
         return chain
 

@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from psd_deflection.budget.chain import Chain
-from psd_deflection.budget.optics import (
+from psd_deflection.records import FloatArray
+from psd_deflection.studies.budget.chain import MeasuringChain
+from psd_deflection.studies.budget.optics import (
     STANDARD_PRESSURE,
     air_index,
     boundary_shift,
     gradient_shift,
     index_per_kelvin,
 )
-from psd_deflection.budget.term import Kind, Situation, Term, adds_to
-from psd_deflection.records import FloatArray
+from psd_deflection.studies.budget.term import Kind, Situation, Term, adds_to
 
 # ---- E_RF: refraction ----
 
@@ -30,7 +30,7 @@ def _refraction(at: Situation) -> FloatArray:
     return np.array([abs(gradient)] * 2 + [abs(boundary)] * 4)
 
 
-def _refract(chain: Chain, values: FloatArray, at: Situation) -> Chain:
+def _refract(chain: MeasuringChain, values: FloatArray, at: Situation) -> MeasuringChain:
     # A gradient bends both beams equally; a boundary (a plume) meets each beam separately.
     both, each = values[:, None, :2], values[:, 2:].reshape(-1, 2, 2)
     return replace(chain, beam_shift=chain.beam_shift + both + each)

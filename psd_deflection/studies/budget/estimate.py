@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag
 
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError
-from psd_deflection.geometry.linear import design_matrix, gain_matrix
-from psd_deflection.geometry.plate import crossings, flat_poses, tie_matrix, tied_pose
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.plate.linear import design_matrix, gain_matrix
+from psd_deflection.model.plate.plate import crossings, flat_poses, tie_matrix, tied_pose
+from psd_deflection.model.solvers.registry import solver_class
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.registry import solver_class
+from psd_deflection.rig.config import Rig
 
 
 class Estimator(abc.ABC):
@@ -81,7 +81,7 @@ class ExactEstimator(Estimator):
 class LinearEstimator(Estimator):
     """The thesis's direct method (4.24, 4.27) with the corrected A: linear in the displacement of the dots.
 
-    ``gain`` (3, 2P): what ``geometry.linear.gain_matrix`` gives.
+    ``gain`` (3, 2P): what ``model.plate.linear.gain_matrix`` gives.
     """
 
     gain: FloatArray
@@ -117,7 +117,7 @@ def method_of(rig: Rig) -> str:
 def estimator_of(rig: Rig, method: str) -> Estimator:
     """The estimator of one of ``METHODS``.
 
-    ``thesis_iteration`` gives the exact angle minus the error of its stop rule (``budget.computation``),
+    ``thesis_iteration`` gives the exact angle minus the error of its stop rule (``studies.budget.computation``),
     so it responds to errors as ``exact`` does. Raises ConfigError for another name, or if the two centres
     coincide.
     """

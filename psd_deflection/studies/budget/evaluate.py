@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.budget import environment, installation, sensor
-from psd_deflection.budget.chain import measure
-from psd_deflection.budget.computation import COMPUTATION
-from psd_deflection.budget.term import Cause, Contribution, Kind, Situation
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.budget import environment, installation, sensor
+from psd_deflection.studies.budget.chain import measure
+from psd_deflection.studies.budget.computation import COMPUTATION
+from psd_deflection.studies.budget.term import Cause, Contribution, Kind, Situation
 
 CAUSES: tuple[Cause, ...] = (*sensor.TERMS, *environment.TERMS, *installation.TERMS, COMPUTATION)
 """Every line of the budget."""

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from psd_deflection.budget.chain import Chain
-from psd_deflection.budget.term import ROOT_3, Kind, Situation, Term, adds_to
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.budget.chain import MeasuringChain
+from psd_deflection.studies.budget.term import ROOT_3, Kind, Situation, Term, adds_to
 
 
 def _tolerance(name: str, count: int) -> Callable[[Situation], FloatArray]:
@@ -43,7 +43,7 @@ BEAM_MISALIGNMENT = Term(
 # ---- E_Tilt: tilt of the plane of the sensors ----
 
 
-def _tilt(chain: Chain, values: FloatArray, at: Situation) -> Chain:
+def _tilt(chain: MeasuringChain, values: FloatArray, at: Situation) -> MeasuringChain:
     modelled = at.estimator.slope_ratio
     return replace(chain, slope_ratio=modelled + values[:, 0] * (at.rig.link.slope_ratio - modelled))
 
@@ -59,7 +59,7 @@ PLANE_TILT = Term(
 )
 
 
-def _vary_slope_ratio(chain: Chain, values: FloatArray, at: Situation) -> Chain:
+def _vary_slope_ratio(chain: MeasuringChain, values: FloatArray, at: Situation) -> MeasuringChain:
     return replace(chain, slope_ratio=chain.slope_ratio + values[:, 0])
 
 
@@ -107,7 +107,7 @@ SENSOR_HEIGHT = Term(
 )
 
 
-def _expand(chain: Chain, values: FloatArray, at: Situation) -> Chain:
+def _expand(chain: MeasuringChain, values: FloatArray, at: Situation) -> MeasuringChain:
     return replace(chain, center_shift=chain.center_shift + values[:, :, None] * at.chain.centers)
 
 

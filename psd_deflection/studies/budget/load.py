@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from psd_deflection.budget.chain import Chain, measure
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.mechanics import LinkStatics
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.studies.budget.chain import MeasuringChain, measure
 
 SIDEBAR_FORCE = 50.0
 """N: the largest load of the thesis (chapter 5), hung on a sidebar one link length out on +X."""
@@ -26,7 +26,7 @@ def default_load(rig: Rig) -> tuple[float, float, float]:
     length = rig.link.length
     if _has_the_thesis_layout(rig):
         return 0.0, -SIDEBAR_FORCE, -SIDEBAR_FORCE * length
-    chain = Chain.of(rig)
+    chain = MeasuringChain.of(rig)
     statics = LinkStatics.from_rig(rig)
     # So small a turn that everything is linear in it.
     unit = 1e-6 * length / max(abs(v) for v in statics.deflection(0.0, -1.0, -length))

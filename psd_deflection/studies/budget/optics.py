@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from psd_deflection.errors import ConfigError
+from psd_deflection.base.errors import ConfigError
 
 STANDARD_PRESSURE = 101_325.0
 """Pa."""

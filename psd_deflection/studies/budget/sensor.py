@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from psd_deflection.budget.chain import Chain
-from psd_deflection.budget.optics import beam_diameter
-from psd_deflection.budget.term import ROOT_3, Kind, Situation, Term, adds_to
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.budget.chain import MeasuringChain
+from psd_deflection.studies.budget.optics import beam_diameter
+from psd_deflection.studies.budget.term import ROOT_3, Kind, Situation, Term, adds_to
 
 
 def spot_diameter(at: Situation) -> float:
@@ -42,7 +42,7 @@ LIGHT_PROFILE = Term(
 )
 
 
-def _clip(chain: Chain, values: FloatArray, at: Situation) -> Chain:
+def _clip(chain: MeasuringChain, values: FloatArray, at: Situation) -> MeasuringChain:
     return replace(chain, spot_diameter=values * spot_diameter(at))
 
 

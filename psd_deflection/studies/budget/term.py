@@ -23,12 +23,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from psd_deflection.budget.chain import Chain, measure
-from psd_deflection.budget.estimate import Estimator, estimator_of
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError
-from psd_deflection.mechanics import LinkStatics
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.link import LinkStatics
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.budget.chain import MeasuringChain, measure
+from psd_deflection.studies.budget.estimate import Estimator, estimator_of
 
 ROOT_3 = math.sqrt(3.0)
 """Half-width over deviation of a uniform distribution."""
@@ -53,7 +53,7 @@ class Situation:
     inputs: Mapping[str, float]
     pose: FloatArray
     method: str
-    chain: Chain
+    chain: MeasuringChain
     estimator: Estimator
 
     @classmethod
@@ -65,7 +65,7 @@ class Situation:
                 f'load = {load[0]:g} {load[1]:g} {load[2]:g}: the tip would move by more than the link is long '
                 'or turn by more than half a turn: take a smaller load'
             )
-        chain = Chain.of(rig)
+        chain = MeasuringChain.of(rig)
         estimator = estimator_of(rig, method)
         places, _ = measure(chain, pose)
         over = np.abs(places[0]) - chain.half_area
@@ -118,11 +118,11 @@ class Cause(abc.ABC):
         """Its effect to first and second order."""
 
     @abc.abstractmethod
-    def without(self, chain: Chain, at: Situation) -> Chain:
+    def without(self, chain: MeasuringChain, at: Situation) -> MeasuringChain:
         """``chain`` with its errors at 0 (a known effect absent)."""
 
     @abc.abstractmethod
-    def perturb(self, chain: Chain, at: Situation, count: int, random: np.random.Generator) -> Chain:
+    def perturb(self, chain: MeasuringChain, at: Situation, count: int, random: np.random.Generator) -> MeasuringChain:
         """``chain`` with ``count`` draws of its errors."""
 
     @abc.abstractmethod
@@ -144,7 +144,7 @@ class Term(Cause):
     formula: str
     inputs: tuple[str, ...]
     deviations: Callable[[Situation], FloatArray]
-    apply: Callable[[Chain, FloatArray, Situation], Chain]
+    apply: Callable[[MeasuringChain, FloatArray, Situation], MeasuringChain]
 
     def contribution(self, at: Situation) -> Contribution:
         """As declared."""
@@ -159,7 +159,7 @@ class Term(Cause):
         product = both - plus[first] - plus[second]
         return Contribution(square.sum(axis=0), linear.T @ linear + 2.0 * square.T @ square + product.T @ product)
 
-    def perturb(self, chain: Chain, at: Situation, count: int, random: np.random.Generator) -> Chain:
+    def perturb(self, chain: MeasuringChain, at: Situation, count: int, random: np.random.Generator) -> MeasuringChain:
         """As declared: normal values, or the known effect."""
         sizes = self.deviations(at)
         if self.kind is Kind.KNOWN:
@@ -170,12 +170,12 @@ class Term(Cause):
         """As declared: nothing."""
         return np.zeros((count, 3))
 
-    def without(self, chain: Chain, at: Situation) -> Chain:
+    def without(self, chain: MeasuringChain, at: Situation) -> MeasuringChain:
         """As declared."""
         return self.apply(chain, np.zeros((1, self.deviations(at).size)), at)
 
 
-def _respond(at: Situation, chain: Chain) -> FloatArray:
+def _respond(at: Situation, chain: MeasuringChain) -> FloatArray:
     """(n, 3): the estimator's first-order answer to a chain's readings, up to a constant."""
     readings, zeros = measure(chain, at.pose)
     by_readings, by_zeros = at.estimator.response(at.pose, at.chain.zeros)
@@ -183,10 +183,10 @@ def _respond(at: Situation, chain: Chain) -> FloatArray:
     return np.asarray(readings.reshape(count, -1) @ by_readings.T + zeros.reshape(count, -1) @ by_zeros.T)
 
 
-def adds_to(name: str) -> Callable[[Chain, FloatArray, Situation], Chain]:
+def adds_to(name: str) -> Callable[[MeasuringChain, FloatArray, Situation], MeasuringChain]:
     """An ``apply`` that adds the values to one field of the chain: one for each sensor, or for each axis too."""
 
-    def apply(chain: Chain, values: FloatArray, at: Situation) -> Chain:
+    def apply(chain: MeasuringChain, values: FloatArray, at: Situation) -> MeasuringChain:
         old: FloatArray = getattr(chain, name)
         changes: dict[str, Any] = {name: old + values.reshape(len(values), *(len(at.chain.centers), 2)[: old.ndim - 1])}
         return replace(chain, **changes)

@@ -3,5 +3,5 @@
 ``observation``: a recording as arrays, and the rows that are fitted. ``fit``: parameters with their covariance.
 ``calibrate``: which of them the recordings determine, held-out motion, the answer. ``check``: whether an old
 calibration still holds. ``dark``: what the PSDs read with the lasers off. ``result``, ``report``: calibration.json, the
-rig file, the page. This room reads no files.
+rig file, the page. ``from_recordings`` alone reads files.
 """

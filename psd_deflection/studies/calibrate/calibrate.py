@@ -14,13 +14,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.calibrating.dark import DarkLevel, check_effects
-from psd_deflection.calibrating.fit import (
+from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.model.misalignment.model import COUNT, INDEX, ZERO
+from psd_deflection.model.misalignment.rig import RigVector, vector_of_rig
+from psd_deflection.model.solvers.registry import psds_at_base
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.calibrate.dark import DarkLevel, check_effects
+from psd_deflection.studies.calibrate.fit import (
     CLAMP_AT,
     CLOCK,
     NAMES,
     SIZE,
-    Fit,
+    CalibrationFit,
     Kind,
     Mask,
     Prior,
@@ -34,10 +40,10 @@ from psd_deflection.calibrating.fit import (
     weight_matrices,
     with_one_zero,
 )
-from psd_deflection.calibrating.observation import (
+from psd_deflection.studies.calibrate.observation import (
     LEAST_HOLD,
+    CalibrationRun,
     Rows,
-    Run,
     joined,
     noise_of,
     rows_of,
@@ -45,12 +51,6 @@ from psd_deflection.calibrating.observation import (
     smoothed,
     usable_dots,
 )
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError, RecordingError
-from psd_deflection.misalignment.model import COUNT, INDEX, ZERO
-from psd_deflection.misalignment.rig import RigVector, vector_of_rig
-from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.solvers.registry import psds_at_base
 
 OPEN = 0.9
 """A standard deviation above this share of the tolerance: undetermined."""
@@ -99,9 +99,9 @@ class Calibration:
     kind: Kind
     vector: RigVector
     prior: Prior
-    fit: Fit
+    fit: CalibrationFit
     rows: Rows
-    runs: Sequence[Run]
+    runs: Sequence[CalibrationRun]
     noise: FloatArray
     gap: Gap
     undetermined: list[Direction]
@@ -128,7 +128,7 @@ class Calibration:
 
 
 def calibrate(
-    runs: Sequence[Run],
+    runs: Sequence[CalibrationRun],
     rig: Rig,
     *,
     alone: bool = False,
@@ -195,7 +195,7 @@ def calibrate(
     )
 
 
-def kind_of(runs: Sequence[Run], alone: bool) -> Kind:
+def kind_of(runs: Sequence[CalibrationRun], alone: bool) -> Kind:
     """What the recordings are fitted to. Raises RecordingError if some have nothing."""
     if alone:
         return 'self'
@@ -225,7 +225,7 @@ def before_of(vector: RigVector, prior: Prior) -> FloatArray:
     return out
 
 
-def roughly_late(runs: Sequence[Run], rig: Rig, noise: FloatArray) -> float:
+def roughly_late(runs: Sequence[CalibrationRun], rig: Rig, noise: FloatArray) -> float:
     """Seconds to add to the reference's times so that it fits the dots best, in steps; 0 if nothing moves."""
     costs = np.zeros(2 * round(CLOCK_RANGE / CLOCK_STEP) + 1)
     lates = (np.arange(len(costs)) - len(costs) // 2) * CLOCK_STEP
@@ -250,7 +250,9 @@ def roughly_late(runs: Sequence[Run], rig: Rig, noise: FloatArray) -> float:
     return float(lates[best]) if costs[best] < 0.9 * costs[middle] else 0.0
 
 
-def _believed(first: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask) -> tuple[Fit, Prior, list[str]]:
+def _believed(
+    first: CalibrationFit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask
+) -> tuple[CalibrationFit, Prior, list[str]]:
     """Widen what the rows contradict, the worst at a time."""
     widened: list[str] = []
     while len(widened) < 6:
@@ -269,7 +271,7 @@ def _believed(first: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: 
     return first, prior, widened
 
 
-def _determined(first: Fit, prior: Prior, free: Mask) -> Mask:
+def _determined(first: CalibrationFit, prior: Prior, free: Mask) -> Mask:
     """Which parameters are fitted; the others are held at the file's values, the least known first.
 
     One is held only if the rest then knows hardly less: of parameters that the rows tie together, such as a turn and a
@@ -297,7 +299,7 @@ def _pieces(rows: Rows) -> IntArray:
 
 
 def _misfit(
-    residual: FloatArray, whole: Fit, inverse: FloatArray, rows: Rows, kind: Kind
+    residual: FloatArray, whole: CalibrationFit, inverse: FloatArray, rows: Rows, kind: Kind
 ) -> tuple[FloatArray, FloatArray]:
     """Weighted and plain squares (n,) of ``residual`` (n, 4)."""
     weighted = np.einsum('ni,nij,nj->n', residual, inverse, residual) * whole.weights
@@ -307,7 +309,7 @@ def _misfit(
     return weighted, np.mean(residual**2, axis=1) * whole.weights
 
 
-def _held_out(whole: Fit, rows: Rows, prior: Prior, free: Mask) -> FloatArray:
+def _held_out(whole: CalibrationFit, rows: Rows, prior: Prior, free: Mask) -> FloatArray:
     """Residuals (n, 4) of each half of the rows by the parameters that the other half gives."""
     half = _pieces(rows)
     out = np.empty_like(whole.linear.residual)
@@ -317,7 +319,9 @@ def _held_out(whole: Fit, rows: Rows, prior: Prior, free: Mask) -> FloatArray:
     return out
 
 
-def _heldout(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, before: FloatArray) -> tuple[Gap, bool]:
+def _heldout(
+    whole: CalibrationFit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, before: FloatArray
+) -> tuple[Gap, bool]:
     """The gaps, and whether unseen motion is predicted worse than with the rig file."""
     inverse = weight_matrices(whole.linear, rows, whole.noise)
     old, old_plain = _misfit(linearised(rows, before, rig, kind).residual, whole, inverse, rows, kind)
@@ -331,7 +335,9 @@ def _heldout(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, before:
     return gap, bool(new.sum() > old.sum() or gap.heldout_after > WORSE * gap.heldout_before)
 
 
-def _without_refused_terms(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind: Kind) -> tuple[Fit, Prior, list[str]]:
+def _without_refused_terms(
+    whole: CalibrationFit, rows: Rows, rig: Rig, prior: Prior, kind: Kind
+) -> tuple[CalibrationFit, Prior, list[str]]:
     """Drop a non-linearity that unseen motion contradicts: the file's value stays, within what the rows leave open."""
     dropped: list[str] = []
     for name in ('psd_1.nonlinearity', 'psd_2.nonlinearity'):
@@ -358,7 +364,7 @@ def _without_refused_terms(whole: Fit, rows: Rows, rig: Rig, prior: Prior, kind:
     return whole, prior, dropped
 
 
-def _with_clamp(whole: Fit, rows: Rows, rig: Rig, prior: Prior) -> Fit:
+def _with_clamp(whole: CalibrationFit, rows: Rows, rig: Rig, prior: Prior) -> CalibrationFit:
     """The clamp's compliances from the reference's poses at rest under known loads, if there are any.
 
     The link's own stiffness is taken as the rig file has it: at one length a clamp that gives way is a softer link.
@@ -387,7 +393,7 @@ def _with_clamp(whole: Fit, rows: Rows, rig: Rig, prior: Prior) -> Fit:
             values[at], covariance[at, at], free[at] = prior.mean[at], before, False
         else:
             values[at], covariance[at, at], free[at] = after * (right + prior.mean[at] / before), after, True
-    return Fit(values, covariance, whole.information, whole.linear, whole.weights, whole.noise, free)
+    return CalibrationFit(values, covariance, whole.information, whole.linear, whole.weights, whole.noise, free)
 
 
 _NEEDS = {
@@ -417,7 +423,7 @@ def needs_of(names: Sequence[str]) -> str:
     return '; '.join(dict.fromkeys(_NEEDS[k] for k in short))
 
 
-def undetermined(whole: Fit, prior: Prior) -> list[Direction]:
+def undetermined(whole: CalibrationFit, prior: Prior) -> list[Direction]:
     """Directions whose spread stays above ``OPEN`` of the tolerances: single parameters, then combinations."""
     # The zero is measured at every start, and the clock is no parameter of the rig.
     reported = np.array([not ZERO <= i < COUNT and i != CLOCK for i in range(SIZE)])

@@ -19,10 +19,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from psd_deflection.calibrating.calibrate import fitted_parameters, kind_of, roughly_late
-from psd_deflection.calibrating.fit import (
+from psd_deflection.model.misalignment.model import COUNT, PARAMETERS, TOLERANCES, ZERO
+from psd_deflection.model.misalignment.rig import vector_of_rig
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.calibrate.calibrate import fitted_parameters, kind_of, roughly_late
+from psd_deflection.studies.calibrate.fit import (
     NAMES,
-    Fit,
+    CalibrationFit,
     Kind,
     Mask,
     Prior,
@@ -31,11 +35,7 @@ from psd_deflection.calibrating.fit import (
     score_at,
     with_one_zero,
 )
-from psd_deflection.calibrating.observation import Rows, Run, joined, noise_of, rows_of, settled
-from psd_deflection.config import Rig
-from psd_deflection.misalignment.model import COUNT, PARAMETERS, TOLERANCES, ZERO
-from psd_deflection.misalignment.rig import vector_of_rig
-from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.studies.calibrate.observation import CalibrationRun, Rows, joined, noise_of, rows_of, settled
 
 LEVEL = 0.05
 """Share of rigs that did not move and are said to have moved."""
@@ -51,7 +51,7 @@ _SEEN = 1e-4
 """A direction that the rows show by less than this share of a tolerance's inverse variance counts as unseen."""
 
 
-class Moved(NamedTuple):
+class MovedGroup(NamedTuple):
     """One group: ``p`` that it did not move, ``evidence`` (natural logarithm of the Bayes factor) that it did.
 
     ``shifts``: by parameter, the value that it moved by if it alone did, and its standard deviation.
@@ -64,22 +64,26 @@ class Moved(NamedTuple):
     shifts: dict[str, tuple[float, float]]
 
 
-class Checked(NamedTuple):
+class CalibrationCheck(NamedTuple):
     """``holds``: nothing moved. ``p``: over all groups. ``groups``: the likeliest first. ``like``: groups that the
     first cannot be told from. ``zero``: the unloaded readings less the file's, (4,) m, and their deviations.
     """
 
     holds: bool
     p: float
-    groups: list[Moved]
+    groups: list[MovedGroup]
     like: list[str]
     zero: FloatArray
     zero_sd: FloatArray
 
 
 def check(
-    runs: Sequence[Run], rig: Rig, *, alone: bool = False, progress: Callable[[str], None] = lambda words: None
-) -> Checked:
+    runs: Sequence[CalibrationRun],
+    rig: Rig,
+    *,
+    alone: bool = False,
+    progress: Callable[[str], None] = lambda words: None,
+) -> CalibrationCheck:
     """Hold the rig file against recordings made since. Raises RecordingError as a calibration does."""
     kind = kind_of(runs, alone)
     progress('rows')
@@ -120,7 +124,7 @@ def check(
         seen = [*sorted(fitted, key=lambda g: -g.evidence), *seen[FITTED:]]
     like = [g.group for g in seen[1:] if seen[0].evidence - g.evidence < LIKE] if overall < LEVEL else []
     zeros = slice(ZERO, COUNT)
-    return Checked(
+    return CalibrationCheck(
         overall >= LEVEL,
         overall,
         seen,
@@ -130,7 +134,7 @@ def check(
     )
 
 
-def _moved(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale: FloatArray) -> Moved:
+def _moved(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale: FloatArray) -> MovedGroup:
     own = [i for i, index in enumerate(at) if index < ZERO and PARAMETERS[int(index)].group == name]
     block, score = m[np.ix_(own, own)], left[own]
     size, vectors = np.linalg.eigh(0.5 * (block + block.T))
@@ -146,10 +150,12 @@ def _moved(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale: Floa
         NAMES[int(at[i])]: (float(scale[i] * shift[j]), float(scale[i] * covariance[j, j] ** 0.5))
         for j, i in enumerate(own)
     }
-    return Moved(name, float(chi2.sf(statistic, freedom)) if freedom else 1.0, evidence, freedom, named)
+    return MovedGroup(name, float(chi2.sf(statistic, freedom)) if freedom else 1.0, evidence, freedom, named)
 
 
-def _fitted(group: Moved, rows: Rows, rig: Rig, told: Prior, kind: Kind, free: Mask, best: Fit, null: float) -> Moved:
+def _fitted(
+    group: MovedGroup, rows: Rows, rig: Rig, told: Prior, kind: Kind, free: Mask, best: CalibrationFit, null: float
+) -> MovedGroup:
     """The group with the evidence and the shifts of a full fit; ``null``: what :func:`explained` says if none moved."""
     covariance = told.covariance.copy()
     for name in group.shifts:
@@ -160,7 +166,7 @@ def _fitted(group: Moved, rows: Rows, rig: Rig, told: Prior, kind: Kind, free: M
     return group._replace(evidence=evidence - null, shifts=moved)
 
 
-def result(found: Checked) -> dict[str, Any]:
+def result(found: CalibrationCheck) -> dict[str, Any]:
     """As JSON."""
     return {
         'verdict': 'holds' if found.holds else 'moved',
@@ -184,7 +190,7 @@ def result(found: Checked) -> dict[str, Any]:
     }
 
 
-def sentence(found: Checked) -> str:
+def sentence(found: CalibrationCheck) -> str:
     """The answer in one sentence."""
     if found.holds:
         return f'The calibration holds: nothing moved (p {found.p:.2g}; false alarms at most {LEVEL:.0%}).'

@@ -4,7 +4,7 @@ Photocurrents add, and an amplifier that divides shows quotients. With laser lig
 
     sum W = S + b,    v = (S v_laser + b v_dark)/W,    with the laser off:  W = b,  v = v_dark.
 
-So x, y and sum of a recording with the laser off are all that :class:`psd_deflection.calibration.Calibration` needs
+So x, y and sum of a recording with the laser off are all that :class:`psd_deflection.model.detector.VoltsToDots` needs
 to take the other light off, and x and y alone must not be subtracted. A constant offset o of the x output is in both
 readings, v + o and v_dark + o, and stays: v_laser + o. It is taken off with the zero. An offset of the sum's own
 output is taken for light: a share o/S of the gains, which a reference finds as such.
@@ -20,14 +20,14 @@ import numpy as np
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from psd_deflection.calibrating.fit import Mask, fewer
-from psd_deflection.calibrating.observation import Run
-from psd_deflection.calibration import Calibration
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError, RecordingError
-from psd_deflection.misalignment.rig import is_calibrated, vector_of_rig
+from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.measure.uncertainty.noise import undithered
+from psd_deflection.model.detector import VoltsToDots
+from psd_deflection.model.misalignment.rig import is_calibrated, vector_of_rig
 from psd_deflection.records import FloatArray
-from psd_deflection.uncertainty.noise import undithered
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.calibrate.fit import Mask, fewer
+from psd_deflection.studies.calibrate.observation import CalibrationRun
 
 PIECES = 20
 """Means that the standard error comes from."""
@@ -77,7 +77,7 @@ class DarkLevel(NamedTuple):
         return self.share_sd * self.half
 
 
-def dark_levels(runs: Sequence[Run], rig: Rig, lit: Sequence[Run] = ()) -> list[DarkLevel]:
+def dark_levels(runs: Sequence[CalibrationRun], rig: Rig, lit: Sequence[CalibrationRun] = ()) -> list[DarkLevel]:
     """The dark level of each PSD, from the longest time in ``runs`` in which its laser is off.
 
     ``lit``: recordings with the lasers on, for the share; without them it is that of amplifier.sum_nominal. Raises
@@ -156,7 +156,7 @@ def _limit(rig: Rig) -> float:
     return rig.estimator.sum_min * (0.5 if rig.estimator.splitter else 1.0)
 
 
-def _lit(lit: Sequence[Run], rig: Rig, psd: int) -> float | None:
+def _lit(lit: Sequence[CalibrationRun], rig: Rig, psd: int) -> float | None:
     """The sum with the laser on, V; None if nothing tells."""
     sums = np.concatenate([np.empty(0), *(run.volts[:, 3 * psd + 2] for run in lit)])
     on = sums[sums >= _limit(rig)]
@@ -173,7 +173,7 @@ def longest(off: Mask) -> slice:
     return slice(int(starts[best]), int(ends[best]))
 
 
-def _dark_part(run: Run, rig: Rig, psd: int) -> slice:
+def _dark_part(run: CalibrationRun, rig: Rig, psd: int) -> slice:
     """The longest time without this laser; a lost sample does not end it."""
     with np.errstate(invalid='ignore'):
         lit = run.volts[:, 3 * psd + 2] >= _limit(rig)
@@ -184,7 +184,7 @@ def _dark_part(run: Run, rig: Rig, psd: int) -> slice:
     return slice(first, max(first, last))
 
 
-def _level(runs: Sequence[Run], rig: Rig, psd: int, lit: float | None) -> DarkLevel:
+def _level(runs: Sequence[CalibrationRun], rig: Rig, psd: int, lit: float | None) -> DarkLevel:
     rate = rig.converter.sample_rate_hz
     columns = slice(3 * psd, 3 * psd + 3)
     parts = [run.volts[_dark_part(run, rig, psd), columns] for run in runs]
@@ -222,7 +222,7 @@ def _level(runs: Sequence[Run], rig: Rig, psd: int, lit: float | None) -> DarkLe
             )
     zero = np.zeros((1, 3 * len(rig.psds)), dtype=np.float32)
     zero[0, columns] = mean
-    place = replace(Calibration.from_rig(rig), dark=()).dots(zero)[0, 2 * psd : 2 * psd + 2]
+    place = replace(VoltsToDots.from_rig(rig), dark=()).dots(zero)[0, 2 * psd : 2 * psd + 2]
     return DarkLevel(psd + 1, mean, sd, rig.psds[psd].dark, whole, place, half, seconds, run.name, run.digest)
 
 
@@ -230,8 +230,8 @@ def _mean_and_drift(part: FloatArray, step: float) -> tuple[FloatArray, FloatArr
     """Mean (3,) of ``part`` (n, 3), its standard error, the drift over all of it, and that of noise alone.
 
     From means of ``PIECES`` pieces, which colour shorter than they are does not correlate, and fewer of them if they
-    are correlated all the same (:func:`psd_deflection.calibrating.fit.fewer`). They are few: the standard error is as
-    much larger as makes 1.96 of it Student's interval of 95 %. ``step``: of the converter, V.
+    are correlated all the same (:func:`psd_deflection.studies.calibrate.fit.fewer`). They are few: the standard error
+    is as much larger as makes 1.96 of it Student's interval of 95 %. ``step``: of the converter, V.
     """
     pieces = [piece[np.isfinite(piece).all(axis=1)] for piece in np.array_split(part, PIECES)]
     means = np.array([piece.mean(axis=0) for piece in pieces if len(piece)])

@@ -23,11 +23,11 @@ from typing import Literal
 
 import numpy as np
 
-from psd_deflection.calibrating.observation import Rows
-from psd_deflection.config import Rig
-from psd_deflection.misalignment.model import ALL, COUNT, TOLERANCES, ZERO, by_parameters, by_pose, readings
-from psd_deflection.misalignment.rig import CLAMP, RigVector, known_of_rig, stated_sd, vector_of_rig
+from psd_deflection.model.misalignment.model import ALL, COUNT, TOLERANCES, ZERO, by_parameters, by_pose, readings
+from psd_deflection.model.misalignment.rig import CLAMP, RigVector, known_of_rig, stated_sd, vector_of_rig
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.calibrate.observation import Rows
 
 Mask = np.ndarray[tuple[int], np.dtype[np.bool_]]
 Kind = Literal['reference', 'loads', 'self']
@@ -103,7 +103,7 @@ class Linear:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class CalibrationFit:
     """``values`` (SIZE,), ``covariance`` (SIZE, SIZE), ``information`` (SIZE, SIZE) of the rows alone.
 
     ``linear``: the rows about ``values``; ``weights`` (n,): 0 of an outlier. ``noise``: the variance components.
@@ -174,8 +174,8 @@ def fit(
     kind: Kind = 'reference',
     *,
     free: Mask,
-    start: Fit | None = None,
-) -> Fit:
+    start: CalibrationFit | None = None,
+) -> CalibrationFit:
     """Fit ``rows``. ``start``: an earlier fit of the same rows, to begin from.
 
     ``free``: parameters that are not fitted keep the prior's value; their spread enters the covariance of the rest.
@@ -199,7 +199,7 @@ def fit(
     inverse = weight_matrices(linear, rows, noise)
     robust = _robust(linear, inverse, noise, kind, PASSES)
     _, information = _step(linear, inverse, robust, z, prior, free, rows)
-    return Fit(z, posterior(information, prior, free), information, linear, robust, noise, free)
+    return CalibrationFit(z, posterior(information, prior, free), information, linear, robust, noise, free)
 
 
 def _robust(linear: Linear, inverse: FloatArray, noise: Noise, kind: Kind, number: int) -> FloatArray:
@@ -211,14 +211,16 @@ def _robust(linear: Linear, inverse: FloatArray, noise: Noise, kind: Kind, numbe
     return np.asarray(distance < FAR, dtype=np.float64)
 
 
-def score_at(rows: Rows, z: FloatArray, rig: Rig, kind: Kind, best: Fit) -> tuple[FloatArray, FloatArray]:
+def score_at(rows: Rows, z: FloatArray, rig: Rig, kind: Kind, best: CalibrationFit) -> tuple[FloatArray, FloatArray]:
     """J^T C^-1 r (SIZE,) and J^T C^-1 J (SIZE, SIZE) at ``z``, with the noise and the outliers of the fit ``best``."""
     linear = linearised(rows, z, rig, kind)
     inverse = weight_matrices(linear, rows, best.noise) * best.weights[:, None, None]
     return _normal(linear, inverse, rows)
 
 
-def explained(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask, best: Fit) -> tuple[float, FloatArray]:
+def explained(
+    rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask, best: CalibrationFit
+) -> tuple[float, FloatArray]:
     """How well rows and ``prior`` go together, and the parameters (SIZE,) that fit both.
 
     The natural logarithm of the rows' probability, but for a constant, with the noise and the outliers of ``best``.
@@ -241,7 +243,7 @@ def explained(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask, best: 
     return -0.5 * (misfit + float(away @ np.linalg.solve(p, away)) + spread), z
 
 
-def refitted(whole: Fit, rows: Rows, prior: Prior, kept: FloatArray, free: Mask) -> FloatArray:
+def refitted(whole: CalibrationFit, rows: Rows, prior: Prior, kept: FloatArray, free: Mask) -> FloatArray:
     """Parameters (SIZE,) from some of the rows, ``kept`` (n,) 1 or 0, by one step from the fit of all of them."""
     inverse = weight_matrices(whole.linear, rows, whole.noise)
     z = whole.values.copy()
@@ -250,7 +252,7 @@ def refitted(whole: Fit, rows: Rows, prior: Prior, kept: FloatArray, free: Mask)
     return z + _step(shifted, inverse, whole.weights * kept, z, prior, free, rows)[0]
 
 
-def residual_at(whole: Fit, z: FloatArray) -> FloatArray:
+def residual_at(whole: CalibrationFit, z: FloatArray) -> FloatArray:
     """Residuals (n, 4), m, for parameters near those of the fit, to first order."""
     return whole.linear.residual - whole.linear.slopes @ (z - whole.values)
 
@@ -302,7 +304,7 @@ def _of_zero(linear: Linear, weighted: FloatArray, own: Mask) -> tuple[FloatArra
     return shared[:, zero] + np.diag(TOLERANCES[zero] ** -2), shared, pull
 
 
-def with_one_zero(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask) -> tuple[Rows, Fit]:
+def with_one_zero(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask) -> tuple[Rows, CalibrationFit]:
     """The rows as if all recordings had the zero of the first one, and their fit.
 
     The beams may have been aimed anew between two recordings, and a camera takes its rest anew. The offset is a

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from psd_deflection.calibrating.observation import Run
-from psd_deflection.calibration import Wiring
-from psd_deflection.config import Rig, check_two_psds
-from psd_deflection.errors import RecordingError
-from psd_deflection.recordings.grid import MAX_SAMPLES, digest_of, held_at
-from psd_deflection.recordings.readers import open_recording
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.recordings.read.grid import MAX_SAMPLES, digest_of, held_at
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.read.references import References, read_references, references_in
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.references import References, read_references, references_in
-from psd_deflection.recordings.replay_engine import check_psds
+from psd_deflection.recordings.replay.engine import check_psds
 from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.rig.config import Rig, check_two_psds
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.calibrate.observation import CalibrationRun
 
 
 def read_run(
@@ -26,7 +26,7 @@ def read_run(
     reference: str | Path | None = None,
     exposure: float = 0.0,
     namespace: str | None = None,
-) -> Run:
+) -> CalibrationRun:
     """One recording: the recording or its path. Raises RecordingError if it cannot be read.
 
     ``reference``: a table of it, or another recording; None: in the recording. ``exposure``: time over which each
@@ -57,7 +57,7 @@ def read_run(
         times = np.array([a.t_ns - start for a in applied], dtype=np.int64)
         grace = 0.25e9 / rig.converter.sample_rate_hz
         loads = held_at(times, np.array([a[1:] for a in applied]), t * 1e9, grace, np.zeros(3))
-    return Run(
+    return CalibrationRun(
         path.name,
         t,
         Wiring.from_rig(rig).to_psds(volts),
@@ -77,7 +77,7 @@ def read_runs(
     references: Sequence[str | Path] = (),
     exposure: float = 0.0,
     namespace: str | None = None,
-) -> list[Run]:
+) -> list[CalibrationRun]:
     """All of ``sources``; ``references``: none, or the reference of each."""
     tables: Sequence[str | Path | None] = references or [None] * len(sources)
     return [

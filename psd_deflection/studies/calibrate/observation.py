@@ -13,12 +13,12 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from psd_deflection.calibration import Calibration
-from psd_deflection.config import Rig
-from psd_deflection.errors import RecordingError
-from psd_deflection.misalignment.model import readings
-from psd_deflection.misalignment.rig import vector_of_rig
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.model.detector import VoltsToDots
+from psd_deflection.model.misalignment.model import readings
+from psd_deflection.model.misalignment.rig import vector_of_rig
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray, IntArray
+from psd_deflection.rig.config import Rig
 
 HALF, DEGREE = 10, 6
 """Samples to either side of a time, and degree of the polynomial through them."""
@@ -36,7 +36,7 @@ _BASIS = np.vander(_OFFSETS, DEGREE + 1, increasing=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class CalibrationRun:
     """One recording. ``t`` (n,) s of the whole grid; ``volts`` (n, 6) V of the PSDs, NaN if a sample is lost.
 
     ``reference_t`` (m,) s, ``reference`` (m, 3) m, m, rad; ``loads`` (n, 3) N, N, N m, held, or None. ``digest``: of
@@ -93,7 +93,7 @@ class Smoothed:
     squares: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
 
 
-def usable_dots(run: Run, rig: Rig) -> FloatArray:
+def usable_dots(run: CalibrationRun, rig: Rig) -> FloatArray:
     """Dots (n, 4), m, as the detectors give them; NaN where a sample is lost, dark, saturated or has other light."""
     volts = run.volts.copy()
     full = 0.99 * rig.converter.full_scale
@@ -103,7 +103,7 @@ def usable_dots(run: Run, rig: Rig) -> FloatArray:
             bad = (np.abs(v[:, :2]) >= full).any(axis=1)
             bad |= (v[:, 2] < rig.estimator.sum_min) | (v[:, 2] > rig.estimator.sum_max)
         volts[bad] = np.nan
-    return Calibration.from_rig(rig).dots(volts.astype(np.float32))
+    return VoltsToDots.from_rig(rig).dots(volts.astype(np.float32))
 
 
 def smoothed(dots: FloatArray, period: float, places: FloatArray, exposure: float = 0.0) -> Smoothed:
@@ -144,7 +144,7 @@ def smoothed(dots: FloatArray, period: float, places: FloatArray, exposure: floa
     )
 
 
-def noise_of(run: Run, rig: Rig) -> FloatArray:
+def noise_of(run: CalibrationRun, rig: Rig) -> FloatArray:
     """Noise (4,) of a sample of x1, y1, x2, y2, V rms, from what is left of the polynomials."""
     dots = usable_dots(run, rig)
     places = np.arange(HALF, len(dots) - HALF, 2 * HALF + 1, dtype=np.float64)
@@ -170,7 +170,7 @@ def at_rest(loads: FloatArray | None, t: FloatArray) -> np.ndarray[tuple[int], n
     return out
 
 
-def rows_of(run: Run, rig: Rig, noise: FloatArray, *, late: float = 0.0, blocks: bool = False) -> Rows:
+def rows_of(run: CalibrationRun, rig: Rig, noise: FloatArray, *, late: float = 0.0, blocks: bool = False) -> Rows:
     """The rows of one recording: one for each reference, or one a block if the reference is as fast as that.
 
     ``noise`` (4,) V. ``late``: seconds to add to the reference's times. ``blocks``: one a block, without reference.

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from psd_deflection.calibrating.calibrate import Calibration, before_of
-from psd_deflection.calibrating.fit import CLOCK, NAMES, linearised
-from psd_deflection.calibrating.observation import CHANNEL_NAMES
-from psd_deflection.calibrating.result import REPORTED, UNITS, result, sentence
-from psd_deflection.misalignment.model import ALL, COUNT, ZERO
-from psd_deflection.pages import page, picture, table
+from psd_deflection.base.pages import page, picture, table
+from psd_deflection.model.misalignment.model import ALL, COUNT, ZERO
+from psd_deflection.studies.calibrate.calibrate import Calibration, before_of
+from psd_deflection.studies.calibrate.fit import CLOCK, NAMES, linearised
+from psd_deflection.studies.calibrate.observation import CHANNEL_NAMES
+from psd_deflection.studies.calibrate.result import REPORTED, UNITS, result, sentence
 
 BEFORE, AFTER = '#c44e52', '#4c72b0'
 _READ = {'rad': (1e3, 'mrad'), 'm': (1e3, 'mm'), 's': (1e3, 'ms'), '': (1.0, '')}

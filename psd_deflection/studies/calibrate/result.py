@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from psd_deflection import __version__
-from psd_deflection.calibrating.calibrate import Calibration
-from psd_deflection.calibrating.dark import result_of_levels, source_of_levels, values_of_levels
-from psd_deflection.calibrating.fit import CLAMP_AT, CLOCK, NAMES
-from psd_deflection.calibrating.observation import CHANNEL_NAMES
-from psd_deflection.misalignment.model import ALL, COUNT, ZERO
-from psd_deflection.misalignment.rig import CLAMP, rig_values
-from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.model.misalignment.model import ALL, COUNT, ZERO
+from psd_deflection.model.misalignment.rig import CLAMP, rig_values
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.studies.calibrate.calibrate import Calibration
+from psd_deflection.studies.calibrate.dark import result_of_levels, source_of_levels, values_of_levels
+from psd_deflection.studies.calibrate.fit import CLAMP_AT, CLOCK, NAMES
+from psd_deflection.studies.calibrate.observation import CHANNEL_NAMES
 
 REPORTED = (*range(ZERO), CLAMP_AT, CLAMP_AT + 1)
 """Parameters of calibration.json, by their index: the zero has a place of its own."""

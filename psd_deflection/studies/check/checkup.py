@@ -8,13 +8,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from psd_deflection.calibration import Wiring
-from psd_deflection.commissioning.levels import NOISE_FACTOR, SUM_FACTOR, Levels
-from psd_deflection.commissioning.wirings import (
+from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.check.levels import NOISE_FACTOR, SUM_FACTOR, Levels
+from psd_deflection.studies.check.wirings import (
     DOTS,
     LIMIT,
     MARGIN,
-    Response,
+    PushResponse,
     WiringFit,
     differences,
     fitting_wirings,
@@ -23,8 +25,6 @@ from psd_deflection.commissioning.wirings import (
     misfit,
     parameters,
 )
-from psd_deflection.config import Rig
-from psd_deflection.records import CHANNELS, FloatArray
 
 RIGHT, WRONG, CANNOT_TELL = 'right', 'wrong', 'cannot_tell'
 
@@ -66,7 +66,7 @@ class Checkup:
     verdict: str
     findings: tuple[Finding, ...]
     lines: Mapping[str, object]
-    pushes: tuple[Response, ...]
+    pushes: tuple[PushResponse, ...]
     sizes: tuple[float, ...]
     found: tuple[WiringFit, ...]
     levels: Levels
@@ -75,7 +75,9 @@ class Checkup:
     notes: tuple[str, ...] = field(default=())
 
 
-def check(rig: Rig, pushes: Sequence[Response], measured: Levels, drift: FloatArray, drift_sd: FloatArray) -> Checkup:
+def check(
+    rig: Rig, pushes: Sequence[PushResponse], measured: Levels, drift: FloatArray, drift_sd: FloatArray
+) -> Checkup:
     """Hold the pushes, the noise and the light against the rig file."""
     file = Wiring.from_rig(rig)
     seen = tuple(p for p in pushes if p.seen)
@@ -109,7 +111,7 @@ def check(rig: Rig, pushes: Sequence[Response], measured: Levels, drift: FloatAr
     )
 
 
-def _dead(seen: Sequence[Response]) -> list[str]:
+def _dead(seen: Sequence[PushResponse]) -> list[str]:
     """Channels that answer to no push although pushes along X and along Y moved others."""
     if not {('fx',), ('fy',)} <= {p.loads for p in seen}:
         return []
@@ -118,7 +120,7 @@ def _dead(seen: Sequence[Response]) -> list[str]:
 
 
 def _wiring_findings(
-    file: Wiring, seen: Sequence[Response], found: Sequence[WiringFit], best: WiringFit, lines: dict[str, object]
+    file: Wiring, seen: Sequence[PushResponse], found: Sequence[WiringFit], best: WiringFit, lines: dict[str, object]
 ) -> list[Finding]:
     """How ``best`` differs from the rig file's wiring; nothing if that explains the pushes too."""
     if any(c.wiring == file for c in found):
@@ -143,7 +145,7 @@ def _wiring_findings(
     ]
 
 
-def _same_to_first_order(file: Wiring, seen: Sequence[Response], best: WiringFit) -> tuple[str, ...]:
+def _same_to_first_order(file: Wiring, seen: Sequence[PushResponse], best: WiringFit) -> tuple[str, ...]:
     """Whether the rig file's wiring explains the pushes as well if some went the other way than was said."""
     turned = tuple(load for p in seen if p.misfit(file)[1] < 0.0 for load in p.loads)
     total, worst = misfit(file, seen, turned)
@@ -151,7 +153,7 @@ def _same_to_first_order(file: Wiring, seen: Sequence[Response], best: WiringFit
     return (f'load_sign of {" ".join(turned)}',) if same else ()
 
 
-def _load_findings(seen: Sequence[Response], found: WiringFit) -> list[Finding]:
+def _load_findings(seen: Sequence[PushResponse], found: WiringFit) -> list[Finding]:
     out = [Finding('load_sign', load, -1.0, f'the sign of load_{load} is turned') for load in found.reversed_loads]
     sizes = [p.misfit(found.wiring)[1] for p in seen if p.sized]
     for factor, words in UNITS.items():
@@ -188,7 +190,9 @@ def _channel_findings(rig: Rig, measured: Levels, wiring: Wiring, psd: int, line
     return [Finding('noise_level', f'{"xy"[worst]}{psd}', round(float(factors[worst]), 3), line(name, level))]
 
 
-def _coverage(pushes: Sequence[Response], seen: Sequence[Response], found: Sequence[WiringFit]) -> list[Finding]:
+def _coverage(
+    pushes: Sequence[PushResponse], seen: Sequence[PushResponse], found: Sequence[WiringFit]
+) -> list[Finding]:
     missing = [load for load in ('fx', 'fy', 'tz') if (load,) not in {p.loads for p in seen}]
     weak = [p.name for p in pushes if not p.seen]
     if seen and not found:
@@ -204,7 +208,7 @@ def _notes(
     rig: Rig,
     measured: Levels,
     wiring: Wiring,
-    pushes: Sequence[Response],
+    pushes: Sequence[PushResponse],
     sizes: Sequence[float],
     drift: FloatArray,
     drift_sd: FloatArray,

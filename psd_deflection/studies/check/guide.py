@@ -1,7 +1,7 @@
 """Leads a person through three pushes, and takes each when it is held: nobody needs a free hand for a key.
 
 Fed with the device's volts chunk by chunk, it says what to do next and sees for itself when the link rests, is pushed
-and is let go. It ends with the pushes as :class:`~psd_deflection.commissioning.wirings.Response`.
+and is let go. It ends with the pushes as :class:`~psd_deflection.studies.check.wirings.PushResponse`.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from enum import Enum
 
 import numpy as np
 
-from psd_deflection.commissioning.wirings import DOTS, Response, pattern, scales_of
-from psd_deflection.config import Rig, check_two_psds
 from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.rig.config import Rig, check_two_psds
+from psd_deflection.studies.check.wirings import DOTS, PushResponse, pattern, scales_of
 
 REST_S = 2.0
 HOLD_S = 0.6
@@ -83,7 +83,7 @@ class Guide:
         self.number = 0
         self.moved = np.zeros(4)
         self.progress = 0.0
-        self.pushes: list[Response] = []
+        self.pushes: list[PushResponse] = []
         self._rest_volts: list[FloatArray] = []
         self._rests: list[tuple[float, FloatArray]] = []
         self._means: deque[tuple[FloatArray, int]] = deque()
@@ -187,7 +187,9 @@ class Guide:
         load = ('fx', 'fy', 'tz')[self.number]
         expected = self._expected[:, self.number]
         self.pushes.append(
-            Response((load,), moved, sd, expected, sized=False, only_twist=load == 'tz', scales=scales_of(self._rig))
+            PushResponse(
+                (load,), moved, sd, expected, sized=False, only_twist=load == 'tz', scales=scales_of(self._rig)
+            )
         )
         self._rests.append((self._t, after))
         self.number += 1

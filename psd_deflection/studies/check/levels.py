@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.config import Rig
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
+from psd_deflection.rig.config import Rig
 
 MAINS = (50.0, 60.0)
 """Hz."""

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.commissioning.wirings import Response, pattern, scales_of
-from psd_deflection.config import Rig
-from psd_deflection.errors import RecordingError
-from psd_deflection.mechanics import LinkStatics
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.records import DOT_CHANNELS, FloatArray
-from psd_deflection.simulation.modes import Filter, mode_coefficients
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.check.wirings import PushResponse, pattern, scales_of
 
 LOADS = ('fx', 'fy', 'tz')
 TOGETHER = 0.95
@@ -29,7 +29,7 @@ FEWEST_BLOCKS = 8
 class Responses:
     """``pushes``: one for each load that was applied. ``drift``, ``drift_sd`` (4,): m/s, of the device's channels."""
 
-    pushes: tuple[Response, ...]
+    pushes: tuple[PushResponse, ...]
     drift: FloatArray
     drift_sd: FloatArray
 
@@ -60,7 +60,7 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
         first = held[present][:, group[0]]
         largest = [peak * _slope(first, held[present][:, k]) if k in group else 0.0 for k in range(3)]
         names = tuple(LOADS[k] for k in group)
-        pushes.append(Response(names, slopes[i], sd[i], pattern(rig) @ np.array(largest), scales=scales_of(rig)))
+        pushes.append(PushResponse(names, slopes[i], sd[i], pattern(rig) @ np.array(largest), scales=scales_of(rig)))
     return Responses(tuple(pushes), slopes[-1], sd[-1])
 
 

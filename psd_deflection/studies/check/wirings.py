@@ -1,7 +1,7 @@
 """Which of all wirings of a two-PSD rig explain how the dots answered to pushes.
 
 A push along +X moves both dots along -x, one along +Y both along -y, and a turn about +Z moves dot i by θ times
-(l_iy, -l_ix): the columns of :func:`psd_deflection.geometry.linear.design_matrix`. The size is left open, because
+(l_iy, -l_ix): the columns of :func:`psd_deflection.model.plate.linear.design_matrix`. The size is left open, because
 nobody knows the stiffness of a new rig: only direction and proportion count. Four signs, two orders of the axes of each
 PSD and the exchange of the PSDs are 128 wirings. Each is held against each push.
 
@@ -17,11 +17,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.calibration import Wiring
-from psd_deflection.config import Rig
-from psd_deflection.errors import ConfigError
-from psd_deflection.geometry.linear import design_matrix
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.plate.linear import design_matrix
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.wiring import Wiring
 
 _PAIRS = tuple(itertools.product(('x', '-x'), ('y', '-y')))
 _AXES = (*_PAIRS, *((y, x) for x, y in _PAIRS))
@@ -56,7 +56,7 @@ def scales_of(rig: Rig) -> tuple[float, ...]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Response:
+class PushResponse:
     """How the dots answered to one push.
 
     ``loads``: which of fx, fy, tz it was; several if they always came together. ``channels`` (4,): movement on the
@@ -129,7 +129,9 @@ class WiringFit:
     reversed_loads: tuple[str, ...] = ()
 
 
-def misfit(wiring: Wiring, responses: Sequence[Response], reversed_loads: Sequence[str] = ()) -> tuple[float, float]:
+def misfit(
+    wiring: Wiring, responses: Sequence[PushResponse], reversed_loads: Sequence[str] = ()
+) -> tuple[float, float]:
     """(sum over the pushes, worst push) of the misfit, with the sign of some loads turned."""
     shares = []
     for response in responses:
@@ -140,7 +142,7 @@ def misfit(wiring: Wiring, responses: Sequence[Response], reversed_loads: Sequen
     return sum(shares), max(shares, default=0.0)
 
 
-def fitting_wirings(responses: Sequence[Response]) -> list[WiringFit]:
+def fitting_wirings(responses: Sequence[PushResponse]) -> list[WiringFit]:
     """The wirings that explain the pushes about as well as the best one does, best first; [] if none does.
 
     First with the loads as they are said to be. Only if no wiring explains these, with the sign of loads turned.

@@ -12,25 +12,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.calibration import dot_noise_variances
-from psd_deflection.commissioning.checkup import Finding
-from psd_deflection.config import Rig, replace_values
-from psd_deflection.discovery import proposals as propose
-from psd_deflection.discovery.cleaning import clean
-from psd_deflection.discovery.coincidence import coincidences
-from psd_deflection.discovery.comparison import Comparison
-from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.hidden import FIRST, SETUP, beginning, mistakes
-from psd_deflection.discovery.laws import FoundLaw, find_law
-from psd_deflection.discovery.localise import Localisation, localise
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.planning import suggest
-from psd_deflection.discovery.screen import Screen
-from psd_deflection.discovery.search import BIC_ACCEPT, Search, SearchResult, far
-from psd_deflection.discovery.setup import likely_delays, likely_jumps, noise_finding, said, wire
-from psd_deflection.discovery.signatures import SignatureBank, candidates, signatures_beside
-from psd_deflection.discovery.validate import HeldOut, heldout_tables
-from psd_deflection.discovery.weighing import (
+from psd_deflection.model.detector import dot_noise_variances
+from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.solvers import solver_from_rig
+from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.studies.check.checkup import Finding
+from psd_deflection.studies.discover.laws.laws import FoundLaw, find_law
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.planning import suggest
+from psd_deflection.studies.discover.search import proposals as propose
+from psd_deflection.studies.discover.search.coincidence import coincidences
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.hold_out import HeldOut, heldout_tables
+from psd_deflection.studies.discover.search.localise import Localisation, localise
+from psd_deflection.studies.discover.search.screen import Screen
+from psd_deflection.studies.discover.search.search import BIC_ACCEPT, Search, SearchResult, far
+from psd_deflection.studies.discover.search.signatures import SignatureBank, candidates, signatures_beside
+from psd_deflection.studies.discover.search.weighing import (
     UNSAID,
     Conclusion,
     NamedEffect,
@@ -45,11 +46,10 @@ from psd_deflection.discovery.weighing import (
     waterfall_of,
     without_one,
 )
-from psd_deflection.discovery.workspace import Workspace
-from psd_deflection.simulation.catalogue import catalogue, effects_of_rig
-from psd_deflection.simulation.declaration import ActiveEffect, Effect
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.solvers import solver_from_rig
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.cleaning import clean
+from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, beginning, mistakes
+from psd_deflection.studies.discover.setup.setup import likely_delays, likely_jumps, noise_finding, said, wire
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

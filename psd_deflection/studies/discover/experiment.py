@@ -15,17 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.config import Rig, replace_values
-from psd_deflection.discovery.fit import STEP, Fit
-from psd_deflection.discovery.hidden import only_in
-from psd_deflection.discovery.workspace import FINE_SECONDS, Workspace, fine_means
+from psd_deflection.model.simulation.catalogue import sort_effects
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.load_words import load_history, temperature_table
+from psd_deflection.model.simulation.loads import SIDEBAR_ARM
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import sort_effects
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.load_words import load_history, temperature_table
-from psd_deflection.simulation.loads import SIDEBAR_ARM
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.studies.discover.search.fit import STEP, Fit
+from psd_deflection.studies.discover.search.workspace import FINE_SECONDS, Workspace, fine_means
+from psd_deflection.studies.discover.setup.hidden import only_in
 
 ROOM = 0.8
 """Share of the way from an unloaded dot to the edge of its sensor, or of the converter's range, that a load may use."""
@@ -196,7 +196,7 @@ def proposals(rig: Rig, limits: Limits) -> list[Proposal]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shown:
+class ModelSums:
     """What a recording shows of some models, all sums over its readings, in units of the noise.
 
     ``apart`` (m, m): squared distance of the predictions of two models. ``pull`` [a][b] (p_b,): the distance from b to
@@ -208,16 +208,16 @@ class Shown:
     fisher: list[FloatArray]
     seconds: float
 
-    def __add__(self, other: Shown) -> Shown:
-        return Shown(
+    def __add__(self, other: ModelSums) -> ModelSums:
+        return ModelSums(
             self.apart + other.apart,
             [[x + y for x, y in zip(a, b, strict=True)] for a, b in zip(self.pull, other.pull, strict=True)],
             [x + y for x, y in zip(self.fisher, other.fisher, strict=True)],
             self.seconds + other.seconds,
         )
 
-    def __mul__(self, times: float) -> Shown:
-        return Shown(
+    def __mul__(self, times: float) -> ModelSums:
+        return ModelSums(
             times * self.apart,
             [[times * x for x in a] for a in self.pull],
             [times * x for x in self.fisher],
@@ -238,10 +238,10 @@ class Shown:
         return max(float(self.apart[true, other] - g @ step), 0.0)
 
 
-def nothing_of(models: Sequence[Fit]) -> Shown:
+def nothing_of(models: Sequence[Fit]) -> ModelSums:
     """What a recording of no samples shows."""
     sizes = [len(m.free) for m in models]
-    return Shown(
+    return ModelSums(
         np.zeros((len(models), len(models))),
         [[np.zeros(k) for k in sizes] for _ in models],
         [np.zeros((k, k)) for k in sizes],
@@ -251,7 +251,7 @@ def nothing_of(models: Sequence[Fit]) -> Shown:
 
 def shown(
     workspace: Workspace, models: Sequence[Fit], setting: Setting, loads: FloatArray, rig: Rig | None = None
-) -> Shown:
+) -> ModelSums:
     """What a recording with ``loads`` (n, 3) in ``setting`` would show of ``models``.
 
     Noise is that of the first recording so far. ``rig``: that of the recording, if it is at hand.
@@ -290,7 +290,7 @@ def shown(
         slopes.append(columns)
     apart = np.array([[float(np.sum((a - b) ** 2)) for b in rows] for a in rows])
     pull = [[c.T @ (a - b) for b, c in zip(rows, slopes, strict=True)] for a in rows]
-    return Shown(apart, pull, [c.T @ c for c in slopes], len(loads) / rate)
+    return ModelSums(apart, pull, [c.T @ c for c in slopes], len(loads) / rate)
 
 
 def limits_to_tree(limits: Limits) -> dict[str, Any]:

@@ -9,20 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
-from psd_deflection.calibration import Wiring
-from psd_deflection.config import Rig, check_two_psds, load_rig, replace_values
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.readings import Readings
-from psd_deflection.errors import ConfigError, RecordingError
-from psd_deflection.foreign_yaml import tree_of_file
-from psd_deflection.recordings.csv_reader import CsvRecording
-from psd_deflection.recordings.grid import MAX_SAMPLES, digest_of, held_at
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.readings_table import KINDS, KNOWN, MILLIMETRES, ReadingsTable, is_table
+from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.base.foreign_yaml import tree_of_file
+from psd_deflection.recordings.read.csv_reader import CsvRecording
+from psd_deflection.recordings.read.grid import MAX_SAMPLES, digest_of, held_at
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.read.readings_table import KINDS, KNOWN, MILLIMETRES, ReadingsTable, is_table
 from psd_deflection.recordings.recording import TEMPERATURE_COLUMN, Recording
-from psd_deflection.recordings.replay_engine import check_psds, nominal_rig, rig_at_end
-from psd_deflection.recordings.simulated_recording import SimulatedRecording
+from psd_deflection.recordings.replay.engine import check_psds, nominal_rig, rig_at_end
+from psd_deflection.recordings.replay.simulated_recording import SimulatedRecording
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
+from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_values
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.readings import Readings
 
 
 def read_observation(

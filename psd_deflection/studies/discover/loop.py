@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from psd_deflection.config import Rig
-from psd_deflection.discovery.discover import Discovery, discover
-from psd_deflection.discovery.experiment import Limits
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.planning import Plan, plan_next
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.discover.discover import Discovery, discover
+from psd_deflection.studies.discover.experiment import Limits
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.planning import Plan, plan_next
 
 Outcome = Literal['unique', 'limits', 'recordings']
 

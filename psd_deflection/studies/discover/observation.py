@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.config import Rig
-from psd_deflection.errors import RecordingError
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.rig.config import Rig
 
 QUIET = 0.25
 """A load that has not changed for this long, s, ends a load case at its next change."""

@@ -15,20 +15,20 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.config import Rig, replace_values
-from psd_deflection.discovery.experiment import (
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.studies.discover.experiment import (
     Limits,
+    ModelSums,
     Piece,
     Setting,
-    Shown,
     limits_to_tree,
     nothing_of,
     proposals,
     shown,
 )
-from psd_deflection.discovery.fit import Fit
-from psd_deflection.discovery.workspace import Workspace
-from psd_deflection.records import FloatArray
+from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.search.workspace import Workspace
 
 TELLS_APART = 21.6
 """lambda sin^2(theta) from which two effects are told apart: lambda sin^2(theta/2) >= 5.4, small angles."""
@@ -168,7 +168,7 @@ def plan_next(workspace: Workspace, named: Fit, rivals: Sequence[Fit], limits: L
     pairs = list(itertools.permutations(range(len(models)), 2))
     rig = workspace.observations[0].rig
 
-    def separations(s: Shown) -> FloatArray:
+    def separations(s: ModelSums) -> FloatArray:
         return np.array([s.separation(a, b, known[b]) for a, b in pairs])
 
     possible = np.zeros(len(pairs))
@@ -210,16 +210,16 @@ def rate_of(rig: Rig, setting: Setting) -> float:
 
 
 def _together(
-    seen: Sequence[tuple[Piece, Shown]],
-    total: Shown,
-    separations: Callable[[Shown], FloatArray],
+    seen: Sequence[tuple[Piece, ModelSums]],
+    total: ModelSums,
+    separations: Callable[[ModelSums], FloatArray],
     seconds: float,
 ) -> tuple[float, list[Piece]]:
     """Pieces for one recording, the most valuable first, and the value of all."""
     chosen: list[Piece] = []
     value = 0.0
     while True:
-        trials: list[tuple[float, int, Piece, Shown]] = []
+        trials: list[tuple[float, int, Piece, ModelSums]] = []
         for piece, s in seen:
             more = total + s
             if more.seconds <= seconds + 1e-6:

@@ -15,15 +15,19 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 from scipy.stats import chi2 as chi2_law
 
-from psd_deflection.discovery.coincidence import coincidences
-from psd_deflection.discovery.comparison import Comparison
-from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.localise import Cell, Localisation, dependences
-from psd_deflection.discovery.screen import Screen
-from psd_deflection.discovery.search import Search, SearchResult
-from psd_deflection.discovery.signatures import candidates, signatures_beside
-from psd_deflection.discovery.validate import heldout_tables
-from psd_deflection.discovery.weighing import (
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter, Values
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.studies.discover.search.coincidence import coincidences
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.hold_out import heldout_tables
+from psd_deflection.studies.discover.search.localise import Cell, Localisation, dependences
+from psd_deflection.studies.discover.search.screen import Screen
+from psd_deflection.studies.discover.search.search import Search, SearchResult
+from psd_deflection.studies.discover.search.signatures import candidates, signatures_beside
+from psd_deflection.studies.discover.search.weighing import (
     Conclusion,
     accept,
     credible,
@@ -36,10 +40,6 @@ from psd_deflection.discovery.weighing import (
     unsaid,
     waterfall_of,
 )
-from psd_deflection.errors import ConfigError
-from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter, Values
-from psd_deflection.simulation.physics import Physics
 
 BUDGET = 4000
 FOLDS = 4

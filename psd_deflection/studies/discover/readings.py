@@ -1,6 +1,6 @@
 """A table of readings: one row for each load that was hung on the link and left until it was at rest.
 
-It is a plant for :func:`~psd_deflection.discovery.plants.discover_in`. Nobody knows how long each reading was
+It is a plant for :func:`~psd_deflection.studies.discover.plants.discover_in`. Nobody knows how long each reading was
 averaged, so the level of what remains is fitted. An effect takes part if what it does to a row depends on that row
 alone: what depends on time or on the row before (drift, creep, friction, mains) cannot be told from a table.
 """
@@ -13,16 +13,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.calibration import dot_noise_variances
-from psd_deflection.config import Rig
-from psd_deflection.discovery.plants import Model, Plant
-from psd_deflection.errors import RecordingError
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.model.detector import dot_noise_variances
+from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig, sort_effects
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
-from psd_deflection.simulation.catalogue import catalogue, effects_of_rig, sort_effects
-from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.simulator import ForwardModel
-from psd_deflection.solvers import solver_from_rig
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.discover.plants import Model, Plant
 
 CHANNELS: Mapping[str, tuple[str, ...]] = {
     'dots': ('x1', 'y1', 'x2', 'y2'),

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from psd_deflection.discovery.discover import Discovery
-from psd_deflection.discovery.law_features import known_values
-from psd_deflection.discovery.laws import FoundLaw
-from psd_deflection.discovery.result import parameters_of, provenance, sentence, size_of
-from psd_deflection.discovery.screen import Score
-from psd_deflection.discovery.trust import BANDS
-from psd_deflection.discovery.weighing import Conclusion, NamedEffect
-from psd_deflection.pages import page, picture, table
+from psd_deflection.base.pages import page, picture, table
+from psd_deflection.model.simulation.laws import VARIABLES
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
-from psd_deflection.simulation.laws import VARIABLES
+from psd_deflection.studies.discover.discover import Discovery
+from psd_deflection.studies.discover.laws.law_features import known_values
+from psd_deflection.studies.discover.laws.laws import FoundLaw
+from psd_deflection.studies.discover.result import parameters_of, provenance, sentence, size_of
+from psd_deflection.studies.discover.search.screen import Score
+from psd_deflection.studies.discover.search.trust import BANDS
+from psd_deflection.studies.discover.search.weighing import Conclusion, NamedEffect
 
 BEFORE, AFTER, HELD, FLOOR = '#c44e52', '#4c72b0', '#55a868', '#8c8c8c'
 DOTS = ('x1', 'y1', 'x2', 'y2')

@@ -9,14 +9,14 @@ from typing import Any
 import yaml
 
 from psd_deflection import __version__
-from psd_deflection.config import Rig
-from psd_deflection.declarations import DESCRIPTION
-from psd_deflection.discovery.discover import Discovery
-from psd_deflection.discovery.laws import FoundLaw
-from psd_deflection.discovery.ties import ties
-from psd_deflection.discovery.weighing import Conclusion, NamedEffect, Rival
-from psd_deflection.simulation.catalogue import effects_to_values
-from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.catalogue import effects_to_values
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.declarations import DESCRIPTION
+from psd_deflection.studies.discover.discover import Discovery
+from psd_deflection.studies.discover.laws.laws import FoundLaw
+from psd_deflection.studies.discover.search.ties import ties
+from psd_deflection.studies.discover.search.weighing import Conclusion, NamedEffect, Rival
 
 
 def _number(value: float) -> float:
@@ -187,7 +187,7 @@ def _nested(flat: Mapping[str, object]) -> dict[str, Any]:
 def model_yaml(rig: Rig, effects: Sequence[ActiveEffect]) -> str:
     """What describes the rig, as a ROS 2 parameter file with ``effects`` instead of its own.
 
-    For a rig without a file of its own; :func:`psd_deflection.parameter_files.with_effects_section` adds them to a
+    For a rig without a file of its own; :func:`psd_deflection.rig.parameter_files.with_effects_section` adds them to a
     file. Port, folders and page are left out: they belong to a machine.
     """
     tree = _nested({name: rig.values[name] for name in DESCRIPTION})

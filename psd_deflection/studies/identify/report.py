@@ -12,10 +12,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.signal import welch
 
-from psd_deflection.identification.modes import AxisModes
-from psd_deflection.identification.shapers import KINDS, Shaper, recommended, shaper
-from psd_deflection.pages import page, picture, table
+from psd_deflection.arms.shapers import KINDS, Shaper, recommended, shaper
+from psd_deflection.base.pages import page, picture, table
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.identify.modes import AxisModes
 
 AXES = ('dx', 'dy', 'theta')
 SYMBOLS = ('ΔX', 'ΔY', 'θ')

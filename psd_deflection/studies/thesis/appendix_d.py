@@ -19,11 +19,11 @@ from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from psd_deflection.errors import SolverError
-from psd_deflection.geometry.layout import Geometry, check_twist
-from psd_deflection.geometry.plate import flat_points
-from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
-from psd_deflection.thesis.iterative_printed import NO_COVARIANCE
+from psd_deflection.base.errors import SolverError
+from psd_deflection.model.plate.layout import Geometry, check_twist
+from psd_deflection.model.plate.plate import flat_points
+from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.studies.thesis.iterative_printed import NO_COVARIANCE
 
 Branch = Literal['A', 'B', 'none']
 

@@ -13,11 +13,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from psd_deflection.errors import SolverError
-from psd_deflection.geometry.layout import Geometry, check_twist
+from psd_deflection.base.errors import SolverError
+from psd_deflection.model.plate.layout import Geometry, check_twist
+from psd_deflection.model.solvers.fixed_gain import FixedGain
+from psd_deflection.model.solvers.wls import THESIS_ROW_SCALING
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers.fixed_gain import FixedGain
-from psd_deflection.solvers.wls import THESIS_ROW_SCALING
 
 
 def printed_design_matrix(geometry: Geometry) -> FloatArray:

@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from psd_deflection.errors import SolverError
-from psd_deflection.geometry import Geometry
-from psd_deflection.geometry.plate import plate_points, tied_pose
-from psd_deflection.geometry.rays import hit, lifted, rotation
+from psd_deflection.base.errors import SolverError
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.plate.plate import plate_points, tied_pose
+from psd_deflection.model.plate.rays import hit, lifted, rotation
+from psd_deflection.model.solvers import registry
+from psd_deflection.model.solvers.interface import Solutions, SolverStatus
+from psd_deflection.model.solvers.registry import make_solver
 from psd_deflection.records import FloatArray
-from psd_deflection.solvers import registry
-from psd_deflection.solvers.interface import Solutions, SolverStatus
-from psd_deflection.solvers.registry import make_solver
 
 SIDEBAR = (0.03, 0.5, 10.0, 0.1)
 """Po of the thesis for the load on the sidebar."""
@@ -153,7 +153,7 @@ def _cell(label: str, condition: str) -> Errors:
 
 
 def printed_bound(design: FloatArray, pose: FloatArray, design_error: FloatArray, reading_error: FloatArray) -> float:
-    """4.33 as printed, with A in mm and mm added to rad; arguments as of ``geometry.linear.error_bound``."""
+    """4.33 as printed, with A in mm and mm added to rad; arguments as of ``model.plate.linear.error_bound``."""
     units = np.array([1e3, 1e3, 1.0])
     inverse = np.linalg.norm(np.linalg.pinv(1e3 * design / units))
     change = np.linalg.norm(1e3 * design_error / units)

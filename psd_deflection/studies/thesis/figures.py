@@ -14,14 +14,14 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from psd_deflection.calibration.sensors import Duolateral, Quadrant
-from psd_deflection.geometry import Geometry
-from psd_deflection.geometry.landing import landing
-from psd_deflection.geometry.linear import design_matrix, gain_matrix
-from psd_deflection.geometry.placement import pose_spread
-from psd_deflection.geometry.plate import tied_pose
-from psd_deflection.solvers.registry import make_solver
-from psd_deflection.thesis.comparison import (
+from psd_deflection.model.detector.sensors import Duolateral, Quadrant
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.plate.landing import landing
+from psd_deflection.model.plate.linear import design_matrix, gain_matrix
+from psd_deflection.model.plate.placement import pose_spread
+from psd_deflection.model.plate.plate import tied_pose
+from psd_deflection.model.solvers.registry import make_solver
+from psd_deflection.studies.thesis.comparison import (
     CONDITIONS,
     DIRECT,
     SIDEBAR,

@@ -21,9 +21,9 @@ from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
-from psd_deflection.errors import ConfigError, SolverError
-from psd_deflection.geometry.layout import Geometry, check_twist
-from psd_deflection.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.base.errors import ConfigError, SolverError
+from psd_deflection.model.plate.layout import Geometry, check_twist
+from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus
 
 Criterion = Literal['printed', 'absolute', 'argmin']
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from decimal import Decimal
 from typing import NamedTuple
 
-from psd_deflection.mechanics.section import TubeSection
-from psd_deflection.mechanics.statics import LinkStatics
+from psd_deflection.model.link.section import TubeSection
+from psd_deflection.model.link.statics import LinkStatics
 
 FORCE = 60.0
 """N, at D, all cases of Table B1."""

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.errors import RecordingError
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.records import FloatArray
-from psd_deflection.validation.clock import FEWEST, Offset, clock_offset, variance_of_sum
-from psd_deflection.validation.motion import Motion, Solve
+from psd_deflection.studies.validate.clock import FEWEST, Offset, clock_offset, variance_of_sum
+from psd_deflection.studies.validate.motion import Motion, Solve
 
 AXES = ('dx', 'dy', 'theta')
 UNITS = ('m', 'm', 'rad')

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import minimum_filter1d
 
-from psd_deflection.errors import RecordingError
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.records import FloatArray
-from psd_deflection.validation.motion import Motion
+from psd_deflection.studies.validate.motion import Motion
 
 FEWEST = 20
 """References, at least."""

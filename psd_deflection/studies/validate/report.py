@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from psd_deflection.pages import page, picture, table
-from psd_deflection.validation.agreement import AXES, UNITS, Agreement, Validated
+from psd_deflection.base.pages import page, picture, table
+from psd_deflection.studies.validate.agreement import AXES, UNITS, Agreement, Validated
 
 SYMBOLS = ('ΔX', 'ΔY', 'θ')
 SHOWN = (1e6, 1e6, math.degrees(1e3))

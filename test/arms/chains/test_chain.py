@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.chains.chain import Chain, ChainLink, EndEffector, TipDeflection
-from psd_deflection.chains.transform import IDENTITY, Transform, of_position_and_angles, shift
-from psd_deflection.errors import ConfigError
-from psd_deflection.mechanics.statics import LinkStatics
+from psd_deflection.arms.chains.chain import Chain, ChainLink, EndEffector, TipDeflection
+from psd_deflection.arms.chains.transform import IDENTITY, Transform, of_position_and_angles, shift
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.link.statics import LinkStatics
 from psd_deflection.records import FloatArray
-from psd_deflection.thesis.scaling import FORCE, TwinLink, table_b1_cases
+from psd_deflection.studies.thesis.scaling import FORCE, TwinLink, table_b1_cases
 
 CERTAIN = np.zeros((3, 3))
 RIGID = 1e7

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psd_deflection.chains.chain_file import read_chain
-from psd_deflection.errors import ConfigError
+from psd_deflection.arms.chains.chain_file import read_chain
+from psd_deflection.base.errors import ConfigError
 
-EXAMPLE = Path(__file__).parents[2] / 'config' / 'two_links.yaml'
+EXAMPLE = Path(__file__).parents[3] / 'config' / 'two_links.yaml'
 
 
 def test_the_example() -> None:

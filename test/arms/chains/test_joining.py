@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.chains.joining import PATIENCE, Joined, Joiner
+from psd_deflection.arms.chains.joining import PATIENCE, Joined, Joiner
 from psd_deflection.records import DeflectionEstimate
 
 BLOCK_NS = 20_000_000

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psd_deflection.chains.chain_file import read_chain
-from psd_deflection.compensation.arm import read_arm
-from psd_deflection.errors import ConfigError
+from psd_deflection.arms.chains.chain_file import read_chain
+from psd_deflection.arms.compensation.arm import read_arm
+from psd_deflection.base.errors import ConfigError
 
-URDF = Path(__file__).parents[2] / 'config' / 'two_links.urdf'
-EXAMPLE = Path(__file__).parents[2] / 'config' / 'two_links.yaml'
+URDF = Path(__file__).parents[3] / 'config' / 'two_links.urdf'
+EXAMPLE = Path(__file__).parents[3] / 'config' / 'two_links.yaml'
 
 WRIST = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/><link name="d"/>
 <joint name="slide" type="prismatic"><parent link="a"/><child link="b"/><origin xyz="1 2 3" rpy="0.1 -0.4 0.9"/>

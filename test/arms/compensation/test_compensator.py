@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from bench.simulated_arm import SimulatedArm
-from psd_deflection.chains.chain_file import read_chain
-from psd_deflection.chains.transform import IDENTITY, Transform, shift
-from psd_deflection.compensation.arm import Arm, read_arm
-from psd_deflection.compensation.compensator import Command, Compensator, CompensatorSettings, Observed, State
-from psd_deflection.errors import ConfigError
+from psd_deflection.arms.chains.chain_file import read_chain
+from psd_deflection.arms.chains.transform import IDENTITY, Transform, shift
+from psd_deflection.arms.compensation.arm import Arm, read_arm
+from psd_deflection.arms.compensation.compensator import Command, Compensator, CompensatorSettings, Observed, State
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
 
 HERE = Path(__file__).parent
-EXAMPLE = HERE.parents[1] / 'config' / 'two_links.yaml'
+EXAMPLE = HERE.parents[2] / 'config' / 'two_links.yaml'
 PERIOD = 0.02
 ELBOW = np.array([1.2, 0.6])
 PAYLOAD = np.array([0.0, 0.0, -40.0])

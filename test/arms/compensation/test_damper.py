@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from bench.damped_link import SETTINGS, swing
-from psd_deflection.compensation.compensator import State
-from psd_deflection.compensation.damper import Damper, DamperSettings
-from psd_deflection.errors import ConfigError
+from psd_deflection.arms.compensation.compensator import State
+from psd_deflection.arms.compensation.damper import Damper, DamperSettings
+from psd_deflection.base.errors import ConfigError
 
 W = 2.0 * math.pi * 14.0
 PERIOD = 0.02

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
 from bench import damping
-from psd_deflection.compensation.arm import JointLimits, read_limits
-from psd_deflection.compensation.trajectory import Trajectory, TrajectoryShaper, checked
-from psd_deflection.errors import ConfigError
-from psd_deflection.identification.shapers import KINDS, Shaper, in_series, shaper
+from psd_deflection.arms.compensation.arm import JointLimits, read_limits
+from psd_deflection.arms.compensation.trajectory import Trajectory, TrajectoryShaper, checked
+from psd_deflection.arms.shapers import KINDS, Shaper, in_series, shaper
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
 
 S = 1_000_000_000
@@ -146,7 +146,7 @@ def test_a_jump_under_way_is_refused_and_nothing_changes() -> None:
 
 
 def test_limits_of_the_arm_are_those_of_its_file() -> None:
-    limits = read_limits(Path(__file__).parents[2] / 'config' / 'two_links.urdf')
+    limits = read_limits(Path(__file__).parents[3] / 'config' / 'two_links.urdf')
     assert limits == {'shoulder': JointLimits(-2.0, 2.0, 1.0), 'elbow': JointLimits(-math.inf, math.inf, math.inf)}
     by = TrajectoryShaper(ZV, limits)
     with pytest.raises(ConfigError, match=r'shoulder goes to 2.4, must be at most 2 rad or m'):

@@ -10,7 +10,7 @@ from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.protocol.frames import (
+from psd_deflection.devices.protocol.frames import (
     MAX_ENCODED,
     BadFrame,
     BadReason,

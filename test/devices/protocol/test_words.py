@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.errors import printable
-from psd_deflection.protocol.frames import BadFrame, FrameDecoder, HelloFrame, encode
-from psd_deflection.protocol.text_lines import Description, parse, positive
-from psd_deflection.protocol.words import MAX_TEXT, device_words, finite
+from psd_deflection.base.errors import printable
+from psd_deflection.devices.protocol.frames import BadFrame, FrameDecoder, HelloFrame, encode
+from psd_deflection.devices.protocol.text_lines import Description, parse, positive
+from psd_deflection.devices.protocol.words import MAX_TEXT, device_words, finite
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(st.characters()),

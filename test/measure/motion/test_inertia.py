@@ -15,18 +15,18 @@ from scipy.integrate import solve_ivp
 
 from blind import motion
 from msg_adapters import ACCELERATION, to_messages
-from psd_deflection.config import rig_from_values
-from psd_deflection.filtering import inertia
-from psd_deflection.filtering.inertia import HOLD_NS, Inertia
-from psd_deflection.filtering.modal import Oscillator
-from psd_deflection.filtering.motion import INERTIA
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.motion import inertia
+from psd_deflection.measure.motion.inertia import HOLD_NS, Inertia
+from psd_deflection.measure.motion.modal import Oscillator
+from psd_deflection.measure.motion.motion import INERTIA
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.bag_writer import BagWriter
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.replay_engine import replayed
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.replay.engine import replayed
+from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import BaseAcceleration, FloatArray, RawChunk, Record, TipMotion
-from psd_deflection.runner.diagnostics import HealthReporter
+from psd_deflection.rig.config import rig_from_values
+from psd_deflection.run.diagnostics import HealthReporter
 
 MODES = (Oscillator(14.0, 0.02), Oscillator(14.0, 0.02), Oscillator(21.0, 0.02))
 L = 0.585

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from psd_deflection.filtering.modal import BlockTables, Oscillator
+from psd_deflection.measure.motion.modal import BlockTables, Oscillator
 from psd_deflection.records import FloatArray
 
 MODE = Oscillator(14.0, 0.02)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from blind import motion
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli.main import main
-from psd_deflection.config import load_rig
-from psd_deflection.errors import ConfigError
-from psd_deflection.filtering.motion import STATE
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.motion.motion import STATE
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import KNOWN_LOAD, AppliedLoad, FloatArray, ParameterChange, RawChunk, TipMotion
+from psd_deflection.rig.config import load_rig
 
 RIG = motion.rig_of()
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from psd_deflection.filtering.modal import Oscillator
-from psd_deflection.filtering.unseen import LARGER, LATELY, UnseenLoads
+from psd_deflection.measure.motion.modal import Oscillator
+from psd_deflection.measure.motion.unseen import LARGER, LATELY, UnseenLoads
 
 MODES = (Oscillator(14.0, 0.02), Oscillator(21.0, 0.05))
 SECONDS = 0.02

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from psd_deflection.measure.uncertainty.combinations import combinations_of
 from psd_deflection.records import FloatArray
-from psd_deflection.uncertainty.combinations import combinations_of
 
 CENTERS = np.array([[0.1, 0.0], [-0.05, 0.087], [-0.04, -0.087], [0.02, 0.03]])
 ZEROS = np.array([[1e-3, 2e-3], [0.0, 1e-3], [-1e-3, 0.0], [2e-3, -1e-3]])

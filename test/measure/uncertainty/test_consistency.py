@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.config import rig_from_values
+from psd_deflection.measure.uncertainty.consistency import Consistency, Suspect, widened
+from psd_deflection.measure.uncertainty.stamped import StampedDots
 from psd_deflection.records import FloatArray
-from psd_deflection.uncertainty.consistency import Consistency, Suspect, widened
-from psd_deflection.uncertainty.stamped import StampedDots
+from psd_deflection.rig.config import rig_from_values
 
 CENTERS = np.array([[0.0, 0.070], [-0.100, 0.0]])
 COVARIANCE = np.diag([4e-12, 1e-12, 9e-12, 2e-12]) + 0.5e-12

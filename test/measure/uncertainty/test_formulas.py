@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from psd_deflection.measure.uncertainty import noise
+from psd_deflection.measure.uncertainty.block_fit import BlockFit, basis
+from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.uncertainty import noise
-from psd_deflection.uncertainty.block_fit import BlockFit, basis
-from psd_deflection.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise
 
 PLACES = np.array([[0.0, 0.070], [-0.100, 0.0]])
 SIZE = 20

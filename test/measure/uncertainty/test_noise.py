@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from psd_deflection.measure.uncertainty.block_fit import BlockFit
+from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise
 from psd_deflection.records import FloatArray
-from psd_deflection.uncertainty.block_fit import BlockFit
-from psd_deflection.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise
 
 PLACES = np.array([[0.0, 0.070], [-0.100, 0.0]])
 SIGMA = 1e-6

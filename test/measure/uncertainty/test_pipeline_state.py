@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from blind import generator
-from psd_deflection.config import Rig, load_rig, rig_as_recorded
-from psd_deflection.pipeline import FROZEN, HELD, TIP_LOADS, ZERO_VARIANCES, Pipeline
+from psd_deflection.measure.pipeline import FROZEN, HELD, TIP_LOADS, ZERO_VARIANCES, Pipeline
+from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import (
     ENVIRONMENT,
     KNOWN_LOAD,
@@ -19,7 +19,7 @@ from psd_deflection.records import (
     SpotMeans,
     TipLoad,
 )
-from psd_deflection.simulation.simulator import RigSimulator
+from psd_deflection.rig.config import Rig, load_rig, rig_as_recorded
 
 
 def volts(seconds: int, seed: int, dead: int | None = None) -> generator.Array:
@@ -205,7 +205,7 @@ def test_a_dead_reading_is_widened_named_and_refused_if_asked() -> None:
 
 
 def test_every_solver_has_the_gain_that_its_answers_show() -> None:
-    from psd_deflection.solvers import solver_from_rig
+    from psd_deflection.model.solvers import solver_from_rig
 
     rig = load_rig()
     dots, variances = (1.1e-3, -2.2e-3, 1e-5, -2.3e-3), (5e-14, 6e-14, 7e-14, 8e-14)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from psd_deflection.measure.uncertainty.consistency import ConsistencyCheck
+from psd_deflection.measure.uncertainty.redundancy import CONTRADICTS, DOUBTFUL, HOLD, Redundancy, survival
 from psd_deflection.records import FloatArray
-from psd_deflection.uncertainty.consistency import Checked
-from psd_deflection.uncertainty.redundancy import CONTRADICTS, DOUBTFUL, HOLD, Redundancy, survival
 
 RNG = np.random.default_rng(7)
 PSDS, UNKNOWNS = 4, 3
@@ -42,7 +42,9 @@ def with_error(psd: int, error: tuple[float, float], chi_square: float | None = 
     return SLOPES @ [1e-5, -2e-5, 3e-5] + wrong
 
 
-def check(of: Redundancy, readings: FloatArray, blamed: Collection[int] | None = None, times: float = 1.0) -> Checked:
+def check(
+    of: Redundancy, readings: FloatArray, blamed: Collection[int] | None = None, times: float = 1.0
+) -> ConsistencyCheck:
     """``blamed``: PSDs without which the others agree; None: none may be left out."""
     without = None if blamed is None else lambda psd: psd in blamed
     return of.check(tuple(readings.tolist()), SLOPES, COVARIANCE, times, without)

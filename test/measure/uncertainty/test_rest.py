@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from psd_deflection.config import load_rig
-from psd_deflection.uncertainty.rest import why_moving
-from psd_deflection.uncertainty.stamped import StampedDots
+from psd_deflection.measure.uncertainty.rest import why_moving
+from psd_deflection.measure.uncertainty.stamped import StampedDots
+from psd_deflection.rig.config import load_rig
 
 
 def moves(um: list[float], noise_um: float = 0.01) -> str:

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.geometry.plate import Tilts, flat_points, plate_points
-from psd_deflection.uncertainty.consistency import Checked
-from psd_deflection.uncertainty.stamped import PlateModel, StampedDots
+from psd_deflection.measure.uncertainty.consistency import ConsistencyCheck
+from psd_deflection.measure.uncertainty.stamped import PlateModel, StampedDots
+from psd_deflection.model.plate.plate import Tilts, flat_points, plate_points
+from psd_deflection.rig.config import Rig, load_rig
 
 THIRD: dict[str, Any] = {
     'psd_1.zero': [1e-3, -2e-3],
@@ -26,8 +26,8 @@ def rig_of(psds: int = 2, named: Mapping[str, object] | None = None, **more: obj
     return load_rig(overrides={**(THIRD if psds == 3 else {}), **(named or {}), **more})
 
 
-def checked(contradict: bool) -> Checked:
-    return Checked(1.0, contradict, (1e-6,) * 4, (0.0,) * 4)
+def checked(contradict: bool) -> ConsistencyCheck:
+    return ConsistencyCheck(1.0, contradict, (1e-6,) * 4, (0.0,) * 4)
 
 
 def unknowns_of(tilts: Tilts) -> int:
@@ -133,7 +133,7 @@ def test_while_noise_is_unknown_readings_may_contradict_each_other_more(
     wrong[0] = 1e-6
     rest = tuple((stamped._rig.zeros.ravel()).tolist())
 
-    def said(size: float) -> Checked:
+    def said(size: float) -> ConsistencyCheck:
         dots = tuple((np.array(rest) + size * wrong).tolist())
         left = tuple((size * wrong).tolist())
         return stamped.check(dots, left, spread, (0.0,) * 5)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.calibration.health import OpticsHealth, Verdict
-from psd_deflection.config import load_rig
+from psd_deflection.measure.health import OpticsHealth, Verdict
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, SampleBlock
+from psd_deflection.rig.config import load_rig
 
 STEP = 10.0 / 32768
 GOOD = (0.5, -0.5, 5.0, 0.25, -0.25, 5.0)

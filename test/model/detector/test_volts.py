@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from psd_deflection.calibration import (
-    Calibration,
+from psd_deflection.model.detector import (
     Quadrant,
+    VoltsToDots,
     counts_to_volts,
     dot_noise_variances,
     make_sensor,
 )
-from psd_deflection.config import replace_values, rig_from_values
-from psd_deflection.declarations import SENSOR_TYPES, PsdConfig
 from psd_deflection.records import CHANNELS
+from psd_deflection.rig.config import replace_values, rig_from_values
+from psd_deflection.rig.declarations import SENSOR_TYPES, PsdConfig
 
 
 def psd(kind: str, spot_radius: float = 0.5e-3) -> PsdConfig:
@@ -38,7 +38,7 @@ def test_counts_become_volts_rounded_once() -> None:
 
 
 def test_ten_volts_are_five_millimetres_and_channels_stay_in_order() -> None:
-    dots = Calibration.from_rig(rig_from_values({})).dots(volts(10.0, -10.0, 5.0, 2.0, -4.0, 5.0))
+    dots = VoltsToDots.from_rig(rig_from_values({})).dots(volts(10.0, -10.0, 5.0, 2.0, -4.0, 5.0))
     assert dots.dtype == np.float64
     np.testing.assert_allclose(dots, [[5e-3, -5e-3, 1e-3, -2e-3]], rtol=1e-15)
     assert [CHANNELS[i] for i in (0, 1, 3, 4)] == ['x1', 'y1', 'x2', 'y2']
@@ -58,7 +58,7 @@ def test_each_channel_has_its_own_noise_and_sensitivity_and_zero_means_the_ampli
     step = 20.0 / 65536.0
     expected = [s**2 * (n**2 + step**2 / 12.0) for s, n in ((5e-4, 1e-3), (5e-4, 2e-3), (5e-4, 4e-3), (1e-3, 3e-3))]
     np.testing.assert_allclose(dot_noise_variances(rig), expected, rtol=1e-12)
-    dots = Calibration.from_rig(rig).dots(volts(2.0, 2.0, 5.0, 2.0, 2.0, 5.0))
+    dots = VoltsToDots.from_rig(rig).dots(volts(2.0, 2.0, 5.0, 2.0, 2.0, 5.0))
     np.testing.assert_allclose(dots, [[1e-3, 1e-3, 1e-3, 2e-3]], rtol=1e-15)
 
 
@@ -112,7 +112,7 @@ def test_a_quadrant_sees_the_light_of_a_gaussian_spot() -> None:
 def test_a_quadrants_volts_are_unbent_and_agree_with_a_lateral_one_at_the_centre() -> None:
     w = 0.5e-3
     rig = rig_from_values({'psd_1.type': 'quadrant', 'psd_1.spot_radius': w, 'amplifier.sensitivity': 0.1e-3})
-    calibration = Calibration.from_rig(rig)
+    calibration = VoltsToDots.from_rig(rig)
     sensor = calibration.sensors[0]
     assert isinstance(sensor, Quadrant)
     place = 0.3e-3
@@ -127,7 +127,7 @@ def test_a_quadrants_volts_are_unbent_and_agree_with_a_lateral_one_at_the_centre
 
 
 def test_electrodes_of_both_psds_come_out_as_places_and_light() -> None:
-    calibration = Calibration.from_rig(rig_from_values({'psd_2.type': 'pincushion'}))
+    calibration = VoltsToDots.from_rig(rig_from_values({'psd_2.type': 'pincushion'}))
     electrodes = np.array([[3.0, 1.0, 2.0, 2.0, 0.0, 1.0, 1.0, 0.0]])
     volts = calibration.volts_of_electrodes(electrodes)
     # 5 mm at the edge: (3 - 1)/(3 + 1) and ((X2 + Y1) - (X1 + Y2))/sum of it; a duolateral counts the light twice.
@@ -137,7 +137,7 @@ def test_electrodes_of_both_psds_come_out_as_places_and_light() -> None:
 
 def test_electrodes_go_through_the_wiring_once() -> None:
     wired = {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x'], 'psd_1.sensitivity': [1e-3, 2e-3]}
-    calibration = Calibration.from_rig(rig_from_values(wired))
+    calibration = VoltsToDots.from_rig(rig_from_values(wired))
     # The second input is that of PSD 1: its own x is 1/2 of the way and its own y 1/4 back.
     electrodes = np.array([[1.0, 1.0, 1.0, 1.0, 3.0, 1.0, 3.0, 5.0]])
     dots = calibration.dots(calibration.seen(calibration.volts_of_electrodes(electrodes).astype(np.float32)))
@@ -145,14 +145,14 @@ def test_electrodes_go_through_the_wiring_once() -> None:
 
 
 def test_an_axis_without_current_makes_no_place() -> None:
-    calibration = Calibration.from_rig(rig_from_values({}))
+    calibration = VoltsToDots.from_rig(rig_from_values({}))
     volts = calibration.volts_of_electrodes(np.array([[0.0, 0.0, 3.0, 1.0, 1.0, 1.0, 1.0, 1.0]]))
     np.testing.assert_array_equal(volts, [[0.0, 0.0, 0.0, 0.0, 0.0, 2.0]])
 
 
 def test_a_quadrants_electrodes_are_unbent_once() -> None:
     rig = rig_from_values({'psd_1.type': 'quadrant', 'psd_1.spot_radius': 0.5e-3})
-    calibration = Calibration.from_rig(rig)
+    calibration = VoltsToDots.from_rig(rig)
     four = calibration.sensors[0].currents(np.array([[0.3e-3, -0.1e-3]]), 4.0)
     volts = calibration.volts_of_electrodes(np.hstack((four, np.ones((1, 4)))))
     np.testing.assert_allclose(calibration.dots(volts.astype(np.float32))[0, :2], [0.3e-3, -0.1e-3], rtol=1e-5)
@@ -161,7 +161,7 @@ def test_a_quadrants_electrodes_are_unbent_once() -> None:
 def test_other_light_is_taken_off_as_photocurrents_add() -> None:
     """Currents of the laser at a place and of the light elsewhere, added electrode by electrode."""
     rig = rig_from_values({'psd_1.sensitivity': [1e-3, 2e-3], 'psd_2.type': 'quadrant', 'psd_2.spot_radius': 1e-3})
-    plain = Calibration.from_rig(rig)
+    plain = VoltsToDots.from_rig(rig)
     places = np.array([[1e-3, -2e-3], [-3e-3, 0.5e-3]]), np.array([[0.3e-3, -0.1e-3], [0.0, 0.4e-3]])
     laser = [s.currents(place, 5.0) for s, place in zip(plain.sensors, places, strict=True)]
     light = [
@@ -171,19 +171,19 @@ def test_other_light_is_taken_off_as_photocurrents_add() -> None:
     levels = {f'psd_{n}.dark': dark[3 * n - 3 : 3 * n].tolist() for n in (1, 2)}
     both = plain.volts_of_electrodes(np.hstack([a + b for a, b in zip(laser, light, strict=True)])).astype(np.float32)
     assert abs(plain.dots(both) - np.hstack(places)).max() > 20e-6
-    freed = Calibration.from_rig(replace_values(rig, levels)).dots(both)
+    freed = VoltsToDots.from_rig(replace_values(rig, levels)).dots(both)
     np.testing.assert_allclose(freed, np.hstack(places), atol=2e-9)
 
 
 def test_a_rig_without_dark_levels_reads_as_before_and_one_without_laser_stays_finite() -> None:
     nominal = rig_from_values({})
     some = np.random.default_rng(1).uniform(-9.0, 9.0, (50, 6)).astype(np.float32)
-    no_light = Calibration.from_rig(
+    no_light = VoltsToDots.from_rig(
         replace_values(nominal, {'psd_1.dark': [5.0, 5.0, 0.0], 'psd_2.dark': [1.0, 1.0, -0.1]})
     )
-    np.testing.assert_array_equal(no_light.dots(some), Calibration.from_rig(nominal).dots(some))
-    one = Calibration.from_rig(replace_values(nominal, {'psd_2.dark': [1.0, -1.0, 0.1]}))
-    np.testing.assert_array_equal(one.dots(some)[:, :2], Calibration.from_rig(nominal).dots(some)[:, :2])
+    np.testing.assert_array_equal(no_light.dots(some), VoltsToDots.from_rig(nominal).dots(some))
+    one = VoltsToDots.from_rig(replace_values(nominal, {'psd_2.dark': [1.0, -1.0, 0.1]}))
+    np.testing.assert_array_equal(one.dots(some)[:, :2], VoltsToDots.from_rig(nominal).dots(some)[:, :2])
     # With the laser off what is left is noise, 2 mV of the sum and of x: no dot outside the active area.
     for noise in (-2e-3, 0.0, 2e-3):
         assert np.abs(one.dots(volts(0.0, 0.0, 0.0, 1.0 - noise, -1.0, 0.1 + noise))).max() < 1e-3
@@ -220,7 +220,7 @@ def test_each_of_three_psds_has_its_own_curve_and_sensitivity() -> None:
     """A quadrant between two lateral sensors: places through electrodes and volts, and back."""
     values: dict[str, Any] = {'psd_3.center': [0.08, -0.06], 'psd_2.type': 'quadrant', 'psd_2.spot_radius': 1e-3}
     sizes = {f'psd_{n}.sensitivity': [n * 1e-4, n * 1e-4 + 5e-5] for n in (1, 2, 3)}
-    calibration = Calibration.from_rig(rig_from_values({**values, **sizes}))
+    calibration = VoltsToDots.from_rig(rig_from_values({**values, **sizes}))
     places = np.array([[1e-3, -2e-3, 0.3e-3, -0.1e-3, -3e-3, 0.5e-3], [-1e-3, 2e-3, -0.4e-3, 0.2e-3, 2e-3, 1e-3]])
     parts = [s.currents(places[:, 2 * i : 2 * i + 2], 5.0) for i, s in enumerate(calibration.sensors)]
     read = calibration.volts_of_electrodes(np.hstack(parts))
@@ -238,7 +238,7 @@ def test_each_of_three_psds_has_its_own_curve_and_sensitivity() -> None:
 
 
 def test_less_light_than_a_tenth_of_the_other_is_taken_for_a_tenth() -> None:
-    one = Calibration.from_rig(rig_from_values({'psd_2.dark': [1.0, -1.0, 0.1]}))
+    one = VoltsToDots.from_rig(rig_from_values({'psd_2.dark': [1.0, -1.0, 0.1]}))
     # (S v - b d) / 0.01 V, for v = (1, 0) V at 0.5 mm/V, whatever is left of the light above 0.1 V.
     for whole in (0.105, 0.1, 0.09):
         want = [(whole * 0.5e-3 - 0.05e-3) / 0.01, 0.05e-3 / 0.01]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.config import load_rig
-from psd_deflection.mechanics import LinkStatics
-from psd_deflection.mechanics.section import TubeSection
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.model.link.section import TubeSection
+from psd_deflection.rig.config import load_rig
 
 LINK = LinkStatics.from_rig(load_rig())
 SECTION = TubeSection(0.0159, 0.0138)

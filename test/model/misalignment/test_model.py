@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from blind import misaligned
-from psd_deflection.config import Rig, rig_from_values
-from psd_deflection.correction import Correction
-from psd_deflection.errors import ConfigError
-from psd_deflection.misalignment.model import (
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.measure.correction import Correction
+from psd_deflection.model.misalignment.model import (
     ALL,
     COUNT,
     INDEX,
@@ -21,9 +20,10 @@ from psd_deflection.misalignment.model import (
     reading_of_place,
     readings,
 )
-from psd_deflection.misalignment.rig import known_of_rig, rig_values, vector_of_rig
+from psd_deflection.model.misalignment.rig import known_of_rig, rig_values, vector_of_rig
+from psd_deflection.model.simulation.catalogue import effects_to_values
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import effects_to_values
+from psd_deflection.rig.config import Rig, rig_from_values
 
 LENGTH = 0.585
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.config import Rig, rig_from_values
-from psd_deflection.misalignment.model import COUNT, INDEX, readings
-from psd_deflection.misalignment.rig import known_of_rig, vector_of_rig
-from psd_deflection.misalignment.spread import ParameterSpread
-from psd_deflection.pipeline import SYSTEMATIC, ZERO_VARIANCES, Pipeline
+from psd_deflection.measure.pipeline import SYSTEMATIC, ZERO_VARIANCES, Pipeline
+from psd_deflection.model.misalignment.model import COUNT, INDEX, readings
+from psd_deflection.model.misalignment.rig import known_of_rig, vector_of_rig
+from psd_deflection.model.misalignment.spread import ParameterSpread
 from psd_deflection.records import DeflectionEstimate, FloatArray, ParameterChange, RawChunk, Record, TipMotion
+from psd_deflection.rig.config import Rig, rig_from_values
 
 NAMES = ['psd_1.rotation', 'psd_1.gain_x', 'psd_2.gain_y', 'psd_2.center_x', 'psd_1.zero_x']
 SDS = [0.005, 0.004, 0.003, 2e-4, 3e-6]
@@ -79,7 +79,7 @@ def test_a_rig_that_was_not_calibrated_has_no_spread() -> None:
 
 
 def test_the_polynomial_is_what_it_stands_for() -> None:
-    from psd_deflection.misalignment.spread import _dots_by_parameters
+    from psd_deflection.model.misalignment.spread import _dots_by_parameters
 
     rig = calibrated()
     spread = ParameterSpread.from_rig(rig)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.errors import SolverError
-from psd_deflection.geometry import Geometry
-from psd_deflection.geometry.landing import landing, landings
-from psd_deflection.geometry.layout import check_shapes, check_twist
-from psd_deflection.geometry.plate import points_under_leaning
-from psd_deflection.geometry.rays import hit, rotation
+from psd_deflection.base.errors import SolverError
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.plate.landing import landing, landings
+from psd_deflection.model.plate.layout import check_shapes, check_twist
+from psd_deflection.model.plate.plate import points_under_leaning
+from psd_deflection.model.plate.rays import hit, rotation
 
 POSES = np.array([[1e-3, -2e-3, 0.05, 0.02, -0.03], [0.0, 0.0, -0.3, -0.2, 0.25], [2e-3, 1e-3, 0.1, 0.15, 0.1]])
 PLACE = (0.03, -0.08)

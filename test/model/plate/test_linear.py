@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.geometry.linear import condition_number, design_matrix, error_bound, gain_matrix
-from psd_deflection.thesis.appendix_d_least_squares import printed_design_matrix
-from psd_deflection.thesis.comparison import DIRECT, SIDEBAR, printed_bound
+from psd_deflection.model.plate.linear import condition_number, design_matrix, error_bound, gain_matrix
+from psd_deflection.studies.thesis.appendix_d_least_squares import printed_design_matrix
+from psd_deflection.studies.thesis.comparison import DIRECT, SIDEBAR, printed_bound
 
 
 @pytest.mark.parametrize('scaling', [(1.0,) * 4, SIDEBAR, DIRECT])

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from psd_deflection.errors import ConfigError
-from psd_deflection.geometry import placement
-from psd_deflection.geometry.linear import condition_number, design_matrix
-from psd_deflection.geometry.placement import Room
-from psd_deflection.geometry.plate import plate_points
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.plate import placement
+from psd_deflection.model.plate.linear import condition_number, design_matrix
+from psd_deflection.model.plate.placement import Room
+from psd_deflection.model.plate.plate import plate_points
 from psd_deflection.records import FloatArray
 
 THESIS = np.array([[0.0, 0.070], [-0.100, 0.0]])

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.config import load_rig
-from psd_deflection.geometry import Geometry
-from psd_deflection.geometry.plate import (
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.plate.plate import (
     Tilts,
     crossing,
     crossings,
@@ -22,7 +21,8 @@ from psd_deflection.geometry.plate import (
     tie_matrix,
     tied_pose,
 )
-from psd_deflection.geometry.rays import hit, lifted, rotation
+from psd_deflection.model.plate.rays import hit, lifted, rotation
+from psd_deflection.rig.config import load_rig
 
 POSES = np.random.default_rng(5).normal(size=(6, 5)) * [0.003, 0.003, 0.05, 0.02, 0.02]
 STAGGERED = Geometry(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.config import load_rig
-from psd_deflection.geometry.scene import bend, tip_boxes
+from psd_deflection.model.plate.scene import bend, tip_boxes
+from psd_deflection.rig.config import load_rig
 
 
 def test_the_link_bends_as_under_a_force_at_its_tip() -> None:

@@ -16,17 +16,17 @@ import numpy as np
 import pytest
 
 import psd_deflection
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli.main import main
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.correction import Correction
-from psd_deflection.errors import ConfigError
-from psd_deflection.mechanics import LinkStatics
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.measure.correction import Correction
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.model.simulation import effects
+from psd_deflection.model.simulation.catalogue import FOLDERS, GROUP, catalogue, effect_names, effects_of_rig
+from psd_deflection.model.simulation.loads import sidebar
+from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import Counts, DeflectionEstimate, FloatArray, RawChunk
-from psd_deflection.simulation import effects
-from psd_deflection.simulation.catalogue import FOLDERS, GROUP, catalogue, effect_names, effects_of_rig
-from psd_deflection.simulation.loads import sidebar
-from psd_deflection.simulation.simulator import RigSimulator
+from psd_deflection.rig.config import Rig, load_rig
 
 PACKAGE = Path(psd_deflection.__file__).parent
 PAGE = (PACKAGE.parent / 'docs' / 'simulation.md').read_text(encoding='utf-8')
@@ -124,7 +124,7 @@ def test_a_beam_that_reads_what_it_does_not_declare_is_refused(folder: Path) -> 
 
 def test_moved_heights_are_moved_optics(folder: Path) -> None:
     code = """
-from psd_deflection.simulation.declaration import Effect, EffectParameter
+from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 
 def _configure(physics, values):
     physics.heights = physics.heights + values['by']
@@ -138,7 +138,7 @@ EFFECT = Effect('taller', 'optics', 's', 'e', 's', 'n', (EffectParameter('by', '
 
 
 LOADED = """
-from psd_deflection.simulation.declaration import Effect, EffectParameter
+from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 
 def _apply(samples, values, state):
     samples.loads *= 1.0 + values['by']
@@ -261,9 +261,11 @@ def words_of(path: Path) -> list[tuple[int, str]]:
 def test_no_other_file_names_an_effect() -> None:
     places = Path(effects.__file__).parent
     # The terms of the error budget are a list of their own; some have the name of the effect they are due to.
-    files = [f for f in PACKAGE.rglob('*.py') if places not in f.parents and PACKAGE / 'budget' not in f.parents]
+    files = [
+        f for f in PACKAGE.rglob('*.py') if places not in f.parents and PACKAGE / 'studies' / 'budget' not in f.parents
+    ]
     # A calibrated rig file has its parameters as effects.
-    files.remove(PACKAGE / 'misalignment' / 'rig.py')
+    files.remove(PACKAGE / 'model' / 'misalignment' / 'rig.py')
     assert len(files) > 100
     names = {f.stem for f in places.glob('[a-z]*.py')} - LINK
     assert len(names) >= 26
@@ -275,7 +277,7 @@ def test_discovery_names_no_parameter_of_an_effect() -> None:
     parameters = {p.name for e in catalogue().values() for p in e.parameters} - SEARCH
     texts = [
         (file.name, node.lineno, node.value)
-        for file in (PACKAGE / 'discovery').glob('*.py')
+        for file in (PACKAGE / 'studies' / 'discover').rglob('*.py')
         for node in ast.walk(ast.parse(file.read_text(encoding='utf-8')))
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     ]
@@ -294,8 +296,8 @@ def test_a_start_loads_the_effects_that_are_on_and_nothing_heavy(
     (folder / 'x.py').write_text(CODE.replace(NAME, 'x'))
     program = f"""
 import json, sys
-from psd_deflection.config import load_rig
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.rig.config import load_rig
+from psd_deflection.measure.pipeline import Pipeline
 Pipeline(load_rig(overrides=json.loads({json.dumps(overrides)!r})))
 print(json.dumps(sorted(sys.modules)))
 """
@@ -305,5 +307,7 @@ print(json.dumps(sorted(sys.modules)))
     modules = json.loads(done.stdout)
     assert [m for m in modules if m.startswith(HEAVY)] == []
     assert [m for m in modules if m.startswith(effects.__name__ + '.')] == []
-    assert [m.rsplit('.', 1)[1] for m in modules if m.startswith('psd_deflection.simulation.catalogue.')] == loaded
-    assert 'psd_deflection.simulation.simulator' not in modules
+    assert [
+        m.rsplit('.', 1)[1] for m in modules if m.startswith('psd_deflection.model.simulation.catalogue.')
+    ] == loaded
+    assert 'psd_deflection.model.simulation.simulator' not in modules

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import yaml
 
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli.main import main
-from psd_deflection.config import load_rig
-from psd_deflection.correction import Correction
-from psd_deflection.errors import ConfigError
-from psd_deflection.geometry import Geometry
-from psd_deflection.mechanics import LinkStatics
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.simulation.optics import dots_on_plate
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.simulator import RigSimulator
+from psd_deflection.measure.correction import Correction
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.simulation.optics import dots_on_plate
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.rig.config import load_rig
 from test.judges import RayPlane
 
 BASE = {'psd_1.height': -0.585, 'psd_2.height': -0.485, 'solver': 'base_pair', 'solvers': ['base_pair']}

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from psd_deflection.config import load_rig
-from psd_deflection.simulation.catalogue import catalogue, sort_effects
-from psd_deflection.simulation.declaration import ActiveEffect, Effect
-from psd_deflection.simulation.physics import Physics
+from psd_deflection.model.simulation.catalogue import catalogue, sort_effects
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.rig.config import load_rig
 
-TABLE = Path(__file__).parents[1] / 'data' / 'effects.txt'
+TABLE = Path(__file__).parents[2] / 'data' / 'effects.txt'
 
 
 def lines_of(effect: Effect) -> list[str]:

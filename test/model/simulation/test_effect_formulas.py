@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from blind import generator
-from psd_deflection.config import load_rig
+from psd_deflection.model.simulation import loads
+from psd_deflection.model.simulation.catalogue import catalogue
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, Traced
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.samples import SimulatedSamples
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import CHANNELS, FloatArray
-from psd_deflection.simulation import loads
-from psd_deflection.simulation.catalogue import catalogue
-from psd_deflection.simulation.declaration import ActiveEffect, Effect, Traced
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.samples import SimulatedSamples
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.rig.config import load_rig
 
 LENGTHS = (0.585, 0.400)
 HISTORY = loads.steps([(0, 0, 0), (5, -50, -29), (30, 10, 12), (20, -25, 10), (-15, -25, 10)], 0.5).loads

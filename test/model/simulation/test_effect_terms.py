@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
-from psd_deflection.config import load_rig
+from psd_deflection.model.simulation import loads
+from psd_deflection.model.simulation.catalogue import catalogue
+from psd_deflection.model.simulation.declaration import ActiveEffect, Reading, State, Traced
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.samples import SimulatedSamples
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import CHANNELS, FloatArray
-from psd_deflection.simulation import loads
-from psd_deflection.simulation.catalogue import catalogue
-from psd_deflection.simulation.declaration import ActiveEffect, Reading, State, Traced
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.samples import SimulatedSamples
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.rig.config import load_rig
 
 COUNT = 9
 RIG = load_rig()

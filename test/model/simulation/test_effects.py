@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 import yaml
 
-from psd_deflection.config import Rig, load_rig, replace_values, rig_from_values
-from psd_deflection.correction import Correction
-from psd_deflection.errors import ConfigError
-from psd_deflection.pipeline import Pipeline
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.measure.correction import Correction
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.simulation import loads
+from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig, effects_to_values, make_active
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect
+from psd_deflection.model.simulation.hysteresis import play
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
 from psd_deflection.records import FloatArray, RawChunk, TipLoad
-from psd_deflection.simulation import loads
-from psd_deflection.simulation.catalogue import catalogue, effects_of_rig, effects_to_values, make_active
-from psd_deflection.simulation.declaration import ActiveEffect, Effect
-from psd_deflection.simulation.hysteresis import play
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
+from psd_deflection.rig.config import Rig, load_rig, replace_values, rig_from_values
 
 NAMES = {
     *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),

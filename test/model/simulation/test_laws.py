@@ -8,24 +8,24 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from psd_deflection.config import load_rig
-from psd_deflection.correction import Correction
-from psd_deflection.errors import ConfigError
-from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import FOLDERS, catalogue, effects_of_rig
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.laws import (
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.measure.correction import Correction
+from psd_deflection.model.simulation.catalogue import FOLDERS, catalogue, effects_of_rig
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.laws import (
     FORMS,
     TARGETS,
     Law,
-    Term,
+    LawTerm,
     effect_of,
     law_text,
     read_law,
     unit_of,
     values_of,
 )
-from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
+from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import load_rig
 
 RIG = load_rig()
 LOADS = np.repeat([[0.0, 0.0, 0.0], [20.0, -30.0, 10.0], [5.0, 10.0, -20.0], [0.0, 0.0, 0.0]], 150, axis=0)
@@ -44,7 +44,7 @@ SHAPES = {
 def law_of(form: str, target: str = 'y2', variable: str = 'y1') -> Law:
     shapes = {k: SHAPES[k] for k in (*FORMS[form].fitted, *FORMS[form].fixed)}
     times = (0.1, 0.25) if form == 'switched' else ()
-    return Law('odd', TARGETS[target].stage, target, (Term(form, (variable,), 1e-6, shapes, times),))
+    return Law('odd', TARGETS[target].stage, target, (LawTerm(form, (variable,), 1e-6, shapes, times),))
 
 
 def active(law: Law) -> list[ActiveEffect]:
@@ -83,7 +83,7 @@ def test_a_law_acts_on_what_it_names(target: str) -> None:
 
 
 def test_a_jitter_is_noise_that_grows_and_has_no_mean() -> None:
-    law = Law('shaky', 'electronics', 'x1', (Term('jitter', ('temperature',), 1e-5),))
+    law = Law('shaky', 'electronics', 'x1', (LawTerm('jitter', ('temperature',), 1e-5),))
     samples = ForwardModel(RIG, active(law)).expect(LOADS, WARM)
     np.testing.assert_array_equal(samples.volts, ForwardModel(RIG, []).expect(LOADS, WARM).volts)
     model = ForwardModel(RIG, active(law))
@@ -99,15 +99,15 @@ def test_a_jitter_is_noise_that_grows_and_has_no_mean() -> None:
 def test_a_lag_and_a_rate_are_those_of_their_equations() -> None:
     t = np.arange(400) * 1e-3
     u = np.sin(2.0 * np.pi * 5.0 * t)
-    lag = Term('relaxed', ('y1',), 1.0, {'tau': 0.05}).evaluate(lambda _: u, len(t), 1e-3, {})
+    lag = LawTerm('relaxed', ('y1',), 1.0, {'tau': 0.05}).evaluate(lambda _: u, len(t), 1e-3, {})
     want = solve_ivp(lambda s, y: (np.sin(10.0 * np.pi * s) - y) / 0.05, (0.0, t[-1]), [0.0], t_eval=t, rtol=1e-9)
     np.testing.assert_allclose(lag, want.y[0], atol=3e-4)
-    rate = Term('rate', ('y1',)).evaluate(lambda _: u, len(t), 1e-3, {})
+    rate = LawTerm('rate', ('y1',)).evaluate(lambda _: u, len(t), 1e-3, {})
     np.testing.assert_allclose(rate[3:], 10.0 * np.pi * np.cos(10.0 * np.pi * t[3:]), atol=0.02)
 
 
 def test_a_law_of_what_a_reading_knows_is_corrected() -> None:
-    terms = (Term('product', ('y1', 'temperature'), 2e-3), Term('beyond', ('y1',), 0.05, {'threshold': 5e-5}))
+    terms = (LawTerm('product', ('y1', 'temperature'), 2e-3), LawTerm('beyond', ('y1',), 0.05, {'threshold': 5e-5}))
     law = Law('odd', 'psd', 'y1', terms)
     seen = ForwardModel(RIG, active(law)).run(LOADS, WARM)
     true = ForwardModel(RIG, []).run(LOADS, WARM)
@@ -123,8 +123,8 @@ def test_a_law_of_the_load_is_not_corrected_and_does_no_harm() -> None:
 
 def test_a_file_is_read_as_it_was_written_and_switched_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     terms = (
-        Term('above', ('load_fx',), 2.5e-7, {'threshold': 10.0}, sd={'coefficient': 1e-9, 'threshold': 0.1}),
-        Term('switched', (), 1e-6, times=(0.1, 0.3)),
+        LawTerm('above', ('load_fx',), 2.5e-7, {'threshold': 10.0}, sd={'coefficient': 1e-9, 'threshold': 0.1}),
+        LawTerm('switched', (), 1e-6, times=(0.1, 0.3)),
     )
     law = Law('yielding', 'psd', 'y2', terms, 'the mount yields')
     file = tmp_path / 'yielding.yaml'
@@ -140,11 +140,11 @@ def test_a_file_is_read_as_it_was_written_and_switched_on(tmp_path: Path, monkey
 
 
 def test_units_and_words_are_those_of_the_variables() -> None:
-    term = Term('product', ('load_tz', 'load_tz', 'temperature'), 2.0)
+    term = LawTerm('product', ('load_tz', 'load_tz', 'temperature'), 2.0)
     assert unit_of(term.of) == '(N m)^2 K'
     assert term.unit('y2') == 'm/((N m)^2 K)'
     assert Law('a', 'psd', 'y2', (term,)).expression == 'y2 += 2 m/((N m)^2 K) · load_tz^2 temperature'
-    assert Term('rate', ('x1',)).unit('y1') == 'm s/m'
+    assert LawTerm('rate', ('x1',)).unit('y1') == 'm s/m'
 
 
 @pytest.mark.parametrize(
@@ -161,7 +161,7 @@ def test_units_and_words_are_those_of_the_variables() -> None:
     ],
 )
 def test_a_malformed_law_is_refused_with_file_and_key(tmp_path: Path, change: dict[str, str], said: str) -> None:
-    text = law_text(Law('yielding', 'psd', 'y2', (Term('above', ('load_fx',), 2.5e-7, {'threshold': 10.0}),)))
+    text = law_text(Law('yielding', 'psd', 'y2', (LawTerm('above', ('load_fx',), 2.5e-7, {'threshold': 10.0}),)))
     for old, new in change.items():
         assert old in text
         text = text.replace(old, new)
@@ -178,7 +178,7 @@ def test_every_form_has_a_sound_unit() -> None:
     for form in set(FORMS) - {'jitter', 'switched'}:
         term = law_of(form).terms[0]
         shapes = {k: 1e3 * v if term.shape_unit(k) == 'm' else v for k, v in term.shapes.items()}
-        scaled = Term(form, term.of, 1.0, shapes)
+        scaled = LawTerm(form, term.of, 1.0, shapes)
         a = term.evaluate(lambda _: values, 50, 1e-3, {})
         b = scaled.evaluate(lambda _: 1e3 * values, 50, 1e-3, {})
         np.testing.assert_allclose(b, 1e3 ** FORMS[form].unit_of_v * a, rtol=1e-9, atol=1e-15, err_msg=form)

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from psd_deflection.calibration import Calibration, counts_to_volts, dot_noise_variances
-from psd_deflection.config import load_rig
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.devices.serve import served_loads
-from psd_deflection.errors import RecordingError
+from psd_deflection.model.detector import VoltsToDots, counts_to_volts, dot_noise_variances
+from psd_deflection.model.simulation import loads, simulator
+from psd_deflection.model.simulation.catalogue import catalogue, make_active
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.modes import Filter, mode_coefficients
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation import loads, simulator
-from psd_deflection.simulation.catalogue import catalogue, make_active
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.modes import Filter, mode_coefficients
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
+from psd_deflection.rig.config import load_rig
 
 
 def test_any_splitting_gives_the_same_samples_bit_for_bit() -> None:
@@ -144,7 +144,7 @@ def test_each_channel_has_its_own_noise_and_sensitivity() -> None:
     rig = load_rig(overrides=OWN)
     step = RigSimulator(rig, seed=4).step(loads.constant((3.0, -5.0, 1.0), 20.0).loads)
     volts = counts_to_volts(step.counts, rig.converter.volts_per_count)
-    error = Calibration.from_rig(rig).dots(volts) - step.dots
+    error = VoltsToDots.from_rig(rig).dots(volts) - step.dots
     assert np.abs(error.mean(axis=0)).max() < 1e-7
     np.testing.assert_allclose(error.var(axis=0), dot_noise_variances(rig), rtol=0.05)
 
@@ -158,7 +158,7 @@ def test_a_rig_with_dark_levels_is_simulated_in_that_light() -> None:
     np.testing.assert_allclose(both[3], (5.0 * laser[3] + 0.2) / 5.2, rtol=1e-12)
     np.testing.assert_allclose(both[4], (5.0 * laser[4] - 0.4) / 5.2, rtol=1e-12)
     np.testing.assert_allclose(both[5], 5.2)
-    dots = Calibration.from_rig(lit).dots(both.T.astype(np.float32))
+    dots = VoltsToDots.from_rig(lit).dots(both.T.astype(np.float32))
     np.testing.assert_allclose(dots, ForwardModel(plain).run(history).dots.T, atol=2e-9)
 
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.geometry import Geometry
-from psd_deflection.solvers import make_solver
-from psd_deflection.thesis.comparison import VARIANCES, dots_of, grid, thesis_geometry
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.solvers import make_solver
+from psd_deflection.studies.thesis.comparison import VARIANCES, dots_of, grid, thesis_geometry
 
 UNITS = np.array([1e6, 1e6, 1e3 * 180.0 / np.pi])
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.errors import SolverError
-from psd_deflection.geometry import Geometry
-from psd_deflection.solvers import SOLVERS, make_solver
+from psd_deflection.base.errors import SolverError
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.solvers import SOLVERS, make_solver
 
 
 def rig(centers: Any, heights: Any = None, k: float = 1.5, length: float = 0.585) -> Geometry:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from psd_deflection.solvers.gauss_newton import MAX_STEPS, Minimum, answer, fit
-from psd_deflection.solvers.interface import SolverStatus
+from psd_deflection.model.solvers.gauss_newton import MAX_STEPS, Minimum, answer, fit
+from psd_deflection.model.solvers.interface import SolverStatus
 
 
 def curve(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.solvers import SolverStatus, make_solver
-from psd_deflection.thesis.appendix_d import appendix_d_iterative
+from psd_deflection.model.solvers import SolverStatus, make_solver
+from psd_deflection.studies.thesis.appendix_d import appendix_d_iterative
 
 CASES = [f'G{i}' for i in range(1, 13)]
 PARALLEL_BEAMS = CASES[:11]

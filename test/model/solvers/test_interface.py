@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.config import rig_from_values
-from psd_deflection.errors import ConfigError, SolverError
-from psd_deflection.geometry import Geometry
-from psd_deflection.solvers import SOLVERS, SolverStatus, make_solver, solver_from_rig
+from psd_deflection.base.errors import ConfigError, SolverError
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.solvers import SOLVERS, SolverStatus, make_solver, solver_from_rig
+from psd_deflection.rig.config import rig_from_values
 
 VARIANCES = {
     'equal': (4e-12, 4e-12, 4e-12, 4e-12),

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.config import load_rig
-from psd_deflection.geometry import Geometry
-from psd_deflection.solvers.one_psd import OnePsd
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.solvers.one_psd import OnePsd
+from psd_deflection.rig.config import load_rig
 
 
 @pytest.mark.parametrize('psd', [0, 1])

@@ -10,8 +10,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psd_deflection.geometry import Geometry
-from psd_deflection.solvers import SolverStatus, make_solver
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.solvers import SolverStatus, make_solver
 
 L = 0.585
 ISOTROPIC = (4e-12, 4e-12, 1e-12, 1e-12)

@@ -8,19 +8,19 @@ from types import MappingProxyType
 
 import pytest
 
-from psd_deflection.budget.estimate import METHODS
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli.main import main
-from psd_deflection.config import rig_from_values
-from psd_deflection.errors import ConfigError
-from psd_deflection.runner.session import Session
-from psd_deflection.solvers import SOLVERS, registry
-from psd_deflection.solvers.registry import Entry, check_live, solver_class
+from psd_deflection.model.solvers import SOLVERS, registry
+from psd_deflection.model.solvers.registry import Entry, check_live, solver_class
+from psd_deflection.rig.config import rig_from_values
+from psd_deflection.run.session import Session
+from psd_deflection.studies.budget.estimate import METHODS
 
-BAG = Path(__file__).parents[2] / 'bags' / 'clean'
+BAG = Path(__file__).parents[3] / 'bags' / 'clean'
 
 MADE_UP = """
-from psd_deflection.errors import SolverError
-from psd_deflection.solvers.exact import ExactSolver
+from psd_deflection.base.errors import SolverError
+from psd_deflection.model.solvers.exact import ExactSolver
 
 
 class MadeUp(ExactSolver):

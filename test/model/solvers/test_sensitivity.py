@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.config import rig_from_values
-from psd_deflection.errors import ConfigError, SolverError
-from psd_deflection.geometry import Geometry
-from psd_deflection.solvers import SolverStatus, make_solver, solver_from_rig
-from psd_deflection.solvers.interface import Solver
-from psd_deflection.solvers.registry import check_arrangement, solver_class
-from psd_deflection.solvers.some_psds import geometry_of, solver_of_some
-from test.solvers.test_truth import FLAT_THREE, RAISED, THREE, TWO, VARIANCES, least_squares
+from psd_deflection.base.errors import ConfigError, SolverError
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.solvers import SolverStatus, make_solver, solver_from_rig
+from psd_deflection.model.solvers.interface import Solver
+from psd_deflection.model.solvers.registry import check_arrangement, solver_class
+from psd_deflection.model.solvers.some_psds import geometry_of, solver_of_some
+from psd_deflection.rig.config import rig_from_values
+from test.model.solvers.test_truth import FLAT_THREE, RAISED, THREE, TWO, VARIANCES, least_squares
 
 Array = np.ndarray[Any, Any]
 

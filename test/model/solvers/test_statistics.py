@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.geometry import Geometry
-from psd_deflection.solvers import make_solver
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.solvers import make_solver
 
 DRAWS = 20_000
 FEWER = 4_000

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.errors import SolverError
-from psd_deflection.geometry import Geometry
-from psd_deflection.solvers import SolverStatus, make_solver
+from psd_deflection.base.errors import SolverError
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.solvers import SolverStatus, make_solver
 
 Array = np.ndarray[Any, Any]
 

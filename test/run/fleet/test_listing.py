@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection.errors import RecordingError
-from psd_deflection.fleet.listing import LARGEST_LIST, is_plain, listed
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.run.fleet.listing import LARGEST_LIST, is_plain, listed
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ import pytest
 
 from bench.campaign.mortal import dies, length
 from psd_deflection import __version__
-from psd_deflection.errors import DaemonError, UsageError
-from psd_deflection.fleet.engines import check_engine, open_engine
-from psd_deflection.fleet.tasks import AHEAD, Outcome, attempt, outcomes
+from psd_deflection.base.errors import DaemonError, UsageError
+from psd_deflection.run.fleet.engines import check_engine, open_engine
+from psd_deflection.run.fleet.tasks import AHEAD, Outcome, attempt, outcomes
 
 T = TypeVar('T')
 NAMES = ['a', 'bbb', 'refused', 'cc', 'defect', 'dddd']
@@ -155,7 +155,7 @@ def test_another_word_is_refused(word: str) -> None:
 
 
 def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('psd_deflection.fleet.engines.CONNECT_S', 0.2)
+    monkeypatch.setattr('psd_deflection.run.fleet.engines.CONNECT_S', 0.2)
     # Nothing listens on the port of tcpmux.
     with (
         pytest.raises(DaemonError, match=r'^dask://127\.0\.0\.1:1: no Dask scheduler answers'),

@@ -7,10 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.config import Rig, load_rig
-from psd_deflection.monitor.feed import Feed
-from psd_deflection.monitor.server import MonitorServer
-from psd_deflection.monitor.shown import RefusedError
 from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
@@ -18,6 +14,10 @@ from psd_deflection.records import (
     DiagnosticReport,
     SpotMeans,
 )
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.run.monitor.feed import Feed
+from psd_deflection.run.monitor.server import MonitorServer
+from psd_deflection.run.monitor.shown import RefusedError
 
 START_NS = 1_700_000_000_000_000_000
 BLOCK_NS = 20_000_000

@@ -4,7 +4,7 @@ import socket
 
 import pytest
 
-from psd_deflection.monitor.access import is_loopback, is_own_host, is_own_page, is_token
+from psd_deflection.run.monitor.access import is_loopback, is_own_host, is_own_page, is_token
 
 OWN = socket.gethostname().lower()
 

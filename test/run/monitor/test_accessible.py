@@ -18,7 +18,7 @@ from .serving import BLOCK_NS, START_NS, Serving
 
 pytestmark = pytest.mark.browser
 
-BAGS = Path(__file__).parent.parent.parent / 'bags'
+BAGS = Path(__file__).parents[3] / 'bags'
 
 
 @pytest.fixture(scope='module')

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.browser
 
 Start = Callable[..., Program]
 
-BAGS = Path(__file__).parent.parent.parent / 'bags'
+BAGS = Path(__file__).parents[3] / 'bags'
 WARM_BLOCKS = 72_000
 """Until then the engine compiles and recompiles what runs often: 150 kB more than after 36 000 blocks, 20 kB less than
 after 144 000."""

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.monitor import client
-from psd_deflection.monitor.served import Served, announce, served_pages
 from psd_deflection.records import BlockStatus
+from psd_deflection.run.monitor import client
+from psd_deflection.run.monitor.served import Served, announce, served_pages
 from test.heard import WAIT_S
 
 from .serving import START_NS, Serving
@@ -71,7 +71,7 @@ def test_zero_waits_for_a_link_that_moves(
         if len(waited) == 3:
             serving.shown.refusal = ''
 
-    monkeypatch.setattr('psd_deflection.cli.zero.time.sleep', rests)
+    monkeypatch.setattr('psd_deflection.cli.run.zero.time.sleep', rests)
     assert main(['zero']) == 0
     assert len(waited) == 3
     assert capsys.readouterr() == ('unloaded dots taken\n', '')

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from psd_deflection.monitor.feed import COLUMNS, BlockResult, Feed, row_columns, row_json
 from psd_deflection.records import BlockStatus, SampleBlock, TipLoad
+from psd_deflection.run.monitor.feed import COLUMNS, BlockResult, Feed, row_columns, row_json
 
 from .serving import START_NS, estimate_of, spots_of
 

@@ -18,15 +18,15 @@ from mcap.reader import make_reader
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli.main import main
-from psd_deflection.config import load_rig
-from psd_deflection.errors import ConfigError
-from psd_deflection.monitor.foxglove import FoxgloveServer
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run.monitor.foxglove import FoxgloveServer
 from tools.program import PSD_DEFLECTION, WAIT_S, Program
 
 pytest.importorskip('foxglove')
 
-BAGS = Path(__file__).parent.parent.parent / 'bags'
+BAGS = Path(__file__).parents[3] / 'bags'
 
 Messages = dict[str, list[tuple[int, bytes]]]
 

@@ -11,12 +11,12 @@ from typing import Any
 import aiohttp
 import pytest
 
-from psd_deflection.config import load_rig
-from psd_deflection.errors import ConfigError
-from psd_deflection.monitor import server
-from psd_deflection.monitor.feed import Feed
-from psd_deflection.monitor.server import BROWSERS, CONNECTIONS, MonitorServer
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import AppliedLoad, BlockStatus, ParameterChange, ReferencePose
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run.monitor import server
+from psd_deflection.run.monitor.feed import Feed
+from psd_deflection.run.monitor.server import BROWSERS, CONNECTIONS, MonitorServer
 from test.heard import WAIT_S
 
 from .serving import BLOCK_NS, START_NS, Serving, StillShown

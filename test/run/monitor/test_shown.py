@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.monitor.feed import BlockResult, Feed
-from psd_deflection.monitor.shown import RefusedError, ShownRecording
-from psd_deflection.pipeline import Pipeline
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.replay_engine import replayed, rig_at_start
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.replay.engine import replayed, rig_at_start
 from psd_deflection.records import AppliedLoad, BlockStatus, ParameterChange, Record, ReferencePose, SpotMeans
+from psd_deflection.run.monitor.feed import BlockResult, Feed
+from psd_deflection.run.monitor.shown import RefusedError, ShownRecording
 
-BAGS = Path(__file__).parent.parent.parent / 'bags'
+BAGS = Path(__file__).parents[3] / 'bags'
 
 
 def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event, speed: float = 1e6) -> ShownRecording:
@@ -36,7 +36,7 @@ def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event, sp
 
 
 def test_rates_are_of_a_second_however_long_ago_the_last_report_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('psd_deflection.monitor.shown.time.time_ns', lambda: 0)
+    monkeypatch.setattr('psd_deflection.run.monitor.shown.time.time_ns', lambda: 0)
     ended = threading.Event()
     source = source_of('clean', Feed(), list[str](), ended)
     source.start()
@@ -171,6 +171,6 @@ def test_what_cannot_be_is_one_line(
 def test_without_aiohttp_the_error_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr('psd_deflection.monitor.start.importlib.util.find_spec', lambda name: None)
+    monkeypatch.setattr('psd_deflection.run.monitor.start.importlib.util.find_spec', lambda name: None)
     assert main(['monitor']) == 3
     assert "pip install 'psd_deflection[monitor]'" in capsys.readouterr().err

@@ -6,9 +6,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from psd_deflection.config import load_rig
-from psd_deflection.monitor.spectrum import SEGMENT, Spectrum, density_json
 from psd_deflection.records import SampleBlock
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run.monitor.spectrum import SEGMENT, Spectrum, density_json
 
 RIG = load_rig()
 

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.budget.chain import Chain, clipped, dots, measure
-from psd_deflection.budget.estimate import estimator_of
-from psd_deflection.config import load_rig, replace_values
-from psd_deflection.errors import ConfigError
-from psd_deflection.geometry.plate import plate_points, tied_pose
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.plate.plate import plate_points, tied_pose
+from psd_deflection.rig.config import load_rig, replace_values
+from psd_deflection.studies.budget.chain import MeasuringChain, clipped, dots, measure
+from psd_deflection.studies.budget.estimate import estimator_of
 
-GOLDEN: dict[str, Any] = json.loads((Path(__file__).parent.parent / 'data' / 'golden.json').read_text(encoding='utf-8'))
+GOLDEN: dict[str, Any] = json.loads((Path(__file__).parents[2] / 'data' / 'golden.json').read_text(encoding='utf-8'))
 CASES = {c['name']: c for c in GOLDEN['cases']}
 RIG = load_rig()
 
@@ -33,7 +33,7 @@ def _slope_ratio(name: str) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 @pytest.mark.parametrize('name', ['G1', 'G2', 'G3', 'G4', 'G5', 'G6', 'G9', 'G10'])
 def test_a_perfect_chain_gives_the_golden_readings(name: str) -> None:
-    chain = replace(Chain.of(RIG), slope_ratio=_slope_ratio(name))
+    chain = replace(MeasuringChain.of(RIG), slope_ratio=_slope_ratio(name))
     readings, zeros = measure(chain, _pose(name))
     assert readings[0] == pytest.approx(np.array(CASES[name]['readings']), abs=1e-15)
     assert np.all(zeros == 0.0)
@@ -45,7 +45,7 @@ def test_everything_wrong_at_once() -> None:
     gains = np.array([[1.01, 1.0], [1.0, 0.98]])
     slope = np.tan(np.radians([1.0, 0.5]))
     chain = replace(
-        Chain.of(RIG),
+        MeasuringChain.of(RIG),
         slope_ratio=_slope_ratio('G12'),
         zeros=np.array(case['m0']) / gains,
         heights=np.array([0.02, 0.02]),
@@ -62,7 +62,9 @@ def test_everything_wrong_at_once() -> None:
 
 
 def test_the_chain_and_the_model_of_the_estimators_agree() -> None:
-    chain = replace(Chain.of(RIG), heights=np.array([0.05, -0.02]), zeros=np.array([[7e-5, -5e-5], [-3e-5, 4e-5]]))
+    chain = replace(
+        MeasuringChain.of(RIG), heights=np.array([0.05, -0.02]), zeros=np.array([[7e-5, -5e-5], [-3e-5, 4e-5]])
+    )
     pose = np.array([0.001, -0.002, 0.017])
     points = plate_points(tied_pose(pose, 1.5, 0.585), chain.centers + chain.zeros, chain.heights)
     assert dots(chain, pose)[0] == pytest.approx(points - chain.centers, abs=1e-15)
@@ -86,7 +88,7 @@ def test_responses_agree_with_differences(method: str) -> None:
     rig = replace_values(RIG, {'psd_1.height': 0.03, 'psd_2.zero': [1e-4, -2e-4]})
     estimator = estimator_of(rig, method)
     pose = np.array([0.0003, -0.0022, -0.0164])
-    chain = replace(Chain.of(rig), slope_ratio=np.array([estimator.slope_ratio]))
+    chain = replace(MeasuringChain.of(rig), slope_ratio=np.array([estimator.slope_ratio]))
     readings, zeros = measure(chain, pose)
     by_readings, by_zeros = estimator.response(pose, chain.zeros)
     step = 1e-7 * np.eye(4).reshape(4, 2, 2)

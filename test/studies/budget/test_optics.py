@@ -6,8 +6,9 @@ import math
 
 import pytest
 
-from psd_deflection.budget.environment import averaging_gain
-from psd_deflection.budget.optics import (
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.studies.budget.environment import averaging_gain
+from psd_deflection.studies.budget.optics import (
     air_index,
     beam_diameter,
     boundary_shift,
@@ -15,7 +16,6 @@ from psd_deflection.budget.optics import (
     index_per_kelvin,
     refracted_angle,
 )
-from psd_deflection.errors import ConfigError
 
 
 @pytest.mark.parametrize(

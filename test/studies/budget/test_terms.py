@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.budget.chain import measure
-from psd_deflection.budget.computation import COMPUTATION, stop_window
-from psd_deflection.budget.evaluate import CAUSES, evaluate, monte_carlo
-from psd_deflection.budget.inputs import INPUTS, read_inputs
-from psd_deflection.budget.installation import CENTER_POSITION, PLANE_TILT, SENSOR_HEIGHT, SENSOR_ROTATION
-from psd_deflection.budget.sensor import AMPLIFIER_NOISE, QUANTISATION, SENSOR_GAIN, ZEROING
-from psd_deflection.budget.term import Cause, Kind, Situation
-from psd_deflection.config import Rig, load_rig, replace_values
-from psd_deflection.errors import ConfigError
-from psd_deflection.geometry import placement
-from psd_deflection.geometry.linear import design_matrix, gain_matrix
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.plate import placement
+from psd_deflection.model.plate.linear import design_matrix, gain_matrix
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.studies.budget.chain import measure
+from psd_deflection.studies.budget.computation import COMPUTATION, stop_window
+from psd_deflection.studies.budget.evaluate import CAUSES, evaluate, monte_carlo
+from psd_deflection.studies.budget.inputs import INPUTS, read_inputs
+from psd_deflection.studies.budget.installation import CENTER_POSITION, PLANE_TILT, SENSOR_HEIGHT, SENSOR_ROTATION
+from psd_deflection.studies.budget.sensor import AMPLIFIER_NOISE, QUANTISATION, SENSOR_GAIN, ZEROING
+from psd_deflection.studies.budget.term import Cause, Kind, Situation
 
-GOLDEN: dict[str, Any] = json.loads((Path(__file__).parent.parent / 'data' / 'golden.json').read_text(encoding='utf-8'))
+GOLDEN: dict[str, Any] = json.loads((Path(__file__).parents[2] / 'data' / 'golden.json').read_text(encoding='utf-8'))
 CASES = {c['name']: c for c in GOLDEN['cases']}
 RIG = load_rig()
 SIDEBAR = (0.0, -50.0, -29.25)

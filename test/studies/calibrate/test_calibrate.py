@@ -9,14 +9,14 @@ import pytest
 
 from blind import calibration as campaign
 from blind import misaligned
-from psd_deflection.calibrating.calibrate import Calibration, calibrate
-from psd_deflection.calibrating.check import check
-from psd_deflection.calibrating.fit import NAMES
-from psd_deflection.calibrating.observation import Run, smoothed
-from psd_deflection.calibrating.result import values_of
-from psd_deflection.config import Rig, replace_values, rig_from_values
-from psd_deflection.errors import RecordingError
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig, replace_values, rig_from_values
+from psd_deflection.studies.calibrate.calibrate import Calibration, calibrate
+from psd_deflection.studies.calibrate.check import check
+from psd_deflection.studies.calibrate.fit import NAMES
+from psd_deflection.studies.calibrate.observation import CalibrationRun, smoothed
+from psd_deflection.studies.calibrate.result import values_of
 
 AT = {name: i for i, name in enumerate(NAMES)}
 
@@ -98,8 +98,10 @@ def test_frames_count_as_much_as_they_say(nominal: Rig, pose: FloatArray) -> Non
     share = np.where(np.arange(len(run.reference)) % 2, 3.0, 1.0)[:, None] * np.ones(3)
     noisy = pose[recorded.frames] + (run.reference - pose[recorded.frames]) * share
     # In its own units: only the proportions are believed.
-    stated = Run(run.name, run.t, run.volts, run.reference_t, noisy, reference_sd=7.0 * share * misaligned.CAMERA)
-    unstated = Run(run.name, run.t, run.volts, run.reference_t, noisy)
+    stated = CalibrationRun(
+        run.name, run.t, run.volts, run.reference_t, noisy, reference_sd=7.0 * share * misaligned.CAMERA
+    )
+    unstated = CalibrationRun(run.name, run.t, run.volts, run.reference_t, noisy)
     known, guessed = calibrate([stated], nominal), calibrate([unstated], nominal)
     clock = AT['reference.clock']
     assert known.sd[clock] < guessed.sd[clock] / 1.4
@@ -151,7 +153,7 @@ def test_every_recording_has_a_zero_of_its_own(nominal: Rig) -> None:
 def test_a_late_reference_is_put_right(nominal: Rig, pose: FloatArray) -> None:
     recorded = misaligned.record(only(), pose, np.random.default_rng(2))
     run = campaign.run_of(recorded)
-    late = Run(run.name, run.t, run.volts, run.reference_t + 0.0123, run.reference)
+    late = CalibrationRun(run.name, run.t, run.volts, run.reference_t + 0.0123, run.reference)
     found = calibrate([late], nominal)
     clock = found.clock + found.values[AT['reference.clock']]
     assert clock == pytest.approx(-0.0123, abs=2e-4)
@@ -160,7 +162,9 @@ def test_a_late_reference_is_put_right(nominal: Rig, pose: FloatArray) -> None:
 
 def test_a_reference_that_is_no_reference_is_refused(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(), pose, np.random.default_rng(2)))
-    wrong = Run(run.name, run.t, run.volts, run.reference_t, np.random.default_rng(1).permutation(run.reference))
+    wrong = CalibrationRun(
+        run.name, run.t, run.volts, run.reference_t, np.random.default_rng(1).permutation(run.reference)
+    )
     found = calibrate([wrong], nominal)
     assert found.refused.startswith('on motion that was not fitted')
     values, effects = values_of(found, 'today')
@@ -171,12 +175,14 @@ def test_a_reference_that_is_no_reference_is_refused(nominal: Rig, pose: FloatAr
 def test_a_recording_without_reference_and_loads_is_refused(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(), pose[:2000], np.random.default_rng(2)))
     with pytest.raises(RecordingError, match=r'neither a reference .* nor known loads; --self'):
-        calibrate([Run(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0])], nominal)
+        calibrate([CalibrationRun(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0])], nominal)
 
 
 def test_the_redundant_reading_alone_tells_a_relative_gain(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(psd_1__gain_x=0.02), pose, np.random.default_rng(2)))
-    found = calibrate([Run(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0])], nominal, alone=True)
+    found = calibrate(
+        [CalibrationRun(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0])], nominal, alone=True
+    )
     # Along the base line (0.1, 0.07), which the one reading too many sees when the plate goes along X.
     v = {name: found.values[i] for name, i in AT.items()}
     along = v['psd_1.gain_x'] - v['psd_2.gain_x']
@@ -190,7 +196,7 @@ def test_known_loads_alone_leave_the_scale_to_the_clamp(nominal: Rig) -> None:
     loads = misaligned.pushes(rng, 14, 3.0)
     truth = only(psd_1__gain_x=0.02, psd_2__rotation=0.015)
     run = campaign.run_of(misaligned.record(truth, misaligned.poses(loads), rng))
-    held = Run(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0], loads)
+    held = CalibrationRun(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0], loads)
     found = calibrate([held], nominal)
     relative = found.values[AT['psd_1.gain_x']] - found.values[AT['psd_2.gain_x']]
     assert relative == pytest.approx(0.02, abs=0.006)

@@ -9,14 +9,20 @@ import pytest
 
 from blind import calibration as campaign
 from blind import misaligned
-from psd_deflection.calibrating.calibrate import calibrate
-from psd_deflection.calibrating.dark import DarkLevel, dark_levels, result_of_levels, values_of_levels, words_of_level
-from psd_deflection.calibrating.observation import Run
-from psd_deflection.calibration import Calibration
-from psd_deflection.config import Rig, replace_values, rig_from_values
-from psd_deflection.errors import ConfigError, RecordingError
-from psd_deflection.misalignment.model import COUNT, INDEX, ZERO, by_parameters, readings
+from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.model.detector import VoltsToDots
+from psd_deflection.model.misalignment.model import COUNT, INDEX, ZERO, by_parameters, readings
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig, replace_values, rig_from_values
+from psd_deflection.studies.calibrate.calibrate import calibrate
+from psd_deflection.studies.calibrate.dark import (
+    DarkLevel,
+    dark_levels,
+    result_of_levels,
+    values_of_levels,
+    words_of_level,
+)
+from psd_deflection.studies.calibrate.observation import CalibrationRun
 
 RATE = 1000
 LIT = misaligned.Light(0.12, 3.0, -2.0, 0.0, 0.0, 0.0)
@@ -28,8 +34,8 @@ def nominal() -> Rig:
     return rig_from_values({})
 
 
-def run_of(volts: FloatArray, name: str = 'off.csv') -> Run:
-    return Run(name, np.arange(len(volts)) / RATE, volts, np.zeros(0), np.zeros((0, 3)), digest='ab' * 32)
+def run_of(volts: FloatArray, name: str = 'off.csv') -> CalibrationRun:
+    return CalibrationRun(name, np.arange(len(volts)) / RATE, volts, np.zeros(0), np.zeros((0, 3)), digest='ab' * 32)
 
 
 def darkness(seconds: float = 5.0, seed: int = 1, light: tuple[Any, Any] = (LIT, DIM)) -> FloatArray:
@@ -153,7 +159,7 @@ def test_without_light_x_and_y_mean_nothing_and_are_not_judged(nominal: Rig) -> 
     assert 'no other light' in words_of_level(levels[0])
     rig = replace_values(nominal, values_of_levels(levels[:1]))
     sample = np.array([[1.0, 2.0, 5.0, 3.0, 4.0, 5.0]], dtype=np.float32)
-    np.testing.assert_array_equal(Calibration.from_rig(rig).dots(sample), Calibration.from_rig(nominal).dots(sample))
+    np.testing.assert_array_equal(VoltsToDots.from_rig(rig).dots(sample), VoltsToDots.from_rig(nominal).dots(sample))
 
 
 def test_light_is_not_taken_off_twice(nominal: Rig) -> None:

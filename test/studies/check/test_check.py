@@ -15,16 +15,16 @@ import numpy as np
 import pytest
 
 from blind import generator
-from psd_deflection.calibration import Wiring
+from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.cli.main import main
-from psd_deflection.commissioning.checkup import CANNOT_TELL, RIGHT, WRONG, Checkup, check
-from psd_deflection.commissioning.levels import levels
-from psd_deflection.commissioning.responses import responses
-from psd_deflection.commissioning.wirings import WIRINGS, differences, line, parameters
-from psd_deflection.config import Rig, load_rig, rig_from_values
-from psd_deflection.errors import ConfigError, RecordingError
-from psd_deflection.parameter_files import read_parameter_file
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig, load_rig, rig_from_values
+from psd_deflection.rig.parameter_files import read_parameter_file
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.check.checkup import CANNOT_TELL, RIGHT, WRONG, Checkup, check
+from psd_deflection.studies.check.levels import levels
+from psd_deflection.studies.check.responses import responses
+from psd_deflection.studies.check.wirings import WIRINGS, differences, line, parameters
 
 CLOUD = 2e-3 * 0.5e-3
 """Noise of one sample, m."""

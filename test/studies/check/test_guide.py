@@ -7,15 +7,15 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from psd_deflection.calibration import Wiring
-from psd_deflection.commissioning.checkup import RIGHT, WRONG, Checkup, check
-from psd_deflection.commissioning.guide import Guide, Phase, directions
-from psd_deflection.commissioning.levels import levels
-from psd_deflection.commissioning.wirings import WIRINGS, parameters
-from psd_deflection.config import Rig, load_rig, rig_from_values
-from psd_deflection.mechanics import LinkStatics
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.simulator import RigSimulator
+from psd_deflection.rig.config import Rig, load_rig, rig_from_values
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.check.checkup import RIGHT, WRONG, Checkup, check
+from psd_deflection.studies.check.guide import Guide, Phase, directions
+from psd_deflection.studies.check.levels import levels
+from psd_deflection.studies.check.wirings import WIRINGS, parameters
 
 BLOCK = 20
 

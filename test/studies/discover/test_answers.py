@@ -11,30 +11,38 @@ import numpy as np
 import pytest
 
 from psd_deflection import __version__
-from psd_deflection.commissioning.checkup import Finding
-from psd_deflection.discovery import discover as answer
-from psd_deflection.discovery import planning, proposals, weighing
-from psd_deflection.discovery import result as told
-from psd_deflection.discovery.discover import Discovery, discover
-from psd_deflection.discovery.experiment import Limits, Piece, Setting, Shown
-from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.hidden import beginning, mistakes, only_in
-from psd_deflection.discovery.laws import FoundLaw
-from psd_deflection.discovery.localise import Cell, Dependence, Localisation
-from psd_deflection.discovery.planning import Plan, Suggestion, Told
-from psd_deflection.discovery.search import far, promising, slot, unbound, unphysical
-from psd_deflection.discovery.setup import _blocks, _units, likely_delays, likely_jumps, noise_finding, said
-from psd_deflection.discovery.signatures import Candidate, candidates, signature_columns
-from psd_deflection.discovery.validate import HeldOut
-from psd_deflection.discovery.weighing import NamedEffect, Rival, Unknown, unknown_of
-from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.model.simulation.catalogue import catalogue, make_active
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter, Proposal
+from psd_deflection.model.simulation.laws import Law, LawTerm
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.samples import SimulatedSamples
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import catalogue, make_active
-from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter, Proposal
-from psd_deflection.simulation.laws import Law, Term
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.samples import SimulatedSamples
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.studies.check.checkup import Finding
+from psd_deflection.studies.discover import discover as answer
+from psd_deflection.studies.discover import planning
+from psd_deflection.studies.discover import result as told
+from psd_deflection.studies.discover.discover import Discovery, discover
+from psd_deflection.studies.discover.experiment import Limits, ModelSums, Piece, Setting
+from psd_deflection.studies.discover.laws.laws import FoundLaw
+from psd_deflection.studies.discover.planning import Plan, Suggestion, Told
+from psd_deflection.studies.discover.search import proposals, weighing
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.hold_out import HeldOut
+from psd_deflection.studies.discover.search.localise import Cell, Dependence, Localisation
+from psd_deflection.studies.discover.search.search import far, promising, slot, unbound, unphysical
+from psd_deflection.studies.discover.search.signatures import Candidate, candidates, signature_columns
+from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival, Unknown, unknown_of
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.hidden import beginning, mistakes, only_in
+from psd_deflection.studies.discover.setup.setup import (
+    _blocks,
+    _units,
+    likely_delays,
+    likely_jumps,
+    noise_finding,
+    said,
+)
 
 from .test_formulas import RIG, observed
 
@@ -517,8 +525,8 @@ def test_a_plan_says_what_it_tells_apart() -> None:
 def test_pieces_are_put_together_as_long_as_each_is_worth_it() -> None:
     """A minute costs 0.03; a further piece must add 0.02; beyond a chi-square of 60 there is nothing more to gain."""
 
-    def shows(gain: float, seconds: float) -> Shown:
-        return Shown(np.array([[gain]]), [], [], seconds)
+    def shows(gain: float, seconds: float) -> ModelSums:
+        return ModelSums(np.array([[gain]]), [], [], seconds)
 
     seen = [(Piece(n, ()), shows(g, s)) for n, g, s in (('a', 30.0, 10.0), ('b', 25.0, 1.0), ('c', 1.0, 1.0))]
 
@@ -851,7 +859,7 @@ def test_places_are_told_if_one_in_twenty_by_chance(found: Discovery) -> None:
 
 
 def test_the_law_is_written_with_the_first_unknown(found: Discovery) -> None:
-    law = Law('law_y2', 'psd', 'y2', (Term('product', ('load_fx',), 1e-6),))
+    law = Law('law_y2', 'psd', 'y2', (LawTerm('product', ('load_fx',), 1e-6),))
     other = Law('law_beam_y2', 'optics', 'beam_y2', law.terms)
     further = Law('law_x1', 'psd', 'x1', law.terms)
     of_law = FoundLaw(

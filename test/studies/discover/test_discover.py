@@ -11,29 +11,29 @@ import numpy as np
 import pytest
 
 import psd_deflection
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.cli.main import main
-from psd_deflection.config import Rig, load_rig, replace_values
-from psd_deflection.declarations import DESCRIPTION
-from psd_deflection.discovery import proposals
-from psd_deflection.discovery.coincidence import coincidences
-from psd_deflection.discovery.discover import Discovery, discover
-from psd_deflection.discovery.fit import refit
-from psd_deflection.discovery.noise import estimate_noise, rest_windows, strip_lines
-from psd_deflection.discovery.observation import Observation, load_cases
-from psd_deflection.discovery.result import model_yaml, result, sentence
-from psd_deflection.discovery.screen import solve_seen
-from psd_deflection.discovery.signatures import SignatureBank
-from psd_deflection.discovery.workspace import Workspace
-from psd_deflection.errors import RecordingError
-from psd_deflection.parameter_files import read_parameter_file
-from psd_deflection.recordings.readers import open_recording
-from psd_deflection.recordings.replay_engine import rig_at_end
+from psd_deflection.model.simulation import loads
+from psd_deflection.model.simulation.catalogue import effect_names, effects_of_rig, make_active
+from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.replay.engine import rig_at_end
 from psd_deflection.records import FloatArray, ParameterChange
-from psd_deflection.simulation import loads
-from psd_deflection.simulation.catalogue import effect_names, effects_of_rig, make_active
-from psd_deflection.simulation.simulator import RigSimulator
+from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.rig.declarations import DESCRIPTION
+from psd_deflection.rig.parameter_files import read_parameter_file
+from psd_deflection.studies.discover.discover import Discovery, discover
+from psd_deflection.studies.discover.observation import Observation, load_cases
+from psd_deflection.studies.discover.result import model_yaml, result, sentence
+from psd_deflection.studies.discover.search import proposals
+from psd_deflection.studies.discover.search.coincidence import coincidences
+from psd_deflection.studies.discover.search.fit import refit
+from psd_deflection.studies.discover.search.screen import solve_seen
+from psd_deflection.studies.discover.search.signatures import SignatureBank
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.noise import estimate_noise, rest_windows, strip_lines
 
-SCHEMA = json.loads((Path(__file__).parents[1] / 'data' / 'result.schema.json').read_text())
+SCHEMA = json.loads((Path(__file__).parents[2] / 'data' / 'result.schema.json').read_text())
 RIG = load_rig()
 HISTORY = loads.identification()
 WARM = 21.0 + 2.0 * np.sin(np.linspace(0.0, 5.0, len(HISTORY)))

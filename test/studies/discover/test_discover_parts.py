@@ -11,29 +11,29 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import pytest
 
-from psd_deflection.commissioning.checkup import Finding
-from psd_deflection.config import replace_values
-from psd_deflection.discovery import discover as answer
-from psd_deflection.discovery import proposals, weighing
-from psd_deflection.discovery.comparison import Comparison
-from psd_deflection.discovery.discover import Discovery, discover, pose_change
-from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.hidden import mistakes
-from psd_deflection.discovery.laws import FoundLaw
-from psd_deflection.discovery.localise import Dependence, Localisation
-from psd_deflection.discovery.noise import NoiseModel
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.result import result
-from psd_deflection.discovery.screen import Screen
-from psd_deflection.discovery.search import Search, SearchResult
-from psd_deflection.discovery.setup import said
-from psd_deflection.discovery.signatures import SignatureBank
-from psd_deflection.discovery.validate import HeldOut
-from psd_deflection.discovery.weighing import NamedEffect, Rival, Unknown
-from psd_deflection.discovery.workspace import Workspace
-from psd_deflection.simulation.catalogue import catalogue, make_active
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.model.simulation.catalogue import catalogue, make_active
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.rig.config import replace_values
+from psd_deflection.studies.check.checkup import Finding
+from psd_deflection.studies.discover import discover as answer
+from psd_deflection.studies.discover.discover import Discovery, discover, pose_change
+from psd_deflection.studies.discover.laws.laws import FoundLaw
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.result import result
+from psd_deflection.studies.discover.search import proposals, weighing
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.hold_out import HeldOut
+from psd_deflection.studies.discover.search.localise import Dependence, Localisation
+from psd_deflection.studies.discover.search.screen import Screen
+from psd_deflection.studies.discover.search.search import Search, SearchResult
+from psd_deflection.studies.discover.search.signatures import SignatureBank
+from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival, Unknown
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.hidden import mistakes
+from psd_deflection.studies.discover.setup.noise import NoiseModel
+from psd_deflection.studies.discover.setup.setup import said
 
 from .test_formulas import RIG, observed
 

@@ -11,21 +11,21 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from psd_deflection.config import load_rig, replace_values
-from psd_deflection.discovery import experiment
-from psd_deflection.discovery.cleaning import clean, outliers, stuck
-from psd_deflection.discovery.experiment import Limits, Shown, nothing_of, pieces, settings
-from psd_deflection.discovery.fit import Fit
-from psd_deflection.discovery.localise import _plain, regressors
-from psd_deflection.discovery.noise import NoiseModel, rest_windows, strip_lines
-from psd_deflection.discovery.observation import Observation, load_cases
-from psd_deflection.discovery.trust import energies, gain_beyond
-from psd_deflection.discovery.workspace import Workspace
-from psd_deflection.errors import RecordingError
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.model.simulation import loads
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import CHANNELS, FloatArray
-from psd_deflection.simulation import loads
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.rig.config import load_rig, replace_values
+from psd_deflection.studies.discover import experiment
+from psd_deflection.studies.discover.experiment import Limits, ModelSums, nothing_of, pieces, settings
+from psd_deflection.studies.discover.observation import Observation, load_cases
+from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.search.localise import _plain, regressors
+from psd_deflection.studies.discover.search.trust import energies, gain_beyond
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.cleaning import clean, outliers, stuck
+from psd_deflection.studies.discover.setup.noise import NoiseModel, rest_windows, strip_lines
 
 RIG = load_rig()
 PUSHES = [(0.0, 0.0, 0.0), (5.0, -20.0, -9.0), (-10.0, 10.0, 12.0), (0.0, 0.0, 0.0)]
@@ -183,13 +183,13 @@ def test_settings_are_lengths_rates_and_temperatures_other_than_now() -> None:
     assert experiment.limits_to_tree(Limits())['lengths_m'] is None
 
 
-def some_shown(rng: np.random.Generator, seconds: float = 2.0) -> tuple[Shown, list[FloatArray], list[FloatArray]]:
+def some_shown(rng: np.random.Generator, seconds: float = 2.0) -> tuple[ModelSums, list[FloatArray], list[FloatArray]]:
     """What random pictures of two models show: with no parameter, and with three."""
     rows = [rng.standard_normal(40) for _ in range(2)]
     slopes = [rng.standard_normal((40, k)) for k in (0, 3)]
     apart = np.array([[float((a - b) @ (a - b)) for b in rows] for a in rows])
     pull = [[c.T @ (a - b) for b, c in zip(rows, slopes, strict=True)] for a in rows]
-    return Shown(apart, pull, [c.T @ c for c in slopes], seconds), rows, slopes
+    return ModelSums(apart, pull, [c.T @ c for c in slopes], seconds), rows, slopes
 
 
 def test_a_separation_is_what_least_squares_leaves_of_both_recordings() -> None:

@@ -11,16 +11,16 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from psd_deflection.discovery import law_features, laws
-from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.law_features import responses, score, switchings, terms
-from psd_deflection.discovery.validate import heldout_gap
-from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.model.simulation.catalogue import make_active
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.laws import TARGETS, VARIABLES, Law, LawTerm, effect_of, values_of
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import CHANNELS, FloatArray
-from psd_deflection.simulation.catalogue import make_active
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.laws import TARGETS, VARIABLES, Law, Term, effect_of, values_of
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.studies.discover.laws import law_features, laws
+from psd_deflection.studies.discover.laws.law_features import responses, score, switchings, terms
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.hold_out import heldout_gap
+from psd_deflection.studies.discover.search.workspace import Workspace
 
 from .test_formulas import HISTORY, RIG, observed
 
@@ -32,7 +32,7 @@ def seen() -> tuple[Workspace, Fit]:
     return workspace, refit(workspace, [make_active('sensor_rotation', {'psd': 2, 'angle': 0.0}, 'test')], 2)
 
 
-def term_names(found: list[Term]) -> dict[tuple[str, tuple[str, ...]], list[dict[str, float]]]:
+def term_names(found: list[LawTerm]) -> dict[tuple[str, tuple[str, ...]], list[dict[str, float]]]:
     out: dict[tuple[str, tuple[str, ...]], list[dict[str, float]]] = {}
     for t in found:
         out.setdefault((t.form, t.of), []).append(dict(t.shapes))
@@ -117,7 +117,7 @@ def test_two_dozen_values_are_few_and_one_more_is_many(seen: tuple[Workspace, Fi
 def test_a_gain_is_that_of_the_simulated_picture(seen: tuple[Workspace, Fit], target: str, of: str) -> None:
     """The term is put into the simulation, and its picture, freed of what the fit explains, held to the residual."""
     workspace, fit = seen
-    law = Law('one', TARGETS[target].stage, target, (Term('product', (of,), 1.0),))
+    law = Law('one', TARGETS[target].stage, target, (LawTerm('product', (of,), 1.0),))
     size = {'load_fy': 1e-9, 'load_tz': 1e-9, 'dx': 1e-5, 'dy': 1e-5, 'load_fx': 1e-9, 'temperature': 1e-9}[of]
     size *= 1e3 if target.startswith('sum') else 1.0
     values = {**values_of(law), 'c1': size}
@@ -128,11 +128,11 @@ def test_a_gain_is_that_of_the_simulated_picture(seen: tuple[Workspace, Fit], ta
     across = picture - q @ (q.T @ picture)
     want = float(across @ fit.residual) ** 2 / float(across @ across)
     found = responses(workspace, fit)
-    (got,) = score(found, [Term('product', (of,))], (target,))
+    (got,) = score(found, [LawTerm('product', (of,))], (target,))
     # A first-order answer: held over a fine block, and the optics at the middle of it.
     assert got.gain == pytest.approx(want, rel=0.1, abs=0.02)
     assert got.term.coefficient == pytest.approx(float(across @ fit.residual) / float(across @ across), rel=0.1)
-    assert score(found, [Term('product', ('dx',))], ('static_dx', 'load_fx')) == []
+    assert score(found, [LawTerm('product', ('dx',))], ('static_dx', 'load_fx')) == []
 
 
 def test_what_a_target_lacks_is_estimated_with_its_weight(seen: tuple[Workspace, Fit]) -> None:
@@ -242,7 +242,9 @@ def test_times_that_show_are_terms_and_become_better(seen: tuple[Workspace, Fit]
                 4,
                 (
                     ActiveEffect(
-                        effect_of(law := Law('bump', 'psd', 'y1', (Term('switched', (), 3e-5, times=(0.313, 0.871)),))),
+                        effect_of(
+                            law := Law('bump', 'psd', 'y1', (LawTerm('switched', (), 3e-5, times=(0.313, 0.871)),))
+                        ),
                         values_of(law),
                     ),
                 ),
@@ -253,7 +255,7 @@ def test_times_that_show_are_terms_and_become_better(seen: tuple[Workspace, Fit]
     first, *_ = switchings(found, ('y1',))
     assert (first.form, first.of) == ('switched', ())
     assert first.times == pytest.approx((0.313, 0.871), abs=0.0011)
-    rough = law_features.with_better_times(found, 'y1', Term('switched', (), times=(0.25, 0.95)))
+    rough = law_features.with_better_times(found, 'y1', LawTerm('switched', (), times=(0.25, 0.95)))
     assert rough.times == pytest.approx((0.313, 0.871), abs=0.0011)
     assert {t.of for t in switchings(found, ('y1',))} <= {(), ('x1',), ('y1',)}
 
@@ -262,18 +264,18 @@ def test_times_that_show_are_terms_and_become_better(seen: tuple[Workspace, Fit]
 def test_a_level_at_which_a_dot_jumps_becomes_better(form: str) -> None:
     (ringing,) = law_features.known_fine(Workspace([observed(4)]), (), 'y1')
     level = float(np.quantile(ringing[np.abs(ringing) > 1e-6], 0.6))
-    law = Law('bump', 'psd', 'x1', (Term(form, ('y1',), 3e-5, {'threshold': level}),))
+    law = Law('bump', 'psd', 'x1', (LawTerm(form, ('y1',), 3e-5, {'threshold': level}),))
     workspace = Workspace([observed(4, (ActiveEffect(effect_of(law), values_of(law)),))])
     found = responses(workspace, refit(workspace, ()))
     pitch = float(np.ptp(ringing)) / 24
     for start in (level - 0.9 * pitch, level + 0.9 * pitch):
-        rough = score(found, [Term(form, ('y1',), shapes={'threshold': start})], ('x1',))[0]
+        rough = score(found, [LawTerm(form, ('y1',), shapes={'threshold': start})], ('x1',))[0]
         better = law_features.with_better_level(found, rough)
         assert better.gain > rough.gain
         assert better.term.shapes['threshold'] == pytest.approx(level, abs=0.04 * pitch)
         assert better.term.coefficient == pytest.approx(3e-5, rel=0.02)
         assert 0.0 < better.term.sd['threshold'] < 0.04 * pitch
-    kept = score(found, [Term('above', ('y1',), shapes={'threshold': level})], ('x1',))[0]
+    kept = score(found, [LawTerm('above', ('y1',), shapes={'threshold': level})], ('x1',))[0]
     assert law_features.with_better_level(found, kept) is kept
 
 
@@ -283,7 +285,7 @@ def test_between_two_loads_any_level_is_as_good(seen: tuple[Workspace, Fit]) -> 
     found = responses(workspace, fit)
     levels = np.unique(found[0].known['load_fx'])
     low, high = levels[-2:].tolist()
-    start = score(found, [Term('over', ('load_fx',), shapes={'threshold': low + 0.1 * (high - low)})], ('x2',))[0]
+    start = score(found, [LawTerm('over', ('load_fx',), shapes={'threshold': low + 0.1 * (high - low)})], ('x2',))[0]
     better = law_features.with_better_level(found, start)
     assert better.gain == pytest.approx(start.gain)
     assert better.term.shapes['threshold'] == pytest.approx(0.5 * (low + high))
@@ -304,7 +306,9 @@ def fit_of(jacobian: FloatArray, *effects: ActiveEffect, **given: Any) -> Fit:
 
 
 def test_a_fitted_law_has_the_numbers_of_the_fit_and_their_deviations() -> None:
-    law = Law('law_y2', 'psd', 'y2', (Term('above', ('load_fy',), shapes={'threshold': 4.0}), Term('product', ('dx',))))
+    law = Law(
+        'law_y2', 'psd', 'y2', (LawTerm('above', ('load_fy',), shapes={'threshold': 4.0}), LawTerm('product', ('dx',)))
+    )
     values = {'c1': 2.0, 'threshold1': 5.0, 'c2': -3.0}
     beside = make_active('sensor_gain', {'psd': 1, 'x': 0.1, 'y': 0.2}, 'test')
     jacobian = np.random.default_rng(0).standard_normal((30, 5)) * [1.0, 2.0, 3.0, 4.0, 0.005]
@@ -337,7 +341,7 @@ def test_a_fitted_law_has_the_numbers_of_the_fit_and_their_deviations() -> None:
 
 
 def test_terms_are_added_to_the_law_on_their_quantity_and_left_out_one_by_one() -> None:
-    a, b, c = (Term('product', (v,)) for v in ('load_fx', 'load_fy', 'load_tz'))
+    a, b, c = (LawTerm('product', (v,)) for v in ('load_fx', 'load_fy', 'load_tz'))
     first = Law('law_y2', 'psd', 'y2', (a,))
     (both,) = laws._with([first], law_features.Scored('y2', b, 1.0))
     assert both == Law('law_y2', 'psd', 'y2', (a, b))
@@ -357,22 +361,22 @@ def trial(law: Law, cost: float, chi2: float, *beside: ActiveEffect) -> laws._Tr
 
 
 def test_of_laws_that_cannot_be_told_apart_the_simplest_is_taken() -> None:
-    two = trial(Law('a', 'psd', 'y2', (Term('product', ('load_fx', 'load_fy')),)), 10.0, 5.0)
-    one = Law('b', 'psd', 'y2', (Term('product', ('x2',)),))
+    two = trial(Law('a', 'psd', 'y2', (LawTerm('product', ('load_fx', 'load_fy')),)), 10.0, 5.0)
+    one = Law('b', 'psd', 'y2', (LawTerm('product', ('x2',)),))
     assert laws._simplest(two, [trial(one, 19.9, 26.5)]).laws == (one,)
     assert laws._simplest(two, [trial(one, 20.1, 6.0)]) is two
     assert laws._simplest(two, [trial(one, 11.0, 26.7)]) is two
     # Beside other effects it is another answer; a dot goes before the pose; of equals the cheaper.
     assert laws._simplest(two, [trial(one, 11.0, 6.0, make_active('creep', {'amplitude': 0.1}, 'test'))]) is two
-    of_pose = trial(Law('c', 'psd', 'y2', (Term('product', ('dx',)),)), 5.0, 5.0)
+    of_pose = trial(Law('c', 'psd', 'y2', (LawTerm('product', ('dx',)),)), 5.0, 5.0)
     assert laws._simplest(of_pose, [trial(one, 6.0, 5.0)]).laws == (one,)
-    on_link = trial(Law('c', 'link', 'theta', (Term('product', ('dx',)),)), 5.0, 5.0)
+    on_link = trial(Law('c', 'link', 'theta', (LawTerm('product', ('dx',)),)), 5.0, 5.0)
     assert laws._simplest(on_link, [trial(one, 6.0, 5.0)]) is on_link
     assert laws._simplest(trial(one, 6.0, 5.0), [on_link]) == on_link
 
 
 def test_laws_that_the_recording_cannot_exclude_are_listed_once() -> None:
-    best = Law('a', 'psd', 'y2', (Term('product', ('load_fx',)),))
+    best = Law('a', 'psd', 'y2', (LawTerm('product', ('load_fx',)),))
     beam, link = dataclasses.replace(best, stage='optics', acts_on='beam_y2'), Law('b', 'link', 'dy', best.terms)
     far, dear = dataclasses.replace(link, acts_on='dx'), dataclasses.replace(link, acts_on='theta')
     others = [
@@ -451,12 +455,12 @@ def test_noise_that_grows_with_a_load_is_told_with_its_size_and_evidence() -> No
 
 def test_a_law_shows_where_a_twentieth_of_its_energy_is(seen: tuple[Workspace, Fit]) -> None:
     workspace, _ = seen
-    big = Law('big', 'psd', 'y2', (Term('product', ('load_fy',), 1e-5),))
+    big = Law('big', 'psd', 'y2', (LawTerm('product', ('load_fy',), 1e-5),))
     for share, shown in ((0.06, ('x1', 'y2')), (0.04, ('y2',))):
         # The residuals' energies per volt are those of the channels' noise.
         sigma = workspace.noise[0].innovation
         ratio = math.sqrt(share / (1.0 - share)) * sigma[0] / sigma[4]
-        small = Law('small', 'psd', 'x1', (Term('product', ('load_fy',), 1e-5 * ratio),))
+        small = Law('small', 'psd', 'x1', (LawTerm('product', ('load_fy',), 1e-5 * ratio),))
         effects = tuple(ActiveEffect(effect_of(law), values_of(law)) for law in (big, small))
         fit = refit(workspace, effects, 0)
         assert laws._channels(workspace, laws._Trial((big, small), fit, 0.0)) == shown
@@ -483,7 +487,7 @@ class Given(laws._Seeker):
 
 
 def law_of(*variables: str, on: str = 'y2') -> Law:
-    return Law(f'law_{on}', TARGETS[on].stage, on, tuple(Term('product', (v,)) for v in variables))
+    return Law(f'law_{on}', TARGETS[on].stage, on, tuple(LawTerm('product', (v,)) for v in variables))
 
 
 BESIDE = (make_active('creep', {'amplitude': 0.1}, 't'), make_active('sensor_gain', {'psd': 1, 'x': 0.1}, 't'))
@@ -510,7 +514,7 @@ def test_a_term_that_the_law_does_not_miss_goes(without: float, terms_left: str)
 @pytest.mark.parametrize(('second', 'grown'), [(89.9, 'dx dy'), (90.0, 'dx'), (90.1, 'dx')])
 def test_a_further_term_must_gain_as_an_effect_must(monkeypatch: pytest.MonkeyPatch, second: float, grown: str) -> None:
     offered = [
-        law_features.Scored('y2', Term('product', (v,)), g) for v, g in (('theta', 9.0), ('dy', 8.0), ('x1', 7.0))
+        law_features.Scored('y2', LawTerm('product', (v,)), g) for v, g in (('theta', 9.0), ('dy', 8.0), ('x1', 7.0))
     ]
     monkeypatch.setattr(laws, 'responses', lambda *_: [])
     monkeypatch.setattr(laws, 'score', lambda *_: offered)
@@ -538,14 +542,14 @@ def test_whatever_was_looked_for_counts_as_a_parameter() -> None:
     seeker = Given({})
     fit = cast(Fit, SimpleNamespace(chi2=50.0, parameters=2))
     assert seeker.cost([law_of('dx')], fit) == 56.0
-    switched = Law('s', 'psd', 'y2', (Term('switched', (), times=(1.0, 2.0, 3.0)),))
+    switched = Law('s', 'psd', 'y2', (LawTerm('switched', (), times=(1.0, 2.0, 3.0)),))
     assert seeker.cost([switched, law_of('dx')], fit) == 65.0
 
 
 def test_the_best_of_each_kind_is_refitted_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """Down to three tenths of the best gain, a dozen at most; the cheapest three once more in full."""
     names = list(VARIABLES)
-    scored = [law_features.Scored('y2', Term('product', (v,)), 100.0 - i) for i, v in enumerate(names)]
+    scored = [law_features.Scored('y2', LawTerm('product', (v,)), 100.0 - i) for i, v in enumerate(names)]
     scored.insert(1, dataclasses.replace(scored[0], gain=99.5))
     monkeypatch.setattr(laws, 'score', lambda *_: scored)
     seeker = Given({(v, ''): 100.0 - i for i, v in enumerate(names)})
@@ -555,7 +559,7 @@ def test_the_best_of_each_kind_is_refitted_first(monkeypatch: pytest.MonkeyPatch
     assert [a[0] for a in seeker.asked if a[2] == 8] == names[::-1][:3]
     assert [t.cost for t in got] == sorted(t.cost for t in got)
     assert len(got) == 12
-    weak = [scored[0], law_features.Scored('y2', Term('product', ('dy',)), 29.9)]
+    weak = [scored[0], law_features.Scored('y2', LawTerm('product', ('dy',)), 29.9)]
     monkeypatch.setattr(laws, 'score', lambda *_: weak)
     seeker = Given({})
     assert len(seeker.first()) == 1
@@ -573,7 +577,7 @@ def test_a_law_shows_alike_at_other_stages() -> None:
         ('static_dy', 'load_fy', link.length**3 / (3.0 * link.bending_stiffness)),
         ('static_theta', 'load_tz', link.length / link.torsional_stiffness),
     ):
-        law = dataclasses.replace(law_of('load_fx', on=on), terms=(Term('product', ('load_fx',), 3e-6),))
+        law = dataclasses.replace(law_of('load_fx', on=on), terms=(LawTerm('product', ('load_fx',), 3e-6),))
         (moved,) = seeker.same_elsewhere(seeker.trial([law, law_of('dx')], (), 1))
         assert (moved.laws[0].acts_on, moved.laws[0].stage) == (load, 'load')
         assert moved.laws[0].terms[0].coefficient == pytest.approx(3e-6 / per)
@@ -591,7 +595,7 @@ def test_a_shape_at_its_bound_is_not_the_right_form(seen: tuple[Workspace, Fit])
     assert got.cost == pytest.approx(got.fit.chi2 + 3.0 * got.fit.parameters)
     assert got.laws[0].terms[0].coefficient == got.fit.effects[-1].values['c1']
     assert got.beside == got.fit.effects[:1]
-    bound = Law('b', 'psd', 'y2', (Term('wave', ('x1',), shapes={'period': 1e-3, 'phase': 0.0}),))
+    bound = Law('b', 'psd', 'y2', (LawTerm('wave', ('x1',), shapes={'period': 1e-3, 'phase': 0.0}),))
     whole = refit(workspace, [*fit.effects, ActiveEffect(effect_of(bound), values_of(bound))], 0)
     with pytest.MonkeyPatch.context() as patch:
         for at, refused in (((0, 'angle'), False), ((1, 'period1'), True)):
@@ -604,7 +608,7 @@ def test_a_shape_at_its_bound_is_not_the_right_form(seen: tuple[Workspace, Fit])
 def test_a_threshold_that_no_refit_moves_is_not_at_its_bound(seen: tuple[Workspace, Fit], form: str) -> None:
     workspace, fit = seen
     seeker = laws._Seeker(workspace, fit, 3.0)
-    level = Law('b', 'psd', 'y2', (Term(form, ('x1',), shapes={'threshold': 1e-4}),))
+    level = Law('b', 'psd', 'y2', (LawTerm(form, ('x1',), shapes={'threshold': 1e-4}),))
     got = seeker.trial([law_of('load_fy'), level], fit.effects, 2)
     assert math.isfinite(got.cost)
     assert got.fit.effects[-1].values['threshold1'] == 1e-4
@@ -613,7 +617,7 @@ def test_a_threshold_that_no_refit_moves_is_not_at_its_bound(seen: tuple[Workspa
 @pytest.mark.parametrize('recordings', [1, 2])
 def test_events_are_looked_for_in_one_recording_only(monkeypatch: pytest.MonkeyPatch, recordings: int) -> None:
     """In another one they have other times."""
-    term, event = Term('product', ('dx',)), Term('switched', (), times=(1.0,))
+    term, event = LawTerm('product', ('dx',)), LawTerm('switched', (), times=(1.0,))
     monkeypatch.setattr(laws, 'responses', lambda *_: [])
     monkeypatch.setattr(laws, 'terms', lambda _: iter([term]))
     monkeypatch.setattr(laws, 'switchings', lambda _: [event])

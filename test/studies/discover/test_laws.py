@@ -10,24 +10,24 @@ import numpy as np
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.config import load_rig
-from psd_deflection.discovery.fit import refit
-from psd_deflection.discovery.law_features import responses, score, switchings, terms
-from psd_deflection.discovery.laws import find_jitter, find_law
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.workspace import Workspace
-from psd_deflection.simulation import loads
-from psd_deflection.simulation.catalogue import FOLDERS, effect_names, effects_of_rig
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.laws import Law, Term, effect_of, law_text, read_law, values_of
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.model.simulation import loads
+from psd_deflection.model.simulation.catalogue import FOLDERS, effect_names, effects_of_rig
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.laws import Law, LawTerm, effect_of, law_text, read_law, values_of
+from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.discover.laws.law_features import responses, score, switchings, terms
+from psd_deflection.studies.discover.laws.laws import find_jitter, find_law
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.search.fit import refit
+from psd_deflection.studies.discover.search.workspace import Workspace
 
 from .test_formulas import observed
 
 RIG = load_rig()
 HISTORY = loads.identification().loads
 WARM = 21.0 + 2.0 * np.sin(np.linspace(0.0, 5.0, len(HISTORY)))
-SCHEMA = json.loads((Path(__file__).parents[1] / 'data' / 'result.schema.json').read_text())
+SCHEMA = json.loads((Path(__file__).parents[2] / 'data' / 'result.schema.json').read_text())
 
 
 def workspace(law: Law | None, seed: int = 0) -> Workspace:
@@ -40,7 +40,7 @@ def workspace(law: Law | None, seed: int = 0) -> Workspace:
 
 
 def test_a_term_scores_to_first_order_what_it_explains() -> None:
-    law = Law('odd', 'link', 'static_dy', (Term('product', ('load_fy', 'load_fy'), 2e-9),))
+    law = Law('odd', 'link', 'static_dy', (LawTerm('product', ('load_fy', 'load_fy'), 2e-9),))
     ws = workspace(law)
     null = refit(ws, ())
     found = responses(ws, null)
@@ -54,7 +54,7 @@ def test_a_term_scores_to_first_order_what_it_explains() -> None:
 
 def test_times_of_switching_are_found_to_a_sample_or_two() -> None:
     for target, size in (('x1', 3e-6), ('static_dx', 5e-6)):
-        law = Law('bump', 'psd', target, (Term('switched', (), size, times=(3.217, 7.5, 15.003)),))
+        law = Law('bump', 'psd', target, (LawTerm('switched', (), size, times=(3.217, 7.5, 15.003)),))
         ws = workspace(law)
         found = responses(ws, refit(ws, ()))
         best = score(found, switchings(found))[0]
@@ -71,7 +71,7 @@ def test_there_is_no_law_in_noise() -> None:
 
 
 def test_noise_that_follows_a_variable_is_a_law_of_its_variance() -> None:
-    ws = workspace(Law('shaky', 'electronics', 'y2', (Term('jitter', ('load_fy',), 5e-8),)))
+    ws = workspace(Law('shaky', 'electronics', 'y2', (LawTerm('jitter', ('load_fy',), 5e-8),)))
     found = find_jitter(ws, refit(ws, ()), float(np.log(ws.effective_size())))
     assert found is not None
     assert (found.law.acts_on, found.law.variables, found.law.kind) == ('y2', ('load_fy',), 'variance')
@@ -82,7 +82,7 @@ def test_a_law_is_told_adopted_and_then_explains_the_recording(tmp_path: Path, m
     theirs, ours = tmp_path / 'theirs', tmp_path / 'ours'
     theirs.mkdir()
     ours.mkdir()
-    hidden = Law('base_moves', 'psd', 'y2', (Term('product', ('load_fx', 'load_fx'), 3e-9),))
+    hidden = Law('base_moves', 'psd', 'y2', (LawTerm('product', ('load_fx', 'load_fx'), 3e-9),))
     (theirs / 'base_moves.yaml').write_text(law_text(hidden))
     monkeypatch.setenv(FOLDERS, str(theirs))
     run, out = str(tmp_path / 'run'), tmp_path / 'found'

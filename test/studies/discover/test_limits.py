@@ -10,50 +10,34 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from psd_deflection.calibration import Wiring
-from psd_deflection.commissioning.wirings import WIRINGS, differences
-from psd_deflection.config import replace_values
-from psd_deflection.discovery import (
-    cleaning,
-    coincidence,
-    discover,
-    experiment,
-    hidden,
-    law_features,
-    laws,
-    localise,
-    observation,
-    planning,
-    plants,
-    proposals,
-    readings,
-    result,
-    setup,
-    ties,
-    trust,
-    validate,
-    weighing,
-)
-from psd_deflection.discovery import fit as fits
-from psd_deflection.discovery import noise as noises
-from psd_deflection.discovery import screen as screens
-from psd_deflection.discovery import search as steps
-from psd_deflection.discovery import workspace as whitened
-from psd_deflection.discovery.comparison import Comparison
-from psd_deflection.discovery.experiment import Shown
-from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.law_features import SOUGHT, Response
-from psd_deflection.discovery.localise import dependences
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.screen import Screen
-from psd_deflection.discovery.search import SearchResult
-from psd_deflection.discovery.signatures import Candidate
-from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.model.simulation.declaration import Effect, EffectParameter
+from psd_deflection.model.simulation.laws import Law, LawTerm
+from psd_deflection.model.simulation.loads import SIDEBAR_ARM
+from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import Effect, EffectParameter
-from psd_deflection.simulation.laws import Law, Term
-from psd_deflection.simulation.loads import SIDEBAR_ARM
-from psd_deflection.simulation.physics import Physics
+from psd_deflection.rig.config import replace_values
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.check.wirings import WIRINGS, differences
+from psd_deflection.studies.discover import discover, experiment, observation, planning, plants, readings, result
+from psd_deflection.studies.discover.experiment import ModelSums
+from psd_deflection.studies.discover.laws import law_features, laws
+from psd_deflection.studies.discover.laws.law_features import SOUGHT, Response
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.search import coincidence, localise, proposals, ties, trust, weighing
+from psd_deflection.studies.discover.search import fit as fits
+from psd_deflection.studies.discover.search import hold_out as validate
+from psd_deflection.studies.discover.search import screen as screens
+from psd_deflection.studies.discover.search import search as steps
+from psd_deflection.studies.discover.search import workspace as whitened
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.localise import dependences
+from psd_deflection.studies.discover.search.screen import Screen
+from psd_deflection.studies.discover.search.search import SearchResult
+from psd_deflection.studies.discover.search.signatures import Candidate
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup import cleaning, hidden, setup
+from psd_deflection.studies.discover.setup import noise as noises
 
 from .test_formulas import RIG, observed
 from .test_law_formulas import Given
@@ -201,7 +185,7 @@ def test_two_models_are_told_apart_by_what_no_sizes_of_one_explain() -> None:
     apart = slopes @ [3.0, 50.0] + rng.standard_normal(30)
     left = apart - slopes @ np.linalg.lstsq(slopes, apart, rcond=None)[0]
     pull = [[np.empty(0), slopes.T @ apart], [np.empty(0), np.zeros(2)]]
-    shown = Shown(np.full((2, 2), apart @ apart), pull, [np.empty((0, 0)), slopes.T @ slopes], 1.0)
+    shown = ModelSums(np.full((2, 2), apart @ apart), pull, [np.empty((0, 0)), slopes.T @ slopes], 1.0)
     assert shown.separation(0, 1, np.zeros((2, 2))) == pytest.approx(left @ left, rel=1e-6)
 
 
@@ -227,7 +211,7 @@ def test_a_term_that_is_explained_already_is_not_scored(rest: float, seen: bool)
         weight = np.zeros((n, rows, 2))
         weight[:, :, 0], weight[:, :, 1] = values[:, None], column[:, None]
         r = response(weight.reshape(n, -1), np.ones((n, rows)), values)
-        got = law_features.score([r], [Term('product', ('load_fx',))], ('y1',))
+        got = law_features.score([r], [LawTerm('product', ('load_fx',))], ('y1',))
         assert bool(got) == seen
         for s in got:
             assert s.gain == pytest.approx((values @ values) / rest, rel=1e-3)
@@ -569,11 +553,11 @@ def test_where_something_is_left_does_not_depend_on_the_units_of_what_is_fitted(
     assert [c.p for c in one.cells] == pytest.approx([c.p for c in other.cells])
 
 
-def law_with(*listed: Term) -> Law:
+def law_with(*listed: LawTerm) -> Law:
     return Law('law_static_dx', 'link', 'static_dx', listed)
 
 
-SWITCHED, STRAIGHT = Term('switched', (), 1e-6, times=(1.0, 2.0)), Term('product', ('dx',), 1e-6)
+SWITCHED, STRAIGHT = LawTerm('switched', (), 1e-6, times=(1.0, 2.0)), LawTerm('product', ('dx',), 1e-6)
 
 
 @pytest.mark.parametrize(
@@ -605,13 +589,13 @@ def test_a_time_moves_by_up_to_168_ms(monkeypatch: pytest.MonkeyPatch, sign: flo
     """Twice by up to 80 ms, and then by eight samples: the ends are tried too."""
     wanted = 1.0 + sign * 0.168
 
-    def score(found: object, tries: list[Term], targets: object) -> list[law_features.Scored]:
+    def score(found: object, tries: list[LawTerm], targets: object) -> list[law_features.Scored]:
         best = min(tries, key=lambda t: abs(t.times[0] - wanted))
         return [law_features.Scored('y1', best, 1.0)]
 
     monkeypatch.setattr(law_features, 'score', score)
     found = cast(list[Response], [SimpleNamespace(period=1e-3)])
-    got = law_features.with_better_times(found, 'y1', Term('switched', (), times=(1.0,)))
+    got = law_features.with_better_times(found, 'y1', LawTerm('switched', (), times=(1.0,)))
     assert got.times == pytest.approx((wanted,), abs=1e-9)
 
 

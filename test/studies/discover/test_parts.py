@@ -10,28 +10,32 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from psd_deflection.config import replace_values
-from psd_deflection.discovery import cleaning, experiment, laws, localise, planning, proposals, validate, weighing
-from psd_deflection.discovery import workspace as whitened
-from psd_deflection.discovery.coincidence import Coincidence
-from psd_deflection.discovery.comparison import Comparison
-from psd_deflection.discovery.experiment import Limits, Piece, Proposal, Setting, Shown
-from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.hidden import beginning, mistakes
-from psd_deflection.discovery.localise import Dependence
-from psd_deflection.discovery.noise import NoiseModel, _filled, _kept, _level, estimate_noise
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.screen import Screen
-from psd_deflection.discovery.search import SearchResult
-from psd_deflection.discovery.setup import likely_delays
-from psd_deflection.discovery.signatures import Candidate, SignatureBank, signatures_beside
-from psd_deflection.discovery.trust import energies
-from psd_deflection.discovery.validate import HeldOut
-from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.model.simulation.catalogue import make_active
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import make_active
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.rig.config import replace_values
+from psd_deflection.studies.discover import experiment, planning
+from psd_deflection.studies.discover.experiment import Limits, ModelSums, Piece, Proposal, Setting
+from psd_deflection.studies.discover.laws import laws
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.search import hold_out as validate
+from psd_deflection.studies.discover.search import localise, proposals, weighing
+from psd_deflection.studies.discover.search import workspace as whitened
+from psd_deflection.studies.discover.search.coincidence import Coincidence
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.hold_out import HeldOut
+from psd_deflection.studies.discover.search.localise import Dependence
+from psd_deflection.studies.discover.search.screen import Screen
+from psd_deflection.studies.discover.search.search import SearchResult
+from psd_deflection.studies.discover.search.signatures import Candidate, SignatureBank, signatures_beside
+from psd_deflection.studies.discover.search.trust import energies
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup import cleaning
+from psd_deflection.studies.discover.setup.hidden import beginning, mistakes
+from psd_deflection.studies.discover.setup.noise import NoiseModel, _filled, _kept, _level, estimate_noise
+from psd_deflection.studies.discover.setup.setup import likely_delays
 
 from .test_formulas import HISTORY, RIG, observed
 from .test_rules import CASES, FINE, SIGMA, Plant, active, columns, noise, nowhere, pictures, without_noise
@@ -744,9 +748,9 @@ def test_what_is_possible_is_what_the_longest_recording_shows(monkeypatch: pytes
     none = [[np.zeros(0)] * 3] * 3
     shows: list[FloatArray] = []
 
-    def shown(ws: object, models: object, setting: object, loads: FloatArray) -> Shown:
+    def shown(ws: object, models: object, setting: object, loads: FloatArray) -> ModelSums:
         shows.append(loads)
-        return Shown(apart * len(loads) / 3000.0, none, [np.zeros((0, 0))] * 3, len(loads) / 1000.0)
+        return ModelSums(apart * len(loads) / 3000.0, none, [np.zeros((0, 0))] * 3, len(loads) / 1000.0)
 
     monkeypatch.setattr(planning, 'proposals', lambda *_: offered)
     monkeypatch.setattr(planning, 'shown', shown)

@@ -13,21 +13,21 @@ import numpy as np
 import pytest
 
 from blind.next import table
+from psd_deflection.base.errors import UsageError
 from psd_deflection.cli._next import limits_from_words, plan_table, write_plan
 from psd_deflection.cli.main import main
-from psd_deflection.config import Rig, load_rig, replace_values
-from psd_deflection.discovery import loop
-from psd_deflection.discovery.experiment import Limits, Setting, pieces, proposals, settings, shown
-from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.planning import TELLS_APART, Plan, plan_next
-from psd_deflection.discovery.workspace import Workspace
-from psd_deflection.errors import UsageError
-from psd_deflection.recordings.observations import read_observations
-from psd_deflection.simulation import loads
-from psd_deflection.simulation.catalogue import make_active
-from psd_deflection.simulation.load_words import load_history
-from psd_deflection.simulation.simulator import ForwardModel, RigSimulator
+from psd_deflection.model.simulation import loads
+from psd_deflection.model.simulation.catalogue import make_active
+from psd_deflection.model.simulation.load_words import load_history
+from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
+from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.studies.discover import loop
+from psd_deflection.studies.discover.experiment import Limits, Setting, pieces, proposals, settings, shown
+from psd_deflection.studies.discover.from_recordings import read_observations
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.planning import TELLS_APART, Plan, plan_next
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.workspace import Workspace
 
 RIG = load_rig()
 EI = make_active('bending_stiffness', {'scale': -0.002, 'moves_frequency': 0}, 'test')

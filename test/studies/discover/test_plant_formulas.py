@@ -15,14 +15,14 @@ from scipy.stats import chi2 as chi2_law
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from psd_deflection.discovery import plants
-from psd_deflection.discovery.fit import refit
-from psd_deflection.discovery.plants import Model, Plant, PlantComparison, discover_in, plant_effect
-from psd_deflection.discovery.result import sentence
-from psd_deflection.errors import ConfigError
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter
+from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter
-from psd_deflection.simulation.physics import Physics
+from psd_deflection.studies.discover import plants
+from psd_deflection.studies.discover.plants import Model, Plant, PlantComparison, discover_in, plant_effect
+from psd_deflection.studies.discover.result import sentence
+from psd_deflection.studies.discover.search.fit import refit
 
 LENGTHS = (10, 7, 13)
 

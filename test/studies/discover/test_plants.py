@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import psd_deflection
-from psd_deflection.discovery.plants import Model, Plant, PlantComparison, plant_effect
-from psd_deflection.discovery.report import report_html
-from psd_deflection.discovery.result import result, sentence
-from psd_deflection.errors import ConfigError
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import Effect, EffectParameter
+from psd_deflection.studies.discover.plants import Model, Plant, PlantComparison, plant_effect
+from psd_deflection.studies.discover.report import report_html
+from psd_deflection.studies.discover.result import result, sentence
 
 STIFFNESS = plant_effect('stiffness', EffectParameter('scale', '', -0.9, 9.0, 0.1, 'of k'))
 CUBIC = plant_effect('cubic', EffectParameter('c', 'N/mm^3', -9.0, 9.0, 0.1, 'of u^3'), equation='F += c u^3')

@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.cli.main import main
-from psd_deflection.config import load_rig, replace_values
-from psd_deflection.discovery.plants import discover_in
-from psd_deflection.discovery.readings import CHANNELS, Readings, ReadingsPlant
-from psd_deflection.errors import ConfigError, RecordingError
-from psd_deflection.recordings.observations import read_tables
-from psd_deflection.recordings.readings_table import is_table
+from psd_deflection.model.simulation.catalogue import make_active
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.recordings.read.readings_table import is_table
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.catalogue import make_active
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.rig.config import load_rig, replace_values
+from psd_deflection.studies.discover.from_recordings import read_tables
+from psd_deflection.studies.discover.plants import discover_in
+from psd_deflection.studies.discover.readings import CHANNELS, Readings, ReadingsPlant
 
 RIG = load_rig()
 LOADS = np.array(

@@ -16,11 +16,19 @@ import numpy as np
 import pytest
 from scipy.stats import chi2 as chi2_law
 
-from psd_deflection.config import load_rig
-from psd_deflection.discovery import experiment, planning
-from psd_deflection.discovery.coincidence import coincidences
-from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.localise import (
+from psd_deflection.model.simulation import loads
+from psd_deflection.model.simulation.catalogue import make_active
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.discover import experiment, planning
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.search.coincidence import coincidences
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.hold_out import HeldOut, heldout_gain, heldout_gap, heldout_residual
+from psd_deflection.studies.discover.search.localise import (
     Dependence,
     Localisation,
     _energies,
@@ -29,20 +37,18 @@ from psd_deflection.discovery.localise import (
     localise,
     regressors,
 )
-from psd_deflection.discovery.noise import NoiseModel, _ar_density, _block_autocovariance, _level, estimate_noise
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.screen import Screen
-from psd_deflection.discovery.search import Search, SearchResult
-from psd_deflection.discovery.signatures import Candidate
-from psd_deflection.discovery.validate import HeldOut, heldout_gain, heldout_gap, heldout_residual
-from psd_deflection.discovery.weighing import accept, credible, named_effects, tied, unknown_of
-from psd_deflection.discovery.workspace import Workspace, fine_means
-from psd_deflection.records import FloatArray
-from psd_deflection.simulation import loads
-from psd_deflection.simulation.catalogue import make_active
-from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.studies.discover.search.screen import Screen
+from psd_deflection.studies.discover.search.search import Search, SearchResult
+from psd_deflection.studies.discover.search.signatures import Candidate
+from psd_deflection.studies.discover.search.weighing import accept, credible, named_effects, tied, unknown_of
+from psd_deflection.studies.discover.search.workspace import Workspace, fine_means
+from psd_deflection.studies.discover.setup.noise import (
+    NoiseModel,
+    _ar_density,
+    _block_autocovariance,
+    _level,
+    estimate_noise,
+)
 
 RIG = load_rig()
 SIGMA = 1e-3

@@ -12,22 +12,23 @@ import numpy as np
 import pytest
 from scipy.stats import chi2 as chi2_law
 
-from psd_deflection.calibration import Wiring
-from psd_deflection.discovery import law_features, laws, setup
-from psd_deflection.discovery import search as steps
-from psd_deflection.discovery.coincidence import coincidences
-from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.law_features import Response, Scored
-from psd_deflection.discovery.screen import Score, Screen
-from psd_deflection.discovery.search import Search
-from psd_deflection.discovery.signatures import Candidate
-from psd_deflection.discovery.validate import HeldOut
-from psd_deflection.discovery.weighing import accept, named_effects
-from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter
+from psd_deflection.model.simulation.laws import Law, LawTerm, effect_of, values_of
+from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter
-from psd_deflection.simulation.laws import Law, Term, effect_of, values_of
-from psd_deflection.simulation.physics import Physics
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.discover.laws import law_features, laws
+from psd_deflection.studies.discover.laws.law_features import Response, Scored
+from psd_deflection.studies.discover.search import search as steps
+from psd_deflection.studies.discover.search.coincidence import coincidences
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.hold_out import HeldOut
+from psd_deflection.studies.discover.search.screen import Score, Screen
+from psd_deflection.studies.discover.search.search import Search
+from psd_deflection.studies.discover.search.signatures import Candidate
+from psd_deflection.studies.discover.search.weighing import accept, named_effects
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup import setup
 
 from .test_formulas import RIG, observed
 from .test_rules import SIGMA, N, Plant, active, candidate, effect, noise, pictures, result_of, search_of, without_noise
@@ -318,8 +319,8 @@ def trial(law: Law, chi2: float, cost: float, parameters: int = 1, *beside: Acti
     return laws._Trial((law,), cast(Fit, fit), cost)
 
 
-BUMP = Law('law_y2', 'psd', 'y2', (Term('switched', (), 1e-6, times=(1.0, 2.0)),))
-STRAIGHT = Law('law_y2', 'psd', 'y2', (Term('product', ('load_fx',), 1e-6),))
+BUMP = Law('law_y2', 'psd', 'y2', (LawTerm('switched', (), 1e-6, times=(1.0, 2.0)),))
+STRAIGHT = Law('law_y2', 'psd', 'y2', (LawTerm('product', ('load_fx',), 1e-6),))
 
 
 @pytest.mark.parametrize(
@@ -439,25 +440,25 @@ def test_a_switched_law_gets_the_times_that_show_beside_it(monkeypatch: pytest.M
             return trial(listed[0], 1.0, 10.0 * len(listed[0].terms[0].times))
 
     offered = [
-        Term('switched', (), times=(2.0, 3.0, 4.0)),
-        Term('switched', ('y1',), times=(5.0,)),
-        Term('switched', (), times=(1.0, 2.0)),
-        Term('switched', (), times=(7.0,)),
+        LawTerm('switched', (), times=(2.0, 3.0, 4.0)),
+        LawTerm('switched', ('y1',), times=(5.0,)),
+        LawTerm('switched', (), times=(1.0, 2.0)),
+        LawTerm('switched', (), times=(7.0,)),
     ]
     targets: list[tuple[str, ...]] = []
 
-    def switchings(left: object, on: tuple[str, ...]) -> list[Term]:
+    def switchings(left: object, on: tuple[str, ...]) -> list[LawTerm]:
         targets.append(on)
         return offered
 
-    def better(found: object, on: str, term: Term) -> Term:
+    def better(found: object, on: str, term: LawTerm) -> LawTerm:
         assert (found, on) == ('found', law.acts_on)
         return dataclasses.replace(term, times=tuple(t + 0.5 for t in term.times))
 
     monkeypatch.setattr(laws, 'switchings', switchings)
     monkeypatch.setattr(laws, 'with_better_times', better)
-    second = Term('product', ('dx',), 1e-6)
-    law = Law('law_static_dx', 'link', 'static_dx', (Term('switched', (), 1e-6, times=(1.0, 2.0)), second))
+    second = LawTerm('product', ('dx',), 1e-6)
+    law = Law('law_static_dx', 'link', 'static_dx', (LawTerm('switched', (), 1e-6, times=(1.0, 2.0)), second))
     got = Seeker()._switched_again(trial(law, 1.0, 35.0), [])
     times = [(1.5, 3.5, 4.5), (1.5, 2.5, 7.5)]
     assert [(a.terms[0].times, n) for a, n in asked] == [(t, 4) for t in times]
@@ -512,14 +513,14 @@ def test_of_terms_with_times_the_best_four_are_improved(monkeypatch: pytest.Monk
         assert (weight == v * v).all()
         return list(range(1, next(counts) + 1))
 
-    def score(found: object, listed: Sequence[Term], targets: Sequence[str]) -> list[Scored]:
+    def score(found: object, listed: Sequence[LawTerm], targets: Sequence[str]) -> list[Scored]:
         (term,) = listed
         asked.append((term.form, term.of, term.times, tuple(targets)))
         return [Scored(targets[0], term, float(len(term.times)))]
 
     better: list[int] = []
 
-    def with_better(found: object, target: str, term: Term) -> Term:
+    def with_better(found: object, target: str, term: LawTerm) -> LawTerm:
         better.append(len(term.times))
         return term
 
@@ -846,7 +847,7 @@ def test_limits_themselves_do_not_pass(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_further_terms_are_those_without_times(monkeypatch: pytest.MonkeyPatch) -> None:
     """The times that show beside a law are looked for anew."""
-    offered: list[Sequence[Term]] = []
+    offered: list[Sequence[LawTerm]] = []
     straight, bump = STRAIGHT.terms[0], BUMP.terms[0]
 
     class Seeker(laws._Seeker):
@@ -858,7 +859,7 @@ def test_further_terms_are_those_without_times(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(laws, 'responses', lambda ws, fit: fit)
 
-    def score(more: object, listed: Sequence[Term]) -> list[Scored]:
+    def score(more: object, listed: Sequence[LawTerm]) -> list[Scored]:
         offered.append(listed)
         return []
 

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.config import Rig, load_rig, replace_values
-from psd_deflection.discovery.cleaning import clean, outliers, stuck
-from psd_deflection.discovery.discover import Discovery, discover
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.result import result, sentence
-from psd_deflection.discovery.setup import likely_delays, likely_jumps, wire
-from psd_deflection.discovery.workspace import Workspace
-from psd_deflection.recordings.observations import read_observation
+from psd_deflection.model.simulation import loads
+from psd_deflection.model.simulation.catalogue import effect_names
+from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation import loads
-from psd_deflection.simulation.catalogue import effect_names
-from psd_deflection.simulation.simulator import RigSimulator
+from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.studies.discover.discover import Discovery, discover
+from psd_deflection.studies.discover.from_recordings import read_observation
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.result import result, sentence
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.cleaning import clean, outliers, stuck
+from psd_deflection.studies.discover.setup.setup import likely_delays, likely_jumps, wire
 
 RIG = load_rig()
 PUSHES = [(0.0, -40.0, -15.0), (0.0, -40.0, 0.0), (25.0, 0.0, 0.0), (0.0, 15.0, 20.0)]

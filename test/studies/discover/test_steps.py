@@ -13,25 +13,25 @@ import pytest
 from scipy.stats import chi2 as chi2_law
 from scipy.stats import norm
 
-from psd_deflection.calibration import Wiring
-from psd_deflection.discovery import planning
-from psd_deflection.discovery import search as steps
-from psd_deflection.discovery.coincidence import coincidences
-from psd_deflection.discovery.experiment import Limits, Piece, Proposal, Setting, Shown
-from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.localise import Dependence, dependences, localise, regressors
-from psd_deflection.discovery.proposals import coarse_step
-from psd_deflection.discovery.screen import Screen
-from psd_deflection.discovery.search import Search
-from psd_deflection.discovery.setup import _changes, _movement, _noise_energy, _sizes, _words, wire
-from psd_deflection.discovery.signatures import Candidate
-from psd_deflection.discovery.validate import HeldOut
-from psd_deflection.discovery.weighing import named_effects
-from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.model.simulation.declaration import ActiveEffect, EffectParameter
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import CHANNELS, FloatArray
-from psd_deflection.simulation.declaration import ActiveEffect, EffectParameter
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.discover import planning
+from psd_deflection.studies.discover.experiment import Limits, ModelSums, Piece, Proposal, Setting
+from psd_deflection.studies.discover.search import search as steps
+from psd_deflection.studies.discover.search.coincidence import coincidences
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.hold_out import HeldOut
+from psd_deflection.studies.discover.search.localise import Dependence, dependences, localise, regressors
+from psd_deflection.studies.discover.search.proposals import coarse_step
+from psd_deflection.studies.discover.search.screen import Screen
+from psd_deflection.studies.discover.search.search import Search
+from psd_deflection.studies.discover.search.signatures import Candidate
+from psd_deflection.studies.discover.search.weighing import named_effects
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.setup import _changes, _movement, _noise_energy, _sizes, _words, wire
 
 from .test_formulas import RIG, observed
 from .test_rules import CASES, FINE, SIGMA, Pictures, Plant, active, candidate, columns, noise, pictures, without_noise
@@ -276,7 +276,7 @@ def test_cells_are_normal_deviates_of_their_energy(explains: bool) -> None:
 
 def test_the_chance_of_the_greatest_cell_is_that_of_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of noise alone it is anything between 0 and 1; what the model has fitted is taken off the noise too."""
-    monkeypatch.setattr('psd_deflection.discovery.localise.dependences', lambda *_: [])
+    monkeypatch.setattr('psd_deflection.studies.discover.search.localise.dependences', lambda *_: [])
     plant = Plant({}, noise())
     chances = [
         localise(plant, noise(20 + k).ravel() / SIGMA, None, np.random.default_rng(k)).cells[0].p for k in range(6)
@@ -300,7 +300,7 @@ def test_what_a_channel_follows_is_named_where_it_is_slow(monkeypatch: pytest.Mo
         Dependence('x2', 'time', 60.0, 1e-9),
         Dependence('y1', 'time^2', 50.0, 0.01),
     ]
-    monkeypatch.setattr('psd_deflection.discovery.localise.dependences', lambda *_: depends)
+    monkeypatch.setattr('psd_deflection.studies.discover.search.localise.dependences', lambda *_: depends)
     residual = noise(6) / SIGMA
     t = np.arange(50) * 0.004
     residual[3, 150:200] += 2.5 * np.sin(2 * np.pi * 20.0 * t) + 2.5 * np.sin(2 * np.pi * 80.0 * t)
@@ -542,7 +542,7 @@ def test_of_recordings_of_the_same_value_the_easier_one_is_planned(
     apart = np.array([[0.0, 40.0], [30.0, 0.0]])
     none = [[np.zeros(0)] * 2] * 2
     monkeypatch.setattr(planning, 'proposals', lambda *_: offered)
-    monkeypatch.setattr(planning, 'shown', lambda *_: Shown(apart, none, [np.zeros((0, 0))] * 2, 3.0))
+    monkeypatch.setattr(planning, 'shown', lambda *_: ModelSums(apart, none, [np.zeros((0, 0))] * 2, 3.0))
     fits = [
         cast(Fit, SimpleNamespace(jacobian=np.zeros((5, 0)), free=(), effects=(active(name, x=0.1),))) for name in 'ab'
     ]

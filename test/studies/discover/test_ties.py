@@ -7,13 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from psd_deflection.discovery.coincidence import coincidences
-from psd_deflection.discovery.fit import Fit
-from psd_deflection.discovery.ties import CommonCause, Tie, ties
-from psd_deflection.discovery.validate import HeldOut
-from psd_deflection.discovery.weighing import NamedEffect, Rival
-from psd_deflection.simulation.catalogue import make_active
-from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.catalogue import make_active
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.studies.discover.search.coincidence import coincidences
+from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.search.hold_out import HeldOut
+from psd_deflection.studies.discover.search.ties import CommonCause, Tie, ties
+from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival
 
 FIT = Fit((), 0.0, np.zeros(1), [], np.zeros((1, 0)), (), ())
 

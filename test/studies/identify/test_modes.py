@@ -9,8 +9,8 @@ import pytest
 from scipy.signal import lsim
 
 from blind.modes import RATE, Link, bound, driven, rung, scored
-from psd_deflection.identification.modes import modes_of
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.identify.modes import modes_of
 
 
 @pytest.mark.statistics

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.thesis.comparison import CAUSES, CONDITIONS, Method, errors, methods, table_5_1
+from psd_deflection.studies.thesis.comparison import CAUSES, CONDITIONS, Method, errors, methods, table_5_1
 
 Cell = tuple[float, float, float]
 

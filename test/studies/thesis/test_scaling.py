@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from psd_deflection.mechanics.section import TubeSection
-from psd_deflection.thesis.scaling import (
+from psd_deflection.model.link.section import TubeSection
+from psd_deflection.studies.thesis.scaling import (
     BASE_SECTION,
     COLUMNS,
     ERRATA_B1,
@@ -29,7 +29,7 @@ from psd_deflection.thesis.scaling import (
 )
 
 CONSTANTS: dict[str, Any] = json.loads(
-    (Path(__file__).parents[1] / 'data' / 'golden.json').read_text(encoding='utf-8')
+    (Path(__file__).parents[2] / 'data' / 'golden.json').read_text(encoding='utf-8')
 )['constants']
 CASES = table_b1_cases()
 

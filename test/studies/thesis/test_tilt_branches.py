@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from psd_deflection.errors import SolverError
-from psd_deflection.geometry import Geometry
-from psd_deflection.geometry.layout import check_twist
+from psd_deflection.base.errors import SolverError
+from psd_deflection.model.plate import Geometry
+from psd_deflection.model.plate.layout import check_twist
 
 
 class TiltBranch(NamedTuple):

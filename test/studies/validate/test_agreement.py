@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.validation.agreement import agreement
+from psd_deflection.studies.validate.agreement import agreement
 
 
 def test_bias_scale_and_noise_are_told_apart() -> None:

@@ -8,9 +8,9 @@ import pytest
 from blind.clock import Seen, dots, scored, seen, truth
 from blind.clock import motion_of as motion_of_samples
 from blind.generator import Array
-from psd_deflection.errors import RecordingError
-from psd_deflection.validation.clock import Offset, clock_offset
-from psd_deflection.validation.motion import Motion
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.studies.validate.clock import Offset, clock_offset
+from psd_deflection.studies.validate.motion import Motion
 
 
 def motion_of(run: Seen, kept: Array | None = None) -> Motion:

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.samples import SimulatedSamples
+from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.samples import SimulatedSamples
 
 
 def _on_the_detector(axis: int) -> Callable[[Physics, Values], tuple[float, float]]:

@@ -7,10 +7,10 @@ import math
 import numpy as np
 from scipy.signal import lfilter
 
+from psd_deflection.model.simulation.declaration import Effect, EffectParameter, State, Values
+from psd_deflection.model.simulation.modes import LAG_NODES, lag_weights
+from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
-from psd_deflection.simulation.modes import LAG_NODES, lag_weights
-from psd_deflection.simulation.samples import SimulatedSamples
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtr
 
+from psd_deflection.model.simulation.declaration import Effect, EffectParameter, State, Values
+from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray, dot_channels
-from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
-from psd_deflection.simulation.samples import SimulatedSamples
 
 
 def _excess(v: FloatArray, sigma: float) -> FloatArray:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
-from psd_deflection.simulation.samples import SimulatedSamples
+from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
+from psd_deflection.model.simulation.samples import SimulatedSamples
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:

@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, State, Values
-from psd_deflection.simulation.samples import SimulatedSamples
+from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, State, Values
+from psd_deflection.model.simulation.samples import SimulatedSamples
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
-from psd_deflection.simulation.hysteresis import play
-from psd_deflection.simulation.samples import SimulatedSamples
+from psd_deflection.model.simulation.declaration import Effect, EffectParameter, State, Traced, Values
+from psd_deflection.model.simulation.hysteresis import play
+from psd_deflection.model.simulation.samples import SimulatedSamples
 
 _REST_BLOCKS = 12
 """Blocks in which the link is at rest if it has not moved by more than a quarter of the loop."""

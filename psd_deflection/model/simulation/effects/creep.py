@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
-from psd_deflection.simulation.modes import Filter, held_lag_coefficients
-from psd_deflection.simulation.samples import SimulatedSamples
+from psd_deflection.model.simulation.declaration import Effect, EffectParameter, State, Traced, Values
+from psd_deflection.model.simulation.modes import Filter, held_lag_coefficients
+from psd_deflection.model.simulation.samples import SimulatedSamples
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:

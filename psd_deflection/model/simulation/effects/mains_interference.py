@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from psd_deflection.model.simulation.declaration import Effect, EffectParameter, State, Values
+from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import CHANNELS
-from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
-from psd_deflection.simulation.samples import SimulatedSamples
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:

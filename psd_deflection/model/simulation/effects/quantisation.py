@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 
+from psd_deflection.model.simulation.declaration import Effect, EffectParameter, State, Values
+from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Values
-from psd_deflection.simulation.samples import SimulatedSamples
 
 
 def _rounded(volts: FloatArray, noise: float, step: float) -> FloatArray:

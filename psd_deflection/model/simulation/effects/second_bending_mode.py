@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.declaration import Effect, EffectParameter, State, Traced, Values
-from psd_deflection.simulation.modes import Filter, mode_coefficients
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.samples import SimulatedSamples
+from psd_deflection.model.simulation.declaration import Effect, EffectParameter, State, Traced, Values
+from psd_deflection.model.simulation.modes import Filter, mode_coefficients
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.samples import SimulatedSamples
 
 HIGHER = 1.6
 """Smallest ratio to the first mode's frequency: a closer second mode would only mimic the first."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from psd_deflection.arithmetic import Arithmetic
+from psd_deflection.base.arithmetic import Arithmetic
+from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
+from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
-from psd_deflection.simulation.samples import SimulatedSamples
 
 
 def _turn(dots: FloatArray, psd: float, angle: float, by: Arithmetic) -> None:

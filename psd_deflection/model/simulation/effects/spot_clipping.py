@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtr
 
+from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, State, Values
+from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import PSD, Effect, EffectParameter, State, Values
-from psd_deflection.simulation.samples import SimulatedSamples
 
 
 def _cut_disc(distance: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from psd_deflection.simulation.declaration import Effect, EffectParameter, Values
-from psd_deflection.simulation.physics import Physics
+from psd_deflection.model.simulation.declaration import Effect, EffectParameter, Values
+from psd_deflection.model.simulation.physics import Physics
 
 
 def _configure(physics: Physics, values: Values) -> None:

@@ -16,17 +16,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from psd_deflection.discovery.fit import Fit
-from psd_deflection.discovery.hidden import only_in
-from psd_deflection.discovery.workspace import Workspace, fine_means
+from psd_deflection.model.simulation.catalogue import sort_effects
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.laws import FORMS, TARGETS, VARIABLES, LawTerm, known
+from psd_deflection.model.simulation.modes import mode_coefficients
+from psd_deflection.model.simulation.optics import dots_on_plate
+from psd_deflection.model.simulation.samples import SimulatedSamples
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
-from psd_deflection.simulation.catalogue import sort_effects
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.laws import FORMS, TARGETS, VARIABLES, Term, known
-from psd_deflection.simulation.modes import mode_coefficients
-from psd_deflection.simulation.optics import dots_on_plate
-from psd_deflection.simulation.samples import SimulatedSamples
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.search.workspace import Workspace, fine_means
+from psd_deflection.studies.discover.setup.hidden import only_in
 
 LOADS, POSE, DOTS = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta'), ('x1', 'y1', 'x2', 'y2')
 SOUGHT = (*(f'static_{n}' for n in POSE), *POSE, *DOTS, 'sum1', 'sum2')
@@ -159,7 +159,7 @@ def _levels(parts: Sequence[FloatArray], count: int) -> list[float]:
     return [low + (high - low) * (k + 0.5) / count for k in range(count)]
 
 
-def terms(found: Sequence[Response]) -> Iterator[Term]:
+def terms(found: Sequence[Response]) -> Iterator[LawTerm]:
     """Every term that is tried, with a grid for its shapes; variables that never change are left out."""
     parts = {name: [r.known[name] for r in found] for name in VARIABLES}
     size = {name: _spread(values) for name, values in parts.items()}
@@ -168,43 +168,43 @@ def terms(found: Sequence[Response]) -> Iterator[Term]:
     for k in (1, 2, 3):
         for several in itertools.combinations_with_replacement(moving, k):
             if k < 3 or len(set(several)) == 1:
-                yield Term('product', several)
+                yield LawTerm('product', several)
     for name in placed:
-        yield Term('absolute', (name,))
-        yield Term('signed_square', (name,))
+        yield LawTerm('absolute', (name,))
+        yield LawTerm('signed_square', (name,))
         levels = _levels(parts[name], 8)
         for level in levels:
-            yield Term('above', (name,), shapes={'threshold': level})
-            yield Term('below', (name,), shapes={'threshold': level})
+            yield LawTerm('above', (name,), shapes={'threshold': level})
+            yield LawTerm('below', (name,), shapes={'threshold': level})
         for share in (0.05, 0.15, 0.3, 0.5, 0.7):
-            yield Term('beyond', (name,), shapes={'threshold': share * size[name]})
-            yield Term('within', (name,), shapes={'threshold': share * size[name]})
+            yield LawTerm('beyond', (name,), shapes={'threshold': share * size[name]})
+            yield LawTerm('within', (name,), shapes={'threshold': share * size[name]})
         # Held loads take few values, and any threshold between two of them is the same.
         distinct = np.unique(np.concatenate(parts[name]))
         few = [0.5 * (a + b) for a, b in itertools.pairwise(distinct.tolist())] if len(distinct) <= LEVELS else []
         for level in few or _levels(parts[name], LEVELS):
-            yield Term('over', (name,), shapes={'threshold': level})
-            yield Term('under', (name,), shapes={'threshold': level})
+            yield LawTerm('over', (name,), shapes={'threshold': level})
+            yield LawTerm('under', (name,), shapes={'threshold': level})
     for name in placed:
         if name not in LOADS:
-            yield Term('rate', (name,))
-            yield Term('rate_absolute', (name,))
-            yield Term('drag', (name,))
+            yield LawTerm('rate', (name,))
+            yield LawTerm('rate_absolute', (name,))
+            yield LawTerm('drag', (name,))
         if name in LOADS or name in POSE:
-            yield Term('direction', (name,))
+            yield LawTerm('direction', (name,))
         for share in (0.02, 0.1, 0.3):
-            yield Term('play', (name,), shapes={'half_width': share * size[name]})
+            yield LawTerm('play', (name,), shapes={'half_width': share * size[name]})
         for tau in (0.02, 0.1, 0.3, 1.0, 3.0, 10.0):
-            yield Term('relaxed', (name,), shapes={'tau': tau})
-            yield Term('relaxed', (name, name), shapes={'tau': tau})
+            yield LawTerm('relaxed', (name,), shapes={'tau': tau})
+            yield LawTerm('relaxed', (name, name), shapes={'tau': tau})
         if name in DOTS or name in POSE:
             for share in (0.2, 0.3, 0.45, 0.7, 1.0, 1.5):
                 for phase in (0.0, 0.5 * math.pi):
-                    yield Term('wave', (name,), shapes={'period': share * size[name], 'phase': phase})
+                    yield LawTerm('wave', (name,), shapes={'period': share * size[name], 'phase': phase})
     for name in LOADS:
         if name in moving:
             for f in np.geomspace(2.0, 180.0, 48).tolist():
-                yield Term('resonance', (name,), shapes={'natural_frequency': f, 'zeta': 0.04})
+                yield LawTerm('resonance', (name,), shapes={'natural_frequency': f, 'zeta': 0.04})
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,11 +212,11 @@ class Scored:
     """A term with its coefficient to first order, and its gain in chi-square."""
 
     target: str
-    term: Term
+    term: LawTerm
     gain: float
 
 
-def allowed(target: str, term: Term) -> bool:
+def allowed(target: str, term: LawTerm) -> bool:
     """Whether the term's variables are known where it acts."""
     return all(v in TARGETS[target].variables for v in term.depends_on)
 
@@ -234,7 +234,7 @@ def _through(r: Response, way: int, row: FloatArray) -> FloatArray:
     return row if way == 0 else np.asarray(lfilter(*r.modes[way - 1], row))
 
 
-def score(found: Sequence[Response], listed: Sequence[Term], targets: Sequence[str] = SOUGHT) -> list[Scored]:
+def score(found: Sequence[Response], listed: Sequence[LawTerm], targets: Sequence[str] = SOUGHT) -> list[Scored]:
     """Each term on each target, the best first."""
     out: list[Scored] = []
     count, k = len(SOUGHT), found[0].weight.shape[1] // len(SOUGHT)
@@ -262,7 +262,7 @@ def score(found: Sequence[Response], listed: Sequence[Term], targets: Sequence[s
                 g, across = totals[way, i, t, 0], totals[way, i, t, 1:]
                 f = lengths[way, i, t] - float(across @ across)
                 if f > 1e-6 * lengths[way, i, t] > 0.0:
-                    guess = Term(term.form, term.of, float(g / f), term.shapes, term.times)
+                    guess = LawTerm(term.form, term.of, float(g / f), term.shapes, term.times)
                     out.append(Scored(name, guess, float(g * g / f)))
     out.sort(key=lambda s: -s.gain)
     return out
@@ -275,7 +275,7 @@ TOGGLE_COST = 24.0
 """Chi-square that each switching must gain: twice the logarithm of the blocks of a recording, and some more."""
 
 
-def switchings(found: Sequence[Response], targets: Sequence[str] = SOUGHT) -> list[Term]:
+def switchings(found: Sequence[Response], targets: Sequence[str] = SOUGHT) -> list[LawTerm]:
     """Terms that are on between times which the residual of the only recording shows.
 
     The states are the likeliest of two levels, 0 and A (Viterbi's algorithm), with A fitted in turn. What the link
@@ -293,7 +293,7 @@ def switchings(found: Sequence[Response], targets: Sequence[str] = SOUGHT) -> li
             error = _averaged(r.error[t], r.rings[int(name == 'theta')]) if on_link else r.error[t]
             times = _two_levels(error, r.power[t] * v * v, v)
             if 0 < len(times) <= MOST_TIMES:
-                term = Term('switched', of, times=tuple(float(k * r.fine * r.period) for k in times))
+                term = LawTerm('switched', of, times=tuple(float(k * r.fine * r.period) for k in times))
                 places = (name, f'static_{name}') if on_link else (name,)
                 seen += score(found, [term], places)
     seen.sort(key=lambda s: -s.gain)
@@ -308,7 +308,7 @@ def _averaged(values: FloatArray, blocks: int) -> FloatArray:
     return np.asarray(np.convolve(values, np.ones(blocks) / blocks, mode='same'))
 
 
-def with_better_times(found: Sequence[Response], target: str, term: Term) -> Term:
+def with_better_times(found: Sequence[Response], target: str, term: LawTerm) -> LawTerm:
     """Each time moved to where the term explains most on ``target``: by up to 0.08 s, then to a sample."""
     step = found[0].period
     for reach, pitch in ((0.08, 8.0 * step), (0.08, 8.0 * step), (8.0 * step, step)):
@@ -318,10 +318,10 @@ def with_better_times(found: Sequence[Response], target: str, term: Term) -> Ter
                 times = [*term.times]
                 times[k] = round(times[k] + shift, 9)
                 if times == sorted(set(times)):
-                    tries.append(Term(term.form, term.of, times=tuple(times)))
+                    tries.append(LawTerm(term.form, term.of, times=tuple(times)))
             best = score(found, tries, (target,))
             if best:
-                term = Term(term.form, term.of, times=best[0].term.times)
+                term = LawTerm(term.form, term.of, times=best[0].term.times)
     return term
 
 

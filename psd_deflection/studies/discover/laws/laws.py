@@ -16,8 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2 as chi2_law
 
-from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.law_features import (
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.laws import FORMS, TARGETS, VARIABLES, Law, LawTerm, effect_of, values_of
+from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.studies.discover.laws.law_features import (
     DOTS,
     LOADS,
     POSE,
@@ -32,12 +34,10 @@ from psd_deflection.discovery.law_features import (
     with_better_level,
     with_better_times,
 )
-from psd_deflection.discovery.search import BIC_ACCEPT, P_ACCEPT
-from psd_deflection.discovery.validate import HeldOut, heldout_gain, heldout_gap
-from psd_deflection.discovery.workspace import Workspace
-from psd_deflection.records import CHANNELS, FloatArray
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.laws import FORMS, TARGETS, VARIABLES, Law, Term, effect_of, values_of
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.hold_out import HeldOut, heldout_gain, heldout_gap
+from psd_deflection.studies.discover.search.search import BIC_ACCEPT, P_ACCEPT
+from psd_deflection.studies.discover.search.workspace import Workspace
 
 TRIED = 12
 """Terms that are refitted in the simulation for the first place."""
@@ -109,7 +109,7 @@ class _Trial:
         return tuple(dict.fromkeys(v for law in self.laws for v in law.variables))
 
 
-def _on(target: str, *listed: Term) -> Law:
+def _on(target: str, *listed: LawTerm) -> Law:
     return Law(f'law_{target}', TARGETS[target].stage, target, listed)
 
 
@@ -225,7 +225,7 @@ class _Seeker:
         for more in switchings(left, (law.acts_on.removeprefix('static_'),)):
             times = tuple(sorted({*term.times} ^ {*more.times}))
             if more.of == term.of and times:
-                better = with_better_times(self.found, law.acts_on, Term(term.form, term.of, times=times))
+                better = with_better_times(self.found, law.acts_on, LawTerm(term.form, term.of, times=times))
                 both = dataclasses.replace(term, times=better.times)
                 now = dataclasses.replace(law, terms=(both, *law.terms[1:]))
                 best = min(best, self.trial([now], trial.beside, 4), key=lambda t: t.cost)
@@ -390,7 +390,7 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
         scale *= float(ws.physics.sensitivity.ravel()[DOTS.index(channel)])
     coefficient = math.sqrt(slope) * scale
     # The curvature of the likelihood of a single parameter, to first order.
-    term = Term('jitter', (name,), coefficient, sd={'coefficient': coefficient / math.sqrt(gain)})
+    term = LawTerm('jitter', (name,), coefficient, sd={'coefficient': coefficient / math.sqrt(gain)})
     law = Law(f'law_{channel}', 'electronics', channel, (term,))
     # What this noise adds to block means is no gap any more.
     added = sum(float(np.sum((coefficient * v) ** 2)) for v in known[name]) / sum(len(v) for v in known[name])

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.discovery.fit import Fit
+from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.physics import Physics
+from psd_deflection.studies.discover.search.fit import Fit
 
 DECADES = 2.0
 """Range over which the ratio of two independent sizes is spread."""

@@ -1,8 +1,8 @@
 """Measured against simulated, as whitened vectors of one likelihood: what the search asks of a rig or of another plant.
 
-:class:`~psd_deflection.discovery.workspace.Workspace` is the rig with its recordings,
-:class:`~psd_deflection.discovery.plants.PlantComparison` any machine that simulates itself. Search, refit, hold-out and
-verdict know neither.
+:class:`~psd_deflection.studies.discover.search.workspace.Workspace` is the rig with its recordings,
+:class:`~psd_deflection.studies.discover.plants.PlantComparison` any machine that simulates itself. Search, refit,
+hold-out and verdict know neither.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.physics import Physics
 
 
 class Comparison(ABC):

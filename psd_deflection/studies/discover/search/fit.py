@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.discovery.comparison import Comparison
+from psd_deflection.model.simulation.declaration import ActiveEffect, EffectParameter
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import ActiveEffect, EffectParameter
+from psd_deflection.studies.discover.search.comparison import Comparison
 
 STEP = 0.05
 """Step of the finite difference, in units of the parameter's scale."""

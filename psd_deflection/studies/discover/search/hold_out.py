@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.discovery.comparison import Comparison
-from psd_deflection.discovery.fit import Fit
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import Fit
 
 BOOTSTRAPS = 400
 

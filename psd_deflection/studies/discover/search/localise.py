@@ -16,12 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2 as chi2_law
 
-from psd_deflection.discovery.comparison import Comparison
-from psd_deflection.discovery.hidden import only_in
-from psd_deflection.discovery.trust import BANDS, RELATIVE
-from psd_deflection.discovery.workspace import Workspace, fine_means
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import CHANNELS, FloatArray, IntArray
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.trust import BANDS, RELATIVE
+from psd_deflection.studies.discover.search.workspace import Workspace, fine_means
+from psd_deflection.studies.discover.setup.hidden import only_in
 
 CLIP = 6.0
 """Whitened values are limited to this, so outliers of heavy-tailed noise do not count as structure."""

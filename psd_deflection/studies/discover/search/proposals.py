@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from psd_deflection.discovery.observation import Observation
 from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.studies.discover.observation import Observation
 
 PEAK = 40.0
 """A spectral line must exceed the median power around it by this factor (chance: 1e-12 per bin)."""

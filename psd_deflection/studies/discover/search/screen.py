@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from psd_deflection.discovery.comparison import Comparison
-from psd_deflection.discovery.signatures import Candidate, Columns
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.signatures import Candidate, Columns
 
 SEEN = 1e-6
 """Columns that keep less than this fraction of their squared length after projection are skipped as

@@ -14,12 +14,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.stats import chi2 as chi2_law
 
-from psd_deflection.discovery.comparison import Comparison
-from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.screen import Score, Screen
-from psd_deflection.discovery.trust import gain_beyond
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import ActiveEffect, Effect
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.screen import Score, Screen
+from psd_deflection.studies.discover.search.trust import gain_beyond
 
 P_ACCEPT = 0.01
 """Largest library-wide p of an accepted effect."""

@@ -7,11 +7,11 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from psd_deflection.discovery.comparison import Comparison
-from psd_deflection.discovery.fit import Fit
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect
+from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import ActiveEffect, Effect
-from psd_deflection.simulation.physics import Physics
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import Fit
 
 Columns = list[list[FloatArray]]
 """Per column, per recording: fine-block volts (6, nf)."""

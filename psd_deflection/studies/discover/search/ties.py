@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from psd_deflection.discovery.weighing import NamedEffect, Rival
+from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival
 
 BENDING, TORSION = 'bending_stiffness', 'torsional_stiffness'
 SAME = 3.0

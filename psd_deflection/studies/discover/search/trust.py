@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from psd_deflection.discovery.comparison import Comparison
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.discover.search.comparison import Comparison
 
 RELATIVE = 0.002
 """Share of the explained movement, as an amplitude, by which the simulation may be wrong."""

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.discovery.coincidence import Coincidence
-from psd_deflection.discovery.comparison import Comparison
-from psd_deflection.discovery.fit import Fit, refit
-from psd_deflection.discovery.localise import Localisation
-from psd_deflection.discovery.planning import Suggestion
-from psd_deflection.discovery.search import BIC_ACCEPT, P_ACCEPT, Search, SearchResult, unphysical
-from psd_deflection.discovery.validate import HeldOut, heldout_gain, scatter
+from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.records import FloatArray
-from psd_deflection.simulation.declaration import ActiveEffect
+from psd_deflection.studies.discover.planning import Suggestion
+from psd_deflection.studies.discover.search.coincidence import Coincidence
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.hold_out import HeldOut, heldout_gain, scatter
+from psd_deflection.studies.discover.search.localise import Localisation
+from psd_deflection.studies.discover.search.search import BIC_ACCEPT, P_ACCEPT, Search, SearchResult, unphysical
 
 EQUIVALENT = 21.6
 """Loss in chi-square below which an alternative of no more parameters counts as equivalent: at

@@ -12,15 +12,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from psd_deflection.discovery.comparison import Comparison
-from psd_deflection.discovery.hidden import FIRST, SETUP, only_in
-from psd_deflection.discovery.noise import NoiseModel, estimate_noise
-from psd_deflection.discovery.observation import Observation, load_cases
+from psd_deflection.model.simulation.catalogue import sort_effects
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
-from psd_deflection.simulation.catalogue import sort_effects
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.studies.discover.observation import Observation, load_cases
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, only_in
+from psd_deflection.studies.discover.setup.noise import NoiseModel, estimate_noise
 
 LEAST_NOISE = 0.05
 """Share of the rig file's noise that is assumed at least."""

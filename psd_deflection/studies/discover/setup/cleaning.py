@@ -14,13 +14,13 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter1d, median_filter
 
-from psd_deflection.commissioning.checkup import Finding
-from psd_deflection.commissioning.wirings import line
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.proposals import coarse_step
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import CHANNELS, FloatArray
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.studies.check.checkup import Finding
+from psd_deflection.studies.check.wirings import line
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.search.proposals import coarse_step
 
 FAR = 8.0
 """A sample this many standard deviations from what its neighbours predict is an outlier."""

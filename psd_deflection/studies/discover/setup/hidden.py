@@ -12,9 +12,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from psd_deflection.simulation.declaration import ActiveEffect, Effect, EffectParameter, Stage, State, Values
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.samples import SimulatedSamples
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter, Stage, State, Values
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.samples import SimulatedSamples
 
 AXES = ('dx', 'dy', 'theta')
 

@@ -18,8 +18,8 @@ from scipy.linalg import solve_toeplitz
 from scipy.ndimage import median_filter
 from scipy.signal import detrend
 
-from psd_deflection.discovery.observation import Observation
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.discover.observation import Observation
 
 BoolArray = npt.NDArray[np.bool_]
 

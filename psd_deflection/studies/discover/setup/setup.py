@@ -13,18 +13,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from psd_deflection.calibration import Wiring
-from psd_deflection.commissioning.checkup import Finding
-from psd_deflection.commissioning.wirings import WIRINGS, differences, fix_of, line, parameters
-from psd_deflection.config import Rig, replace_values
-from psd_deflection.discovery.fit import Fit
-from psd_deflection.discovery.observation import Observation
-from psd_deflection.discovery.workspace import Workspace
+from psd_deflection.model.simulation.catalogue import sort_effects
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import DOT_CHANNELS, FloatArray
-from psd_deflection.simulation.catalogue import sort_effects
-from psd_deflection.simulation.declaration import ActiveEffect
-from psd_deflection.simulation.physics import Physics
-from psd_deflection.simulation.simulator import ForwardModel
+from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.check.checkup import Finding
+from psd_deflection.studies.check.wirings import WIRINGS, differences, fix_of, line, parameters
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.search.workspace import Workspace
 
 LOADS = ('load_fx', 'load_fy', 'load_tz')
 BETTER = 10.0
