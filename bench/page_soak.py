@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import csv
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -88,6 +89,8 @@ def main() -> int:
     parser.add_argument('--rate', type=float, default=1.0, help='times 1000 samples a second (default: 1)')
     parser.add_argument('--out', type=Path, default=Path('build/page_soak.csv'), help='the table')
     args = parser.parse_args()
+    # A run that is told to end takes its daemon and its browser along.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     args.out.parent.mkdir(parents=True, exist_ok=True)
     with args.out.open('w', newline='') as out:
         rows = soak(round(60.0 * args.hours), args.rate, out)

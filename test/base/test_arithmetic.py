@@ -205,15 +205,35 @@ def test_nodes_and_weights_of_gauss_and_legendre(count: int) -> None:
 
 # What a block or a rig goes through on its way to an estimate. Rooms whole, but for what the table below names.
 PIPELINE = (
-    'averaging.py', 'pipeline.py', 'estimation.py', 'correction.py', 'model/detector/volts.py', 'measure/health.py',
-    'filtering', 'uncertainty', 'solvers', 'model/plate/plate.py', 'model/plate/landing.py', 'model/plate/layout.py',
-    'model/plate/linear.py', 'model/misalignment/model.py', 'model/misalignment/spread.py', 'model/misalignment/rig.py',
-    'model/link/statics.py', 'model/simulation/optics.py', 'model/simulation/physics.py', 'model/simulation/tip_load.py',
-    'model/simulation/effects/ambient_light.py', 'model/simulation/effects/axis_crosstalk.py', 'model/simulation/effects/sensor_gain.py',
-    'model/simulation/effects/sensor_nonlinearity.py', 'model/simulation/effects/sensor_rotation.py',
-    'model/simulation/effects/thermal_drift.py', 'model/simulation/effects/sensor_position.py',
+    'averaging.py',
+    'pipeline.py',
+    'estimation.py',
+    'correction.py',
+    'model/detector/volts.py',
+    'measure/health.py',
+    'filtering',
+    'uncertainty',
+    'solvers',
+    'model/plate/plate.py',
+    'model/plate/landing.py',
+    'model/plate/layout.py',
+    'model/plate/linear.py',
+    'model/misalignment/model.py',
+    'model/misalignment/spread.py',
+    'model/misalignment/rig.py',
+    'model/link/statics.py',
+    'model/simulation/optics.py',
+    'model/simulation/physics.py',
+    'model/simulation/tip_load.py',
+    'model/simulation/effects/ambient_light.py',
+    'model/simulation/effects/axis_crosstalk.py',
+    'model/simulation/effects/sensor_gain.py',
+    'model/simulation/effects/sensor_nonlinearity.py',
+    'model/simulation/effects/sensor_rotation.py',
+    'model/simulation/effects/thermal_drift.py',
+    'model/simulation/effects/sensor_position.py',
     'model/simulation/effects/plane_tilt.py',
-)  # fmt: skip
+)
 NOT_OF_A_BLOCK = {
     # (file, function): why it may use what depends on the processor.
     ('model/plate/linear.py', 'condition_number'): 'told to people, by design alone',
