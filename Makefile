@@ -164,7 +164,7 @@ mutants: $(READY)
 	build/mutants/bin/python -m tools.mutants --python $(abspath $(BIN)/python) $(MUTANTS)
 
 # The rooms of the numerics. The kernel: one that any processor of these ten years runs, and that is no machine's own.
-NUMERICS := budget calibrating calibration camera chains commissioning compensation discovery filtering geometry identification mechanics misalignment recordings simulation solvers thesis uncertainty validation watching
+NUMERICS := arms base camera measure model recordings rig studies
 shaken: $(READY)
 	OPENBLAS_CORETYPE=$${KERNEL:-Nehalem} $(BIN)/python -m pytest --shaken -n $(WORKERS) -m 'not browser and not statistics' $(PYTEST) $(NUMERICS:%=test/%) test/blind test/test_*.py
 

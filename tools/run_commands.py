@@ -61,6 +61,8 @@ CI_RUNS = (
     (r'^make doc-commands\b', '.ci/run', 'make doc-commands '),
     (r'^make wheel$|^pip install dist/\*\.whl', '.ci/run', 'make wheel '),
     (r'^make rerun$', '.ci/run', 'make rerun '),
+    (r'^make shaken$', '.ci/run', 'make shaken '),
+    (r'^make bits$', '.ci/run', 'make bits '),
     (r"^pip install '\.\[rerun\]'$", 'Makefile', "'.[rerun]'"),
     (r'^psd-deflection convert .*\.rrd$|^rerun ', 'Makefile', 'python -m tools.check_rerun bags/'),
     (
@@ -95,6 +97,7 @@ SHORTEST = {
     'blind-next': 'NEXT="--only quantisation --designs torque"',
     'blind-watch': 'WATCH="--runs 1 --hours 0"',
     'shots': 'SHOT_SECONDS=2',
+    'page-soak': 'PAGE_HOURS=0.02',
 }
 """Variables with which a ``make`` target takes only seconds."""
 
@@ -119,13 +122,14 @@ VERDICTS = {
     'blind-laws': r'right variables',
     'blind-next': r'recordings needed: ',
     'blind-watch': r'slip of ',
+    'page-soak': r'too short to tell',
     'blind': r'failures \(\d+\)',
 }
 """What a campaign says at its end: cut short, on a busy machine, it may come to another verdict than in full."""
 
 TOOLS = {
     r'^make firmware': ('arm-none-eabi-gcc', 'qemu-system-arm'),
-    r'^make shots|first_look': ('chromium', 'chromedriver'),
+    r'^make (shots|page-soak)|first_look': ('chromium', 'chromedriver'),
     r'^curl ': ('curl',),
     r'^ros2 ': ('ros2',),
 }

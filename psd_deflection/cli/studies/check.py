@@ -37,7 +37,7 @@ from psd_deflection.records import CHANNELS
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.run.guided import run_guided
-from psd_deflection.studies.check.checkup import CANNOT_TELL, RIGHT, Checkup, check
+from psd_deflection.studies.check.checkup import CANNOT_TELL, RIGHT, TELLING_DRIFT, Checkup, check
 from psd_deflection.studies.check.guide import Guide
 from psd_deflection.studies.check.levels import levels
 from psd_deflection.studies.check.responses import responses
@@ -56,8 +56,6 @@ NAMES = {
 }
 WIRED = ('channel_sign', 'axis_swap', 'psd_swap')
 BAR = 12
-TELLING_DRIFT = 5e-6 / 60.0
-"""m/s."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -31,6 +31,9 @@ RIGHT, WRONG, CANNOT_TELL = 'right', 'wrong', 'cannot_tell'
 DEAD = 0.1
 """A channel that moves less than this share of every push does not answer."""
 
+TELLING_DRIFT = 5e-6 / 60.0
+"""m/s: a drift whose standard deviation is larger is not told; the recording is too short."""
+
 SIZE_FACTOR = 1.1
 """A movement that is so many times the expected one, or so many times less, is told."""
 
@@ -240,7 +243,7 @@ def _notes(
         )
     per_minute = np.abs(drift) * 60e6
     far = (per_minute > 5.0) & (np.abs(drift) > 5.0 * drift_sd)
-    if far.any():
+    if far.any() and drift_sd.max() <= TELLING_DRIFT:
         worst = int(np.argmax(np.where(far, per_minute, 0.0)))
         out.append(f'drift: {drift[worst] * 60e6:+.1f} µm a minute on {DOTS[worst]}; let lasers and amplifier warm up')
     return out

@@ -1,8 +1,10 @@
-"""How the dots of a recording answered to its loads, by linear regression on what the link model expects.
+"""How the dots of a recording answered to its loads, by linear regression on the dots that the simulation shows.
 
-Each load alone moves the expected pose through the link's compliance and its first mode; its movement on each channel
-is the slope of that channel's block means on the expected pose. A constant and a straight line in time are fitted with
-them: where the dots were before load, and drift. Loads that always came together cannot be told apart and count as one.
+The simulation has the plate's geometry and the ringing of both modes. So what is left of a regression on its dots is
+wiring, gain, noise and drift. Each channel is a combination of the four simulated dots, whatever the wiring is; a
+constant and a straight line in time are fitted with them: where the dots were before load, and drift. The movement by a
+load is that combination of the dots that the load alone moves, at rest. Loads that always came together cannot be told
+apart and count as one.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import numpy as np
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.check.wirings import PushResponse, pattern, scales_of
@@ -23,6 +26,8 @@ TOGETHER = 0.95
 """Loads whose expected poses are correlated more than this count as one."""
 
 FEWEST_BLOCKS = 8
+LEAST_MOVED = 1e-6
+"""Combinations of the simulated dots that move by less than this share of the largest say nothing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,28 +45,36 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
     Raises RecordingError if there are too few blocks.
     """
     size, period = rig.estimator.block_size, 1.0 / rig.converter.sample_rate_hz
-    static = loads @ LinkStatics.from_rig(rig).compliance
-    poses = _moved(rig, static, period)
     n = len(volts) // size
     dots = _block_means(volts[: n * size, DOT_CHANNELS], n) * rig.amplifier.sensitivity
-    means, held = (p[: n * size].reshape(n, size, 3).mean(axis=1) for p in (poses, static))
     present = np.isfinite(dots).all(axis=1)
     if int(present.sum()) < FEWEST_BLOCKS:
         raise RecordingError(f'{int(present.sum())} blocks of samples: at least {FEWEST_BLOCKS} are needed')
+    static = loads @ LinkStatics.from_rig(rig).compliance
+    poses = _moved(rig, static, period)
+    means, held = (p[: n * size].reshape(n, size, 3).mean(axis=1) for p in (poses, static))
+    shown = _simulated(rig, loads)[: n * size].reshape(n, size, 4).mean(axis=1)
     t = np.arange(n) * size * period
-    groups = _groups(held[present], means[present], pattern(rig))
-    peaks = [float(np.abs(means[present][:, group[0]]).max()) for group in groups]
-    columns = [means[:, group[0]] / peak for group, peak in zip(groups, peaks, strict=True)]
-    design = np.column_stack([*columns, np.ones(n), t - t.mean()])[present]
-    slopes, sd = _regression(design, dots[present])
+    design = np.column_stack((shown - shown[present].mean(axis=0), np.ones(n), t - t.mean()))[present]
+    slopes, spread, variance = _regression(design, dots[present])
     pushes = []
-    for i, (group, peak) in enumerate(zip(groups, peaks, strict=True)):
-        # Loads that came together ring apart: their proportion is that of the held loads.
-        first = held[present][:, group[0]]
-        largest = [peak * _slope(first, held[present][:, k]) if k in group else 0.0 for k in range(3)]
+    for group in _groups(held[present], means[present], pattern(rig)):
+        most = int(np.argmax(np.abs(held[present][:, group[0]])))
+        alone = np.zeros((2, 3))
+        alone[1, group] = loads[: n * size].reshape(n, size, 3).mean(axis=1)[present][most, group]
+        before, after = _simulated(rig, alone, settled=True)
+        # The way that the push is named.
+        expected = np.sign(alone[1, group[0]]) * (after - before)
+        moved = np.append(expected, (0.0, 0.0))
         names = tuple(LOADS[k] for k in group)
-        pushes.append(PushResponse(names, slopes[i], sd[i], pattern(rig) @ np.array(largest), scales=scales_of(rig)))
-    return Responses(tuple(pushes), slopes[-1], sd[-1])
+        sd = np.sqrt(moved @ spread @ moved * variance)
+        pushes.append(PushResponse(names, moved @ slopes, sd, expected, scales=scales_of(rig)))
+    return Responses(tuple(pushes), slopes[-1], np.sqrt(spread[-1, -1] * variance))
+
+
+def _simulated(rig: Rig, loads: FloatArray, *, settled: bool = False) -> FloatArray:
+    """Dots x1 y1 x2 y2 (n, 4), m, under ``loads`` (n, 3), N, N, N m; ``settled``: at rest under each."""
+    return np.asarray(ForwardModel(rig, settled=settled).run(loads).true_dots.T)
 
 
 def _moved(rig: Rig, static: FloatArray, period: float) -> FloatArray:
@@ -96,22 +109,20 @@ def _groups(poses: FloatArray, moved: FloatArray, per_pose: FloatArray) -> list[
     return sorted((sorted(group) for group in out), key=lambda group: group[0])
 
 
-def _slope(x: FloatArray, y: FloatArray) -> float:
-    x = x - x.mean()
-    return float(x @ (y - y.mean()) / (x @ x))
+def _regression(design: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Slopes (k, c) of ``values`` (n, c) on ``design`` (n, k), their spread (k, k) per variance, the variances (c,).
 
-
-def _regression(design: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Slopes (k, c) of ``values`` (n, c) on ``design`` (n, k) and their standard deviations.
-
-    These count the correlation of one block's rest with the next one's, so that hum, ringing and drift widen them.
+    The variances count the correlation of one block's rest with the next one's, so that hum, ringing and drift widen
+    them.
     """
-    inverse = np.linalg.pinv(design)
+    size = np.abs(design).max(axis=0)
+    # The four dots in one unit: their proportions count.
+    size[:4] = size[:4].max()
+    size[size == 0.0] = 1.0
+    inverse = np.linalg.pinv(design / size, rcond=LEAST_MOVED) / size[:, None]
     slopes = inverse @ values
     rest = values - design @ slopes
     variance = (rest**2).sum(axis=0) / max(len(design) - design.shape[1], 1)
     ahead = (rest[1:] * rest[:-1]).sum(axis=0) / np.maximum((rest**2).sum(axis=0), np.finfo(float).tiny)
     colour = np.clip(ahead, 0.0, 0.98)
-    wider = (1.0 + colour) / (1.0 - colour)
-    spread = (inverse**2).sum(axis=1)
-    return slopes, np.sqrt(spread[:, None] * (variance * wider)[None, :])
+    return slopes, inverse @ inverse.T, variance * (1.0 + colour) / (1.0 - colour)

@@ -17,6 +17,7 @@ import pytest
 from blind import generator
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.cli.main import main
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, rig_from_values
 from psd_deflection.rig.parameter_files import read_parameter_file
@@ -25,6 +26,7 @@ from psd_deflection.studies.check.checkup import CANNOT_TELL, RIGHT, WRONG, Chec
 from psd_deflection.studies.check.levels import levels
 from psd_deflection.studies.check.responses import responses
 from psd_deflection.studies.check.wirings import WIRINGS, differences, line, parameters
+from psd_deflection.studies.discover.from_recordings import read_observation
 
 CLOUD = 2e-3 * 0.5e-3
 """Noise of one sample, m."""
@@ -415,3 +417,59 @@ def test_what_cannot_be_checked_is_refused(
 ) -> None:
     assert main(args) == status
     assert said in capsys.readouterr().err
+
+
+# A perfect rig: nothing drifts, whatever hangs on it.
+HUNG = (
+    'steps:0,0,0;0,-10,-5.85;0,-30,-17.55;0,-50,-29.25:9',
+    'steps:0,0,0;0,-1,-0.585;0,-3,-1.755;0,-5,-2.925:9',
+    'steps:0,-50,-29.25;0,0,0:4',
+    'thesis:9',
+)
+
+
+def drift_of(folder: Path, capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
+    """What ``check --json`` says of a simulated recording."""
+    made = str(folder / 'made')
+    assert main(['simulate', '--out', made, *words]) == 0
+    capsys.readouterr()
+    main(['check', made, '--json'])
+    answer: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return answer
+
+
+@pytest.mark.parametrize('seed', ['1', '2'])
+@pytest.mark.parametrize('loads', HUNG)
+def test_loads_and_ringing_are_no_drift(
+    loads: str, seed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = drift_of(tmp_path, capsys, '--loads', loads, '--seed', seed)
+    for channel, drift in found['drift'].items():
+        assert abs(drift) < 4.0 * found['drift_sd'][channel]
+        assert found['drift_sd'][channel] < 1e-6 / 60.0
+    assert not any('drift' in note for note in found['notes'])
+
+
+def test_a_drift_under_a_staircase_of_loads_is_found_to_a_hundredth(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # 4.5 um/K over 4 K in a minute.
+    hidden = ('--temperature', '20,24', '--effect', 'thermal_drift,psd=1,x=4.5e-6')
+    found = drift_of(tmp_path, capsys, '--loads', HUNG[0].replace(':9', ':15'), *hidden)
+    assert found['drift']['x1'] * 60.0 == pytest.approx(18e-6, rel=0.01)
+    (note,) = [note for note in found['notes'] if 'drift' in note]
+    assert 'on x1; let lasers and amplifier warm up' in note
+
+
+def test_a_weight_that_is_taken_off_moves_the_dots_by_what_it_held(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = load_rig()
+    before, after = ForwardModel(rig, settled=True).run(np.array([[0.0, 0.0, 0.0], [0.0, -50.0, -29.25]])).true_dots.T
+    made = str(tmp_path / 'made')
+    assert main(['simulate', '--out', made, '--loads', HUNG[2]]) == 0
+    seen = read_observation(made, rig)
+    (push,) = responses(rig, seen.volts, seen.loads).pushes
+    # Named by the load upwards; what hung there pulled down.
+    assert push.channels == pytest.approx(before - after, abs=1e-6)
+    assert push.expected == pytest.approx(before - after, abs=1e-9)
