@@ -60,7 +60,7 @@ RECORDINGS: dict[str, Golden] = {
         values={
             'filter': 'modal',
             'degraded': 'hold',
-            'solvers': ['exact', 'wls', 'iterative', 'beam', 'wls_exact', 'ols', 'minimum_tilt'],
+            'solvers': ['exact', 'wls', 'iterative', 'beam', 'wls_exact', 'ols'],
         },
         dark=((2, 1507, 2523),),
     ),

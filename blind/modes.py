@@ -16,6 +16,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.integrate import trapezoid
 from tqdm import tqdm
 
 from blind.generator import Array
@@ -85,7 +86,7 @@ def bound(link: Link, seconds: float = 60.0, rms: float = 200e-6) -> tuple[float
     slopes = np.stack(
         (mode * shape * (4.0 * x * (x - 1.0) + 8.0 * zeta**2 * x), -8.0 * zeta**2 * x * shape * mode, mode, noise)
     ) / (mode + noise)
-    information = seconds * np.trapezoid(slopes[:, None] * slopes, f, axis=-1)
+    information = seconds * trapezoid(slopes[:, None] * slopes, f, axis=-1)
     least = np.sqrt(np.linalg.inv(information).diagonal())
     return float(least[0]), float(least[1])
 

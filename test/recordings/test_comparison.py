@@ -78,13 +78,13 @@ def disturbed(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
 def test_rounding_of_another_version_is_told_and_is_no_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    name = recorded(tmp_path, monkeypatch, {'psd_deflection': '0.0.9', 'numpy': '1.26.4'})
+    name = recorded(tmp_path, monkeypatch, {'psd_deflection': '0.0.9', 'numpy': '1.25.0'})
     disturbed(monkeypatch, 3e-16)
     assert main(['replay', name, '--compare']) == 0
     said = capsys.readouterr().out
     assert 'differ by rounding alone' in said
     assert 'rounding may differ: recorded with psd_deflection 0.0.9, now ' in said
-    assert 'numpy 1.26.4, now ' in said
+    assert 'numpy 1.25.0, now ' in said
     assert main(['replay', name, '--compare', '--strict']) == 1
 
 
