@@ -12,6 +12,7 @@
 # make mutants  break the numerics line by line and see whether the tests notice (an hour; MUTANTS="--rooms solvers" for one room)
 # make shaken   the numerics with another kernel of OpenBLAS, LAPACK a last bit off: does a test compare bits that nobody promised
 # make bits     record and replay as other processors would: does a bit differ (half a minute)
+# make suites   every test on other processors and on busy ones, a row each (an hour on two idle cores; SUITES='--rows 3' for one)
 # make golden   make those recordings of bags/ anew that have today's defaults
 # make colcon   build with colcon in a virtual environment of its own and look at what it installed
 # make docs     the documentation as a web site, in build/site
@@ -56,7 +57,7 @@ BIN := $(VENV)/bin
 # A run needs the first of these, all the others need both.
 READY := $(VENV)/.installed $(VENV)/.for_tests
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak fleet firmware mutants shaken bits golden docs notebooks axe page-soak shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak fleet firmware mutants shaken bits suites golden docs notebooks axe page-soak shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -170,6 +171,10 @@ shaken: $(READY)
 
 bits: $(READY)
 	$(BIN)/python -m bench.bits
+
+SUITES ?=
+suites: $(READY)
+	$(BIN)/python -m bench.suites $(SUITES)
 
 golden: $(READY)
 	$(BIN)/python bags/make.py

@@ -98,6 +98,7 @@ SHORTEST = {
     'blind-watch': 'WATCH="--runs 1 --hours 0"',
     'shots': 'SHOT_SECONDS=2',
     'page-soak': 'PAGE_HOURS=0.02',
+    'suites': 'SUITES="--rows 2 --tests test/base"',
 }
 """Variables with which a ``make`` target takes only seconds."""
 
