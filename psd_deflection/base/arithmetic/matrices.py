@@ -1,0 +1,108 @@
+"""Sums and eliminations of small matrices, each in an order that stands here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from math import sqrt
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from psd_deflection.records import FloatArray
+
+AnyFloats = npt.NDArray[np.floating[Any]]
+
+AT_ONCE = 1 << 15
+"""Numbers of an operand up to which a table of all products is made."""
+
+
+@cache
+def plan(spec: str) -> tuple[tuple[tuple[tuple[int, ...] | None, tuple[Any, ...]], ...], int]:
+    """How each operand is turned so that the summed indices come first; and the number of these."""
+    left, _, out = spec.partition('->')
+    terms = left.split(',')
+    summed = ''.join(dict.fromkeys(c for c in left if c not in out and c != ','))
+    order = summed + out
+    turns = []
+    for term in terms:
+        axes = tuple(term.index(c) for c in order if c in term)
+        if len(axes) != len(term):
+            raise ValueError(f'{spec}: an index is twice in {term}')
+        at = tuple(slice(None) if c in term else None for c in order)
+        turns.append((axes if axes != tuple(range(len(axes))) else None, at))
+    return tuple(turns), len(summed)
+
+
+def product_of(factors: Sequence[AnyFloats]) -> AnyFloats:
+    """From the left; the first index is the slowest in memory."""
+    out = factors[0]
+    for factor in factors[1:]:
+        out = np.multiply(out, factor, order='C')
+    return out
+
+
+def in_pairs(rows: AnyFloats) -> FloatArray:
+    """Sum of ``rows`` (n, ...): the first half to the second until one row is left; zeros of none.
+
+    A row without a partner goes to the first pair. Adding in pairs rounds less than adding in turn, and takes fewer
+    calls.
+    """
+    rest = np.asarray(rows, dtype=np.float64)
+    if not len(rest):
+        return np.zeros(rest.shape[1:])
+    while (count := len(rest)) > 1:
+        half = count // 2
+        pairs = rest[:half] + rest[half : 2 * half]
+        if count & 1:
+            pairs[0] += rest[-1]
+        rest = pairs
+    return np.asarray(rest[0])
+
+
+def orthogonal(a: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Q (m, n) with orthonormal columns and R (n, n), 0 below the diagonal, of ``a`` (m, n) = Q R.
+
+    A column that depends on those before it has 0 in both.
+    """
+    columns = np.array(a.T, dtype=np.float64)
+    r = np.zeros((len(columns), len(columns)))
+    for i, column in enumerate(columns):
+        size = sqrt(float(in_pairs(column * column)))
+        # Twice: once leaves rounding that shows.
+        for _ in range(2):
+            for j in range(i):
+                part = float(in_pairs(columns[j] * column))
+                r[j, i] += part
+                column -= part * columns[j]
+        left = sqrt(float(in_pairs(column * column)))
+        r[i, i] = left if left > 1e-13 * size else 0.0
+        column[:] = column / left if left > 1e-13 * size else 0.0
+    return columns.T, r
+
+
+def pivots(a: FloatArray) -> list[FloatArray]:
+    """Pivots (...) of the elimination of symmetric ``a`` (..., n, n); it ends at one that is not above 0."""
+    rest, out = np.asarray(a, dtype=np.float64), []
+    while rest.shape[-1]:
+        pivot, row = rest[..., 0, 0], rest[..., 0, 1:]
+        out.append(np.asarray(pivot))
+        if not bool((pivot > 0.0).all()):
+            break
+        rest = rest[..., 1:, 1:] - row[..., :, None] * (row / pivot[..., None])[..., None, :]
+    return out
+
+
+def rotate(a: FloatArray, vectors: FloatArray, i: int, j: int) -> None:
+    """Turn axes ``i`` and ``j`` so that the element that they share is 0 (Golub & Van Loan, 8.5)."""
+    between = float(a[i, j])
+    tau = (float(a[j, j]) - float(a[i, i])) / (2.0 * between)
+    t = (1.0 if tau >= 0.0 else -1.0) / (abs(tau) + sqrt(1.0 + tau * tau))
+    c = 1.0 / sqrt(1.0 + t * t)
+    s = t * c
+    for rows in (a, a.T, vectors.T):
+        first, second = rows[i].copy(), rows[j].copy()
+        rows[i] = c * first - s * second
+        rows[j] = s * first + c * second
+    a[i, j] = a[j, i] = 0.0
