@@ -1,4 +1,4 @@
-"""Columns with units, as a pandas DataFrame, an xarray Dataset or the HTML that a notebook shows."""
+"""Columns with units, as text, a pandas DataFrame, an xarray Dataset or the HTML that a notebook shows."""
 
 from __future__ import annotations
 
@@ -93,3 +93,14 @@ def html_table(caption: str, rows: Iterable[tuple[str, object]]) -> str:
 
 def _cell(value: object) -> str:
     return html.escape(printable(str(value), LONGEST_CELL))
+
+
+def columns(rows: Sequence[Sequence[str]], left: int = 1) -> str:
+    """``rows`` (the first is the head) as text: the first ``left`` columns flush left, the rest right."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        cells = [c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
+        lines.append('  '.join(cells).rstrip())
+    lines.insert(1, '  '.join('-' * w for w in widths))
+    return '\n'.join(lines)

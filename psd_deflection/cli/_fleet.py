@@ -13,8 +13,9 @@ from typing import TypeVar
 from tqdm import tqdm
 
 from psd_deflection.base.errors import SomeFailedError, UsageError
+from psd_deflection.base.tables import columns
 from psd_deflection.cli._options import make_folder, make_writable
-from psd_deflection.cli._report import columns, print_json, save_all, show, show_text, warn
+from psd_deflection.cli._report import print_json, save_all, show, show_text, warn
 from psd_deflection.run.fleet.engines import FORMS, SERIAL, check_engine, open_engine
 from psd_deflection.run.fleet.listing import is_plain, listed
 from psd_deflection.run.fleet.parquet import ENDING, Field, ParquetFile, is_parquet

@@ -14,8 +14,9 @@ import numpy as np
 import yaml
 
 from psd_deflection.base.errors import UsageError
+from psd_deflection.base.tables import columns
 from psd_deflection.cli._options import given_as_option, in_the_world, whole, world_option
-from psd_deflection.cli._report import columns, save
+from psd_deflection.cli._report import save
 from psd_deflection.model.simulation.effect_words import with_effects
 from psd_deflection.recordings.replay.simulated_run import SimulatedRun
 from psd_deflection.recordings.write.sinks import open_sink

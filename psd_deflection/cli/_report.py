@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import io
-import json
-import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from psd_deflection.base.errors import RecordingError, printable
 from psd_deflection.base.files import replace_file
+from psd_deflection.base.json_text import json_text
 
 LONGEST_LINE = 2000
 """Characters of a line with words of a file or of a device in it."""
@@ -36,28 +35,9 @@ def show_text(text: str, *, aside: bool = False) -> None:
     show(*text.split('\n'), aside=aside)
 
 
-def columns(rows: Sequence[Sequence[str]], left: int = 1) -> str:
-    """``rows`` (the first is the head) as text: the first ``left`` columns flush left, the rest right."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = []
-    for row in rows:
-        cells = [c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
-        lines.append('  '.join(cells).rstrip())
-    lines.insert(1, '  '.join('-' * w for w in widths))
-    return '\n'.join(lines)
-
-
 def print_json(value: Any, indent: int | None = None) -> None:
     """Print ``value`` as JSON, with null for numbers that JSON does not have (NaN, infinite)."""
-    print(json.dumps(_plain(value), indent=indent, allow_nan=False))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {k: _plain(v) for k, v in value.items()}
-    return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
+    print(json_text(value, indent))
 
 
 def save_figure(figure: Any, path: Path, **options: Any) -> None:

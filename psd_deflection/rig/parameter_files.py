@@ -179,3 +179,15 @@ def _flatten(tree: Mapping[Any, Any], prefix: str, out: dict[str, object], sourc
             out[name] = value
         if len(out) > MAX_KEYS:
             raise ConfigError(f'{source}: more than {MAX_KEYS} parameters')
+
+
+def nested(flat: Mapping[str, object]) -> dict[str, Any]:
+    """Names with dots as maps in maps, the inverse of :func:`flattened`; tuples as lists."""
+    tree: dict[str, Any] = {}
+    for key, value in flat.items():
+        *path, last = key.split('.')
+        at = tree
+        for step in path:
+            at = at.setdefault(step, {})
+        at[last] = list(value) if isinstance(value, tuple) else value
+    return tree

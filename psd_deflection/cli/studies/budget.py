@@ -24,6 +24,7 @@ import numpy as np
 from tqdm import tqdm
 
 from psd_deflection.base.errors import UsageError
+from psd_deflection.base.tables import columns
 from psd_deflection.cli._options import (
     PICTURES,
     given_as_option,
@@ -34,7 +35,7 @@ from psd_deflection.cli._options import (
     seed,
     whole,
 )
-from psd_deflection.cli._report import columns, print_json, save_figure, show, show_text
+from psd_deflection.cli._report import print_json, save_figure, show, show_text
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.budget import optics

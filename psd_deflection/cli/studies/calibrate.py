@@ -50,7 +50,6 @@ from psd_deflection.cli._fleet import (
 from psd_deflection.cli._options import make_writable, namespace_option, number
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save_all, show, warn
-from psd_deflection.cli._rig_file import rig_file
 from psd_deflection.model.misalignment.rig import is_calibrated
 from psd_deflection.model.simulation.catalogue import effects_of_rig, effects_to_values
 from psd_deflection.recordings.read.readers import open_recording
@@ -73,7 +72,7 @@ from psd_deflection.studies.calibrate.from_recordings import read_run, read_runs
 from psd_deflection.studies.calibrate.observation import CalibrationRun
 from psd_deflection.studies.calibrate.report import report_html
 from psd_deflection.studies.calibrate.result import REPORTED, UNITS, result, sentence, source_of, values_of
-from psd_deflection.studies.discover.result import model_yaml
+from psd_deflection.studies.study import described, edited_rig_file
 
 MOST_EXPOSURE = 0.02
 """s. The polynomial that is fitted to the samples about a reference is 21 samples long."""
@@ -286,19 +285,19 @@ def _rig_yaml(params_file: str | None, rig: Rig, found: Calibration, date: str) 
         plain = text if found.refused else with_effects_section(text, effects_to_values(effects), path)
         return with_values(plain, values, f'Calibrated by {source_of(found, date)}', path)
 
-    return rig_file(
-        params_file, 'rig.yaml', lambda: model_yaml(rig, effects_of_rig(rig) if found.refused else effects), edit
-    )
+    kept = effects_of_rig(rig) if found.refused else effects
+    return edited_rig_file(params_file, 'rig.yaml', lambda: described(rig, kept), edit, warn)
 
 
 def _dark_alone(args: argparse.Namespace, asked: CalibrationOptions, rig: Rig, levels: Sequence[DarkLevel]) -> int:
     """Write the dark levels into the rig file and change nothing else."""
     source = f'Dark levels by psd-deflection {__version__}, {asked.date}, from {source_of_levels(levels)}'
-    text = rig_file(
+    text = edited_rig_file(
         asked.params_file,
         'rig.yaml',
-        lambda: model_yaml(rig, effects_of_rig(rig)),
+        lambda: described(rig, effects_of_rig(rig)),
         lambda text, path: with_values(text, values_of_levels(levels), source, path),
+        warn,
     )
     save_all({'rig.yaml': text}, Path(args.out))
     if args.json:

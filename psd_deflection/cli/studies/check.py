@@ -28,9 +28,10 @@ from typing import Any
 import numpy as np
 
 from psd_deflection.base.errors import printable
+from psd_deflection.base.tables import columns
 from psd_deflection.cli._options import given_parameters, in_the_world, parameter_option, refuse, world_option
 from psd_deflection.cli._progress import told
-from psd_deflection.cli._report import LONGEST_LINE, columns, print_json, show
+from psd_deflection.cli._report import LONGEST_LINE, print_json, show
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import rig_at_end
 from psd_deflection.records import CHANNELS

@@ -54,7 +54,6 @@ from psd_deflection.cli._fleet import (
 from psd_deflection.cli._options import make_folder, make_writable, namespace_option, refuse, seed
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import save, save_all, show, show_text, warn
-from psd_deflection.cli._rig_file import rig_file
 from psd_deflection.model.simulation.catalogue import FOLDERS, effect_folders, effect_names, effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.laws import Law, effect_of, law_text, values_of
@@ -68,7 +67,8 @@ from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.plants import discover_in
 from psd_deflection.studies.discover.readings import Readings, ReadingsPlant
 from psd_deflection.studies.discover.report import report_html
-from psd_deflection.studies.discover.result import model_yaml, result, sentence
+from psd_deflection.studies.discover.result import result, sentence
+from psd_deflection.studies.study import described, edited_rig_file
 
 STEPS = 8
 """Steps that the progress bar counts: described, signatures, adding, weighing, alternatives, where, report, done.
@@ -389,4 +389,4 @@ def _model(
             return text
         return with_values(text, lines, f'Put right by psd-deflection {__version__}', path)
 
-    return rig_file(params_file, 'model.yaml', lambda: model_yaml(rig, effects), edit)
+    return edited_rig_file(params_file, 'model.yaml', lambda: described(rig, effects), edit, warn)

@@ -14,7 +14,8 @@ import argparse
 from typing import Any
 
 from psd_deflection.base.errors import UsageError, did_you_mean
-from psd_deflection.cli._report import columns, print_json, show, show_text
+from psd_deflection.base.tables import columns
+from psd_deflection.cli._report import print_json, show, show_text
 from psd_deflection.model.simulation.catalogue import catalogue
 from psd_deflection.model.simulation.declaration import STAGES, Effect, EffectParameter
 

@@ -84,7 +84,7 @@ SENSOR_TILT = Term(
 )
 
 
-# ---- Section 3.2: where the centres are ----
+# ---- PageSection 3.2: where the centres are ----
 
 CENTER_POSITION = Term(
     'center_position',

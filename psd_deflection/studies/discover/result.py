@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
-import yaml
-
 from psd_deflection import __version__
-from psd_deflection.model.simulation.catalogue import effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
-from psd_deflection.rig.config import Rig
-from psd_deflection.rig.declarations import DESCRIPTION
 from psd_deflection.studies.discover.discover import Discovery
 from psd_deflection.studies.discover.laws.laws import FoundLaw
 from psd_deflection.studies.discover.search.ties import ties
@@ -171,29 +166,6 @@ def provenance(discovery: Conclusion) -> dict[str, Any]:
         'forward_simulations': discovery.simulations,
         'recordings': discovery.workspace.provenance(),
     }
-
-
-def _nested(flat: Mapping[str, object]) -> dict[str, Any]:
-    tree: dict[str, Any] = {}
-    for key, value in flat.items():
-        *path, last = key.split('.')
-        at = tree
-        for step in path:
-            at = at.setdefault(step, {})
-        at[last] = list(value) if isinstance(value, tuple) else value
-    return tree
-
-
-def model_yaml(rig: Rig, effects: Sequence[ActiveEffect]) -> str:
-    """What describes the rig, as a ROS 2 parameter file with ``effects`` instead of its own.
-
-    For a rig without a file of its own; :func:`psd_deflection.rig.parameter_files.with_effects_section` adds them to a
-    file. Port, folders and page are left out: they belong to a machine.
-    """
-    tree = _nested({name: rig.values[name] for name in DESCRIPTION})
-    if effects:
-        tree['effects'] = effects_to_values(effects)
-    return yaml.safe_dump({'/**': {'ros__parameters': tree}}, sort_keys=False, allow_unicode=True)
 
 
 def size_of(effect: NamedEffect | Rival) -> str:

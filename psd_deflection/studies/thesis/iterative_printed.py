@@ -45,7 +45,7 @@ _S = np.array([sin(theta) for theta in _THETA])
 
 
 class IterativePrintedSolver(Solver):
-    """Section 2.2 with its threshold; two PSDs. ``NO_HIT``, without numbers, if no trial passes.
+    """PageSection 2.2 with its threshold; two PSDs. ``NO_HIT``, without numbers, if no trial passes.
 
     The covariance is NaN: the answer is a step function of the readings.
     """

@@ -12,13 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.base.errors import RecordingError
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.validate.clock import FEWEST, Offset, clock_offset, variance_of_sum
-from psd_deflection.studies.validate.motion import Motion, Solve
-
-AXES = ('dx', 'dy', 'theta')
-UNITS = ('m', 'm', 'rad')
+from psd_deflection.studies.validate.clock import variance_of_sum
 
 
 @dataclass(frozen=True)
@@ -40,27 +35,6 @@ class Agreement:
     rms: float
     largest: float
     share: float
-
-
-@dataclass(frozen=True)
-class Validated:
-    """The answer of :func:`validate`.
-
-    ``t`` (k,), s, when the references were taken by the clock of the samples; ``reference`` (k, 3), m, m, rad;
-    ``estimates``: of each solver at these times (k, 3), NaN if it has no answer. ``agreements``: of each solver, for
-    dX, dY, theta. ``offset``: between the clocks, None if it was not looked for; ``applied``: whether it was removed.
-    ``covered``: share of differences within 1.96 standard deviations of estimate and reference together, for each
-    axis; NaN if the reference does not state its own. ``left_out``: references without samples about them.
-    """
-
-    t: FloatArray
-    reference: FloatArray
-    estimates: dict[str, FloatArray]
-    agreements: dict[str, tuple[Agreement, Agreement, Agreement]]
-    offset: Offset
-    applied: bool
-    covered: tuple[float, float, float]
-    left_out: int
 
 
 def agreement(estimate: FloatArray, reference: FloatArray) -> Agreement:
@@ -95,50 +69,3 @@ def agreement(estimate: FloatArray, reference: FloatArray) -> Agreement:
         largest=float(np.abs(difference).max()),
         share=rms / deflection if math.isfinite(slope) else math.nan,
     )
-
-
-def validate(
-    motion: Motion,
-    solvers: dict[str, Solve],
-    t: FloatArray,
-    reference: FloatArray,
-    sd: FloatArray | None,
-    estimate_sd: FloatArray,
-    *,
-    align: bool,
-    largest: float,
-    exposure: float,
-) -> Validated:
-    """Compare the motion, as each of ``solvers`` (the first is the rig's) has it, with a reference.
-
-    ``t`` (k,), s, by the reference's clock, increasing. ``reference`` (k, 3), m, m, rad; ``sd`` (k, 3) of it if it is
-    known. ``estimate_sd`` (3,): of the published estimates. ``align``: remove the offset between the clocks if
-    it is told. ``largest``: offset that is looked for, s. ``exposure``: of the reference, s.
-    Raises RecordingError if fewer than 20 references lie within the motion.
-    """
-    offset = clock_offset(motion, t, reference, largest=largest, exposure=exposure)
-    applied = align and offset.told
-    at = t + offset.value if applied else t
-    dots, _, _ = motion.dots_at(at, exposure)
-    there = np.isfinite(dots).all(axis=1)
-    if there.sum() < FEWEST:
-        raise RecordingError(
-            f'{int(there.sum())} references lie within the recording by their stamps; at least {FEWEST} are needed '
-            f'(with the offset between the clocks removed there may be more: --align)'
-        )
-    kept, dots = reference[there], dots[there]
-    estimates = {name: solve(dots) for name, solve in solvers.items()}
-    agreements = {}
-    for name, poses in estimates.items():
-        good = np.isfinite(poses).all(axis=1)
-        if good.sum() >= FEWEST:
-            first, second, third = (agreement(poses[good, i], kept[good, i]) for i in range(3))
-            agreements[name] = (first, second, third)
-    covered = (math.nan, math.nan, math.nan)
-    primary = next(iter(solvers))
-    if sd is not None and primary in agreements:
-        error = estimates[primary] - kept
-        both = np.sqrt(sd[there] ** 2 + estimate_sd**2)
-        x, y, twist = (float(v) for v in np.nanmean(np.abs(error) <= 1.96 * both, axis=0))
-        covered = (x, y, twist)
-    return Validated(at[there], kept, estimates, agreements, offset, applied, covered, int((~there).sum()))

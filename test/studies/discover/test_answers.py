@@ -18,6 +18,7 @@ from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.parameter_files import nested
 from psd_deflection.studies.check.checkup import Finding
 from psd_deflection.studies.discover import discover as answer
 from psd_deflection.studies.discover import planning
@@ -727,7 +728,7 @@ def test_numbers_of_json_are_finite() -> None:
     assert tree == {'bending_ratio': {'value': 0.03, 'sd': 1e300, 'unit': ''}}
     turned = named_effect(make_active('sensor_rotation', {'psd': 2, 'angle': 0.1}, 't'))
     assert told.parameters_of(turned) == {'psd': 2, 'angle': {'value': 0.1, 'sd': 0.0, 'unit': 'rad'}}
-    assert told._nested({'a.b': (1, 2), 'a.c.d': 'x', 'e': 3}) == {'a': {'b': [1, 2], 'c': {'d': 'x'}}, 'e': 3}
+    assert nested({'a.b': (1, 2), 'a.c.d': 'x', 'e': 3}) == {'a': {'b': [1, 2], 'c': {'d': 'x'}}, 'e': 3}
 
 
 # A whole discovery of few effects.

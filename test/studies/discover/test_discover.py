@@ -24,7 +24,7 @@ from psd_deflection.rig.declarations import DESCRIPTION
 from psd_deflection.rig.parameter_files import read_parameter_file
 from psd_deflection.studies.discover.discover import Discovery, discover
 from psd_deflection.studies.discover.observation import Observation, load_cases
-from psd_deflection.studies.discover.result import model_yaml, result, sentence
+from psd_deflection.studies.discover.result import result, sentence
 from psd_deflection.studies.discover.search import proposals
 from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.fit import refit
@@ -32,6 +32,7 @@ from psd_deflection.studies.discover.search.screen import solve_seen
 from psd_deflection.studies.discover.search.signatures import SignatureBank
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.noise import estimate_noise, rest_windows, strip_lines
+from psd_deflection.studies.study import described
 
 SCHEMA = json.loads((Path(__file__).parents[2] / 'data' / 'result.schema.json').read_text())
 RIG = load_rig()
@@ -119,7 +120,7 @@ def test_where_is_the_turned_sensor(rotated: Discovery) -> None:
 
 def test_the_model_closes_the_gap_on_new_data(rotated: Discovery, tmp_path: Path) -> None:
     path = tmp_path / 'model.yaml'
-    path.write_text(model_yaml(RIG, rotated.active_effects))
+    path.write_text(described(RIG, rotated.active_effects))
     model = load_rig(path)
     assert model.values == RIG.values
     assert [a.effect.name for a in effects_of_rig(model)] == ['sensor_rotation']
@@ -354,7 +355,7 @@ def test_from_simulate_to_model(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 def test_a_bag_tells_its_own_rig_but_not_what_was_hidden(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     short = tmp_path / 'short.yaml'
-    short.write_text(model_yaml(replace_values(RIG, {'link.length': 0.4}), ()))
+    short.write_text(described(replace_values(RIG, {'link.length': 0.4}), ()))
     words = ['--params-file', str(short), '--loads', 'thesis:1', '--effect', 'sensor_rotation,psd=1,angle=0.003']
     assert main(['simulate', '--out', str(tmp_path / 'run'), *words]) == 0
     assert main(['discover', str(tmp_path / 'run'), '--out', str(tmp_path / 'found'), '--quiet']) == 0

@@ -1,0 +1,55 @@
+"""What every study's command does with its result: print it, or its JSON, and write its files."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable
+
+from psd_deflection.cli._options import make_writable, namespace_option
+from psd_deflection.cli._progress import progress_of, told
+from psd_deflection.cli._report import print_json, save_all, show, warn
+from psd_deflection.records import SampleBlock
+from psd_deflection.studies.study import Opened, StudyResult, opened
+
+
+def recording_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare a recording and its rig."""
+    parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
+    parser.add_argument(
+        '--params-file', metavar='RIG.yaml', help='use this rig instead of the parameters in the recording'
+    )
+    namespace_option(parser)
+
+
+def answer_arguments(parser: argparse.ArgumentParser, files: str) -> None:
+    """Declare where the answer goes."""
+    parser.add_argument('--out', metavar='DIR', help=f'write {files} into this folder')
+    parser.add_argument('--json', action='store_true', help='print the answer as JSON in SI units')
+
+
+def opened_recording(args: argparse.Namespace) -> Opened:
+    """The recording and the rig of ``args``; the folder of --out is made first, before the work."""
+    if args.out is not None:
+        make_writable(args.out)
+    return opened(args.recording, args.params_file, namespace=args.namespace, tell=warn)
+
+
+def counted(args: argparse.Namespace) -> Callable[[Iterable[SampleBlock]], Iterable[SampleBlock]]:
+    """Hands blocks on below a progress bar."""
+    return lambda blocks: progress_of(blocks, quiet=args.json)
+
+
+def answer(args: argparse.Namespace, result: StudyResult) -> int:
+    """Print the result and write its files."""
+    if args.json:
+        print_json(result.tree(), indent=1)
+    else:
+        show(*result.lines())
+    if args.out is not None:
+        with told('drawing', quiet=args.json):
+            files = result.files()
+        folder = make_writable(args.out)
+        save_all(files, folder)
+        *others, last = files
+        show(f'wrote {", ".join(others)} and {last} into {folder}', aside=args.json)
+    return 0

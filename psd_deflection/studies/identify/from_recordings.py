@@ -1,0 +1,40 @@
+"""What identify looks at: the poses of single samples of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.detector import dot_noise_variances
+from psd_deflection.model.solvers.registry import solver_from_rig
+from psd_deflection.recordings.read.references import read_run
+from psd_deflection.records import FloatArray, SampleBlock
+from psd_deflection.studies.study import Opened
+
+Counted = Callable[[Iterable[SampleBlock]], Iterable[SampleBlock]]
+"""Hands blocks on and counts them, for a progress bar."""
+
+
+@dataclass(frozen=True)
+class IdentifyProblem:
+    """``poses`` (n, 3): dX m, dY m, theta rad of single samples on an even grid, NaN if lost; ``rate``, Hz."""
+
+    opened: Opened
+    poses: FloatArray
+    rate: float
+
+
+def read_identify(opened: Opened, counted: Counted = iter) -> IdentifyProblem:
+    """Solve every trusted sample. Raises RecordingError if there are none."""
+    recording, rig = opened.recording, opened.rig
+    seen = read_run(recording, Pipeline(rig), counted(recording.blocks()))
+    rate = rig.converter.sample_rate_hz
+    solved = solver_from_rig(rig.estimator.solver, rig).solve_many(seen.dots, dot_noise_variances(rig))
+    place = np.rint((seen.t_ns - seen.t_ns[0]) * 1e-9 * rate).astype(np.int64)
+    poses = np.full((int(place[-1]) + 1, 3), np.nan)
+    good = solved.status == 0
+    poses[place[good]] = solved.pose[good]
+    return IdentifyProblem(opened, poses, rate)

@@ -1,0 +1,13 @@
+"""Find the modes of the link in a recording."""
+
+from __future__ import annotations
+
+from psd_deflection.studies.identify.from_recordings import IdentifyProblem
+from psd_deflection.studies.identify.modes import modes_of
+from psd_deflection.studies.identify.result import Identified
+
+
+def identify(problem: IdentifyProblem) -> Identified:
+    """The modes of each axis; see :mod:`psd_deflection.studies.identify.modes` for the methods."""
+    x, y, twist = (modes_of(problem.poses[:, i], problem.rate) for i in range(3))
+    return Identified(problem, (x, y, twist))

@@ -1,0 +1,182 @@
+"""The shape of every study: recordings give a problem, steps solve it, the result says, shows and writes itself.
+
+A study is a folder. ``from_recordings.py`` reads the problem, which is frozen and has arrays alone. A function of
+the study's name takes it and gives a :class:`StudyResult`. So the command and Python write the same files, and every
+page has the same form: the answer first, then sections, then what it was made from.
+"""
+
+from __future__ import annotations
+
+import abc
+import html
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import yaml
+
+from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.base.files import replace_file
+from psd_deflection.base.json_text import json_text
+from psd_deflection.base.pages import page, table
+from psd_deflection.model.simulation.catalogue import effects_to_values
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.replay.engine import nominal_rig, rig_at_end
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.rig.declarations import DESCRIPTION
+from psd_deflection.rig.parameter_files import nested, parameter_text
+
+Tell = Callable[[str], None]
+"""Takes a warning."""
+
+
+def warn_caller(warning: str) -> None:
+    """A warning as Python has it, for a caller who names no other way."""
+    warnings.warn(warning, stacklevel=3)
+
+
+class PageSection(NamedTuple):
+    """A part of the page: ``title`` ('' if it belongs to what is above) and HTML."""
+
+    title: str
+    parts: tuple[str, ...]
+
+
+class StudyResult(abc.ABC):
+    """The answer of a study. ``study``: its name, and that of its JSON file. ``title``: of its page."""
+
+    study: ClassVar[str]
+    title: ClassVar[str]
+
+    @abc.abstractmethod
+    def tree(self) -> dict[str, Any]:
+        """The answer for programs: names, numbers in SI units, lists."""
+
+    @abc.abstractmethod
+    def sentences(self) -> list[str]:
+        """The answer for a person, the most important first."""
+
+    @abc.abstractmethod
+    def sections(self) -> Iterable[PageSection]:
+        """The page below the sentences."""
+
+    @property
+    def sources(self) -> Mapping[str, str]:
+        """What the answer was made from, by what it is."""
+        return {}
+
+    def lines(self) -> list[str]:
+        """What the command prints."""
+        return self.sentences()
+
+    def report(self) -> str:
+        """The page as HTML, with its pictures inside."""
+        first, *others = self.sentences()
+        body = [f'<h1>{html.escape(self.title)}</h1><p class=verdict>{html.escape(first)}</p>']
+        body += [f'<p>{html.escape(text)}</p>' for text in others]
+        for section in self.sections():
+            body += [f'<h2>{html.escape(section.title)}</h2>'] if section.title else []
+            body += section.parts
+        if self.sources:
+            body += ['<h2>Made from</h2>', table(('what', 'from'), list(self.sources.items()))]
+        return page(f'psd-deflection {self.study}', body)
+
+    def json(self) -> str:
+        """The tree as text; null for numbers that JSON does not have."""
+        return json_text(self.tree(), indent=1) + '\n'
+
+    def files(self) -> dict[str, str]:
+        """What :meth:`save` writes, by name."""
+        return {'report.html': self.report(), f'{self.study}.json': self.json()}
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write the page, the JSON and whatever else there is into ``folder``; it is made if it is not there.
+
+        Returns the paths. Raises RecordingError if the disk refuses.
+        """
+        into = Path(folder)
+        files = self.files()
+        try:
+            into.mkdir(parents=True, exist_ok=True)
+            for name, text in files.items():
+                replace_file(into / name, text.encode(errors='replace'))
+        except OSError as error:
+            raise RecordingError(f'{into}: cannot be written ({error.strerror or error})') from None
+        return [into / name for name in files]
+
+
+class Opened(NamedTuple):
+    """A recording, cut into the rig's blocks, and its rig.
+
+    ``params_file``: of the rig, if it has one. ``tell``: takes warnings.
+    """
+
+    recording: Recording
+    rig: Rig
+    params_file: Path | None
+    tell: Tell = warn_caller
+
+    @property
+    def sources(self) -> dict[str, str]:
+        """See :attr:`StudyResult.sources`."""
+        rig = 'the parameters in the recording' if self.params_file is None else str(self.params_file)
+        return {'recording': str(self.recording.path), 'rig': rig}
+
+
+def opened(
+    recording: Recording | str | Path,
+    rig: Rig | str | Path | None = None,
+    *,
+    namespace: str | None = None,
+    tell: Tell = warn_caller,
+) -> Opened:
+    """The recording and the rig that describes it: ``rig``, its parameter file, or that of the recording's end.
+
+    ``tell`` gets a warning if nobody names a rig. Raises RecordingError and ConfigError.
+    """
+    if not isinstance(recording, Recording):
+        recording = open_recording(recording, namespace=namespace)
+    params_file = None if rig is None or isinstance(rig, Rig) else Path(rig)
+    if rig is None:
+        for warning in nominal_rig(recording):
+            tell(warning)
+        known = rig_at_end(recording)
+    else:
+        known = rig if isinstance(rig, Rig) else load_rig(rig)
+    return Opened(recording.with_block_size(known.estimator.block_size), known, params_file, tell)
+
+
+def described(rig: Rig, effects: Iterable[ActiveEffect]) -> str:
+    """What describes the rig, as a ROS 2 parameter file with ``effects`` instead of its own.
+
+    For a rig without a file of its own; :func:`psd_deflection.rig.parameter_files.with_effects_section` adds them to a
+    file. Port, folders and page are left out: they belong to a machine.
+    """
+    tree = nested({name: rig.values[name] for name in DESCRIPTION})
+    if given := list(effects):
+        tree['effects'] = effects_to_values(given)
+    return yaml.safe_dump({'/**': {'ros__parameters': tree}}, sort_keys=False, allow_unicode=True)
+
+
+def edited_rig_file(
+    params_file: str | Path | None,
+    name: str,
+    rig_text: Callable[[], str],
+    edit: Callable[[str, Path], str],
+    tell: Tell = warn_caller,
+) -> str:
+    """The text of the file ``name``: ``edit`` of the user's file and its path, comments kept.
+
+    Without a file of the user, or if it cannot be edited, which ``tell`` gets, ``edit`` of what ``rig_text`` gives.
+    """
+    if params_file is not None:
+        path = Path(params_file)
+        text = parameter_text(path)
+        try:
+            return edit(text, path)
+        except ConfigError as error:
+            tell(f'{error}: {name} has its values without its comments')
+    return edit(rig_text(), Path(name))

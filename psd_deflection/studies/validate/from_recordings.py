@@ -1,0 +1,112 @@
+"""What validate compares: the motion of a recording as each solver has it, and a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from psd_deflection.base.errors import ConfigError, SolverError
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.detector import dot_noise_variances
+from psd_deflection.model.solvers.registry import SOLVERS, solver_from_rig
+from psd_deflection.recordings.read.references import read_references, read_run, references_of
+from psd_deflection.records import FloatArray, IntArray, SampleBlock
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.study import Opened
+from psd_deflection.studies.validate.motion import Motion, Solve
+
+
+@dataclass(frozen=True)
+class ValidateProblem:
+    """``motion``: what the detectors saw. ``solvers``: those that can solve the rig, the rig's first.
+
+    ``t`` (k,), s, by the reference's clock, increasing. ``reference`` (k, 3), m, m, rad; ``sd`` (k, 3) of it if it is
+    known; ``refused``: measurements without an answer, by reason. ``estimate_sd`` (3,): of the published estimates.
+    ``align``: remove the offset between the clocks if it is told. ``largest``: offset that is looked for, s.
+    ``exposure``: time over which each reference is a mean, s. ``sources``: what is compared, by name.
+    """
+
+    motion: Motion
+    solvers: Mapping[str, Solve]
+    t: FloatArray
+    reference: FloatArray
+    sd: FloatArray | None
+    refused: Mapping[str, int]
+    estimate_sd: FloatArray
+    align: bool
+    largest: float
+    exposure: float
+    sources: Mapping[str, str]
+
+    @property
+    def solver(self) -> str:
+        """That of the rig."""
+        return next(iter(self.solvers))
+
+
+def read_validate(
+    opened: Opened,
+    reference: str | Path | None = None,
+    *,
+    align: bool = False,
+    largest: float = 1.0,
+    exposure: float = 0.0,
+    counted: Callable[[Iterable[SampleBlock]], Iterable[SampleBlock]] = iter,
+) -> ValidateProblem:
+    """Read the recording and its reference, or the one of a file. Raises RecordingError if one lacks what is needed.
+
+    ``counted`` hands blocks on and counts them.
+    """
+    recording, rig = opened.recording, opened.rig
+    references = references_of(recording) if reference is None else read_references(reference)
+    seen = read_run(recording, Pipeline(rig), counted(recording.blocks()))
+    solvers = _solvers(rig)
+    start = int(seen.t_ns[0])
+    return ValidateProblem(
+        motion=Motion(
+            _seconds(seen.t_ns, start), seen.dots, 1.0 / rig.converter.sample_rate_hz, solvers[rig.estimator.solver]
+        ),
+        solvers=solvers,
+        t=_seconds(references.t_ns, start),
+        reference=references.poses,
+        sd=references.sd,
+        refused=references.refused,
+        estimate_sd=seen.estimate_sd,
+        align=align,
+        largest=largest,
+        exposure=exposure,
+        sources={**opened.sources, 'reference': str(reference or recording.path)},
+    )
+
+
+def _seconds(t_ns: IntArray, start_ns: int) -> FloatArray:
+    seconds: FloatArray = (t_ns - start_ns).astype(np.float64) * 1e-9
+    return seconds
+
+
+def _solvers(rig: Rig) -> dict[str, Solve]:
+    """Every solver that can solve the rig, the rig's first."""
+    variances = dot_noise_variances(rig) / rig.estimator.block_size
+    out: dict[str, Solve] = {}
+    for name in dict.fromkeys([rig.estimator.solver, *SOLVERS]):
+        try:
+            out[name] = _solve(name, rig, variances)
+        except (SolverError, ConfigError):
+            if name == rig.estimator.solver:
+                raise
+    return out
+
+
+def _solve(name: str, rig: Rig, variances: FloatArray) -> Solve:
+    solver = solver_from_rig(name, rig)
+
+    def solve(dots: FloatArray) -> FloatArray:
+        found = solver.solve_many(dots, variances)
+        poses = found.pose.copy()
+        poses[found.status != 0] = float('nan')
+        return poses
+
+    return solve
