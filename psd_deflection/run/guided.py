@@ -13,9 +13,10 @@ from psd_deflection.model.link import LinkStatics
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.run.reading.acquisition import Acquisition, Arrival, Ended
 from psd_deflection.run.simulated_rig import SimulatedRigProcess, simulates
-from psd_deflection.studies.check.checkup import Checkup, check
+from psd_deflection.studies.check.checkup import CheckProblem, check
 from psd_deflection.studies.check.guide import Guide, Phase
 from psd_deflection.studies.check.levels import levels
+from psd_deflection.studies.check.result import Checkup
 
 LOOK_S = 0.2
 SILENT_LOOKS = 50
@@ -87,7 +88,7 @@ def _lead(
             if told:
                 say(told)
     drift, sd = guide.drift()
-    return check(rig, guide.pushes, levels(rig, guide.rest()), drift, sd)
+    return check(CheckProblem(rig, guide.pushes, levels(rig, guide.rest()), drift, sd))
 
 
 def _simulated_push(rig: Rig, guide: Guide) -> tuple[float, float, float]:

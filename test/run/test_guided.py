@@ -9,7 +9,7 @@ import pytest
 from psd_deflection.base.errors import DeviceError
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.guided import run_guided
-from psd_deflection.studies.check.checkup import WRONG
+from psd_deflection.studies.check.result import WRONG
 
 
 def test_the_simulated_rig_and_hand_show_a_wrong_wiring() -> None:
@@ -18,7 +18,7 @@ def test_the_simulated_rig_and_hand_show_a_wrong_wiring() -> None:
     world = load_rig(overrides={'psd_1.axes': ['-y', 'x'], 'psds_exchanged': True})
     found = run_guided(load_rig(), world, said.append, lambda guide: shown.append(guide.progress))
     assert found.verdict == WRONG
-    assert dict(found.lines) == {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x']}
+    assert dict(found.values) == {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x']}
     prompts = [text[:12] for text in said if text.startswith(('Leave', '1 of', '2 of', '3 of', 'Let go'))]
     assert prompts == [
         'Leave the li',

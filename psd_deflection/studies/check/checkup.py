@@ -1,17 +1,19 @@
-"""The check of a rig: what its rig file has wrong, how sure that is, and the lines that put it right."""
+"""The check of a rig: wiring, loads, noise and light against its rig file."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.check.levels import NOISE_FACTOR, SUM_FACTOR, Levels
+from psd_deflection.studies.check.levels import NOISE_FACTOR, SUM_FACTOR, Levels, levels
+from psd_deflection.studies.check.responses import responses
+from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, TELLING_DRIFT, WRONG, Checkup, Finding
 from psd_deflection.studies.check.wirings import (
     DOTS,
     LIMIT,
@@ -26,13 +28,8 @@ from psd_deflection.studies.check.wirings import (
     parameters,
 )
 
-RIGHT, WRONG, CANNOT_TELL = 'right', 'wrong', 'cannot_tell'
-
 DEAD = 0.1
 """A channel that moves less than this share of every push does not answer."""
-
-TELLING_DRIFT = 5e-6 / 60.0
-"""m/s: a drift whose standard deviation is larger is not told; the recording is too short."""
 
 SIZE_FACTOR = 1.1
 """A movement that is so many times the expected one, or so many times less, is told."""
@@ -41,47 +38,29 @@ UNITS = {9.80665: 'kg for N', 1.0 / 9.80665: 'N for kg', 1000.0: 'kN for N', 1e-
 UNIT_TOLERANCE = 0.1
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing that is not as the rig file or the recording says.
-
-    ``name``: channel_sign, axis_swap, psd_swap, load_sign, load_unit, load_coverage, stuck_channel, noise_level.
-    ``where``: channel, PSD or load. ``value``: -1 for a turned sign, or a factor. ``fix``: the line for the rig file,
-    or what to do. ``evidence``: how much more of the movement (summed over the pushes) the rig file leaves unexplained.
-    ``equivalent``: other causes that look the same to first order.
-    """
-
-    name: str
-    where: str
-    value: float | None
-    fix: str
-    evidence: float = 0.0
-    equivalent: tuple[str, ...] = ()
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class Checkup:
-    """``findings``: what is wrong. ``lines``: parameters for the rig file. ``sizes``: movement of each push over the
-    expected one, NaN if it was not seen. ``found``: the wirings that explain the pushes. ``drift``, ``drift_sd`` (4,):
-    m/s, of the device's channels x1 y1 x2 y2. ``notes``: what else is worth a look.
+class CheckProblem:
+    """``pushes``: how the channels answered. ``levels``: noise, hum and light. ``drift``, ``drift_sd`` (4,): m/s, of
+    the device's channels x1 y1 x2 y2. ``source``: the recording, '' at the bench.
     """
 
-    verdict: str
-    findings: tuple[Finding, ...]
-    lines: Mapping[str, object]
-    pushes: tuple[PushResponse, ...]
-    sizes: tuple[float, ...]
-    found: tuple[WiringFit, ...]
+    rig: Rig
+    pushes: Sequence[PushResponse]
     levels: Levels
     drift: FloatArray
     drift_sd: FloatArray
-    notes: tuple[str, ...] = field(default=())
+    source: str = ''
 
 
-def check(
-    rig: Rig, pushes: Sequence[PushResponse], measured: Levels, drift: FloatArray, drift_sd: FloatArray
-) -> Checkup:
+def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '') -> CheckProblem:
+    """The problem of a recording: ``volts`` (n, 6) of the device's channels, ``loads`` (n, 3), N, N, N m, held."""
+    answered = responses(rig, volts, loads)
+    return CheckProblem(rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd, source)
+
+
+def check(problem: CheckProblem) -> Checkup:
     """Hold the pushes, the noise and the light against the rig file."""
+    rig, pushes, measured = problem.rig, problem.pushes, problem.levels
     file = Wiring.from_rig(rig)
     seen = tuple(p for p in pushes if p.seen)
     dead = [*measured.stuck, *(c for c in _dead(seen) if c not in measured.stuck)]
@@ -101,16 +80,18 @@ def check(
     verdict = WRONG if any(f.name != 'load_coverage' for f in findings) else RIGHT if told else CANNOT_TELL
     sizes = tuple(p.misfit(best.wiring)[1] if p.seen else math.nan for p in pushes)
     return Checkup(
-        verdict,
-        tuple(findings),
-        lines,
-        tuple(pushes),
-        sizes,
-        tuple(found),
-        measured,
-        drift,
-        drift_sd,
-        tuple(_notes(rig, measured, best.wiring, pushes, sizes, drift, drift_sd)),
+        rig=rig,
+        verdict=verdict,
+        findings=tuple(findings),
+        values=lines,
+        pushes=tuple(pushes),
+        sizes=sizes,
+        found=tuple(found),
+        levels=measured,
+        drift=problem.drift,
+        drift_sd=problem.drift_sd,
+        notes=tuple(_notes(problem, best.wiring, sizes)),
+        source=problem.source,
     )
 
 
@@ -207,17 +188,10 @@ def _coverage(
     return [Finding('load_coverage', ' '.join(missing) or 'fx fy tz', None, text)]
 
 
-def _notes(
-    rig: Rig,
-    measured: Levels,
-    wiring: Wiring,
-    pushes: Sequence[PushResponse],
-    sizes: Sequence[float],
-    drift: FloatArray,
-    drift_sd: FloatArray,
-) -> list[str]:
+def _notes(problem: CheckProblem, wiring: Wiring, sizes: Sequence[float]) -> list[str]:
+    rig, measured, drift, drift_sd = problem.rig, problem.levels, problem.drift, problem.drift_sd
     out = []
-    for push, size in zip(pushes, sizes, strict=True):
+    for push, size in zip(problem.pushes, sizes, strict=True):
         if push.sized and math.isfinite(size) and not 1.0 / SIZE_FACTOR <= abs(size) <= SIZE_FACTOR:
             out.append(
                 f'{push.name}: the dots move {abs(size):.2f} times what the rig file expects; see its link and '

@@ -18,7 +18,7 @@ from psd_deflection.model.simulation.declaration import ActiveEffect, Effect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.rig.config import Rig, replace_values
-from psd_deflection.studies.check.checkup import Finding
+from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.laws.laws import FoundLaw, find_law
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import suggest

@@ -22,9 +22,9 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, rig_from_values
 from psd_deflection.rig.parameter_files import read_parameter_file
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.check.checkup import CANNOT_TELL, RIGHT, WRONG, Checkup, check
-from psd_deflection.studies.check.levels import levels
+from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.check.responses import responses
+from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, WRONG, Checkup
 from psd_deflection.studies.check.wirings import WIRINGS, differences, line, parameters
 from psd_deflection.studies.discover.from_recordings import read_observation
 
@@ -93,8 +93,7 @@ def every_turn() -> list[Turn]:
 
 def checked(volts: FloatArray, loads: FloatArray, rig: Rig | None = None) -> Checkup:
     rig = rig or load_rig()
-    answered = responses(rig, volts, loads)
-    return check(rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd)
+    return check(of_recording(rig, volts, loads))
 
 
 def lines_of(turn: Turn) -> dict[str, object]:
@@ -121,8 +120,8 @@ def test_each_of_the_127_wrong_wirings_is_named_from_three_pushes_at_ten_times_t
         loads = pushes(10.0 if seed % 8 == 7 else 10.0 * BLOCK)
         found = checked(recorded(loads, seed, turn), loads)
         wanted = lines_of(turn)
-        if found.verdict != (WRONG if wanted else RIGHT) or found.lines != wanted or len(found.found) != 1:
-            misnamed.append((turn, found.verdict, found.lines))
+        if found.verdict != (WRONG if wanted else RIGHT) or found.values != wanted or len(found.found) != 1:
+            misnamed.append((turn, found.verdict, found.values))
     assert not misnamed
 
 
@@ -130,7 +129,7 @@ def test_a_right_rig_is_accused_by_none_of_20_seeds() -> None:
     for size, seed in itertools.product((10.0, 10.0 * BLOCK), range(20)):
         loads = pushes(size)
         found = checked(recorded(loads, seed), loads)
-        assert (found.verdict, found.findings, dict(found.lines)) == (RIGHT, (), {})
+        assert (found.verdict, found.findings, dict(found.values)) == (RIGHT, (), {})
 
 
 @pytest.mark.parametrize(
@@ -152,7 +151,7 @@ def test_a_rig_that_is_wired_right_is_not_accused_for_what_else_is_wrong_with_it
     for seed in range(3):
         found = checked(recorded(loads, seed, effects=effects), loads)
         assert found.verdict == RIGHT, found.findings
-        assert not found.lines
+        assert not found.values
 
 
 @pytest.mark.parametrize('noise', [{'memory': 0.9}, {'heavy': True}, {'sigmas': (1e-3, 2e-3, 2e-3, 3e-3, 2e-3, 2e-3)}])
@@ -171,7 +170,7 @@ def test_a_rig_file_that_knows_its_wiring_is_right_and_the_nominal_one_is_then_w
         assert checked(recorded(loads, seed, turn), loads, rig).verdict == RIGHT
         nominal = checked(recorded(loads, seed), loads, rig)
         assert nominal.verdict == WRONG
-        assert rig_from_values({**lines_of(turn), **nominal.lines}).values == load_rig().values
+        assert rig_from_values({**lines_of(turn), **nominal.values}).values == load_rig().values
 
 
 def test_all_four_signs_wrong_could_be_the_load_too_and_both_are_said() -> None:
@@ -182,7 +181,7 @@ def test_all_four_signs_wrong_could_be_the_load_too_and_both_are_said() -> None:
         ('channel_sign', c, -1.0) for c in ('x1', 'y1', 'x2', 'y2')
     ]
     assert {f.equivalent for f in found.findings} == {('load_sign of fx fy tz',)}
-    assert dict(found.lines) == {'psd_1.axes': ['-x', '-y'], 'psd_2.axes': ['-x', '-y']}
+    assert dict(found.values) == {'psd_1.axes': ['-x', '-y'], 'psd_2.axes': ['-x', '-y']}
     # Pushed the other way on a rig that is wired right: the same evidence, the same two answers.
     other = checked(recorded(pushes(10.0, (-1.0, -1.0, -1.0)), 0), loads)
     assert [(f.name, f.where, f.equivalent) for f in other.findings] == [
@@ -202,7 +201,7 @@ def test_the_sign_of_one_load_is_named_and_no_wire(i: int, load: str) -> None:
     signs[i] = -1.0
     found = checked(recorded(pushes(10.0, signs), 1), pushes(10.0))
     assert [(f.name, f.where, f.value) for f in found.findings] == [('load_sign', load, -1.0)]
-    assert not found.lines
+    assert not found.values
 
 
 def test_loads_in_kilograms_are_named() -> None:
@@ -221,7 +220,7 @@ def test_a_dead_channel_is_named_and_no_wiring(channel: str, stuck: bool) -> Non
     volts[:, column] = 0.1 if stuck else generator.electronic_noise(len(volts), 9)[:, column]
     found = checked(volts, loads)
     assert [(f.name, f.where) for f in found.findings] == [('stuck_channel', channel)]
-    assert not found.lines
+    assert not found.values
 
 
 def test_loads_that_leave_a_wire_untouched_cannot_tell_and_say_what_is_needed() -> None:
@@ -232,7 +231,7 @@ def test_loads_that_leave_a_wire_untouched_cannot_tell_and_say_what_is_needed() 
     assert [f.name for f in found.findings] == ['load_coverage']
     assert 'fx' in found.findings[0].fix
     assert Wiring() in [c.wiring for c in found.found]
-    assert not found.lines
+    assert not found.values
     # Weights on a sidebar: a force along Y and its torque, always together.
     together = np.zeros((6000, 3))
     together[2000:4000] = (0.0, -10.0, -5.85)
@@ -256,8 +255,8 @@ def test_noise_hum_and_light_are_held_against_the_rig_file() -> None:
     volts[:, 5] *= 0.7
     found = checked(volts, loads)
     (noisy,) = found.findings
-    assert (noisy.name, noisy.fix) == ('noise_level', f'amplifier.noise: {found.lines["amplifier.noise"]}')
-    assert found.lines['amplifier.noise'] == pytest.approx(6e-3, rel=0.05)
+    assert (noisy.name, noisy.fix) == ('noise_level', f'amplifier.noise: {found.values["amplifier.noise"]}')
+    assert found.values['amplifier.noise'] == pytest.approx(6e-3, rel=0.05)
     np.testing.assert_allclose(found.levels.noise[[0, 1, 3, 4]], 6e-3, rtol=0.05)
     assert found.levels.hum_hz == 60.0
     assert found.levels.hum[1] == pytest.approx(4e-3, rel=0.1)
@@ -276,7 +275,7 @@ def test_noise_that_the_rig_file_says_for_each_channel_is_held_against_each() ->
     (noisy,) = found.findings
     assert (noisy.name, noisy.where) == ('noise_level', 'x2')
     assert noisy.value == pytest.approx(2.0, rel=0.05)
-    assert found.lines == {'psd_2.noise': pytest.approx([8e-3, 2e-3], rel=0.05)}
+    assert found.values == {'psd_2.noise': pytest.approx([8e-3, 2e-3], rel=0.05)}
     right = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [8e-3, 2e-3]})
     assert not checked(volts, loads, right).findings
 
@@ -297,7 +296,7 @@ def test_a_wrong_wiring_is_named_whatever_the_sensitivities_are(name: str) -> No
     turned = np.column_stack([sign * volts[:, names.index(of)] for of, sign in (turn[n] for n in names)])
     found = checked(turned, loads, rig)
     assert found.verdict == WRONG
-    assert dict(found.lines) == lines_of(turn)
+    assert dict(found.values) == lines_of(turn)
 
 
 def test_drift_is_told_with_its_sign() -> None:
@@ -332,7 +331,7 @@ def test_loads_that_say_nothing_and_samples_with_gaps_are_no_accident() -> None:
     gaps = volts.copy()
     gaps[::3] = np.nan
     found = checked(gaps, loads)
-    assert (found.verdict, dict(found.lines)) == (RIGHT, {})
+    assert (found.verdict, dict(found.values)) == (RIGHT, {})
     lost = np.where(np.arange(len(volts))[:, None] % 40 < 20, volts, np.nan)
     assert checked(lost, loads).verdict == RIGHT
     with pytest.raises(RecordingError, match='at least 8 are needed'):

@@ -12,9 +12,10 @@ from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, rig_from_values
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.check.checkup import RIGHT, WRONG, Checkup, check
+from psd_deflection.studies.check.checkup import CheckProblem, check
 from psd_deflection.studies.check.guide import Guide, Phase, directions
 from psd_deflection.studies.check.levels import levels
+from psd_deflection.studies.check.result import RIGHT, WRONG, Checkup
 from psd_deflection.studies.check.wirings import WIRINGS, parameters
 
 BLOCK = 20
@@ -60,7 +61,7 @@ def hand_of(rig: Rig, size: float, clumsy: float = 0.0) -> tuple[FloatArray, ...
 
 
 def verdict(known: Rig, guide: Guide) -> Checkup:
-    return check(known, guide.pushes, levels(known, guide.rest()), *guide.drift())
+    return check(CheckProblem(known, guide.pushes, levels(known, guide.rest()), *guide.drift()))
 
 
 @pytest.mark.parametrize('number', range(0, 128, 9))
@@ -73,7 +74,7 @@ def test_a_wiring_is_named_by_hand(number: int, clumsy: float) -> None:
     assert sum(text.startswith('Got it: ') for text in said) == 3
     found = verdict(known, guide)
     assert found.verdict == (WRONG if number else RIGHT)
-    assert dict(found.lines) == parameters(wiring, Wiring())
+    assert dict(found.values) == parameters(wiring, Wiring())
     # A hand's turn shifts the tip, so exchanged PSDs look like a turn the other way; that is said.
     if wiring == Wiring(exchanged=True):
         assert found.findings[0].equivalent == ('load_sign of tz',)

@@ -19,7 +19,7 @@ from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import nested
-from psd_deflection.studies.check.checkup import Finding
+from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover import discover as answer
 from psd_deflection.studies.discover import planning
 from psd_deflection.studies.discover import result as told

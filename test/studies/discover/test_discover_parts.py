@@ -15,7 +15,7 @@ from psd_deflection.model.simulation.catalogue import catalogue, make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.rig.config import replace_values
-from psd_deflection.studies.check.checkup import Finding
+from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover import discover as answer
 from psd_deflection.studies.discover.discover import Discovery, discover, pose_change
 from psd_deflection.studies.discover.laws.laws import FoundLaw

@@ -20,7 +20,7 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.check.checkup import Finding
+from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import WIRINGS, differences, fix_of, line, parameters
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.fit import Fit

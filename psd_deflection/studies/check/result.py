@@ -1,0 +1,228 @@
+"""The answer of check: what the rig file has wrong, how sure that is, and the lines that put it right."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from psd_deflection.base.pages import table
+from psd_deflection.base.tables import columns
+from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.check.levels import Levels
+from psd_deflection.studies.check.wirings import DOTS, WIRINGS, PushResponse, WiringFit, line, on_channels
+from psd_deflection.studies.study import PageSection, StudyResult
+
+RIGHT, WRONG, CANNOT_TELL = 'right', 'wrong', 'cannot_tell'
+
+TELLING_DRIFT = 5e-6 / 60.0
+"""m/s: a drift whose standard deviation is larger is not told; the recording is too short."""
+
+NAMES = {
+    'channel_sign': 'sign turned',
+    'axis_swap': 'x and y exchanged',
+    'psd_swap': 'exchanged',
+    'load_sign': 'sign turned',
+    'load_unit': 'other unit',
+    'stuck_channel': 'dead',
+    'noise_level': 'noise',
+    'load_coverage': 'not seen',
+}
+WIRED = ('channel_sign', 'axis_swap', 'psd_swap')
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is not as the rig file or the recording says.
+
+    ``name``: channel_sign, axis_swap, psd_swap, load_sign, load_unit, load_coverage, stuck_channel, noise_level.
+    ``where``: channel, PSD or load. ``value``: -1 for a turned sign, or a factor. ``fix``: the line for the rig file,
+    or what to do. ``evidence``: how much more of the movement (summed over the pushes) the rig file leaves unexplained.
+    ``equivalent``: other causes that look the same to first order.
+    """
+
+    name: str
+    where: str
+    value: float | None
+    fix: str
+    evidence: float = 0.0
+    equivalent: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Checkup(StudyResult):
+    """``findings``: what is wrong. ``values``: parameters for the rig file. ``sizes``: movement of each push over
+    the expected one, NaN if it was not seen. ``found``: the wirings that explain the pushes. ``drift``, ``drift_sd``
+    (4,): m/s, of the device's channels x1 y1 x2 y2. ``notes``: what else is worth a look. ``source``: the recording.
+    """
+
+    study = 'check'
+    title = 'Is the rig set up as its file says?'
+
+    rig: Rig
+    verdict: str
+    findings: tuple[Finding, ...]
+    values: Mapping[str, object]
+    pushes: tuple[PushResponse, ...]
+    sizes: tuple[float, ...]
+    found: tuple[WiringFit, ...]
+    levels: Levels
+    drift: FloatArray
+    drift_sd: FloatArray
+    notes: tuple[str, ...] = field(default=())
+    source: str = ''
+
+    @property
+    def sources(self) -> Mapping[str, str]:
+        """The recording, if it was one."""
+        return {'recording': self.source} if self.source else {}
+
+    def sentences(self) -> list[str]:
+        """The verdict, then what is wrong, one line each, then what to look at."""
+        return [_verdict(self), *_findings(self), *(f'look at  {note}' for note in self.notes)]
+
+    def lines(self) -> list[str]:
+        """Pushes, verdict, lines for the rig file, levels."""
+        out = ['', *columns(_pushes(self)).splitlines(), '', _verdict(self)]
+        out += [f'  {text}' for text in _findings(self)]
+        if self.values:
+            out += ['', 'Lines for the rig file, below ros__parameters:', '']
+            out += [f'    {line(name, value)}' for name, value in self.values.items()]
+        levels = [f'{name:<9}{text}' for name, text in _levels(self)]
+        return [*out, '', *levels, *(f'look at  {note}' for note in self.notes)]
+
+    def sections(self) -> Iterable[PageSection]:
+        """Pushes, lines for the rig file, levels."""
+        head, *rows = _pushes(self)
+        out = [PageSection('How each channel answered', (table(head, rows),))]
+        if self.values:
+            lines = [(line(name, value),) for name, value in self.values.items()]
+            out.append(PageSection('Lines for the rig file', (table(('below ros__parameters',), lines),)))
+        return [*out, PageSection('Noise, light and drift', (table(('', ''), _levels(self)),))]
+
+    def tree(self) -> dict[str, Any]:
+        """In SI units."""
+        measured = self.levels
+        return {
+            'verdict': self.verdict,
+            'setup': [
+                {
+                    'name': f.name,
+                    'where': f.where,
+                    'value': f.value,
+                    'fix': f.fix,
+                    'evidence': f.evidence,
+                    'equivalent': list(f.equivalent),
+                }
+                for f in self.findings
+            ],
+            'lines': dict(self.values),
+            'wirings_that_fit': [_wiring_json(c.wiring) for c in self.found],
+            'pushes': [
+                {
+                    'loads': list(p.loads),
+                    'seen': p.seen,
+                    'channels': _by(DOTS, p.channels.tolist()),
+                    'sd': _by(DOTS, p.sd.tolist()),
+                    'size': size if p.sized else None,
+                }
+                for p, size in zip(self.pushes, self.sizes, strict=True)
+            ],
+            'noise': {**_by(CHANNELS, measured.noise.tolist()), 'rig_file': measured.stated},
+            'hum': {'hz': measured.hum_hz, **_by(CHANNELS, measured.hum.tolist())},
+            'sums': measured.sums.tolist(),
+            'drift': _by(DOTS, self.drift.tolist()),
+            'drift_sd': _by(DOTS, self.drift_sd.tolist()),
+            'notes': list(self.notes),
+        }
+
+
+def _pushes(found: Checkup) -> list[list[str]]:
+    """How each channel answered, beside what the rig file expects of it."""
+    rows = [['push', *(f'{c} µm' for c in DOTS), '', *DOTS, 'size']]
+    for push, size in zip(found.pushes, found.sizes, strict=True):
+        expected = on_channels(Wiring.from_rig(found.rig), push.expected)
+        told_size = f'{abs(size):.2f}' if push.sized and math.isfinite(size) else ''
+        words = [_arrow(v, float(np.linalg.norm(expected))) for v in expected.tolist()]
+        rows.append([push.name, *(f'{v * 1e6:+.1f}' for v in push.channels.tolist()), '  rig file:', *words, told_size])
+    if not any(row[-1] for row in rows[1:]):
+        rows = [row[:-1] for row in rows]
+    return rows
+
+
+def _arrow(value: float, size: float) -> str:
+    """A direction: + or -, or 0 for next to nothing."""
+    return '0' if abs(value) < 0.1 * size else '+' if value > 0.0 else '-'
+
+
+def _verdict(found: Checkup) -> str:
+    fit = len(found.found)
+    if found.verdict == RIGHT:
+        return f'RIGHT: of {len(WIRINGS)} wirings only that of the rig file fits.'
+    if found.verdict == CANNOT_TELL:
+        if not fit:
+            return 'CANNOT TELL: these pushes fit no wiring.'
+        return f'CANNOT TELL: the rig file fits, and so do {fit - 1} other wirings of {len(WIRINGS)}.'
+    if not any(f.name in WIRED for f in found.findings):
+        return 'WRONG, but not in the wiring: that of the rig file fits.' if fit == 1 else 'WRONG:'
+    fits = f'one wiring of {len(WIRINGS)} fits' if fit == 1 else f'{fit} wirings of {len(WIRINGS)} fit'
+    return f'WRONG: {fits}, and that of the rig file does not.'
+
+
+def _findings(found: Checkup) -> list[str]:
+    if not found.findings:
+        return []
+    rows = []
+    for f in found.findings:
+        where = f.where.replace(' ', ' and ') if f.name == 'psd_swap' else f.where
+        rows.append((f'{where}: {NAMES[f.name]}', f.fix))
+    width = max(len(what) for what, _ in rows)
+    out = [f'{what:<{width}}   {fix}' for what, fix in rows]
+    also = dict.fromkeys(text for f in found.findings for text in f.equivalent)
+    return [*out, *(f'or else: {_other(text)}' for text in also)]
+
+
+def _other(text: str) -> str:
+    name, _, loads = text.partition(' of ')
+    if name != 'load_sign':
+        return text
+    ways = {'fx': '+X', 'fy': '+Y', 'tz': '+θ'}
+    pushes = ', '.join(ways[load] for load in loads.split())
+    return f'the rig file is right, and {pushes} went the other way (sign of the load); this would look the same'
+
+
+def _levels(found: Checkup) -> list[tuple[str, str]]:
+    measured = found.levels
+    noise = '  '.join(f'{c} {v * 1e3:.2f}' for c, v in zip(CHANNELS, measured.noise.tolist(), strict=True))
+    drift = '  '.join(
+        f'{c} {v * 60e6:+.1f} +- {sd * 60e6:.1f}'
+        for c, v, sd in zip(DOTS, found.drift.tolist(), found.drift_sd.tolist(), strict=True)
+    )
+    drift += '  µm a minute'
+    if found.drift_sd.max() > TELLING_DRIFT:
+        drift = 'too short a time to tell'
+    hum = 'none at 50 or 60 Hz'
+    if measured.hum.max() > 0.0:
+        sizes = '  '.join(f'{c} {v * 1e3:.1f}' for c, v in zip(CHANNELS, measured.hum.tolist(), strict=True))
+        hum = f'{sizes}  mV at {measured.hum_hz:g} Hz'
+    sums = '  '.join(f'{name} {v:.2f}' for name, v in zip(('sum1', 'sum2'), measured.sums.tolist(), strict=True))
+    return [
+        ('noise', f'{noise}  mV rms a sample (rig file {measured.stated * 1e3:.2f})'),
+        ('hum', hum),
+        ('light', f'{sums}  V (rig file {found.rig.amplifier.sum_nominal:g})'),
+        ('drift', drift),
+    ]
+
+
+def _wiring_json(wiring: Wiring) -> dict[str, object]:
+    axes = {f'psd_{psd}.axes': list(own) for psd, own in enumerate(wiring.axes, start=1)}
+    return {'psds_exchanged': wiring.exchanged, **axes}
+
+
+def _by(names: Sequence[str], values: Sequence[float]) -> dict[str, float]:
+    return dict(zip(names, values, strict=True))
