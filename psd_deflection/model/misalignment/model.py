@@ -1,14 +1,10 @@
 """Parameters of a rig and a pose -> the four readings; the one model that calibration fits and propagates.
 
-Of PSD i with centre c and height h, in the order in which it happens: the beam crosses the plate at q
-(:mod:`psd_deflection.model.plate.plate`, tilts phi = -k dY/L and omega = k dX/L, leaning beams), m = q - c, and then
-
-    u = Rz(-rotation) m,    v = u (1 + nonlinearity |u|^2),
-    x = (1 + gain_x)(v_x + crosstalk_xy v_y),    y = (1 + gain_y)(v_y + crosstalk_yx v_x).
-
-The signs are those of the effects of the same names. ``zero`` is the reading (x, y) of the unloaded link, as the
-detector gives it: what is known of the beam's place. m_0 follows from it by the inverse, and l = c + m_0. So a
-zero that is taken anew is independent of all other parameters.
+Of PSD i with centre c and height h: the beam crosses the plate at q (:mod:`psd_deflection.model.plate.plate`, tilts
+phi = -k dY/L and omega = k dX/L, leaning beams), m = q - c, and the detector reads S(m)
+(:class:`psd_deflection.model.detector.response.DetectorResponse`). ``zero`` is the reading (x, y) of the unloaded link,
+as the detector gives it: what is known of the beam's place. m_0 = S^-1(zero), and l = c + m_0. So a zero that is taken
+anew is independent of all other parameters.
 """
 
 from __future__ import annotations
@@ -19,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
+from psd_deflection.model.detector.response import DetectorResponse
 from psd_deflection.model.plate.plate import points_under_leaning
 from psd_deflection.records import FloatArray
 
@@ -75,39 +72,13 @@ TOLERANCES: FloatArray = np.array([p.tolerance for p in ALL])
 
 _PER_PSD, _CENTER, _HEIGHT, _CUBIC = 9, 5, 7, 8
 _BEAMS = 2 * _PER_PSD
-_NEWTON = 6
-"""Steps that reach rounding anywhere on a detector."""
 
 
-def reading_of_place(
-    p: FloatArray, psd: int, x: FloatArray, y: FloatArray, by: Arithmetic = LIBRARY
-) -> tuple[FloatArray, FloatArray]:
-    """What PSD ``psd`` (0, 1) reads of a dot at (x, y), m; ``p`` (COUNT,)."""
-    a, gx, gy, xy, yx = p[_PER_PSD * psd : _PER_PSD * psd + 5]
-    c, s = by.cos_many(a), by.sin_many(a)
-    u, v = c * x + s * y, c * y - s * x
-    grown = 1.0 + p[_PER_PSD * psd + _CUBIC] * (u * u + v * v)
-    u, v = u * grown, v * grown
-    return (1.0 + gx) * (u + xy * v), (1.0 + gy) * (v + yx * u)
-
-
-def place_of_reading(
-    p: FloatArray, psd: int, x: FloatArray, y: FloatArray, by: Arithmetic = LIBRARY
-) -> tuple[FloatArray, FloatArray]:
-    """The inverse of :func:`reading_of_place`."""
-    a, gx, gy, xy, yx = p[_PER_PSD * psd : _PER_PSD * psd + 5]
-    k = p[_PER_PSD * psd + _CUBIC]
-    x, y = x / (1.0 + gx), y / (1.0 + gy)
-    det = 1.0 - xy * yx
-    u, v = (x - xy * y) / det, (y - yx * x) / det
-    read = by.hypot_many(u, v)
-    true = read
-    for _ in range(_NEWTON):
-        true = true - (true * (1.0 + k * true**2) - read) / np.maximum(1.0 + 3.0 * k * true**2, 0.1)
-    grown = 1.0 + k * true**2
-    u, v = u / grown, v / grown
-    c, s = by.cos_many(a), by.sin_many(a)
-    return c * u - s * v, s * u + c * v
+def response_of(p: FloatArray, psd: int) -> DetectorResponse:
+    """What PSD ``psd`` (0, 1) does to the place of a dot; ``p`` (COUNT,)."""
+    first = _PER_PSD * psd
+    rotation, gain_x, gain_y, xy, yx = p[first : first + _CENTER]
+    return DetectorResponse(rotation, gain_x, gain_y, xy, yx, p[first + _CUBIC])
 
 
 def readings(p: FloatArray, pose: FloatArray, length: float, by: Arithmetic = LIBRARY) -> FloatArray:
@@ -115,9 +86,10 @@ def readings(p: FloatArray, pose: FloatArray, length: float, by: Arithmetic = LI
     out = np.empty((4, pose.shape[1]))
     for psd in range(2):
         center = p[_PER_PSD * psd + _CENTER : _PER_PSD * psd + _CENTER + 2]
-        m0 = place_of_reading(p, psd, p[ZERO + 2 * psd], p[ZERO + 2 * psd + 1], by)
+        response = response_of(p, psd)
+        m0 = response.place(p[ZERO + 2 * psd], p[ZERO + 2 * psd + 1], by)
         place = _points(p, psd, center + m0, pose, length, by) - center[:, None]
-        out[2 * psd : 2 * psd + 2] = reading_of_place(p, psd, place[0], place[1], by)
+        out[2 * psd : 2 * psd + 2] = response.reading(place[0], place[1], by)
     return out
 
 
@@ -150,19 +122,20 @@ def _psd_by_parameters(
     """
     first = _PER_PSD * psd
     at, zero = slice(first + _CENTER, first + _CENTER + 2), slice(ZERO + 2 * psd, ZERO + 2 * psd + 2)
-    m0 = np.array(place_of_reading(p, psd, p[zero][0], p[zero][1], by))
+    response = response_of(p, psd)
+    m0 = np.array(response.place(p[zero][0], p[zero][1], by))
     beam = p[at] + m0
     place = _points(p, psd, beam, pose, length, by) - p[at, None]
-    turned = by_place(p, psd, place[0], place[1], by)
+    turned = response.slopes(place[0], place[1], by)
 
     def moved_beam(d: FloatArray) -> FloatArray:
         return _points(p, psd, beam + d, pose, length, by)
 
     def read_there(d: FloatArray) -> FloatArray:
-        return np.stack(reading_of_place(p + d, psd, place[0], place[1], by))
+        return np.stack(response_of(p + d, psd).reading(place[0], place[1], by))
 
     def rest_place(d: FloatArray) -> FloatArray:
-        return np.array(place_of_reading(p + d, psd, p[zero][0], p[zero][1], by))
+        return np.array(response_of(p + d, psd).place(p[zero][0], p[zero][1], by))
 
     def point(d: FloatArray) -> FloatArray:
         return _points(p + d, psd, beam, pose, length, by)
@@ -171,7 +144,7 @@ def _psd_by_parameters(
     under = np.stack([_difference(moved_beam, 1e-6 * unit) for unit in np.eye(2)], axis=1)
     read = by.einsum('ijn,jkn->ikn', turned, under)
     out[:, at] = read - turned
-    out[:, zero] = by.einsum('ijn,jk->ikn', read, by.inverse_of(by_place(p, psd, m0[0], m0[1], by)))
+    out[:, zero] = by.einsum('ijn,jk->ikn', read, by.inverse_of(response.slopes(m0[0], m0[1], by)))
     for i in (*range(first, first + _CENTER), first + _CUBIC):
         away = by.einsum('ijn,j->in', read, _difference(rest_place, _step(i)))
         out[:, i] = _difference(read_there, _step(i)) + away
@@ -198,14 +171,3 @@ def by_pose(p: FloatArray, pose: FloatArray, length: float) -> FloatArray:
         for d, s in zip(np.diag(step), step, strict=True)
     ]
     return np.stack(out, axis=1)
-
-
-def by_place(p: FloatArray, psd: int, x: FloatArray, y: FloatArray, by: Arithmetic = LIBRARY) -> FloatArray:
-    """Derivatives (2, 2, ...) of :func:`reading_of_place` by x and y."""
-    step = 1e-6
-    columns = [
-        np.subtract(reading_of_place(p, psd, x + a, y + b, by), reading_of_place(p, psd, x - a, y - b, by))
-        / (2.0 * step)
-        for a, b in ((step, 0.0), (0.0, step))
-    ]
-    return np.stack(columns, axis=1)

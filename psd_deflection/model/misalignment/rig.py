@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,40 +15,32 @@ from psd_deflection.model.misalignment.model import (
     SLOPE,
     TOLERANCES,
     ZERO,
-    place_of_reading,
-    reading_of_place,
+    response_of,
 )
-from psd_deflection.model.simulation.catalogue import effects_of_rig, make_active, sort_effects
-from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig, is_ours, make_active, sort_effects
+from psd_deflection.model.simulation.declaration import PSD, ActiveEffect, Effect
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds
 
-_OF_PSD = {
-    'sensor_rotation': {'angle': 'rotation'},
-    'sensor_gain': {'x': 'gain_x', 'y': 'gain_y'},
-    'axis_crosstalk': {'xy': 'crosstalk_xy', 'yx': 'crosstalk_yx'},
-    'sensor_nonlinearity': {'k': 'nonlinearity'},
-    'sensor_position': {'x': 'center_x', 'y': 'center_y'},
-}
-"""Effects of one detector: their parameters, and what these are called here."""
-TILT = 'plane_tilt'
-CLAMP = {
-    'clamp_bending_compliance': 'clamp.bending_compliance',
-    'clamp_torsional_compliance': 'clamp.torsional_compliance',
-}
+CLAMP = ('clamp.bending_compliance', 'clamp.torsional_compliance')
+"""Compliances, rad/(N m): parameters of a calibration that no reading depends on by itself."""
+_SLOPE = 'link.slope_ratio'
+_AIMED = 'aimed'
+"""Whether the laser was aimed at the true centre: a choice, no number that a calibration finds."""
 NOT_CALIBRATED = ('none',)
 
 
 class RigVector(NamedTuple):
     """``values`` (COUNT,). ``clamp``: compliances by name, rad/(N m). ``others``: effects that are no parameters here.
 
-    ``tilts``: whether the rig file says that the plate tilts (an effect); otherwise its estimates are those of a
-    plate that stays parallel, and ``values`` has the k that the link has.
+    ``listed``: names of the effects that are. ``tilts``: whether one of them says that the plate tilts; otherwise the
+    estimates are those of a plate that stays parallel, and ``values`` has the k that the link has.
     """
 
     values: FloatArray
     clamp: dict[str, float]
     others: list[ActiveEffect]
+    listed: frozenset[str]
     tilts: bool
 
     @property
@@ -67,9 +59,11 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
     """
     check_two_psds(rig, 'a calibration')
     v = np.zeros(len(ALL))
-    clamp = dict.fromkeys(CLAMP.values(), 0.0)
+    clamp = dict.fromkeys(CLAMP, 0.0)
     others: list[ActiveEffect] = []
     seen: set[str] = set()
+    listed: set[str] = set()
+    tilts = False
     v[SLOPE] = rig.link.slope_ratio
     aimed = np.ones(2)
     for i, psd in enumerate(rig.psds):
@@ -78,31 +72,32 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
         for axis, angle in zip('xy', rig.beams[i].angle, strict=True):
             v[INDEX[f'beam_{i + 1}.angle_{axis}']] = angle
     for active in effects_of_rig(rig) if effects is None else effects:
-        name = active.effect.name
-        if name not in (*_OF_PSD, *CLAMP, TILT):
+        called = active.effect.calibrated_as
+        if not called:
             others.append(active)
             continue
         if active.label in seen:
             raise ConfigError(f'effects: {active.label}: listed twice; a calibration takes one of them')
+        # Of one PSD an effect counts once, whatever its other choices are.
         seen.add(active.label.split(',')[0])
-        if name == TILT:
-            v[SLOPE] = active.values['slope_ratio']
-        elif name in CLAMP:
-            clamp[CLAMP[name]] = active.values['compliance']
-        else:
-            psd_number = int(active.values['psd'])
-            for own, called in _OF_PSD[name].items():
-                v[INDEX[f'psd_{psd_number}.{called}']] += active.values[own]
-            if name == 'sensor_position':
-                aimed[psd_number - 1] = active.values['aimed']
+        for own, name in called.items():
+            if name in clamp:
+                clamp[name] = active.values[own]
+            elif name == _SLOPE:
+                v[SLOPE] = active.values[own]
+            elif name == _AIMED:
+                aimed[int(active.values[PSD.name]) - 1] = active.values[own]
+            else:
+                v[INDEX[f'psd_{active.values[PSD.name]:.0f}.{name}']] += active.values[own]
+        listed.add(active.effect.name)
+        tilts = tilts or _SLOPE in called.values()
     for i, psd in enumerate(rig.psds):
         center = v[INDEX[f'psd_{i + 1}.center_x']], v[INDEX[f'psd_{i + 1}.center_y']]
         # A laser that was not aimed at the true centre stands where the rig file has it.
         x, y = (z - (1.0 - aimed[i]) * (c - f) for z, c, f in zip(psd.zero, center, psd.center, strict=True))
-        v[ZERO + 2 * i : ZERO + 2 * i + 2] = reading_of_place(
-            v, i, np.array(x), np.array(y), ARITHMETICS[rig.estimator.arithmetic]
-        )
-    return RigVector(v, clamp, others, any(label.startswith(TILT) for label in seen))
+        by = ARITHMETICS[rig.estimator.arithmetic]
+        v[ZERO + 2 * i : ZERO + 2 * i + 2] = response_of(v, i).reading(np.array(x), np.array(y), by)
+    return RigVector(v, clamp, others, frozenset(listed), tilts)
 
 
 class Known(NamedTuple):
@@ -123,8 +118,8 @@ def stated_sd(rig: Rig) -> dict[str, float]:
     if not is_calibrated(rig):
         return {}
     for name in names:
-        if name not in INDEX and name not in CLAMP.values():
-            known = (*INDEX, *CLAMP.values())
+        if name not in INDEX and name not in CLAMP:
+            known = (*INDEX, *CLAMP)
             raise ConfigError(f'calibration.names: {name}: no parameter of a calibration{did_you_mean(name, known)}')
     if len(set(names)) < len(names):
         raise ConfigError('calibration.names: a name is there twice')
@@ -177,23 +172,40 @@ def rig_values(
     p = np.array([float(f'{v:.12g}') for v in p])
     values: dict[str, object] = {'link.slope_ratio': float(p[SLOPE])}
     effects = list(vector.others)
-
-    def add(name: str, parameters: dict[str, float]) -> None:
-        if any(v for key, v in parameters.items() if key != 'psd'):
-            effects.append(make_active(name, parameters, 'calibration'))
-
     for n in (1, 2):
         own = {name: float(p[INDEX[name]]) for name in INDEX if name.startswith((f'psd_{n}.', f'beam_{n}.'))}
         values[f'psd_{n}.center'] = [own[f'psd_{n}.center_x'], own[f'psd_{n}.center_y']]
         values[f'psd_{n}.height'] = own[f'psd_{n}.height']
         values[f'beam_{n}.angle'] = [own[f'beam_{n}.angle_x'], own[f'beam_{n}.angle_y']]
-        place = place_of_reading(p, n - 1, p[ZERO + 2 * n - 2], p[ZERO + 2 * n - 1])
+        place = response_of(p, n - 1).place(p[ZERO + 2 * n - 2], p[ZERO + 2 * n - 1])
         values[f'psd_{n}.zero'] = [float(f'{x:.12g}') for x in place]
-        for name, called in _OF_PSD.items():
-            if name != 'sensor_position':
-                add(name, {'psd': float(n), **{key: own[f'psd_{n}.{to}'] for key, to in called.items()}})
-    add(TILT, {'slope_ratio': float(p[SLOPE])})
-    for name, clamp_name in CLAMP.items():
-        # A clamp that gives less than nothing is the link's stiffness, not the clamp.
-        add(name, {'compliance': max(float(f'{clamp[clamp_name]:.12g}'), 0.0)})
+    # A clamp that gives less than nothing is the link's stiffness, not the clamp.
+    whole = {name: max(float(f'{clamp[name]:.12g}'), 0.0) for name in CLAMP} | {_SLOPE: float(p[SLOPE])}
+    for effect, called in _written(vector.listed):
+        if PSD not in effect.parameters:
+            _add(effects, effect, {key: whole[name] for key, name in called.items()})
+            continue
+        for n in (1, 2):
+            found = {key: float(p[INDEX[f'psd_{n}.{name}']]) for key, name in called.items()}
+            _add(effects, effect, found, {PSD.name: float(n)})
     return values, sort_effects(effects)
+
+
+def _written(listed: frozenset[str]) -> Iterator[tuple[Effect, dict[str, str]]]:
+    """The effects that a calibrated rig file has, each with those of its parameters that go into it.
+
+    Of several effects for one parameter: that which the rig file listed, otherwise the package's own.
+    """
+    known = [e for e in catalogue().values() if e.calibrated_as and not e.in_rig_file]
+    taken: set[str] = set()
+    for effect in sorted(known, key=lambda e: (e.name not in listed, not is_ours(e.name))):
+        if called := {key: name for key, name in effect.calibrated_as.items() if name not in taken}:
+            taken.update(called.values())
+            yield effect, called
+
+
+def _add(
+    effects: list[ActiveEffect], effect: Effect, sizes: Mapping[str, float], choices: Mapping[str, float] | None = None
+) -> None:
+    if any(sizes.values()):
+        effects.append(make_active(effect.name, {**(choices or {}), **sizes}, 'calibration'))

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from psd_deflection.base.arithmetic import ARITHMETICS, FIXED, Arithmetic
-from psd_deflection.model.misalignment.model import ZERO, by_parameters, by_place, place_of_reading, readings
+from psd_deflection.model.misalignment.model import ZERO, by_parameters, readings, response_of
 from psd_deflection.model.misalignment.rig import is_calibrated, known_of_rig, vector_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.records import FloatArray
@@ -98,8 +98,9 @@ def _dots_by_parameters(p: FloatArray, pose: FloatArray, length: float, by: Arit
     read = readings(p, pose, length, by)
     for psd in range(2):
         own = slice(2 * psd, 2 * psd + 2)
-        x, y = place_of_reading(p, psd, read[2 * psd], read[2 * psd + 1], by)
-        turned = by_place(p, psd, x, y, by).transpose(2, 0, 1)
+        response = response_of(p, psd)
+        x, y = response.place(read[2 * psd], read[2 * psd + 1], by)
+        turned = response.slopes(x, y, by).transpose(2, 0, 1)
         slopes[:, own] = by.solve(turned, slopes[:, own])
     return slopes
 

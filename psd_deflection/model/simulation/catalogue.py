@@ -83,6 +83,11 @@ def _words(place: Place) -> str:
     return str(place) if isinstance(place, Path) else place.value
 
 
+def is_ours(name: str) -> bool:
+    """Whether the package has that effect, and not a user."""
+    return any(module.name == name for module in pkgutil.iter_modules(ours.__path__))
+
+
 def effect_names() -> list[str]:
     """Every effect's name, without loading any. Raises ConfigError if two have one name."""
     return sorted(_places())

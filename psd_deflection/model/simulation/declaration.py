@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import typing
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
 from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
@@ -169,7 +169,12 @@ class Effect:
     ``uses``: inputs of the correction besides dots and sums. ``order``: among the effects of one
     stage. ``finite``: the signature at the nominal value vanishes, so exactly the values of
     ``grid`` are probed. ``whole``: ``apply`` must see the whole history at once, because a sample depends on later
-    ones; no effect of the catalogue does. Raises ValueError if the declaration contradicts itself.
+    ones; no effect of the catalogue does.
+
+    ``calibrated_as``: what a calibration calls the effect's parameters (:mod:`psd_deflection.model.misalignment.model`,
+    without ``psd_N.``): it then finds the effect's size; without it a calibration refuses rigs that have the effect.
+    ``in_rig_file``: the rig file states what a calibration finds of it, so that a calibrated file does not list it.
+    Raises ValueError if the declaration contradicts itself.
     """
 
     name: str
@@ -188,6 +193,8 @@ class Effect:
     finite: bool = False
     whole: bool = False
     order: int = 0
+    calibrated_as: Mapping[str, str] = field(default_factory=dict, hash=False)
+    in_rig_file: bool = False
 
     def __post_init__(self) -> None:
         names = [p.name for p in self.parameters]
@@ -211,6 +218,8 @@ class Effect:
                 raise ValueError(f'{p.name}: minimum must be at most maximum, and scale above 0')
             if (p.kind == 'choice') != bool(p.choices):
                 raise ValueError(f'{p.name}: a choice, and nothing else, has choices')
+        if not set(self.calibrated_as) <= set(names):
+            raise ValueError(f'calibrated_as = {dict(self.calibrated_as)!r}: must name parameters')
 
     @property
     def rank(self) -> tuple[int, int, str]:

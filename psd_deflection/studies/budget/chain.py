@@ -15,8 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import ndtr
 
+from psd_deflection.model.detector.clipping import cut_by_edges
+from psd_deflection.model.detector.response import grown, pulled, scaled
 from psd_deflection.model.plate.plate import tied_pose
 from psd_deflection.model.plate.rays import hit, lifted, rotation
 from psd_deflection.records import FloatArray
@@ -93,26 +94,14 @@ def dots(chain: MeasuringChain, pose: FloatArray, dz: float = 0.0) -> FloatArray
     return hit(start, lifted(chain.beam_slope, 1.0), origin, plate @ own)
 
 
-def clipped(places: FloatArray, diameter: FloatArray, half_area: FloatArray) -> FloatArray:
-    """Centroid (n, P, 2) of the part of a Gaussian spot at ``places`` that is on the active area.
-
-    Beam diameter D (1/e^2) is four standard deviations of the intensity, and the area's edges clip x
-    and y independently. So each coordinate is the mean of a truncated normal. A spot at least 6
-    deviations inside the area is unchanged.
-    """
-    if not np.any(diameter > 0.0):
-        return places
-    deviation = np.maximum(diameter[..., None] / 4.0, 1e-12)
-    low, high = (-half_area - places) / deviation, (half_area - places) / deviation
-    caught = np.maximum(ndtr(high) - ndtr(low), 1e-300)
-    pull = (np.exp(-(low**2) / 2.0) - np.exp(-(high**2) / 2.0)) / np.sqrt(2.0 * np.pi) / caught
-    return np.asarray(places + deviation * pull)
-
-
 def _read(chain: MeasuringChain, places: FloatArray) -> FloatArray:
-    places = clipped(places, chain.spot_diameter, chain.half_area)
-    places = places * (1.0 + chain.nonlinearity[..., None] * np.sum(places**2, axis=-1, keepdims=True))
-    return np.asarray(places / (1.0 + chain.background[..., None]) * (1.0 + chain.gain))
+    if np.any(chain.spot_diameter > 0.0):
+        _, moved = cut_by_edges(places, chain.half_area, np.maximum(chain.spot_diameter[..., None] / 2.0, 1e-12))
+        places = places + moved
+    # Other light is centred.
+    places = pulled(places, 1.0, chain.background[..., None], 0.0)
+    x, y = grown(places[..., 0], places[..., 1], chain.nonlinearity)
+    return np.stack(scaled(x, y, chain.gain[..., 0], chain.gain[..., 1]), axis=-1)
 
 
 def measure(chain: MeasuringChain, pose: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -32,7 +32,7 @@ from psd_deflection.studies.calibrate.observation import Rows
 Mask = np.ndarray[tuple[int], np.dtype[np.bool_]]
 Kind = Literal['reference', 'loads', 'self']
 
-NAMES = (*(p.name for p in ALL), *CLAMP.values(), 'reference.clock')
+NAMES = (*(p.name for p in ALL), *CLAMP, 'reference.clock')
 SIZE = len(NAMES)
 CLAMP_AT, CLOCK = COUNT, COUNT + 2
 CLOCK_SD = 0.005
@@ -74,7 +74,7 @@ def prior_of_rig(rig: Rig, vector: RigVector | None = None) -> Prior:
     own = (rig.link.length / rig.link.bending_stiffness, rig.link.length / rig.link.torsional_stiffness)
     # A tip force F gives L^3 F/3EI; a clamp that turns by c F L moves the tip by c F L^2.
     shares = (CLAMP_SHARE * own[0] / 3.0, CLAMP_SHARE * own[1])
-    for i, (name, share) in enumerate(zip(CLAMP.values(), shares, strict=True)):
+    for i, (name, share) in enumerate(zip(CLAMP, shares, strict=True)):
         covariance[CLAMP_AT + i, CLAMP_AT + i] = (stated.get(name) or share) ** 2
     covariance[CLOCK, CLOCK] = CLOCK_SD**2
     mean = np.concatenate((vector.values, list(vector.clamp.values()), [0.0]))

@@ -71,7 +71,7 @@ def values_of(found: Calibration, date: str) -> tuple[dict[str, object], list[Ac
     measured = {**noise, **values_of_levels(found.dark)}
     if found.refused:
         return measured, []
-    clamp = {name: float(found.values[CLAMP_AT + i]) for i, name in enumerate(CLAMP.values())}
+    clamp = {name: float(found.values[CLAMP_AT + i]) for i, name in enumerate(CLAMP)}
     values, effects = rig_values(found.vector, found.values[:COUNT], clamp)
     at = np.array([*range(COUNT), *(CLAMP_AT + i for i in range(2) if found.fit.free[CLAMP_AT + i])])
     sd = found.sd[at]

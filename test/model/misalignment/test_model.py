@@ -16,9 +16,8 @@ from psd_deflection.model.misalignment.model import (
     ZERO,
     by_parameters,
     by_pose,
-    place_of_reading,
-    reading_of_place,
     readings,
+    response_of,
 )
 from psd_deflection.model.misalignment.rig import known_of_rig, rig_values, vector_of_rig
 from psd_deflection.model.simulation.catalogue import effects_to_values
@@ -65,7 +64,8 @@ def test_a_place_is_read_and_found_again(truth: dict[str, float]) -> None:
     p = vector_of(truth)
     p[INDEX['psd_2.nonlinearity']] = -3000.0
     x, y = np.random.default_rng(3).uniform(-5e-3, 5e-3, (2, 100))
-    assert np.array(place_of_reading(p, 1, *reading_of_place(p, 1, x, y))) == pytest.approx(np.array([x, y]), abs=1e-15)
+    response = response_of(p, 1)
+    assert np.array(response.place(*response.reading(x, y))) == pytest.approx(np.array([x, y]), abs=1e-15)
 
 
 def test_a_rig_file_of_a_vector_corrects_the_dots(truth: dict[str, float], poses: FloatArray) -> None:

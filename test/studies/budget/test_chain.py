@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.detector.clipping import cut_by_edges
 from psd_deflection.model.plate.plate import plate_points, tied_pose
 from psd_deflection.rig.config import load_rig, replace_values
-from psd_deflection.studies.budget.chain import MeasuringChain, clipped, dots, measure
+from psd_deflection.studies.budget.chain import MeasuringChain, dots, measure
 from psd_deflection.studies.budget.estimate import estimator_of
 
 GOLDEN: dict[str, Any] = json.loads((Path(__file__).parents[2] / 'data' / 'golden.json').read_text(encoding='utf-8'))
@@ -72,7 +73,8 @@ def test_the_chain_and_the_model_of_the_estimators_agree() -> None:
 
 def test_a_clipped_spot_reads_the_centroid_of_what_is_caught() -> None:
     half, diameter, place = np.array([5e-3, 5e-3]), 2e-3, np.array([4.6e-3, -1.0e-3])
-    got = clipped(place[None, None], np.array([[diameter]]), half)[0, 0]
+    _, moved = cut_by_edges(place, half, diameter / 2.0)
+    got = place + moved
     # By brute force: intensity of 1/e^2 diameter D on a fine grid over the active area.
     edges = np.linspace(-5e-3, 5e-3, 20_001)
     axis = (edges[1:] + edges[:-1]) / 2.0
@@ -80,7 +82,9 @@ def test_a_clipped_spot_reads_the_centroid_of_what_is_caught() -> None:
         light = np.exp(-8.0 * (axis - place[k]) ** 2 / diameter**2)
         assert got[k] == pytest.approx(float(np.sum(axis * light) / np.sum(light)), abs=2e-9)
     assert got[0] < place[0] - 1e-4
-    assert clipped(place[None, None], np.array([[0.0]]), half)[0, 0].tolist() == place.tolist()
+    point = replace(MeasuringChain.of(RIG), spot_diameter=np.zeros((1, 1)))
+    readings, _ = measure(point, np.zeros(3))
+    assert readings[0] == pytest.approx(RIG.zeros, abs=1e-15)
 
 
 @pytest.mark.parametrize('method', ['exact', 'beam', 'wls', 'thesis_iteration'])

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from psd_deflection.model.detector.response import pulled
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.samples import SimulatedSamples
@@ -23,10 +24,9 @@ def _on_the_detector(axis: int) -> Callable[[Physics, Values], tuple[float, floa
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     psd = int(values['psd']) - 1
     laser, level = samples.sums[psd], values['level']
-    whole = laser + level
     for row, center in ((2 * psd, values['x']), (2 * psd + 1, values['y'])):
-        samples.dots[row] = (laser * samples.dots[row] + level * center) / whole
-    samples.sums[psd] = whole
+        samples.dots[row] = pulled(samples.dots[row], laser, level, center)
+    samples.sums[psd] = laser + level
 
 
 def _correct(reading: Reading, values: Values) -> None:

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+from psd_deflection.model.detector.response import crossed, uncrossed
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     i = 2 * (int(values['psd']) - 1)
-    x, y = samples.dots[i].copy(), samples.dots[i + 1].copy()
-    samples.dots[i] += values['xy'] * y
-    samples.dots[i + 1] += values['yx'] * x
+    dots = samples.dots
+    dots[i], dots[i + 1] = crossed(dots[i], dots[i + 1], values['xy'], values['yx'])
 
 
 def _correct(reading: Reading, values: Values) -> None:
     i = 2 * (int(values['psd']) - 1)
-    x, y = reading.dots[i].copy(), reading.dots[i + 1].copy()
-    det = 1.0 - values['xy'] * values['yx']
-    reading.dots[i] = (x - values['xy'] * y) / det
-    reading.dots[i + 1] = (y - values['yx'] * x) / det
+    dots = reading.dots
+    dots[i], dots[i + 1] = uncrossed(dots[i], dots[i + 1], values['xy'], values['yx'])
 
 
 EFFECT = Effect(
@@ -37,4 +35,5 @@ EFFECT = Effect(
     apply=_apply,
     correct=_correct,
     order=4,
+    calibrated_as={'xy': 'crosstalk_xy', 'yx': 'crosstalk_yx'},
 )

@@ -21,4 +21,5 @@ EFFECT = Effect(
     order=1,
     point='configure',
     configure=_configure,
+    calibrated_as={'compliance': 'clamp.bending_compliance'},
 )

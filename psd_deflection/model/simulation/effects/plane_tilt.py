@@ -32,4 +32,5 @@ EFFECT = Effect(
     point='configure',
     configure=_configure,
     finite=True,
+    calibrated_as={'slope_ratio': 'link.slope_ratio'},
 )

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from psd_deflection.model.detector.response import scaled, unscaled
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     i = 2 * (int(values['psd']) - 1)
-    samples.dots[i] *= 1.0 + values['x']
-    samples.dots[i + 1] *= 1.0 + values['y']
+    dots = samples.dots
+    dots[i], dots[i + 1] = scaled(dots[i], dots[i + 1], values['x'], values['y'])
 
 
 def _correct(reading: Reading, values: Values) -> None:
     i = 2 * (int(values['psd']) - 1)
-    reading.dots[i] /= 1.0 + values['x']
-    reading.dots[i + 1] /= 1.0 + values['y']
+    dots = reading.dots
+    dots[i], dots[i + 1] = unscaled(dots[i], dots[i + 1], values['x'], values['y'])
 
 
 EFFECT = Effect(
@@ -34,4 +35,5 @@ EFFECT = Effect(
     apply=_apply,
     correct=_correct,
     order=5,
+    calibrated_as={'x': 'gain_x', 'y': 'gain_y'},
 )

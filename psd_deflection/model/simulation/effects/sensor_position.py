@@ -40,4 +40,6 @@ EFFECT = Effect(
     ),
     point='configure',
     configure=_configure,
+    calibrated_as={'x': 'center_x', 'y': 'center_y', 'aimed': 'aimed'},
+    in_rig_file=True,
 )

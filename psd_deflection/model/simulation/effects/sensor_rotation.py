@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from psd_deflection.base.arithmetic import Arithmetic
+from psd_deflection.model.detector.response import turned
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray
@@ -10,10 +11,7 @@ from psd_deflection.records import FloatArray
 
 def _turn(dots: FloatArray, psd: float, angle: float, by: Arithmetic) -> None:
     i = 2 * (int(psd) - 1)
-    c, s = by.cos(angle), by.sin(angle)
-    x, y = dots[i].copy(), dots[i + 1].copy()
-    dots[i] = c * x + s * y
-    dots[i + 1] = c * y - s * x
+    dots[i], dots[i + 1] = turned(dots[i], dots[i + 1], by.cos(angle), by.sin(angle))
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
@@ -39,4 +37,5 @@ EFFECT = Effect(
     apply=_apply,
     correct=_correct,
     order=2,
+    calibrated_as={'angle': 'rotation'},
 )

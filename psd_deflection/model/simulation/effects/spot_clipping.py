@@ -2,32 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-from scipy.special import ndtr
-
+from psd_deflection.model.detector.clipping import cut_by_edges, cut_disc
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, State, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples
-from psd_deflection.records import FloatArray
-
-
-def _cut_disc(distance: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
-    """Share of a disc left by an edge at ``distance`` from its centre, and the share's centroid.
-
-    The centroid is the distance it moves away from the edge, m.
-    """
-    u = np.clip(distance / radius, -0.999, 1.0)
-    root = np.sqrt(1.0 - u * u)
-    left = 1.0 - (np.arccos(u) - u * root) / np.pi
-    return left, (2.0 / (3.0 * np.pi)) * radius * root**3 / left
-
-
-def _cut_gauss(position: FloatArray, half: float, radius: float) -> tuple[FloatArray, FloatArray]:
-    """Share of a Gaussian spot between two edges at +-``half``, and the shift of its centroid, m."""
-    sigma = 0.5 * radius
-    a, b = (-half - position) / sigma, (half - position) / sigma
-    left = np.maximum(ndtr(b) - ndtr(a), 1e-9)
-    density = np.exp(-0.5 * a * a) - np.exp(-0.5 * b * b)
-    return left, sigma * density / (np.sqrt(2.0 * np.pi) * left)
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
@@ -39,11 +16,11 @@ def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
         place = samples.dots[row].copy()
         if values['profile'] == 1:
             for side in (1.0, -1.0):
-                left, moved = _cut_disc(half - side * place, radius)
+                left, moved = cut_disc(half - side * place, radius)
                 samples.dots[row] -= side * moved
                 samples.sums[psd] *= left
         else:
-            left, moved = _cut_gauss(place, half, radius)
+            left, moved = cut_by_edges(place, half, radius)
             samples.dots[row] += moved
             samples.sums[psd] *= left
 

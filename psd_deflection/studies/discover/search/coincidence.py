@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psd_deflection.model.simulation.declaration import MOVES_FREQUENCY
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.fit import Fit
@@ -28,8 +29,6 @@ independent effects reach odds of N at most once in N searches.
 """
 EXACT = 0.003
 """Relative; no ratio is trusted to better, because a stand-in matches the true cause only approximately."""
-STIFFNESSES = frozenset(('bending_stiffness', 'torsional_stiffness'))
-"""What one radius ties; :mod:`.ties` tells that cause."""
 _SAME_UNIT: Mapping[str, str] = {'rad': ''}
 
 
@@ -62,12 +61,12 @@ def coincidences(fit: Fit, physics: Physics | None) -> list[Coincidence]:
     """The ties between amplitudes of different effects of ``fit`` that are beyond chance, the strongest first."""
     covariance = fit.covariance()
     sizes = _amplitudes(fit, physics, covariance)
-    of = [fit.effects[fit.free[size[0]][0]].effect.name for size in sizes]
+    # What ties two stiffnesses is known, and told by :mod:`.ties`.
+    stiff = [MOVES_FREQUENCY in fit.effects[fit.free[size[0]][0]].effect.parameters for size in sizes]
     compared = [
         (a, b)
-        for (a, first), (b, second) in itertools.combinations(zip(sizes, of, strict=True), 2)
-        # Of the two stiffnesses the common cause is known.
-        if fit.free[a[0]][0] != fit.free[b[0]][0] and a[2] == b[2] and {first, second} != STIFFNESSES
+        for (a, first), (b, second) in itertools.combinations(zip(sizes, stiff, strict=True), 2)
+        if fit.free[a[0]][0] != fit.free[b[0]][0] and a[2] == b[2] and not (first and second)
     ]
     out = []
     for (j, a, unit), (k, b, _) in compared:

@@ -7,19 +7,19 @@ smaller, but leave its natural frequencies. A length, 3 : 1, is tried by the sea
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+from psd_deflection.model.simulation.declaration import MOVES_FREQUENCY
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival
 
-BENDING, TORSION = 'bending_stiffness', 'torsional_stiffness'
 SAME = 3.0
 """Standard deviations of their difference up to which two shares count as the same."""
 EXACT = 0.003
 """Relative; a stand-in such as a clamp matches only approximately."""
-_KINDS = 'amplitude', 'choice'
-"""Of the parameters of both effects: the relative change, and whether the mode moves with it."""
 CLEAR = 5.0
 """Standard deviations that a share is away from none."""
 
@@ -49,7 +49,7 @@ class Tie:
         """Why they are tied, the causes with their sizes, and what tells these apart."""
         spread = f'{100.0 * self.share:.3g} ± {100.0 * self.sd:.1g} %'
         factors = {c.name: f'{c.factor:.5g} ± {c.sd:.1g}' for c in self.causes}
-        words = f'{BENDING} and {TORSION} differ by the same share ({spread}), as one cause makes them: '
+        words = f'Both stiffnesses, EI and GJ, differ by the same share ({spread}), as one cause makes them: '
         radius = f"the link's radii times {factors['link_radius']} (EI and GJ grow with their fourth power)"
         if self.moves:
             return (
@@ -64,26 +64,36 @@ class Tie:
 
 def ties(effects: Sequence[NamedEffect]) -> tuple[Tie, ...]:
     """The tie of the two stiffnesses among ``effects`` and their rivals, if they differ by the same share."""
-    for bending in _shares(effects, BENDING):
-        for torsion in _shares(effects, TORSION):
-            (a, sd_a, moves), (b, sd_b, also) = bending, torsion
-            apart = SAME * math.hypot(sd_a, sd_b, EXACT * a)
-            if moves == also and abs(a - b) <= apart and min(abs(a) / sd_a, abs(b) / sd_b) > CLEAR:
-                return (_tie(a, sd_a, b, sd_b, moves),)
+    for first, second in itertools.combinations(sorted(_shares(effects), key=lambda share: share.effect), 2):
+        apart = SAME * math.hypot(first.sd, second.sd, EXACT * first.value)
+        clear = min(abs(first.value) / first.sd, abs(second.value) / second.sd) > CLEAR
+        same = first.moves == second.moves and abs(first.value - second.value) <= apart
+        if first.effect != second.effect and same and clear:
+            return (_tie(first.value, first.sd, second.value, second.sd, first.moves),)
     return ()
 
 
-def _shares(effects: Sequence[NamedEffect], name: str) -> Iterator[tuple[float, float, bool]]:
-    """Relative change of a stiffness, its sd, and whether the mode moves with it, wherever it is named or a rival."""
+class _Share(NamedTuple):
+    """Relative change of a stiffness by an effect, with its sd; ``moves``: whether the mode moves with it."""
+
+    effect: str
+    value: float
+    sd: float
+    moves: bool
+
+
+def _shares(effects: Sequence[NamedEffect]) -> Iterator[_Share]:
+    """The changes of stiffnesses, wherever they are named or a rival."""
     for named in effects:
         either: tuple[NamedEffect | Rival, ...] = (named, *named.rivals)
         for e in either:
-            if e.active.effect.name != name:
+            effect = e.active.effect
+            if MOVES_FREQUENCY not in effect.parameters:
                 continue
-            scale, moves = (next(p.name for p in e.active.effect.parameters if p.kind == k) for k in _KINDS)
+            scale = next(p.name for p in effect.parameters if p.kind == 'amplitude')
             sd = e.sd.get(scale, 0.0)
             if sd > 0.0:
-                yield e.active.values[scale], sd, bool(e.active.values[moves])
+                yield _Share(effect.name, e.active.values[scale], sd, bool(e.active.values[MOVES_FREQUENCY.name]))
 
 
 def _tie(a: float, sd_a: float, b: float, sd_b: float, moves: bool) -> Tie:

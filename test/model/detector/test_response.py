@@ -1,0 +1,208 @@
+"""One model of the detector: simulation, correction, calibration and budget give the same reading."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import psd_deflection
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.measure.correction import Correction
+from psd_deflection.model.detector.response import DetectorResponse, freed, pulled
+from psd_deflection.model.misalignment.model import INDEX, TOLERANCES
+from psd_deflection.model.misalignment.rig import rig_values, vector_of_rig
+from psd_deflection.model.simulation.catalogue import FOLDERS, catalogue, effect_names, make_active
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.samples import SimulatedSamples
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.budget.chain import MeasuringChain, measure
+
+PACKAGE = Path(psd_deflection.__file__).parent
+RIG = load_rig()
+SUM = RIG.amplifier.sum_nominal
+share = st.floats(-0.05, 0.05)
+place = st.floats(-4e-3, 4e-3)
+
+
+def simulated(x: float, y: float, *effects: ActiveEffect) -> FloatArray:
+    """What PSD 1 reads of a dot at (x, y), m, with ``effects``, in the order in which the simulation applies them."""
+    samples = SimulatedSamples(np.zeros(1), np.zeros(1), np.zeros((3, 1)), Physics.of(RIG))
+    samples.dots = np.array([[x], [y], [0.0], [0.0]])
+    samples.sums = np.full((2, 1), SUM)
+    for active in sorted(effects, key=lambda a: a.effect.rank):
+        assert active.effect.apply is not None
+        active.effect.apply(samples, active.values, {})
+    return samples.dots[:2, 0]
+
+
+def budgeted(x: float, y: float, **errors: Any) -> FloatArray:
+    """The same by the chain of the error budget: at rest the dot lies at the zero."""
+    chain = replace(MeasuringChain.of(RIG), zeros=np.array([[x, y], [0.0, 0.0]]), **errors)
+    readings, _ = measure(chain, np.zeros(3))
+    return np.asarray(readings[0, 0])
+
+
+def effect(name: str, **values: float) -> ActiveEffect:
+    return make_active(name, {'psd': 1, **values}, 'test')
+
+
+def test_light_pulls_the_reading_before_it_grows() -> None:
+    # By hand: 4 mm / 1.05 = 3.80952 mm, and that times 1 + 500 /m^2 (3.80952 mm)^2 = 1.0072562.
+    light = effect('ambient_light', level=0.05 * SUM)
+    by_simulation = simulated(4e-3, 0.0, light, effect('sensor_nonlinearity', k=500.0))
+    by_budget = budgeted(4e-3, 0.0, background=np.array([[0.05]]), nonlinearity=np.array([[500.0]]))
+    assert by_simulation[0] == pytest.approx(3.8371666e-3, abs=1e-10)
+    assert by_budget == pytest.approx(by_simulation, rel=1e-14)
+
+
+@given(place, place, st.floats(0.0, 0.2), st.floats(-3000.0, 3000.0), share, share)
+def test_the_budget_reads_what_the_simulation_does(
+    x: float, y: float, light: float, k: float, gain_x: float, gain_y: float
+) -> None:
+    radius = 1.5e-3
+    effects = [
+        effect('spot_clipping', radius=radius, profile=2),
+        effect('ambient_light', level=light * SUM),
+        effect('sensor_nonlinearity', k=k),
+        effect('sensor_gain', x=gain_x, y=gain_y),
+    ]
+    want = simulated(x, y, *effects)
+    # The sum falls with a cut spot, so that the light weighs more; the budget states the light's share itself.
+    cut = SimulatedSamples(np.zeros(1), np.zeros(1), np.zeros((3, 1)), Physics.of(RIG))
+    cut.dots, cut.sums = np.array([[x], [y], [0.0], [0.0]]), np.full((2, 1), SUM)
+    assert effects[0].effect.apply is not None
+    effects[0].effect.apply(cut, effects[0].values, {})
+    got = budgeted(
+        x, y,
+        spot_diameter=np.array([[2.0 * radius]]),
+        background=np.array([[light * SUM / cut.sums[0, 0]]]),
+        nonlinearity=np.array([[k]]),
+        gain=np.array([[[gain_x, gain_y]]]),
+    )  # fmt: skip
+    assert got == pytest.approx(want, abs=1e-16)
+
+
+@given(place, place, st.floats(-0.1, 0.1), share, share, share, share, st.floats(-3000.0, 3000.0))
+def test_the_calibration_reads_what_the_simulation_does_and_finds_the_place_again(
+    x: float, y: float, angle: float, gain_x: float, gain_y: float, xy: float, yx: float, k: float
+) -> None:
+    response = DetectorResponse(angle, gain_x, gain_y, xy, yx, k)
+    got = np.array(response.reading(np.array(x), np.array(y)))
+    want = simulated(
+        x, y,
+        effect('sensor_rotation', angle=angle),
+        effect('sensor_nonlinearity', k=k),
+        effect('axis_crosstalk', xy=xy, yx=yx),
+        effect('sensor_gain', x=gain_x, y=gain_y),
+    )  # fmt: skip
+    assert got == pytest.approx(want, abs=1e-17)
+    assert np.array(response.place(got[0], got[1])) == pytest.approx(np.array([x, y]), abs=1e-15)
+    step = 1e-5
+    slope = (np.array(response.reading(np.array(x + step), np.array(y))) - got) / step
+    assert response.slopes(np.array(x), np.array(y))[:, 0] == pytest.approx(slope, abs=1e-3)
+
+
+@given(place, st.floats(0.0, 5.0), place)
+def test_light_is_taken_off_again(x: float, level: float, center: float) -> None:
+    read = pulled(np.array(x), SUM, level, center)
+    assert freed(read, SUM, level, center) == pytest.approx(x, abs=1e-17)
+
+
+HOMONYMS = {
+    'damping': 'a setting of the compensator and its least squares',
+    'quantisation': 'a cause of the error budget',
+    'plane_tilt': 'a cause of the error budget',
+    'refraction': 'a cause of the error budget',
+    'sensor_gain': 'a cause of the error budget',
+    'sensor_rotation': 'a cause of the error budget',
+    'spot_clipping': 'a cause of the error budget',
+    'thermal_drift': 'a cause of the error budget',
+    'bending_stiffness': 'EI in the table of `design`',
+    'torsional_stiffness': 'GJ in the table of `design`',
+}
+PLACES = ('studies/budget/', 'arms/', 'cli/run/compensator.py', 'cli/studies/design.py')
+"""Where these words stand for something else."""
+
+
+def test_no_other_file_names_an_effect() -> None:
+    names = set(effect_names())
+    assert len(names) >= 30
+    found = []
+    for path in sorted(PACKAGE.rglob('*.py')):
+        where = path.relative_to(PACKAGE).as_posix()
+        if where.startswith('model/simulation/effects/'):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            if not isinstance(node, ast.Constant) or node.value not in names:
+                continue
+            if not (where.startswith(PLACES) and node.value in HOMONYMS):
+                found.append(f'{where}:{node.lineno}: {node.value}')
+    assert found == []
+
+
+OWN = """
+from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter
+
+def _apply(samples, values, state):
+    samples.dots[2 * (int(values['psd']) - 1)] *= 1.0 + values['x']
+
+def _correct(reading, values):
+    reading.dots[2 * (int(values['psd']) - 1)] /= 1.0 + values['x']
+
+EFFECT = Effect(
+    name='my_gain', stage='psd', summary='-', equation='-', source='-', needs='-', point='dots', order=5,
+    parameters=(PSD, EffectParameter('x', '', -0.5, 0.5, 1e-3, 'of x')),
+    apply=_apply, correct=_correct, calibrated_as={'x': 'gain_x'},
+)
+"""
+
+
+def test_a_calibration_takes_an_effect_of_the_users_own_for_what_it_declares(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / 'my_gain.py').write_text(OWN)
+    monkeypatch.setenv(FOLDERS, str(tmp_path))
+    assert catalogue()['my_gain'].calibrated_as == {'x': 'gain_x'}
+    listed = {'effects.a.name': 'my_gain', 'effects.a.psd': 2, 'effects.a.x': 0.01}
+    rig = load_rig(overrides=listed)
+    vector = vector_of_rig(rig)
+    assert vector.others == []
+    at = INDEX['psd_2.gain_x']
+    assert vector.values[at] == 0.01
+    # What a calibration finds goes into the effect that the file has; of others into the package's own.
+    found = vector.values.copy()
+    found[at] = 0.012
+    found[INDEX['psd_1.rotation']] = TOLERANCES[INDEX['psd_1.rotation']]
+    _, effects = rig_values(vector, found, vector.clamp)
+    own = [a for a in effects if 'psd' in a.values]
+    assert [(a.effect.name, a.values['psd']) for a in own] == [('sensor_rotation', 1.0), ('my_gain', 2.0)]
+    assert own[1].values['x'] == 0.012
+    dots = np.array([[0.0, 0.0, 1.01e-3, 0.0]])
+    assert Correction.from_rig(rig).apply(dots)[0, 2] == pytest.approx(1e-3)
+    found[INDEX['psd_2.gain_y']] = 0.004
+    for known, want in ((vector, ['my_gain', 'sensor_gain']), (vector_of_rig(RIG), ['sensor_gain'])):
+        _, effects = rig_values(known, found, vector.clamp)
+        gains = [a for a in effects if a.effect.name.endswith('gain')]
+        assert [a.effect.name for a in gains] == want
+        assert gains[-1].values['y'] == 0.004
+
+
+def test_a_declaration_names_its_own_parameters() -> None:
+    with pytest.raises(ValueError, match=r"calibrated_as = .'z': 'gain_x'.: must name parameters"):
+        replace(catalogue()['sensor_gain'], calibrated_as={'z': 'gain_x'})
+
+
+def test_an_effect_listed_twice_is_refused() -> None:
+    twice = {f'effects.{key}.{name}': value for key in 'ab' for name, value in
+             {'name': 'sensor_gain', 'psd': 1, 'x': 0.01}.items()}  # fmt: skip
+    with pytest.raises(ConfigError, match='listed twice'):
+        vector_of_rig(load_rig(overrides=twice))
